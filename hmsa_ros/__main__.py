@@ -1,0 +1,8 @@
+"""Entry point of ``python -m hmsa_ros``, the same as the ``hmsa`` command."""
+
+import sys
+
+from hmsa_ros.cli import main
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,108 @@
+"""
+The ``hmsa`` command.
+
+Each command is a module of this package with ``add_parser(subparsers)`` and ``run(arguments)``,
+listed in `COMMANDS`. Modules import what is slow (rclpy, Numba, matplotlib) inside ``run``, so
+that ``hmsa --help`` answers at once.
+"""
+
+import argparse
+from collections.abc import Sequence
+from importlib import import_module
+import sys
+from typing import NoReturn
+
+from hmsa_ros import __version__
+from hmsa_ros.errors import BadInputError, HmsaError
+
+COMMANDS = ('demo', 'plan', 'send', 'node', 'bag', 'figures')
+
+
+class Parser(argparse.ArgumentParser):
+    """Argument parser that answers bad input with one line and exit status 2."""
+
+    def error(self, message: str) -> NoReturn:
+        """
+        Print one line on standard error and exit with status 2.
+
+        Parameters
+        ----------
+        message : str
+            What was wrong.
+
+        """
+        self.exit(2, f'hmsa: error: {message}; see {self.prog} --help\n')
+
+
+def build_parser() -> Parser:
+    """
+    Return the parser of the whole command line.
+
+    Returns
+    -------
+    Parser
+        With one subparser a command.
+
+    """
+    parser = Parser(
+        prog='hmsa',
+        description='Move hard-magnetic soft actuators to where they are told, fast and '
+                    'without residual vibration.')
+    parser.add_argument('--version', action='version', version=f'hmsa_ros {__version__}')
+    subparsers = parser.add_subparsers(metavar='COMMAND', required=True)
+    for name in COMMANDS:
+        import_module(f'hmsa_ros.cli.{name}').add_parser(subparsers)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Run the ``hmsa`` command.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Arguments without the program's name; default ``sys.argv[1:]``.
+
+    Returns
+    -------
+    int
+        Exit status: 0 done, 1 the run failed, 2 bad input, 130 interrupted.
+
+    """
+    arguments = build_parser().parse_args(argv)
+    try:
+        status: int = arguments.run(arguments)
+        return status
+    except BadInputError as error:
+        return report(error, 2)
+    except HmsaError as error:
+        return report(error, 1)
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:
+        # The reader of our output (head, less) has gone: there is nobody left to tell.
+        sys.stderr.close()
+        return 0
+
+
+def report(error: Exception, status: int) -> int:
+    """
+    Print an error as one line on standard error.
+
+    Parameters
+    ----------
+    error : Exception
+        What happened.
+    status : int
+        Exit status to pass on.
+
+    Returns
+    -------
+    int
+        ``status``.
+
+    """
+    line = ' '.join(str(error).split())
+    print(f'hmsa: error: {line}', file=sys.stderr)
+    return status

@@ -1,0 +1,54 @@
+"""``hmsa planner``, ``hmsa plant``, ``hmsa recorder`` and ``hmsa player``: run a node."""
+
+import argparse
+from importlib import import_module
+from typing import Any
+
+NODES = {
+    'planner': 'turn setpoint sequences into the shaped command stream',
+    'plant': 'simulate the actuator',
+    'recorder': 'write topics to a bag',
+    'player': 'send the messages of a bag again',
+}
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    Add one command a node.
+
+    Parameters
+    ----------
+    subparsers : argparse action
+        Where to add them.
+
+    """
+    for name, summary in NODES.items():
+        parser = subparsers.add_parser(
+            name, help=f'run the {name} node: {summary}',
+            description=f'Run the {name} node: {summary}.',
+            epilog=f'example: hmsa {name} --ros-args -r __ns:=/left', add_help=True)
+        parser.add_argument(
+            'ros_args', nargs=argparse.REMAINDER, metavar='--ros-args ...',
+            help='ROS arguments: parameters (-p NAME:=VALUE, --params-file FILE), remappings '
+                 '(-r FROM:=TO)')
+        parser.set_defaults(run=run, node=name)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """
+    Run the node until it is told to end.
+
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+        With ``node`` and ``ros_args``.
+
+    Returns
+    -------
+    int
+        Exit status.
+
+    """
+    module = import_module(f'hmsa_ros.nodes.{arguments.node}')
+    status: int = module.main(arguments.ros_args)
+    return status

@@ -1,0 +1,27 @@
+"""
+Errors that a user can meet.
+
+Every message is one sentence that says what was wrong, what was got, what was expected and,
+where it is not obvious, how to mend it.
+"""
+
+
+class HmsaError(Exception):
+    """
+    Base of all errors raised by this package.
+
+    A run that failed for a reason outside the caller's input raises this class itself or a
+    subclass other than `BadInputError`; the command line answers it with exit status 1.
+    """
+
+
+class BadInputError(HmsaError, ValueError):
+    """
+    Input that cannot be used as given.
+
+    The command line answers it with exit status 2.
+    """
+
+
+class BagError(HmsaError):
+    """A recording that cannot be read or written."""

@@ -1,0 +1,101 @@
+"""
+Life of a node process: start, spin, end cleanly on SIGINT and SIGTERM.
+
+One place for what every node's ``main`` does, so that a node file holds wiring only.
+"""
+
+from collections.abc import Callable, Sequence
+import sys
+
+import rclpy
+from rclpy.exceptions import ParameterException
+from rclpy.executors import ExternalShutdownException
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
+from rclpy.task import Future
+
+from hmsa_ros.errors import BadInputError, HmsaError
+
+# EventsExecutor.spin() without a time limit busy-loops and delivers nothing on this rclpy
+# (7.1): waiting for a future that never completes, an hour at a time, behaves as documented.
+_SPIN_SECONDS = 3600.0
+
+
+def spin(node: Node) -> None:
+    """
+    Serve a node's callbacks until its context is shut down.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Node to serve.
+
+    """
+    executor = EventsExecutor(context=node.context)
+    executor.add_node(node)
+    never = Future()
+    try:
+        while node.context.ok():
+            executor.spin_until_future_complete(never, _SPIN_SECONDS)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        executor.shutdown()
+
+
+def run(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
+    """
+    Run one node as a process: initialise, spin until told to end, clean up.
+
+    Parameters
+    ----------
+    factory : callable
+        Makes the node; may raise `HmsaError` or an rclpy parameter error, which refuse the
+        start. A node with a ``close`` method has it called before the node is destroyed.
+    args : sequence of str, optional
+        Command-line arguments, ``--ros-args ...`` included; default ``sys.argv[1:]``.
+
+    Returns
+    -------
+    int
+        Exit status: 0 for a clean end, 2 for bad arguments or parameters, 1 for a failure.
+
+    """
+    arguments = list(sys.argv[1:] if args is None else args)
+    try:
+        rclpy.init(args=['hmsa', *arguments])
+        unknown = rclpy.utilities.remove_ros_args(['hmsa', *arguments])[1:]
+        if unknown:
+            raise BadInputError(
+                f'unknown argument {unknown[0]!r}: expected nothing but --ros-args ...; '
+                'see --help')
+    except BadInputError as error:
+        rclpy.try_shutdown()
+        return _refuse(error, 2)
+    except Exception as error:  # rclpy raises errors of several unrelated classes here
+        return _refuse(error, 2)
+    node: Node | None = None
+    try:
+        node = factory()
+        spin(node)
+        return 0
+    except (BadInputError, ParameterException) as error:
+        return _refuse(error, 2)
+    except HmsaError as error:
+        return _refuse(error, 1)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 0
+    finally:
+        if node is not None:
+            close = getattr(node, 'close', None)
+            if close is not None:
+                close()
+            node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def _refuse(error: Exception, status: int) -> int:
+    """Print an error as one line and return the exit status."""
+    line = ' '.join(str(error).split())
+    print(f'hmsa: error: {line}', file=sys.stderr)
+    return status
