@@ -1,0 +1,525 @@
+"""
+Compiled kernels: integration of Eq. 11 with sensitivities, and the two-step solution.
+
+Everything that Numba compiles stands in this one file, because Numba renews a cached function
+when its own file changes, not when a function that it calls does. All quantities are
+nondimensional as in Eq. 11: stretch ``l``, stretch rate ``v``, time in units of
+``L sqrt(rho/G)``, signed load ``beta = Br B/(mu0 G)``. The chain limit enters as
+``i_j = 1/J_lim``. Callers are the typed functions of `hmsa_ros.core`; nothing here checks its
+arguments.
+
+The equation of motion is integrated with DOP853 together with its derivative with respect to
+one parameter of the load (the variational equations), so that a turning point and its
+derivative come out of one pass. ``s`` and ``r`` are the derivatives of stretch and rate.
+"""
+
+import math
+
+from numba import njit, prange
+import numpy as np
+
+from hmsa_ros.core.dop853 import ERROR_3, ERROR_5, MATRIX, NODES, STAGES, WEIGHTS
+
+# Status codes of the integration.
+DONE = 0
+NO_TURN = 1
+STUCK = 2
+
+# Status codes of a two-step plan; `hmsa_ros.core.two_step.Status` names them for callers.
+TWO_STEP = 0
+HOLD = 1
+TOO_DAMPED = 2
+INDISTINGUISHABLE = 3
+NO_TWO_STEP = 4
+NOT_CONVERGED = 5
+OUT_OF_RANGE = 6
+BAD_INPUT = 7
+
+# A closer approach to an equilibrium than this share of the move counts as rest: what happens
+# below it is lost in rounding.
+_AT_REST = 1e-12
+# Sign of the deviation is decided by the linearised motion below this share of the move.
+_LINEAR = 1e-6
+_MAX_STEPS = 200_000
+_MAX_ITERATIONS = 80
+_COARSE = 1e-5
+
+
+@njit(cache=True, error_model='numpy', inline='always')
+def _derivative(l, v, s, r, beta, p, zeta, c1, i_j):  # noqa: E741
+    """
+    Right-hand side of Eq. 11 and of its variational equation.
+
+    ``p`` is the derivative of the load with respect to the parameter. Outside the admissible
+    stretches the result is NaN, which makes the step control reject the step.
+    """
+    l2 = l * l
+    l3 = l2 * l
+    # l g(l), with g as in Eq. 4, free of cancellation near l = 1.
+    lg = l - (l - 1.0) * (l - 1.0) * (l + 2.0) * i_j
+    if not (l > 0.0 and lg > 0.0):
+        return math.nan, math.nan, math.nan, math.nan
+    inertia = 1.0 + c1 * l3
+    # One division serves the three reciprocals.
+    inverse = 1.0 / (inertia * lg * l)
+    i_inertia = inverse * lg * l
+    i_lg = inverse * inertia * l
+    i_l = inverse * inertia * lg
+    elastic = l2 * (l3 - 1.0) * i_lg
+    d_elastic = (5.0 * l3 * l - 2.0 * l - elastic * (1.0 - 3.0 * (l2 - 1.0) * i_j)) * i_lg
+    damping = 3.0 * zeta * c1 * l2
+    a = (6.0 * (beta * l3 - elastic) - damping * l * v + 1.5 * v * v * i_l) * i_inertia
+    a_l = (6.0 * (3.0 * beta * l2 - d_elastic) - 3.0 * damping * v - 1.5 * v * v * i_l * i_l
+           - 3.0 * a * c1 * l2) * i_inertia
+    a_v = (3.0 * v * i_l - damping * l) * i_inertia
+    return v, a, r, a_l * s + a_v * r + 6.0 * l3 * i_inertia * p
+
+
+@njit(cache=True, error_model='numpy')
+def _step(k, l, v, s, r, beta, slope, p, q, h, zeta, c1, i_j, rtol):  # noqa: E741
+    """
+    One DOP853 step of length ``h``; ``k`` (12, 4) is working space.
+
+    The load is ``beta + slope t`` and its parameter derivative ``p + q t`` from the start of
+    the step. Returns the new state and the error in units of the tolerance.
+    """
+    for i in range(STAGES):
+        d0 = d1 = d2 = d3 = 0.0
+        for j in range(i):
+            w = MATRIX[i, j]
+            d0 += w * k[j, 0]
+            d1 += w * k[j, 1]
+            d2 += w * k[j, 2]
+            d3 += w * k[j, 3]
+        t = h * NODES[i]
+        k[i, 0], k[i, 1], k[i, 2], k[i, 3] = _derivative(
+            l + h * d0, v + h * d1, s + h * d2, r + h * d3,
+            beta + slope * t, p + q * t, zeta, c1, i_j)
+    d0 = d1 = d2 = d3 = 0.0
+    e5_l = e5_v = e3_l = e3_v = 0.0
+    for j in range(STAGES):
+        d0 += WEIGHTS[j] * k[j, 0]
+        d1 += WEIGHTS[j] * k[j, 1]
+        d2 += WEIGHTS[j] * k[j, 2]
+        d3 += WEIGHTS[j] * k[j, 3]
+        e5_l += ERROR_5[j] * k[j, 0]
+        e5_v += ERROR_5[j] * k[j, 1]
+        e3_l += ERROR_3[j] * k[j, 0]
+        e3_v += ERROR_3[j] * k[j, 1]
+    new_l = l + h * d0
+    new_v = v + h * d1
+    scale_l = 1.0 / (rtol * (1.0 + abs(new_l)))
+    scale_v = 1.0 / (rtol * (1.0 + abs(new_v)))
+    e5 = (e5_l * scale_l) ** 2 + (e5_v * scale_v) ** 2
+    e3 = (e3_l * scale_l) ** 2 + (e3_v * scale_v) ** 2
+    error = 0.0
+    if not e5 == 0.0:
+        error = abs(h) * e5 / math.sqrt(2.0 * (e5 + 0.01 * e3))
+    return new_l, new_v, s + h * d2, r + h * d3, error
+
+
+@njit(cache=True, error_model='numpy')
+def elastic_force(l, i_j):  # noqa: E741
+    """Return the load that balances the stretch at rest, psi'(l)."""
+    return (l - 1.0) * (l * l + l + 1.0) / (l * (
+        l - (l - 1.0) * (l - 1.0) * (l + 2.0) * i_j))
+
+
+@njit(cache=True, error_model='numpy')
+def elastic_stiffness(l, i_j):  # noqa: E741
+    """Return psi''(l)."""
+    g = 1.0 - (l - 1.0) * (l - 1.0) * (l + 2.0) * i_j / l
+    f = (l - 1.0) * (l * l + l + 1.0) / (l * l)
+    return (1.0 + 2.0 / l ** 3) / g + 2.0 * f * f * i_j / (g * g)
+
+
+@njit(cache=True, error_model='numpy')
+def elastic_energy(l, i_j):  # noqa: E741
+    """Return psi(l), zero at l = 1."""
+    return -0.5 / i_j * math.log1p(-(l - 1.0) * (l - 1.0) * (l + 2.0) * i_j / l)
+
+
+@njit(cache=True, error_model='numpy')
+def critical_zeta(l, c1, i_j):  # noqa: E741
+    """Return the damping that is critical for small motion about a stretch."""
+    return 4.0 / c1 * math.sqrt((l ** -3 + c1) / 6.0 * elastic_stiffness(l, i_j))
+
+
+@njit(cache=True, error_model='numpy')
+def stretch_limits(i_j):
+    """Return the lower and the upper limiting stretch, the roots of g."""
+    p = 1.0 / i_j + 3.0
+    angle = math.acos(-((3.0 / p) ** 1.5))
+    lower = 2.0 * math.sqrt(p / 3.0) * math.cos((angle - 2.0 * math.pi) / 3.0)
+    upper = 2.0 * math.sqrt(p / 3.0) * math.cos(angle / 3.0)
+    for _ in range(2):
+        # One or two Newton steps recover the digits lost where the roots lie close together.
+        lower -= (lower ** 3 - p * lower + 2.0) / (3.0 * lower * lower - p)
+        upper -= (upper ** 3 - p * upper + 2.0) / (3.0 * upper * upper - p)
+    return lower, upper
+
+
+@njit(cache=True, error_model='numpy')
+def equilibrium_stretch(beta, i_j):
+    """Return the stretch at which a constant load is in balance; psi' is monotone."""
+    lower, upper = stretch_limits(i_j)
+    if beta > 0.0:
+        lower = 1.0
+    elif beta < 0.0:
+        upper = 1.0
+    else:
+        return 1.0
+    l = 0.5 * (lower + upper)  # noqa: E741
+    for _ in range(200):
+        # Newton on l^2 g(l) (psi'(l) - beta), which has no pole at the limits.
+        lg = l - (l - 1.0) * (l - 1.0) * (l + 2.0) * i_j
+        value = (l - 1.0) * (l * l + l + 1.0) - beta * l * lg
+        slope = 3.0 * l * l - beta * (lg + l * (1.0 - 3.0 * (l * l - 1.0) * i_j))
+        if value > 0.0:
+            upper = l
+        else:
+            lower = l
+        new = l - value / slope
+        if not lower < new < upper:
+            new = 0.5 * (lower + upper)
+        if abs(new - l) <= 2e-16 * l:
+            return new
+        l = new  # noqa: E741
+    return l
+
+
+@njit(cache=True, error_model='numpy')
+def _first_step(l, v, beta, zeta, c1, i_j, rtol):  # noqa: E741
+    """Return a first step length: a fixed phase of the local oscillation."""
+    rate = math.sqrt(elastic_stiffness(l, i_j) / ((l ** -3 + c1) / 6.0))
+    return 4.0 * rtol ** 0.125 / (rate + 3.0 * zeta)
+
+
+@njit(cache=True, error_model='numpy')
+def _resize(h, error):
+    """Return the next step length from the error of the last one."""
+    if not error < math.inf:
+        return 0.2 * h
+    return h * min(6.0, max(0.2, 0.9 * max(error, 1e-12) ** -0.125))
+
+
+@njit(cache=True, error_model='numpy')
+def advance(k, l, v, s, r, beta, slope, p, q, duration, zeta, c1, i_j, rtol, h):  # noqa: E741
+    """
+    Integrate over a duration under the load ``beta + slope t``.
+
+    ``h`` is the step length to begin with, 0 for none known. Returns status, state,
+    sensitivities and the step length to go on with.
+    """
+    if h <= 0.0:
+        h = _first_step(l, v, beta, zeta, c1, i_j, rtol)
+    done = 0.0
+    for _ in range(_MAX_STEPS):
+        left = duration - done
+        if not left > 0.0:
+            return DONE, l, v, s, r, h
+        step = min(h, left)
+        new_l, new_v, new_s, new_r, error = _step(
+            k, l, v, s, r, beta + slope * done, slope, p + q * done, q, step, zeta, c1, i_j,
+            rtol)
+        if error <= 1.0:
+            l, v, s, r = new_l, new_v, new_s, new_r  # noqa: E741
+            done = duration if step == left else done + step
+            if step == h or error > 0.5:
+                h = _resize(step, error)
+        else:
+            h = _resize(step, error)
+    return STUCK, l, v, s, r, h
+
+
+@njit(cache=True, error_model='numpy')
+def turning_point(k, l, v, direction, beta, move, zeta, c1, i_j, rtol):  # noqa: E741
+    """
+    Follow a constant load to the first turning point that is reached in a direction.
+
+    That is the first instant at which ``direction * v`` falls through zero. ``move`` is the
+    length against which closeness to an equilibrium is measured.
+
+    Returns status (`NO_TURN` when the motion creeps into an equilibrium instead), time,
+    stretch, its derivative with respect to the load, and the derivative of the time.
+    """
+    s = 0.0
+    r = 0.0
+    t = 0.0
+    h = _first_step(l, v, beta, zeta, c1, i_j, rtol)
+    armed = direction * v > 0.0
+    for _ in range(_MAX_STEPS):
+        new_l, new_v, new_s, new_r, error = _step(
+            k, l, v, s, r, beta, 0.0, 1.0, 0.0, h, zeta, c1, i_j, rtol)
+        if not error <= 1.0:
+            h = _resize(h, error)
+            continue
+        if armed and direction * new_v <= 0.0:
+            return _land(
+                k, l, v, s, r, t, direction, beta, h, new_v, zeta, c1, i_j, rtol)
+        a = k[0, 1]
+        l, v, s, r = new_l, new_v, new_s, new_r  # noqa: E741
+        t += h
+        h = _resize(h, error)
+        armed = direction * v > 0.0
+        rate = math.sqrt(elastic_stiffness(l, i_j) / ((l ** -3 + c1) / 6.0)) + 3.0 * zeta
+        if (abs(v) < _AT_REST * move * rate and abs(a) < _AT_REST * move * rate * rate):
+            return NO_TURN, t, l, s, 0.0
+    return STUCK, t, l, s, 0.0
+
+
+@njit(cache=True, error_model='numpy')
+def _land(k, l, v, s, r, t, direction, beta, h, end_v, zeta, c1, i_j, rtol):  # noqa: E741
+    """
+    Find the turning point inside a step that passes it.
+
+    Newton on the time: each pass makes a DOP853 step of its own from the best state so far,
+    and the last correction, far below rounding, is taken from the Taylor series.
+    """
+    a = k[0, 1]
+    _, end_a, _, _ = _derivative(l, v, 0.0, 0.0, beta, 0.0, zeta, c1, i_j)
+    # Where the cubic through both ends' rates and the start's slope vanishes, roughly: the
+    # secant, improved by one step with the acceleration there.
+    dt = h * v / (v - end_v) if v != end_v else h
+    if direction * a < 0.0:
+        # Decelerating from the start: the parabola through both rates and the first slope.
+        c = (end_v - v - a * h) / (h * h)
+        root = a * a - 4.0 * c * v
+        if root > 0.0:
+            x = 2.0 * v / (-a + direction * math.sqrt(root))
+            if 0.0 < x <= h:
+                dt = x
+    size = max(abs(v), abs(end_v))
+    for _ in range(12):
+        new_l, new_v, new_s, new_r, _ = _step(
+            k, l, v, s, r, beta, 0.0, 1.0, 0.0, dt, zeta, c1, i_j, rtol)
+        l, v, s, r = new_l, new_v, new_s, new_r  # noqa: E741
+        t += dt
+        _, a, _, _ = _derivative(l, v, s, r, beta, 1.0, zeta, c1, i_j)
+        if direction * a >= 0.0:
+            # Before the largest rate (a step that spans most of a swing): bisect onwards.
+            dt = 0.25 * h
+            continue
+        dt = -v / a
+        if abs(v) <= 1e-6 * size:
+            break
+    l += 0.5 * v * dt  # noqa: E741
+    s += r * dt
+    t += dt
+    _, a, _, slope = _derivative(l, 0.0, s, r, beta, 1.0, zeta, c1, i_j)
+    r += slope * dt
+    return DONE, t, l, s, -r / a
+
+
+@njit(cache=True, error_model='numpy')
+def crosses(k, l, v, target, zeta, c1, i_j, rtol):  # noqa: E741
+    """
+    Return whether the response to the target's own load passes the target.
+
+    Below critical damping it always does. Above, it is followed until it has, or until the
+    linearised motion tells: with eigenvalues a < b < 0 and deviation x it creeps in from its
+    own side unless (v - a x) x < 0.
+    """
+    if zeta < critical_zeta(target, c1, i_j):
+        return True
+    beta = elastic_force(target, i_j)
+    mass = (target ** -3 + c1) / 6.0
+    half = 0.25 * zeta * c1 / mass
+    fast = -half - math.sqrt(max(half * half - elastic_stiffness(target, i_j) / mass, 0.0))
+    move = max(abs(l - target), abs(v / fast))
+    side = l - target
+    h = 0.0
+    for _ in range(_MAX_STEPS):
+        x = l - target
+        if x * side < 0.0 or x == 0.0:
+            return True
+        if abs(x) < _LINEAR * move and abs(v) < _LINEAR * move * abs(fast):
+            return (v - fast * x) * x < 0.0
+        if h <= 0.0:
+            h = _first_step(l, v, beta, zeta, c1, i_j, rtol)
+        new_l, new_v, _, _, error = _step(
+            k, l, v, 0.0, 0.0, beta, 0.0, 0.0, 0.0, h, zeta, c1, i_j, rtol)
+        if error <= 1.0:
+            l, v = new_l, new_v  # noqa: E741
+        h = _resize(h, error)
+    return False
+
+
+@njit(cache=True, error_model='numpy')
+def _guess(l, v, target, direction, beta_1, zeta, c1, i_j):  # noqa: E741
+    """
+    Return a first guess of ``direction * (beta_1 - beta_p)``.
+
+    The energy balance gives it exactly without damping; the linear oscillator says how it
+    shrinks with damping: by 2 K/(1 + K), where K is the decay over half a period.
+    """
+    mass = (l ** -3 + c1) / 6.0
+    work = elastic_energy(target, i_j) - elastic_energy(l, i_j) - 0.5 * mass * v * v
+    if target == l:
+        return math.inf
+    delta = direction * (beta_1 - work / (target - l))
+    xi = zeta / math.sqrt(critical_zeta(target, c1, i_j) * critical_zeta(l, c1, i_j))
+    decay = 1e-3
+    if xi < 0.9:
+        decay = math.exp(-math.pi * xi / math.sqrt(1.0 - xi * xi))
+    return delta * 2.0 * decay / (1.0 + decay)
+
+
+@njit(cache=True, error_model='numpy')
+def shoot(k, l, v, target, direction, zeta, c1, i_j, rtol):  # noqa: E741
+    """
+    Find the load whose turning point in a direction is the target.
+
+    Newton on ``d = direction * (beta_1 - beta_p) > 0``, kept inside a bracket: at d = 0 the
+    motion overshoots the target, at a large d it stops short. The difference is the unknown
+    because it falls below the rounding of beta_p itself near critical damping. The first
+    passes are coarse; the last one is at ``rtol``.
+
+    Returns status, beta_p, tau_p, beta_1 and the number of passes.
+    """
+    beta_1 = elastic_force(target, i_j)
+    move = abs(target - l) + abs(v) / math.sqrt(
+        elastic_stiffness(target, i_j) / ((target ** -3 + c1) / 6.0))
+    low = 0.0
+    high = math.inf
+    if v == 0.0:
+        high = direction * (beta_1 - elastic_force(l, i_j))
+        if not high > 0.0:
+            return NO_TWO_STEP, math.nan, math.nan, beta_1, 0
+    top = 1e6 * (1.0 + abs(beta_1))
+    d = _guess(l, v, target, direction, beta_1, zeta, c1, i_j)
+    if not low < d < min(high, top):
+        d = 0.5 * high if high < math.inf else 1.0
+    tolerance = max(rtol, _COARSE)
+    for iteration in range(1, _MAX_ITERATIONS + 1):
+        beta = beta_1 - direction * d
+        status, t, end, s, dt_dbeta = turning_point(
+            k, l, v, direction, beta, move, zeta, c1, i_j, tolerance)
+        if status == STUCK:
+            return NOT_CONVERGED, beta, t, beta_1, iteration
+        excess = direction * (end - target)
+        change = math.inf
+        if status == NO_TURN:
+            high = d
+        else:
+            if excess > 0.0:
+                low = d
+            else:
+                high = d
+            change = excess / s
+        new = d + change
+        if not low < new < high:
+            if status == DONE and tolerance <= rtol and abs(change) <= 1e-13 * d:
+                new = d
+            elif high == math.inf:
+                new = 4.0 * d
+            elif low == 0.0:
+                new = 0.125 * high
+            else:
+                new = 0.5 * (low + high)
+            if new > top:
+                return NO_TWO_STEP, math.nan, math.nan, beta_1, iteration
+            if new < 1e-15 * (abs(beta_1) + high) and low == 0.0:
+                return INDISTINGUISHABLE, math.nan, math.nan, beta_1, iteration
+            relative = abs(new - d) / d
+            if high - low <= 4e-16 * (abs(beta_1) + high) and tolerance <= rtol:
+                relative = 0.0
+        else:
+            relative = abs(change) / d
+        if tolerance <= rtol and relative * relative <= 0.01 * rtol and status == DONE:
+            change = new - d
+            return TWO_STEP, beta - direction * change, t - dt_dbeta * direction * change, \
+                beta_1, iteration
+        d = new
+        if relative < 0.1:
+            # What quadratic convergence leaves for the next pass to resolve.
+            tolerance = max(rtol, min(tolerance, 1e-2 * relative * relative))
+            if tolerance < 1e3 * rtol:
+                tolerance = rtol
+    return NOT_CONVERGED, math.nan, math.nan, beta_1, _MAX_ITERATIONS
+
+
+@njit(cache=True, error_model='numpy')
+def two_step(k, l, v, target, zeta, c1, i_j, beta_min, beta_max, rtol, hold):  # noqa: E741
+    """
+    Plan one move: the fastest single intermediate load that ends at rest at the target.
+
+    There are at most two: one whose turning point is reached on the way up and one on the way
+    down (Eqs. 13 and 14 from rest know the direct one only). ``hold`` is the deviation below
+    which the actuator counts as being there already.
+
+    Returns status, beta_p, tau_p, beta_1 and the number of passes.
+    """
+    lower, upper = stretch_limits(i_j)
+    beta_1 = math.nan
+    if not (lower < target < upper and lower < l < upper):
+        return OUT_OF_RANGE, math.nan, math.nan, beta_1, 0
+    beta_1 = elastic_force(target, i_j)
+    mass = (target ** -3 + c1) / 6.0
+    rate = math.sqrt(elastic_stiffness(target, i_j) / mass)
+    if abs(l - target) <= hold and abs(v) <= hold * rate:
+        return HOLD, beta_1, 0.0, beta_1, 0
+    up = 1.0 if target > l else -1.0
+    if not crosses(k, l, v, target, zeta, c1, i_j, max(rtol, 1e-10)):
+        return TOO_DAMPED, math.nan, math.nan, beta_1, 0
+    status, beta_p, tau_p, _, passes = shoot(k, l, v, target, up, zeta, c1, i_j, rtol)
+    if v == 0.0:
+        return status, beta_p, tau_p, beta_1, passes
+    usable = status == TWO_STEP and beta_min <= beta_p <= beta_max
+    other, beta_q, tau_q, _, more = shoot(k, l, v, target, -up, zeta, c1, i_j, rtol)
+    passes += more
+    if other == TWO_STEP and beta_min <= beta_q <= beta_max and (
+            not usable or tau_q < tau_p):
+        return other, beta_q, tau_q, beta_1, passes
+    if status != TWO_STEP and other == TWO_STEP:
+        return other, beta_q, tau_q, beta_1, passes
+    return status, beta_p, tau_p, beta_1, passes
+
+
+@njit(cache=True, error_model='numpy', parallel=True)
+def two_step_batch(
+        start, rate, target, zeta, c1, j_lim, beta_min, beta_max, rtol, hold, status,
+        beta_p, tau_p, beta_1):
+    """Plan many moves over all cores; the last four arrays (n,) take the results."""
+    for i in prange(start.size):
+        k = np.empty((STAGES, 4))
+        status[i], beta_p[i], tau_p[i], beta_1[i], _ = two_step(
+            k, start[i], rate[i], target[i], zeta[i], c1[i], 1.0 / j_lim[i], beta_min,
+            beta_max, rtol, hold)
+
+
+@njit(cache=True, error_model='numpy')
+def trajectory(
+        l, v, switches, betas, slopes, times, zeta, c1, i_j, rtol, stretch,  # noqa: E741
+        rates):
+    """
+    Sample the response to a piecewise linear load at increasing times.
+
+    The load is ``betas[m] + slopes[m] (t - switches[m])`` from ``switches[m]`` on; the motion
+    begins at ``switches[0]``, which is not later than ``times[0]``. ``stretch`` and ``rates``
+    (n,) take the samples. Returns the status of the integration.
+    """
+    k = np.empty((STAGES, 4))
+    t = switches[0]
+    piece = 0
+    h = 0.0
+    for i in range(times.size):
+        while True:
+            end = times[i]
+            if piece + 1 < switches.size and switches[piece + 1] <= end:
+                end = switches[piece + 1]
+            status, l, v, _, _, h = advance(  # noqa: E741
+                k, l, v, 0.0, 0.0,
+                betas[piece] + slopes[piece] * (t - switches[piece]), slopes[piece],
+                0.0, 0.0, end - t, zeta, c1, i_j, rtol, h)
+            if status != DONE:
+                return status
+            t = end
+            if piece + 1 < switches.size and switches[piece + 1] <= times[i]:
+                piece += 1
+                h = 0.0
+            else:
+                break
+        stretch[i] = l
+        rates[i] = v
+    return DONE
