@@ -1,0 +1,492 @@
+"""
+What tests share: a ROS domain of their own, processes, and waiting on a condition.
+
+Tests that do not ask for one of these fixtures need no ROS.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+import fcntl
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+# Limit of every wait: generous, since it is only reached when a test fails.
+WAIT_SECONDS = 60.0
+POLL_SECONDS = 0.02
+DOMAINS = range(1, 102)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Excuse what ROS itself does, which no change here can mend."""
+    for warning in (
+            'ignore:module .sre_:DeprecationWarning',  # lark, imported by rosidl_parser
+    ):
+        config.addinivalue_line('filterwarnings', warning)
+
+
+def wait_until(
+        condition: Callable[[], Any], what: str = 'the condition',
+        seconds: float = WAIT_SECONDS) -> Any:
+    """
+    Wait until a condition holds and return what it gave.
+
+    Parameters
+    ----------
+    condition : callable
+        Asked again and again until its result is true.
+    what : str
+        Name of what is waited for, for the failure's message.
+    seconds : float
+        Limit in seconds.
+
+    Returns
+    -------
+    object
+        The first true result.
+
+    """
+    end = time.monotonic() + seconds
+    while not (result := condition()):
+        if time.monotonic() > end:
+            pytest.fail(f'waited {seconds:g} s for {what}')
+        time.sleep(POLL_SECONDS)
+    return result
+
+
+@pytest.fixture(name='wait_until')
+def wait_until_fixture() -> Callable[..., Any]:
+    """Return `wait_until`, for test modules that cannot import this one."""
+    return wait_until
+
+
+@pytest.fixture
+def ros_domain_id() -> Iterator[int]:
+    """Return a domain id that no other test on this machine uses at the same time."""
+    folder = Path(tempfile.gettempdir()) / f'hmsa_ros_domains_{os.getuid()}'
+    folder.mkdir(exist_ok=True)
+    # Start at a number of our own, so that id after id is used and late packets of an ended
+    # test meet nobody.
+    first = (os.getpid() * 7 + time.monotonic_ns() // 1000) % len(DOMAINS)
+    for i in range(len(DOMAINS)):
+        domain = DOMAINS[(first + i) % len(DOMAINS)]
+        with (folder / str(domain)).open('w') as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                continue
+            yield domain
+            return
+    pytest.fail('all ROS domain ids are taken')
+
+
+@pytest.fixture
+def ros_env(
+        ros_domain_id: int, tmp_path_factory: pytest.TempPathFactory,
+        monkeypatch: pytest.MonkeyPatch) -> Mapping[str, str]:
+    """Return the environment of ROS processes; it is also set in this process."""
+    settings = {
+        'ROS_DOMAIN_ID': str(ros_domain_id),
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        'ROS_LOG_DIR': str(tmp_path_factory.mktemp('ros_log')),
+        'PYTHONPATH': os.pathsep.join(
+            [str(ROOT), *filter(None, [os.environ.get('PYTHONPATH')])]),
+        'PYTHONUNBUFFERED': '1',
+        'RCUTILS_COLORIZED_OUTPUT': '0',
+    }
+    for name, value in settings.items():
+        monkeypatch.setenv(name, value)
+    return dict(os.environ)
+
+
+@dataclass
+class Process:
+    """
+    A running child process whose output goes to files.
+
+    Attributes
+    ----------
+    popen : subprocess.Popen
+        The process.
+    stdout_path, stderr_path : pathlib.Path
+        Where its output is written.
+
+    """
+
+    popen: 'subprocess.Popen[bytes]'
+    stdout_path: Path
+    stderr_path: Path
+
+    @property
+    def stdout(self) -> str:
+        """Return what it has written to standard output so far."""
+        return self.stdout_path.read_text(errors='replace')
+
+    @property
+    def stderr(self) -> str:
+        """Return what it has written to standard error so far."""
+        return self.stderr_path.read_text(errors='replace')
+
+    @property
+    def output(self) -> str:
+        """Return both outputs so far."""
+        return self.stdout + self.stderr
+
+    def alive(self) -> bool:
+        """Return whether it still runs."""
+        return self.popen.poll() is None
+
+    def wait(self, seconds: float = WAIT_SECONDS) -> int:
+        """
+        Wait for its end.
+
+        Parameters
+        ----------
+        seconds : float
+            Limit in seconds.
+
+        Returns
+        -------
+        int
+            Exit status; negative for the signal that ended it.
+
+        """
+        try:
+            return self.popen.wait(seconds)
+        except subprocess.TimeoutExpired:
+            pytest.fail(f'{self.popen.args!r} did not end within {seconds:g} s: {self.output}')
+
+    def stop(self, number: int = signal.SIGINT, seconds: float = WAIT_SECONDS) -> int:
+        """
+        Send a signal and wait for the end.
+
+        Parameters
+        ----------
+        number : int
+            Signal number.
+        seconds : float
+            Limit in seconds.
+
+        Returns
+        -------
+        int
+            Exit status.
+
+        """
+        self.popen.send_signal(number)
+        return self.wait(seconds)
+
+    def wait_for_output(self, text: str, seconds: float = WAIT_SECONDS) -> str:
+        """
+        Wait until the process has printed a text.
+
+        Parameters
+        ----------
+        text : str
+            What to wait for, on either output.
+        seconds : float
+            Limit in seconds.
+
+        Returns
+        -------
+        str
+            Both outputs.
+
+        """
+        def found() -> bool:
+            if text in self.output:
+                return True
+            if not self.alive() and text not in self.output:
+                pytest.fail(
+                    f'ended with {self.popen.returncode} before {text!r}: {self.output}')
+            return False
+
+        wait_until(found, f'{text!r} in the output of {self.popen.args!r}', seconds)
+        return self.output
+
+
+@dataclass
+class Starter:
+    """Starts child processes and ends those still running when the test is over."""
+
+    env: Mapping[str, str]
+    folder: Path
+    processes: list[Process] = field(default_factory=list)
+
+    def __call__(self, *command: str | os.PathLike[str], **extra_env: str) -> Process:
+        """
+        Start a command.
+
+        Parameters
+        ----------
+        *command : str or path
+            Program and its arguments.
+        **extra_env : str
+            More environment variables.
+
+        Returns
+        -------
+        Process
+            The running process.
+
+        """
+        number = len(self.processes)
+        stdout_path = self.folder / f'{number}.out'
+        stderr_path = self.folder / f'{number}.err'
+        with stdout_path.open('wb') as stdout, stderr_path.open('wb') as stderr:
+            popen = subprocess.Popen(
+                [os.fspath(part) for part in command], stdin=subprocess.DEVNULL,
+                stdout=stdout, stderr=stderr, env={**self.env, **extra_env})
+        process = Process(popen, stdout_path, stderr_path)
+        self.processes.append(process)
+        return process
+
+    def python(self, *arguments: str | os.PathLike[str], **extra_env: str) -> Process:
+        """
+        Start this Python.
+
+        Parameters
+        ----------
+        *arguments : str or path
+            Script and arguments, or ``-c`` and code.
+        **extra_env : str
+            More environment variables.
+
+        Returns
+        -------
+        Process
+            The running process.
+
+        """
+        return self(sys.executable, *arguments, **extra_env)
+
+    def hmsa(self, *arguments: str | os.PathLike[str], **extra_env: str) -> Process:
+        """
+        Start ``hmsa`` with arguments.
+
+        Parameters
+        ----------
+        *arguments : str or path
+            For example ``'plant', '--ros-args', '-p', 'rate:=100.0'``.
+        **extra_env : str
+            More environment variables.
+
+        Returns
+        -------
+        Process
+            The running process.
+
+        """
+        return self.python('-m', 'hmsa_ros', *arguments, **extra_env)
+
+    def stop_all(self) -> None:
+        """End every process that still runs, by force if it does not end by itself."""
+        for process in self.processes:
+            if process.alive():
+                process.popen.terminate()
+        for process in self.processes:
+            try:
+                process.popen.wait(10.0)
+            except subprocess.TimeoutExpired:
+                process.popen.kill()
+                process.popen.wait()
+
+
+@pytest.fixture
+def start(
+        ros_env: Mapping[str, str],
+        tmp_path_factory: pytest.TempPathFactory) -> Iterator[Starter]:
+    """Return a starter of child processes in the test's ROS domain."""
+    starter = Starter(ros_env, tmp_path_factory.mktemp('processes'))
+    yield starter
+    starter.stop_all()
+
+
+class RosSide:
+    """
+    The test's own node: publishes, subscribes, calls services, spins on demand.
+
+    Attributes
+    ----------
+    node : rclpy.node.Node
+        The node.
+    executor : rclpy.executors.Executor
+        Serves it, only while one of the methods below waits.
+
+    """
+
+    def __init__(self, domain_id: int, **node_options: Any) -> None:
+        from rclpy.context import Context
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.node import Node
+        self.context = Context()
+        self.context.init(args=[], domain_id=domain_id)
+        self.node = Node('test', context=self.context, **node_options)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+
+    def close(self) -> None:
+        """Destroy the node and its context."""
+        self.executor.shutdown()
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
+    def spin_until(
+            self, condition: Callable[[], Any], what: str = 'the condition',
+            seconds: float = WAIT_SECONDS) -> Any:
+        """
+        Serve callbacks until a condition holds and return what it gave.
+
+        Parameters
+        ----------
+        condition : callable
+            Asked after each callback.
+        what : str
+            Name of what is waited for.
+        seconds : float
+            Limit in seconds.
+
+        Returns
+        -------
+        object
+            The first true result.
+
+        """
+        end = time.monotonic() + seconds
+        while not (result := condition()):
+            if time.monotonic() > end:
+                pytest.fail(f'waited {seconds:g} s for {what}')
+            self.executor.spin_once(POLL_SECONDS)
+        return result
+
+    def collect(self, message_type: type[Any], topic: str, qos: Any = 1000) -> list[Any]:
+        """
+        Subscribe and return the list that received messages are appended to.
+
+        Parameters
+        ----------
+        message_type : type
+            Message class.
+        topic : str
+            Topic name.
+        qos : rclpy.qos.QoSProfile or int
+            Quality of service or depth.
+
+        Returns
+        -------
+        list
+            Grows while the node spins.
+
+        """
+        messages: list[Any] = []
+        self.node.create_subscription(message_type, topic, messages.append, qos)
+        return messages
+
+    def publisher(
+            self, message_type: type[Any], topic: str, qos: Any = 1000,
+            subscribers: int = 1) -> Any:
+        """
+        Return a publisher that already has its subscribers.
+
+        Parameters
+        ----------
+        message_type : type
+            Message class.
+        topic : str
+            Topic name.
+        qos : rclpy.qos.QoSProfile or int
+            Quality of service or depth.
+        subscribers : int
+            How many subscribers to wait for.
+
+        Returns
+        -------
+        rclpy.publisher.Publisher
+            The publisher.
+
+        """
+        publisher = self.node.create_publisher(message_type, topic, qos)
+        self.spin_until(
+            lambda: publisher.get_subscription_count() >= subscribers,
+            f'{subscribers} subscribers of {topic}')
+        return publisher
+
+    def call(self, service_type: type[Any], name: str, request: Any = None) -> Any:
+        """
+        Call a service and return its response.
+
+        Parameters
+        ----------
+        service_type : type
+            Service class.
+        name : str
+            Service name.
+        request : object, optional
+            Default: an empty request.
+
+        Returns
+        -------
+        object
+            The response.
+
+        """
+        client = self.node.create_client(service_type, name)
+        self.spin_until(client.service_is_ready, f'service {name}')
+        future = client.call_async(service_type.Request() if request is None else request)
+        self.spin_until(future.done, f'the answer of {name}')
+        self.node.destroy_client(client)
+        return future.result()
+
+    def set_parameters(self, node: str, values: Sequence[Any]) -> Any:
+        """
+        Set parameters of another node.
+
+        Parameters
+        ----------
+        node : str
+            Name of the node.
+        values : sequence of rclpy.parameter.Parameter
+            What to set.
+
+        Returns
+        -------
+        list of rcl_interfaces.msg.SetParametersResult
+            One result a parameter.
+
+        """
+        from rcl_interfaces.srv import SetParameters
+        request = SetParameters.Request(
+            parameters=[value.to_parameter_msg() for value in values])
+        return self.call(SetParameters, f'{node}/set_parameters', request).results
+
+
+@pytest.fixture
+def ros(ros_env: Mapping[str, str], ros_domain_id: int) -> Iterator[RosSide]:
+    """Return the test's own ROS node in the test's domain."""
+    side = RosSide(ros_domain_id)
+    yield side
+    side.close()
+
+
+@pytest.fixture
+def make_ros(
+        ros_env: Mapping[str, str],
+        ros_domain_id: int) -> Iterator[Callable[..., RosSide]]:
+    """Return a maker of more test nodes in the test's domain, with node options."""
+    sides: list[RosSide] = []
+
+    def make(**node_options: Any) -> RosSide:
+        sides.append(RosSide(ros_domain_id, **node_options))
+        return sides[-1]
+
+    yield make
+    for side in sides:
+        side.close()
