@@ -1,0 +1,94 @@
+"""Build of the package, by pip and by colcon alike."""
+
+from glob import glob
+import os
+import re
+
+from setuptools import find_packages, setup
+
+PACKAGE = 'hmsa_ros'
+# colcon build --symlink-install runs a link to this file.
+HERE = os.path.dirname(os.path.realpath(__file__))
+
+
+def read(*parts):
+    """Return the text of a file of this repository."""
+    with open(os.path.join(HERE, *parts), encoding='utf-8') as file:
+        return file.read()
+
+
+# Read, not imported: the package need not be importable where it is built.
+VERSION = re.search(r"^__version__ = '([^']+)'$", read(PACKAGE, '__init__.py'), re.M).group(1)
+README = 'README.md' if os.path.exists(os.path.join(HERE, 'README.md')) else None
+
+INSTALL_REQUIRES = [
+    'setuptools',
+    'PyYAML>=6.0',
+    'matplotlib>=3.6',
+    'mcap>=1.6',
+    'mcap-ros2-support>=0.5',
+    'numba>=0.60',
+    'numpy>=1.26',
+    'rich>=13.0',
+    'scipy>=1.11',
+]
+
+# rclpy and the messages are no plain requirement: where ROS is installed they are there
+# already, and a second copy from wheels would shadow them.
+EXTRAS_REQUIRE = {
+    'ros': [
+        'ros-jazzy-common-interfaces',
+        'ros-jazzy-rclpy[fastrtps]',
+    ],
+    'test': [
+        'hypothesis>=6.98',
+        'mypy>=1.9',
+        'pytest>=7.4',
+        'pytest-timeout>=2.2',
+        'rosbags>=0.10',
+        'ruff>=0.5',
+        'sympy>=1.12',
+        'types-PyYAML',
+    ],
+    'bench': [
+        'casadi>=3.6',
+    ],
+    'docs': [
+        'myst-parser>=2.0',
+        'numpydoc>=1.6',
+        'sphinx>=7.2',
+    ],
+}
+
+NODES = ('planner', 'plant', 'recorder', 'player')
+
+setup(
+    name=PACKAGE,
+    version=VERSION,
+    packages=find_packages(include=[PACKAGE, PACKAGE + '.*']),
+    data_files=[
+        ('share/ament_index/resource_index/packages', ['resource/' + PACKAGE]),
+        ('share/' + PACKAGE, ['package.xml']),
+        ('share/' + PACKAGE + '/launch', sorted(glob('launch/*.launch.py'))),
+        ('share/' + PACKAGE + '/config', sorted(glob('config/*.yaml'))),
+    ],
+    zip_safe=True,
+    python_requires='>=3.10,<3.14',
+    install_requires=INSTALL_REQUIRES,
+    extras_require=EXTRAS_REQUIRE,
+    entry_points={
+        'console_scripts': [
+            'hmsa = hmsa_ros.cli:main',
+            *(f'{node} = hmsa_ros.nodes.{node}:main' for node in NODES),
+        ],
+    },
+    author='hmsa_ros maintainers',
+    maintainer='hmsa_ros maintainers',
+    maintainer_email='maintainers@users.noreply.h-seed-1ded8aa1.example',
+    description='Vibration-free motion of hard-magnetic soft actuators: planner, simulated '
+                'plant, recorder and player for ROS 2',
+    long_description=read(README) if README else '',
+    long_description_content_type='text/markdown',
+    license='Apache-2.0',
+    keywords=['ROS', 'soft robotics', 'command shaping', 'magnetic actuators'],
+)
