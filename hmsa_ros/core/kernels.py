@@ -483,6 +483,10 @@ def two_step_batch(
     """Plan many moves over all cores; the last four arrays (n,) take the results."""
     for i in prange(start.size):
         k = np.empty((STAGES, 4))
+        if not (zeta[i] >= 0.0 and c1[i] > 0.0 and j_lim[i] > 0.0
+                and math.isfinite(zeta[i] + c1[i] + j_lim[i] + start[i] + rate[i] + target[i])):
+            status[i], beta_p[i], tau_p[i], beta_1[i] = BAD_INPUT, math.nan, math.nan, math.nan
+            continue
         status[i], beta_p[i], tau_p[i], beta_1[i], _ = two_step(
             k, start[i], rate[i], target[i], zeta[i], c1[i], 1.0 / j_lim[i], beta_min,
             beta_max, rtol, hold)

@@ -15,6 +15,7 @@ from rcl_interfaces.msg import (
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 
+from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.errors import BadInputError
 
 Value = bool | int | float | str | list[str]
@@ -167,3 +168,59 @@ def declare(node: Node, specs: Iterable[ParameterSpec]) -> Mapping[str, Any]:
         spec.check(value)
         values[spec.name] = value
     return values
+
+
+_DEFAULT = paper_actuator()
+
+#: The block that planner and plant have in common.
+ACTUATOR = (
+    ParameterSpec(
+        'actuator.shear_modulus', _DEFAULT.shear_modulus, 'Shear modulus G.', 'Pa',
+        1e-3, 1e12),
+    ParameterSpec(
+        'actuator.density', _DEFAULT.density, 'Density rho.', 'kg/m^3', 1e-3, 1e6),
+    ParameterSpec(
+        'actuator.half_length', _DEFAULT.half_length,
+        'Half length L of the block, across the field.', 'm', 1e-9, 1e3),
+    ParameterSpec(
+        'actuator.half_thickness', _DEFAULT.half_thickness,
+        'Half thickness H of the block, along the field.', 'm', 1e-9, 1e3),
+    ParameterSpec(
+        'actuator.remanence', _DEFAULT.remanence, 'Residual flux density Br.', 'T', 1e-9, 1e3),
+    ParameterSpec(
+        'actuator.chain_limit', _DEFAULT.chain_limit,
+        'Limit of the chains\' extension J_lim of the Gent model.', '', 1e-3, 1e9),
+    ParameterSpec(
+        'actuator.damping_coefficient', _DEFAULT.damping_coefficient,
+        'Damping coefficient c; zeta = c/(8 L H sqrt(rho G)).', 'N s/m', 0.0, 1e12),
+)
+
+JOINT = ParameterSpec(
+    'joint', 'actuator', 'Name of the joint in trajectories and joint states.')
+
+INITIAL_STRETCH = ParameterSpec(
+    'initial_stretch', 1.0, 'Stretch at rest before the first command.', '', 1e-3, 1e3)
+
+
+def actuator_from(values: Mapping[str, Any]) -> ActuatorParameters:
+    """
+    Return the block that declared parameters describe.
+
+    Parameters
+    ----------
+    values : mapping of str to object
+        As `declare` returns them.
+
+    Returns
+    -------
+    ActuatorParameters
+        In SI units.
+
+    Raises
+    ------
+    BadInputError
+        If a value is out of range.
+
+    """
+    return ActuatorParameters(**{
+        spec.name.partition('.')[2]: values[spec.name] for spec in ACTUATOR})

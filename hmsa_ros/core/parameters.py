@@ -1,0 +1,173 @@
+"""Parameters of an actuator, in SI units and as the nondimensional group of Eq. 11."""
+
+from dataclasses import dataclass, fields
+import math
+
+from scipy.constants import mu_0
+
+from hmsa_ros.errors import BadInputError
+
+_ZERO_ALLOWED = ('zeta', 'damping_coefficient')
+
+
+def _check(record: object) -> None:
+    """Refuse a record with a field that is not a finite positive number."""
+    for field in fields(record):  # type: ignore[arg-type]
+        value = getattr(record, field.name)
+        if not isinstance(value, (int, float)) or isinstance(value, bool):
+            raise BadInputError(f'{field.name} is {value!r}: expected a number')
+        zero_allowed = field.name in _ZERO_ALLOWED
+        if not math.isfinite(value) or value < 0.0 or (value == 0.0 and not zero_allowed):
+            least = 'of at least 0' if zero_allowed else 'greater than 0'
+            raise BadInputError(f'{field.name} is {value!r}: expected a finite number {least}')
+        object.__setattr__(record, field.name, float(value))
+
+
+@dataclass(frozen=True)
+class NondimensionalParameters:
+    """
+    What Eq. 11 depends on.
+
+    Attributes
+    ----------
+    zeta : float
+        Damping coefficient c/8 sqrt(1/(L^2 H^2 rho G)), at least 0. It is not a damping
+        ratio: about a stretch of 1.1 the motion is critically damped near 2.16 for J_lim 5.
+    j_lim : float
+        Limit of the chains' extension J_lim of the Gent model (Eq. 4), greater than 0.
+    c1 : float
+        Shape 2 H^2/L^2, greater than 0. The paper does not state it; the damping that it calls
+        critical implies 2 (H = L).
+
+    Raises
+    ------
+    BadInputError
+        If a value is not finite or out of range.
+
+    """
+
+    zeta: float = 0.2
+    j_lim: float = 5.0
+    c1: float = 2.0
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        _check(self)
+
+
+@dataclass(frozen=True)
+class ActuatorParameters:
+    """
+    A block of 2L x 2L x 2H of hard-magnetic elastomer, in SI units.
+
+    Attributes
+    ----------
+    shear_modulus : float
+        G in Pa, greater than 0.
+    density : float
+        rho in kg/m^3, greater than 0.
+    half_length : float
+        L in m, greater than 0.
+    half_thickness : float
+        H in m, along the field, greater than 0.
+    remanence : float
+        Residual flux density Br in T, greater than 0.
+    chain_limit : float
+        J_lim, dimensionless, greater than 0.
+    damping_coefficient : float
+        c of Eq. 9 in N s/m, at least 0.
+
+    Raises
+    ------
+    BadInputError
+        If a value is not finite or out of range.
+
+    """
+
+    shear_modulus: float
+    density: float
+    half_length: float
+    half_thickness: float
+    remanence: float
+    chain_limit: float
+    damping_coefficient: float
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        _check(self)
+
+    @classmethod
+    def from_nondimensional(
+            cls, material: NondimensionalParameters, *, shear_modulus: float, density: float,
+            half_length: float, remanence: float) -> 'ActuatorParameters':
+        """
+        Return the actuator that has a nondimensional group at a given scale.
+
+        Parameters
+        ----------
+        material : NondimensionalParameters
+            zeta, J_lim and c1.
+        shear_modulus, density, half_length, remanence : float
+            The scale, in Pa, kg/m^3, m and T.
+
+        Returns
+        -------
+        ActuatorParameters
+            With H = L sqrt(c1/2) and c = 8 zeta L H sqrt(rho G).
+
+        Raises
+        ------
+        BadInputError
+            If a value is not finite or out of range.
+
+        """
+        # Checked before the root is taken: a negative product has none.
+        unfinished = cls(shear_modulus, density, half_length, half_length, remanence,
+                         material.j_lim, 0.0)
+        half_thickness = half_length * math.sqrt(material.c1 / 2.0)
+        damping = (8.0 * material.zeta * unfinished.half_length * half_thickness
+                   * math.sqrt(density * shear_modulus))
+        return cls(shear_modulus, density, half_length, half_thickness, remanence,
+                   material.j_lim, damping)
+
+    @property
+    def time_unit(self) -> float:
+        """Seconds in one unit of nondimensional time, L sqrt(rho/G)."""
+        return self.half_length * math.sqrt(self.density / self.shear_modulus)
+
+    @property
+    def flux_density_unit(self) -> float:
+        """Flux density in T of the load beta = 1, mu0 G/Br."""
+        return float(mu_0) * self.shear_modulus / self.remanence
+
+    @property
+    def nondimensional(self) -> NondimensionalParameters:
+        """The group that Eq. 11 depends on."""
+        area = self.half_length * self.half_thickness
+        return NondimensionalParameters(
+            zeta=self.damping_coefficient / 8.0
+            / (area * math.sqrt(self.density * self.shear_modulus)),
+            j_lim=self.chain_limit,
+            c1=2.0 * (self.half_thickness / self.half_length) ** 2)
+
+
+def paper_actuator(material: NondimensionalParameters | None = None) -> ActuatorParameters:
+    """
+    Return a soft silicone block with the paper's nondimensional parameters.
+
+    G = 10 kPa, rho = 1900 kg/m^3, L = 10 mm, Br = 0.1 T: a time unit of 4.4 ms.
+
+    Parameters
+    ----------
+    material : NondimensionalParameters, optional
+        Default: zeta 0.2, J_lim 5, c1 2.
+
+    Returns
+    -------
+    ActuatorParameters
+        In SI units.
+
+    """
+    return ActuatorParameters.from_nondimensional(
+        material or NondimensionalParameters(), shear_modulus=1.0e4, density=1900.0,
+        half_length=0.01, remanence=0.1)

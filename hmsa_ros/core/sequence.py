@@ -1,0 +1,182 @@
+"""
+Plans for a sequence of setpoints (Eq. 14), each from the state the last one really ends in.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from hmsa_ros.core import kernels
+from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.core.shapers import get_shaper, Level, Limits, Move, State, Units
+from hmsa_ros.core.simulation import check_stretch
+from hmsa_ros.core.simulation import RTOL
+from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.errors import BadInputError
+
+#: What to do with a spell that ends before the move does.
+SHORT_SPELL = ('refuse', 'continue')
+
+
+@dataclass(frozen=True)
+class Setpoint:
+    """
+    A stretch and how long it lasts, the paper's (lambda_d, span).
+
+    Attributes
+    ----------
+    stretch : float
+        Target, greater than 0.
+    span : float
+        Time from leaving the previous setpoint to leaving this one, greater than 0; infinite
+        for the last one of a sequence that is held.
+
+    Raises
+    ------
+    BadInputError
+        If a value is not in range.
+
+    """
+
+    stretch: float
+    span: float
+
+    def __post_init__(self) -> None:
+        """Check both numbers."""
+        if not (math.isfinite(self.stretch) and self.stretch > 0.0):
+            raise BadInputError(
+                f'stretch is {self.stretch:g}: expected a finite number greater than 0')
+        if not self.span > 0.0:
+            raise BadInputError(f'span is {self.span:g}: expected a number greater than 0')
+
+
+@dataclass(frozen=True)
+class Segment:
+    """
+    One setpoint of a plan.
+
+    Attributes
+    ----------
+    setpoint : Setpoint
+        What was asked for.
+    begin : float
+        Time at which the move begins, from the start of the sequence.
+    start, end : State
+        Predicted at ``begin`` and at the end of the span (after the last change of level, for
+        an infinite span).
+    move : Move
+        The command; its times count from ``begin``.
+
+    """
+
+    setpoint: Setpoint
+    begin: float
+    start: State
+    end: State
+    move: Move
+
+
+def plan_sequence(
+        setpoints: Sequence[Setpoint], material: NondimensionalParameters, *,
+        start: State | None = None, shaper: str = 'two_step', limits: Limits | None = None,
+        units: Units | None = None, short_spell: str = 'refuse',
+        resolution: float = 0.0) -> tuple[Segment, ...]:
+    """
+    Plan a sequence of setpoints.
+
+    Parameters
+    ----------
+    setpoints : sequence of Setpoint
+        At least one.
+    material : NondimensionalParameters
+        zeta, J_lim and c1.
+    start : State, optional
+        Default: stretch 1 at rest (Eq. 12).
+    shaper : str
+        Name of a shaper.
+    limits : Limits, optional
+        Admissible loads; default none.
+    units : Units, optional
+        For the messages; default nondimensional.
+    short_spell : {'refuse', 'continue'}
+        For a span that ends before the move: refuse, or plan the next move from the state that
+        is really reached.
+    resolution : float
+        Times of the levels are rounded to multiples of this; 0 for none. The next move starts
+        from what the rounded command leads to.
+
+    Returns
+    -------
+    tuple of Segment
+        One a setpoint.
+
+    Raises
+    ------
+    RefusedError
+        If a setpoint cannot be had; its reason names which.
+    BadInputError
+        If an argument is out of range.
+
+    """
+    if not setpoints:
+        raise RefusedError(Code.BAD_INPUT, 'no setpoint given: expected at least one')
+    if short_spell not in SHORT_SPELL:
+        raise BadInputError(
+            f'short_spell is {short_spell!r}: expected one of {", ".join(SHORT_SPELL)}')
+    shape = get_shaper(shaper)
+    limits = limits or Limits()
+    units = units or Units()
+    state = start or State(1.0)
+    check_stretch(state.stretch, material.j_lim, 'start stretch')
+    begin = 0.0
+    segments = []
+    for setpoint in setpoints:
+        move = _on_grid(
+            shape(state, setpoint.stretch, material, limits, units), resolution)
+        if setpoint.span < move.duration < math.inf:
+            if short_spell == 'refuse':
+                raise RefusedError(
+                    Code.SPELL_TOO_SHORT,
+                    f'the move from stretch {state.stretch:.6g} to {setpoint.stretch:g} takes '
+                    f'{units.time_text(move.duration)}, its span is '
+                    f'{units.time_text(setpoint.span)}: expected a span of at least the move')
+            kept = tuple(level for level in move.levels if level.time < setpoint.span)
+            move = Move(
+                Code.SPELL_TOO_SHORT, kept, math.inf,
+                f'the span {units.time_text(setpoint.span)} ends before stretch '
+                f'{setpoint.stretch:g} is reached, which takes '
+                f'{units.time_text(move.duration)}')
+        end = _follow(state, move, setpoint.span, material)
+        segments.append(Segment(setpoint, begin, state, end, move))
+        begin += setpoint.span
+        state = end
+    return tuple(segments)
+
+
+def _on_grid(move: Move, resolution: float) -> Move:
+    """Round a move's times to multiples of the resolution."""
+    if resolution == 0.0:
+        return move
+
+    def rounded(time: float) -> float:
+        return time if math.isinf(time) else round(time / resolution) * resolution
+
+    return Move(
+        move.code, tuple(Level(rounded(x.time), x.load) for x in move.levels),
+        rounded(move.duration), move.reason)
+
+
+def _follow(
+        state: State, move: Move, span: float, material: NondimensionalParameters) -> State:
+    """Return the state at the end of the span, or at the last change of level."""
+    work = np.empty((kernels.STAGES, 4))
+    stretch, rate = state.stretch, state.rate
+    ends = [level.time for level in move.levels[1:]]
+    ends.append(span if math.isfinite(span) else move.levels[-1].time)
+    for level, end in zip(move.levels, ends):
+        _, stretch, rate, _, _, _ = kernels.advance(
+            work, stretch, rate, 0.0, 0.0, level.load, 0.0, 0.0, 0.0, end - level.time,
+            material.zeta, material.c1, 1.0 / material.j_lim, RTOL, 0.0)
+    return State(stretch, rate)

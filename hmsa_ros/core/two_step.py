@@ -1,0 +1,177 @@
+"""
+The two-step command of Eqs. 13 and 14, for one move from any state.
+
+A constant load beta_p brings the actuator to its turning point exactly at the target; there
+the load that holds the target, beta_1, takes over and nothing is left to oscillate.
+"""
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hmsa_ros.core import kernels
+from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.core.status import Code
+from hmsa_ros.errors import BadInputError
+
+#: Relative tolerance of the integration and of beta_p.
+RTOL = 1e-12
+#: Deviation from the target below which the actuator counts as being there already.
+HOLD_TOLERANCE = 1e-9
+
+CODES = {
+    kernels.TWO_STEP: Code.TWO_STEP,
+    kernels.HOLD: Code.HOLD,
+    kernels.TOO_DAMPED: Code.TOO_DAMPED,
+    kernels.INDISTINGUISHABLE: Code.INDISTINGUISHABLE,
+    kernels.NO_TWO_STEP: Code.NO_TWO_STEP,
+    kernels.NOT_CONVERGED: Code.NOT_CONVERGED,
+    kernels.OUT_OF_RANGE: Code.OUT_OF_RANGE,
+    kernels.BAD_INPUT: Code.BAD_INPUT,
+}
+
+_WORK = np.empty((kernels.STAGES, 4))
+
+
+@dataclass(frozen=True)
+class TwoStep:
+    """
+    Result of `plan_two_step`.
+
+    Attributes
+    ----------
+    code : Code
+        ``TWO_STEP`` or ``HOLD`` where the plan leaves no vibration; any other value says why
+        there is none.
+    beta_p : float
+        Intermediate load; NaN without a plan.
+    tau_p : float
+        Time at which the target is reached at rest; NaN without a plan.
+    beta_1 : float
+        Load that holds the target; NaN for a target outside the limits.
+    passes : int
+        Integrations that the solution took.
+
+    """
+
+    code: Code
+    beta_p: float
+    tau_p: float
+    beta_1: float
+    passes: int
+
+
+def plan_two_step(
+        start: float, target: float, material: NondimensionalParameters, *,
+        rate: float = 0.0, load_limits: tuple[float, float] = (-math.inf, math.inf),
+        rtol: float = RTOL) -> TwoStep:
+    """
+    Find the intermediate load and its duration for one move (Eq. 13).
+
+    Parameters
+    ----------
+    start : float
+        Stretch at the start, inside the limiting stretches.
+    target : float
+        Stretch to come to rest at, inside the limiting stretches.
+    material : NondimensionalParameters
+        zeta, J_lim and c1.
+    rate : float
+        Stretch rate at the start, per unit of nondimensional time.
+    load_limits : tuple of float
+        Admissible loads. Where two plans exist, the fastest inside them is taken; where none
+        lies inside, the plan with the direct approach is returned and the caller sees from
+        ``beta_p`` what it would need.
+    rtol : float
+        Relative tolerance, 1e-14 to 1e-4.
+
+    Returns
+    -------
+    TwoStep
+        With `Code.TOO_DAMPED` where the response to beta_1 does not cross the target, so that
+        no two-step command exists, and `Code.INDISTINGUISHABLE` where beta_p equals beta_1 to
+        rounding.
+
+    Raises
+    ------
+    BadInputError
+        If an argument is not a finite number or ``rtol`` is out of range.
+
+    """
+    if not math.isfinite(start + target + rate):
+        raise BadInputError(
+            f'start {start!r}, target {target!r}, rate {rate!r}: expected finite numbers')
+    if not 1e-14 <= rtol <= 1e-4:
+        raise BadInputError(f'rtol is {rtol!r}: expected 1e-14 to 1e-4')
+    status, beta_p, tau_p, beta_1, passes = kernels.two_step(
+        _WORK, float(start), float(rate), float(target), material.zeta, material.c1,
+        1.0 / material.j_lim, float(load_limits[0]), float(load_limits[1]), float(rtol),
+        HOLD_TOLERANCE)
+    return TwoStep(CODES[status], beta_p, tau_p, beta_1, passes)
+
+
+@dataclass(frozen=True)
+class TwoStepBatch:
+    """
+    Result of `plan_two_step_batch`: arrays of the broadcast shape.
+
+    Attributes
+    ----------
+    status : ndarray of int64
+        Keys of `CODES`.
+    beta_p, tau_p, beta_1 : ndarray of float64
+        As in `TwoStep`, NaN where there is no plan.
+
+    """
+
+    status: NDArray[np.int64]
+    beta_p: NDArray[np.float64]
+    tau_p: NDArray[np.float64]
+    beta_1: NDArray[np.float64]
+
+
+def plan_two_step_batch(
+        start: ArrayLike, target: ArrayLike, *, zeta: ArrayLike = 0.2,
+        j_lim: ArrayLike = 5.0, c1: ArrayLike = 2.0, rate: ArrayLike = 0.0,
+        load_limits: tuple[float, float] = (-math.inf, math.inf),
+        rtol: float = RTOL) -> TwoStepBatch:
+    """
+    Plan many moves at once, over all cores.
+
+    Parameters
+    ----------
+    start, target, zeta, j_lim, c1, rate : array_like
+        As for `plan_two_step`, broadcast against each other.
+    load_limits : tuple of float
+        Admissible loads.
+    rtol : float
+        Relative tolerance, 1e-14 to 1e-4.
+
+    Returns
+    -------
+    TwoStepBatch
+        A row that cannot be planned carries its status and NaN; it never spoils the others.
+
+    Raises
+    ------
+    BadInputError
+        If the shapes do not broadcast or ``rtol`` is out of range.
+
+    """
+    if not 1e-14 <= rtol <= 1e-4:
+        raise BadInputError(f'rtol is {rtol!r}: expected 1e-14 to 1e-4')
+    try:
+        arrays = np.broadcast_arrays(*(
+            np.asarray(a, dtype=np.float64) for a in (start, rate, target, zeta, c1, j_lim)))
+    except ValueError as error:
+        raise BadInputError(f'the arrays do not broadcast against each other: {error}') from error
+    shape = arrays[0].shape
+    columns = [np.ascontiguousarray(a).ravel() for a in arrays]
+    status = np.empty(columns[0].size, dtype=np.int64)
+    results = [np.empty(status.size) for _ in range(3)]
+    kernels.two_step_batch(
+        *columns, float(load_limits[0]), float(load_limits[1]), float(rtol), HOLD_TOLERANCE,
+        status, *results)
+    return TwoStepBatch(status.reshape(shape), *(a.reshape(shape) for a in results))

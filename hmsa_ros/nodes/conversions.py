@@ -1,0 +1,260 @@
+"""Conversion between messages and the records of `hmsa_ros.core`."""
+
+from collections.abc import Iterable, Mapping
+import math
+
+from builtin_interfaces.msg import Duration, Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState, MagneticField
+from std_msgs.msg import Header
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from hmsa_ros.core.planner import Plan
+from hmsa_ros.core.simulation import NANOSECONDS
+from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.errors import BadInputError
+
+
+def to_time(nanoseconds: int) -> Time:
+    """Return a stamp as a message."""
+    sec, nanosec = divmod(nanoseconds, NANOSECONDS)
+    return Time(sec=sec, nanosec=nanosec)
+
+
+def from_time(stamp: Time | Duration) -> int:
+    """Return a stamp or a duration in ns."""
+    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+
+
+def to_clock(nanoseconds: int) -> Clock:
+    """Return simulated time as a message."""
+    return Clock(clock=to_time(nanoseconds))
+
+
+def to_command(stamp: int, flux_density: float, frame: str) -> MagneticField:
+    """
+    Return a flux density command.
+
+    Parameters
+    ----------
+    stamp : int
+        Time in ns from which it applies.
+    flux_density : float
+        Along z, in T.
+    frame : str
+        Frame of the coil.
+
+    Returns
+    -------
+    sensor_msgs.msg.MagneticField
+        With x and y zero: these axes are commanded to zero, not unknown.
+
+    """
+    message = MagneticField(header=Header(stamp=to_time(stamp), frame_id=frame))
+    message.magnetic_field.z = flux_density
+    return message
+
+
+def from_command(message: MagneticField) -> tuple[int, float]:
+    """
+    Return stamp in ns and flux density in T of a command.
+
+    Parameters
+    ----------
+    message : sensor_msgs.msg.MagneticField
+        As `to_command` makes them.
+
+    Returns
+    -------
+    tuple of int and float
+        Stamp 0 means at once.
+
+    Raises
+    ------
+    BadInputError
+        If the field is not finite, not along z, or stamped before the epoch.
+
+    """
+    field = message.magnetic_field
+    if not math.isfinite(field.x + field.y + field.z):
+        raise BadInputError(
+            f'flux density command ({field.x:g}, {field.y:g}, {field.z:g}) T: expected finite '
+            'numbers')
+    if field.x != 0.0 or field.y != 0.0:
+        raise BadInputError(
+            f'flux density command ({field.x:g}, {field.y:g}, {field.z:g}) T: expected a field '
+            'along z, with x = y = 0')
+    stamp = from_time(message.header.stamp)
+    if stamp < 0:
+        raise BadInputError(f'flux density command stamped {stamp} ns: expected at least 0')
+    return stamp, float(field.z)
+
+
+def to_joint_state(
+        stamp: int, joint: str, stretch: float, rate: float,
+        flux_density: float) -> JointState:
+    """
+    Return a sample of the actuator.
+
+    Parameters
+    ----------
+    stamp : int
+        In ns.
+    joint : str
+        Its name.
+    stretch, rate, flux_density : float
+        Dimensionless, in 1/s and in T.
+
+    Returns
+    -------
+    sensor_msgs.msg.JointState
+        Position is stretch, velocity stretch rate, effort flux density.
+
+    """
+    return JointState(
+        header=Header(stamp=to_time(stamp)), name=[joint], position=[stretch],
+        velocity=[rate], effort=[flux_density])
+
+
+def from_trajectory(
+        message: JointTrajectory, joint: str) -> tuple[list[tuple[float, int]], int | None]:
+    """
+    Return the setpoints of a trajectory and its stamp.
+
+    Parameters
+    ----------
+    message : trajectory_msgs.msg.JointTrajectory
+        For one joint.
+    joint : str
+        Name that it must have.
+
+    Returns
+    -------
+    points : list of (float, int)
+        Stretch, and time from the start in ns.
+    stamp : int or None
+        In ns; None for stamp 0, which means now.
+
+    Raises
+    ------
+    RefusedError
+        If the joint is another one, sizes do not fit, or a point asks for motion or effort.
+
+    """
+    names = list(message.joint_names)
+    if names != [joint]:
+        raise RefusedError(
+            Code.UNKNOWN_JOINT, f'joint_names is {names}: expected [{joint!r}]')
+    points = []
+    for number, point in enumerate(message.points):
+        if len(point.positions) != 1:
+            raise RefusedError(
+                Code.BAD_INPUT,
+                f'point {number} has {len(point.positions)} positions: expected 1, the stretch')
+        for name in ('velocities', 'accelerations', 'effort'):
+            values = list(getattr(point, name))
+            if values not in ([], [0.0]):
+                raise RefusedError(
+                    Code.BAD_INPUT,
+                    f'point {number} has {name} {values}: expected none, the actuator comes to '
+                    'rest at each setpoint')
+        points.append((float(point.positions[0]), from_time(point.time_from_start)))
+    stamp = from_time(message.header.stamp)
+    return points, (None if stamp == 0 else stamp)
+
+
+def to_trajectory(
+        setpoints: Iterable[tuple[float, int]], joint: str, *, stamp: int = 0,
+        frame: str = '') -> JointTrajectory:
+    """
+    Return setpoints as a trajectory message.
+
+    Parameters
+    ----------
+    setpoints : iterable of (float, int)
+        Stretch, and time from the start in ns until which it lasts.
+    joint : str
+        Its name.
+    stamp : int
+        Start in ns; 0 for now.
+    frame : str
+        Identifies the request: the planner's verdict repeats it.
+
+    Returns
+    -------
+    trajectory_msgs.msg.JointTrajectory
+        One point a setpoint.
+
+    """
+    return JointTrajectory(
+        header=Header(stamp=to_time(stamp), frame_id=frame), joint_names=[joint],
+        points=[
+            JointTrajectoryPoint(positions=[stretch], time_from_start=_to_duration(time))
+            for stretch, time in setpoints])
+
+
+def _to_duration(nanoseconds: int) -> Duration:
+    sec, nanosec = divmod(nanoseconds, NANOSECONDS)
+    return Duration(sec=sec, nanosec=nanosec)
+
+
+def to_plan(plan: Plan, joint: str) -> JointTrajectory:
+    """
+    Return a plan's preview: one point at each change of level still ahead of its start.
+
+    Parameters
+    ----------
+    plan : Plan
+        At least one request old.
+    joint : str
+        Its name.
+
+    Returns
+    -------
+    trajectory_msgs.msg.JointTrajectory
+        Stamped with the first change; positions, velocities and effort are the predicted
+        stretch, stretch rate and the flux density from then on.
+
+    """
+    levels = [level for level in plan.levels if level.stamp >= 0]
+    start = levels[0].stamp if levels else 0
+    return JointTrajectory(
+        header=Header(stamp=to_time(start)), joint_names=[joint],
+        points=[
+            JointTrajectoryPoint(
+                positions=[level.stretch], velocities=[level.rate],
+                effort=[level.flux_density],
+                time_from_start=_to_duration(level.stamp - start))
+            for level in levels])
+
+
+def to_status(
+        name: str, joint: str, level: bytes, message: str,
+        values: Mapping[str, object]) -> DiagnosticStatus:
+    """
+    Return a diagnostic status.
+
+    Parameters
+    ----------
+    name, joint, message : str
+        What it is about, for which joint, and the sentence.
+    level : bytes
+        One of DiagnosticStatus.OK, WARN, ERROR.
+    values : mapping of str to object
+        Written with `str`.
+
+    Returns
+    -------
+    diagnostic_msgs.msg.DiagnosticStatus
+        Ready to publish.
+
+    """
+    return DiagnosticStatus(
+        name=name, hardware_id=joint, level=level, message=message,
+        values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
+
+
+def to_diagnostics(stamp: int, *statuses: DiagnosticStatus) -> DiagnosticArray:
+    """Return statuses as the message of /diagnostics, stamped in ns."""
+    return DiagnosticArray(header=Header(stamp=to_time(stamp)), status=list(statuses))
