@@ -1,0 +1,70 @@
+"""Time of a simulation against a steady clock: real-time factor, pause and resume."""
+
+
+class Pacer:
+    """
+    Tells how far a simulation should have got.
+
+    Parameters
+    ----------
+    start : int
+        Simulated time in ns to begin at.
+    factor : float
+        Simulated seconds per second; 0 for as fast as possible.
+    paused : bool
+        Whether to begin paused.
+
+    Attributes
+    ----------
+    paused : bool
+        Whether time stands still.
+
+    """
+
+    def __init__(self, start: int, factor: float, *, paused: bool = False) -> None:
+        """Begin at a time; it runs from the first call of `target` on."""
+        self._factor = factor
+        self._anchor = start
+        self._steady: int | None = None
+        self.paused = paused
+
+    @property
+    def unlimited(self) -> bool:
+        """Whether the simulation runs as fast as it can."""
+        return self._factor == 0.0
+
+    def target(self, steady: int) -> int:
+        """
+        Return the simulated time that is due.
+
+        Parameters
+        ----------
+        steady : int
+            Steady time in ns, not decreasing.
+
+        Returns
+        -------
+        int
+            In ns; the place of the last pause while paused. Without meaning if `unlimited`.
+
+        """
+        if self.paused or self._steady is None:
+            self._steady = steady
+            return self._anchor
+        return self._anchor + round((steady - self._steady) * self._factor)
+
+    def set_paused(self, paused: bool, time: int) -> None:
+        """
+        Pause or go on.
+
+        Parameters
+        ----------
+        paused : bool
+            What to do.
+        time : int
+            Simulated time in ns that has been reached; goes on from here.
+
+        """
+        self._anchor = time
+        self._steady = None
+        self.paused = paused
