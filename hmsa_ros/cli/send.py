@@ -1,0 +1,88 @@
+"""``hmsa send``: publish a sequence to the running planner."""
+
+import argparse
+import sys
+from typing import Any
+
+from hmsa_ros.cli.setpoints import setpoint
+from hmsa_ros.errors import BadInputError
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    Add the command.
+
+    Parameters
+    ----------
+    subparsers : argparse action
+        Where to add it.
+
+    """
+    parser = subparsers.add_parser(
+        'send', help='publish a sequence of setpoints to the running planner',
+        description='Publish a sequence of setpoints to the running planner, beginning now, '
+                    'and print its verdict.',
+        epilog='example: hmsa send 1.10:2 1.20:2 --wait')
+    parser.add_argument(
+        'setpoints', nargs='+', type=setpoint, metavar='STRETCH:SECONDS',
+        help='stretch to come to rest at, and seconds from leaving the last setpoint to '
+             'leaving this one')
+    parser.add_argument(
+        '--wait', action='store_true', help='report until the sequence has been carried out')
+    parser.add_argument(
+        '--namespace', default='', metavar='NS', help='namespace of the planner')
+    parser.add_argument(
+        '--joint', default='actuator', metavar='NAME', help='joint name (default actuator)')
+    parser.add_argument(
+        '--timeout', type=float, default=10.0, metavar='S',
+        help='patience with a silent planner, and beyond the length of the sequence with one '
+             'that is slow (default 10 s)')
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """
+    Send and, if asked to, wait.
+
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+        As parsed.
+
+    Returns
+    -------
+    int
+        Exit status.
+
+    Raises
+    ------
+    HmsaError
+        If there is no planner, it refuses, or the sequence is not carried out.
+
+    """
+    from hmsa_ros.session.client import PlannerClient
+
+    if not arguments.timeout > 0.0:
+        raise BadInputError(
+            f'timeout is {arguments.timeout:g}: expected a number of seconds above 0')
+    with PlannerClient(
+            namespace=arguments.namespace, joint=arguments.joint,
+            timeout=arguments.timeout) as client:
+        client.find_planner()
+        verdict = client.send(arguments.setpoints)
+        print(verdict.message)
+        if not arguments.wait:
+            return 0
+        seen = ''
+
+        def report(now: object) -> None:
+            nonlocal seen
+            line = f'setpoint {now.setpoint} of {now.setpoints}: {now.state}'  # type: ignore
+            if line != seen and now.setpoint:  # type: ignore[attr-defined]
+                seen = line
+                print(line, file=sys.stderr, flush=True)
+
+        length = sum(span for _, span in arguments.setpoints)
+        verdict = client.follow(verdict, each=report, timeout=length + arguments.timeout)
+        print(f'done: {verdict.state}')
+    return 0

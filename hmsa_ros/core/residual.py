@@ -1,0 +1,44 @@
+"""What is left of a move: residual vibration after arrival."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hmsa_ros.errors import HmsaError
+
+
+def residual_vibration(
+        time: ArrayLike, stretch: ArrayLike, *, arrival: float, end: float,
+        step: float) -> float:
+    """
+    Return the peak-to-peak stretch after arrival as a share of the step.
+
+    Parameters
+    ----------
+    time : array_like, shape (n,)
+        Increasing.
+    stretch : array_like, shape (n,)
+        Samples.
+    arrival, end : float
+        Part of the time that counts, both included, in the unit of ``time``.
+    step : float
+        Difference of stretch that was commanded.
+
+    Returns
+    -------
+    float
+        0 for rest; a share, not percent.
+
+    Raises
+    ------
+    HmsaError
+        If no two samples lie between arrival and end, or the step is zero.
+
+    """
+    time = np.asarray(time, dtype=np.float64)
+    inside = (time >= arrival) & (time <= end)
+    count = int(np.count_nonzero(inside))
+    if count < 2 or step == 0.0:
+        raise HmsaError(
+            f'{count} samples between {arrival:g} and {end:g} after a step of {step:g}: '
+            'expected at least two samples and a step')
+    return float(np.ptp(np.asarray(stretch, dtype=np.float64)[inside]) / abs(step))

@@ -1,0 +1,264 @@
+"""A client of the planner: sends a sequence, reads the verdict, follows the progress."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from time import monotonic
+from uuid import uuid4
+
+from diagnostic_msgs.msg import DiagnosticStatus
+import rclpy
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from hmsa_ros.core.simulation import NANOSECONDS
+from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.conversions import to_trajectory
+
+_SLICE_SECONDS = 0.05
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """
+    What the planner says of its last request.
+
+    Attributes
+    ----------
+    level : int
+        0 OK, 1 WARN, 2 ERROR.
+    message : str
+        One sentence.
+    code : str
+        As in `hmsa_ros.core.status.Code`.
+    request : str
+        Identifier of the request, as it was sent.
+    state : str
+        Progress: idle, waiting, moving, holding, settling, at_rest.
+    setpoint, setpoints : int
+        Which one is under way, from 1, and how many there are.
+
+    """
+
+    level: int
+    message: str
+    code: str
+    request: str
+    state: str
+    setpoint: int
+    setpoints: int
+
+    @classmethod
+    def from_message(cls, message: DiagnosticStatus) -> 'Verdict':
+        """
+        Read a status message.
+
+        Parameters
+        ----------
+        message : diagnostic_msgs.msg.DiagnosticStatus
+            As the planner publishes it.
+
+        Returns
+        -------
+        Verdict
+            Its content.
+
+        """
+        values = {x.key: x.value for x in message.values}
+        return cls(
+            message.level[0], message.message, values.get('code', ''),
+            values.get('request', ''), values.get('state', ''),
+            int(values.get('setpoint', 0)), int(values.get('setpoints', 0)))
+
+
+class PlannerClient:
+    """
+    Talks to one planner; a context manager.
+
+    Parameters
+    ----------
+    namespace : str
+        Namespace of the planner.
+    joint : str
+        Name of its joint.
+    timeout : float
+        Patience with a silent planner in s.
+
+    """
+
+    def __init__(
+            self, *, namespace: str = '', joint: str = 'actuator',
+            timeout: float = 10.0) -> None:
+        """Create a node of our own in a context of our own."""
+        self._timeout = timeout
+        self._joint = joint
+        self._namespace = namespace
+        self._context = rclpy.Context()
+        # Signals stay Python's: Ctrl-C raises KeyboardInterrupt here as anywhere else.
+        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            self.node: Node = rclpy.create_node(
+                f'client_{uuid4().hex[:8]}', namespace=namespace, context=self._context)
+        except Exception as error:  # rclpy has several classes for a bad name
+            rclpy.try_shutdown(context=self._context)
+            raise BadInputError(f'namespace {namespace!r}: {error}') from error
+        self._executor = EventsExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self._verdict: Verdict | None = None
+        topic = interface.STATUS
+        self.node.create_subscription(
+            topic.type, interface.from_outside(topic.name, interface.PLANNER),
+            self._on_status, topic.qos)
+        topic = interface.JOINT_TRAJECTORY
+        self._publisher = self.node.create_publisher(
+            topic.type, interface.from_outside(topic.name, interface.PLANNER), topic.qos)
+
+    def __enter__(self) -> 'PlannerClient':
+        """Return the client."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave the graph."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+    def _on_status(self, message: DiagnosticStatus) -> None:
+        self._verdict = Verdict.from_message(message)
+
+    def spin_until(
+            self, condition: Callable[[], bool], waiting_for: str,
+            each: Callable[[], None] | None = None, timeout: float | None = None) -> None:
+        """
+        Serve callbacks until a condition holds.
+
+        Parameters
+        ----------
+        condition : callable
+            Tells whether to go on.
+        waiting_for : str
+            For the message.
+        each : callable, optional
+            Called about 20 times a second.
+        timeout : float, optional
+            Patience in s; default the client's.
+
+        Raises
+        ------
+        HmsaError
+            If the condition does not come true in time.
+
+        """
+        deadline = monotonic() + (self._timeout if timeout is None else timeout)
+        while not condition():
+            if monotonic() > deadline:
+                raise HmsaError(
+                    f'no {waiting_for} within '
+                    f'{self._timeout if timeout is None else timeout:g} s')
+            self._executor.spin_once(timeout_sec=_SLICE_SECONDS)
+            if each is not None:
+                each()
+
+    def find_planner(self, each: Callable[[], None] | None = None) -> None:
+        """
+        Wait until a planner listens and its status has arrived.
+
+        Parameters
+        ----------
+        each : callable, optional
+            Called while waiting.
+
+        Raises
+        ------
+        HmsaError
+            If there is none.
+
+        """
+        where = self._namespace or '/'
+        self.spin_until(
+            lambda: self._verdict is not None and self._publisher.get_subscription_count() > 0,
+            f'planner found in namespace {where}: is one running (hmsa planner), with the same '
+            'ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE? None', each)
+
+    def send(self, setpoints: Sequence[tuple[float, float]]) -> Verdict:
+        """
+        Send a sequence that begins now and wait for the verdict.
+
+        Parameters
+        ----------
+        setpoints : sequence of (float, float)
+            Stretch and span in s.
+
+        Returns
+        -------
+        Verdict
+            Of level OK or WARN.
+
+        Raises
+        ------
+        BadInputError
+            If the planner refuses the sequence.
+        HmsaError
+            If it does not answer.
+
+        """
+        request = uuid4().hex
+        points = []
+        end = 0.0
+        for stretch, span in setpoints:
+            end += span
+            if end >= 2**31:
+                raise BadInputError(f'the sequence lasts {end:g} s: expected less than 2^31 s')
+            points.append((stretch, round(end * NANOSECONDS)))
+        self._publisher.publish(to_trajectory(points, self._joint, frame=request))
+        self.spin_until(
+            lambda: self._verdict is not None and self._verdict.request == request,
+            'verdict of the planner')
+        assert self._verdict is not None
+        if self._verdict.level >= DiagnosticStatus.ERROR[0]:
+            raise BadInputError(f'the planner refused: {self._verdict.message}')
+        return self._verdict
+
+    def follow(
+            self, verdict: Verdict, *, each: Callable[[Verdict], None] | None = None,
+            timeout: float) -> Verdict:
+        """
+        Wait until a sequence has been carried out.
+
+        Parameters
+        ----------
+        verdict : Verdict
+            As `send` returned it.
+        each : callable, optional
+            Called about 20 times a second with the newest verdict.
+        timeout : float
+            Patience in s.
+
+        Returns
+        -------
+        Verdict
+            The last one.
+
+        Raises
+        ------
+        HmsaError
+            If another request took its place, or it takes too long.
+
+        """
+        def current() -> Verdict:
+            assert self._verdict is not None
+            return self._verdict
+
+        def done() -> bool:
+            now = current()
+            if now.request != verdict.request:
+                raise HmsaError(
+                    f'the sequence was not carried out: another request came in between '
+                    f'({now.message})')
+            return now.setpoint == now.setpoints and now.state in ('at_rest', 'settling')
+
+        self.spin_until(
+            done, 'end of the sequence', None if each is None else lambda: each(current()),
+            timeout)
+        return current()

@@ -1,0 +1,200 @@
+"""Node processes: started together, ended in order, never left behind."""
+
+from collections.abc import Mapping, Sequence
+import ctypes
+from dataclasses import dataclass
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+
+from hmsa_ros.errors import HmsaError
+
+_PR_SET_PDEATHSIG = 1
+# Long enough for a recorder to write what it holds on a slow disk.
+_PATIENCE_SECONDS = 15.0
+
+
+@dataclass(frozen=True)
+class NodeProcess:
+    """
+    A node to start.
+
+    Attributes
+    ----------
+    name : str
+        One of the ``hmsa`` node commands.
+    parameters : mapping of str to str
+        Parameters as ``-p`` takes them.
+
+    """
+
+    name: str
+    parameters: Mapping[str, str]
+
+    def command(self) -> list[str]:
+        """
+        Return the command line.
+
+        Returns
+        -------
+        list of str
+            With this Python.
+
+        """
+        words = [sys.executable, '-m', 'hmsa_ros', self.name, '--ros-args']
+        for key, value in self.parameters.items():
+            words += ['-p', f'{key}:={value}']
+        return words
+
+
+class Session:
+    """
+    Node processes with their logs; a context manager that ends them.
+
+    Parameters
+    ----------
+    folder : Path
+        Existing folder for one ``NAME.log`` a process.
+    environment : mapping of str to str
+        Environment of the processes.
+
+    """
+
+    def __init__(self, folder: Path, environment: Mapping[str, str]) -> None:
+        """Start nothing yet."""
+        self._folder = folder
+        self._environment = dict(environment)
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+
+    def __enter__(self) -> 'Session':
+        """Return the session."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End what still runs."""
+        self.stop()
+
+    def start(self, node: NodeProcess) -> None:
+        """
+        Start a node.
+
+        Parameters
+        ----------
+        node : NodeProcess
+            Its name is not in use yet.
+
+        """
+        with open(self.log(node.name), 'wb') as log:
+            # A session of its own: Ctrl-C in the terminal reaches only us, and we end the
+            # nodes in order. Should we be killed, the kernel ends them.
+            self._processes[node.name] = subprocess.Popen(
+                node.command(), env=self._environment, stdin=subprocess.DEVNULL, stdout=log,
+                stderr=log, start_new_session=True, preexec_fn=_die_with_parent)
+
+    def log(self, name: str) -> Path:
+        """
+        Return where a node's output goes.
+
+        Parameters
+        ----------
+        name : str
+            Of the node.
+
+        Returns
+        -------
+        Path
+            In the session's folder.
+
+        """
+        return self._folder / f'{name}.log'
+
+    def check(self) -> None:
+        """
+        Make sure that all started nodes run.
+
+        Raises
+        ------
+        HmsaError
+            If one has ended; with its last words.
+
+        """
+        for name, process in self._processes.items():
+            if process.poll() is not None:
+                raise HmsaError(
+                    f'the {name} ended early with status {process.returncode}: '
+                    f'{self.last_words(name)}')
+
+    def last_words(self, name: str) -> str:
+        """
+        Return the last line of a node's log.
+
+        Parameters
+        ----------
+        name : str
+            Of the node.
+
+        Returns
+        -------
+        str
+            With the place of the log.
+
+        """
+        lines = self.log(name).read_text(errors='replace').strip().splitlines()
+        return f'{lines[-1] if lines else "it said nothing"} (log: {self.log(name)})'
+
+    def stop(self, order: Sequence[str] = ()) -> dict[str, int]:
+        """
+        End all nodes: SIGINT, and SIGKILL for one that does not answer.
+
+        Parameters
+        ----------
+        order : sequence of str
+            Nodes to end first, one after the other; the rest follows.
+
+        Returns
+        -------
+        dict of str to int
+            Exit status by node; negative for the signal that ended it.
+
+        """
+        names = [*(x for x in order if x in self._processes),
+                 *(x for x in self._processes if x not in order)]
+        for name in names:
+            process = self._processes[name]
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+            try:
+                process.wait(_PATIENCE_SECONDS)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        return {name: self._processes[name].returncode for name in names}
+
+
+def _die_with_parent() -> None:
+    """Ask the kernel to interrupt this process when its parent is gone."""
+    # The shell of a background job may have told its children to ignore SIGINT.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
+
+
+def local_environment() -> dict[str, str]:
+    """
+    Return an environment in which nodes talk to this host only.
+
+    The ROS domain is the caller's where ROS_DOMAIN_ID is set, and otherwise one that other
+    runs on this host are unlikely to use.
+
+    Returns
+    -------
+    dict of str to str
+        A copy of ours with the two variables set.
+
+    """
+    environment = dict(os.environ)
+    environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    # Domains above 101 collide with the ephemeral ports of Linux.
+    environment.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 101))
+    return environment
