@@ -1,0 +1,89 @@
+# make help says what there is. Nothing is needed but Python (with venv) and make: what is
+# installed goes into .venv.
+
+PYTHON ?= python3
+VENV ?= .venv
+# Passed to the command or to pytest, as in: make demo ARGS='--out /tmp/demo --json'
+ARGS ?=
+# For make constraints.
+PYTHONS ?= python3.10 python3.11 python3.12 python3.13
+
+BIN := $(VENV)/bin
+INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet -c constraints.txt
+
+# The environment brings its own ROS: one that the calling shell has sourced is set aside, and
+# what it selects (middleware, profiles, security) with it.
+unexport PYTHONPATH PYTHONHOME PYTHONWARNINGS
+unexport AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH LD_LIBRARY_PATH
+unexport ROS_DISTRO ROS_VERSION ROS_PYTHON_VERSION ROS_LOCALHOST_ONLY ROS_STATIC_PEERS
+unexport ROS_DISCOVERY_SERVER ROS_SECURITY_ENABLE ROS_SECURITY_STRATEGY ROS_SECURITY_KEYSTORE
+unexport RMW_IMPLEMENTATION CYCLONEDDS_URI
+unexport FASTDDS_DEFAULT_PROFILES_FILE FASTRTPS_DEFAULT_PROFILES_FILE
+unexport RCUTILS_CONSOLE_OUTPUT_FORMAT RCUTILS_LOGGING_USE_STDOUT
+export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+
+.PHONY: help
+help: ## say what there is (default)
+	@sed -n 's/^\([a-z]*\):.*## /\1	/p' $(MAKEFILE_LIST) | expand -t 14
+	@echo "Variables: PYTHON=$(PYTHON) VENV=$(VENV) ARGS='$(ARGS)'"
+
+.PHONY: demo
+demo: env ## run the demonstration
+	$(BIN)/hmsa demo $(ARGS)
+
+.PHONY: test
+test: env ## run the whole gate: ruff, mypy, pytest with warnings as errors
+	$(BIN)/python -m ruff check .
+	$(BIN)/python -m mypy
+	$(BIN)/python -m pytest $(ARGS)
+
+.PHONY: bench
+bench: $(VENV)/.bench env ## measure speed and accuracy
+	$(BIN)/python -m benchmarks $(ARGS)
+
+.PHONY: figures
+figures: env ## draw Figures 2 to 10 of the paper into figures/
+	$(BIN)/hmsa figures --out figures $(ARGS)
+
+.PHONY: constraints
+constraints: ## write constraints.txt anew, with each of $(PYTHONS)
+	$(PYTHON) scripts/make_constraints.py $(PYTHONS)
+
+.PHONY: clean
+clean: ## remove the environment, builds and caches
+	rm -rf $(VENV) build install log dist figures *.egg-info
+	rm -rf .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+.PHONY: env
+env: $(VENV)/.kernels ## make the environment
+
+# The stamps come last in their recipes: an environment left half made has none and is made anew.
+$(VENV)/.installed: setup.py setup.cfg pyproject.toml package.xml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(0 if (3, 10) <= sys.version_info[:2] <= (3, 13) else 1)' \
+	2>/dev/null || { echo "hmsa_ros: $(PYTHON) is $$($(PYTHON) --version 2>&1 | tail -n 1): expected" \
+	"Python 3.10 to 3.13; name one, as in: make PYTHON=python3.12" >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null \
+	|| { echo "hmsa_ros: $(PYTHON) cannot make environments: expected its modules venv and" \
+	"ensurepip; install them (on Debian and Ubuntu: python3-venv)" >&2; exit 1; }
+	@echo "Making the environment $(VENV), which takes some minutes the first time"
+	$(PYTHON) -m venv --clear $(VENV)
+	$(INSTALL) -e '.[ros,test]'
+	@touch $@
+
+$(VENV)/.bench: $(VENV)/.installed
+	$(INSTALL) -e '.[bench]'
+	@touch $@
+
+# Compiled now and cached, so that no command waits for it.
+$(VENV)/.kernels: $(VENV)/.installed $(wildcard hmsa_ros/core/*.py)
+	$(BIN)/python -m hmsa_ros.core.warmup
+	@touch $@
+
+# An environment whose Python does not start (moved, or its base removed) is made anew too.
+ifneq ($(shell $(BIN)/python -I -c 'print("starts")' 2>/dev/null),starts)
+.PHONY: $(VENV)/.installed
+endif

@@ -1,0 +1,206 @@
+"""What describes the package: setup.py, package.xml, constraints and files must agree."""
+
+import ast
+from importlib import import_module
+import json
+from pathlib import Path
+import re
+import subprocess
+import sys
+from typing import Any
+from xml.etree import ElementTree
+
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+import pytest
+import yaml
+
+import hmsa_ros
+
+ROOT = Path(__file__).resolve().parent.parent
+PYTHONS = ('3.10', '3.11', '3.12', '3.13')
+# Where the key of a requirement is not python3- and its name in lower case.
+KEYS = {'mcap': 'mcap-ros2-support', 'mcap-ros2-support': 'mcap-ros2-support',
+        'PyYAML': 'python3-yaml', 'rosbags': 'python3-rosbags-pip'}
+# ruff and type stubs have no key.
+WITHOUT_KEY = {'ruff', 'types-PyYAML'}
+# Requirements whose module has another name.
+MODULES = {'PyYAML': 'yaml', 'mcap-ros2-support': 'mcap_ros2'}
+# Needed to install, or to be launched, not to be imported.
+NOT_IMPORTED = {'setuptools', 'ros2launch'}
+# What setup() was called with, without building anything.
+READ_SETUP = """
+import json, setuptools
+from distutils.core import run_setup
+given = run_setup('setup.py', stop_after='init')
+print(json.dumps({
+    'name': given.get_name(), 'version': given.get_version(), 'license': given.get_license(),
+    'description': given.get_description(), 'email': given.get_maintainer_email(),
+    'maintainer': given.get_maintainer(), 'packages': given.packages,
+    'data_files': given.data_files, 'install_requires': given.install_requires,
+    'extras_require': given.extras_require, 'scripts': given.entry_points['console_scripts'],
+    'python_requires': str(given.python_requires)}))
+"""
+
+
+@pytest.fixture(scope='module')
+def setup() -> dict[str, Any]:
+    """Return what setup.py says."""
+    output = subprocess.run(
+        [sys.executable, '-c', READ_SETUP], cwd=ROOT, check=True, capture_output=True,
+        text=True).stdout
+    given: dict[str, Any] = json.loads(output.splitlines()[-1])
+    return given
+
+
+@pytest.fixture(scope='module')
+def manifest() -> ElementTree.Element:
+    """Return package.xml."""
+    return ElementTree.parse(ROOT / 'package.xml').getroot()
+
+
+def texts(manifest: ElementTree.Element, tag: str) -> list[str]:
+    """Return the texts of all elements of a kind, on one line each."""
+    return [' '.join((element.text or '').split()) for element in manifest.findall(tag)]
+
+
+def names(requirements: list[str]) -> set[str]:
+    """Return the names in a list of requirements."""
+    return {Requirement(requirement).name for requirement in requirements}
+
+
+def keys(requirements: list[str]) -> set[str]:
+    """Return the rosdep keys of a list of requirements."""
+    return {KEYS.get(name, f'python3-{name.lower()}')
+            for name in names(requirements) - WITHOUT_KEY}
+
+
+def imported() -> set[str]:
+    """Return the top-level modules that the package imports, the standard library's not."""
+    modules = set()
+    for path in (ROOT / 'hmsa_ros').rglob('*.py'):
+        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+            if isinstance(node, ast.Import):
+                modules |= {alias.name.partition('.')[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                modules.add(node.module.partition('.')[0])
+    return modules - set(sys.stdlib_module_names) - {'hmsa_ros'}
+
+
+def test_package_xml_and_setup_py_describe_the_same_package(setup, manifest):
+    assert [setup['name']] == texts(manifest, 'name')
+    assert [setup['version']] == texts(manifest, 'version')
+    assert [setup['description']] == texts(manifest, 'description')
+    assert [setup['license']] == texts(manifest, 'license')
+    assert [setup['maintainer']] == texts(manifest, 'maintainer')
+    assert [setup['email']] == [
+        element.get('email') for element in manifest.findall('maintainer')]
+
+
+def test_version_is_the_same_in_the_package_and_the_changelog(setup):
+    assert setup['version'] == hmsa_ros.__version__
+    versions = re.findall(
+        r'^(\d+\.\d+\.\d+) \(.+\)\n-+$', (ROOT / 'CHANGELOG.rst').read_text(), re.M)
+    assert versions[0] == hmsa_ros.__version__
+
+
+def test_licence_is_the_one_in_the_licence_file(setup, manifest):
+    assert setup['license'] == 'Apache-2.0'
+    licence = manifest.find('license')
+    assert licence is not None
+    text = (ROOT / licence.attrib['file']).read_text()
+    assert 'Apache License\n                           Version 2.0' in text
+    assert 'END OF TERMS AND CONDITIONS' in text
+
+
+def test_package_xml_asks_for_ament_python_in_format_3(manifest):
+    assert manifest.get('format') == '3'
+    assert texts(manifest, 'export/build_type') == ['ament_python']
+
+
+def test_package_xml_and_setup_py_require_the_same_python_packages(setup, manifest):
+    depends = {key for key in texts(manifest, 'exec_depend')
+               if key.startswith('python3-') or key in KEYS.values()}
+    assert depends == keys(setup['install_requires'])
+    assert set(texts(manifest, 'test_depend')) == keys(setup['extras_require']['test'])
+
+
+def test_everything_imported_is_required_and_everything_required_is_imported(setup, manifest):
+    python = {MODULES.get(name, name.lower()) for name in names(setup['install_requires'])}
+    ros = {key for key in texts(manifest, 'exec_depend')
+           if not key.startswith('python3-') and key not in KEYS.values()}
+    assert imported() == (python | ros) - NOT_IMPORTED
+
+
+def test_rclpy_and_messages_come_only_with_the_extra_for_machines_without_ros(setup):
+    assert not any('ros-' in name for name in names(setup['install_requires']))
+    assert names(setup['extras_require']['ros']) == {
+        'ros-jazzy-rclpy', 'ros-jazzy-common-interfaces'}
+
+
+def test_every_module_of_the_package_is_installed(setup):
+    found = {'.'.join(path.parent.relative_to(ROOT).parts)
+             for path in (ROOT / 'hmsa_ros').rglob('*.py')}
+    assert set(setup['packages']) == found
+
+
+def test_every_launch_and_parameter_file_is_installed_where_ros_looks(setup):
+    installed = {(target, file) for target, files in setup['data_files'] for file in files}
+    expected = {('share/ament_index/resource_index/packages', 'resource/hmsa_ros'),
+                ('share/hmsa_ros', 'package.xml')}
+    for kind in ('launch', 'config'):
+        files = [path for path in (ROOT / kind).iterdir() if path.is_file()]
+        assert files
+        expected |= {(f'share/hmsa_ros/{kind}', f'{kind}/{path.name}') for path in files}
+    assert installed == expected
+    assert all((ROOT / file).is_file() for _, file in installed)
+
+
+def test_every_script_names_a_function_that_exists(setup):
+    scripts = dict(script.split(' = ') for script in setup['scripts'])
+    assert set(scripts) == {'hmsa', 'planner', 'plant', 'recorder', 'player'}
+    for target in scripts.values():
+        module, function = target.split(':')
+        assert callable(getattr(import_module(module), function))
+
+
+def test_setup_cfg_puts_scripts_where_ros2_run_looks():
+    assert re.findall(r'^\w+=(.*)$', (ROOT / 'setup.cfg').read_text(), re.M) == [
+        '$base/lib/hmsa_ros', '$base/lib/hmsa_ros']
+
+
+@pytest.mark.parametrize('python', PYTHONS)
+def test_constraints_pin_every_requirement_once_for_each_python(setup, python):
+    pins: dict[str, str] = {}
+    for line in (ROOT / 'constraints.txt').read_text().splitlines():
+        if line.startswith('#'):
+            continue
+        pin = Requirement(line)
+        if pin.marker is None or pin.marker.evaluate({'python_version': python}):
+            assert pin.name not in pins
+            pins[pin.name] = str(pin.specifier)
+    requirements = [Requirement(text) for text in sum(
+        setup['extras_require'].values(), setup['install_requires'])]
+    for requirement in requirements:
+        if requirement.name != 'setuptools':
+            version = pins[requirement.name.lower()].removeprefix('==')
+            assert requirement.specifier.contains(version)
+
+
+def test_supported_pythons_are_the_ones_that_the_constraints_were_made_for(setup):
+    supported = SpecifierSet(setup['python_requires'])
+    assert [f'3.{minor}' for minor in range(20) if f'3.{minor}' in supported] == list(PYTHONS)
+    header = (ROOT / 'constraints.txt').read_text().partition('\n')[0]
+    assert f'for Python {PYTHONS[0]} to {PYTHONS[-1]}' in header
+
+
+@pytest.mark.parametrize(
+    'path', sorted((ROOT / 'config').glob('*')), ids=lambda path: path.name)
+def test_parameter_file_is_well_formed(path):
+    assert path.suffix == '.yaml'
+    document = yaml.safe_load(path.read_text(encoding='utf-8'))
+    assert isinstance(document, dict)
+    for pattern, entry in document.items():
+        assert re.fullmatch(r'(/\*\*/?)?\w*', pattern)
+        assert set(entry) == {'ros__parameters'}
+        assert isinstance(entry['ros__parameters'], dict)

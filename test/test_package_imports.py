@@ -1,0 +1,85 @@
+"""What may be imported from where: the physics and the bags know no ROS, help is quick."""
+
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+ROS = ('rclpy', 'rcl_interfaces', 'ament_index_python', 'builtin_interfaces', 'diagnostic_msgs',
+       'geometry_msgs', 'rosgraph_msgs', 'rosidl_runtime_py', 'sensor_msgs', 'std_msgs',
+       'std_srvs', 'trajectory_msgs')
+SLOW = ('rclpy', 'numba', 'matplotlib', 'scipy', 'numpy')
+# Refuses some modules, as if they were not installed, then runs the rest of the arguments.
+BLOCKED = """
+import sys
+
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition('.')[0] in {blocked!r}:
+            raise ModuleNotFoundError('blocked: ' + name, name=name)
+        return None
+
+sys.meta_path.insert(0, Blocker())
+"""
+
+
+def run(code: str) -> 'subprocess.CompletedProcess[str]':
+    """Run code in a fresh Python at the root of the repository."""
+    return subprocess.run(
+        [sys.executable, '-W', 'error', '-c', code], cwd=ROOT, capture_output=True, text=True,
+        check=False)
+
+
+def modules(package: str) -> list[str]:
+    """Return the names of all modules of a subpackage."""
+    folder = ROOT / 'hmsa_ros' / package
+    return [f'hmsa_ros.{package}.{path.stem}' for path in sorted(folder.glob('*.py'))
+            if path.stem != '__init__']
+
+
+@pytest.mark.parametrize('name', [*modules('core'), *modules('bag')])
+def test_physics_and_bags_import_without_ros(name):
+    result = run(BLOCKED.format(blocked=ROS) + f'import {name}')
+    assert (result.returncode, result.stderr) == (0, '')
+
+
+def test_nodes_do_not_import_without_ros_so_the_blocking_works():
+    result = run(BLOCKED.format(blocked=ROS) + 'import hmsa_ros.nodes.interface')
+    assert result.returncode == 1
+    assert 'ModuleNotFoundError: blocked: ' in result.stderr
+
+
+@pytest.mark.parametrize('arguments', [['--help'], ['--version'], ['demo', '--help']])
+def test_help_imports_nothing_slow(arguments):
+    result = run(BLOCKED.format(blocked=SLOW) + f"""
+sys.argv[1:] = {arguments!r}
+from hmsa_ros.cli import main
+sys.exit(main())
+""")
+    assert (result.returncode, result.stderr) == (0, '')
+    assert 'hmsa' in result.stdout
+
+
+@pytest.mark.parametrize('command', ['demo', 'plan', 'send', 'planner', 'plant', 'recorder',
+                                     'player', 'bag', 'figures'])
+def test_every_command_of_the_interface_answers_help(command):
+    result = run(f"""
+import sys
+sys.argv[1:] = [{command!r}, '--help']
+from hmsa_ros.cli import main
+sys.exit(main())
+""")
+    assert (result.returncode, result.stderr) == (0, '')
+    assert f'hmsa {command}' in result.stdout
+
+
+def test_module_and_console_script_are_the_same_command():
+    result = subprocess.run(
+        [sys.executable, '-m', 'hmsa_ros', 'nonsense'], cwd=ROOT, capture_output=True,
+        text=True, check=False)
+    assert result.returncode == 2
+    assert result.stderr.count('\n') == 1
+    assert 'nonsense' in result.stderr
+    assert 'Traceback' not in result.stderr
