@@ -70,9 +70,9 @@ def run(arguments: argparse.Namespace) -> int:
         If a setpoint cannot be had or a parameter is out of range.
 
     """
+    from hmsa_ros.core.moves import State
     from hmsa_ros.core.parameters import NondimensionalParameters
     from hmsa_ros.core.sequence import plan_sequence, Setpoint
-    from hmsa_ros.core.shapers import State
 
     material = NondimensionalParameters(arguments.zeta, arguments.j_lim, arguments.c1)
     segments = plan_sequence(

@@ -17,6 +17,7 @@ import math
 
 from numba import njit, prange
 import numpy as np
+from numpy.typing import NDArray
 
 from hmsa_ros.core.dop853 import ERROR_3, ERROR_5, MATRIX, NODES, STAGES, WEIGHTS
 
@@ -43,6 +44,11 @@ _LINEAR = 1e-6
 _MAX_STEPS = 200_000
 _MAX_ITERATIONS = 80
 _COARSE = 1e-5
+
+
+def work_space() -> NDArray[np.float64]:
+    """Return the working space that the integration needs, one for each thread."""
+    return np.empty((STAGES, 4))
 
 
 @njit(cache=True, error_model='numpy', inline='always')
@@ -113,7 +119,7 @@ def _step(k, l, v, s, r, beta, slope, p, q, h, zeta, c1, i_j, rtol):  # noqa: E7
     e5 = (e5_l * scale_l) ** 2 + (e5_v * scale_v) ** 2
     e3 = (e3_l * scale_l) ** 2 + (e3_v * scale_v) ** 2
     error = 0.0
-    if not e5 == 0.0:
+    if e5 != 0.0:
         error = abs(h) * e5 / math.sqrt(2.0 * (e5 + 0.01 * e3))
     return new_l, new_v, s + h * d2, r + h * d3, error
 

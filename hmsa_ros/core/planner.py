@@ -10,14 +10,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
-import numpy as np
-
 from hmsa_ros.core import kernels
+from hmsa_ros.core.moves import Limits, State
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.sequence import plan_sequence, Segment, Setpoint
-from hmsa_ros.core.shapers import Limits, State, Units
-from hmsa_ros.core.simulation import check_stretch, NANOSECONDS, RTOL
+from hmsa_ros.core.simulation import check_stretch, RTOL
 from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.core.units import NANOSECONDS, Units
 
 # Stretch rates below this share of the natural frequency are rounding, not motion.
 _AT_REST = 1e-6
@@ -152,7 +151,7 @@ class Planner:
         self._actuator = actuator
         self._material = actuator.nondimensional
         check_stretch(stretch, self._material.j_lim, 'initial stretch')
-        self._work = np.empty((kernels.STAGES, 4))
+        self._work = kernels.work_space()
         self._units = Units(actuator.time_unit, actuator.flux_density_unit, ' s', ' T')
         self.set_options(options)
         self._rest(stretch, 0)

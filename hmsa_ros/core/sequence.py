@@ -1,19 +1,16 @@
-"""
-Plans for a sequence of setpoints (Eq. 14), each from the state the last one really ends in.
-"""
+"""Plans for a sequence of setpoints (Eq. 14), each from where the last one really ends."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
-import numpy as np
-
 from hmsa_ros.core import kernels
+from hmsa_ros.core.moves import Level, Limits, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
-from hmsa_ros.core.shapers import get_shaper, Level, Limits, Move, State, Units
-from hmsa_ros.core.simulation import check_stretch
-from hmsa_ros.core.simulation import RTOL
+from hmsa_ros.core.shapers import get_shaper
+from hmsa_ros.core.simulation import check_stretch, RTOL
 from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.core.units import Units
 from hmsa_ros.errors import BadInputError
 
 #: What to do with a spell that ends before the move does.
@@ -171,11 +168,11 @@ def _on_grid(move: Move, resolution: float) -> Move:
 def _follow(
         state: State, move: Move, span: float, material: NondimensionalParameters) -> State:
     """Return the state at the end of the span, or at the last change of level."""
-    work = np.empty((kernels.STAGES, 4))
+    work = kernels.work_space()
     stretch, rate = state.stretch, state.rate
     ends = [level.time for level in move.levels[1:]]
     ends.append(span if math.isfinite(span) else move.levels[-1].time)
-    for level, end in zip(move.levels, ends):
+    for level, end in zip(move.levels, ends, strict=True):
         _, stretch, rate, _, _, _ = kernels.advance(
             work, stretch, rate, 0.0, 0.0, level.load, 0.0, 0.0, 0.0, end - level.time,
             material.zeta, material.c1, 1.0 / material.j_lim, RTOL, 0.0)

@@ -14,11 +14,11 @@ from hmsa_ros.core import kernels
 from hmsa_ros.core.model import Array, equilibrium_stretch, stretch_limits
 from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.core.schedule import CommandSchedule
+from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError, HmsaError
 
 #: Relative tolerance of the plant's integration.
 RTOL = 1e-13
-NANOSECONDS = 1_000_000_000
 
 
 def simulate(
@@ -146,7 +146,7 @@ class ActuatorSimulation:
         self.actuator = actuator
         self._material = actuator.nondimensional
         check_stretch(stretch, self._material.j_lim, 'initial stretch')
-        self._work = np.empty((kernels.STAGES, 4))
+        self._work = kernels.work_space()
         self._initial = (
             stretch,
             float(kernels.elastic_force(stretch, 1.0 / self._material.j_lim))

@@ -32,7 +32,7 @@ CODES = {
     kernels.BAD_INPUT: Code.BAD_INPUT,
 }
 
-_WORK = np.empty((kernels.STAGES, 4))
+_WORK = kernels.work_space()
 
 
 @dataclass(frozen=True)

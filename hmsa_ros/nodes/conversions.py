@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 import math
+from typing import TYPE_CHECKING
 
 from builtin_interfaces.msg import Duration, Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -10,10 +11,13 @@ from sensor_msgs.msg import JointState, MagneticField
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from hmsa_ros.core.planner import Plan
-from hmsa_ros.core.simulation import NANOSECONDS
 from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
+
+if TYPE_CHECKING:
+    # Numba comes along with the planner, which a recorder has no use for.
+    from hmsa_ros.core.planner import Plan
 
 
 def to_time(nanoseconds: int) -> Time:
@@ -199,7 +203,7 @@ def _to_duration(nanoseconds: int) -> Duration:
     return Duration(sec=sec, nanosec=nanosec)
 
 
-def to_plan(plan: Plan, joint: str) -> JointTrajectory:
+def to_plan(plan: 'Plan', joint: str) -> JointTrajectory:
     """
     Return a plan's preview: one point at each change of level still ahead of its start.
 

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import math
 from typing import Any
 
-from rcl_interfaces.msg import (
-    FloatingPointRange, IntegerRange, ParameterDescriptor)
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 
@@ -189,7 +188,7 @@ ACTUATOR = (
         'actuator.remanence', _DEFAULT.remanence, 'Residual flux density Br.', 'T', 1e-9, 1e3),
     ParameterSpec(
         'actuator.chain_limit', _DEFAULT.chain_limit,
-        'Limit of the chains\' extension J_lim of the Gent model.', '', 1e-3, 1e9),
+        "Limit of the chains' extension J_lim of the Gent model.", '', 1e-3, 1e9),
     ParameterSpec(
         'actuator.damping_coefficient', _DEFAULT.damping_coefficient,
         'Damping coefficient c; zeta = c/(8 L H sqrt(rho G)).', 'N s/m', 0.0, 1e12),

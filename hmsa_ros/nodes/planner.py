@@ -15,12 +15,18 @@ from trajectory_msgs.msg import JointTrajectory
 from hmsa_ros.core.planner import Options, Plan, Planner
 from hmsa_ros.core.sequence import SHORT_SPELL
 from hmsa_ros.core.shapers import SHAPERS
-from hmsa_ros.core.simulation import NANOSECONDS
 from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import conversions, interface
 from hmsa_ros.nodes.parameters import (
-    ACTUATOR, actuator_from, declare, INITIAL_STRETCH, JOINT, ParameterSpec)
+    ACTUATOR,
+    actuator_from,
+    declare,
+    INITIAL_STRETCH,
+    JOINT,
+    ParameterSpec,
+)
 from hmsa_ros.nodes.runner import run
 
 PARAMETERS = (

@@ -11,11 +11,18 @@ from std_msgs.msg import Float64
 from std_srvs.srv import SetBool, Trigger
 
 from hmsa_ros.core.pacer import Pacer
-from hmsa_ros.core.simulation import ActuatorSimulation, NANOSECONDS
+from hmsa_ros.core.simulation import ActuatorSimulation
+from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import conversions, interface
 from hmsa_ros.nodes.parameters import (
-    ACTUATOR, actuator_from, declare, INITIAL_STRETCH, JOINT, ParameterSpec)
+    ACTUATOR,
+    actuator_from,
+    declare,
+    INITIAL_STRETCH,
+    JOINT,
+    ParameterSpec,
+)
 from hmsa_ros.nodes.runner import run
 
 PARAMETERS = (
@@ -23,7 +30,7 @@ PARAMETERS = (
     JOINT,
     INITIAL_STRETCH,
     ParameterSpec(
-        'publish_rate', 1000.0, 'Samples per second of the plant\'s own time.', 'Hz',
+        'publish_rate', 1000.0, "Samples per second of the plant's own time.", 'Hz',
         1e-3, 1e6),
     ParameterSpec(
         'publish_clock', False,

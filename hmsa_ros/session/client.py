@@ -11,7 +11,7 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from hmsa_ros.core.simulation import NANOSECONDS
+from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import to_trajectory
@@ -128,7 +128,7 @@ class PlannerClient:
         self._verdict = Verdict.from_message(message)
 
     def spin_until(
-            self, condition: Callable[[], bool], waiting_for: str,
+            self, condition: Callable[[], bool], failure: str,
             each: Callable[[], None] | None = None, timeout: float | None = None) -> None:
         """
         Serve callbacks until a condition holds.
@@ -137,8 +137,8 @@ class PlannerClient:
         ----------
         condition : callable
             Tells whether to go on.
-        waiting_for : str
-            For the message.
+        failure : str
+            What to say if it does not come true.
         each : callable, optional
             Called about 20 times a second.
         timeout : float, optional
@@ -150,12 +150,11 @@ class PlannerClient:
             If the condition does not come true in time.
 
         """
-        deadline = monotonic() + (self._timeout if timeout is None else timeout)
+        patience = self._timeout if timeout is None else timeout
+        deadline = monotonic() + patience
         while not condition():
             if monotonic() > deadline:
-                raise HmsaError(
-                    f'no {waiting_for} within '
-                    f'{self._timeout if timeout is None else timeout:g} s')
+                raise HmsaError(f'waited {patience:g} s: {failure}')
             self._executor.spin_once(timeout_sec=_SLICE_SECONDS)
             if each is not None:
                 each()
@@ -178,8 +177,8 @@ class PlannerClient:
         where = self._namespace or '/'
         self.spin_until(
             lambda: self._verdict is not None and self._publisher.get_subscription_count() > 0,
-            f'planner found in namespace {where}: is one running (hmsa planner), with the same '
-            'ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE? None', each)
+            f'no planner in namespace {where}; start one with hmsa planner, with the same '
+            'ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE as here', each)
 
     def send(self, setpoints: Sequence[tuple[float, float]]) -> Verdict:
         """
@@ -214,7 +213,7 @@ class PlannerClient:
         self._publisher.publish(to_trajectory(points, self._joint, frame=request))
         self.spin_until(
             lambda: self._verdict is not None and self._verdict.request == request,
-            'verdict of the planner')
+            'the planner gave no verdict')
         assert self._verdict is not None
         if self._verdict.level >= DiagnosticStatus.ERROR[0]:
             raise BadInputError(f'the planner refused: {self._verdict.message}')
@@ -259,6 +258,7 @@ class PlannerClient:
             return now.setpoint == now.setpoints and now.state in ('at_rest', 'settling')
 
         self.spin_until(
-            done, 'end of the sequence', None if each is None else lambda: each(current()),
+            done, 'the sequence has not come to its end',
+            None if each is None else lambda: each(current()),
             timeout)
         return current()

@@ -91,7 +91,8 @@ class Session:
             # nodes in order. Should we be killed, the kernel ends them.
             self._processes[node.name] = subprocess.Popen(
                 node.command(), env=self._environment, stdin=subprocess.DEVNULL, stdout=log,
-                stderr=log, start_new_session=True, preexec_fn=_die_with_parent)
+                stderr=log, start_new_session=True,
+                preexec_fn=_die_with_parent)  # noqa: PLW1509 - only calls the kernel
 
     def log(self, name: str) -> Path:
         """

@@ -1,0 +1,110 @@
+"""``hmsa demo``: the paper's sequence on real ROS 2 processes."""
+
+import argparse
+from datetime import datetime
+import json
+import os
+from pathlib import Path
+import signal
+from typing import Any, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from hmsa_ros.session.demo import DemoResult
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    Add the command.
+
+    Parameters
+    ----------
+    subparsers : argparse action
+        Where to add it.
+
+    """
+    parser = subparsers.add_parser(
+        'demo', help="run the paper's sequence as real ROS 2 processes",
+        description="Start planner, plant and recorder, send the paper's sequence, and show "
+                    'what was left of the vibration. Writes a bag, a picture and the logs.',
+        epilog='example: hmsa demo --out my_first_run')
+    parser.add_argument(
+        '--out', type=Path, metavar='DIR',
+        help='folder for the output (default hmsa_demo/ and the time of day)')
+    parser.add_argument('--json', action='store_true', help='print the result as JSON')
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """
+    Run the demo.
+
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+        As parsed.
+
+    Returns
+    -------
+    int
+        0 only if every setpoint was reached and held and every process ended cleanly.
+
+    Raises
+    ------
+    HmsaError
+        If a process fails.
+
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from hmsa_ros.session.processes import local_environment
+
+    folder = arguments.out or Path('hmsa_demo') / datetime.now().strftime('%Y-%m-%d_%H-%M-%S')
+    # Set before anything of ROS is imported: this process joins the nodes' domain.
+    os.environ.update(local_environment())
+    from hmsa_ros.session.demo import prepare, run_demo
+
+    prepare(folder)
+    # A service manager's way to say Ctrl-C.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    console = Console(stderr=True)
+    console.print(
+        f'ROS_DOMAIN_ID {os.environ["ROS_DOMAIN_ID"]}, output in {folder}', highlight=False)
+    try:
+        with Progress(
+                TextColumn('{task.description:<22}'), BarColumn(), TextColumn(
+                    '{task.percentage:>3.0f} %'), TimeElapsedColumn(),
+                console=console) as progress:
+            task = progress.add_task('starting', total=1.0)
+            result = run_demo(
+                folder, dict(os.environ),
+                lambda what, share: progress.update(task, description=what, completed=share))
+    except KeyboardInterrupt:
+        console.print(f'interrupted; the bag so far: {folder / "run"}', highlight=False)
+        return 130
+    if arguments.json:
+        print(json.dumps(result.as_json(), indent=2))
+    else:
+        _print_table(result)
+    return 0 if result.succeeded else 1
+
+
+def _print_table(result: 'DemoResult') -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(caption=(
+        'b and tau nondimensional as in the paper; residual: peak-to-peak stretch after '
+        'arrival, share of the step; unshaped: simulated on the same plant'))
+    for name in ('target', 'b_p', 'tau_p', 'b_1', 'arrival', 'residual', 'unshaped'):
+        table.add_column(name, justify='right')
+    table.add_column('held')
+    for x in result.setpoints:
+        table.add_row(
+            f'{x.stretch:g}', f'{x.b_p:.6f}', f'{x.tau_p:.6f}', f'{x.b_1:.6f}',
+            f'{x.arrival * 1e3:.3f} ms', f'{x.residual:.1e}', f'{x.residual_unshaped:.1%}',
+            'yes' if x.reached else 'no')
+    console = Console()
+    console.print(table)
+    console.print(f'bag      {result.bag}', highlight=False, soft_wrap=True)
+    console.print(f'picture  {result.picture}', highlight=False, soft_wrap=True)

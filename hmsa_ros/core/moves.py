@@ -1,0 +1,121 @@
+"""Records of a move: state, level, command and the limits it keeps."""
+
+from dataclasses import dataclass
+import math
+
+from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.core.units import Units
+from hmsa_ros.errors import BadInputError
+
+
+@dataclass(frozen=True)
+class State:
+    """
+    Stretch and stretch rate (nondimensional time).
+
+    Attributes
+    ----------
+    stretch : float
+        Principal stretch.
+    rate : float
+        Per unit of nondimensional time.
+
+    """
+
+    stretch: float
+    rate: float = 0.0
+
+
+@dataclass(frozen=True)
+class Level:
+    """
+    A constant load from a time on.
+
+    Attributes
+    ----------
+    time : float
+        From the start of the move.
+    load : float
+        Signed load beta.
+
+    """
+
+    time: float
+    load: float
+
+
+@dataclass(frozen=True)
+class Move:
+    """
+    How one target is reached.
+
+    Attributes
+    ----------
+    code : Code
+        Which command it is.
+    levels : tuple of Level
+        In order; the last one holds the target.
+    duration : float
+        Time until rest at the target; infinite where it is only approached.
+    reason : str
+        Why it is not the command that was asked for; empty if it is.
+
+    """
+
+    code: Code
+    levels: tuple[Level, ...]
+    duration: float
+    reason: str = ''
+
+
+@dataclass(frozen=True)
+class Limits:
+    """
+    Admissible loads.
+
+    Attributes
+    ----------
+    minimum, maximum : float
+        Signed loads beta, minimum below maximum.
+
+    Raises
+    ------
+    BadInputError
+        If they are not in order.
+
+    """
+
+    minimum: float = -math.inf
+    maximum: float = math.inf
+
+    def __post_init__(self) -> None:
+        """Check the order."""
+        if not self.minimum < self.maximum:
+            raise BadInputError(
+                f'the least flux density {self.minimum:g} is not below the largest '
+                f'{self.maximum:g}')
+
+    def check(self, load: float, target: float, units: Units) -> None:
+        """
+        Refuse a load outside the limits.
+
+        Parameters
+        ----------
+        load : float
+            Load that is needed.
+        target : float
+            For which stretch, for the message.
+        units : Units
+            For the message.
+
+        Raises
+        ------
+        RefusedError
+            With `Code.FLUX_LIMIT`.
+
+        """
+        if not self.minimum <= load <= self.maximum:
+            raise RefusedError(
+                Code.FLUX_LIMIT,
+                f'stretch {target:g} needs a flux density of {units.load_text(load)}: expected '
+                f'{units.load_text(self.minimum)} to {units.load_text(self.maximum)}')

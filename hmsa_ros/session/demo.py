@@ -1,0 +1,317 @@
+"""
+The paper's sequence on real ROS 2 processes, recorded and evaluated.
+
+Planner, plant and recorder run as processes of their own and talk over DDS on this host. The
+plant is the authority on time and runs in slow motion: the whole sequence lasts 0.13 s for the
+silicone block of `paper_actuator`.
+"""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from time import monotonic
+
+from diagnostic_msgs.msg import DiagnosticArray
+import numpy as np
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool
+
+from hmsa_ros.bag.reader import read_messages
+from hmsa_ros.core.model import signed_root
+from hmsa_ros.core.parameters import paper_actuator
+from hmsa_ros.core.residual import residual_vibration
+from hmsa_ros.core.simulation import unshaped
+from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.conversions import from_time
+from hmsa_ros.session.client import PlannerClient
+from hmsa_ros.session.processes import NodeProcess, Session
+
+#: The paper's first expansion sequence, (stretch, span) in nondimensional time (Figs. 4, 5).
+SEQUENCE = ((1.10, 10.0), (1.20, 10.0), (1.40, 10.0))
+REAL_TIME_FACTOR = 0.0125
+PUBLISH_RATE = 20_000.0
+LEAD_TIME = 0.005
+#: Largest residual vibration, as a share of the step, of a setpoint that counts as held.
+LARGEST_RESIDUAL = 1e-6
+_START_SECONDS = 20.0
+_TOPICS = (
+    interface.FLUX_DENSITY_COMMAND.name, interface.JOINT_STATES.name, interface.STRETCH.name,
+    interface.STRETCH_RATE.name, 'planner/joint_trajectory', 'planner/plan', 'planner/status',
+    '/diagnostics', '/clock')
+
+
+@dataclass(frozen=True)
+class SetpointResult:
+    """
+    What became of one setpoint, from the bag.
+
+    Attributes
+    ----------
+    stretch : float
+        Target.
+    b_p, tau_p, b_1 : float
+        Of the commands that were recorded, nondimensional as in the paper.
+    begin, arrival, end : float
+        In s of the sequence.
+    error : float
+        Largest distance from the target after arrival, as a share of the step.
+    residual, residual_unshaped : float
+        Peak-to-peak stretch after arrival as a share of the step: recorded, and simulated for
+        plain steps on the same plant.
+    reached : bool
+        Whether error and residual are within `LARGEST_RESIDUAL`.
+
+    """
+
+    stretch: float
+    b_p: float
+    tau_p: float
+    b_1: float
+    begin: float
+    arrival: float
+    end: float
+    error: float
+    residual: float
+    residual_unshaped: float
+    reached: bool
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """
+    What the demo found.
+
+    Attributes
+    ----------
+    setpoints : tuple of SetpointResult
+        In order.
+    exits : dict of str to int
+        Exit status of each process.
+    bag, picture : Path
+        What was written.
+
+    """
+
+    setpoints: tuple[SetpointResult, ...]
+    exits: dict[str, int]
+    bag: Path
+    picture: Path
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether every setpoint was reached and held and every process ended cleanly."""
+        return all(x.reached for x in self.setpoints) and not any(self.exits.values())
+
+    def as_json(self) -> dict[str, object]:
+        """
+        Return the result for JSON.
+
+        Returns
+        -------
+        dict
+            With plain types.
+
+        """
+        return {
+            'succeeded': self.succeeded, 'setpoints': [asdict(x) for x in self.setpoints],
+            'exits': self.exits, 'bag': str(self.bag), 'picture': str(self.picture)}
+
+
+def prepare(folder: Path) -> None:
+    """
+    Make the output folder.
+
+    Parameters
+    ----------
+    folder : Path
+        May exist, but not hold an earlier run.
+
+    Raises
+    ------
+    BadInputError
+        If it cannot be used.
+
+    """
+    if (folder / 'run').exists():
+        raise BadInputError(
+            f'{folder} holds an earlier run: expected another folder (--out) or that one '
+            'removed')
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / '.writable'
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise BadInputError(
+            f'cannot write to {folder}: {error.strerror}; expected a folder with write '
+            'permission (--out)') from error
+
+
+def run_demo(
+        folder: Path, environment: dict[str, str],
+        progress: Callable[[str, float], None]) -> DemoResult:
+    """
+    Run the paper's sequence and evaluate the bag.
+
+    Parameters
+    ----------
+    folder : Path
+        Prepared output folder.
+    environment : dict of str to str
+        Environment of the processes; this process must live in the same ROS domain.
+    progress : callable
+        Called with what is going on and the share of the sequence that is done.
+
+    Returns
+    -------
+    DemoResult
+        Read back from the bag.
+
+    Raises
+    ------
+    HmsaError
+        If a process fails or the bag does not hold the run.
+
+    """
+    bag = folder / 'run'
+    with Session(folder, environment) as session:
+        _start(session, bag)
+        with PlannerClient(timeout=_START_SECONDS) as client:
+            watch = _Watch(client)
+            progress('starting the nodes', 0.0)
+            client.find_planner(session.check)
+            client.spin_until(
+                lambda: watch.recorder_ready,
+                f'the recorder is not ready: {session.last_words("recorder")}', session.check)
+            watch.unpause(session.check)
+            spans = [span * paper_actuator().time_unit for _, span in SEQUENCE]
+            verdict = client.send([(x, s) for (x, _), s in zip(SEQUENCE, spans, strict=True)])
+            begin = watch.time
+            total = sum(spans) + LEAD_TIME
+
+            def report() -> None:
+                session.check()
+                progress('running the sequence', min((watch.time - begin) / total, 1.0))
+
+            # Not only carried out: the last setpoint is watched for its whole span.
+            limit = 3.0 * total / REAL_TIME_FACTOR + _START_SECONDS
+            client.follow(verdict, each=lambda _: report(), timeout=limit)
+            client.spin_until(
+                lambda: watch.time - begin > total, 'simulated time stands still', report,
+                limit)
+        progress('closing the bag', 1.0)
+        exits = session.stop(('recorder',))
+        for name, status in exits.items():
+            if status:
+                raise HmsaError(
+                    f'the {name} ended with status {status}: {session.last_words(name)}')
+    progress('evaluating the bag', 1.0)
+    return _evaluate(bag, folder / 'run.png', exits)
+
+
+def _start(session: Session, bag: Path) -> None:
+    """Start the three nodes; time stands still until all are ready."""
+    session.start(NodeProcess('plant', {
+        'publish_clock': 'true', 'start_paused': 'true',
+        'real_time_factor': str(REAL_TIME_FACTOR), 'publish_rate': str(PUBLISH_RATE)}))
+    session.start(NodeProcess('planner', {
+        'use_sim_time': 'true', 'lead_time': str(LEAD_TIME)}))
+    session.start(NodeProcess('recorder', {
+        'use_sim_time': 'true', 'storage.uri': str(bag),
+        'record.topics': '[' + ', '.join(_TOPICS) + ']'}))
+
+
+class _Watch:
+    """What the demo looks at while it runs: the recorder's readiness and the plant's time."""
+
+    def __init__(self, client: PlannerClient) -> None:
+        self._client = client
+        self.recorder_ready = False
+        self.time = 0.0
+        node = client.node
+        topic = interface.DIAGNOSTICS
+        node.create_subscription(topic.type, topic.name, self._on_diagnostics, topic.qos)
+        topic = interface.JOINT_STATES
+        node.create_subscription(topic.type, topic.name, self._on_joint_state, topic.qos)
+        self._set_paused = node.create_client(
+            interface.SET_PAUSED.type,
+            interface.from_outside(interface.SET_PAUSED.name, interface.PLANT))
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name.startswith('recorder'):
+                for item in status.values:
+                    if item.key == 'subscribed':
+                        done, _, wanted = item.value.partition('/')
+                        self.recorder_ready = done.strip() == wanted.strip()
+
+    def _on_joint_state(self, message: JointState) -> None:
+        self.time = from_time(message.header.stamp) / NANOSECONDS
+
+    def unpause(self, each: Callable[[], None]) -> None:
+        """Let time run."""
+        self._client.spin_until(
+            self._set_paused.service_is_ready, 'the plant offers no service to unpause it',
+            each)
+        future = self._set_paused.call_async(SetBool.Request(data=False))
+        self._client.spin_until(future.done, 'the plant did not answer', each)
+        begin = monotonic()
+        self._client.spin_until(
+            lambda: self.time > 0.0, f'no sample of the plant since {begin:.1f} s', each)
+
+
+def _evaluate(bag: Path, picture: Path, exits: dict[str, int]) -> DemoResult:
+    """Read the run back from the bag, measure it and draw it."""
+    from hmsa_ros.figures.run import draw_run
+
+    actuator = paper_actuator()
+    joint_states, commands = [], []
+    for topic, _, _, message in read_messages(bag, ['/joint_states', '/flux_density_command']):
+        if topic == '/joint_states':
+            joint_states.append((
+                from_time(message.header.stamp), message.position[0], message.velocity[0]))
+        else:
+            commands.append((from_time(message.header.stamp), message.magnetic_field.z))
+    if len(commands) != 2 * len(SEQUENCE):
+        raise HmsaError(
+            f'the bag holds {len(commands)} commands: expected {2 * len(SEQUENCE)}')
+    samples = np.array(joint_states)
+    begin = commands[0][0]
+    time = (samples[:, 0] - begin) / NANOSECONDS
+    stretch, rate = samples[:, 1], samples[:, 2]
+    begins = [(stamp - begin) / NANOSECONDS for stamp, _ in commands[::2]]
+    arrivals = [(stamp - begin) / NANOSECONDS for stamp, _ in commands[1::2]]
+    ends = [*begins[1:], begins[-1] + SEQUENCE[-1][1] * actuator.time_unit]
+    targets = [target for target, _ in SEQUENCE]
+
+    unit = actuator.time_unit
+    material = actuator.nondimensional
+    plain_stretch, plain_rate = np.full_like(time, 1.0), np.zeros_like(time)
+    running = time >= 0.0
+    plain_stretch[running], plain_rate[running] = unshaped(
+        targets, [x / unit for x in begins], time[running] / unit, material)
+
+    loads = [value / actuator.flux_density_unit for _, value in commands]
+    results = []
+    previous = 1.0
+    for i, target in enumerate(targets):
+        window = {'arrival': arrivals[i], 'end': ends[i], 'step': target - previous}
+        after = (time >= arrivals[i]) & (time <= ends[i])
+        error = float(np.max(np.abs(stretch[after] - target)) / abs(target - previous))
+        residual = residual_vibration(time, stretch, **window)
+        results.append(SetpointResult(
+            stretch=target, b_p=float(signed_root(loads[2 * i])),
+            tau_p=(arrivals[i] - begins[i]) / unit, b_1=float(signed_root(loads[2 * i + 1])),
+            begin=begins[i], arrival=arrivals[i], end=ends[i], error=error, residual=residual,
+            residual_unshaped=residual_vibration(time, plain_stretch, **window),
+            reached=max(error, residual) <= LARGEST_RESIDUAL))
+        previous = target
+    draw_run(
+        picture, time=time, stretch=stretch, rate=rate,
+        command_time=np.array([x - begin for x, _ in commands]) / NANOSECONDS,
+        command=np.array([value for _, value in commands]),
+        unshaped=(plain_stretch, plain_rate / unit),
+        targets=list(zip(targets, begins, arrivals, ends, strict=True)))
+    return DemoResult(tuple(results), exits, bag, picture)
