@@ -1,0 +1,143 @@
+"""
+Message definitions and type hashes of installed interface packages.
+
+A bag holds the text of each message type with all it depends on, so that a reader needs no
+ROS. The text is taken from the ``share`` folders of the environment, without rclpy.
+"""
+
+from collections.abc import Iterator
+from functools import lru_cache
+import json
+import os
+from pathlib import Path
+import re
+import sys
+
+from hmsa_ros.errors import BagError
+
+# Types that are part of the language of .msg files and have no file of their own.
+_BUILTIN = frozenset((
+    'bool', 'byte', 'char', 'float32', 'float64', 'int8', 'uint8', 'int16', 'uint16', 'int32',
+    'uint32', 'int64', 'uint64', 'string', 'wstring'))
+_FIELD = re.compile(r'^([A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+[A-Za-z]\w*')
+_SEPARATOR = '\n' + '=' * 80 + '\nMSG: '
+
+
+def share_folders() -> list[Path]:
+    """
+    Return the folders that hold the packages' shared files, in order of precedence.
+
+    Returns
+    -------
+    list of pathlib.Path
+        Those of AMENT_PREFIX_PATH, then of this Python environment, where wheels put them.
+
+    """
+    prefixes = [prefix for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
+                if prefix]
+    return [Path(prefix) / 'share' for prefix in [*prefixes, sys.prefix]]
+
+
+def _split(type_name: str) -> tuple[str, str]:
+    """Split 'pkg/msg/Name' or 'pkg/Name'."""
+    parts = type_name.split('/')
+    if len(parts) not in (2, 3) or not all(re.fullmatch(r'\w+', part) for part in parts):
+        raise BagError(
+            f'message type is {type_name!r}: expected a name such as std_msgs/msg/Float64')
+    return parts[0], parts[-1]
+
+
+def _find(type_name: str, suffix: str) -> Path | None:
+    """Return the file of a type, or None if no package of the environment has it."""
+    package, name = _split(type_name)
+    for folder in share_folders():
+        path = folder / package / 'msg' / f'{name}{suffix}'
+        if path.is_file():
+            return path
+    return None
+
+
+def _dependencies(type_name: str, text: str) -> list[str]:
+    """Return the types that a definition uses, as it names them, sorted."""
+    package, _ = _split(type_name)
+    names = set()
+    for line in text.splitlines():
+        match = _FIELD.match(line.split('#', 1)[0].strip())
+        if match and match[1] not in _BUILTIN:
+            name = match[1]
+            if name == 'Header':
+                name = 'std_msgs/Header'
+            names.add(name if '/' in name else f'{package}/{name}')
+    return sorted(names)
+
+
+@lru_cache(maxsize=None)
+def message_definition(type_name: str) -> tuple[str, str]:
+    """
+    Return the encoding and the text of a message type with all it depends on.
+
+    Parameters
+    ----------
+    type_name : str
+        For example ``'sensor_msgs/msg/MagneticField'``.
+
+    Returns
+    -------
+    encoding : str
+        ``'ros2msg'``.
+    text : str
+        The definition, then one section for each dependency, depth first.
+
+    Raises
+    ------
+    BagError
+        If the definition of the type or of a dependency is not installed.
+
+    """
+    seen = {'/'.join(_split(type_name))}
+
+    def sections(name: str) -> Iterator[str]:
+        path = _find(name, '.msg')
+        if path is None:
+            raise BagError(
+                f'no definition of message type {name} found under '
+                + ', '.join(map(str, share_folders()))
+                + ': expected an installed interface package; source its workspace')
+        text = path.read_text(encoding='utf-8')
+        yield text
+        for dependency in _dependencies(name, text):
+            key = '/'.join(_split(dependency))
+            if key not in seen:
+                seen.add(key)
+                inner = sections(dependency)
+                yield f'{_SEPARATOR}{dependency}\n{next(inner)}'
+                yield from inner
+
+    return 'ros2msg', ''.join(sections(type_name))
+
+
+@lru_cache(maxsize=None)
+def type_hash(type_name: str) -> str:
+    """
+    Return the type's RIHS01 hash.
+
+    Parameters
+    ----------
+    type_name : str
+        For example ``'sensor_msgs/msg/MagneticField'``.
+
+    Returns
+    -------
+    str
+        ``'RIHS01_'`` and 64 hexadecimal digits; empty if the environment does not tell.
+
+    """
+    path = _find(type_name, '.json')
+    if path is None:
+        return ''
+    try:
+        hashes = json.loads(path.read_text(encoding='utf-8'))['type_hashes']
+        return next((str(entry['hash_string']) for entry in hashes
+                     if '/'.join(_split(entry['type_name'])) == '/'.join(_split(type_name))), '')
+    except (ValueError, KeyError, TypeError):
+        return ''

@@ -1,0 +1,309 @@
+"""
+The file ``metadata.yaml`` of a bag: version 9 as Jazzy writes it, and how to read its elders.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+import os
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from hmsa_ros.bag import qos
+from hmsa_ros.errors import BagError
+
+FILE_NAME = 'metadata.yaml'
+VERSION = 9
+# What rosbag2 writes as the start of a bag without a message.
+NO_TIME = 9223372036854775807
+_Loader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+_Dumper: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
+
+
+@dataclass(frozen=True)
+class TopicMetadata:
+    """
+    One recorded topic.
+
+    Attributes
+    ----------
+    name, type : str
+        Topic and message type.
+    serialization_format : str
+        ``'cdr'``.
+    profiles : tuple of hmsa_ros.bag.qos.Qos
+        What the publishers offered.
+    type_hash : str
+        RIHS01 hash, empty if unknown.
+    message_count : int
+        At least 0.
+
+    """
+
+    name: str
+    type: str
+    serialization_format: str = 'cdr'
+    profiles: tuple[qos.Qos, ...] = ()
+    type_hash: str = ''
+    message_count: int = 0
+
+
+@dataclass(frozen=True)
+class FileMetadata:
+    """
+    One file of a bag.
+
+    Attributes
+    ----------
+    path : str
+        Relative to the bag's folder.
+    start_ns, duration_ns : int
+        First log time and length in nanoseconds; `NO_TIME` and 0 without a message.
+    message_count : int
+        At least 0.
+
+    """
+
+    path: str
+    start_ns: int = NO_TIME
+    duration_ns: int = 0
+    message_count: int = 0
+
+
+@dataclass(frozen=True)
+class BagMetadata:
+    """
+    What ``metadata.yaml`` says of a bag.
+
+    Attributes
+    ----------
+    start_ns, duration_ns : int
+        First log time and length in nanoseconds; `NO_TIME` and 0 without a message.
+    message_count : int
+        At least 0.
+    topics : tuple of TopicMetadata
+        Recorded topics.
+    files : tuple of FileMetadata
+        Files in order of writing.
+    custom_data : mapping of str to str
+        What the user and the recorder noted.
+    ros_distro : str
+        Name of the distribution that wrote it.
+    version : int
+        Of the file's layout.
+    storage : str
+        Storage plugin, ``'mcap'``.
+    compression_format, compression_mode : str
+        Of rosbag2's own compression; empty for none. MCAP's chunk compression is not told here.
+
+    """
+
+    start_ns: int = NO_TIME
+    duration_ns: int = 0
+    message_count: int = 0
+    topics: tuple[TopicMetadata, ...] = ()
+    files: tuple[FileMetadata, ...] = ()
+    custom_data: Mapping[str, str] = field(default_factory=dict)
+    ros_distro: str = 'jazzy'
+    version: int = VERSION
+    storage: str = 'mcap'
+    compression_format: str = ''
+    compression_mode: str = ''
+
+
+def to_map(metadata: BagMetadata) -> dict[str, Any]:
+    """
+    Return metadata as plain maps, in the order of keys that rosbag2 writes.
+
+    Parameters
+    ----------
+    metadata : BagMetadata
+        What to write.
+
+    Returns
+    -------
+    dict
+        Without the outer key.
+
+    """
+    return {
+        'version': VERSION,
+        'storage_identifier': metadata.storage,
+        'duration': {'nanoseconds': metadata.duration_ns},
+        'starting_time': {'nanoseconds_since_epoch': metadata.start_ns},
+        'message_count': metadata.message_count,
+        'topics_with_message_count': [{
+            'topic_metadata': {
+                'name': topic.name,
+                'type': topic.type,
+                'serialization_format': topic.serialization_format,
+                'offered_qos_profiles': qos.to_maps(topic.profiles),
+                'type_description_hash': topic.type_hash,
+            },
+            'message_count': topic.message_count,
+        } for topic in metadata.topics],
+        'compression_format': metadata.compression_format,
+        'compression_mode': metadata.compression_mode,
+        'relative_file_paths': [file.path for file in metadata.files],
+        'files': [{
+            'path': file.path,
+            'starting_time': {'nanoseconds_since_epoch': file.start_ns},
+            'duration': {'nanoseconds': file.duration_ns},
+            'message_count': file.message_count,
+        } for file in metadata.files],
+        'custom_data': dict(metadata.custom_data) or None,
+        'ros_distro': metadata.ros_distro,
+    }
+
+
+def to_yaml(metadata: BagMetadata, *, outer_key: bool = True) -> str:
+    """
+    Return metadata as YAML.
+
+    Parameters
+    ----------
+    metadata : BagMetadata
+        What to write.
+    outer_key : bool
+        True for the file, False for the record inside an MCAP file.
+
+    Returns
+    -------
+    str
+        The text.
+
+    """
+    content = to_map(metadata)
+    text: str = yaml.dump(
+        {'rosbag2_bagfile_information': content} if outer_key else content, Dumper=_Dumper,
+        sort_keys=False, allow_unicode=True, width=10**6)
+    return text
+
+
+def write(folder: Path, metadata: BagMetadata) -> None:
+    """
+    Replace a bag's metadata file in one step.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        The bag's folder.
+    metadata : BagMetadata
+        What to write.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; the file that was there is then unchanged.
+
+    """
+    path = folder / FILE_NAME
+    # Written beside it and renamed: a reader never sees half of it, nor does a crash leave it.
+    temporary = folder / f'.{FILE_NAME}.new'
+    try:
+        with temporary.open('w', encoding='utf-8') as file:
+            file.write(to_yaml(metadata))
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def read(path: Path) -> BagMetadata:
+    """
+    Read a metadata file of version 1 to 9.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        The file.
+
+    Returns
+    -------
+    BagMetadata
+        What it says; what an older version does not say is left at its default.
+
+    Raises
+    ------
+    BagError
+        If it cannot be read.
+
+    """
+    try:
+        text = path.read_text(encoding='utf-8')
+    except (OSError, UnicodeDecodeError) as error:
+        raise BagError(f'{path} cannot be read: {error}') from error
+    try:
+        content = yaml.load(text, _Loader)
+    except yaml.YAMLError as error:
+        raise BagError(f'{path} is not YAML: expected the metadata of a bag') from error
+    if not isinstance(content, dict) or 'rosbag2_bagfile_information' not in content:
+        raise BagError(f'{path} has no key rosbag2_bagfile_information: expected the metadata '
+                       'of a bag')
+    return from_map(content['rosbag2_bagfile_information'], str(path))
+
+
+def from_map(content: Any, source: str) -> BagMetadata:
+    """
+    Read metadata from plain maps.
+
+    Parameters
+    ----------
+    content : object
+        As YAML gives it, without the outer key.
+    source : str
+        Where it comes from, for messages.
+
+    Returns
+    -------
+    BagMetadata
+        What it says.
+
+    Raises
+    ------
+    BagError
+        If a key that every version has is missing or has the wrong form.
+
+    """
+    try:
+        version = int(content['version'])
+        if version > VERSION:
+            raise BagError(
+                f'{source} is of version {version}: expected at most {VERSION}')
+        topics = tuple(_topic(entry) for entry in content['topics_with_message_count'] or ())
+        start = int(content['starting_time']['nanoseconds_since_epoch'])
+        duration = int(content['duration']['nanoseconds'])
+        count = int(content['message_count'])
+        paths = [str(path) for path in content['relative_file_paths'] or ()]
+        if 'files' in content:
+            files = tuple(FileMetadata(
+                str(entry['path']), int(entry['starting_time']['nanoseconds_since_epoch']),
+                int(entry['duration']['nanoseconds']), int(entry['message_count']))
+                for entry in content['files'] or ())
+        else:
+            files = tuple(FileMetadata(path) for path in paths)
+        # Up to version 8 a path could carry the folder's name; it never leads out of it.
+        return BagMetadata(
+            start, duration, count, topics, files or tuple(map(FileMetadata, paths)),
+            {str(key): str(value) for key, value in (content.get('custom_data') or {}).items()},
+            str(content.get('ros_distro') or ''), version, str(content['storage_identifier']),
+            str(content.get('compression_format') or ''),
+            str(content.get('compression_mode') or ''))
+    except BagError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        what = f'key {error} is missing' if isinstance(error, KeyError) else str(error)
+        raise BagError(f'{source} cannot be understood ({what}): expected the metadata of a '
+                       'bag') from error
+
+
+def _topic(entry: Any) -> TopicMetadata:
+    """Read one topic."""
+    topic = entry['topic_metadata']
+    return TopicMetadata(
+        str(topic['name']), str(topic['type']), str(topic['serialization_format']),
+        qos.from_stored(topic.get('offered_qos_profiles')),
+        str(topic.get('type_description_hash') or ''), int(entry['message_count']))

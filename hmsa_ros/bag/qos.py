@@ -1,0 +1,180 @@
+"""
+Quality of service as rosbag2 stores it: a YAML list of profiles.
+
+Jazzy (metadata version 9) writes names (``reliable``); older bags hold the numbers of rmw.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import yaml
+
+from hmsa_ros.errors import BagError
+
+HISTORIES = ('system_default', 'keep_last', 'keep_all', 'unknown')
+RELIABILITIES = ('system_default', 'reliable', 'best_effort', 'unknown', 'best_available')
+DURABILITIES = ('system_default', 'transient_local', 'volatile', 'unknown', 'best_available')
+LIVELINESSES = (
+    'system_default', 'automatic', 'manual_by_node', 'manual_by_topic', 'unknown',
+    'best_available')
+INFINITE_NS = 9223372036854775807
+
+
+@dataclass(frozen=True)
+class Qos:
+    """
+    One offered profile.
+
+    Attributes
+    ----------
+    history, reliability, durability, liveliness : str
+        One of `HISTORIES`, `RELIABILITIES`, `DURABILITIES`, `LIVELINESSES`.
+    depth : int
+        Queue depth, at least 0; 0 where it was not discovered.
+    deadline_ns, lifespan_ns, lease_ns : int
+        Durations in nanoseconds, at least 0; `INFINITE_NS` for none.
+    avoid_ros_namespace_conventions : bool
+        As in rmw.
+
+    """
+
+    history: str = 'unknown'
+    depth: int = 0
+    reliability: str = 'reliable'
+    durability: str = 'volatile'
+    deadline_ns: int = INFINITE_NS
+    lifespan_ns: int = INFINITE_NS
+    liveliness: str = 'automatic'
+    lease_ns: int = INFINITE_NS
+    avoid_ros_namespace_conventions: bool = False
+
+    def __post_init__(self) -> None:
+        for name, value, known in (
+                ('history', self.history, HISTORIES),
+                ('reliability', self.reliability, RELIABILITIES),
+                ('durability', self.durability, DURABILITIES),
+                ('liveliness', self.liveliness, LIVELINESSES)):
+            if value not in known:
+                raise BagError(f'QoS {name} is {value!r}: expected one of {", ".join(known)}')
+        for name, number in (
+                ('depth', self.depth), ('deadline', self.deadline_ns),
+                ('lifespan', self.lifespan_ns), ('liveliness lease', self.lease_ns)):
+            if number < 0:
+                raise BagError(f'QoS {name} is {number}: expected at least 0')
+
+
+def _time_to_map(nanoseconds: int) -> dict[str, int]:
+    """Split as rosbag2 does."""
+    return {'sec': nanoseconds // 10**9, 'nsec': nanoseconds % 10**9}
+
+
+def _time_from_map(value: Any) -> int:
+    """Read a duration; zero is how rmw spells infinity in requests, and means none here too."""
+    total = int(value['sec']) * 10**9 + int(value['nsec'])
+    return min(total, INFINITE_NS)
+
+
+def _name(value: Any, known: tuple[str, ...]) -> str:
+    """Read a policy given as a name or as the number of rmw; what is unknown says so."""
+    if isinstance(value, str):
+        return value if value in known else 'unknown'
+    number = int(value)
+    return known[number] if 0 <= number < len(known) else 'unknown'
+
+
+def to_maps(profiles: Iterable[Qos]) -> list[dict[str, Any]]:
+    """
+    Return profiles as plain maps, in the order of keys that rosbag2 writes.
+
+    Parameters
+    ----------
+    profiles : iterable of Qos
+        What was offered.
+
+    Returns
+    -------
+    list of dict
+        One map a profile.
+
+    """
+    return [{
+        'history': profile.history,
+        'depth': profile.depth,
+        'reliability': profile.reliability,
+        'durability': profile.durability,
+        'deadline': _time_to_map(profile.deadline_ns),
+        'lifespan': _time_to_map(profile.lifespan_ns),
+        'liveliness': profile.liveliness,
+        'liveliness_lease_duration': _time_to_map(profile.lease_ns),
+        'avoid_ros_namespace_conventions': profile.avoid_ros_namespace_conventions,
+    } for profile in profiles]
+
+
+def to_yaml(profiles: Iterable[Qos]) -> str:
+    """
+    Return profiles as the text that goes into a channel's metadata.
+
+    Parameters
+    ----------
+    profiles : iterable of Qos
+        What was offered.
+
+    Returns
+    -------
+    str
+        A YAML block list; empty for no profile.
+
+    """
+    maps = to_maps(profiles)
+    if not maps:
+        return ''
+    text: str = yaml.safe_dump(maps, sort_keys=False)
+    return text
+
+
+def from_stored(value: Any) -> tuple[Qos, ...]:
+    """
+    Read profiles from a YAML text or from the list a newer metadata file holds.
+
+    Parameters
+    ----------
+    value : str, list or None
+        As stored.
+
+    Returns
+    -------
+    tuple of Qos
+        Empty if none was stored.
+
+    Raises
+    ------
+    BagError
+        If it is neither.
+
+    """
+    try:
+        items = yaml.load(value, _Loader) if isinstance(value, str) else value
+        return tuple(_from_map(item) for item in items or ())
+    except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise BagError(
+            f'offered_qos_profiles cannot be read ({type(error).__name__}): expected a YAML '
+            'list of profiles') from error
+
+
+def _from_map(item: Mapping[str, Any]) -> Qos:
+    """Read one profile."""
+    return Qos(
+        history=_name(item['history'], HISTORIES),
+        depth=max(0, int(item['depth'])),
+        reliability=_name(item['reliability'], RELIABILITIES),
+        durability=_name(item['durability'], DURABILITIES),
+        deadline_ns=_time_from_map(item['deadline']),
+        lifespan_ns=_time_from_map(item['lifespan']),
+        liveliness=_name(item['liveliness'], LIVELINESSES),
+        lease_ns=_time_from_map(item['liveliness_lease_duration']),
+        avoid_ros_namespace_conventions=bool(item['avoid_ros_namespace_conventions']))
+
+
+# The C parser is some ten times faster; not every installation of PyYAML has it.
+_Loader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
