@@ -5,7 +5,7 @@ Declaration of ROS parameters: each once, with default, unit, range and descript
 ``config/`` are held against them by a test.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 import math
 from typing import Any
@@ -65,6 +65,9 @@ class ParameterSpec:
         """
         text = f'{self.description} [{self.unit}]' if self.unit else self.description
         descriptor = ParameterDescriptor(description=text, read_only=self.read_only)
+        # An empty list says nothing of its type: rclpy would take it for one of bytes and
+        # refuse every list of strings. `declare` checks instead.
+        descriptor.dynamic_typing = isinstance(self.default, list)
         if self.choices:
             descriptor.additional_constraints = 'one of: ' + ', '.join(self.choices)
         if self.minimum is None and self.maximum is None:
@@ -156,6 +159,8 @@ def declare(node: Node, specs: Iterable[ParameterSpec]) -> Mapping[str, Any]:
             # does not.
             value = node.declare_parameter(
                 spec.name, spec.default, spec.descriptor()).value
+            if isinstance(spec.default, list):
+                value = _as_list(spec.name, value)
         except ParameterException as error:
             override = node._parameter_overrides.get(spec.name)
             got = 'a value of another kind' if override is None else repr(override.value)
@@ -166,6 +171,17 @@ def declare(node: Node, specs: Iterable[ParameterSpec]) -> Mapping[str, Any]:
                 f'parameter {spec.name} is {got}: expected {expected}') from error
         spec.check(value)
         values[spec.name] = value
+    return values
+
+
+def _as_list(name: str, value: Any) -> list[str]:
+    """Return a list of strings; one string is a list of one, an unset value is empty."""
+    if value is None:
+        return []
+    values = list(value) if isinstance(value, Sequence) and not isinstance(value, str) \
+        else [value]
+    if not all(isinstance(item, str) for item in values):
+        raise BadInputError(f'parameter {name} is {value!r}: expected a list of strings')
     return values
 
 
