@@ -1,0 +1,162 @@
+"""
+One look for all pictures.
+
+Pictures are drawn on figures of their own, never through pyplot: nothing of the caller's
+matplotlib (backend, settings, open windows) has a say or is changed, and the same data always
+gives the same bytes.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from matplotlib import style
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import AutoMinorLocator, NullLocator
+
+from hmsa_ros.errors import BadInputError
+
+# Okabe and Ito's palette, told apart with every kind of colour vision.
+BLACK = '#000000'
+ORANGE = '#E69F00'
+SKY_BLUE = '#56B4E9'
+GREEN = '#009E73'
+BLUE = '#0072B2'
+VERMILION = '#D55E00'
+PURPLE = '#CC79A7'
+GREY = '#8A8A8A'
+
+# What each kind of curve looks like, everywhere. Colour is never alone: style or width differ.
+SHAPED: dict[str, Any] = {'color': BLUE, 'linewidth': 1.8, 'zorder': 3}
+UNSHAPED: dict[str, Any] = {
+    'color': VERMILION, 'linewidth': 1.0, 'linestyle': (0, (4, 1.5)), 'zorder': 2}
+TARGET: dict[str, Any] = {
+    'color': GREY, 'linewidth': 0.8, 'linestyle': (0, (1, 1.5)), 'zorder': 1}
+EQUILIBRIUM: dict[str, Any] = {
+    'color': BLACK, 'linestyle': 'none', 'marker': 'o', 'markersize': 5, 'zorder': 5}
+
+#: Width of a picture in inches: two columns of a journal.
+WIDTH = 7.2
+_RESOLUTION = 200
+_SETTINGS: dict[str, Any] = {
+    'font.family': 'DejaVu Sans',
+    'font.size': 9,
+    'mathtext.fontset': 'dejavusans',
+    'axes.labelsize': 9,
+    'axes.titlesize': 9,
+    'axes.linewidth': 0.7,
+    'axes.spines.top': False,
+    'axes.spines.right': False,
+    'axes.unicode_minus': True,
+    'xtick.labelsize': 8,
+    'ytick.labelsize': 8,
+    'legend.fontsize': 8,
+    'legend.frameon': False,
+    'legend.handlelength': 2.4,
+    'lines.solid_capstyle': 'round',
+    'savefig.dpi': _RESOLUTION,
+    'path.simplify': True,
+}
+
+
+@contextmanager
+def picture(path: Path, height: float, *, width: float = WIDTH) -> Iterator[Figure]:
+    """
+    Draw a picture and write it as PNG.
+
+    Parameters
+    ----------
+    path : Path
+        File to write; one of that name is replaced.
+    height, width : float
+        Size in inches.
+
+    Yields
+    ------
+    Figure
+        To draw on; it is written when the block ends without an exception.
+
+    Raises
+    ------
+    BadInputError
+        If the file cannot be written.
+
+    """
+    with style.context(['default', _SETTINGS]):
+        figure = Figure(figsize=(width, height), layout='constrained')
+        FigureCanvasAgg(figure)
+        yield figure
+        try:
+            # Without the entry that names matplotlib's version.
+            figure.savefig(path, format='png', metadata={'Software': None})
+        except OSError as error:
+            raise unwritable(path, error) from error
+
+
+def unwritable(path: Path, error: OSError) -> BadInputError:
+    """
+    Return the error for a file or folder that cannot be written.
+
+    Parameters
+    ----------
+    path : Path
+        What was to be written.
+    error : OSError
+        What the system said.
+
+    Returns
+    -------
+    BadInputError
+        To raise.
+
+    """
+    return BadInputError(
+        f'cannot write {path}: {error.strerror or error}; expected a folder with write '
+        'permission')
+
+
+def finish(axes: Axes, x_label: str, y_label: str, letter: str = '') -> None:
+    """
+    Name the axes of a panel.
+
+    Parameters
+    ----------
+    axes : Axes
+        The panel.
+    x_label, y_label : str
+        Quantity with its symbol and unit; an empty one leaves the tick labels off.
+    letter : str
+        Letter of the panel, shown in brackets above it.
+
+    """
+    axes.set_xlabel(x_label)
+    axes.set_ylabel(y_label)
+    if letter:
+        axes.set_title(f'({letter})', loc='left', fontweight='bold')
+    for axis in (axes.xaxis, axes.yaxis):
+        if not isinstance(axis.get_major_locator(), NullLocator):
+            axis.set_minor_locator(AutoMinorLocator(2))
+    axes.grid(visible=True, color='#E4E4E4', linewidth=0.5, zorder=0)
+    axes.set_axisbelow(True)
+
+
+def legend_above(axes: Axes, columns: int, *, anchor: float = 1.0) -> None:
+    """
+    Put the legend above a panel, where it covers no data.
+
+    Parameters
+    ----------
+    axes : Axes
+        The panel.
+    columns : int
+        Entries side by side.
+    anchor : float
+        Height of the legend's lower edge, in heights of the panel.
+
+    """
+    axes.legend(
+        loc='lower right', bbox_to_anchor=(1.0, anchor), ncols=columns, borderaxespad=0.2,
+        columnspacing=1.4)
