@@ -24,6 +24,7 @@ README = 'README.md' if os.path.exists(os.path.join(HERE, 'README.md')) else Non
 INSTALL_REQUIRES = [
     'setuptools',
     'PyYAML>=6.0',
+    'lz4>=4.0',
     'matplotlib>=3.6',
     'mcap>=1.6',
     'mcap-ros2-support>=0.5',
@@ -31,6 +32,7 @@ INSTALL_REQUIRES = [
     'numpy>=1.26',
     'rich>=13.0',
     'scipy>=1.11',
+    'zstandard>=0.18',
 ]
 
 # rclpy and the messages are no plain requirement: where ROS is installed they are there

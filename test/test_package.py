@@ -20,8 +20,11 @@ import hmsa_ros
 ROOT = Path(__file__).resolve().parent.parent
 PYTHONS = ('3.10', '3.11', '3.12', '3.13')
 # Where the key of a requirement is not python3- and its name in lower case.
-KEYS = {'mcap': 'mcap-ros2-support', 'mcap-ros2-support': 'mcap-ros2-support',
-        'PyYAML': 'python3-yaml', 'rosbags': 'python3-rosbags-pip'}
+# mcap, lz4 and zstandard come along with mcap-ros2-support.
+KEYS = {
+    'lz4': 'mcap-ros2-support', 'mcap': 'mcap-ros2-support',
+    'mcap-ros2-support': 'mcap-ros2-support', 'zstandard': 'mcap-ros2-support',
+    'PyYAML': 'python3-yaml', 'rosbags': 'python3-rosbags-pip'}
 # ruff and type stubs have no key.
 WITHOUT_KEY = {'ruff', 'types-PyYAML'}
 # Requirements whose module has another name.
