@@ -6,7 +6,7 @@ ROS. The text is taken from the ``share`` folders of the environment, without rc
 """
 
 from collections.abc import Iterator
-from functools import lru_cache
+from functools import cache
 import json
 import os
 from pathlib import Path
@@ -71,7 +71,7 @@ def _dependencies(type_name: str, text: str) -> list[str]:
     return sorted(names)
 
 
-@lru_cache(maxsize=None)
+@cache
 def message_definition(type_name: str) -> tuple[str, str]:
     """
     Return the encoding and the text of a message type with all it depends on.
@@ -116,7 +116,7 @@ def message_definition(type_name: str) -> tuple[str, str]:
     return 'ros2msg', ''.join(sections(type_name))
 
 
-@lru_cache(maxsize=None)
+@cache
 def type_hash(type_name: str) -> str:
     """
     Return the type's RIHS01 hash.

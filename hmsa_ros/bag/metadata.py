@@ -1,6 +1,4 @@
-"""
-The file ``metadata.yaml`` of a bag: version 9 as Jazzy writes it, and how to read its elders.
-"""
+"""The file ``metadata.yaml`` of a bag: version 9 as Jazzy writes it, and reading its elders."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

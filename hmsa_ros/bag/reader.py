@@ -15,7 +15,7 @@ that was cut off gives everything up to the cut, a damaged chunk costs that chun
 """
 
 from bisect import bisect_left
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 import os
 from pathlib import Path
@@ -147,9 +147,8 @@ class BagReader:
         self.path = Path(path)
         self.problems: list[str] = []
         self.metadata: metadata.BagMetadata | None = None
-        self._compression = ''
         paths = self._find_files()
-        self._files = []
+        self._files: list[_File] = []
         for file_path in paths:
             try:
                 self._files.append(self._scan(file_path, len(self._files)))
@@ -695,7 +694,7 @@ def _make_decoder(info: TopicInfo) -> Callable[[bytes], Any]:
             return decode(data)
         except Exception as error:
             raise BagError(f'a message of topic {info.name} does not decode as {info.type}: '
-                           f'{error or type(error).__name__}') from error
+                           f'{str(error) or type(error).__name__}') from error
 
     return checked
 

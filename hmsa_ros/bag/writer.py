@@ -139,6 +139,16 @@ class BagWriter:
     fsync : bool
         Whether each flush waits until the data are on the disk.
 
+    Attributes
+    ----------
+    folder : pathlib.Path
+        Folder of the bag.
+    custom_data : dict of str to str
+        See `note`.
+    dropped : dict of str to int
+        By topic, messages that were given to `write` and are not in the bag: those that could
+        not be written by the end, and those in a file that was removed under the writer.
+
     Raises
     ------
     BadInputError
@@ -171,6 +181,7 @@ class BagWriter:
         self._chunk = _Chunk()
         self._file: _File | None = None
         self._next_number = 0
+        self._closed = False
         self.dropped: dict[str, int] = {}
         try:
             self.folder.mkdir(parents=True)
@@ -281,20 +292,21 @@ class BagWriter:
             self._append(self._declare(self._file, topic))
         return len(self._topics) - 1
 
-    def write(self, entries: Iterable[Entry]) -> None:
+    def write(self, entries: Iterable[tuple[int, int, int, int, bytes]]) -> None:
         """
         Add messages; full chunks go to the file.
 
         Parameters
         ----------
-        entries : iterable of Entry
-            In any order of stamps.
+        entries : iterable of tuple
+            As `Entry`, in any order of stamps.
 
         Raises
         ------
         OSError
-            If a chunk cannot be written. Its messages are counted in `dropped`; the file is
-            as it was before.
+            If a chunk cannot be written. The file is then as it was before, the messages taken
+            from ``entries`` so far wait in memory for `flush` or `reopen`, and the rest can
+            still be taken if ``entries`` is an iterator.
 
         """
         chunk = self._chunk
@@ -312,13 +324,34 @@ class BagWriter:
                 publish_time), data
             chunk.size += head_size + length
             chunk.count += 1
-            if log_time < chunk.start:
-                chunk.start = log_time
-            if log_time > chunk.end:
-                chunk.end = log_time
+            chunk.start = min(chunk.start, log_time)
+            chunk.end = max(chunk.end, log_time)
             if chunk.size >= self._chunk_size:
                 self._write_chunk()
                 chunk = self._chunk
+
+    def note(self, values: Mapping[str, str]) -> None:
+        """
+        Add to the custom data, in the file and in ``metadata.yaml``.
+
+        Parameters
+        ----------
+        values : mapping of str to str
+            Replace those of the same key.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written; it is then tried again when the file is closed.
+
+        """
+        self.custom_data.update(values)
+        if self._file is None:
+            return
+        data = records.metadata(EXPERIMENT, {'version': __version__, **self.custom_data})
+        self._file.metadata_indexes.append(
+            records.metadata_index(self._append(data), len(data), EXPERIMENT))
+        metadata.write(self.folder, self._metadata())
 
     def flush(self) -> None:
         """
@@ -406,13 +439,18 @@ class BagWriter:
             If it cannot be written; what was written before stays readable.
 
         """
-        if self._file is not None:
-            try:
-                self._write_chunk()
-            finally:
-                self._finish_file()
-        elif self.folder.is_dir():
-            metadata.write(self.folder, self._metadata())
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            self._write_chunk()
+            self._finish_file()
+        finally:
+            self._lose({topic: len(index) // 2 for topic, index in self._chunk.index.items()})
+            self._chunk = _Chunk()
+            self.abandon()
+            if self.folder.is_dir():
+                metadata.write(self.folder, self._metadata())
 
     # Inside ----------------------------------------------------------------------------------
 
@@ -493,9 +531,7 @@ class BagWriter:
         chunk = self._chunk
         if not chunk.count:
             return
-        self._chunk = _Chunk()
         if self._file is None:
-            self._lose({topic: len(index) // 2 for topic, index in chunk.index.items()})
             raise OSError('no file is open')
         content = b''.join(chunk.parts)
         preset = self._preset
@@ -510,11 +546,8 @@ class BagWriter:
             offsets.append((topic + 1, position))
             indexes.append(data)
             position += len(data)
-        try:
-            start = self._append(b''.join([record, *indexes]))
-        except OSError:
-            self._lose({topic: len(index) // 2 for topic, index in chunk.index.items()})
-            raise
+        start = self._append(b''.join([record, *indexes]))
+        self._chunk = _Chunk()
         file = self._file
         file.chunk_indexes.append(records.record(records.CHUNK_INDEX, b''.join((
             struct.pack('<QQQQI', chunk.start, chunk.end, start, len(record),

@@ -51,7 +51,8 @@ def run(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
     ----------
     factory : callable
         Makes the node; may raise `HmsaError` or an rclpy parameter error, which refuse the
-        start. A node with a ``close`` method has it called before the node is destroyed.
+        start. A node with a ``close`` method has it called before the node is destroyed; an
+        error in its attribute ``failure`` makes the run a failed one.
     args : sequence of str, optional
         Command-line arguments, ``--ros-args ...`` included; default ``sys.argv[1:]``.
 
@@ -75,16 +76,16 @@ def run(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
     except Exception as error:  # rclpy raises errors of several unrelated classes here
         return _refuse(error, 2)
     node: Node | None = None
+    status = 0
     try:
         node = factory()
         spin(node)
-        return 0
     except (BadInputError, ParameterException) as error:
-        return _refuse(error, 2)
+        status = _refuse(error, 2)
     except HmsaError as error:
-        return _refuse(error, 1)
+        status = _refuse(error, 1)
     except (KeyboardInterrupt, ExternalShutdownException):
-        return 0
+        pass
     finally:
         if node is not None:
             close = getattr(node, 'close', None)
@@ -92,6 +93,8 @@ def run(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
                 close()
             node.destroy_node()
         rclpy.try_shutdown()
+    failure = getattr(node, 'failure', None)
+    return _refuse(failure, 1) if failure is not None and not status else status
 
 
 def _refuse(error: Exception, status: int) -> int:

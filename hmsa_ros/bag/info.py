@@ -1,0 +1,255 @@
+"""What is in a bag, in figures and in words."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+import datetime
+import json
+import os
+
+from hmsa_ros.bag.reader import BagReader
+
+
+@dataclass(frozen=True)
+class TopicSummary:
+    """
+    One topic in figures.
+
+    Attributes
+    ----------
+    name, type : str
+        Topic and message type.
+    count : int
+        Messages in the bag.
+    rate : float or None
+        Messages a second over the length of the bag; None where that is not defined.
+    lost : int or None
+        Messages known to be lost; None if the recorder did not tell.
+    reliability, durability : str
+        Of the publishers, several separated by a slash; empty if unknown.
+
+    """
+
+    name: str
+    type: str
+    count: int
+    rate: float | None
+    lost: int | None
+    reliability: str
+    durability: str
+
+
+@dataclass(frozen=True)
+class BagSummary:
+    """
+    A bag in figures.
+
+    Attributes
+    ----------
+    path : str
+        As given.
+    files : tuple of (str, int)
+        Name and size in bytes of each file.
+    start_ns, end_ns : int or None
+        First and last log time; None without a message.
+    topics : tuple of TopicSummary
+        In order of name.
+    parameters : mapping of str to str
+        Parameters of the recorded nodes, values as JSON.
+    custom_data : mapping of str to str
+        Everything else that was stored with the bag.
+    complete : bool
+        Whether every file was closed by its writer.
+    problems : tuple of str
+        What could not be read, one sentence each.
+
+    """
+
+    path: str
+    files: tuple[tuple[str, int], ...]
+    start_ns: int | None
+    end_ns: int | None
+    topics: tuple[TopicSummary, ...]
+    parameters: Mapping[str, str]
+    custom_data: Mapping[str, str]
+    complete: bool
+    problems: tuple[str, ...]
+
+    @property
+    def duration(self) -> float:
+        """Return the length in seconds."""
+        if self.start_ns is None or self.end_ns is None:
+            return 0.0
+        return (self.end_ns - self.start_ns) * 1e-9
+
+    @property
+    def message_count(self) -> int:
+        """Return the number of messages."""
+        return sum(topic.count for topic in self.topics)
+
+    @property
+    def lost(self) -> int | None:
+        """Return the number of lost messages, None if the recorder did not tell."""
+        counts = [topic.lost for topic in self.topics if topic.lost is not None]
+        return sum(counts) if counts else None
+
+
+def summarize(path: str | os.PathLike[str]) -> BagSummary:
+    """
+    Read a bag's figures.
+
+    Parameters
+    ----------
+    path : path
+        Folder of a bag, or one ``.mcap`` file.
+
+    Returns
+    -------
+    BagSummary
+        In figures.
+
+    Raises
+    ------
+    BadInputError
+        If there is no bag.
+
+    """
+    reader = BagReader(path)
+    counts = reader.counts()
+    start, end = reader.start_time, reader.end_time
+    seconds = 0.0 if start is None or end is None else (end - start) * 1e-9
+    lost = lost_messages(reader.custom_data)
+    topics = tuple(TopicSummary(
+        info.name, info.type, counts[name],
+        (counts[name] - 1) / seconds if seconds > 0.0 and counts[name] > 1 else None,
+        None if lost is None else lost.get(name, 0),
+        '/'.join(sorted({profile.reliability for profile in info.profiles})),
+        '/'.join(sorted({profile.durability for profile in info.profiles})))
+        for name, info in sorted(reader.topics.items()))
+    nodes = {key.partition('.')[0] for key in reader.custom_data
+             if key.endswith('.use_sim_time')}
+    parameters = {key: value for key, value in reader.custom_data.items()
+                  if key.partition('.')[0] in nodes}
+    return BagSummary(
+        str(path), tuple((file.name, file.stat().st_size) for file in reader.files), start, end,
+        topics, parameters,
+        {key: value for key, value in reader.custom_data.items()
+         if key not in parameters and key != 'lost'},
+        reader.complete, tuple(reader.problems))
+
+
+def lost_messages(custom_data: Mapping[str, str]) -> dict[str, int] | None:
+    """
+    Read the counts of lost messages.
+
+    Parameters
+    ----------
+    custom_data : mapping of str to str
+        Of a bag.
+
+    Returns
+    -------
+    dict of str to int or None
+        By topic; None if the bag does not tell.
+
+    """
+    try:
+        counts = json.loads(custom_data['lost'])
+        return {str(name): int(count) for name, count in counts.items()}
+    except (KeyError, ValueError, TypeError, AttributeError):
+        return None
+
+
+def to_json(summary: BagSummary) -> str:
+    """
+    Return a summary as JSON.
+
+    Parameters
+    ----------
+    summary : BagSummary
+        A bag in figures.
+
+    Returns
+    -------
+    str
+        One object.
+
+    """
+    return json.dumps({
+        'path': summary.path,
+        'files': [{'name': name, 'size': size} for name, size in summary.files],
+        'start_ns': summary.start_ns,
+        'end_ns': summary.end_ns,
+        'duration': summary.duration,
+        'message_count': summary.message_count,
+        'lost': summary.lost,
+        'topics': [{
+            'name': topic.name, 'type': topic.type, 'count': topic.count, 'rate': topic.rate,
+            'lost': topic.lost, 'reliability': topic.reliability,
+            'durability': topic.durability} for topic in summary.topics],
+        'parameters': dict(summary.parameters),
+        'custom_data': dict(summary.custom_data),
+        'complete': summary.complete,
+        'problems': list(summary.problems),
+    }, indent=2)
+
+
+def to_text(summary: BagSummary) -> str:
+    """
+    Return a summary in words.
+
+    Parameters
+    ----------
+    summary : BagSummary
+        A bag in figures.
+
+    Returns
+    -------
+    str
+        Several lines.
+
+    """
+    return '\n'.join(_lines(summary))
+
+
+def _lines(summary: BagSummary) -> Iterator[str]:
+    """Return the lines of a summary."""
+    yield f'bag       {summary.path}'
+    for name, size in summary.files:
+        yield f'file      {name}  {size / 1024:.1f} KiB'
+    yield f'complete  {"yes" if summary.complete else "no, see hmsa bag recover"}'
+    if summary.start_ns is not None:
+        yield f'start     {_time(summary.start_ns)}'
+    yield f'duration  {summary.duration:.3f} s'
+    yield f'messages  {summary.message_count}'
+    yield 'lost      ' + ('not told' if summary.lost is None else str(summary.lost))
+    if summary.topics:
+        rows = [('topic', 'type', 'count', 'rate [1/s]', 'lost', 'offered')]
+        rows += [(
+            topic.name, topic.type or 'unknown', str(topic.count),
+            '' if topic.rate is None else f'{topic.rate:.1f}',
+            '' if topic.lost is None else str(topic.lost),
+            ', '.join(filter(None, (topic.reliability, topic.durability))))
+            for topic in summary.topics]
+        widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+        yield ''
+        for row in rows:
+            yield '  '.join(
+                text.rjust(width) if 2 <= i <= 4 else text.ljust(width)
+                for i, (text, width) in enumerate(zip(row, widths, strict=True))).rstrip()
+    for title, values in (
+            ('parameters', summary.parameters), ('custom data', summary.custom_data)):
+        if values:
+            yield ''
+            yield title
+            for key, value in values.items():
+                yield f'  {key} = {value if len(value) <= 200 else value[:200] + " ..."}'
+    for problem in summary.problems:
+        yield f'note: {problem}'
+
+
+def _time(nanoseconds: int) -> str:
+    """Return a time as a date, or as seconds where it is simulated."""
+    seconds = nanoseconds * 1e-9
+    if seconds < 1e8:
+        return f'{seconds:.9f} s'
+    return datetime.datetime.fromtimestamp(seconds).astimezone().isoformat(sep=' ')

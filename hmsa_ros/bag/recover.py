@@ -1,0 +1,95 @@
+"""Making a readable bag out of what a crash, a full disk or a damaged file left."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+import os
+
+from hmsa_ros.bag.reader import BagReader
+from hmsa_ros.bag.writer import BagWriter, Topic
+from hmsa_ros.errors import BagError
+
+_BATCH = 5000
+
+
+@dataclass(frozen=True)
+class Recovered:
+    """
+    What was recovered.
+
+    Attributes
+    ----------
+    folder : str
+        The new bag.
+    message_count : int
+        Messages in it.
+    problems : tuple of str
+        What could not be read of the old one, one sentence each.
+
+    """
+
+    folder: str
+    message_count: int
+    problems: tuple[str, ...]
+
+
+def recover(path: str | os.PathLike[str], out: str | os.PathLike[str]) -> Recovered:
+    """
+    Write everything that can be read of a bag to a new one, and check that by reading it.
+
+    Parameters
+    ----------
+    path : path
+        Folder of a bag, or one ``.mcap`` file.
+    out : path
+        Folder of the new bag; must not exist.
+
+    Returns
+    -------
+    Recovered
+        What it holds.
+
+    Raises
+    ------
+    BadInputError
+        If there is no bag, or the new one cannot be made.
+    BagError
+        If it cannot be written, or does not read back the same.
+
+    """
+    reader = BagReader(path)
+    try:
+        with BagWriter(out, custom_data=reader.custom_data) as writer:
+            numbers: dict[str, int] = {}
+
+            def entries() -> Iterator[tuple[int, int, int, int, bytes]]:
+                for message in reader.stored_messages():
+                    if message.topic not in numbers:
+                        numbers[message.topic] = _add(reader, writer, message.topic)
+                    yield (numbers[message.topic], message.log_time, message.publish_time,
+                           message.sequence, message.data)
+
+            for topic in reader.topics:
+                numbers[topic] = _add(reader, writer, topic)
+            stream = entries()
+            while batch := list(islice(stream, _BATCH)):
+                writer.write(batch)
+        expected = writer.topic_counts()
+    except OSError as error:
+        raise BagError(f'{out} cannot be written: {error.strerror or error}') from error
+    check = BagReader(out)
+    found = dict.fromkeys(check.topics, 0)
+    for message in check.messages():
+        found[message.topic] += 1
+    if check.problems or found != expected:
+        raise BagError(f'{out} does not read back as written: '
+                       + ('; '.join(check.problems) or f'{found}, expected {expected}'))
+    return Recovered(str(out), sum(found.values()), tuple(reader.problems))
+
+
+def _add(reader: BagReader, writer: BagWriter, name: str) -> int:
+    """Announce a topic of one bag to another."""
+    info = reader.topics[name]
+    return writer.add_topic(Topic(
+        name, info.type or 'unknown', info.definition, info.definition_encoding, info.profiles,
+        info.type_hash))

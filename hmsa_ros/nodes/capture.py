@@ -1,0 +1,392 @@
+"""
+Taking raw messages off subscriptions, fast and with all that is known of each.
+
+rclpy's own executors pass one message at a time and do not tell which publisher sent it. Here
+a thread of its own waits for several subscriptions and takes whatever has arrived in one go,
+with the publisher's identifier, so that a gap in its sequence numbers is a lost message.
+"""
+
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
+import ctypes
+import threading
+import time
+from typing import Any, NamedTuple
+
+from rclpy.exceptions import InvalidHandle
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.type_support import check_is_valid_msg_type
+
+# Taken from one subscription before the next has its turn.
+_BATCH = 2000
+# After messages have arrived the thread rests this long, so that at high rates many are taken
+# for one wait. Stamps come from the middleware, so this does not blur them.
+_REST_SECONDS = 0.001
+_WAIT_NS = 200_000_000
+
+
+class Taken(NamedTuple):
+    """A message as received: stamps in ns, sequence number, publisher's identifier, payload."""
+
+    source_ns: int
+    received_ns: int
+    sequence: int
+    publisher: bytes
+    data: bytes
+
+
+class _Allocator(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_void_p) for name in (
+        'allocate', 'deallocate', 'reallocate', 'zero_allocate', 'state')]
+
+
+class _Buffer(ctypes.Structure):
+    """rcutils_uint8_array_t."""
+
+    _fields_ = [
+        ('buffer', ctypes.c_void_p), ('length', ctypes.c_size_t),
+        ('capacity', ctypes.c_size_t), ('allocator', _Allocator)]
+
+
+class _Info(ctypes.Structure):
+    """rmw_message_info_t of Jazzy."""
+
+    _fields_ = [
+        ('source', ctypes.c_int64), ('received', ctypes.c_int64),
+        ('sequence', ctypes.c_uint64), ('reception_sequence', ctypes.c_uint64),
+        ('implementation', ctypes.c_char_p), ('publisher', ctypes.c_ubyte * 16),
+        ('from_intra_process', ctypes.c_bool),
+        # Room for what a later distribution may add at the end.
+        ('_reserve', ctypes.c_ubyte * 64)]
+
+
+class _Taker:
+    """
+    Takes serialized messages by rcl's own function.
+
+    rclpy's binding leaves out the publisher's identifier, without which gaps cannot be told
+    where several publishers share a topic. The interpreter lock is kept: a take lasts about a
+    microsecond, giving the lock away and getting it back much longer.
+    """
+
+    def __init__(self) -> None:
+        rcl = ctypes.PyDLL('librcl.so')
+        utils = ctypes.PyDLL('librcutils.so')
+        utils.rcutils_get_default_allocator.restype = _Allocator
+        allocator = utils.rcutils_get_default_allocator()
+        self._array = _Buffer()
+        self._info = _Info()
+        init = utils.rcutils_uint8_array_init
+        init.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p]
+        if init(ctypes.byref(self._array), 2**16, ctypes.byref(allocator)) != 0:
+            raise MemoryError('no memory for a receive buffer')
+        self._take = rcl.rcl_take_serialized_message
+        self._take.argtypes = [ctypes.c_void_p] * 4
+        self._take.restype = ctypes.c_int
+
+    def take(self, pointer: int, limit: int) -> list[Taken]:
+        """Take up to some number of messages off the subscription at an address."""
+        result: list[Taken] = []
+        take, string_at, array, info = self._take, ctypes.string_at, self._array, self._info
+        array_at, info_at = ctypes.addressof(array), ctypes.addressof(info)
+        while len(result) < limit and take(pointer, array_at, info_at, None) == 0:
+            result.append(Taken(
+                info.source, info.received, info.sequence, bytes(info.publisher),
+                string_at(array.buffer, array.length)))
+        return result
+
+
+class RawSubscription:
+    """
+    A subscription that belongs to no executor and is read by `take`.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Node that subscribes.
+    message_type : type
+        Message class.
+    topic : str
+        Topic name.
+    qos : rclpy.qos.QoSProfile
+        Quality of service.
+
+    """
+
+    _taker: _Taker | None = None
+    _taker_tried = False
+
+    def __init__(
+            self, node: Node, message_type: type[Any], topic: str, qos: QoSProfile) -> None:
+        check_is_valid_msg_type(message_type)
+        self._type = message_type
+        with node.handle:
+            self.handle = _rclpy.Subscription(
+                node.handle, message_type, topic, qos.get_c_qos_profile())
+
+    @classmethod
+    def tells_publishers(cls) -> bool:
+        """Return whether `take` tells publishers apart, which needs rcl's library."""
+        if not cls._taker_tried:
+            cls._taker_tried = True
+            try:
+                cls._taker = _Taker()
+            except (OSError, AttributeError):
+                cls._taker = None
+        return cls._taker is not None
+
+    def take(self, limit: int = _BATCH) -> list[Taken]:
+        """
+        Take what has arrived.
+
+        Parameters
+        ----------
+        limit : int
+            Largest number of messages.
+
+        Returns
+        -------
+        list of Taken
+            In order of arrival; empty if there is nothing.
+
+        """
+        try:
+            with self.handle:
+                if self.tells_publishers() and self._taker is not None:
+                    return self._taker.take(self.handle.pointer, limit)
+                return self._take_by_rclpy(limit)
+        except InvalidHandle:
+            return []
+
+    def _take_by_rclpy(self, limit: int) -> list[Taken]:
+        """Take without knowing the publishers."""
+        result: list[Taken] = []
+        while len(result) < limit:
+            pair = self.handle.take_message(self._type, True)
+            if pair is None:
+                break
+            data, info = pair
+            result.append(Taken(
+                info['source_timestamp'], info['received_timestamp'],
+                info['publication_sequence_number'], b'', data))
+        return result
+
+    def destroy(self) -> None:
+        """Stop receiving."""
+        self.handle.destroy_when_not_in_use()
+
+
+class Capture:
+    """
+    A thread that takes messages off subscriptions and passes them on in batches.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Node the subscriptions belong to.
+    deliver : callable
+        Called in the thread with a list of (key, messages) of one round, in the order in which
+        the subscriptions were added.
+
+    """
+
+    def __init__(
+            self, node: Node,
+            deliver: Callable[[Sequence[tuple[Any, list[Taken]]]], None]) -> None:
+        self._node = node
+        self._deliver = deliver
+        self._lock = threading.Lock()
+        self._subscriptions: list[tuple[Any, RawSubscription]] = []
+        self._leaving: list[tuple[Any, RawSubscription]] = []
+        self._changed = True
+        self._stopping = False
+        self.error: BaseException | None = None
+        with node.context.handle:
+            self._guard = _rclpy.GuardCondition(node.context.handle)
+        self._thread = threading.Thread(target=self._run, name='capture', daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def add(self, key: Any, subscription: RawSubscription) -> None:
+        """
+        Take messages off one more subscription.
+
+        Parameters
+        ----------
+        key : object
+            Passed on with its messages.
+        subscription : RawSubscription
+            From now on read and in the end destroyed by this object.
+
+        """
+        with self._lock:
+            self._subscriptions.append((key, subscription))
+            self._changed = True
+        self._wake()
+
+    def replace(self, key: Any, subscription: RawSubscription) -> None:
+        """
+        Take messages off another subscription under the same key.
+
+        What has arrived at the old one is still passed on.
+
+        Parameters
+        ----------
+        key : object
+            As given to `add`.
+        subscription : RawSubscription
+            The new one.
+
+        """
+        with self._lock:
+            for i, (known, old) in enumerate(self._subscriptions):
+                if known is key:
+                    self._leaving.append((known, old))
+                    self._subscriptions[i] = (key, subscription)
+                    self._changed = True
+        self._wake()
+
+    def stop(self) -> None:
+        """Pass on what has arrived so far and end the thread."""
+        self._stopping = True
+        self._wake()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _wake(self) -> None:
+        """Make the thread look around."""
+        try:
+            self._guard.trigger_guard_condition()
+        except Exception:  # the context may be gone: the wait then ends by its own limit
+            return
+
+    def _run(self) -> None:
+        """Wait, take, pass on."""
+        wait_set = None
+        try:
+            while True:
+                with self._lock:
+                    # Read before the last round, so that this round is complete.
+                    stopping = self._stopping
+                    subscriptions = [*self._leaving, *self._subscriptions]
+                    leaving = len(self._leaving)
+                    self._leaving = []
+                    changed, self._changed = self._changed, False
+                if changed or wait_set is None:
+                    wait_set = self._make_wait_set(len(subscriptions))
+                if wait_set is not None and not stopping and not leaving:
+                    self._wait(wait_set, subscriptions)
+                taken = self._round(subscriptions)
+                for _, subscription in subscriptions[:leaving]:
+                    subscription.destroy()
+                if leaving:
+                    with self._lock:
+                        self._changed = True
+                if stopping and not taken:
+                    break
+                if taken:
+                    self._deliver(taken)
+                    if not stopping:
+                        time.sleep(_REST_SECONDS)
+        except BaseException as error:  # reported by the node that owns the thread
+            self.error = error
+        finally:
+            for _, subscription in self._subscriptions:
+                subscription.destroy()
+
+    def _make_wait_set(self, count: int) -> Any:
+        """Return a wait set of the right size, None once the context is shut down."""
+        try:
+            with self._node.context.handle:
+                return _rclpy.WaitSet(count, 1, 0, 0, 0, 0, self._node.context.handle)
+        except (InvalidHandle, _rclpy.RCLError):
+            time.sleep(_REST_SECONDS)
+            return None
+
+    def _wait(self, wait_set: Any, subscriptions: list[tuple[Any, RawSubscription]]) -> None:
+        """Wait until something has arrived or been asked for."""
+        try:
+            wait_set.clear_entities()
+            wait_set.add_guard_condition(self._guard)
+            for _, subscription in subscriptions:
+                wait_set.add_subscription(subscription.handle)
+            wait_set.wait(_WAIT_NS)
+        except (InvalidHandle, _rclpy.RCLError):
+            # The context has been shut down; `stop` is about to come.
+            time.sleep(_REST_SECONDS)
+
+    @staticmethod
+    def _round(
+            subscriptions: list[tuple[Any, RawSubscription]]) -> list[tuple[Any, list[Taken]]]:
+        """
+        Take once from each subscription.
+
+        The first is taken last: with /clock added first, every tick that came before a message
+        of this round is known when the message is stamped.
+        """
+        taken = []
+        for key, subscription in reversed(subscriptions):
+            messages = subscription.take()
+            if messages:
+                taken.append((key, messages))
+        taken.reverse()
+        return taken
+
+
+class SimulatedTime:
+    """
+    Tells the simulated time at which a message was received.
+
+    The time of a message is that of the last ``/clock`` message received before it, by the
+    stamps of the middleware, however late either is taken.
+    """
+
+    def __init__(self) -> None:
+        self._received: list[int] = []
+        self._times: list[int] = []
+        self.jumped_back = False
+
+    @property
+    def started(self) -> bool:
+        """Return whether a ``/clock`` message has come."""
+        return bool(self._times)
+
+    def add(self, received_ns: int, time_ns: int) -> None:
+        """
+        Take in a ``/clock`` message.
+
+        Parameters
+        ----------
+        received_ns : int
+            When it was received, in system time.
+        time_ns : int
+            What it says.
+
+        """
+        if self._times and time_ns < self._times[-1]:
+            self.jumped_back = True
+        self._received.append(received_ns)
+        self._times.append(time_ns)
+        if len(self._times) > 100_000:
+            del self._received[:50_000], self._times[:50_000]
+
+    def at(self, received_ns: int) -> int:
+        """
+        Return the simulated time at a moment.
+
+        Parameters
+        ----------
+        received_ns : int
+            System time.
+
+        Returns
+        -------
+        int
+            Nanoseconds; the first known time for an earlier moment.
+
+        """
+        return self._times[max(0, bisect_right(self._received, received_ns) - 1)]

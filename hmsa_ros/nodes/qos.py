@@ -1,0 +1,106 @@
+"""Quality of service between rclpy and what a bag stores."""
+
+from collections.abc import Iterable, Sequence
+
+from rclpy.duration import Duration
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    LivelinessPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+)
+
+from hmsa_ros.bag.qos import Qos
+
+# Depth of a republished topic whose recorded depth is unknown, as it is where publishers are
+# discovered over DDS.
+PUBLISHER_DEPTH = 1000
+
+
+def stored(profile: QoSProfile) -> Qos:
+    """
+    Return a discovered profile as a bag stores it.
+
+    Parameters
+    ----------
+    profile : rclpy.qos.QoSProfile
+        As `Node.get_publishers_info_by_topic` gives it.
+
+    Returns
+    -------
+    hmsa_ros.bag.qos.Qos
+        The same.
+
+    """
+    return Qos(
+        profile.history.name.lower(), profile.depth, profile.reliability.name.lower(),
+        profile.durability.name.lower(), profile.deadline.nanoseconds,
+        profile.lifespan.nanoseconds, profile.liveliness.name.lower(),
+        profile.liveliness_lease_duration.nanoseconds,
+        profile.avoid_ros_namespace_conventions)
+
+
+def subscription(offered: Iterable[Qos], depth: int) -> QoSProfile:
+    """
+    Return the strongest profile that receives from all of some publishers.
+
+    Parameters
+    ----------
+    offered : iterable of Qos
+        What the publishers offer, at least one.
+    depth : int
+        Depth of the queue.
+
+    Returns
+    -------
+    rclpy.qos.QoSProfile
+        Reliable only if all are, transient local only if all are.
+
+    """
+    profiles = list(offered)
+    reliable = all(profile.reliability == 'reliable' for profile in profiles)
+    latched = all(profile.durability == 'transient_local' for profile in profiles)
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST, depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE)
+
+
+def publisher(recorded: Sequence[Qos]) -> QoSProfile:
+    """
+    Return the profile that serves every subscriber that the recorded publishers served.
+
+    Parameters
+    ----------
+    recorded : sequence of Qos
+        What the publishers offered; empty if the bag does not tell.
+
+    Returns
+    -------
+    rclpy.qos.QoSProfile
+        Reliable if any was, transient local if any was. The depth is the recorded one. Where it
+        is unknown a latched topic keeps one message a recorded publisher, so that who comes late
+        gets what it would have got.
+
+    """
+    latched = any(profile.durability == 'transient_local' for profile in recorded)
+    reliable = not recorded or any(
+        profile.reliability in ('reliable', 'system_default') for profile in recorded)
+    depth = max((profile.depth for profile in recorded), default=0)
+    profile = QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth or (len(recorded) if latched else PUBLISHER_DEPTH),
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE)
+    alike = set(recorded)
+    if len(alike) == 1:
+        # Deadlines and the like only mean something if all publishers agreed on them.
+        only = alike.pop()
+        profile.deadline = Duration(nanoseconds=only.deadline_ns)
+        profile.lifespan = Duration(nanoseconds=only.lifespan_ns)
+        profile.liveliness_lease_duration = Duration(nanoseconds=only.lease_ns)
+        profile.avoid_ros_namespace_conventions = only.avoid_ros_namespace_conventions
+        if only.liveliness == 'manual_by_topic':
+            profile.liveliness = LivelinessPolicy.MANUAL_BY_TOPIC
+    return profile

@@ -1,0 +1,624 @@
+"""
+Recorder: writes topics to a bag, counts what is lost, and says so.
+
+The node's own executor serves discovery, services and diagnostics. Messages take another way:
+`Capture` takes them off their subscriptions in a thread, `Recording` writes them in another.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+import datetime
+from importlib import import_module
+import json
+import os
+from pathlib import Path
+import re
+import time
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import ParameterEvent
+from rcl_interfaces.srv import GetParameters, ListParameters
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from rclpy.parameter import parameter_value_to_python
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
+from rosgraph_msgs.msg import Clock as ClockMessage
+from std_srvs.srv import Trigger
+
+from hmsa_ros import __version__
+from hmsa_ros.bag.definitions import message_definition, type_hash
+from hmsa_ros.bag.qos import Qos
+from hmsa_ros.bag.recording import Limits, lost_by_topic, Message, Recording, Status
+from hmsa_ros.bag.writer import BagWriter, parse_custom_data, PRESETS, Topic
+from hmsa_ros.errors import BadInputError, BagError
+from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.capture import Capture, RawSubscription, SimulatedTime, Taken
+from hmsa_ros.nodes.parameters import declare, ParameterSpec
+from hmsa_ros.nodes.qos import stored, subscription
+from hmsa_ros.nodes.runner import run
+
+DIAGNOSTICS_SECONDS = 1.0
+# Setpoints kept for the bag's custom data.
+MAX_SETPOINTS = 1000
+
+PARAMETERS = (
+    ParameterSpec(
+        'storage.uri', '',
+        'Folder of the bag, which must not exist; empty for a name with date and time.'),
+    ParameterSpec(
+        'storage.storage_preset_profile', 'none',
+        'Compression: none, fastwrite (none, without checksums), lz4, zstd_fast or zstd_small.',
+        choices=tuple(PRESETS)),
+    ParameterSpec(
+        'storage.max_bagfile_size', 0,
+        'Size at which a new file is begun, 0 for never, else at least 1024.', 'B', 0),
+    ParameterSpec(
+        'storage.max_bagfile_duration', 0,
+        'Time span at which a new file is begun, 0 for never.', 's', 0),
+    ParameterSpec(
+        'storage.max_cache_size', 100 * 2**20,
+        'Memory for messages that wait to be written; what comes on top is counted as lost.',
+        'B', 2**16),
+    ParameterSpec(
+        'storage.custom_data', [], 'Pairs key=value that are stored in the bag.'),
+    ParameterSpec(
+        'storage.flush_period', 0.5,
+        'Time after which at the latest a message survives the end of the process.', 's',
+        0.01, 3600.0),
+    ParameterSpec(
+        'storage.fsync', False,
+        'Whether each flush waits for the disk, so that messages survive a power cut too.'),
+    ParameterSpec(
+        'record.topics', [],
+        'Topics to record; with no selection at all, every topic is recorded.'),
+    ParameterSpec('record.all_topics', False, 'Whether to record every topic.'),
+    ParameterSpec(
+        'record.regex', '', 'Topics in which this regular expression is found are recorded.'),
+    ParameterSpec('record.exclude_topics', [], 'Topics not to record.'),
+    ParameterSpec(
+        'record.exclude_regex', '',
+        'Topics in which this regular expression is found are not recorded.'),
+    ParameterSpec('record.start_paused', False, 'Whether to begin paused.'),
+    ParameterSpec(
+        'record.topic_polling_interval.sec', 0, 'Whole seconds between looks for new topics.',
+        's', 0, 3600),
+    ParameterSpec(
+        'record.topic_polling_interval.nsec', 100_000_000, 'Nanoseconds on top of them.', 'ns',
+        0, 999_999_999),
+    ParameterSpec(
+        'record.queue_depth', 10_000,
+        'Messages of a topic that the middleware keeps until they are taken.', '', 1, 1_000_000),
+    ParameterSpec(
+        'record.snapshot_mode', False,
+        'Whether messages are only kept in memory until ~/snapshot is called.'),
+    ParameterSpec(
+        'record.snapshot_duration', 10.0, 'Time that a snapshot reaches back.', 's', 1e-3, 1e6),
+    ParameterSpec(
+        'experiment.nodes', [interface.PLANNER, interface.PLANT],
+        'Nodes whose parameters are stored in the bag.'),
+)
+
+
+@dataclass(frozen=True)
+class Selection:
+    """
+    Which topics to record.
+
+    Attributes
+    ----------
+    topics, exclude_topics : tuple of str
+        Full names.
+    all_topics : bool
+        Whether every topic that is not hidden is wanted.
+    regex, exclude_regex : str
+        Regular expressions, empty for none.
+
+    """
+
+    topics: tuple[str, ...] = ()
+    all_topics: bool = False
+    regex: str = ''
+    exclude_topics: tuple[str, ...] = ()
+    exclude_regex: str = ''
+
+    def __post_init__(self) -> None:
+        for name, pattern in (
+                ('record.regex', self.regex), ('record.exclude_regex', self.exclude_regex)):
+            try:
+                re.compile(pattern)
+            except re.error as error:
+                raise BadInputError(
+                    f'parameter {name} is {pattern!r}: expected a regular expression '
+                    f'({error})') from error
+
+    def wants(self, topic: str) -> bool:
+        """
+        Return whether a topic is to be recorded.
+
+        Parameters
+        ----------
+        topic : str
+            Full name.
+
+        Returns
+        -------
+        bool
+            A topic named in ``topics`` is wanted unless it is excluded.
+
+        """
+        if topic in self.exclude_topics or (
+                self.exclude_regex and re.search(self.exclude_regex, topic)):
+            return False
+        if topic in self.topics:
+            return True
+        if topic_or_service_is_hidden(topic):
+            return False
+        if self.regex and re.search(self.regex, topic):
+            return True
+        return self.all_topics or not (self.topics or self.regex)
+
+
+@dataclass
+class _Recorded:
+    """A topic being recorded: its subscription and what is known of its publishers."""
+
+    name: str
+    type: str
+    number: int
+    qos: QoSProfile
+    offered: tuple[Qos, ...]
+    last: dict[bytes, int] = field(default_factory=dict)
+    received: int = 0
+    missed: int = 0
+
+
+class Recorder(Node):
+    """
+    ROS 2 node that records.
+
+    Raises
+    ------
+    BadInputError
+        If a parameter cannot be used or the bag cannot be made.
+
+    """
+
+    def __init__(self) -> None:
+        super().__init__(interface.RECORDER)
+        self._parameters_in = declare(self, PARAMETERS)
+        values = self._parameters_in
+        self._selection = Selection(
+            tuple(map(self._full_name, values['record.topics'])), values['record.all_topics'],
+            values['record.regex'], tuple(map(self._full_name, values['record.exclude_topics'])),
+            values['record.exclude_regex'])
+        self._topics: dict[str, _Recorded] = {}
+        self._refused: dict[str, str] = {}
+        self._paused = values['record.start_paused']
+        self._sim_time = SimulatedTime() if self.get_parameter('use_sim_time').value else None
+        self._experiment: dict[str, str] = {'hmsa_ros.version': __version__}
+        self._setpoints: list[dict[str, Any]] = []
+        self._said_ready = False
+        self._closed = False
+        limits = Limits(
+            values['storage.flush_period'], values['storage.max_bagfile_size'],
+            values['storage.max_bagfile_duration'] * 10**9, values['storage.max_cache_size'],
+            round(values['record.snapshot_duration'] * 1e9)
+            if values['record.snapshot_mode'] else 0)
+        writer = BagWriter(
+            values['storage.uri'] or datetime.datetime.now().strftime(
+                'hmsa_%Y_%m_%d-%H_%M_%S'),
+            preset=values['storage.storage_preset_profile'],
+            custom_data={**self._experiment, **parse_custom_data(
+                values['storage.custom_data'])},
+            ros_distro=os.environ.get('ROS_DISTRO', 'jazzy'), fsync=values['storage.fsync'])
+        self.folder: Path = writer.folder
+        self._recording = Recording(writer, limits, self._report)
+        self._capture = Capture(self, self._deliver)
+        self._start()
+
+    def _start(self) -> None:
+        """Create what the node offers and start receiving."""
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        if self._sim_time is not None:
+            self._clock_subscription = RawSubscription(
+                self, ClockMessage, interface.CLOCK_TOPIC.name,
+                QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1000,
+                           reliability=ReliabilityPolicy.BEST_EFFORT))
+            self._capture.add(self._sim_time, self._clock_subscription)
+        self._capture.start()
+        self._diagnostics = self.create_publisher(
+            interface.DIAGNOSTICS.type, interface.DIAGNOSTICS.name, interface.DIAGNOSTICS.qos)
+        for name, callback in (
+                (interface.PAUSE.name, self._on_pause), (interface.RESUME.name, self._on_resume),
+                (interface.IS_PAUSED.name, self._on_is_paused),
+                (interface.SPLIT_BAGFILE.name, self._on_split),
+                ('~/snapshot', self._on_snapshot)):
+            self.create_service(Trigger, name, callback)
+        for topic in (interface.JOINT_TRAJECTORY, interface.SETPOINT):
+            name = interface.from_outside(topic.name, interface.PLANNER)
+            self.create_subscription(
+                topic.type, name, lambda message, name=name: self._on_setpoint(name, message),
+                topic.qos)
+        self._followed = {
+            self._full_name(name): _Followed(self, self._full_name(name))
+            for name in self._parameters_in['experiment.nodes']}
+        self.create_subscription(
+            ParameterEvent, '/parameter_events', self._on_parameter_event, 100)
+        interval = (self._parameters_in['record.topic_polling_interval.sec']
+                    + self._parameters_in['record.topic_polling_interval.nsec'] * 1e-9)
+        self.create_timer(max(interval, 1e-3), self._on_poll, clock=steady)
+        self.create_timer(DIAGNOSTICS_SECONDS, self._on_diagnostics, clock=steady)
+        self.get_logger().info(f'recording to {self.folder}')
+
+    def _full_name(self, name: str) -> str:
+        """Return the full, remapped name of a topic or node."""
+        resolved: str = self.resolve_topic_name(name)
+        return resolved
+
+    # Discovery -------------------------------------------------------------------------------
+
+    def _on_poll(self) -> None:
+        """Look for new topics, new publishers, and parameters of the experiment's nodes."""
+        if self._capture.error is not None:
+            error, self._capture.error = self._capture.error, None
+            self.get_logger().error(f'receiving has ended: {error!r}')
+        if self._sim_time is not None and not self._sim_time.started:
+            return
+        for name, types in self.get_topic_names_and_types():
+            if self._selection.wants(name):
+                self._look_at(name, types)
+        self._say_ready()
+        for followed in self._followed.values():
+            followed.poll(self._note)
+
+    def _look_at(self, name: str, types: Sequence[str]) -> None:
+        """Subscribe to a topic, or again if its publishers ask for it."""
+        known = self._topics.get(name)
+        infos = [info for info in self.get_publishers_info_by_topic(name)
+                 if known is None or info.topic_type == known.type]
+        if not infos:
+            return
+        offered = tuple(sorted((stored(info.qos_profile) for info in infos), key=repr))
+        if known is not None and offered == known.offered:
+            return
+        type_name = known.type if known is not None else infos[0].topic_type
+        if len(types) > 1 and known is None:
+            self._refuse(f'{name}#', f'topic {name} has the types {", ".join(types)}: '
+                                     f'{type_name} is recorded')
+        try:
+            message_type = _message_class(type_name)
+        except BagError as error:
+            self._refuse(name, f'topic {name} is not recorded: {error}')
+            return
+        hashes = {str(info.topic_type_hash) for info in infos
+                  if info.topic_type == type_name}
+        number = self._recording.add_topic(self._describe(name, type_name, offered, hashes))
+        qos = subscription(offered, self._parameters_in['record.queue_depth'])
+        if known is None:
+            recorded = _Recorded(name, type_name, number, qos, offered)
+            self._topics[name] = recorded
+            self._capture.add(recorded, RawSubscription(self, message_type, name, qos))
+            self.get_logger().info(f'subscribed to {name} ({type_name})')
+            return
+        known.offered = offered
+        if (qos.reliability, qos.durability) != (known.qos.reliability, known.qos.durability):
+            known.qos = qos
+            self._capture.replace(known, RawSubscription(self, message_type, name, qos))
+            self.get_logger().info(
+                f'subscribed to {name} again, as its publishers offer another quality of service')
+
+    def _describe(
+            self, name: str, type_name: str, offered: tuple[Qos, ...],
+            hashes: Iterable[str]) -> Topic:
+        """Return what the bag is told of a topic."""
+        try:
+            encoding, definition = message_definition(type_name)
+        except BagError as error:
+            self._refuse(f'{name}!', f'topic {name} is recorded without definition: {error}')
+            encoding, definition = '', ''
+        known = {text for text in hashes if text.startswith('RIHS01_')}
+        return Topic(
+            name, type_name, definition, encoding, offered,
+            known.pop() if len(known) == 1 else '' if known else type_hash(type_name))
+
+    def _refuse(self, key: str, sentence: str) -> None:
+        """Warn once."""
+        if key not in self._refused:
+            self._refused[key] = sentence
+            self.get_logger().warning(sentence)
+
+    def _wanted_count(self) -> int:
+        """Return how many topics are waited for, as far as it is known."""
+        missing = [name for name in self._selection.topics if name not in self._topics]
+        return len(self._topics) + len(missing)
+
+    def _say_ready(self) -> None:
+        """Tell, once, that every topic asked for by name is subscribed to."""
+        if not self._said_ready and self._selection.topics \
+                and self._wanted_count() == len(self._topics):
+            self._said_ready = True
+            self.get_logger().info(
+                f'ready: subscribed to all {len(self._selection.topics)} topics')
+
+    # Messages, in the capture thread ---------------------------------------------------------
+
+    def _deliver(self, taken: Sequence[tuple[Any, list[Taken]]]) -> None:
+        """Stamp, count and pass on what has been received."""
+        clock = self._sim_time
+        for key, messages in taken:
+            if key is clock and clock is not None:
+                for message in messages:
+                    stamp = deserialize_message(message.data, ClockMessage).clock
+                    clock.add(message.received_ns, stamp.sec * 10**9 + stamp.nanosec)
+            else:
+                self._take_in(key, messages)
+
+    def _take_in(self, topic: _Recorded, messages: list[Taken]) -> None:
+        """Count gaps and hand the messages to the writer."""
+        clock, number, last = self._sim_time, topic.number, topic.last
+        batch: list[Message] = []
+        size = 0
+        paused = self._paused
+        for source, received, sequence, publisher, data in messages:
+            before = last.get(publisher)
+            if before is not None:
+                if sequence <= before:
+                    continue  # seen already, through the subscription this one replaces
+                if not paused:
+                    topic.missed += sequence - before - 1
+            last[publisher] = sequence
+            if paused:
+                continue
+            # Not every middleware stamps on reception.
+            stamp = received or time.time_ns()
+            batch.append((number, stamp if clock is None else clock.at(stamp), source, sequence,
+                          data))
+            size += len(data)
+        topic.received += len(batch)
+        if batch:
+            self._recording.put(batch, size)
+
+    # Experiment ------------------------------------------------------------------------------
+
+    def _note(self, values: Mapping[str, str]) -> None:
+        """Store something about the experiment."""
+        new = {key: value for key, value in values.items()
+               if self._experiment.get(key) != value}
+        if new:
+            self._experiment.update(new)
+            self._recording.note(new)
+
+    def _on_setpoint(self, name: str, message: Any) -> None:
+        """Store a setpoint or a sequence of them."""
+        entry: dict[str, Any] = {'topic': name, 'received': self.get_clock().now().nanoseconds}
+        if hasattr(message, 'points'):
+            stamp = message.header.stamp
+            entry['stamp'] = stamp.sec * 10**9 + stamp.nanosec
+            entry['points'] = [
+                [list(point.positions),
+                 point.time_from_start.sec + point.time_from_start.nanosec * 1e-9]
+                for point in message.points]
+        else:
+            entry['stretch'] = message.data
+        self._setpoints = [*self._setpoints, entry][-MAX_SETPOINTS:]
+        self._note({'setpoints': json.dumps(self._setpoints)})
+
+    def _on_parameter_event(self, event: ParameterEvent) -> None:
+        """Store a change of a parameter of the experiment's nodes."""
+        followed = self._followed.get(event.node)
+        if followed is not None:
+            self._note(followed.texts(
+                (parameter.name, parameter.value)
+                for parameter in [*event.new_parameters, *event.changed_parameters]))
+
+    # Services and diagnostics ----------------------------------------------------------------
+
+    def _on_pause(
+            self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Stop recording for a while."""
+        return self._set_paused(True, response)
+
+    def _on_resume(
+            self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Go on recording."""
+        return self._set_paused(False, response)
+
+    def _set_paused(self, paused: bool, response: Trigger.Response) -> Trigger.Response:
+        """Pause or go on."""
+        response.success = True
+        state = 'paused' if paused else 'recording'
+        response.message = state if self._paused != paused else f'already {state}'
+        self._paused = paused
+        return response
+
+    def _on_is_paused(
+            self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Tell by ``success`` whether recording is paused."""
+        response.success = self._paused
+        response.message = 'paused' if self._paused else 'recording'
+        return response
+
+    def _on_split(
+            self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Go on in a new file."""
+        try:
+            response.message, response.success = self._recording.split(), True
+        except BagError as error:
+            response.message = str(error)
+        return response
+
+    def _on_snapshot(
+            self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Write what is kept in memory."""
+        try:
+            response.message, response.success = self._recording.snapshot(), True
+        except BagError as error:
+            response.message = str(error)
+        return response
+
+    def _lost(self, status: Status) -> dict[str, int]:
+        """Return the number of lost messages by topic."""
+        missed = {topic.name: topic.missed for topic in list(self._topics.values())}
+        return lost_by_topic(missed, status.overflowed, status.dropped)
+
+    def _on_diagnostics(self) -> None:
+        """Publish the state."""
+        status = self._recording.status()
+        lost = self._lost(status)
+        total = sum(lost.values())
+        state = ('paused' if self._paused else 'waiting for /clock'
+                 if self._sim_time is not None and not self._sim_time.started else 'recording')
+        if status.error:
+            level, text = DiagnosticStatus.ERROR, status.error
+        elif total:
+            level, text = DiagnosticStatus.WARN, f'{state}, {total} messages lost'
+        else:
+            level, text = DiagnosticStatus.OK, state
+        values = {
+            'bag': str(self.folder),
+            'file': status.file,
+            'state': state,
+            'subscribed': f'{len(self._topics)}/{self._wanted_count()}',
+            'received': str(sum(topic.received for topic in self._topics.values())),
+            'written': str(sum(status.written.values())),
+            'lost': str(total),
+            'queued_bytes': str(status.queued_bytes),
+            **{f'lost.{name}': str(count) for name, count in lost.items() if count},
+        }
+        message = DiagnosticArray()
+        message.header.stamp = self.get_clock().now().to_msg()
+        message.status = [DiagnosticStatus(
+            level=level, name=f'{self.get_fully_qualified_name().lstrip("/")}: bag',
+            message=text, hardware_id='',
+            values=[KeyValue(key=key, value=value) for key, value in values.items()])]
+        self._diagnostics.publish(message)
+
+    def _report(self, sentence: str, failure: bool) -> None:
+        """Log what happened to the writer."""
+        if failure:
+            self.get_logger().error(sentence)
+        else:
+            self.get_logger().warning(sentence)
+
+    # End -------------------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """Record what has arrived, close the bag and print the counts."""
+        if self._closed:
+            return
+        self._closed = True
+        self._capture.stop()
+        status = self._recording.close(lambda last: {
+            'lost': json.dumps({
+                **dict.fromkeys(self._topics, 0), **self._lost(last)})})
+        lost = self._lost(status)
+        written = sum(status.written.values())
+        print(f'hmsa recorder: {written} messages of {len(self._topics)} topics in '
+              f'{self.folder}, {sum(lost.values())} lost', flush=True)
+        for name, count in sorted(lost.items()):
+            if count:
+                print(f'hmsa recorder: lost {count} of {name}', flush=True)
+        if status.error:
+            self.failure = BagError(status.error)
+
+
+class _Followed:
+    """
+    A node whose parameters go into the bag.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Node that asks.
+    name : str
+        Full name of the node that is asked.
+
+    """
+
+    def __init__(self, node: Node, name: str) -> None:
+        self._prefix = name.rsplit('/', 1)[-1]
+        self._list = node.create_client(ListParameters, f'{name}/list_parameters')
+        self._get = node.create_client(GetParameters, f'{name}/get_parameters')
+        self._future: Any = None
+        self._names: list[str] = []
+        self._done = False
+
+    def poll(self, note: Any) -> None:
+        """
+        Take the next step towards the node's parameters, if it is there.
+
+        Parameters
+        ----------
+        note : callable
+            Takes the parameters as custom data.
+
+        """
+        if self._done:
+            # Asked again when it comes back, perhaps with other parameters.
+            self._done = bool(self._list.service_is_ready())
+        elif self._future is None:
+            if self._list.service_is_ready() and self._get.service_is_ready():
+                self._future = self._list.call_async(ListParameters.Request())
+        elif self._future.done():
+            answer, self._future = self._future.result(), None
+            if hasattr(answer, 'result'):
+                self._names = list(answer.result.names)
+                self._future = self._get.call_async(GetParameters.Request(names=self._names))
+            else:
+                self._done = True
+                note(self.texts(zip(self._names, answer.values, strict=False)))
+        elif not self._list.service_is_ready():
+            self._future = None
+
+    def texts(self, values: Iterable[tuple[str, Any]]) -> dict[str, str]:
+        """
+        Return parameters as custom data.
+
+        Parameters
+        ----------
+        values : iterable of (str, rcl_interfaces.msg.ParameterValue)
+            Names and values.
+
+        Returns
+        -------
+        dict of str to str
+            Node name, dot and parameter name; the value as JSON.
+
+        """
+        return {f'{self._prefix}.{name}': json.dumps(
+            parameter_value_to_python(value), default=list) for name, value in values}
+
+
+def _message_class(type_name: str) -> type[Any]:
+    """Return the class of a message type, or raise if its package is not installed."""
+    parts = type_name.split('/')
+    try:
+        package, folder, name = parts
+        message_class: type[Any] = getattr(import_module(f'{package}.{folder}'), name)
+    except (ValueError, ImportError, AttributeError) as error:
+        raise BagError(
+            f'message type {type_name} is not installed: expected its Python package; source '
+            'its workspace') from error
+    return message_class
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """
+    Run the recorder.
+
+    Parameters
+    ----------
+    args : sequence of str, optional
+        Command-line arguments; default ``sys.argv[1:]``.
+
+    Returns
+    -------
+    int
+        Exit status.
+
+    """
+    return run(Recorder, args)
