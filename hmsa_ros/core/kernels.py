@@ -42,8 +42,12 @@ _AT_REST = 1e-12
 # Sign of the deviation is decided by the linearised motion below this share of the move.
 _LINEAR = 1e-6
 _MAX_STEPS = 200_000
+# One swing takes tens of steps, a creep into an equilibrium thousands.
+_MAX_TURN_STEPS = 20_000
 _MAX_ITERATIONS = 80
 _COARSE = 1e-5
+_FARTHEST = 1e3
+_NEWTON_PASSES = 8
 
 
 def work_space() -> NDArray[np.float64]:
@@ -254,7 +258,7 @@ def turning_point(k, l, v, direction, beta, move, zeta, c1, i_j, rtol):  # noqa:
     t = 0.0
     h = _first_step(l, v, beta, zeta, c1, i_j, rtol)
     armed = direction * v > 0.0
-    for _ in range(_MAX_STEPS):
+    for _ in range(_MAX_TURN_STEPS):
         new_l, new_v, new_s, new_r, error = _step(
             k, l, v, s, r, beta, 0.0, 1.0, 0.0, h, zeta, c1, i_j, rtol)
         if not error <= 1.0:
@@ -372,14 +376,16 @@ def _guess(l, v, target, direction, beta_1, zeta, c1, i_j):  # noqa: E741
 
 
 @njit(cache=True, error_model='numpy')
-def shoot(k, l, v, target, direction, zeta, c1, i_j, rtol):  # noqa: E741
+def shoot(
+        k, l, v, target, direction, beta_min, beta_max, zeta, c1, i_j, rtol):  # noqa: E741
     """
     Find the load whose turning point in a direction is the target.
 
     Newton on ``d = direction * (beta_1 - beta_p) > 0``, kept inside a bracket: at d = 0 the
     motion overshoots the target, at a large d it stops short. The difference is the unknown
     because it falls below the rounding of beta_p itself near critical damping. The first
-    passes are coarse; the last one is at ``rtol``.
+    passes are coarse; the last one is at ``rtol``. The search ends at the admissible loads, or
+    far from the target's own where they are infinite.
 
     Returns status, beta_p, tau_p, beta_1 and the number of passes.
     """
@@ -392,7 +398,11 @@ def shoot(k, l, v, target, direction, zeta, c1, i_j, rtol):  # noqa: E741
         high = direction * (beta_1 - elastic_force(l, i_j))
         if not high > 0.0:
             return NO_TWO_STEP, math.nan, math.nan, beta_1, 0
-    top = 1e6 * (1.0 + abs(beta_1))
+    top = direction * (beta_1 - (beta_min if direction > 0.0 else beta_max))
+    if not top < math.inf:
+        top = _FARTHEST * (1.0 + abs(beta_1))
+    # From rest beta_p lies between the two holding loads: it is found there, inside or not.
+    top = max(top, high) if high < math.inf else top
     d = _guess(l, v, target, direction, beta_1, zeta, c1, i_j)
     if not low < d < min(high, top):
         d = 0.5 * high if high < math.inf else 1.0
@@ -408,12 +418,17 @@ def shoot(k, l, v, target, direction, zeta, c1, i_j, rtol):  # noqa: E741
         if status == NO_TURN:
             high = d
         else:
-            if excess > 0.0:
-                low = d
-            else:
-                high = d
+            # What the tolerance of this pass cannot tell apart must not narrow the bracket.
+            if abs(excess) > 1e3 * tolerance * (1.0 + abs(end)):
+                if excess > 0.0:
+                    low = max(low, d)
+                else:
+                    high = min(high, d)
             change = excess / s
         new = d + change
+        if high == math.inf and iteration > _NEWTON_PASSES:
+            # Newton creeps along an excess that never ends: stride out to the bound.
+            new = max(new, 4.0 * d)
         if not low < new < high:
             if status == DONE and tolerance <= rtol and abs(change) <= 1e-13 * d:
                 new = d
@@ -423,8 +438,6 @@ def shoot(k, l, v, target, direction, zeta, c1, i_j, rtol):  # noqa: E741
                 new = 0.125 * high
             else:
                 new = 0.5 * (low + high)
-            if new > top:
-                return NO_TWO_STEP, math.nan, math.nan, beta_1, iteration
             if new < 1e-15 * (abs(beta_1) + high) and low == 0.0:
                 return INDISTINGUISHABLE, math.nan, math.nan, beta_1, iteration
             relative = abs(new - d) / d
@@ -437,6 +450,8 @@ def shoot(k, l, v, target, direction, zeta, c1, i_j, rtol):  # noqa: E741
             return TWO_STEP, beta - direction * change, t - dt_dbeta * direction * change, \
                 beta_1, iteration
         d = new
+        if d > top:
+            return NO_TWO_STEP, math.nan, math.nan, beta_1, iteration
         if relative < 0.1:
             # What quadratic convergence leaves for the next pass to resolve.
             tolerance = max(rtol, min(tolerance, 1e-2 * relative * relative))
@@ -468,11 +483,13 @@ def two_step(k, l, v, target, zeta, c1, i_j, beta_min, beta_max, rtol, hold):  #
     up = 1.0 if target > l else -1.0
     if not crosses(k, l, v, target, zeta, c1, i_j, max(rtol, 1e-10)):
         return TOO_DAMPED, math.nan, math.nan, beta_1, 0
-    status, beta_p, tau_p, _, passes = shoot(k, l, v, target, up, zeta, c1, i_j, rtol)
+    status, beta_p, tau_p, _, passes = shoot(
+        k, l, v, target, up, beta_min, beta_max, zeta, c1, i_j, rtol)
     if v == 0.0:
         return status, beta_p, tau_p, beta_1, passes
     usable = status == TWO_STEP and beta_min <= beta_p <= beta_max
-    other, beta_q, tau_q, _, more = shoot(k, l, v, target, -up, zeta, c1, i_j, rtol)
+    other, beta_q, tau_q, _, more = shoot(
+        k, l, v, target, -up, beta_min, beta_max, zeta, c1, i_j, rtol)
     passes += more
     if other == TWO_STEP and beta_min <= beta_q <= beta_max and (
             not usable or tau_q < tau_p):
@@ -533,3 +550,36 @@ def trajectory(
         stretch[i] = l
         rates[i] = v
     return DONE
+
+
+@njit(cache=True, error_model='numpy')
+def respond(
+        l, v, durations, loads, slopes, d_durations, d_loads, zeta, c1, i_j, rtol,  # noqa: E741
+        jacobian):
+    """
+    Follow a piecewise linear load and differentiate the end by two parameters.
+
+    Piece m lasts ``durations[m]`` and applies ``loads[m] + slopes[m] t``; ``d_durations`` and
+    ``d_loads`` (m, 2) are the derivatives by the parameters. ``jacobian`` (2, 2) takes the
+    derivatives of stretch (row 0) and rate (row 1). Returns status and state.
+    """
+    k = np.empty((STAGES, 4))
+    end_l, end_v = l, v
+    for j in range(2):
+        end_l, end_v = l, v
+        s = 0.0
+        r = 0.0
+        for m in range(durations.size):
+            status, end_l, end_v, s, r, _ = advance(
+                k, end_l, end_v, s, r, loads[m], slopes[m], d_loads[m, j], 0.0, durations[m],
+                zeta, c1, i_j, rtol, 0.0)
+            if status != DONE:
+                return status, end_l, end_v
+            _, a, _, _ = _derivative(
+                end_l, end_v, 0.0, 0.0, loads[m] + slopes[m] * durations[m], 0.0, zeta, c1,
+                i_j)
+            s += end_v * d_durations[m, j]
+            r += a * d_durations[m, j]
+        jacobian[0, j] = s
+        jacobian[1, j] = r
+    return DONE, end_l, end_v

@@ -11,7 +11,7 @@ from hmsa_ros.errors import BadInputError
 @dataclass(frozen=True)
 class State:
     """
-    Stretch and stretch rate (nondimensional time).
+    Stretch, stretch rate and the load in force, nondimensional.
 
     Attributes
     ----------
@@ -19,11 +19,15 @@ class State:
         Principal stretch.
     rate : float
         Per unit of nondimensional time.
+    load : float
+        Signed load beta in force; NaN for the one that holds the stretch. It matters where a
+        slew limit makes the next level start from it.
 
     """
 
     stretch: float
     rate: float = 0.0
+    load: float = math.nan
 
 
 @dataclass(frozen=True)

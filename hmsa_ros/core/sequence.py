@@ -4,11 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
-from hmsa_ros.core import kernels
+from hmsa_ros.core.delivery import Delivery, IDEAL, pieces
+from hmsa_ros.core.model import elastic_force
 from hmsa_ros.core.moves import Level, Limits, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.shapers import get_shaper
-from hmsa_ros.core.simulation import check_stretch, RTOL
+from hmsa_ros.core.shapers.request import Request
+from hmsa_ros.core.simulation import check_stretch, simulate
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.units import Units
 from hmsa_ros.errors import BadInputError
@@ -78,8 +80,8 @@ class Segment:
 def plan_sequence(
         setpoints: Sequence[Setpoint], material: NondimensionalParameters, *,
         start: State | None = None, shaper: str = 'two_step', limits: Limits | None = None,
-        units: Units | None = None, short_spell: str = 'refuse',
-        resolution: float = 0.0) -> tuple[Segment, ...]:
+        delivery: Delivery = IDEAL, order: int = 2, units: Units | None = None,
+        short_spell: str = 'refuse', resolution: float = 0.0) -> tuple[Segment, ...]:
     """
     Plan a sequence of setpoints.
 
@@ -95,6 +97,11 @@ def plan_sequence(
         Name of a shaper.
     limits : Limits, optional
         Admissible loads; default none.
+    delivery : Delivery
+        How commands reach the coil; default at any time and at once. With a period, spans
+        must be multiples of it.
+    order : int
+        Of the robust shaper, at least 1.
     units : Units, optional
         For the messages; default nondimensional.
     short_spell : {'refuse', 'continue'}
@@ -130,8 +137,10 @@ def plan_sequence(
     begin = 0.0
     segments = []
     for setpoint in setpoints:
-        move = _on_grid(
-            shape(state, setpoint.stretch, material, limits, units), resolution)
+        move = _rounded(
+            shape(Request(
+                state, setpoint.stretch, material, limits, delivery, order, units)),
+            resolution)
         if setpoint.span < move.duration < math.inf:
             if short_spell == 'refuse':
                 raise RefusedError(
@@ -145,14 +154,14 @@ def plan_sequence(
                 f'the span {units.time_text(setpoint.span)} ends before stretch '
                 f'{setpoint.stretch:g} is reached, which takes '
                 f'{units.time_text(move.duration)}')
-        end = _follow(state, move, setpoint.span, material)
+        end = _follow(state, move, setpoint.span, material, delivery.slew)
         segments.append(Segment(setpoint, begin, state, end, move))
         begin += setpoint.span
         state = end
     return tuple(segments)
 
 
-def _on_grid(move: Move, resolution: float) -> Move:
+def _rounded(move: Move, resolution: float) -> Move:
     """Round a move's times to multiples of the resolution."""
     if resolution == 0.0:
         return move
@@ -166,14 +175,16 @@ def _on_grid(move: Move, resolution: float) -> Move:
 
 
 def _follow(
-        state: State, move: Move, span: float, material: NondimensionalParameters) -> State:
-    """Return the state at the end of the span, or at the last change of level."""
-    work = kernels.work_space()
-    stretch, rate = state.stretch, state.rate
-    ends = [level.time for level in move.levels[1:]]
-    ends.append(span if math.isfinite(span) else move.levels[-1].time)
-    for level, end in zip(move.levels, ends, strict=True):
-        _, stretch, rate, _, _, _ = kernels.advance(
-            work, stretch, rate, 0.0, 0.0, level.load, 0.0, 0.0, 0.0, end - level.time,
-            material.zeta, material.c1, 1.0 / material.j_lim, RTOL, 0.0)
-    return State(stretch, rate)
+        state: State, move: Move, span: float, material: NondimensionalParameters,
+        slew: float) -> State:
+    """Return the state at the end of the span, or where the last ramp ends."""
+    end = span
+    if math.isinf(span):
+        end = move.levels[-1].time if math.isinf(move.duration) else move.duration
+    load = state.load
+    if math.isnan(load):
+        load = float(elastic_force(state.stretch, material.j_lim))
+    switches, loads, slopes, last = pieces(move.levels, load, end, slew)
+    stretch, rate = simulate(
+        switches, loads, end, material, stretch=state.stretch, rate=state.rate, slopes=slopes)
+    return State(float(stretch[0]), float(rate[0]), last)

@@ -9,17 +9,21 @@ class Code(str, Enum):
     """
     What became of a move or a request; the value is what messages and files carry.
 
-    The first five are plans that can be carried out, the others refusals.
+    The first eight are plans that can be carried out, the others refusals.
     """
 
     TWO_STEP = 'two_step'
     STEP = 'step'
     HOLD = 'hold'
+    ROBUST = 'robust'
+    MINIMUM_TIME = 'minimum_time'
+    LINEAR = 'linear'
     TOO_DAMPED = 'too_damped'
     INDISTINGUISHABLE = 'indistinguishable'
 
     OUT_OF_RANGE = 'out_of_range'
     FLUX_LIMIT = 'flux_limit'
+    SLEW_LIMIT = 'slew_limit'
     SPELL_TOO_SHORT = 'spell_too_short'
     NO_TWO_STEP = 'no_two_step'
     NOT_CONVERGED = 'not_converged'

@@ -1,0 +1,115 @@
+"""
+How commands reach the coil: at any time or on a grid, in steps or in ramps.
+
+A command names a level. Ideal hardware takes it up at once; sampled hardware takes commands at
+multiples of a period only; an amplifier with a slew limit ramps to the level.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from hmsa_ros.core.model import Array
+from hmsa_ros.core.moves import Level
+from hmsa_ros.errors import BadInputError
+
+
+@dataclass(frozen=True)
+class Delivery:
+    """
+    Nondimensional properties of the hardware that carries the command.
+
+    Attributes
+    ----------
+    period : float
+        Commands take effect at multiples of this; 0 for any time.
+    slew : float
+        Largest change of the load per unit of time; infinite for steps.
+
+    Raises
+    ------
+    BadInputError
+        If a value is out of range.
+
+    """
+
+    period: float = 0.0
+    slew: float = math.inf
+
+    def __post_init__(self) -> None:
+        """Check both numbers."""
+        if not 0.0 <= self.period < math.inf:
+            raise BadInputError(
+                f'command period is {self.period:g}: expected a finite number of at least 0')
+        if not self.slew > 0.0:
+            raise BadInputError(f'slew limit is {self.slew:g}: expected a number above 0')
+
+    @property
+    def ideal(self) -> bool:
+        """Whether levels apply at any time and at once."""
+        return self.period == 0.0 and math.isinf(self.slew)
+
+    def ramp(self, change: float) -> float:
+        """
+        Return how long a change of level takes.
+
+        Parameters
+        ----------
+        change : float
+            Of the load, signed.
+
+        Returns
+        -------
+        float
+            0 without a slew limit.
+
+        """
+        return 0.0 if math.isinf(self.slew) else abs(change) / self.slew
+
+
+IDEAL = Delivery()
+
+
+def pieces(
+        levels: Sequence[Level], load: float, end: float,
+        slew: float) -> tuple[Array, Array, Array, float]:
+    """
+    Return the load that levels make, piece by piece.
+
+    Parameters
+    ----------
+    levels : sequence of Level
+        By time, the first at the start.
+    load : float
+        In force before the first level.
+    end : float
+        Time until which the load is wanted, not before the last level.
+    slew : float
+        Largest change of the load per unit of time; infinite for steps.
+
+    Returns
+    -------
+    switches, loads, slopes : ndarray, shape (m,)
+        From ``switches[i]`` on the load is ``loads[i] + slopes[i] (t - switches[i])``.
+    load : float
+        In force at the end.
+
+    """
+    rows: list[tuple[float, float, float]] = []
+    for number, level in enumerate(levels):
+        until = levels[number + 1].time if number + 1 < len(levels) else end
+        begin = level.time
+        if not math.isinf(slew) and level.load != load:
+            sign = math.copysign(1.0, level.load - load)
+            reached = begin + abs(level.load - load) / slew
+            rows.append((begin, load, sign * slew))
+            if reached > until:
+                load += sign * slew * (until - begin)
+                continue
+            begin = reached
+        load = level.load
+        rows.append((begin, load, 0.0))
+    switches, loads, slopes = np.array(rows).T
+    return switches, loads, slopes, load

@@ -1,0 +1,57 @@
+"""
+Shapers: ways to command one move, in a registry by name.
+
+A shaper takes a `Request` and answers with a `Move`, or refuses with a reason. Everything is
+nondimensional; `Units` only words the messages.
+"""
+
+from collections.abc import Callable
+
+from hmsa_ros.core.moves import Move
+from hmsa_ros.core.shapers.linear import ei, zv, zvd
+from hmsa_ros.core.shapers.minimum_time import minimum_time
+from hmsa_ros.core.shapers.request import Request
+from hmsa_ros.core.shapers.robust import robust
+from hmsa_ros.core.shapers.step import step
+from hmsa_ros.core.shapers.two_step import two_step
+from hmsa_ros.errors import BadInputError
+
+Shaper = Callable[[Request], Move]
+
+#: Shapers by name.
+SHAPERS: dict[str, Shaper] = {
+    'two_step': two_step,
+    'robust': robust,
+    'minimum_time': minimum_time,
+    'step': step,
+    'zv': zv,
+    'zvd': zvd,
+    'ei': ei,
+}
+
+
+def get_shaper(name: str) -> Shaper:
+    """
+    Return the shaper of a name.
+
+    Parameters
+    ----------
+    name : str
+        One of `SHAPERS`.
+
+    Returns
+    -------
+    callable
+        The shaper.
+
+    Raises
+    ------
+    BadInputError
+        If there is none of that name.
+
+    """
+    try:
+        return SHAPERS[name]
+    except KeyError:
+        raise BadInputError(
+            f'shaper {name!r} is unknown: expected one of {", ".join(SHAPERS)}') from None

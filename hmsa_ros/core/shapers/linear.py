@@ -1,0 +1,122 @@
+"""
+Linear input shapers, as references for comparison.
+
+ZV and ZVD (N. C. Singer, W. P. Seering, "Preshaping command inputs to reduce system
+vibration", J. Dyn. Syst. Meas. Control 112, 1990) and EI with 5 % tolerated vibration
+(W. E. Singhose, W. P. Seering, N. C. Singer, "Residual vibration reduction using vector
+diagrams to generate shaped inputs", J. Mech. Des. 116, 1994), designed for the motion
+linearised about the target. The actuator is not linear: they leave vibration, the more the
+larger the move.
+"""
+
+import math
+
+from hmsa_ros.core import kernels
+from hmsa_ros.core.moves import Level, Move
+from hmsa_ros.core.shapers.request import Request
+from hmsa_ros.core.status import Code
+
+_EI_TOLERANCE = 0.05
+
+
+def zv(request: Request) -> Move:
+    """
+    Two impulses, half a damped period apart.
+
+    Parameters
+    ----------
+    request : Request
+        The move.
+
+    Returns
+    -------
+    Move
+        Two levels.
+
+    Raises
+    ------
+    RefusedError
+        If the target lies outside the stretch limits or needs a load outside the limits.
+
+    """
+    return _shaped(request, (1.0, 1.0))
+
+
+def zvd(request: Request) -> Move:
+    """
+    Three impulses, a ZV shaper convolved with itself.
+
+    Parameters
+    ----------
+    request : Request
+        The move.
+
+    Returns
+    -------
+    Move
+        Three levels.
+
+    Raises
+    ------
+    RefusedError
+        If the target lies outside the stretch limits or needs a load outside the limits.
+
+    """
+    return _shaped(request, (1.0, 2.0, 1.0))
+
+
+def ei(request: Request) -> Move:
+    """
+    Three impulses, insensitive at the price of 5 % vibration at the design point.
+
+    The undamped amplitudes are weighted with the decay over half a period, as is usual for
+    light damping.
+
+    Parameters
+    ----------
+    request : Request
+        The move.
+
+    Returns
+    -------
+    Move
+        Three levels.
+
+    Raises
+    ------
+    RefusedError
+        If the target lies outside the stretch limits or needs a load outside the limits.
+
+    """
+    return _shaped(
+        request, (1.0 + _EI_TOLERANCE, 2.0 * (1.0 - _EI_TOLERANCE), 1.0 + _EI_TOLERANCE))
+
+
+def _shaped(request: Request, weights: tuple[float, ...]) -> Move:
+    """Shape the step with impulses half a damped period apart, decaying as the motion does."""
+    holding = request.holding_load()
+    material, target = request.material, request.target
+    i_j = 1.0 / material.j_lim
+    xi = material.zeta / kernels.critical_zeta(target, material.c1, i_j)
+    if xi >= 1.0:
+        return request.plain(
+            Code.TOO_DAMPED,
+            f'zeta {material.zeta:g} is above critical damping at stretch {target:g}: there is '
+            'no oscillation to shape for, the plain step is used')
+    frequency = math.sqrt(
+        kernels.elastic_stiffness(target, i_j) / ((target ** -3 + material.c1) / 6.0))
+    damped = math.sqrt(1.0 - xi * xi)
+    half_period = math.pi / (frequency * damped)
+    decay = math.exp(-math.pi * xi / damped)
+    impulses = [weight * decay ** i for i, weight in enumerate(weights)]
+    share = 0.0
+    levels = []
+    for i, impulse in enumerate(impulses):
+        share += impulse / sum(impulses)
+        time = i * half_period
+        if request.delivery.period > 0.0:
+            time = round(time / request.delivery.period) * request.delivery.period
+        levels.append(Level(time, request.load + share * (holding - request.load)))
+    levels[-1] = Level(levels[-1].time, holding)
+    request.check(levels)
+    return Move(Code.LINEAR, tuple(levels), levels[-1].time)

@@ -1,0 +1,191 @@
+"""The fastest command within the load limits: full push, full brake, hold."""
+
+import math
+
+import numpy as np
+from scipy.optimize import brentq
+
+from hmsa_ros.core import kernels
+from hmsa_ros.core.moves import Level, Move, State
+from hmsa_ros.core.shapers.request import Request
+from hmsa_ros.core.shooting import solve, Template
+from hmsa_ros.core.status import Code, RefusedError
+
+_RTOL = 1e-12
+_AT_REST = 1e-9
+_MOST_STEPS = 20_000
+
+
+def minimum_time(request: Request, reason: str = '') -> Move:
+    """
+    Push with the load limit on one side, brake with the other, then hold.
+
+    With bounded load the fastest transfer is bang-bang with one switch. It exists from any
+    state, moving ones and those above critical damping included, as long as the limits leave
+    room on both sides of the target's own load. Without limits, a push of twice the move's
+    change of load is used.
+
+    Parameters
+    ----------
+    request : Request
+        The move.
+    reason : str
+        Why it takes the place of another command.
+
+    Returns
+    -------
+    Move
+        Three levels.
+
+    Raises
+    ------
+    RefusedError
+        If the target lies outside the stretch limits, needs a load outside the limits, or the
+        limits leave no room.
+
+    """
+    holding = request.holding_load()
+    state, target = request.state, request.target
+    frequency = _frequency(request)
+    if abs(target - state.stretch) <= _AT_REST and abs(state.rate) <= _AT_REST * frequency:
+        return Move(Code.HOLD, (Level(0.0, holding),), 0.0)
+    least, most = _bounds(request, holding, frequency)
+    work = kernels.work_space()
+    direction = _direction(work, request, least, most)
+    push, brake = (most, least) if direction > 0.0 else (least, most)
+    pushing, braking = _durations(work, request, direction, push, brake)
+    delivery = request.delivery
+    if delivery.ideal:
+        levels = (Level(0.0, push), Level(pushing, brake), Level(pushing + braking, holding))
+        unknowns = [('time', 1), ('time', 2)]
+    elif delivery.period > 0.0:
+        # On the grid the durations are rounded up, which leaves the heights free.
+        period = delivery.period
+        first = max(1, math.ceil(pushing / period))
+        second = max(1, math.ceil(braking / period))
+        levels = (
+            Level(0.0, holding + (push - holding) * pushing / (first * period)),
+            Level(first * period, holding + (brake - holding) * braking / (second * period)),
+            Level((first + second) * period, holding))
+        unknowns = [('load', 0), ('load', 1)]
+    else:
+        up = delivery.ramp(push - request.load)
+        down = delivery.ramp(push - brake)
+        levels = (Level(0.0, push), Level(max(pushing, up), brake),
+                  Level(max(pushing, up) + max(braking, down), holding))
+        unknowns = [('time', 1), ('time', 2)]
+    found = solve(
+        Template.of(levels, unknowns), state, request.load, target, request.material,
+        delivery.slew)
+    if found is None:
+        raise RefusedError(
+            Code.NOT_CONVERGED,
+            f'no command of two levels within the limits was found from stretch '
+            f'{state.stretch:.6g} at rate {state.rate / request.units.time:.4g} to rest at '
+            f'{target:g}')
+    request.check(found[0])
+    return Move(Code.MINIMUM_TIME, *found, reason)
+
+
+def _frequency(request: Request) -> float:
+    i_j = 1.0 / request.material.j_lim
+    mass = (request.target ** -3 + request.material.c1) / 6.0
+    return math.sqrt(kernels.elastic_stiffness(request.target, i_j) / mass)
+
+
+def _bounds(request: Request, holding: float, frequency: float) -> tuple[float, float]:
+    """Return the loads to push and brake with: the limits, or twice the move's own change."""
+    state = request.state
+    change = abs(holding - kernels.elastic_force(state.stretch, 1.0 / request.material.j_lim))
+    mass = (state.stretch ** -3 + request.material.c1) / 6.0
+    room = 2.0 * (change + mass * abs(state.rate) * frequency)
+    least = max(request.limits.minimum, holding - room)
+    most = min(request.limits.maximum, holding + room)
+    if math.isfinite(request.limits.minimum):
+        least = request.limits.minimum
+    if math.isfinite(request.limits.maximum):
+        most = request.limits.maximum
+    if not least < holding < most:
+        raise RefusedError(
+            Code.FLUX_LIMIT,
+            f'stretch {request.target:g} is held by {request.units.load_text(holding)}, on the '
+            'limit itself: expected limits with room on both sides to push and to brake')
+    return least, most
+
+
+def _direction(
+        work: np.ndarray, request: Request, least: float, most: float) -> float:
+    """Return where to push: +1 if full braking would stop short of the target, seen upwards."""
+    state, material = request.state, request.material
+    stop = state.stretch
+    if state.rate != 0.0:
+        up = state.rate > 0.0
+        status, _, stop, _, _ = kernels.turning_point(
+            work, state.stretch, state.rate, 1.0 if up else -1.0, least if up else most, 1.0,
+            material.zeta, material.c1, 1.0 / material.j_lim, _RTOL)
+        if status != kernels.DONE:
+            stop = state.stretch
+    return 1.0 if request.target > stop else -1.0
+
+
+def _durations(
+        work: np.ndarray, request: Request, direction: float, push: float,
+        brake: float) -> tuple[float, float]:
+    """Find how long to push so that braking turns at the target, and how long that brakes."""
+    state, material, target = request.state, request.material, request.target
+    i_j = 1.0 / material.j_lim
+    constants = (material.zeta, material.c1, i_j)
+
+    def follow(start: State, time: float) -> State:
+        _, stretch, rate, _, _, _ = kernels.advance(
+            work, start.stretch, start.rate, 0.0, 0.0, push, 0.0, 0.0, 0.0, time, *constants,
+            _RTOL, 0.0)
+        return State(stretch, rate)
+
+    def turn(start: State) -> tuple[float, float]:
+        if direction * start.rate <= 0.0:
+            return 0.0, start.stretch
+        status, time, stretch, _, _ = kernels.turning_point(
+            work, start.stretch, start.rate, direction, brake, 1.0, *constants, _RTOL)
+        if status != kernels.DONE:
+            raise RefusedError(
+                Code.NOT_CONVERGED,
+                f'the motion towards stretch {target:g} does not come to a stop under '
+                f'{request.units.load_text(brake)}')
+        return time, stretch
+
+    begin = 0.0
+    here = state
+    if direction * state.rate < 0.0:
+        # Moving away: the push first has to bring it to a stop.
+        status, begin, stretch, _, _ = kernels.turning_point(
+            work, state.stretch, state.rate, -direction, push, 1.0, *constants, _RTOL)
+        if status == kernels.DONE:
+            here = State(stretch, 0.0)
+    stride = 0.02 / (_frequency(request) + material.zeta)
+    low = 0.0
+    high = stride
+    ahead = follow(here, high)
+    for _ in range(_MOST_STEPS):
+        if direction * (ahead.stretch - target) >= 0.0:
+            break
+        low = high
+        high += stride
+        ahead = follow(ahead, stride)
+        if direction * ahead.rate <= 0.0:
+            break
+    if direction * (ahead.stretch - target) < 0.0:
+        raise RefusedError(
+            Code.FLUX_LIMIT,
+            f'stretch {target:g} is not reached under {request.units.load_text(push)}: '
+            'expected wider flux density limits')
+
+    def excess(time: float) -> float:
+        return direction * (turn(follow(here, time))[1] - target)
+
+    if excess(0.0) >= 0.0:
+        low = high = 0.0
+    elif excess(low) > 0.0:
+        low = 0.0
+    pushing = high if low == high else float(brentq(excess, low, high, xtol=1e-14, rtol=1e-13))
+    return begin + pushing, turn(follow(here, pushing))[0]

@@ -1,0 +1,131 @@
+"""What a shaper is asked for, and the checks that all shapers share."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+import math
+
+from hmsa_ros.core import kernels
+from hmsa_ros.core.delivery import Delivery, IDEAL
+from hmsa_ros.core.moves import Level, Limits, Move, State
+from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.core.simulation import check_stretch
+from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.core.units import Units
+from hmsa_ros.errors import BadInputError
+
+
+@dataclass(frozen=True)
+class Request:
+    """
+    One move to be commanded.
+
+    Attributes
+    ----------
+    state : State
+        At the start, moving or at rest.
+    target : float
+        Stretch to come to rest at.
+    material : NondimensionalParameters
+        zeta, J_lim and c1.
+    limits : Limits
+        Admissible loads.
+    delivery : Delivery
+        How commands reach the coil.
+    order : int
+        Number of chained two-step commands of the robust shaper, at least 1.
+    units : Units
+        For the messages.
+
+    """
+
+    state: State
+    target: float
+    material: NondimensionalParameters
+    limits: Limits = field(default_factory=Limits)
+    delivery: Delivery = IDEAL
+    order: int = 2
+    units: Units = field(default_factory=Units)
+
+    @property
+    def load(self) -> float:
+        """Load in force before the move."""
+        if math.isfinite(self.state.load):
+            return self.state.load
+        return float(kernels.elastic_force(self.state.stretch, 1.0 / self.material.j_lim))
+
+    def to(self, target: float) -> 'Request':
+        """
+        Return the same request for another target.
+
+        Parameters
+        ----------
+        target : float
+            Stretch.
+
+        Returns
+        -------
+        Request
+            Otherwise unchanged.
+
+        """
+        return replace(self, target=target)
+
+    def holding_load(self) -> float:
+        """
+        Check the target and return the load that holds it, beta_1.
+
+        Returns
+        -------
+        float
+            Signed load.
+
+        Raises
+        ------
+        RefusedError
+            If the target lies outside the stretch limits or beta_1 outside the load limits.
+
+        """
+        try:
+            check_stretch(self.target, self.material.j_lim, 'target stretch')
+        except BadInputError as error:
+            raise RefusedError(Code.OUT_OF_RANGE, str(error)) from error
+        load = float(kernels.elastic_force(self.target, 1.0 / self.material.j_lim))
+        self.limits.check(load, self.target, self.units)
+        return load
+
+    def check(self, levels: Sequence[Level]) -> None:
+        """
+        Refuse levels outside the load limits.
+
+        Parameters
+        ----------
+        levels : sequence of Level
+            To be checked.
+
+        Raises
+        ------
+        RefusedError
+            With `Code.FLUX_LIMIT` and the value that is needed.
+
+        """
+        for level in levels:
+            self.limits.check(level.load, self.target, self.units)
+
+    def plain(self, code: Code, reason: str) -> Move:
+        """
+        Return the plain step in place of what was asked for.
+
+        Parameters
+        ----------
+        code : Code
+            Why.
+        reason : str
+            Why, as a sentence.
+
+        Returns
+        -------
+        Move
+            One level, target approached.
+
+        """
+        return Move(code, (Level(0.0, self.holding_load()),), math.inf, reason)

@@ -1,0 +1,85 @@
+"""
+Chained two-step commands, the nonlinear counterpart of ZVD and its higher orders.
+
+Two two-step commands without a hold between them, through the stretch that beta_p itself would
+hold, leave no vibration either, and forgive errors of the model as a ZVD shaper does: the
+vibration that the first one leaves in error meets the second half a period later. A chain of
+order n goes through the stretches that the levels of order n - 1 would hold, which on a linear
+oscillator gives the levels of n convolved ZV shapers.
+"""
+
+from dataclasses import replace
+
+from hmsa_ros.core import kernels
+from hmsa_ros.core.delivery import IDEAL
+from hmsa_ros.core.moves import Level, Move, State
+from hmsa_ros.core.shapers.request import Request
+from hmsa_ros.core.shapers.two_step import two_step
+from hmsa_ros.core.status import Code
+from hmsa_ros.errors import BadInputError
+
+
+def robust(request: Request) -> Move:
+    """
+    Command a move through ``request.order`` chained two-step commands.
+
+    Parameters
+    ----------
+    request : Request
+        The move; of order 1 it is the two-step command itself.
+
+    Returns
+    -------
+    Move
+        ``order + 1`` levels on ideal hardware, about ``order`` times as long as the two-step
+        command. Where there is none, what `two_step` answers.
+
+    Raises
+    ------
+    RefusedError
+        As `two_step`.
+    BadInputError
+        If the order is below 1.
+
+    """
+    if request.order < 1:
+        raise BadInputError(f'order is {request.order}: expected at least 1')
+    move = two_step(request)
+    if request.order == 1 or move.code is not Code.TWO_STEP:
+        return move
+    # Waypoints belong to the actuator, not to the hardware: they come from the ideal command.
+    ideal = replace(request, delivery=IDEAL)
+    chain = two_step(ideal)
+    for _ in range(request.order - 1):
+        waypoints = [
+            float(kernels.equilibrium_stretch(x.load, 1.0 / request.material.j_lim))
+            for x in chain.levels[:-1]]
+        chain = _chain(ideal, [*waypoints, request.target])
+        if chain.code is not Code.ROBUST:
+            return replace(
+                move, reason=f'no chain of order {request.order} leads to stretch '
+                             f'{request.target:g} ({chain.code}): a single two-step command is '
+                             'used')
+    return chain if request.delivery.ideal else _chain(
+        request, [*waypoints, request.target])
+
+
+def _chain(request: Request, waypoints: list[float]) -> Move:
+    """Return the two-step commands through waypoints, without a hold at any of them."""
+    levels: list[Level] = []
+    begin = 0.0
+    state = request.state
+    for waypoint in waypoints:
+        move = two_step(replace(request, state=state, target=waypoint))
+        if move.code is not Code.TWO_STEP:
+            return move
+        last = move.levels[-1]
+        levels += [Level(begin + x.time, x.load) for x in move.levels]
+        begin += move.duration
+        if begin == levels[-1].time:
+            # No ramp to finish: the next command takes over at once.
+            levels.pop()
+        state = State(waypoint, 0.0, last.load)
+    if begin > levels[-1].time and levels[-1].load == last.load:
+        return Move(Code.ROBUST, tuple(levels), begin)
+    return Move(Code.ROBUST, (*levels, Level(begin, last.load)), begin)

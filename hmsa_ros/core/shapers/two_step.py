@@ -1,0 +1,138 @@
+"""The two-step command, on ideal and on real hardware."""
+
+from itertools import product
+import math
+
+from hmsa_ros.core.moves import Level, Move
+from hmsa_ros.core.shapers.minimum_time import minimum_time
+from hmsa_ros.core.shapers.request import Request
+from hmsa_ros.core.shooting import solve, Template
+from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.core.two_step import plan_two_step
+
+# How many half periods more a slow ramp may wait for its second half.
+_MOST_HALF_PERIODS = 64
+_SHARES = (0.0, 0.25, 0.5, 0.75, -0.5)
+
+
+def two_step(request: Request) -> Move:
+    """
+    Apply beta_p for tau_p, then beta_1 (Eq. 13): at rest at the target, nothing left to ring.
+
+    On a grid, the second last period gets a level of its own and both levels are solved for;
+    through ramps, beta_p and its duration are. From a moving start for which no single level
+    leads to rest within the limits, two are used. Where the response is too damped to cross
+    the target there is no such command; the plain step, which does not overshoot there, takes
+    its place. Both say so in the move's reason.
+
+    Parameters
+    ----------
+    request : Request
+        The move.
+
+    Returns
+    -------
+    Move
+        Two levels on ideal hardware.
+
+    Raises
+    ------
+    RefusedError
+        If the target lies outside the stretch limits, or no command within the load limits
+        was found.
+
+    """
+    holding = request.holding_load()
+    state, material, target = request.state, request.material, request.target
+    plan = plan_two_step(
+        state.stretch, target, material, rate=state.rate,
+        load_limits=(request.limits.minimum, request.limits.maximum))
+    if plan.code is Code.HOLD:
+        return Move(Code.HOLD, (Level(0.0, holding),), 0.0)
+    if plan.code is Code.TOO_DAMPED:
+        return request.plain(
+            plan.code,
+            f'zeta {material.zeta:g} is too damped for the response to cross stretch '
+            f'{target:g}: no two-step command exists, the plain step approaches without '
+            'overshoot (shaper minimum_time arrives in finite time)')
+    if plan.code is Code.INDISTINGUISHABLE:
+        return request.plain(
+            plan.code,
+            f'zeta {material.zeta:g} is so close to critical damping at stretch {target:g} '
+            'that beta_p equals beta_1 to rounding: the plain step is used')
+    inside = request.limits.minimum <= plan.beta_p <= request.limits.maximum
+    if plan.code is not Code.TWO_STEP or not inside:
+        if state.rate == 0.0:
+            request.check([Level(0.0, plan.beta_p)])
+        return minimum_time(
+            request,
+            f'no single intermediate flux density within the limits leads from stretch '
+            f'{state.stretch:.6g} at rate {state.rate / request.units.time:.4g} to rest at '
+            f'{target:g}: two are used')
+    ideal = (Level(0.0, plan.beta_p), Level(plan.tau_p, holding))
+    if request.delivery.ideal:
+        return Move(Code.TWO_STEP, ideal, plan.tau_p)
+    if request.delivery.period > 0.0:
+        return _sampled(request, *ideal)
+    return _ramped(request, *ideal)
+
+
+def _sampled(request: Request, first: Level, last: Level) -> Move:
+    """
+    Place the command on the grid: one level, and another for its last period.
+
+    The share of the last period that the ideal command spends at beta_1 gives the first guess.
+    """
+    period = request.delivery.period
+    tau_p = last.time
+    least = max(2, math.ceil(tau_p / period - 1e-9))
+    # Ramps may need a longer move than steps.
+    for count in range(least, least + 4):
+        share = min(count - tau_p / period, 1.0)
+        between = Level(
+            (count - 1) * period, first.load + share * (last.load - first.load))
+        levels = (Level(0.0, first.load), between, Level(count * period, last.load))
+        found = solve(
+            Template.of(levels, [('load', 0), ('load', 1)]), request.state, request.load,
+            request.target, request.material, request.delivery.slew)
+        if found is not None and all(
+                request.limits.minimum <= x.load <= request.limits.maximum for x in found[0]):
+            return Move(Code.TWO_STEP, *found)
+    raise RefusedError(
+        Code.NO_TWO_STEP,
+        f'no command on a grid of {request.units.time_text(period)} within the limits brings '
+        f'stretch {request.target:g} to rest: expected a shorter command period (the ideal '
+        f'move takes {request.units.time_text(tau_p)})')
+
+
+def _ramped(request: Request, first: Level, last: Level) -> Move:
+    """
+    Solve for the level between two ramps and for how long it holds.
+
+    A linear oscillator comes to rest where ramps and hold together span an odd number of half
+    periods: slower ramps wait for the next one.
+    """
+    delivery = request.delivery
+    total = delivery.ramp(first.load - request.load) + delivery.ramp(last.load - first.load)
+    # Damping leaves less for the second ramp to cancel the longer the hold: later guesses give
+    # the first ramp a larger share.
+    for half_periods, share in product(range(1, _MOST_HALF_PERIODS, 2), _SHARES):
+        between = first.load + share * (last.load - first.load)
+        up = delivery.ramp(between - request.load)
+        hold = half_periods * last.time - 0.5 * total
+        if hold < 0.0:
+            continue
+        levels = (Level(0.0, between), Level(up + hold, last.load))
+        found = solve(
+            Template.of(levels, [('load', 0), ('time', 1)]), request.state, request.load,
+            request.target, request.material, delivery.slew)
+        if found is not None and all(
+                request.limits.minimum <= x.load <= request.limits.maximum for x in found[0]):
+            return Move(Code.TWO_STEP, *found)
+    change = abs(last.load - request.load)
+    raise RefusedError(
+        Code.SLEW_LIMIT,
+        f'no command through ramps of {request.units.load_text(delivery.slew)} in '
+        f'{request.units.time_text(1.0)} brings stretch {request.target:g} to rest: expected '
+        f'a slew limit of about {request.units.load_text(change / last.time)} in '
+        f'{request.units.time_text(1.0)}')
