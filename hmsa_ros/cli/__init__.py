@@ -13,6 +13,7 @@ import sys
 from typing import NoReturn
 
 from hmsa_ros import __version__
+from hmsa_ros.cli.node import NODES
 from hmsa_ros.errors import BadInputError, HmsaError
 
 COMMANDS = ('demo', 'plan', 'send', 'node', 'bag', 'figures')
@@ -70,7 +71,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit status: 0 done, 1 the run failed, 2 bad input, 130 interrupted.
 
     """
-    arguments = build_parser().parse_args(argv)
+    words = list(sys.argv[1:] if argv is None else argv)
+    arguments = build_parser().parse_args(split_ros_args(words))
+    arguments.ros_args = words[len(split_ros_args(words)):]
     try:
         status: int = arguments.run(arguments)
         return status
@@ -84,6 +87,26 @@ def main(argv: Sequence[str] | None = None) -> int:
         # The reader of our output (head, less) has gone: there is nobody left to tell.
         sys.stderr.close()
         return 0
+
+
+def split_ros_args(words: list[str]) -> list[str]:
+    """
+    Return what stands before ``--ros-args``: the rest is not argparse's to read.
+
+    Parameters
+    ----------
+    words : list of str
+        Arguments.
+
+    Returns
+    -------
+    list of str
+        Unchanged for a command that is not a node's.
+
+    """
+    if '--ros-args' in words and words[0] in NODES:
+        return words[:words.index('--ros-args')]
+    return words
 
 
 def report(error: Exception, status: int) -> int:

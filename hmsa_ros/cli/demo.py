@@ -96,13 +96,13 @@ def _print_table(result: 'DemoResult') -> None:
     table = Table(caption=(
         'b and tau nondimensional as in the paper; residual: peak-to-peak stretch after '
         'arrival, share of the step; unshaped: simulated on the same plant'))
-    for name in ('target', 'b_p', 'tau_p', 'b_1', 'arrival', 'residual', 'unshaped'):
-        table.add_column(name, justify='right')
+    for name in ('target', 'b_p', 'tau_p', 'b_1', 'arrival ms', 'residual', 'unshaped'):
+        table.add_column(name, justify='right', no_wrap=True)
     table.add_column('held')
     for x in result.setpoints:
         table.add_row(
-            f'{x.stretch:g}', f'{x.b_p:.6f}', f'{x.tau_p:.6f}', f'{x.b_1:.6f}',
-            f'{x.arrival * 1e3:.3f} ms', f'{x.residual:.1e}', f'{x.residual_unshaped:.1%}',
+            f'{x.stretch:g}', f'{x.b_p:.5f}', f'{x.tau_p:.5f}', f'{x.b_1:.5f}',
+            f'{x.arrival * 1e3:.3f}', f'{x.residual:.1e}', f'{x.residual_unshaped:.1%}',
             'yes' if x.reached else 'no')
     console = Console()
     console.print(table)

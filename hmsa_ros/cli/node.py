@@ -26,11 +26,9 @@ def add_parser(subparsers: Any) -> None:
         parser = subparsers.add_parser(
             name, help=f'run the {name} node: {summary}',
             description=f'Run the {name} node: {summary}.',
-            epilog=f'example: hmsa {name} --ros-args -r __ns:=/left', add_help=True)
-        parser.add_argument(
-            'ros_args', nargs=argparse.REMAINDER, metavar='--ros-args ...',
-            help='ROS arguments: parameters (-p NAME:=VALUE, --params-file FILE), remappings '
-                 '(-r FROM:=TO)')
+            usage=f'hmsa {name} [-h] [--ros-args ...]',
+            epilog='ROS arguments are parameters (-p NAME:=VALUE, --params-file FILE) and '
+                   f'remappings (-r FROM:=TO); example: hmsa {name} --ros-args -r __ns:=/left')
         parser.set_defaults(run=run, node=name)
 
 

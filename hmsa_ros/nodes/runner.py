@@ -5,6 +5,7 @@ One place for what every node's ``main`` does, so that a node file holds wiring 
 """
 
 from collections.abc import Callable, Sequence
+import signal
 import sys
 
 import rclpy
@@ -12,32 +13,52 @@ from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from hmsa_ros.errors import BadInputError, HmsaError
 
 # EventsExecutor.spin() without a time limit busy-loops and delivers nothing on this rclpy
-# (7.1): waiting for a future that never completes, an hour at a time, behaves as documented.
-_SPIN_SECONDS = 3600.0
+# (7.1); waiting for a future that never completes, a slice at a time, behaves as documented.
+_SLICE_SECONDS = 0.1
 
 
-def spin(node: Node) -> None:
+class _Ending:
     """
-    Serve a node's callbacks until its context is shut down.
+    Whether SIGINT or SIGTERM has asked the process to end.
+
+    The signals are ours, not rclpy's: its handlers shut the context down in the middle of a
+    callback, which then fails where it publishes.
+    """
+
+    def __init__(self) -> None:
+        self.asked = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+
+    def _on_signal(self, *_: object) -> None:
+        self.asked = True
+
+
+def spin(node: Node, ending: Callable[[], bool]) -> None:
+    """
+    Serve a node's callbacks until told to end or its context is shut down.
 
     Parameters
     ----------
     node : rclpy.node.Node
         Node to serve.
+    ending : callable
+        Tells whether to end.
 
     """
     executor = EventsExecutor(context=node.context)
     executor.add_node(node)
     never = Future()
     try:
-        while node.context.ok():
-            executor.spin_until_future_complete(never, _SPIN_SECONDS)
-    except (KeyboardInterrupt, ExternalShutdownException):
+        while node.context.ok() and not ending():
+            executor.spin_until_future_complete(never, _SLICE_SECONDS)
+    except ExternalShutdownException:
         pass
     finally:
         executor.shutdown()
@@ -62,9 +83,11 @@ def run(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
         Exit status: 0 for a clean end, 2 for bad arguments or parameters, 1 for a failure.
 
     """
+    ending = _Ending()
     arguments = list(sys.argv[1:] if args is None else args)
     try:
-        rclpy.init(args=['hmsa', *arguments])
+        rclpy.init(
+            args=['hmsa', *arguments], signal_handler_options=SignalHandlerOptions.NO)
         unknown = rclpy.utilities.remove_ros_args(['hmsa', *arguments])[1:]
         if unknown:
             raise BadInputError(
@@ -79,7 +102,7 @@ def run(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
     status = 0
     try:
         node = factory()
-        spin(node)
+        spin(node, lambda: ending.asked)
     except (BadInputError, ParameterException) as error:
         status = _refuse(error, 2)
     except HmsaError as error:
