@@ -73,7 +73,8 @@ def run(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
     factory : callable
         Makes the node; may raise `HmsaError` or an rclpy parameter error, which refuse the
         start. A node with a ``close`` method has it called before the node is destroyed; an
-        error in its attribute ``failure`` makes the run a failed one.
+        error in its attribute ``failure`` makes the run a failed one, and a true attribute
+        ``finished`` ends it.
     args : sequence of str, optional
         Command-line arguments, ``--ros-args ...`` included; default ``sys.argv[1:]``.
 
@@ -102,7 +103,7 @@ def run(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
     status = 0
     try:
         node = factory()
-        spin(node, lambda: ending.asked)
+        spin(node, lambda: ending.asked or getattr(node, 'finished', False))
     except (BadInputError, ParameterException) as error:
         status = _refuse(error, 2)
     except HmsaError as error:
