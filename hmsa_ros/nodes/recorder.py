@@ -290,7 +290,7 @@ class Recorder(Node):
             self._refuse(f'{name}#', f'topic {name} has the types {", ".join(types)}: '
                                      f'{type_name} is recorded')
         try:
-            message_type = _message_class(type_name)
+            message_type = message_class(type_name)
         except BagError as error:
             self._refuse(name, f'topic {name} is not recorded: {error}')
             return
@@ -593,8 +593,26 @@ class _Followed:
             parameter_value_to_python(value), default=list) for name, value in values}
 
 
-def _message_class(type_name: str) -> type[Any]:
-    """Return the class of a message type, or raise if its package is not installed."""
+def message_class(type_name: str) -> type[Any]:
+    """
+    Return the class of a message type.
+
+    Parameters
+    ----------
+    type_name : str
+        For example ``'std_msgs/msg/Float64'``.
+
+    Returns
+    -------
+    type
+        The class.
+
+    Raises
+    ------
+    BagError
+        If its package is not installed.
+
+    """
     parts = type_name.split('/')
     try:
         package, folder, name = parts
