@@ -1,0 +1,80 @@
+"""``hmsa figures``: the paper's figures from this package's own computation."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from hmsa_ros.errors import BadInputError
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    Add the command.
+
+    Parameters
+    ----------
+    subparsers : argparse action
+        Where to add it.
+
+    """
+    parser = subparsers.add_parser(
+        'figures', help="compute and draw the paper's Figures 2 to 10",
+        description="Compute the paper's Figures 2 to 10 and write each as PNG and CSV "
+                    '(figure_02.png, figure_02.csv, ...). Files of these names are replaced.',
+        epilog='example: hmsa figures --out figures')
+    parser.add_argument(
+        '--out', type=Path, default=Path('figures'), metavar='DIR',
+        help='folder to write to, made if need be (default figures)')
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """
+    Write the figures and print what was written.
+
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+        With ``out``.
+
+    Returns
+    -------
+    int
+        Exit status.
+
+    Raises
+    ------
+    BadInputError
+        If the folder cannot be written to.
+    HmsaError
+        If a computation fails.
+
+    """
+    folder: Path = arguments.out
+    # Before the slow imports: a bad folder is told at once.
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInputError(
+            f'cannot make the folder {folder}: {error.strerror}; expected a folder with write '
+            'permission (--out)') from error
+
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from hmsa_ros.figures.paper import FIGURES, write_figure
+
+    written: list[Path] = []
+    console = Console(stderr=True)
+    with Progress(
+            TextColumn('{task.description:<10}'), BarColumn(),
+            TextColumn('{task.completed} of {task.total}'), TimeElapsedColumn(),
+            console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task('', total=len(FIGURES))
+        for number, figure in FIGURES.items():
+            progress.update(task, description=f'Figure {number}')
+            written += write_figure(figure, folder)
+            progress.advance(task)
+    for path in written:
+        print(path)
+    return 0

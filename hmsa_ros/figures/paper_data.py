@@ -1,0 +1,443 @@
+"""
+The numbers in the paper's Figs. 2 to 10 (Polymers 2022, 14, 3037), computed with this package.
+
+Everything is nondimensional as in the paper: time in L sqrt(rho/G), b = sqrt(Br B/(mu0 G))
+with the sign of the field. What the paper leaves open is settled here, as constants.
+"""
+
+from collections.abc import Iterator, Sequence
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hmsa_ros.core.model import Array, critical_zeta, signed_root, stretch_limits
+from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.core.sequence import plan_sequence, Segment, Setpoint
+from hmsa_ros.core.simulation import simulate
+from hmsa_ros.core.status import Code
+from hmsa_ros.core.two_step import CODES, plan_two_step, plan_two_step_batch
+
+#: Span of each setpoint, as stated in the paper.
+SPAN = 10.0
+#: The sequence of Figs. 4, 5 and 7; also taken for Fig. 2, whose levels the paper leaves open.
+EXPANSION = (1.10, 1.20, 1.40)
+SECOND_EXPANSION = (1.15, 1.25, 1.35)
+CONTRACTION = (0.90, 0.80, 0.70)
+SECOND_CONTRACTION = (0.85, 0.70, 0.85)
+DEEP_CONTRACTION = (0.90, 0.80, 0.60)
+#: Fig. 3 shows one move; the paper does not say which.
+SINGLE = (1.10,)
+ZETAS = (0.02, 0.40, 1.10)
+J_LIMS = (1.0, 3.0, 5.0)
+#: Third stretch of Fig. 9 over the limiting stretch. The paper says only that it is near.
+#: Much nearer than this, the plain step, unlike the shaped one, cannot be followed: it would
+#: swing closer to the limit than double precision can tell from it.
+NEAR_LIMIT = 0.95
+#: Range of Fig. 10.
+J_LIM_RANGE = (0.5, 10.0)
+SAMPLES = 1201
+SWEEP_POINTS = 1000
+
+_PAPER = NondimensionalParameters(zeta=0.2, j_lim=5.0)
+# The response near the limiting stretch is this much faster than elsewhere.
+_FASTER = 5
+
+
+@dataclass(frozen=True)
+class Run:
+    """
+    A response of the actuator.
+
+    Attributes
+    ----------
+    name : str
+        What sets it apart from the other runs of its figure, for instance ``zeta 0.02``.
+    command : str
+        ``shaped``, ``unshaped`` or ``b_p alone``.
+    material : NondimensionalParameters
+        zeta, J_lim and c1.
+    targets : tuple of float
+        Setpoints.
+    switches, loads : ndarray, shape (m,)
+        Times at which a level of the load begins, and the level beta.
+    time, stretch, rate : ndarray, shape (n,)
+        Samples; every switch is among them.
+
+    """
+
+    name: str
+    command: str
+    material: NondimensionalParameters
+    targets: tuple[float, ...]
+    switches: Array
+    loads: Array
+    time: Array
+    stretch: Array
+    rate: Array
+
+    @property
+    def load(self) -> Array:
+        """The load from each sample on."""
+        level = np.searchsorted(self.switches, self.time, side='right') - 1
+        return np.asarray(self.loads[level])
+
+    def turning_points(self, begin: float, end: float) -> int:
+        """
+        Count the changes of direction.
+
+        Parameters
+        ----------
+        begin, end : float
+            Part of the time that counts.
+
+        Returns
+        -------
+        int
+            Two a cycle.
+
+        """
+        part = self.rate[(self.time > begin) & (self.time < end)]
+        return int(np.count_nonzero(np.diff(np.signbit(part))))
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """
+    The first move of a sequence over a parameter.
+
+    Attributes
+    ----------
+    start, target : float
+        The move.
+    zeta, j_lim : ndarray, shape (n,)
+        One varies, the other is constant.
+    status : tuple of str, length n
+        Verdict on each plan, ``two_step`` where there is one.
+    tau_p, beta_p, beta_1 : ndarray, shape (n,)
+        The plan; NaN where there is none.
+    critical : float
+        Linearised critical zeta at the target; NaN where zeta is not what varies.
+
+    """
+
+    start: float
+    target: float
+    zeta: Array
+    j_lim: Array
+    status: tuple[str, ...]
+    tau_p: Array
+    beta_p: Array
+    beta_1: Array
+    critical: float
+
+
+Data = tuple[Run, ...] | Sweep
+
+
+def respond(
+        name: str, targets: Sequence[float], material: NondimensionalParameters, *,
+        commands: Sequence[str] = ('shaped', 'unshaped'), span: float = SPAN,
+        samples: int = SAMPLES, faster: int = 1) -> tuple[Run, ...]:
+    """
+    Compute the responses to a sequence that starts at rest.
+
+    Parameters
+    ----------
+    name : str
+        Name of the runs.
+    targets : sequence of float
+        Stretches, each lasting ``span``.
+    material : NondimensionalParameters
+        zeta, J_lim and c1.
+    commands : sequence of str
+        Any of ``shaped``, ``unshaped`` and ``b_p alone``.
+    span : float
+        In nondimensional time.
+    samples : int
+        Evenly spaced samples a run, at least 2.
+    faster : int
+        How many times denser the samples of the last setpoint are, at least 1.
+
+    Returns
+    -------
+    tuple of Run
+        One a command.
+
+    Raises
+    ------
+    HmsaError
+        If a target cannot be had.
+
+    """
+    setpoints = [Setpoint(x, span) for x in targets]
+    runs = []
+    for command in commands:
+        shaper = 'step' if command == 'unshaped' else 'two_step'
+        segments = plan_sequence(setpoints, material, shaper=shaper)
+        switches, loads = _levels(segments)
+        if command == 'b_p alone':
+            switches, loads = switches[:1], loads[:1]
+        end = span * len(setpoints)
+        fine = np.linspace(0.0, end, faster * (samples - 1) + 1)
+        even = np.concatenate((fine[::faster], fine[fine > end - span]))
+        time = np.union1d(even, switches)
+        stretch, rate = simulate(switches, loads, time, material)
+        runs.append(Run(
+            name, command, material, tuple(targets), switches, loads, time, stretch, rate))
+    return tuple(runs)
+
+
+def _levels(segments: Sequence[Segment]) -> tuple[Array, Array]:
+    levels = [(x.begin + level.time, level.load) for x in segments for level in x.move.levels]
+    times, loads = np.array(levels).T
+    return times, loads
+
+
+def multi_step(samples: int = SAMPLES) -> tuple[Run, ...]:
+    """
+    Compute Fig. 2: the response to plain steps.
+
+    Parameters
+    ----------
+    samples : int
+        Samples a run.
+
+    Returns
+    -------
+    tuple of Run
+        One.
+
+    """
+    return respond(
+        '1.1, 1.2, 1.4', EXPANSION, _PAPER, commands=('unshaped',), samples=samples)
+
+
+def single_move(samples: int = SAMPLES) -> tuple[Run, ...]:
+    """
+    Compute Fig. 3: one move, shaped, unshaped and with b_p alone.
+
+    Parameters
+    ----------
+    samples : int
+        Samples a run.
+
+    Returns
+    -------
+    tuple of Run
+        Shaped, unshaped, b_p alone.
+
+    """
+    return respond(
+        '1.1', SINGLE, _PAPER, commands=('shaped', 'unshaped', 'b_p alone'), samples=samples)
+
+
+def shaped_multi_step(samples: int = SAMPLES) -> tuple[Run, ...]:
+    """
+    Compute Fig. 4: three setpoints, shaped and unshaped.
+
+    Parameters
+    ----------
+    samples : int
+        Samples a run.
+
+    Returns
+    -------
+    tuple of Run
+        Shaped, unshaped.
+
+    """
+    return respond('1.1, 1.2, 1.4', EXPANSION, _PAPER, samples=samples)
+
+
+def expansion(samples: int = SAMPLES) -> tuple[Run, ...]:
+    """
+    Compute Fig. 5: two sequences in expansion.
+
+    Parameters
+    ----------
+    samples : int
+        Samples a run.
+
+    Returns
+    -------
+    tuple of Run
+        Shaped and unshaped for the first sequence, then for the second.
+
+    """
+    return (*respond('1.1, 1.2, 1.4', EXPANSION, _PAPER, samples=samples),
+            *respond('1.15, 1.25, 1.35', SECOND_EXPANSION, _PAPER, samples=samples))
+
+
+def contraction(samples: int = SAMPLES) -> tuple[Run, ...]:
+    """
+    Compute Fig. 6: two sequences in contraction.
+
+    Parameters
+    ----------
+    samples : int
+        Samples a run.
+
+    Returns
+    -------
+    tuple of Run
+        Shaped and unshaped for the first sequence, then for the second.
+
+    """
+    return (*respond('0.9, 0.8, 0.7', CONTRACTION, _PAPER, samples=samples),
+            *respond('0.85, 0.7, 0.85', SECOND_CONTRACTION, _PAPER, samples=samples))
+
+
+def damping_cases(samples: int = SAMPLES) -> tuple[Run, ...]:
+    """
+    Compute Fig. 7: three values of zeta in expansion and in contraction.
+
+    Parameters
+    ----------
+    samples : int
+        Samples a run.
+
+    Returns
+    -------
+    tuple of Run
+        Shaped and unshaped for each zeta in expansion, then in contraction.
+
+    """
+    return tuple(
+        run for targets in (EXPANSION, DEEP_CONTRACTION) for zeta in ZETAS
+        for run in respond(
+            f'zeta {zeta:.2f}, {", ".join(f"{x:g}" for x in targets)}', targets,
+            NondimensionalParameters(zeta=zeta, j_lim=5.0), samples=samples))
+
+
+def damping_sweep(points: int = SWEEP_POINTS) -> Sweep:
+    """
+    Compute Fig. 8: tau_p over zeta for 1 -> 1.1, up to where no two-step command exists.
+
+    Parameters
+    ----------
+    points : int
+        Values of zeta; they crowd towards the end, where tau_p grows without bound.
+
+    Returns
+    -------
+    Sweep
+        Over zeta.
+
+    """
+    start, target = 1.0, EXPANSION[0]
+    critical = float(critical_zeta(target, _PAPER))
+    last, beyond = 0.5 * critical, 2.0 * critical
+    while beyond - last > 1e-9:
+        middle = 0.5 * (last + beyond)
+        plan = plan_two_step(start, target, NondimensionalParameters(middle, _PAPER.j_lim))
+        if plan.code in (Code.TOO_DAMPED, Code.INDISTINGUISHABLE):
+            beyond = middle
+        else:
+            last = middle
+    zeta = last * (1.0 - np.linspace(1.0, 0.0, points) ** 2)
+    return _sweep(start, target, zeta, np.full(points, _PAPER.j_lim), critical)
+
+
+def chain_limit_cases(samples: int = SAMPLES) -> tuple[Run, ...]:
+    """
+    Compute Fig. 9: three values of J_lim, the last setpoint near the limiting stretch.
+
+    Parameters
+    ----------
+    samples : int
+        Samples a run; the last setpoint is sampled more densely.
+
+    Returns
+    -------
+    tuple of Run
+        Shaped and unshaped for each J_lim.
+
+    """
+    runs: list[Run] = []
+    for j_lim in J_LIMS:
+        targets = (1.2, 1.4, NEAR_LIMIT * stretch_limits(j_lim)[1])
+        runs += respond(
+            f'J_lim {j_lim:g}', targets, NondimensionalParameters(zeta=0.2, j_lim=j_lim),
+            samples=samples,
+            faster=_FASTER)
+    return tuple(runs)
+
+
+def chain_limit_sweep(points: int = SWEEP_POINTS) -> Sweep:
+    """
+    Compute Fig. 10: tau_p and b_p over J_lim for 1 -> 1.2.
+
+    Parameters
+    ----------
+    points : int
+        Values of J_lim.
+
+    Returns
+    -------
+    Sweep
+        Over J_lim.
+
+    """
+    j_lim = np.linspace(*J_LIM_RANGE, points)
+    return _sweep(1.0, 1.2, np.full(points, _PAPER.zeta), j_lim, float('nan'))
+
+
+def _sweep(start: float, target: float, zeta: Array, j_lim: Array, critical: float) -> Sweep:
+    plans = plan_two_step_batch(start, target, zeta=zeta, j_lim=j_lim, c1=_PAPER.c1)
+    status = tuple(str(CODES[x]) for x in plans.status.tolist())
+    return Sweep(
+        start, target, zeta, j_lim, status, plans.tau_p, plans.beta_p, plans.beta_1, critical)
+
+
+_RUN_COLUMNS = (
+    'run', 'command', 'zeta [1]', 'J_lim [1]', 'tau [L sqrt(rho/G)]', 'b [1]',
+    'beta [mu0 G/Br]', 'stretch [1]', 'stretch_rate [sqrt(G/rho)/L]')
+_SWEEP_COLUMNS = (
+    'start_stretch [1]', 'target_stretch [1]', 'zeta [1]', 'J_lim [1]', 'tau_p [L sqrt(rho/G)]',
+    'b_p [1]', 'b_1 [1]', 'beta_p [mu0 G/Br]', 'beta_1 [mu0 G/Br]',
+    'status')
+
+
+def write_csv(path: Path, data: Data) -> None:
+    """
+    Write a figure's numbers, one observation a row, units in the header.
+
+    Loads are those in force from the row's time on. Numbers have full double precision.
+
+    Parameters
+    ----------
+    path : Path
+        File to write; one of that name is replaced.
+    data : tuple of Run or Sweep
+        The numbers.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written.
+
+    """
+    with path.open('w', newline='', encoding='utf-8') as file:
+        writer = csv.writer(file, lineterminator='\n')
+        if isinstance(data, Sweep):
+            writer.writerow(_SWEEP_COLUMNS)
+            writer.writerows(_rows(
+                data.zeta, data.j_lim, data.tau_p, signed_root(data.beta_p),
+                signed_root(data.beta_1), data.beta_p, data.beta_1, data.status,
+                fixed=(data.start, data.target)))
+            return
+        writer.writerow(_RUN_COLUMNS)
+        for run in data:
+            writer.writerows(_rows(
+                run.time, signed_root(run.load), run.load, run.stretch, run.rate,
+                fixed=(run.name, run.command, run.material.zeta, run.material.j_lim)))
+
+
+def _rows(
+        *columns: Array | tuple[str, ...],
+        fixed: tuple[str | float, ...]) -> Iterator[tuple[str | float, ...]]:
+    plain = (x if isinstance(x, tuple) else x.tolist() for x in columns)
+    for row in zip(*plain, strict=True):
+        yield *fixed, *row
