@@ -27,6 +27,8 @@ class Delivery:
         Commands take effect at multiples of this; 0 for any time.
     slew : float
         Largest change of the load per unit of time; infinite for steps.
+    resolution : float
+        Times of commands are rounded to multiples of this; 0 for none.
 
     Raises
     ------
@@ -37,6 +39,7 @@ class Delivery:
 
     period: float = 0.0
     slew: float = math.inf
+    resolution: float = 0.0
 
     def __post_init__(self) -> None:
         """Check both numbers."""
@@ -50,6 +53,25 @@ class Delivery:
     def ideal(self) -> bool:
         """Whether levels apply at any time and at once."""
         return self.period == 0.0 and math.isinf(self.slew)
+
+    def rounded(self, time: float) -> float:
+        """
+        Return a time as a command can carry it.
+
+        Parameters
+        ----------
+        time : float
+            From the start of a sequence; may be infinite.
+
+        Returns
+        -------
+        float
+            The nearest multiple of the resolution.
+
+        """
+        if self.resolution == 0.0 or math.isinf(time):
+            return time
+        return round(time / self.resolution) * self.resolution
 
     def ramp(self, change: float) -> float:
         """

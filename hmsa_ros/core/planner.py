@@ -11,15 +11,19 @@ from dataclasses import dataclass
 import math
 
 from hmsa_ros.core import kernels
-from hmsa_ros.core.moves import Limits, State
+from hmsa_ros.core.delivery import Delivery, pieces
+from hmsa_ros.core.moves import Level, Limits, Move, State
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.sequence import plan_sequence, Segment, Setpoint
-from hmsa_ros.core.simulation import check_stretch, RTOL
+from hmsa_ros.core.shapers import get_shaper
+from hmsa_ros.core.simulation import check_stretch, RTOL, simulate
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.units import NANOSECONDS, Units
 
 # Stretch rates below this share of the natural frequency are rounding, not motion.
 _AT_REST = 1e-6
+# How hard to brake where the hardest does not lead to a plan, from the nearest stop on.
+_BRAKE_SHARES = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.0)
 # Stamp of the level that is in force before the first request.
 _ALWAYS = -2**62
 
@@ -37,6 +41,8 @@ class PlannedLevel:
         In T.
     stretch, rate : float
         Predicted at the stamp; the rate in 1/s.
+    in_force : float
+        Flux density in T predicted at the stamp, from which a slew limit ramps to the level.
 
     """
 
@@ -44,6 +50,7 @@ class PlannedLevel:
     flux_density: float
     stretch: float
     rate: float
+    in_force: float
 
 
 @dataclass(frozen=True)
@@ -109,6 +116,12 @@ class Options:
         In T.
     lead_time : int
         In ns: how far ahead of its stamp a command is sent.
+    period : int
+        In ns: commands are stamped with multiples of it; 0 for any time.
+    slew_limit : float
+        Largest change of the flux density in T/s; infinite for steps.
+    order : int
+        Of the robust shaper.
 
     """
 
@@ -117,6 +130,9 @@ class Options:
     flux_density_min: float = -math.inf
     flux_density_max: float = math.inf
     lead_time: int = 50_000_000
+    period: int = 0
+    slew_limit: float = math.inf
+    order: int = 2
 
 
 class Planner:
@@ -172,14 +188,18 @@ class Planner:
 
         """
         unit = self._actuator.flux_density_unit
-        self._limits = Limits(
-            options.flux_density_min / unit, options.flux_density_max / unit)
-        self.options = options
+        limits = Limits(options.flux_density_min / unit, options.flux_density_max / unit)
+        delivery = Delivery(
+            options.period / NANOSECONDS / self._units.time,
+            options.slew_limit / unit * self._units.time,
+            1.0 / NANOSECONDS / self._units.time)
+        get_shaper(options.shaper)
+        self._limits, self._delivery, self.options = limits, delivery, options
 
     def _rest(self, stretch: float, number: int) -> None:
         load = kernels.elastic_force(stretch, 1.0 / self._material.j_lim)
-        level = PlannedLevel(
-            _ALWAYS, load * self._actuator.flux_density_unit, stretch, 0.0)
+        flux_density = load * self._actuator.flux_density_unit
+        level = PlannedLevel(_ALWAYS, flux_density, stretch, 0.0, flux_density)
         self.plan = Plan(number, (level,), ())
         self._unsent = 1
 
@@ -227,10 +247,11 @@ class Planner:
 
         """
         self._check_points(points)
-        soonest = now + self.options.lead_time
+        soonest = self._soonest(now)
         base = soonest if stamp is None else stamp
-        begin = max(base, soonest)
-        ahead = [(x, base + t) for x, t in points if base + t > begin]
+        begin = self._on_grid(max(base, soonest))
+        ahead = [
+            (x, self._on_grid(base + t)) for x, t in points if base + t > begin]
         if points[0][1] == 0 and len(points) > 1 and base == begin:
             # A first point at time 0 that repeats where the actuator is asks for nothing.
             self._check_first(points[0][0], begin)
@@ -280,7 +301,7 @@ class Planner:
 
         """
         self._check_stretch(stretch)
-        begin = now + self.options.lead_time
+        begin = self._soonest(now)
         if self._is_target(stretch, begin):
             return self.plan
         return self._splice(begin, self._plan(begin, [Setpoint(stretch, math.inf)]))
@@ -303,23 +324,18 @@ class Planner:
             The new plan.
 
         """
-        begin = now + self.options.lead_time
-        stretch, flux_density = self._nearest_rest(begin)
-        levels = [PlannedLevel(begin, flux_density, *self._state_si(begin))]
-        arrival = begin
-        target = self._equilibrium_load(stretch)
-        if flux_density != target:
-            material = self._material
-            state = self.state(begin)
-            _, time, _, _, _ = kernels.turning_point(
-                self._work, state.stretch, state.rate, math.copysign(1.0, state.rate),
-                flux_density / self._units.load, 1.0, material.zeta, material.c1,
-                1.0 / material.j_lim, RTOL)
-            arrival = begin + round(time * self._units.time * NANOSECONDS)
-            levels.append(PlannedLevel(arrival, target, stretch, 0.0))
-        return self._splice(
-            begin, (tuple(levels),
-                    (PlannedSegment(stretch, begin, arrival, Code.HOLD, 'stopped'),)))
+        begin = self._soonest(now)
+        state = self.state(begin)
+        brake, time, stretch = self._brake(state, 1.0)
+        if not self._delivery.ideal and time > 0.0:
+            return self._splice(begin, self._gentle_stop(begin, state))
+        move = Move(Code.HOLD, tuple(
+            [Level(0.0, brake)] * (time > 0.0)
+            + [Level(time, float(kernels.elastic_force(stretch, 1.0 / self._material.j_lim)))]),
+            time, 'stopped')
+        end = State(stretch, 0.0, move.levels[-1].load)
+        return self._splice(begin, self._place(
+            begin, [Segment(Setpoint(stretch, math.inf), 0.0, state, end, move)]))
 
     # -- what comes of them --------------------------------------------------------------------
 
@@ -367,15 +383,13 @@ class Planner:
 
         """
         level = self._level(time)
+        load = level.in_force / self._units.load
         if level.stamp == _ALWAYS:
-            return State(level.stretch)
-        material = self._material
-        _, stretch, rate, _, _, _ = kernels.advance(
-            self._work, level.stretch, level.rate * self._units.time, 0.0, 0.0,
-            level.flux_density / self._units.load, 0.0, 0.0, 0.0,
-            (time - level.stamp) / NANOSECONDS / self._units.time, material.zeta, material.c1,
-            1.0 / material.j_lim, RTOL, 0.0)
-        return State(stretch, rate)
+            return State(level.stretch, 0.0, load)
+        return self._follow(
+            State(level.stretch, level.rate * self._units.time, load),
+            level.flux_density / self._units.load,
+            (time - level.stamp) / NANOSECONDS / self._units.time)
 
     def segment(self, now: int) -> tuple[int, PlannedSegment] | None:
         """
@@ -401,13 +415,23 @@ class Planner:
         levels = self.plan.levels
         return levels[max(bisect_right([x.stamp for x in levels], time) - 1, 0)]
 
-    def _state_si(self, time: int) -> tuple[float, float]:
-        state = self.state(time)
-        return state.stretch, state.rate / self._units.time
+    def _follow(self, state: State, load: float, duration: float) -> State:
+        """Predict the state after one level has been commanded for a time."""
+        switches, loads, slopes, last = pieces(
+            (Level(0.0, load),), state.load, duration, self._delivery.slew)
+        stretch, rate = simulate(
+            switches, loads, duration, self._material, stretch=state.stretch,
+            rate=state.rate, slopes=slopes)
+        return State(float(stretch[0]), float(rate[0]), last)
 
-    def _equilibrium_load(self, stretch: float) -> float:
-        return float(kernels.elastic_force(
-            stretch, 1.0 / self._material.j_lim)) * self._units.load
+    def _soonest(self, now: int) -> int:
+        """Return the first time that a command can still reach in time."""
+        return self._on_grid(now + self.options.lead_time)
+
+    def _on_grid(self, time: int) -> int:
+        """Return the next multiple of the command period."""
+        period = self.options.period
+        return time if period == 0 else -(-time // period) * period
 
     def _check_stretch(self, stretch: float) -> None:
         if not math.isfinite(stretch):
@@ -445,38 +469,41 @@ class Planner:
             and segments[-1].begin <= begin
 
     def _plan(
-            self, begin: int, setpoints: Sequence[Setpoint]
+            self, begin: int, setpoints: Sequence[Setpoint], shaper: str = ''
     ) -> tuple[tuple[PlannedLevel, ...], tuple[PlannedSegment, ...]]:
         """Plan setpoints from a time on and place the result on the timeline."""
-        segments = plan_sequence(
-            setpoints, self._material, start=self.state(begin), shaper=self.options.shaper,
-            limits=self._limits, units=self._units, short_spell=self.options.short_spell,
-            resolution=1.0 / NANOSECONDS / self._units.time)
-        return self._levels(begin, segments), tuple(
-            PlannedSegment(
-                x.setpoint.stretch, begin + self._ns(x.begin),
-                None if math.isinf(x.move.duration)
-                else begin + self._ns(x.begin) + self._ns(x.move.duration),
-                x.move.code, x.move.reason)
-            for x in segments)
+        options = self.options
+        return self._place(begin, plan_sequence(
+            setpoints, self._material, start=self.state(begin),
+            shaper=shaper or options.shaper, limits=self._limits, delivery=self._delivery,
+            order=options.order, units=self._units, short_spell=options.short_spell))
 
-    def _levels(self, begin: int, segments: Sequence[Segment]) -> tuple[PlannedLevel, ...]:
-        material = self._material
+    def _place(
+            self, begin: int, segments: Sequence[Segment]
+    ) -> tuple[tuple[PlannedLevel, ...], tuple[PlannedSegment, ...]]:
+        """Place planned moves on the timeline, in SI units."""
         levels = []
+        placed = []
         for segment in segments:
-            stretch, rate = segment.start.stretch, segment.start.rate
+            start = begin + self._ns(segment.begin)
+            state = segment.start
+            if math.isnan(state.load):
+                raise ValueError('a segment on the timeline knows the load it starts from')
             time = 0.0
-            load = 0.0
-            for level in segment.move.levels:
-                _, stretch, rate, _, _, _ = kernels.advance(
-                    self._work, stretch, rate, 0.0, 0.0, load, 0.0, 0.0, 0.0,
-                    level.time - time, material.zeta, material.c1, 1.0 / material.j_lim, RTOL,
-                    0.0)
-                time, load = level.time, level.load
+            for number, level in enumerate(segment.move.levels):
+                if number:
+                    state = self._follow(
+                        state, segment.move.levels[number - 1].load, level.time - time)
+                time = level.time
                 levels.append(PlannedLevel(
-                    begin + self._ns(segment.begin) + self._ns(level.time),
-                    level.load * self._units.load, stretch, rate / self._units.time))
-        return tuple(levels)
+                    start + self._ns(time), level.load * self._units.load, state.stretch,
+                    state.rate / self._units.time, state.load * self._units.load))
+            duration = segment.move.duration
+            placed.append(PlannedSegment(
+                segment.setpoint.stretch, start,
+                None if math.isinf(duration) else start + self._ns(duration),
+                segment.move.code, segment.move.reason))
+        return tuple(levels), tuple(placed)
 
     def _ns(self, time: float) -> int:
         return round(time * self._units.time * NANOSECONDS)
@@ -495,25 +522,39 @@ class Planner:
             old.number + 1, old.levels[first:kept] + future[0], segments[-1:] + future[1])
         return self.plan
 
-    def _nearest_rest(self, begin: int) -> tuple[float, float]:
-        """Return the stretch to stop at and the flux density to apply until there."""
-        state = self.state(begin)
+    def _gentle_stop(
+            self, begin: int, state: State
+    ) -> tuple[tuple[PlannedLevel, ...], tuple[PlannedSegment, ...]]:
+        """Plan a stop on a grid or through ramps, which need room to be solved for."""
+        for share in _BRAKE_SHARES:
+            stretch = self._brake(state, share)[2]
+            try:
+                return self._plan(begin, [Setpoint(stretch, math.inf)], 'two_step')
+            except RefusedError as error:
+                refusal = error
+        raise refusal
+
+    def _brake(self, state: State, share: float) -> tuple[float, float, float]:
+        """Return a load that brakes with a share of the limit, for how long, and until where."""
         material = self._material
         i_j = 1.0 / material.j_lim
+        holding = float(kernels.elastic_force(state.stretch, i_j))
         frequency = math.sqrt(
             kernels.elastic_stiffness(state.stretch, i_j)
             / ((state.stretch ** -3 + material.c1) / 6.0))
         if abs(state.rate) <= _AT_REST * frequency:
-            return state.stretch, self._equilibrium_load(state.stretch)
+            return holding, 0.0, state.stretch
         up = state.rate > 0.0
         load = self._limits.minimum if up else self._limits.maximum
         if not math.isfinite(load):
-            # Unlimited: brake with the stiffest load that the elastic force is compared to.
-            load = kernels.elastic_force(state.stretch, i_j) - math.copysign(
+            # Unlimited: a load that stops within a fraction of a period.
+            load = holding - math.copysign(
                 10.0 * abs(state.rate) * frequency + 10.0, state.rate)
-        status, _, stretch, _, _ = kernels.turning_point(
+        load = holding + share * (load - holding)
+        status, time, stretch, _, _ = kernels.turning_point(
             self._work, state.stretch, state.rate, 1.0 if up else -1.0, load, 1.0,
             material.zeta, material.c1, i_j, RTOL)
         if status != kernels.DONE:
-            return state.stretch, self._equilibrium_load(state.stretch)
-        return stretch, load * self._units.load
+            return holding, 0.0, state.stretch
+        time = self._ns(time) / NANOSECONDS / self._units.time
+        return float(load), time, stretch

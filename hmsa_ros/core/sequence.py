@@ -81,7 +81,7 @@ def plan_sequence(
         setpoints: Sequence[Setpoint], material: NondimensionalParameters, *,
         start: State | None = None, shaper: str = 'two_step', limits: Limits | None = None,
         delivery: Delivery = IDEAL, order: int = 2, units: Units | None = None,
-        short_spell: str = 'refuse', resolution: float = 0.0) -> tuple[Segment, ...]:
+        short_spell: str = 'refuse') -> tuple[Segment, ...]:
     """
     Plan a sequence of setpoints.
 
@@ -99,7 +99,7 @@ def plan_sequence(
         Admissible loads; default none.
     delivery : Delivery
         How commands reach the coil; default at any time and at once. With a period, spans
-        must be multiples of it.
+        must be multiples of it. The next move starts from what the rounded command leads to.
     order : int
         Of the robust shaper, at least 1.
     units : Units, optional
@@ -107,9 +107,6 @@ def plan_sequence(
     short_spell : {'refuse', 'continue'}
         For a span that ends before the move: refuse, or plan the next move from the state that
         is really reached.
-    resolution : float
-        Times of the levels are rounded to multiples of this; 0 for none. The next move starts
-        from what the rounded command leads to.
 
     Returns
     -------
@@ -140,7 +137,7 @@ def plan_sequence(
         move = _rounded(
             shape(Request(
                 state, setpoint.stretch, material, limits, delivery, order, units)),
-            resolution)
+            delivery)
         if setpoint.span < move.duration < math.inf:
             if short_spell == 'refuse':
                 raise RefusedError(
@@ -161,17 +158,11 @@ def plan_sequence(
     return tuple(segments)
 
 
-def _rounded(move: Move, resolution: float) -> Move:
-    """Round a move's times to multiples of the resolution."""
-    if resolution == 0.0:
-        return move
-
-    def rounded(time: float) -> float:
-        return time if math.isinf(time) else round(time / resolution) * resolution
-
+def _rounded(move: Move, delivery: Delivery) -> Move:
+    """Return a move with its times as commands can carry them."""
     return Move(
-        move.code, tuple(Level(rounded(x.time), x.load) for x in move.levels),
-        rounded(move.duration), move.reason)
+        move.code, tuple(Level(delivery.rounded(x.time), x.load) for x in move.levels),
+        delivery.rounded(move.duration), move.reason)
 
 
 def _follow(

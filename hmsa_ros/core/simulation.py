@@ -6,6 +6,7 @@ changes of level is integrated on its own.
 """
 
 from collections.abc import Sequence
+import math
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -123,6 +124,8 @@ class ActuatorSimulation:
         Time at the start in ns.
     stretch : float
         Stretch at the start, at rest and held by its flux density.
+    slew_limit : float
+        Largest change of the flux density in T/s that the amplifier makes; infinite for steps.
 
     Attributes
     ----------
@@ -130,6 +133,8 @@ class ActuatorSimulation:
         Time in ns that the state belongs to.
     stretch, rate : float
         State; the rate in 1/s.
+    flux_density : float
+        In force, in T.
     schedule : CommandSchedule
         Commands in force and ahead, in T.
 
@@ -141,11 +146,15 @@ class ActuatorSimulation:
     """
 
     def __init__(
-            self, actuator: ActuatorParameters, *, time: int = 0, stretch: float = 1.0) -> None:
+            self, actuator: ActuatorParameters, *, time: int = 0, stretch: float = 1.0,
+            slew_limit: float = math.inf) -> None:
         """Start at rest."""
         self.actuator = actuator
         self._material = actuator.nondimensional
         check_stretch(stretch, self._material.j_lim, 'initial stretch')
+        if not slew_limit > 0.0:
+            raise BadInputError(f'slew limit is {slew_limit:g} T/s: expected a number above 0')
+        self._slew = slew_limit / actuator.flux_density_unit * actuator.time_unit
         self._work = kernels.work_space()
         self._initial = (
             stretch,
@@ -159,17 +168,13 @@ class ActuatorSimulation:
         self.stretch, flux_density = self._initial
         self._rate = 0.0
         self._step = 0.0
+        self.flux_density = flux_density
         self.schedule = CommandSchedule(flux_density)
 
     @property
     def rate(self) -> float:
         """Stretch rate in 1/s."""
         return self._rate / self.actuator.time_unit
-
-    @property
-    def flux_density(self) -> float:
-        """Flux density in force in T."""
-        return self.schedule.current
 
     def command(self, stamp: int, flux_density: float) -> int:
         """
@@ -229,15 +234,33 @@ class ActuatorSimulation:
             if change is None or change > time:
                 return
             self.schedule.apply_next()
+            if math.isinf(self._slew):
+                self.flux_density = self.schedule.current
             self._step = 0.0
 
     def _integrate(self, duration: int) -> None:
+        unit = self.actuator.flux_density_unit
+        left = duration / NANOSECONDS / self.actuator.time_unit
+        change = (self.schedule.current - self.flux_density) / unit
+        if change != 0.0 and not math.isinf(self._slew):
+            ramp = abs(change) / self._slew
+            span = min(left, ramp)
+            slope = math.copysign(self._slew, change)
+            self._follow(span, slope)
+            if span < ramp:
+                self.flux_density += slope * span * unit
+                return
+            left -= span
+        self.flux_density = self.schedule.current
+        if left > 0.0:
+            self._follow(left, 0.0)
+
+    def _follow(self, duration: float, slope: float) -> None:
         material = self._material
         status, stretch, rate, _, _, step = kernels.advance(
             self._work, self.stretch, self._rate, 0.0, 0.0,
-            self.schedule.current / self.actuator.flux_density_unit, 0.0, 0.0, 0.0,
-            duration / NANOSECONDS / self.actuator.time_unit, material.zeta, material.c1,
-            1.0 / material.j_lim, RTOL, self._step)
+            self.flux_density / self.actuator.flux_density_unit, slope, 0.0, 0.0, duration,
+            material.zeta, material.c1, 1.0 / material.j_lim, RTOL, self._step)
         if status != kernels.DONE:
             raise HmsaError(
                 f'the integration stopped at {self.time} ns under {self.flux_density:g} T: the '

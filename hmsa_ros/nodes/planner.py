@@ -1,6 +1,8 @@
 """Planner node: setpoints in, the shaped stream of stamped flux density commands out."""
 
 from collections.abc import Callable, Sequence
+import math
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
@@ -17,6 +19,7 @@ from hmsa_ros.core.sequence import SHORT_SPELL
 from hmsa_ros.core.shapers import SHAPERS
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.core.warmup import warm_up
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import conversions, interface
 from hmsa_ros.nodes.parameters import (
@@ -42,6 +45,20 @@ PARAMETERS = (
         'shaper', 'two_step', 'How a move is commanded.', choices=tuple(SHAPERS),
         read_only=False),
     ParameterSpec(
+        'robust_order', 2, 'Number of chained two-step commands of the shaper robust.', '',
+        1, 16, read_only=False),
+    ParameterSpec(
+        'command_mode', 'continuous',
+        'Whether commands are stamped with any time, or on the grid of command_period.',
+        choices=('continuous', 'sampled')),
+    ParameterSpec(
+        'command_period', 0.001, 'Period of the grid in command_mode sampled.', 's',
+        1e-9, 1e3),
+    ParameterSpec(
+        'slew_limit', 0.0,
+        'Rate at which the amplifier ramps to a commanded level; 0 for steps.', 'T/s',
+        0.0, 1e12),
+    ParameterSpec(
         'short_spell', 'refuse', 'What to do with a spell that ends before its move does.',
         choices=SHORT_SPELL, read_only=False),
     ParameterSpec(
@@ -66,6 +83,9 @@ class PlannerNode(Node):
         values = dict(declare(self, PARAMETERS))
         self._values = values
         self._joint: str = values['joint']
+        seconds = warm_up()
+        if seconds > 1.0:
+            self.get_logger().info(f'loaded the numerical kernels in {seconds:.1f} s')
         self._planner = Planner(
             actuator_from(values), _options(values), stretch=values['initial_stretch'])
         self._verdict = (DiagnosticStatus.OK, 'no request yet', 'none', '')
@@ -239,13 +259,17 @@ class PlannerNode(Node):
         return SetParametersResult(successful=True)
 
 
-def _options(values: dict[str, object]) -> Options:
+def _options(values: dict[str, Any]) -> Options:
     """Return the planning options that declared parameters describe."""
     return Options(
         shaper=str(values['shaper']), short_spell=str(values['short_spell']),
-        flux_density_min=float(values['flux_density_min']),  # type: ignore[arg-type]
-        flux_density_max=float(values['flux_density_max']),  # type: ignore[arg-type]
-        lead_time=round(float(values['lead_time']) * NANOSECONDS))  # type: ignore[arg-type]
+        flux_density_min=float(values['flux_density_min']),
+        flux_density_max=float(values['flux_density_max']),
+        lead_time=round(float(values['lead_time']) * NANOSECONDS),
+        period=0 if values['command_mode'] == 'continuous'
+        else round(float(values['command_period']) * NANOSECONDS),
+        slew_limit=float(values['slew_limit']) or math.inf,
+        order=int(values['robust_order']))
 
 
 def main(args: Sequence[str] | None = None) -> int:

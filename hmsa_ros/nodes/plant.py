@@ -1,6 +1,7 @@
 """Plant node: the simulated actuator, driven by stamped flux density commands."""
 
 from collections.abc import Callable, Sequence
+import math
 from time import monotonic_ns
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -29,6 +30,10 @@ PARAMETERS = (
     *ACTUATOR,
     JOINT,
     INITIAL_STRETCH,
+    ParameterSpec(
+        'slew_limit', 0.0,
+        'Rate at which the amplifier ramps to a commanded level; 0 for steps.', 'T/s',
+        0.0, 1e12),
     ParameterSpec(
         'publish_rate', 1000.0, "Samples per second of the plant's own time.", 'Hz',
         1e-3, 1e6),
@@ -72,7 +77,8 @@ class PlantNode(Node):
                 'leads simulated time or follows it')
         start = round(values['start_time'] * NANOSECONDS) if self._authority else 0
         self._simulation = ActuatorSimulation(
-            actuator_from(values), time=start, stretch=values['initial_stretch'])
+            actuator_from(values), time=start, stretch=values['initial_stretch'],
+            slew_limit=values['slew_limit'] or math.inf)
         self._pacer = Pacer(
             start, values['real_time_factor'] if self._authority else 1.0,
             paused=values['start_paused'])

@@ -13,6 +13,8 @@ from hmsa_ros.core.status import Code, RefusedError
 
 _RTOL = 1e-12
 _AT_REST = 1e-9
+# Room that is left below the limits, as a share, for what rounded times ask of the levels.
+_MARGIN = 1e-4
 _MOST_STEPS = 20_000
 
 
@@ -83,8 +85,19 @@ def minimum_time(request: Request, reason: str = '') -> Move:
             f'no command of two levels within the limits was found from stretch '
             f'{state.stretch:.6g} at rate {state.rate / request.units.time:.4g} to rest at '
             f'{target:g}')
+    if delivery.resolution > 0.0 and delivery.period == 0.0:
+        found = _on_time(request, found[0]) or found
     request.check(found[0])
     return Move(Code.MINIMUM_TIME, *found, reason)
+
+
+def _on_time(
+        request: Request, levels: tuple[Level, ...]) -> tuple[tuple[Level, ...], float] | None:
+    """Solve once more for the heights, with the times as commands can carry them."""
+    rounded = [Level(request.delivery.rounded(x.time), x.load) for x in levels]
+    return solve(
+        Template.of(rounded, [('load', 0), ('load', 1)]), request.state, request.load,
+        request.target, request.material, request.delivery.slew)
 
 
 def _frequency(request: Request) -> float:
@@ -102,9 +115,9 @@ def _bounds(request: Request, holding: float, frequency: float) -> tuple[float, 
     least = max(request.limits.minimum, holding - room)
     most = min(request.limits.maximum, holding + room)
     if math.isfinite(request.limits.minimum):
-        least = request.limits.minimum
+        least = holding - (1.0 - _MARGIN) * (holding - request.limits.minimum)
     if math.isfinite(request.limits.maximum):
-        most = request.limits.maximum
+        most = holding + (1.0 - _MARGIN) * (request.limits.maximum - holding)
     if not least < holding < most:
         raise RefusedError(
             Code.FLUX_LIMIT,
