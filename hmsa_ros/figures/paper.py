@@ -160,14 +160,15 @@ def _draw_multi_step(figure: Figure, runs: tuple[Run, ...]) -> None:
     left.set_xlim(-0.5, float(run.time[-1]))
     left.set_ylim(0.0, 1.12)
     style.finish(left, TAU, FLUX, 'a')
-    _plot_targets(right, run)
-    right.plot(
-        run.time, run.stretch, **style.UNSHAPED | {'linestyle': '-', 'linewidth': 1.4},
-        label='response')
     for i, target in enumerate(run.targets):
+        right.axhline(target, **style.TARGET)
+        # Beside the panel, where no curve runs.
         right.annotate(
-            rf'$\lambda(b_{i + 1})={target:.2f}$', ((i + 1) * paper_data.SPAN, target),
-            xytext=(-2, -20), textcoords='offset points', ha='right')
+            rf'$\lambda(b_{i + 1})={target:.2f}$', (1.0, target),
+            xycoords=('axes fraction', 'data'), xytext=(3, 0), textcoords='offset points',
+            va='center', fontsize=8)
+    right.plot(
+        run.time, run.stretch, **style.UNSHAPED | {'linestyle': '-', 'linewidth': 1.4})
     right.set_xlim(0.0, float(run.time[-1]))
     style.finish(right, TAU, STRETCH, 'b')
 
@@ -195,18 +196,18 @@ def _draw_single_move(figure: Figure, runs: tuple[Run, ...]) -> None:
         ha='right')
     # The balance of forces at the two critical points, Eq. 11 times m.
     left.annotate(
-        r'after $\tau_p$: $b_1^2=\psi^{\prime}(\lambda_d)$, $\ddot{\lambda}=0$', (tau_p, b_1),
+        r'$b_1^2$ equals the elastic force: $\ddot{\lambda}=0$', (tau_p, b_1),
         xytext=(16, 26), textcoords='offset points', va='center',
         arrowprops={'arrowstyle': '-', 'linewidth': 0.6, 'shrinkB': 4})
     left.annotate(
-        r'before $\tau_p$: $b_p^2-\psi^{\prime}(\lambda_d)=m\ddot{\lambda}<0$', (tau_p, b_p),
+        r'$b_p^2$ below the elastic force: $\ddot{\lambda}<0$', (tau_p, b_p),
         xytext=(16, -32), textcoords='offset points', va='center',
         arrowprops={'arrowstyle': '-', 'linewidth': 0.6, 'shrinkB': 4})
     left.axvline(tau_p, **style.TARGET)
     left.annotate(
         rf'$\tau_p={tau_p:.4f}$', (tau_p, 0.03), xytext=(4, 0), textcoords='offset points')
     left.set_xlim(-0.3, 10.0)
-    left.set_ylim(0.0, 0.66)
+    left.set_ylim(0.0, 0.7)
     style.finish(left, TAU, FLUX, 'a')
 
     right.axhline(shaped.targets[0], label=r'desired $\lambda_d$', **style.TARGET)
@@ -322,7 +323,7 @@ def _draw_chain_limit_cases(figure: Figure, runs: tuple[Run, ...]) -> None:
             rf'$J_{{\mathrm{{lim}}}}={pair[0].material.j_lim:g}$, $\lambda_m={limit:.3f}$, '
             rf'$\tilde{{\lambda}}_m={paper_data.NEAR_LIMIT:g}\,\lambda_m'
             rf'={pair[0].targets[2]:.3f}$', loc='right')
-        right.set_ylim(left.get_ylim())
+        right.set_ylim(1.35, 1.35 + 1.05 * (limit - 1.35))
     _legend_below(figure, grid[0, 0])
 
 
@@ -330,19 +331,16 @@ def _draw_chain_limit_sweep(figure: Figure, sweep: Sweep) -> None:
     left, right = figure.subplots(1, 2)
     marks = np.searchsorted(sweep.j_lim, paper_data.J_LIMS)
     extension = r'chain extensibility $J_{\mathrm{lim}}$'
-    left.plot(sweep.j_lim, sweep.tau_p, **style.SHAPED)
-    right.plot(
-        sweep.j_lim, signed_root(sweep.beta_p), label='$b_p$, intermediate', **style.SHAPED)
-    right.plot(
-        sweep.j_lim, signed_root(sweep.beta_1), label='$b_1$, holding', **style.UNSHAPED)
-    left.plot(sweep.j_lim[marks], sweep.tau_p[marks], **style.EQUILIBRIUM)
-    right.plot(
-        sweep.j_lim[marks], signed_root(sweep.beta_p[marks]),
-        label=r'$J_{\mathrm{lim}}$ of Fig. 9', **style.EQUILIBRIUM)
+    b_p = signed_root(sweep.beta_p)
+    for axes, values in ((left, sweep.tau_p), (right, b_p)):
+        axes.plot(sweep.j_lim, values, label=r'$1\to1.2$', **style.SHAPED)
+        axes.plot(
+            sweep.j_lim[marks], values[marks], label=r'$J_{\mathrm{lim}}$ of Fig. 9',
+            **style.EQUILIBRIUM)
     for axes in (left, right):
         axes.set_xlim(0.0, float(sweep.j_lim[-1]))
     style.finish(left, extension, TAU_P, 'a')
-    style.finish(right, extension, FLUX, 'b')
+    style.finish(right, extension, 'intermediate flux density $b_p$', 'b')
     _legend_below(figure, right)
 
 
