@@ -5,8 +5,9 @@ from datetime import datetime
 import json
 import os
 from pathlib import Path
-import signal
 from typing import Any, TYPE_CHECKING
+
+from hmsa_ros.ending import Ending
 
 if TYPE_CHECKING:
     from hmsa_ros.session.demo import DemoResult
@@ -65,8 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hmsa_ros.session.demo import prepare, run_demo
 
     prepare(folder)
-    # A service manager's way to say Ctrl-C.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    ending = Ending()
     console = Console(stderr=True)
     console.print(
         f'ROS_DOMAIN_ID {os.environ["ROS_DOMAIN_ID"]}, output in {folder}', highlight=False)
@@ -76,9 +76,12 @@ def run(arguments: argparse.Namespace) -> int:
                     '{task.percentage:>3.0f} %'), TimeElapsedColumn(),
                 console=console) as progress:
             task = progress.add_task('starting', total=1.0)
-            result = run_demo(
-                folder, dict(os.environ),
-                lambda what, share: progress.update(task, description=what, completed=share))
+
+            def report(what: str, share: float) -> None:
+                progress.update(task, description=what, completed=share)
+
+            result = run_demo(folder, dict(os.environ), report, ending)
+            ending.check()
     except KeyboardInterrupt:
         console.print(f'interrupted; the bag so far: {folder / "run"}', highlight=False)
         return 130
@@ -90,15 +93,16 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _print_table(result: 'DemoResult') -> None:
+    from rich.box import SIMPLE
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(caption=(
+    table = Table(box=SIMPLE, caption=(
         'b and tau nondimensional as in the paper; residual: peak-to-peak stretch after '
         'arrival, share of the step; unshaped: simulated on the same plant'))
     for name in ('target', 'b_p', 'tau_p', 'b_1', 'arrival ms', 'residual', 'unshaped'):
         table.add_column(name, justify='right', no_wrap=True)
-    table.add_column('held')
+    table.add_column('held', no_wrap=True)
     for x in result.setpoints:
         table.add_row(
             f'{x.stretch:g}', f'{x.b_p:.5f}', f'{x.tau_p:.5f}', f'{x.b_1:.5f}',

@@ -5,7 +5,6 @@ One place for what every node's ``main`` does, so that a node file holds wiring 
 """
 
 from collections.abc import Callable, Sequence
-import signal
 import sys
 
 import rclpy
@@ -16,28 +15,12 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
+from hmsa_ros.ending import Ending
 from hmsa_ros.errors import BadInputError, HmsaError
 
 # EventsExecutor.spin() without a time limit busy-loops and delivers nothing on this rclpy
 # (7.1); waiting for a future that never completes, a slice at a time, behaves as documented.
 _SLICE_SECONDS = 0.1
-
-
-class _Ending:
-    """
-    Whether SIGINT or SIGTERM has asked the process to end.
-
-    The signals are ours, not rclpy's: its handlers shut the context down in the middle of a
-    callback, which then fails where it publishes.
-    """
-
-    def __init__(self) -> None:
-        self.asked = False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._on_signal)
-
-    def _on_signal(self, *_: object) -> None:
-        self.asked = True
 
 
 def spin(node: Node, ending: Callable[[], bool]) -> None:
@@ -84,7 +67,7 @@ def run(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
         Exit status: 0 for a clean end, 2 for bad arguments or parameters, 1 for a failure.
 
     """
-    ending = _Ending()
+    ending = Ending()
     arguments = list(sys.argv[1:] if args is None else args)
     try:
         rclpy.init(

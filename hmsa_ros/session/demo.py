@@ -22,6 +22,7 @@ from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.residual import residual_vibration
 from hmsa_ros.core.simulation import unshaped
 from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.ending import Ending
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import from_time
@@ -151,7 +152,7 @@ def prepare(folder: Path) -> None:
 
 def run_demo(
         folder: Path, environment: dict[str, str],
-        progress: Callable[[str, float], None]) -> DemoResult:
+        progress: Callable[[str, float], None], ending: Ending) -> DemoResult:
     """
     Run the paper's sequence and evaluate the bag.
 
@@ -163,6 +164,8 @@ def run_demo(
         Environment of the processes; this process must live in the same ROS domain.
     progress : callable
         Called with what is going on and the share of the sequence that is done.
+    ending : Ending
+        Asked between two callbacks; the processes are ended whatever happens.
 
     Returns
     -------
@@ -173,26 +176,32 @@ def run_demo(
     ------
     HmsaError
         If a process fails or the bag does not hold the run.
+    KeyboardInterrupt
+        If the end was asked for.
 
     """
+    def check() -> None:
+        ending.check()
+        session.check()
+
     bag = folder / 'run'
     with Session(folder, environment) as session:
-        _start(session, bag)
+        _start(session, bag, ending)
         with PlannerClient(timeout=_START_SECONDS) as client:
             watch = _Watch(client)
             progress('starting the nodes', 0.0)
-            client.find_planner(session.check)
+            client.find_planner(check)
             client.spin_until(
                 lambda: watch.recorder_ready,
-                f'the recorder is not ready: {session.last_words("recorder")}', session.check)
-            watch.unpause(session.check)
+                f'the recorder is not ready: {session.last_words("recorder")}', check)
+            watch.unpause(check)
             spans = [span * paper_actuator().time_unit for _, span in SEQUENCE]
             verdict = client.send([(x, s) for (x, _), s in zip(SEQUENCE, spans, strict=True)])
             begin = watch.time
             total = sum(spans) + LEAD_TIME
 
             def report() -> None:
-                session.check()
+                check()
                 progress('running the sequence', min((watch.time - begin) / total, 1.0))
 
             # Not only carried out: the last setpoint is watched for its whole span.
@@ -211,16 +220,19 @@ def run_demo(
     return _evaluate(bag, folder / 'run.png', exits)
 
 
-def _start(session: Session, bag: Path) -> None:
+def _start(session: Session, bag: Path, ending: Ending) -> None:
     """Start the three nodes; time stands still until all are ready."""
-    session.start(NodeProcess('plant', {
-        'publish_clock': 'true', 'start_paused': 'true',
-        'real_time_factor': str(REAL_TIME_FACTOR), 'publish_rate': str(PUBLISH_RATE)}))
-    session.start(NodeProcess('planner', {
-        'use_sim_time': 'true', 'lead_time': str(LEAD_TIME)}))
-    session.start(NodeProcess('recorder', {
-        'use_sim_time': 'true', 'storage.uri': str(bag),
-        'record.topics': '[' + ', '.join(_TOPICS) + ']'}))
+    for node in (
+            NodeProcess('plant', {
+                'publish_clock': 'true', 'start_paused': 'true',
+                'real_time_factor': str(REAL_TIME_FACTOR),
+                'publish_rate': str(PUBLISH_RATE)}),
+            NodeProcess('planner', {'use_sim_time': 'true', 'lead_time': str(LEAD_TIME)}),
+            NodeProcess('recorder', {
+                'use_sim_time': 'true', 'storage.uri': str(bag),
+                'record.topics': '[' + ', '.join(_TOPICS) + ']'})):
+        ending.check()
+        session.start(node)
 
 
 class _Watch:

@@ -1,0 +1,92 @@
+"""The demo, whole: real processes over DDS, one core loaded, evaluated from its bag."""
+
+import json
+from pathlib import Path
+import signal
+
+from mcap.reader import make_reader
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import get_typestore, Stores
+
+# Slow motion makes it last some 15 s; a loaded machine takes longer.
+DEMO_SECONDS = 120.0
+LARGEST_RESIDUAL = 1e-6
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow]
+
+
+def test_every_setpoint_is_reached_and_held_while_another_process_loads_a_core(start, tmp_path):
+    out = tmp_path / 'out'
+    busy = start.python('-c', 'while True: pass')
+    demo = start.hmsa('demo', '--out', str(out), '--json')
+    assert demo.wait(DEMO_SECONDS) == 0, demo.output
+    assert busy.alive()
+    result = json.loads(demo.stdout)
+    assert result['succeeded']
+    assert [x['stretch'] for x in result['setpoints']] == [1.1, 1.2, 1.4]
+    for setpoint in result['setpoints']:
+        assert setpoint['residual'] <= LARGEST_RESIDUAL
+        assert setpoint['error'] <= LARGEST_RESIDUAL
+        assert setpoint['residual_unshaped'] > 0.5
+    # Known values of the paper's first and third move.
+    assert result['setpoints'][0]['tau_p'] == pytest.approx(1.315749737, abs=1e-6)
+    assert result['setpoints'][2]['b_p'] ** 2 == pytest.approx(0.778278436, abs=1e-6)
+    assert result['exits'] == {'recorder': 0, 'plant': 0, 'planner': 0}
+    assert Path(result['picture']).read_bytes().startswith(b'\x89PNG')
+    _check_bag(Path(result['bag']))
+
+    # The same folder again would mix two runs.
+    again = start.hmsa('demo', '--out', str(out))
+    assert again.wait(DEMO_SECONDS) == 2
+    assert 'earlier run' in again.stderr
+    assert 'Traceback' not in again.stderr
+
+
+def _check_bag(bag: Path) -> None:
+    """Open the bag with two readers that are not ours."""
+    with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        counts = {x.topic: x.msgcount for x in reader.connections}
+        assert counts['/flux_density_command'] == 6
+        connections = [x for x in reader.connections if x.topic == '/joint_states']
+        stamps = []
+        for connection, _, data in reader.messages(connections=connections):
+            message = reader.deserialize(data, connection.msgtype)
+            stamps.append(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+    # 20 kHz of the plant's own time, none missing.
+    assert {b - a for a, b in zip(stamps, stamps[1:], strict=False)} == {50_000}
+    with next(bag.glob('*.mcap')).open('rb') as file:
+        assert make_reader(file).get_summary().statistics.message_count == sum(counts.values())
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('moment', ['starting the nodes', 'running the sequence'])
+def test_an_interrupted_demo_ends_its_processes_and_leaves_a_readable_bag(
+        start, tmp_path, wait_until, number, moment):
+    out = tmp_path / 'out'
+    demo = start.hmsa('demo', '--out', str(out))
+    if moment == 'running the sequence':
+        wait_until(lambda: list(out.glob('run/*.mcap')), 'the bag', DEMO_SECONDS)
+    else:
+        wait_until(lambda: list(out.glob('*.log')), 'the first node', DEMO_SECONDS)
+    children = _children(demo.popen.pid)
+    assert demo.stop(number, DEMO_SECONDS) == 130, demo.output
+    assert 'Traceback' not in demo.output
+    assert not [pid for pid in children if Path(f'/proc/{pid}').exists()]
+    if moment == 'running the sequence':
+        with next(out.glob('run/*.mcap')).open('rb') as file:
+            assert make_reader(file).get_summary() is not None
+
+
+def _children(pid: int) -> list[int]:
+    text = Path(f'/proc/{pid}/task/{pid}/children').read_text(encoding='ascii')
+    return [int(x) for x in text.split()]
+
+
+def test_an_output_folder_that_cannot_be_written_is_refused_in_one_line(start, tmp_path):
+    file = tmp_path / 'file'
+    file.touch()
+    demo = start.hmsa('demo', '--out', str(file / 'out'))
+    assert demo.wait(DEMO_SECONDS) == 2
+    assert len(demo.stderr.strip().splitlines()) == 1
+    assert 'cannot write' in demo.stderr
