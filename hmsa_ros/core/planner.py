@@ -12,6 +12,7 @@ import math
 
 from hmsa_ros.core import kernels
 from hmsa_ros.core.delivery import Delivery, pieces
+from hmsa_ros.core.model import equilibrium_stretch
 from hmsa_ros.core.moves import Level, Limits, Move, State
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.sequence import plan_sequence, Segment, Setpoint
@@ -215,7 +216,9 @@ class Planner:
             Time in ns before the jump.
 
         """
-        self._rest(self.state(now).stretch, self.plan.number)
+        load = self._level(now).flux_density / self._units.load
+        self._rest(
+            float(equilibrium_stretch(load, self._material.j_lim)), self.plan.number)
 
     # -- requests ------------------------------------------------------------------------------
 
