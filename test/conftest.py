@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from typing import Any
 
@@ -22,6 +23,8 @@ ROOT = Path(__file__).resolve().parent.parent
 # Limit of every wait: generous, since it is only reached when a test fails.
 WAIT_SECONDS = 60.0
 POLL_SECONDS = 0.02
+# Between two looks at a condition while callbacks are served.
+SPIN_SECONDS = 0.003
 DOMAINS = range(1, 102)
 
 
@@ -364,7 +367,7 @@ class RosSide:
         while not (result := condition()):
             if time.monotonic() > end:
                 pytest.fail(f'waited {seconds:g} s for {what}')
-            self.executor.spin_once(POLL_SECONDS)
+            self.executor.spin_once(SPIN_SECONDS)
         return result
 
     def collect(self, message_type: type[Any], topic: str, qos: Any = 1000) -> list[Any]:
@@ -490,3 +493,135 @@ def make_ros(
     yield make
     for side in sides:
         side.close()
+
+
+class Served:
+    """
+    Nodes of this package that run in a thread of this process, as their processes would.
+
+    They live in rclpy's default context, apart from the test's own.
+
+    Attributes
+    ----------
+    nodes : list of rclpy.node.Node
+        The nodes.
+
+    """
+
+    def __init__(
+            self, domain_id: int, factories: Sequence[Callable[[], Any]],
+            arguments: Sequence[str]) -> None:
+        import rclpy
+        from rclpy.signals import SignalHandlerOptions
+        rclpy.init(
+            args=['test', *(['--ros-args', *arguments] if arguments else [])],
+            domain_id=domain_id, signal_handler_options=SignalHandlerOptions.NO)
+        self.nodes: list[Any] = []
+        self._threads: list[threading.Thread] = []
+        self._failures: list[BaseException] = []
+        self._ending = False
+        try:
+            for factory in factories:
+                self.nodes.append(factory())
+        except BaseException:
+            self.close()
+            raise
+        for node in self.nodes:
+            self._threads.append(threading.Thread(target=self._run, args=(node,)))
+            self._threads[-1].start()
+
+    def _run(self, node: Any) -> None:
+        from hmsa_ros.nodes.runner import spin
+        try:
+            spin(node, lambda: self._ending)
+        except BaseException as error:  # whatever it is, it would have ended the process
+            self._failures.append(error)
+
+    def now(self) -> int:
+        """Return the time in ns on the clock of the first node."""
+        return int(self.nodes[0].get_clock().now().nanoseconds)
+
+    def close(self) -> None:
+        """End the nodes, and raise what one of them has failed with."""
+        import rclpy
+        self._ending = True
+        for thread in self._threads:
+            thread.join(WAIT_SECONDS)
+        for node in self.nodes:
+            node.destroy_node()
+        rclpy.try_shutdown()
+        if self._failures:
+            raise self._failures[0]
+
+
+@pytest.fixture
+def serve(
+        ros_env: Mapping[str, str], ros_domain_id: int) -> Iterator[Callable[..., Served]]:
+    """Return a starter, once a test, of nodes in threads: ``serve(PlantNode, '-p', ...)``."""
+    running: list[Served] = []
+
+    def serve_nodes(*arguments: Any) -> Served:
+        factories = [x for x in arguments if not isinstance(x, str)]
+        running.append(Served(
+            ros_domain_id, factories, [x for x in arguments if isinstance(x, str)]))
+        return running[-1]
+
+    yield serve_nodes
+    for served in running:
+        served.close()
+
+
+class SimulatedClock:
+    """
+    The test as authority on simulated time.
+
+    Parameters
+    ----------
+    side : RosSide
+        Publishes /clock.
+    served : Served
+        Nodes that follow it.
+
+    """
+
+    def __init__(self, side: RosSide, served: Served) -> None:
+        from rclpy.qos import QoSProfile, ReliabilityPolicy
+        from rosgraph_msgs.msg import Clock
+        self._side = side
+        self._served = served
+        self._publisher = side.publisher(
+            Clock, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT),
+            subscribers=len(served.nodes))
+
+    def set(self, time_ns: int) -> None:
+        """
+        Set the time and return when all nodes have it.
+
+        Parameters
+        ----------
+        time_ns : int
+            In ns; it may lie before the present.
+
+        """
+        from builtin_interfaces.msg import Time
+        from rosgraph_msgs.msg import Clock
+        seconds, nanoseconds = divmod(time_ns, 10**9)
+        message = Clock(clock=Time(sec=seconds, nanosec=nanoseconds))
+        ends = [0.0]
+
+        def there() -> bool:
+            if all(x.get_clock().now().nanoseconds == time_ns for x in self._served.nodes):
+                return True
+            # Best effort: said again where it got lost.
+            if time.monotonic() > ends[0]:
+                self._publisher.publish(message)
+                ends[0] = time.monotonic() + 0.1
+            return False
+
+        self._side.spin_until(there, f'{time_ns} ns on the clocks')
+
+
+@pytest.fixture
+def make_clock() -> Callable[[RosSide, Served], SimulatedClock]:
+    """Return a maker of `SimulatedClock`."""
+    return SimulatedClock

@@ -1,0 +1,547 @@
+"""The planner node on the wire: requests in, command stream, plan and verdicts out."""
+
+from collections.abc import Callable
+from dataclasses import replace
+import math
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+import pytest
+from rclpy.parameter import Parameter
+from std_msgs.msg import Float64
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory
+
+from hmsa_ros.core.model import equilibrium_stretch
+from hmsa_ros.core.parameters import paper_actuator
+from hmsa_ros.core.planner import Options, PlannedLevel, Planner
+from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.conversions import (
+    from_command,
+    from_time,
+    to_time,
+    to_trajectory,
+)
+from hmsa_ros.nodes.planner import PlannerNode
+
+pytestmark = pytest.mark.ros
+
+MS = 1_000_000
+START = 1000 * MS
+LEAD = 50 * MS
+# The paper's sequence: a spell of ten units of time is 43.6 ms for this block.
+SPELL = 44 * MS
+SEQUENCE = ((1.1, SPELL), (1.2, 2 * SPELL), (1.4, 3 * SPELL))
+END = START + LEAD + 3 * SPELL
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+
+def trajectory(
+        *points: tuple[float, int], joint: str = 'actuator', stamp: int = 0,
+        request: str = '') -> JointTrajectory:
+    """Return a request."""
+    return to_trajectory(points, joint, stamp=stamp, frame=request)
+
+
+class Bench:
+    """A planner node, simulated time in hand, and the core planner to hold it against."""
+
+    def __init__(
+            self, ros: Any, clock: Any, prefix: str, remapped: dict[str, str]) -> None:
+        self.ros = ros
+        self.clock = clock
+        self.prefix = prefix
+        self.remapped = remapped
+        self.core = Planner(
+            paper_actuator(),
+            Options(flux_density_min=-0.5, flux_density_max=0.5, lead_time=LEAD))
+        self.now = 0
+        self.expected: list[PlannedLevel] = []
+        self.commands = self.collect(interface.FLUX_DENSITY_COMMAND)
+        self.plans = self.collect(interface.PLAN)
+        self.statuses = self.collect(interface.STATUS)
+        self.trajectories = self.publisher(interface.JOINT_TRAJECTORY)
+        self.setpoints = self.publisher(interface.SETPOINT)
+        self.requests = 0
+
+    def name(self, entry: Any) -> str:
+        """Return the full name of a topic or service."""
+        if entry.name in self.remapped:
+            return self.remapped[entry.name]
+        namespace, _, node = self.prefix.rpartition('/')
+        name = interface.from_outside(entry.name, node)
+        return name if name.startswith('/') else f'{namespace}/{name}'
+
+    def collect(self, topic: Any) -> list[Any]:
+        """Return the messages of a topic, once its publisher is there."""
+        messages: list[Any] = self.ros.collect(topic.type, self.name(topic), topic.qos)
+        self.ros.spin_until(
+            lambda: self.ros.node.count_publishers(self.name(topic)), self.name(topic))
+        return messages
+
+    def publisher(self, topic: Any) -> Any:
+        """Return a publisher to the planner."""
+        return self.ros.publisher(topic.type, self.name(topic), topic.qos)
+
+    def at(self, now: int) -> None:
+        """Let time be, and take the commands that the core planner hands out then."""
+        self.clock.set(now)
+        self.now = now
+        self.take()
+
+    def take(self) -> None:
+        """Wait for what the core planner hands out now."""
+        self.expected += self.core.due(self.now)
+        self.ros.spin_until(
+            lambda: len(self.commands) >= len(self.expected),
+            f'{len(self.expected)} commands')
+
+    def run(self, end: int, step: int = 10 * MS) -> None:
+        """Let time run to an end."""
+        while self.now < end:
+            self.at(min(self.now + step, end))
+
+    def values(self) -> dict[str, str]:
+        """Return the newest status' values."""
+        return {x.key: x.value for x in self.statuses[-1].values}
+
+    def verdict(self, code: str, **values: Any) -> DiagnosticStatus:
+        """Wait for a status with a code and values, and return it."""
+        expected = {'code': code, **{key: str(value) for key, value in values.items()}}
+
+        def seen() -> bool:
+            return bool(self.statuses) and expected.items() <= self.values().items()
+
+        self.ros.spin_until(seen, f'a status with {expected}')
+        return self.statuses[-1]
+
+    def send(self, message: JointTrajectory, code: str = 'accepted') -> DiagnosticStatus:
+        """Send a trajectory and wait for its verdict."""
+        self.requests += 1
+        message.header.frame_id = f'request {self.requests}'
+        self.trajectories.publish(message)
+        return self.verdict(code, request=message.header.frame_id)
+
+    def request(self, *points: tuple[float, int], stamp: int | None = None) -> None:
+        """Send a trajectory to the node and to the core planner."""
+        self.core.request(points, stamp, self.now)
+        self.send(trajectory(*points, stamp=stamp or 0))
+        self.take()
+
+    def setpoint(self, stretch: float, code: str = 'accepted') -> None:
+        """Send a setpoint to the node and to the core planner."""
+        self.core.setpoint(stretch, self.now)
+        self.setpoints.publish(Float64(data=stretch))
+        self.verdict(code, request='', plan=self.core.plan.number)
+        self.take()
+
+    def check(self) -> None:
+        """
+        Hold the command stream against the core planner's.
+
+        A last setpoint follows on the same topic, so that a message too many would lie before
+        its commands.
+        """
+        self.at(self.now + 1000 * MS)
+        self.setpoint(1.01)
+        self.at(self.now + 1000 * MS)
+        assert [from_command(x) for x in self.commands] == [
+            (x.stamp, x.flux_density) for x in self.expected]
+
+
+@pytest.fixture
+def bench(ros: Any, serve: Any, make_clock: Any) -> Callable[..., Bench]:
+    """Return a maker of a bench with node arguments."""
+    def make(
+            *arguments: str, prefix: str = '/planner', now: int = START,
+            **remapped: str) -> Bench:
+        served = serve(PlannerNode, '-p', 'use_sim_time:=true', *arguments)
+        made = Bench(ros, make_clock(ros, served), prefix, remapped)
+        if now:
+            made.at(now)
+        return made
+    return make
+
+
+def test_sequence_comes_out_as_the_command_stream_of_the_core_plan(bench):
+    planner = bench()
+    planner.request(*SEQUENCE)
+    planner.run(END)
+    assert len(planner.commands) == 6
+    planner.check()
+    assert {x.header.frame_id for x in planner.commands} == {'coil'}
+    assert {(x.magnetic_field.x, x.magnetic_field.y) for x in planner.commands} == {(0.0, 0.0)}
+    assert not any(
+        any(x.magnetic_field_covariance) for x in planner.commands)
+
+
+def test_each_command_is_sent_once_its_stamp_is_no_more_than_lead_time_ahead(bench):
+    planner = bench()
+    planner.request(*SEQUENCE)
+    sent = []
+    while planner.now < END:
+        known = len(planner.commands)
+        planner.at(planner.now + 4 * MS)
+        sent += [(planner.now, from_command(x)[0]) for x in planner.commands[known:]]
+    assert len(sent) == 5
+    for now, stamp in sent:
+        assert now <= stamp <= now + LEAD
+
+
+def test_lead_time_of_the_parameter_is_kept(bench):
+    planner = bench('-p', 'lead_time:=0.2')
+    planner.core.set_options(replace(planner.core.options, lead_time=200 * MS))
+    planner.request((1.1, 500 * MS))
+    assert [x.stamp for x in planner.expected][0] == START + 200 * MS
+    planner.check()
+
+
+@pytest.mark.parametrize(('arguments', 'options'), [
+    (('-p', 'command_mode:=sampled', '-p', 'command_period:=0.0005'), {'period': MS // 2}),
+    (('-p', 'slew_limit:=100.0'), {'slew_limit': 100.0}),
+    (('-p', 'shaper:=robust', '-p', 'robust_order:=3'), {'shaper': 'robust', 'order': 3}),
+    (('-p', 'flux_density_max:=0.2', '-p', 'shaper:=minimum_time'),
+     {'flux_density_max': 0.2, 'shaper': 'minimum_time'}),
+])
+def test_options_of_the_parameters_are_those_of_the_core_plan(bench, arguments, options):
+    planner = bench(*arguments)
+    planner.core.set_options(replace(planner.core.options, **options))
+    planner.request(*SEQUENCE)
+    planner.run(END)
+    planner.check()
+    if 'period' in options:
+        assert not any(x.stamp % options['period'] for x in planner.expected)
+
+
+def test_future_stamp_keeps_the_running_plan_until_then(bench):
+    planner = bench()
+    planner.request(*SEQUENCE)
+    planner.request((1.3, SPELL), stamp=START + LEAD + SPELL + 20 * MS)
+    planner.run(END)
+    planner.check()
+    # Two levels of the first setpoint, one that is cut off, two of the new one, two of the check.
+    assert len(planner.commands) >= 6
+
+
+def test_past_stamp_with_an_end_ahead_joins_in_the_middle(bench):
+    planner = bench()
+    planner.request(*SEQUENCE, stamp=START - MS)
+    assert [x.stretch for x in planner.core.plan.segments] == [1.2, 1.4]
+    planner.run(END)
+    planner.check()
+
+
+def test_late_joiner_gets_plan_and_status(bench, make_ros):
+    planner = bench()
+    planner.request(*SEQUENCE)
+    late = make_ros()
+    plans = late.collect(
+        interface.PLAN.type, planner.name(interface.PLAN), interface.PLAN.qos)
+    statuses = late.collect(
+        interface.STATUS.type, planner.name(interface.STATUS), interface.STATUS.qos)
+    late.spin_until(lambda: plans and statuses, 'plan and status')
+    assert plans == planner.plans[-1:]
+    assert statuses == planner.statuses[-1:]
+    levels = [x for x in planner.core.plan.levels if x.stamp > 0]
+    start = from_time(plans[0].header.stamp)
+    assert plans[0].joint_names == ['actuator']
+    assert [
+        (start + from_time(x.time_from_start), x.positions[0], x.velocities[0], x.effort[0])
+        for x in plans[0].points] == [
+        (x.stamp, x.stretch, x.rate, x.flux_density) for x in levels]
+
+
+def test_status_tells_the_progress_until_at_rest(bench):
+    planner = bench()
+    assert planner.verdict('none', state='idle', setpoints=0).level == OK
+    planner.request(*SEQUENCE)
+    planner.verdict('accepted', state='waiting', setpoint=0, setpoints=3)
+    begin, arrival = (
+        planner.core.plan.segments[1].begin, planner.core.plan.segments[1].arrival)
+    for now, state, setpoint, stretch in (
+            (START + LEAD - 1, 'waiting', 0, ''),
+            (START + LEAD, 'moving', 1, '1.1'),
+            (begin - 1, 'holding', 1, '1.1'),
+            (begin, 'moving', 2, '1.2'),
+            (arrival - 1, 'moving', 2, '1.2'),
+            (arrival, 'holding', 2, '1.2'),
+            (END, 'at_rest', 3, '1.4')):
+        planner.at(now)
+        status = planner.verdict(
+            'accepted', state=state, setpoint=setpoint, setpoints=3, stretch=stretch,
+            request='request 1', plan=1)
+        assert status.level == OK
+        assert status.hardware_id == 'actuator'
+
+
+def test_setpoint_is_reached_as_soon_as_possible_and_held(bench):
+    planner = bench()
+    planner.setpoint(1.25)
+    planner.at(START + 1000 * MS)
+    planner.verdict('accepted', state='at_rest', stretch='1.25')
+    planner.setpoint(0.9)
+    planner.check()
+
+
+def test_setpoint_sent_again_and_again_changes_nothing(bench):
+    planner = bench()
+    planner.setpoint(1.25)
+    for now in range(START + 100 * MS, START + 300 * MS, 100 * MS):
+        planner.at(now)
+        planner.setpoint(1.25, 'unchanged')
+    assert len(planner.plans) == 1
+    planner.check()
+
+
+def test_stop_comes_to_rest_without_vibration(bench):
+    planner = bench()
+    planner.request(*SEQUENCE)
+    # The middle of the first move lies lead_time ahead of this.
+    planner.at(START + 3 * MS)
+    planner.core.stop(planner.now)
+    answer = planner.ros.call(Trigger, planner.name(interface.STOP))
+    assert (answer.success, answer.message) == (True, 'accepted')
+    planner.take()
+    assert len(planner.core.plan.levels) == 3
+    rest = planner.core.state(END + 1000 * MS)
+    assert abs(rest.rate) < 1e-12
+    assert 1.0 < rest.stretch < 1.1
+    planner.run(END)
+    planner.verdict('accepted', state='at_rest')
+    planner.check()
+
+
+BAD = {
+    'nan': (
+        trajectory((math.nan, SPELL)), 'bad_input', 'stretch is nan: expected a finite number'),
+    'infinite': (
+        trajectory((math.inf, SPELL)), 'bad_input', 'stretch is inf: expected a finite number'),
+    'nan_in_second_point': (
+        trajectory((1.1, SPELL), (math.nan, 2 * SPELL)), 'bad_input', 'stretch is nan'),
+    'no_points': (trajectory(), 'bad_input', 'has no points: expected at least one'),
+    'no_positions': (trajectory((1.1, SPELL)), 'bad_input', 'point 0 has 0 positions'),
+    'two_positions': (trajectory((1.1, SPELL)), 'bad_input', 'point 0 has 2 positions'),
+    'rate_at_the_end': (trajectory((1.1, SPELL)), 'bad_input', 'point 0 has velocities [0.5]'),
+    'nan_rate': (trajectory((1.1, SPELL)), 'bad_input', 'point 0 has velocities [nan]'),
+    'effort': (trajectory((1.1, SPELL)), 'bad_input', 'point 0 has effort [0.1]'),
+    'wrong_joint': (
+        trajectory((1.1, SPELL), joint='knee'), 'unknown_joint',
+        "joint_names is ['knee']: expected ['actuator']"),
+    'no_joint': (trajectory((1.1, SPELL)), 'unknown_joint', 'joint_names is []'),
+    'two_joints': (trajectory((1.1, SPELL)), 'unknown_joint', "['actuator', 'actuator']"),
+    'times_equal': (
+        trajectory((1.1, SPELL), (1.2, SPELL)), 'not_increasing',
+        'time_from_start of point 1 is 0.044 s after 0.044 s'),
+    'times_decreasing': (
+        trajectory((1.1, SPELL), (1.2, SPELL - 1)), 'not_increasing', 'strictly increasing'),
+    'negative_time': (
+        trajectory((1.1, -SPELL)), 'not_increasing',
+        'time_from_start of point 0 is -0.044 s: expected at least 0 s'),
+    'stamp_in_the_past': (
+        trajectory((1.1, SPELL), stamp=START // 2), 'in_the_past', 'use_sim_time'),
+    'stamp_before_the_epoch': (
+        trajectory((1.1, SPELL), stamp=-START), 'in_the_past', 'use_sim_time'),
+    'beyond_the_limit': (
+        trajectory((3.0, SPELL)), 'out_of_range', 'stretch is 3: expected a stretch between'),
+    'negative_stretch': (
+        trajectory((-1.1, SPELL)), 'bad_input', 'expected a finite number greater than 0'),
+    'zero_stretch': (
+        trajectory((0.0, SPELL)), 'bad_input', 'expected a finite number greater than 0'),
+    'flux_limit': (
+        trajectory((2.2, SPELL)), 'flux_limit', 'stretch 2.2 needs a flux density of'),
+    'spell_too_short': (trajectory((1.3, MS)), 'spell_too_short', 'its span is 0.001 s'),
+    'no_time_at_all': (trajectory((1.3, 0)), 'spell_too_short', 'time_from_start 0'),
+    'jump_at_the_start': (
+        trajectory((1.3, 0), (1.4, SPELL)), 'spell_too_short', 'at time_from_start 0'),
+}
+BAD['no_positions'][0].points[0].positions = []
+BAD['two_positions'][0].points[0].positions = [1.1, 1.2]
+BAD['rate_at_the_end'][0].points[0].velocities = [0.5]
+BAD['nan_rate'][0].points[0].velocities = [math.nan]
+BAD['effort'][0].points[0].effort = [0.1]
+BAD['no_joint'][0].joint_names = []
+BAD['two_joints'][0].joint_names = ['actuator', 'actuator']
+
+
+@pytest.mark.parametrize('name', BAD)
+def test_bad_trajectory_is_refused_with_a_reason_and_the_running_plan_goes_on(bench, name):
+    message, code, fragment = BAD[name]
+    planner = bench()
+    planner.request(*SEQUENCE)
+    planner.at(START + 20 * MS)
+    plan = planner.plans[-1]
+    status = planner.send(message, code)
+    assert status.level == ERROR
+    assert fragment in status.message
+    assert '\n' not in status.message
+    assert planner.values()['setpoints'] == '3'
+    planner.run(END)
+    planner.verdict(code, state='at_rest', setpoint=3, plan=1)
+    assert planner.plans == [plan]
+    planner.check()
+
+
+@pytest.mark.parametrize(('stretch', 'code', 'fragment'), [
+    (math.nan, 'bad_input', 'stretch is nan: expected a finite number'),
+    (-math.inf, 'bad_input', 'stretch is -inf: expected a finite number'),
+    (3.0, 'out_of_range', 'stretch is 3: expected a stretch between'),
+    (2.2, 'flux_limit', 'needs a flux density of'),
+])
+def test_bad_setpoint_is_refused_with_a_reason_and_the_running_plan_goes_on(
+        bench, stretch, code, fragment):
+    planner = bench()
+    planner.setpoint(1.2)
+    planner.at(START + 2 * MS)
+    planner.setpoints.publish(Float64(data=stretch))
+    status = planner.verdict(code, plan=1)
+    assert status.level == ERROR
+    assert fragment in status.message
+    planner.check()
+
+
+def test_nothing_is_accepted_before_simulated_time_has_started(bench):
+    planner = bench(now=0)
+    status = planner.send(trajectory(*SEQUENCE), 'no_time')
+    assert status.level == ERROR
+    assert 'expected messages on /clock' in status.message
+    planner.setpoints.publish(Float64(data=1.1))
+    planner.verdict('no_time', request='')
+    answer = planner.ros.call(Trigger, planner.name(interface.STOP))
+    assert not answer.success
+    assert '/clock' in answer.message
+    planner.at(START)
+    planner.request(*SEQUENCE)
+    planner.run(END)
+    planner.check()
+
+
+def test_target_that_is_only_crept_up_to_is_accepted_with_a_warning(bench):
+    planner = bench('-p', 'actuator.damping_coefficient:=10.0')
+    planner.setpoints.publish(Float64(data=1.1))
+    status = planner.verdict('too_damped', plan=1, state='waiting')
+    assert status.level == WARN
+    assert status.message
+    planner.clock.set(START + LEAD)
+    planner.verdict('too_damped', state='settling')
+
+
+def test_changed_shaper_and_limits_are_taken_from_the_next_request_on(bench):
+    planner = bench()
+    planner.request(*SEQUENCE)
+    results = planner.ros.set_parameters('planner', [
+        Parameter('shaper', value='step'), Parameter('flux_density_max', value=0.2)])
+    assert [(x.successful, x.reason) for x in results] == [(True, ''), (True, '')]
+    planner.core.set_options(
+        replace(planner.core.options, shaper='step', flux_density_max=0.2))
+    planner.run(END)
+    assert len(planner.commands) == 6
+    planner.request((1.1, SPELL))
+    assert len(planner.core.plan.levels) == 2
+    assert 'expected -0.5 T to 0.2 T' in planner.send(
+        trajectory((1.8, SPELL)), 'flux_limit').message
+    planner.check()
+
+
+@pytest.mark.parametrize(('name', 'value', 'fragment'), [
+    ('shaper', 'zigzag', "shaper is 'zigzag': expected one of two_step"),
+    ('shaper', 3, 'Wrong parameter type'),
+    ('short_spell', 'ignore', 'expected one of refuse, continue'),
+    ('flux_density_max', -0.6, 'not below'),
+    ('flux_density_min', 0.5, 'not below'),
+    ('flux_density_max', 1e4, 'flux_density_max'),
+    ('flux_density_max', math.nan, 'flux_density_max'),
+    ('lead_time', 0.1, 'read-only'),
+    ('joint', 'knee', 'read-only'),
+    ('initial_stretch', 1.2, 'read-only'),
+    ('frame_id', 'magnet', 'read-only'),
+    ('actuator.shear_modulus', 2e4, 'read-only'),
+])
+def test_refused_parameter_has_a_reason_and_changes_nothing(bench, name, value, fragment):
+    planner = bench()
+    result, = planner.ros.set_parameters('planner', [Parameter(name, value=value)])
+    assert not result.successful
+    assert fragment in result.reason
+    planner.request(*SEQUENCE)
+    planner.run(END)
+    planner.check()
+
+
+def test_names_move_with_the_namespace(bench):
+    planner = bench('-r', '__ns:=/left', prefix='/left/planner')
+    planner.request(*SEQUENCE)
+    planner.run(END)
+    planner.check()
+
+
+def test_topics_can_be_remapped(bench):
+    planner = bench(
+        '-r', 'flux_density_command:=coil/field', '-r', '~/setpoint:=target',
+        **{'flux_density_command': '/coil/field', '~/setpoint': '/target'})
+    planner.setpoint(1.1)
+    planner.check()
+
+
+def test_joint_has_the_name_of_the_parameter(bench):
+    planner = bench('-p', 'joint:=knee')
+    assert planner.verdict('none').hardware_id == 'knee'
+    planner.send(trajectory(*SEQUENCE, joint='knee'))
+    planner.ros.spin_until(lambda: planner.plans, 'the plan')
+    assert planner.plans[-1].joint_names == ['knee']
+    planner.send(trajectory(*SEQUENCE), 'unknown_joint')
+
+
+def test_diagnostics_count_what_was_sent_and_refused(bench):
+    planner = bench()
+    arrays = planner.collect(interface.DIAGNOSTICS)
+    planner.request(*SEQUENCE)
+    planner.run(END)
+    planner.send(trajectory(), 'bad_input')
+
+    def counted() -> bool:
+        return bool(arrays) and {x.key: x.value for x in arrays[-1].status[0].values} == {
+            'sent': '6', 'late': '0', 'refused': '1'}
+
+    planner.ros.spin_until(counted, 'diagnostics')
+    assert arrays[-1].header.stamp == to_time(END)
+    assert arrays[-1].status[0].name == 'planner: commands'
+    assert arrays[-1].status[0].level == OK
+
+
+def test_command_sent_after_its_time_is_counted_as_late(bench):
+    planner = bench()
+    arrays = planner.collect(interface.DIAGNOSTICS)
+    planner.request(*SEQUENCE)
+    planner.at(END)
+
+    def late() -> bool:
+        return bool(arrays) and {x.key: x.value for x in arrays[-1].status[0].values} == {
+            'sent': '6', 'late': '5', 'refused': '0'}
+
+    planner.ros.spin_until(late, 'diagnostics')
+    assert arrays[-1].status[0].level == WARN
+    planner.check()
+
+
+def test_backward_jump_of_the_clock_drops_the_plan_and_says_so(bench):
+    planner = bench()
+    planner.request(*SEQUENCE)
+    planner.run(START + LEAD + 2 * MS)
+    # In the middle of the first move: the level in force is the one that starts it.
+    level = planner.core.plan.levels[1]
+    planner.clock.set(START // 2)
+    status = planner.verdict('clock_jumped', state='idle', setpoints=0, stretch='')
+    assert status.level == WARN
+    assert 'the clock jumped back by 0.552 s' in status.message
+    known = len(planner.commands)
+    planner.clock.set(START + LEAD)
+    planner.send(trajectory((1.3, SPELL)))
+    planner.ros.spin_until(lambda: len(planner.plans) == 2, 'the plan')
+    planner.ros.spin_until(lambda: len(planner.commands) > known, 'a command')
+    # No command of the dropped plan came in between, and the new one starts from rest where
+    # the level in force holds the actuator.
+    assert from_command(planner.commands[known])[0] == START + 2 * LEAD
+    load = level.flux_density / paper_actuator().flux_density_unit
+    first = planner.plans[-1].points[0]
+    assert first.velocities[0] == 0.0
+    assert first.positions[0] == pytest.approx(
+        float(equilibrium_stretch(load, paper_actuator().chain_limit)), abs=1e-12)
