@@ -132,25 +132,29 @@ class PlantNode(Node):
         if now == 0:
             return
         if self._pacer.paused:
-            simulation.time = now
-            self._next_sample = now
+            self._go_on_from(now)
             return
         if simulation.time == 0:
-            simulation.time = self._next_sample = now
+            self._go_on_from(now)
         if now < simulation.time - self._period:
             self.get_logger().warning(
                 f'the clock jumped back by {(simulation.time - now) / 1e9:.3f} s: the '
                 'simulation starts again from its initial state')
             simulation.reset()
-            simulation.time = self._next_sample = now
+            self._go_on_from(now)
         elif now - simulation.time > _LARGEST_GAP_NS:
             self.get_logger().warning(
                 f'the clock jumped ahead by {(now - simulation.time) / 1e9:.3f} s: the '
                 'simulation goes on from there in its present state')
-            simulation.time = self._next_sample = now
+            self._go_on_from(now)
         begin = monotonic_ns()
         while self._next_sample <= now and monotonic_ns() - begin < _BUDGET_NS:
             self._sample()
+
+    def _go_on_from(self, now: int) -> None:
+        """Set the time without simulating up to it; samples lie on a grid from time zero."""
+        self._simulation.time = now
+        self._next_sample = -(-now // self._period) * self._period
 
     def _sample(self) -> None:
         """Advance to the next sample and publish it."""
