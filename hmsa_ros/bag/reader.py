@@ -433,12 +433,17 @@ class BagReader:
             self._problem(
                 f'{file.path.name}: topic {channel.topic} has no message definition: its '
                 'messages can be sent again but not decoded')
-            schema = records.Schema(0, self._type_in_metadata(channel.topic), '', b'')
+            noted = self._metadata_of(channel.topic)
+            schema = records.Schema(0, noted.type if noted is not None else '', '', b'')
         try:
             profiles = qos.from_stored(channel.metadata.get('offered_qos_profiles'))
         except BagError as error:
             self._problem(f'{file.path.name}: topic {channel.topic}: {error}')
             profiles = ()
+        noted = self._metadata_of(channel.topic)
+        if noted is not None and len(noted.profiles) > len(profiles):
+            # A channel tells of the publishers at its first message, the metadata of all.
+            profiles = noted.profiles
         known = self.topics.get(channel.topic)
         if known is not None:
             if known.type != schema.name:
@@ -453,11 +458,10 @@ class BagReader:
             schema.data.decode('utf-8', 'replace'), profiles,
             channel.metadata.get('topic_type_hash', ''))
 
-    def _type_in_metadata(self, topic: str) -> str:
-        """Return a topic's type as the metadata tell it."""
-        if self.metadata is None:
-            return ''
-        return next((entry.type for entry in self.metadata.topics if entry.name == topic), '')
+    def _metadata_of(self, topic: str) -> metadata.TopicMetadata | None:
+        """Return what ``metadata.yaml`` says of a topic."""
+        topics = () if self.metadata is None else self.metadata.topics
+        return next((entry for entry in topics if entry.name == topic), None)
 
     def _find_custom_data(self) -> dict[str, str]:
         """Return the custom data of the metadata or else of the files."""

@@ -1,0 +1,343 @@
+"""The recorder as a process, with publishers in other processes, over DDS."""
+
+import json
+from pathlib import Path
+import signal
+
+from diagnostic_msgs.msg import DiagnosticArray
+import pytest
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosbags.highlevel import AnyReader
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Float64
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from hmsa_ros.bag import metadata
+from hmsa_ros.bag.definitions import type_hash
+from hmsa_ros.bag.info import lost_messages
+from hmsa_ros.bag.reader import BagReader, read_messages
+from hmsa_ros.bag.recover import recover
+
+pytestmark = pytest.mark.ros
+TALKER = Path(__file__).parent / 'talker.py'
+
+
+class Recorder:
+    """A recorder process and what it says of itself."""
+
+    def __init__(self, start, ros, folder, *parameters, topics='/a'):
+        self.folder = folder
+        self.ros = ros
+        self.diagnostics = ros.collect(DiagnosticArray, '/diagnostics')
+        arguments = [f'storage.uri:={folder}', *parameters]
+        if topics:
+            arguments.append(f'record.topics:={topics}')
+        self.process = start.hmsa(
+            'recorder', '--ros-args', *(part for argument in arguments
+                                        for part in ('-p', argument)))
+
+    def says(self, key):
+        """Return the last value of a key in its diagnostics."""
+        for message in reversed(self.diagnostics):
+            for status in message.status:
+                if status.name == 'recorder: bag':
+                    return {item.key: item.value for item in status.values}[key]
+        return ''
+
+    def wait_for(self, key, value):
+        self.ros.spin_until(lambda: self.says(key) == value, f'{key} = {value} of the recorder')
+
+    def call(self, name):
+        return self.ros.call(Trigger, f'recorder/{name}')
+
+    def end(self, number=signal.SIGINT):
+        assert self.process.stop(number) == 0, self.process.output
+        assert 'Traceback' not in self.process.output
+        return BagReader(self.folder)
+
+
+@pytest.fixture
+def record(start, ros, tmp_path):
+    return lambda *parameters, **options: Recorder(
+        start, ros, tmp_path / 'bag', *parameters, **options)
+
+
+@pytest.fixture
+def talk(start):
+    def talk(topic, count, *options):
+        process = start.python(TALKER, topic, str(count), *map(str, options))
+        process.wait_for_output('done')
+        return process
+    return talk
+
+
+def values(reader, topic='/a'):
+    return [item.message.data for item in read_messages(reader.path, [topic])]
+
+
+@pytest.mark.parametrize('ending', [signal.SIGINT, signal.SIGTERM])
+def test_everything_sent_is_in_the_bag_after_a_clean_end(record, talk, ending):
+    recorder = record()
+    talk('/a', 2000, '--rate', 5000)
+    reader = recorder.end(ending)
+    assert values(reader) == list(range(2000))
+    assert reader.complete
+    assert not reader.problems
+    info = reader.topics['/a']
+    assert (info.type, info.type_hash) == ('std_msgs/msg/Float64', type_hash(info.type))
+    assert [(profile.reliability, profile.durability) for profile in info.profiles] == [
+        ('reliable', 'volatile')]
+    for message in reader.messages():
+        assert 0 <= message.log_time - message.publish_time < 60e9
+    stored = metadata.read(recorder.folder / 'metadata.yaml')
+    assert stored.message_count == 2000
+    assert lost_messages(stored.custom_data) == {'/a': 0}
+    assert '2000 messages of 1 topics' in recorder.process.stdout
+    with AnyReader([recorder.folder]) as other:
+        assert [other.deserialize(data, connection.msgtype).data
+                for connection, _, data in other.messages()] == list(range(2000))
+
+
+def test_it_says_when_every_topic_asked_for_is_subscribed_to(record, ros):
+    recorder = record(topics='[/a, b]')
+    recorder.wait_for('subscribed', '0/2')
+    ros.publisher(Float64, '/a')
+    recorder.wait_for('subscribed', '1/2')
+    assert 'ready' not in recorder.process.output
+    ros.publisher(Float64, '/b')
+    recorder.wait_for('subscribed', '2/2')
+    recorder.process.wait_for_output('ready: subscribed to all 2 topics')
+
+
+def test_lost_messages_are_counted_to_the_last_one(record, ros):
+    recorder = record('record.queue_depth:=5')
+    publisher = ros.publisher(Float64, '/a', 2000)
+    publisher.publish(Float64(data=-1.0))
+    recorder.wait_for('received', '1')
+    # While the recorder does not run, all but the last few are overwritten in its queue.
+    recorder.process.popen.send_signal(signal.SIGSTOP)
+    for i in range(1000):
+        publisher.publish(Float64(data=float(i)))
+    recorder.process.popen.send_signal(signal.SIGCONT)
+    ros.spin_until(lambda: int(recorder.says('received')) + int(recorder.says('lost')) == 1001,
+                   'all 1001 messages to be received or counted as lost')
+    reader = recorder.end()
+    got = values(reader)
+    lost = lost_messages(reader.custom_data)['/a']
+    assert got[0] == -1.0
+    assert got[-1] == 999.0
+    assert lost > 0
+    assert len(got) + lost == 1001
+    assert f'{lost} lost' in recorder.process.stdout
+
+
+def test_several_publishers_of_one_topic_are_counted_apart(record, start):
+    recorder = record()
+    talkers = [start.python(TALKER, '/a', '3000', '--rate', '2000', '--first', str(10_000 * i))
+               for i in range(2)]
+    for talker in talkers:
+        talker.wait_for_output('done')
+    reader = recorder.end()
+    got = values(reader)
+    for i in range(2):
+        assert [value for value in got if value // 10_000 == i] == list(
+            range(10_000 * i, 10_000 * i + 3000))
+    assert lost_messages(reader.custom_data) == {'/a': 0}
+
+
+def test_a_bag_is_recovered_after_kill_9(record, ros, tmp_path):
+    recorder = record('storage.flush_period:=0.1')
+    publisher = ros.publisher(Float64, '/a')
+    for i in range(500):
+        publisher.publish(Float64(data=float(i)))
+    recorder.wait_for('written', '500')
+    assert recorder.process.stop(signal.SIGKILL) == -signal.SIGKILL
+    assert metadata.read(recorder.folder / 'metadata.yaml').version == 9
+    result = recover(recorder.folder, tmp_path / 'recovered')
+    assert result.message_count == 500
+    with AnyReader([tmp_path / 'recovered']) as other:
+        assert [other.deserialize(data, connection.msgtype).data
+                for connection, _, data in other.messages()] == list(range(500))
+
+
+def test_an_existing_folder_is_refused_in_one_line(start, tmp_path):
+    process = start.hmsa('recorder', '--ros-args', '-p', f'storage.uri:={tmp_path}')
+    assert process.wait() == 2
+    assert process.stderr.strip().splitlines()[-1] == (
+        f'hmsa: error: {tmp_path} exists: expected the name of a new bag; choose another name or '
+        'remove it')
+
+
+@pytest.mark.parametrize(('parameter', 'expected'), [
+    ('storage.uri:=/proc/none/bag', 'cannot be made'),
+    ('storage.storage_preset_profile:=best', 'expected one of none, fastwrite'),
+    ('storage.custom_data:=[a]', 'expected key=value'),
+    ('storage.max_bagfile_size:=10', 'at least 1024'),
+    ('record.regex:="("', 'expected a regular expression'),
+    ('record.topics:=3', 'expected a list of strings'),
+])
+def test_bad_parameters_are_refused_in_one_line(start, tmp_path, parameter, expected):
+    process = start.hmsa('recorder', '--ros-args', '-p', f'storage.uri:={tmp_path / "bag"}',
+                         '-p', parameter)
+    assert process.wait() == 2
+    line, = process.stderr.strip().splitlines()
+    assert line.startswith('hmsa: error: ')
+    assert expected in line
+    assert not (tmp_path / 'bag').exists()
+
+
+def test_latched_and_best_effort_publishers_are_recorded_alike(record, talk):
+    talk('/latched', 3, '--latched', '--depth', 3, '--wait', 0)
+    recorder = record(topics='[/latched, /fast]')
+    talk('/fast', 200, '--best-effort', '--rate', 1000)
+    recorder.wait_for('received', '203')
+    reader = recorder.end()
+    assert values(reader, '/latched') == [0.0, 1.0, 2.0]
+    assert values(reader, '/fast') == list(range(200))
+    assert reader.topics['/latched'].profiles[0].durability == 'transient_local'
+    assert reader.topics['/fast'].profiles[0].reliability == 'best_effort'
+
+
+def test_a_publisher_that_asks_for_less_is_heard_after_one_that_offered_more(
+        record, talk, make_ros):
+    recorder = record()
+    other = make_ros()
+    reliable = other.publisher(Float64, '/a')
+    reliable.publish(Float64(data=-1.0))
+    recorder.wait_for('received', '1')
+    talk('/a', 100, '--best-effort', '--rate', 500)
+    reliable.publish(Float64(data=-2.0))
+    recorder.wait_for('received', '102')
+    reader = recorder.end()
+    assert values(reader) == [-1.0, *range(100), -2.0]
+    assert {profile.reliability for profile in reader.topics['/a'].profiles} == {
+        'reliable', 'best_effort'}
+
+
+def test_topics_are_chosen_by_expression_and_exclusion(record, ros):
+    recorder = record('record.regex:=^/x', 'record.exclude_topics:=[/x3]', topics='')
+    publishers = {name: ros.node.create_publisher(Float64, name, 10)
+                  for name in ('/x1', '/y', '/x3')}
+    late = ros.publisher(Float64, '/x2')
+    ros.spin_until(publishers['/x1'].get_subscription_count, 'a subscriber of /x1')
+    for publisher in (*publishers.values(), late):
+        publisher.publish(Float64(data=1.0))
+    recorder.wait_for('received', '2')
+    assert recorder.end().counts() == {'/x1': 1, '/x2': 1}
+
+
+def test_without_a_selection_every_topic_is_recorded(record, ros):
+    recorder = record(topics='')
+    ros.publisher(Float64, '/a').publish(Float64(data=1.0))
+    recorder.process.wait_for_output('subscribed to /diagnostics')
+    ros.spin_until(lambda: int(recorder.says('received') or 0) > 3, 'messages')
+    counts = recorder.end().counts()
+    assert counts['/a'] == 1
+    assert counts['/diagnostics'] > 0
+
+
+def test_pause_and_resume(record, ros):
+    recorder = record('record.start_paused:=true')
+    publisher = ros.publisher(Float64, '/a')
+    publisher.publish(Float64(data=1.0))
+    assert recorder.call('is_paused').success
+    assert recorder.call('resume').success
+    assert not recorder.call('is_paused').success
+    publisher.publish(Float64(data=2.0))
+    recorder.wait_for('received', '1')
+    assert recorder.call('pause').message == 'paused'
+    publisher.publish(Float64(data=3.0))
+    # Several rounds of the diagnostics later it would have been counted.
+    before = len(recorder.diagnostics)
+    ros.spin_until(lambda: len(recorder.diagnostics) > before + 1, 'diagnostics')
+    recorder.call('resume')
+    publisher.publish(Float64(data=4.0))
+    recorder.wait_for('received', '2')
+    reader = recorder.end()
+    assert values(reader) == [2.0, 4.0]
+    assert lost_messages(reader.custom_data) == {'/a': 0}
+
+
+def test_files_are_split_by_service_and_by_size(record, ros):
+    recorder = record('storage.max_bagfile_size:=4096')
+    publisher = ros.publisher(Float64, '/a')
+    assert recorder.call('split_bagfile').message == 'bag_1.mcap'
+    for i in range(1000):
+        publisher.publish(Float64(data=float(i)))
+    recorder.wait_for('received', '1000')
+    reader = recorder.end()
+    assert len(reader.files) > 5
+    assert values(reader) == list(range(1000))
+    stored = metadata.read(recorder.folder / 'metadata.yaml')
+    assert sum(file.message_count for file in stored.files) == 1000
+    with AnyReader([recorder.folder]) as other:
+        assert sum(1 for _ in other.messages()) == 1000
+
+
+def test_simulated_time_is_waited_for_and_stamped(record, ros):
+    recorder = record('use_sim_time:=true')
+    clock = ros.node.create_publisher(
+        Clock, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    publisher = ros.node.create_publisher(Float64, '/a', QoSProfile(
+        depth=5, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+    publisher.publish(Float64(data=1.0))
+    recorder.wait_for('state', 'waiting for /clock')
+    message = Clock()
+    message.clock.sec = 100
+
+    def tick():
+        message.clock.nanosec += 1
+        clock.publish(message)
+        return recorder.says('received') == '1'
+
+    ros.spin_until(tick, 'the latched message')
+    message.clock.sec = 200
+    clock.publish(message)
+    publisher.publish(Float64(data=2.0))
+    recorder.wait_for('received', '2')
+    first, second = recorder.end().messages()
+    assert first.log_time // 10**9 == 100
+    assert second.log_time == 200 * 10**9 + message.clock.nanosec
+    assert second.publish_time > 10**18
+
+
+def test_the_experiment_goes_into_the_bag(record, ros, make_ros):
+    other = make_ros()
+    planner = Node('planner', context=other.context)
+    planner.declare_parameter('zeta', 0.1)
+    other.executor.add_node(planner)
+    recorder = record('storage.custom_data:=["actuator=A3", "operator=Kim"]')
+    trajectory = JointTrajectory(joint_names=['actuator'], points=[
+        JointTrajectoryPoint(positions=[1.1])])
+    sender = ros.publisher(JointTrajectory, 'planner/joint_trajectory')
+    sender.publish(trajectory)
+
+    def noted():
+        other.executor.spin_once(0.02)
+        text = (recorder.folder / 'metadata.yaml').read_text()
+        return 'planner.zeta' in text and 'setpoints' in text
+
+    ros.spin_until((recorder.folder / 'metadata.yaml').exists, 'the bag')
+    ros.spin_until(noted, 'parameters and setpoints in the bag')
+    reader = recorder.end()
+    assert reader.custom_data['actuator'] == 'A3'
+    assert reader.custom_data['planner.zeta'] == '0.1'
+    assert json.loads(reader.custom_data['setpoints'])[0]['points'] == [[[1.1], 0.0]]
+    assert reader.records['hmsa_ros']['planner.zeta'] == '0.1'
+    assert 'version' in reader.records['hmsa_ros']
+    planner.destroy_node()
+
+
+def test_a_snapshot_holds_what_came_before_it(record, ros):
+    recorder = record('record.snapshot_mode:=true')
+    publisher = ros.publisher(Float64, '/a')
+    for i in range(50):
+        publisher.publish(Float64(data=float(i)))
+    recorder.wait_for('received', '50')
+    assert recorder.says('written') == '0'
+    assert recorder.call('snapshot').message == '50 messages written'
+    publisher.publish(Float64(data=99.0))
+    recorder.wait_for('received', '51')
+    assert values(recorder.end()) == list(range(50))
