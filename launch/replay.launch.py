@@ -48,7 +48,9 @@ def generate_launch_description() -> LaunchDescription:
             package='hmsa_ros', executable='player', name='player', namespace=namespace,
             parameters=[params_file, {
                 'use_sim_time': False, 'storage.uri': bag, 'play.rate': rate,
-                'play.clock_publish_frequency': 1000.0,
+                # Finer than the planner's lead_time, so that commands arrive ahead.
+                'play.clock_publish_frequency': 4000.0,
+                'play.wait_for_subscribers': ['flux_density_command'],
                 'play.topics_to_filter': ['flux_density_command']}],
             output='screen'),
     ])
