@@ -25,6 +25,7 @@ from hmsa_ros.core.dop853 import ERROR_3, ERROR_5, MATRIX, NODES, STAGES, WEIGHT
 DONE = 0
 NO_TURN = 1
 STUCK = 2
+TOO_CLOSE = 3
 
 # Status codes of a two-step plan; `hmsa_ros.core.two_step.Status` names them for callers.
 TWO_STEP = 0
@@ -46,8 +47,12 @@ _MAX_STEPS = 200_000
 _MAX_TURN_STEPS = 20_000
 _MAX_ITERATIONS = 80
 _COARSE = 1e-5
+# Closer to a limiting stretch than rounding lets this tolerance be kept, motion is not followed.
+_RESOLVED = 1e-8
 _FARTHEST = 1e3
 _NEWTON_PASSES = 8
+# Swings that do not end within the steps allowed are given up after so many.
+_MAX_STUCK = 4
 
 
 def work_space() -> NDArray[np.float64]:
@@ -205,6 +210,18 @@ def _first_step(l, v, beta, zeta, c1, i_j, rtol):  # noqa: E741
     return 4.0 * rtol ** 0.125 / (rate + 3.0 * zeta)
 
 
+@njit(cache=True, error_model='numpy', inline='always')
+def _attainable(rtol, l, v, frequency):  # noqa: E741
+    """
+    Return a tolerance that rounding lets a step keep.
+
+    A stretch rounded to one part in 2^52 changes the acceleration by that share of
+    ``l frequency^2``, and a step lasts about ``1/frequency``. That matters close to the
+    limiting stretches.
+    """
+    return max(rtol, 3e-16 * l * frequency / (1.0 + abs(v)))
+
+
 @njit(cache=True, error_model='numpy')
 def _resize(h, error):
     """Return the next step length from the error of the last one."""
@@ -229,9 +246,10 @@ def advance(k, l, v, s, r, beta, slope, p, q, duration, zeta, c1, i_j, rtol, h):
         if not left > 0.0:
             return DONE, l, v, s, r, h
         step = min(h, left)
+        rate = math.sqrt(elastic_stiffness(l, i_j) / ((l ** -3 + c1) / 6.0))
         new_l, new_v, new_s, new_r, error = _step(
             k, l, v, s, r, beta + slope * done, slope, p + q * done, q, step, zeta, c1, i_j,
-            rtol)
+            _attainable(rtol, l, v, rate))
         if error <= 1.0:
             l, v, s, r = new_l, new_v, new_s, new_r  # noqa: E741
             done = duration if step == left else done + step
@@ -250,17 +268,20 @@ def turning_point(k, l, v, direction, beta, move, zeta, c1, i_j, rtol):  # noqa:
     That is the first instant at which ``direction * v`` falls through zero. ``move`` is the
     length against which closeness to an equilibrium is measured.
 
-    Returns status (`NO_TURN` when the motion creeps into an equilibrium instead), time,
-    stretch, its derivative with respect to the load, and the derivative of the time.
+    Returns status (`NO_TURN` when the motion creeps into an equilibrium instead, `TOO_CLOSE`
+    when it meets a limiting stretch too hard to be resolved), time, stretch, its derivative
+    with respect to the load, and the derivative of the time.
     """
     s = 0.0
     r = 0.0
     t = 0.0
     h = _first_step(l, v, beta, zeta, c1, i_j, rtol)
     armed = direction * v > 0.0
+    rate = math.sqrt(elastic_stiffness(l, i_j) / ((l ** -3 + c1) / 6.0))
     for _ in range(_MAX_TURN_STEPS):
         new_l, new_v, new_s, new_r, error = _step(
-            k, l, v, s, r, beta, 0.0, 1.0, 0.0, h, zeta, c1, i_j, rtol)
+            k, l, v, s, r, beta, 0.0, 1.0, 0.0, h, zeta, c1, i_j,
+            _attainable(rtol, l, v, rate))
         if not error <= 1.0:
             h = _resize(h, error)
             continue
@@ -272,8 +293,11 @@ def turning_point(k, l, v, direction, beta, move, zeta, c1, i_j, rtol):  # noqa:
         t += h
         h = _resize(h, error)
         armed = direction * v > 0.0
-        rate = math.sqrt(elastic_stiffness(l, i_j) / ((l ** -3 + c1) / 6.0)) + 3.0 * zeta
-        if (abs(v) < _AT_REST * move * rate and abs(a) < _AT_REST * move * rate * rate):
+        rate = math.sqrt(elastic_stiffness(l, i_j) / ((l ** -3 + c1) / 6.0))
+        if _attainable(0.0, l, v, rate) > _RESOLVED:
+            return TOO_CLOSE, t, l, s, 0.0
+        fast = rate + 3.0 * zeta
+        if (abs(v) < _AT_REST * move * fast and abs(a) < _AT_REST * move * fast * fast):
             return NO_TURN, t, l, s, 0.0
     return STUCK, t, l, s, 0.0
 
@@ -283,42 +307,40 @@ def _land(k, l, v, s, r, t, direction, beta, h, end_v, zeta, c1, i_j, rtol):  # 
     """
     Find the turning point inside a step that passes it.
 
-    Newton on the time: each pass makes a DOP853 step of its own from the best state so far,
-    and the last correction, far below rounding, is taken from the Taylor series.
+    Newton on the time, kept inside the step: each pass is a DOP853 step of its own from the
+    same start. The last correction, far below rounding, is taken from the Taylor series.
     """
     a = k[0, 1]
-    _, end_a, _, _ = _derivative(l, v, 0.0, 0.0, beta, 0.0, zeta, c1, i_j)
-    # Where the cubic through both ends' rates and the start's slope vanishes, roughly: the
-    # secant, improved by one step with the acceleration there.
-    dt = h * v / (v - end_v) if v != end_v else h
+    # The secant; where the start decelerates, the parabola through both rates and that slope.
+    dt = h * v / (v - end_v)
     if direction * a < 0.0:
-        # Decelerating from the start: the parabola through both rates and the first slope.
         c = (end_v - v - a * h) / (h * h)
         root = a * a - 4.0 * c * v
         if root > 0.0:
-            x = 2.0 * v / (-a + direction * math.sqrt(root))
-            if 0.0 < x <= h:
-                dt = x
+            dt = 2.0 * v / (-a + direction * math.sqrt(root))
+    before = 0.0
+    after = h
     size = max(abs(v), abs(end_v))
-    for _ in range(12):
+    for _ in range(60):
+        if not before < dt < after:
+            dt = 0.5 * (before + after)
         new_l, new_v, new_s, new_r, _ = _step(
             k, l, v, s, r, beta, 0.0, 1.0, 0.0, dt, zeta, c1, i_j, rtol)
-        l, v, s, r = new_l, new_v, new_s, new_r  # noqa: E741
-        t += dt
-        _, a, _, _ = _derivative(l, v, s, r, beta, 1.0, zeta, c1, i_j)
-        if direction * a >= 0.0:
-            # Before the largest rate (a step that spans most of a swing): bisect onwards.
-            dt = 0.25 * h
-            continue
-        dt = -v / a
-        if abs(v) <= 1e-6 * size:
+        _, a, _, _ = _derivative(new_l, new_v, new_s, new_r, beta, 1.0, zeta, c1, i_j)
+        if abs(new_v) <= 1e-6 * size and direction * a < 0.0:
             break
-    l += 0.5 * v * dt  # noqa: E741
-    s += r * dt
-    t += dt
-    _, a, _, slope = _derivative(l, 0.0, s, r, beta, 1.0, zeta, c1, i_j)
-    r += slope * dt
-    return DONE, t, l, s, -r / a
+        if direction * new_v > 0.0:
+            before = dt
+        else:
+            after = dt
+        # Without deceleration it is too early or too late: bisect.
+        dt = dt - new_v / a if direction * a < 0.0 else -1.0
+    left = -new_v / a
+    new_l += 0.5 * new_v * left
+    new_s += new_r * left
+    _, a, _, slope = _derivative(new_l, 0.0, new_s, new_r, beta, 1.0, zeta, c1, i_j)
+    new_r += slope * left
+    return DONE, t + dt + left, new_l, new_s, -new_r / a
 
 
 @njit(cache=True, error_model='numpy')
@@ -360,15 +382,20 @@ def _guess(l, v, target, direction, beta_1, zeta, c1, i_j):  # noqa: E741
     """
     Return a first guess of ``direction * (beta_1 - beta_p)``.
 
-    The energy balance gives it exactly without damping; the linear oscillator says how it
-    shrinks with damping: by 2 K/(1 + K), where K is the decay over half a period.
+    The energy balance gives it exactly without damping. The linear oscillator says how it
+    shrinks with damping, by 2 K/(1 + K) with the decay K over half a period; its damping ratio
+    is the damping force, at the rate that the balance gives half way, against that of the
+    spring.
     """
-    mass = (l ** -3 + c1) / 6.0
-    work = elastic_energy(target, i_j) - elastic_energy(l, i_j) - 0.5 * mass * v * v
     if target == l:
         return math.inf
-    delta = direction * (beta_1 - work / (target - l))
-    xi = zeta / math.sqrt(critical_zeta(target, c1, i_j) * critical_zeta(l, c1, i_j))
+    start = elastic_energy(l, i_j) + 0.5 * (l ** -3 + c1) / 6.0 * v * v
+    beta = (elastic_energy(target, i_j) - start) / (target - l)
+    delta = direction * (beta_1 - beta)
+    half = 0.5 * (l + target)
+    kinetic = start + beta * (half - l) - elastic_energy(half, i_j)
+    fastest = math.sqrt(max(2.0 * kinetic / ((half ** -3 + c1) / 6.0), 0.0))
+    xi = 0.25 * zeta * c1 * fastest / abs(delta)
     decay = 1e-3
     if xi < 0.9:
         decay = math.exp(-math.pi * xi / math.sqrt(1.0 - xi * xi))
@@ -383,81 +410,104 @@ def shoot(
 
     Newton on ``d = direction * (beta_1 - beta_p) > 0``, kept inside a bracket: at d = 0 the
     motion overshoots the target, at a large d it stops short. The difference is the unknown
-    because it falls below the rounding of beta_p itself near critical damping. The first
-    passes are coarse; the last one is at ``rtol``. The search ends at the admissible loads, or
-    far from the target's own where they are infinite.
+    because it falls below the rounding of beta_p itself near critical damping. The turning
+    point is compared to the target by ``log((l - lower)/(upper - l))``, on which the load acts
+    about linearly even close to a limiting stretch. The first passes are coarse and only guess
+    for the last ones, which bracket anew. The search ends at the admissible loads, or far from
+    the target's own where they are infinite.
 
     Returns status, beta_p, tau_p, beta_1 and the number of passes.
     """
     beta_1 = elastic_force(target, i_j)
     move = abs(target - l) + abs(v) / math.sqrt(
         elastic_stiffness(target, i_j) / ((target ** -3 + c1) / 6.0))
-    low = 0.0
-    high = math.inf
+    lower, upper = stretch_limits(i_j)
+    # Errors count against the move and the room that the limits leave.
+    size = 1.0 + target
+    rtol = max(min(rtol, 1e-10 * move / size), 1e-14)
+    enough = max(0.1 * math.sqrt(rtol), 1e-14 * size / move)
+    tolerance = max(rtol, _COARSE * min(size, move, target - lower, upper - target) / size)
+    # A smaller difference of loads is rounding of the elastic force.
+    least = 1e-14 * (abs(beta_1) + target * elastic_stiffness(target, i_j))
+    most = math.inf
     if v == 0.0:
-        high = direction * (beta_1 - elastic_force(l, i_j))
-        if not high > 0.0:
+        most = direction * (beta_1 - elastic_force(l, i_j))
+        if not most > 0.0:
             return NO_TWO_STEP, math.nan, math.nan, beta_1, 0
     top = direction * (beta_1 - (beta_min if direction > 0.0 else beta_max))
     if not top < math.inf:
         top = _FARTHEST * (1.0 + abs(beta_1))
     # From rest beta_p lies between the two holding loads: it is found there, inside or not.
-    top = max(top, high) if high < math.inf else top
-    d = _guess(l, v, target, direction, beta_1, zeta, c1, i_j)
-    if not low < d < min(high, top):
-        d = 0.5 * high if high < math.inf else 1.0
-    tolerance = max(rtol, _COARSE)
+    top = max(top, most) if most < math.inf else top
+    guess = _guess(l, v, target, direction, beta_1, zeta, c1, i_j)
+    if not 0.0 < guess < min(most, top):
+        guess = 0.5 * most if most < math.inf else 1.0
+    low, high, d = 0.0, most, guess
+    stuck = 0
     for iteration in range(1, _MAX_ITERATIONS + 1):
         beta = beta_1 - direction * d
         status, t, end, s, dt_dbeta = turning_point(
             k, l, v, direction, beta, move, zeta, c1, i_j, tolerance)
-        if status == STUCK:
-            return NOT_CONVERGED, beta, t, beta_1, iteration
-        excess = direction * (end - target)
+        stuck += status == STUCK
+        if stuck == _MAX_STUCK:
+            break
+        miss = end - target
         change = math.inf
-        if status == NO_TURN:
-            high = d
+        if status == DONE:
+            excess = math.log1p(miss / (target - lower)) - math.log1p(-miss / (upper - target))
+            change = direction * excess / (
+                s * (1.0 / (end - lower) + 1.0 / (upper - end)))
+        if status != NO_TURN and direction * miss > 0.0:
+            low = max(low, d)
         else:
-            # What the tolerance of this pass cannot tell apart must not narrow the bracket.
-            if abs(excess) > 1e3 * tolerance * (1.0 + abs(end)):
-                if excess > 0.0:
-                    low = max(low, d)
-                else:
-                    high = min(high, d)
-            change = excess / s
+            high = min(high, d)
         new = d + change
         if high == math.inf and iteration > _NEWTON_PASSES:
             # Newton creeps along an excess that never ends: stride out to the bound.
             new = max(new, 4.0 * d)
+        relative = abs(new - d) / d
         if not low < new < high:
-            if status == DONE and tolerance <= rtol and abs(change) <= 1e-13 * d:
+            lost = high < 8.0 * least
+            closed = high - low <= 4e-16 * (abs(beta_1) + high)
+            if tolerance > rtol and (lost or closed):
+                # Coarse passes have misled the search: begin again.
+                tolerance = rtol
+                low, high, d = 0.0, most, guess
+                continue
+            if lost and status not in (DONE, NO_TURN):
+                break
+            if lost:
+                return INDISTINGUISHABLE, math.nan, math.nan, beta_1, iteration
+            if status == DONE and abs(miss) <= 1e-7 * move and (
+                    closed or abs(change) <= 1e-13 * d):
+                # As near as rounding allows.
                 new = d
+            elif closed:
+                break
             elif high == math.inf:
                 new = 4.0 * d
             elif low == 0.0:
                 new = 0.125 * high
             else:
                 new = 0.5 * (low + high)
-            if new < 1e-15 * (abs(beta_1) + high) and low == 0.0:
-                return INDISTINGUISHABLE, math.nan, math.nan, beta_1, iteration
             relative = abs(new - d) / d
-            if high - low <= 4e-16 * (abs(beta_1) + high) and tolerance <= rtol:
-                relative = 0.0
-        else:
-            relative = abs(change) / d
-        if tolerance <= rtol and relative * relative <= 0.01 * rtol and status == DONE:
+        if (tolerance <= rtol and relative <= enough and status == DONE
+                and abs(miss) <= 1e-6 * move):
+            if new < least:
+                return INDISTINGUISHABLE, math.nan, math.nan, beta_1, iteration
             change = new - d
             return TWO_STEP, beta - direction * change, t - dt_dbeta * direction * change, \
                 beta_1, iteration
         d = new
         if d > top:
             return NO_TWO_STEP, math.nan, math.nan, beta_1, iteration
-        if relative < 0.1:
+        if relative < 0.1 and tolerance > rtol:
             # What quadratic convergence leaves for the next pass to resolve.
             tolerance = max(rtol, min(tolerance, 1e-2 * relative * relative))
             if tolerance < 1e3 * rtol:
                 tolerance = rtol
-    return NOT_CONVERGED, math.nan, math.nan, beta_1, _MAX_ITERATIONS
+                low, high = 0.0, most
+    return NOT_CONVERGED, math.nan, math.nan, beta_1, iteration
 
 
 @njit(cache=True, error_model='numpy')
