@@ -337,7 +337,7 @@ def damping_sweep(points: int = SWEEP_POINTS) -> Sweep:
         for status, difference in zip(
             plans.status.tolist(), (plans.beta_1 - plans.beta_p).tolist(), strict=True)]
     last = near[ended.index(True) - 1]
-    zeta = last * (1.0 - np.linspace(1.0, 0.0, points) ** 2)
+    zeta = last * (1.0 - np.linspace(1.0, 0.0, points) ** 1.5)
     return _sweep(start, target, zeta, np.full(points, _PAPER.j_lim), critical)
 
 
