@@ -14,7 +14,7 @@ from std_srvs.srv import SetBool, Trigger
 from hmsa_ros.core.pacer import Pacer
 from hmsa_ros.core.simulation import ActuatorSimulation
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.nodes import conversions, interface
 from hmsa_ros.nodes.parameters import (
     ACTUATOR,
@@ -83,7 +83,7 @@ class PlantNode(Node):
             start, values['real_time_factor'] if self._authority else 1.0,
             paused=values['start_paused'])
         self._next_sample = start
-        self._late = self._received = self._refused = self._latest = 0
+        self._late = self._received = self._refused = self._failed = self._latest = 0
         self._clock_published = 0
 
         self._joint_states = self._publisher(interface.JOINT_STATES)
@@ -131,9 +131,6 @@ class PlantNode(Node):
         simulation = self._simulation
         if now == 0:
             return
-        if self._pacer.paused:
-            self._go_on_from(now)
-            return
         if simulation.time == 0:
             self._go_on_from(now)
         if now < simulation.time - self._period:
@@ -142,13 +139,17 @@ class PlantNode(Node):
                 'simulation starts again from its initial state')
             simulation.reset()
             self._go_on_from(now)
+        elif self._pacer.paused:
+            self._go_on_from(now)
+            return
         elif now - simulation.time > _LARGEST_GAP_NS:
             self.get_logger().warning(
                 f'the clock jumped ahead by {(now - simulation.time) / 1e9:.3f} s: the '
                 'simulation goes on from there in its present state')
             self._go_on_from(now)
         begin = monotonic_ns()
-        while self._next_sample <= now and monotonic_ns() - begin < _BUDGET_NS:
+        while (self._next_sample <= now and not self._pacer.paused
+                and monotonic_ns() - begin < _BUDGET_NS):
             self._sample()
 
     def _go_on_from(self, now: int) -> None:
@@ -159,7 +160,14 @@ class PlantNode(Node):
     def _sample(self) -> None:
         """Advance to the next sample and publish it."""
         simulation = self._simulation
-        simulation.advance(self._next_sample)
+        try:
+            simulation.advance(self._next_sample)
+        except HmsaError as error:
+            self._failed += 1
+            self.get_logger().error(
+                f'{error}; the simulation starts again from its initial state')
+            simulation.reset()
+            simulation.time = self._next_sample
         self._next_sample += self._period
         if self._clock_publisher is not None:
             self._publish_clock(monotonic_ns())
@@ -207,7 +215,10 @@ class PlantNode(Node):
         elif not self._pacer.paused:
             response.message = 'the plant runs: expected it paused (~/set_paused)'
         else:
-            self._sample()
+            before = self._simulation.time
+            while self._simulation.time == before:
+                # The first sample is the start itself.
+                self._sample()
             self._pacer.set_paused(True, self._simulation.time)
             response.success = True
             response.message = f'at {self._simulation.time / 1e9:.9f} s'
@@ -226,10 +237,14 @@ class PlantNode(Node):
         if self._late or self._refused:
             level = DiagnosticStatus.WARN
             message = f'{self._late} commands late, {self._refused} refused'
+        if self._failed:
+            level = DiagnosticStatus.ERROR
+            message = f'{self._failed} times started again after a load too large to follow'
         self._diagnostics.publish(conversions.to_diagnostics(
             int(self.get_clock().now().nanoseconds), conversions.to_status(
                 f'{self.get_name()}: commands', self._joint, level, message,
                 {'received': self._received, 'late': self._late, 'refused': self._refused,
+                 'failed': self._failed,
                  'largest_lateness_ms': f'{self._latest / 1e6:.3f}',
                  'time': f'{self._simulation.time / 1e9:.9f}',
                  'paused': self._pacer.paused})))
