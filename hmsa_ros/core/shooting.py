@@ -20,7 +20,11 @@ from hmsa_ros.core.moves import Level, State
 from hmsa_ros.core.parameters import NondimensionalParameters
 
 _RTOL = 1e-13
-_ITERATIONS = 60
+_ITERATIONS = 25
+# A Newton step that must be cut shorter than this leads nowhere.
+_LEAST_SHARE = 0.01
+# Trials leave the first guess by this factor at the most.
+_FARTHEST = 10.0
 #: Distance from rest at the target, as a share of the move, at which a command is accepted.
 _ACCEPTED = 1e-10
 
@@ -140,6 +144,8 @@ def solve(
     found = _end(template, state, load, target, frequency, material, slew)
     if found is None:
         return None
+    farthest = _FARTHEST * (np.max(np.abs(template.loads)) + abs(load) + 1.0)
+    longest = _FARTHEST * template.times[-1]
     for _ in range(_ITERATIONS):
         error, jacobian, duration = found
         size = float(np.hypot(*error))
@@ -148,9 +154,12 @@ def solve(
         except np.linalg.LinAlgError:
             return None
         share = 1.0
-        while share > 1e-4:
+        while share > _LEAST_SHARE:
             trial = template.moved(share * change)
-            result = _end(trial, state, load, target, frequency, material, slew)
+            result = None
+            # A wild trial is not worth its integration.
+            if np.max(np.abs(trial.loads)) < farthest and trial.times[-1] < longest:
+                result = _end(trial, state, load, target, frequency, material, slew)
             if result is not None and np.hypot(*result[0]) < (1.0 - 0.1 * share) * size:
                 break
             share *= 0.5

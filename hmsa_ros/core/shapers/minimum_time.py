@@ -2,10 +2,10 @@
 
 import math
 
-import numpy as np
 from scipy.optimize import brentq
 
 from hmsa_ros.core import kernels
+from hmsa_ros.core.model import Array
 from hmsa_ros.core.moves import Level, Move, State
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.shooting import solve, Template
@@ -15,6 +15,10 @@ _RTOL = 1e-12
 _AT_REST = 1e-9
 # Room that is left below the limits, as a share, for what rounded times ask of the levels.
 _MARGIN = 1e-4
+# Periods to add on the grid where the least number gives no solution.
+_MORE_PERIODS = ((0, 0), (1, 0), (0, 1), (1, 1), (2, 2), (3, 3))
+# Heights to try, as shares of what the limits allow.
+_SHARES = (1.0, 0.5, 0.25, 0.1, 0.05)
 _MOST_STEPS = 20_000
 
 
@@ -52,43 +56,63 @@ def minimum_time(request: Request, reason: str = '') -> Move:
     if abs(target - state.stretch) <= _AT_REST and abs(state.rate) <= _AT_REST * frequency:
         return Move(Code.HOLD, (Level(0.0, holding),), 0.0)
     least, most = _bounds(request, holding, frequency)
+    for share in _SHARES:
+        # On a grid and through ramps full height may leave no time to switch.
+        found = _attempt(
+            request, holding, holding + share * (least - holding),
+            holding + share * (most - holding))
+        if found is not None and all(
+                request.limits.minimum <= x.load <= request.limits.maximum for x in found[0]):
+            return Move(Code.MINIMUM_TIME, *found, reason)
+    raise RefusedError(
+        Code.NOT_CONVERGED,
+        f'no command of two levels within the limits was found from stretch '
+        f'{state.stretch:.6g} at rate {state.rate / request.units.time:.4g} to rest at '
+        f'{target:g}')
+
+
+def _attempt(
+        request: Request, holding: float, least: float,
+        most: float) -> tuple[tuple[Level, ...], float] | None:
+    """Push and brake with given loads; None if no command comes of it."""
     work = kernels.work_space()
     direction = _direction(work, request, least, most)
     push, brake = (most, least) if direction > 0.0 else (least, most)
     pushing, braking = _durations(work, request, direction, push, brake)
+    if request.delivery.period > 0.0:
+        return _on_grid(request, holding, (push, pushing), (brake, braking))
     delivery = request.delivery
-    if delivery.ideal:
-        levels = (Level(0.0, push), Level(pushing, brake), Level(pushing + braking, holding))
-        unknowns = [('time', 1), ('time', 2)]
-    elif delivery.period > 0.0:
-        # On the grid the durations are rounded up, which leaves the heights free.
-        period = delivery.period
-        first = max(1, math.ceil(pushing / period))
-        second = max(1, math.ceil(braking / period))
-        levels = (
-            Level(0.0, holding + (push - holding) * pushing / (first * period)),
-            Level(first * period, holding + (brake - holding) * braking / (second * period)),
-            Level((first + second) * period, holding))
-        unknowns = [('load', 0), ('load', 1)]
-    else:
-        up = delivery.ramp(push - request.load)
-        down = delivery.ramp(push - brake)
-        levels = (Level(0.0, push), Level(max(pushing, up), brake),
-                  Level(max(pushing, up) + max(braking, down), holding))
-        unknowns = [('time', 1), ('time', 2)]
+    up = delivery.ramp(push - request.load)
+    down = delivery.ramp(push - brake)
+    levels = (Level(0.0, push), Level(max(pushing, up), brake),
+              Level(max(pushing, up) + max(braking, down), holding))
     found = solve(
-        Template.of(levels, unknowns), state, request.load, target, request.material,
-        delivery.slew)
-    if found is None:
-        raise RefusedError(
-            Code.NOT_CONVERGED,
-            f'no command of two levels within the limits was found from stretch '
-            f'{state.stretch:.6g} at rate {state.rate / request.units.time:.4g} to rest at '
-            f'{target:g}')
-    if delivery.resolution > 0.0 and delivery.period == 0.0:
-        found = _on_time(request, found[0]) or found
-    request.check(found[0])
-    return Move(Code.MINIMUM_TIME, *found, reason)
+        Template.of(levels, [('time', 1), ('time', 2)]), request.state, request.load,
+        request.target, request.material, delivery.slew)
+    if found is not None and delivery.resolution > 0.0:
+        return _on_time(request, found[0]) or found
+    return found
+
+
+def _on_grid(
+        request: Request, holding: float, push: tuple[float, float],
+        brake: tuple[float, float]) -> tuple[tuple[Level, ...], float] | None:
+    """Place push and brake, (load, duration) each, on the grid; their heights are free then."""
+    period = request.delivery.period
+    for more_first, more_second in _MORE_PERIODS:
+        first = max(1, math.ceil(push[1] / period)) + more_first
+        second = max(1, math.ceil(brake[1] / period)) + more_second
+        levels = (
+            Level(0.0, holding + (push[0] - holding) * push[1] / (first * period)),
+            Level(first * period,
+                  holding + (brake[0] - holding) * brake[1] / (second * period)),
+            Level((first + second) * period, holding))
+        found = solve(
+            Template.of(levels, [('load', 0), ('load', 1)]), request.state, request.load,
+            request.target, request.material, request.delivery.slew)
+        if found is not None:
+            return found
+    return None
 
 
 def _on_time(
@@ -127,7 +151,7 @@ def _bounds(request: Request, holding: float, frequency: float) -> tuple[float, 
 
 
 def _direction(
-        work: np.ndarray, request: Request, least: float, most: float) -> float:
+        work: Array, request: Request, least: float, most: float) -> float:
     """Return where to push: +1 if full braking would stop short of the target, seen upwards."""
     state, material = request.state, request.material
     stop = state.stretch
@@ -142,7 +166,7 @@ def _direction(
 
 
 def _durations(
-        work: np.ndarray, request: Request, direction: float, push: float,
+        work: Array, request: Request, direction: float, push: float,
         brake: float) -> tuple[float, float]:
     """Find how long to push so that braking turns at the target, and how long that brakes."""
     state, material, target = request.state, request.material, request.target

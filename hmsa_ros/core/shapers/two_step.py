@@ -1,6 +1,5 @@
 """The two-step command, on ideal and on real hardware."""
 
-from itertools import product
 import math
 
 from hmsa_ros.core.moves import Level, Move
@@ -10,9 +9,9 @@ from hmsa_ros.core.shooting import solve, Template
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.two_step import plan_two_step
 
-# How many half periods more a slow ramp may wait for its second half.
-_MOST_HALF_PERIODS = 64
-_SHARES = (0.0, 0.25, 0.5, 0.75, -0.5)
+# How many later half periods are tried where the first that fits gives no solution.
+_LATER = 6
+_SHORTEST_STRIDE = 0.02
 
 
 def two_step(request: Request) -> Move:
@@ -110,29 +109,50 @@ def _ramped(request: Request, first: Level, last: Level) -> Move:
     Solve for the level between two ramps and for how long it holds.
 
     A linear oscillator comes to rest where ramps and hold together span an odd number of half
-    periods: slower ramps wait for the next one.
+    periods: slow ramps wait for a later one, until which more of the first ramp's vibration
+    has decayed. The solution is followed from fast ramps to the real ones.
     """
-    delivery = request.delivery
-    total = delivery.ramp(first.load - request.load) + delivery.ramp(last.load - first.load)
-    # Damping leaves less for the second ramp to cancel the longer the hold: later guesses give
-    # the first ramp a larger share.
-    for half_periods, share in product(range(1, _MOST_HALF_PERIODS, 2), _SHARES):
-        between = first.load + share * (last.load - first.load)
-        up = delivery.ramp(between - request.load)
-        hold = half_periods * last.time - 0.5 * total
-        if hold < 0.0:
-            continue
-        levels = (Level(0.0, between), Level(up + hold, last.load))
-        found = solve(
-            Template.of(levels, [('load', 0), ('time', 1)]), request.state, request.load,
-            request.target, request.material, delivery.slew)
+    slew = request.delivery.slew
+    start, change = request.load, last.load - request.load
+    decay = abs((last.load - first.load) / (first.load - start)) if first.load != start else 1.0
+    least = 1 + 2 * max(0, math.ceil(0.5 * (abs(change) / slew / (2.0 * last.time) - 1.0)))
+    for half_periods in range(least, least + 2 * _LATER, 2):
+        between = first.load
+        if half_periods > 1:
+            between = start + change / (1.0 + decay ** half_periods)
+        ideal = (Level(0.0, between), Level(half_periods * last.time, last.load))
+        found = _follow_slew(request, ideal, slew)
         if found is not None and all(
                 request.limits.minimum <= x.load <= request.limits.maximum for x in found[0]):
             return Move(Code.TWO_STEP, *found)
-    change = abs(last.load - request.load)
     raise RefusedError(
         Code.SLEW_LIMIT,
-        f'no command through ramps of {request.units.load_text(delivery.slew)} in '
+        f'no command through ramps of {request.units.load_text(slew)} in '
         f'{request.units.time_text(1.0)} brings stretch {request.target:g} to rest: expected '
-        f'a slew limit of about {request.units.load_text(change / last.time)} in '
+        f'a slew limit of about {request.units.load_text(abs(change) / last.time)} in '
         f'{request.units.time_text(1.0)}')
+
+
+def _follow_slew(
+        request: Request, ideal: tuple[Level, Level],
+        slew: float) -> tuple[tuple[Level, ...], float] | None:
+    """Follow a command for steps to one for ramps, in smaller strides where it must be."""
+    found: tuple[tuple[Level, ...], float] = (ideal, ideal[-1].time)
+    share, stride = 0.0, 1.0
+    while share < 1.0:
+        aim = min(1.0, share + stride)
+        levels = found[0]
+        # The ramps lengthen about their middles, so that the second one begins earlier.
+        shift = 0.5 * (aim - share) / slew * (
+            abs(levels[0].load - request.load) - abs(levels[1].load - levels[0].load))
+        guess = (levels[0], Level(levels[1].time + shift, levels[1].load))
+        closer = solve(
+            Template.of(guess, [('load', 0), ('time', 1)]), request.state, request.load,
+            request.target, request.material, slew / aim)
+        if closer is not None:
+            found, share = closer, aim
+        elif stride > _SHORTEST_STRIDE:
+            stride *= 0.5
+        else:
+            return None
+    return found

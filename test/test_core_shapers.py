@@ -1,0 +1,263 @@
+"""Shapers against an integration of their own: at rest at the target, or a reason."""
+
+import math
+
+from hypothesis import given, HealthCheck, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from hmsa_ros.core.delivery import Delivery, pieces
+from hmsa_ros.core.model import (
+    acceleration,
+    critical_zeta,
+    elastic_force,
+    natural_frequency,
+    stretch_limits,
+)
+from hmsa_ros.core.moves import Limits, Move, State
+from hmsa_ros.core.parameters import NondimensionalParameters, paper_actuator
+from hmsa_ros.core.planner import Options, Planner
+from hmsa_ros.core.sequence import plan_sequence, Setpoint
+from hmsa_ros.core.shapers import get_shaper, SHAPERS
+from hmsa_ros.core.shapers.request import Request
+from hmsa_ros.core.simulation import ActuatorSimulation
+from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.errors import BadInputError
+
+PAPER = NondimensionalParameters()
+WIDE = Limits(-20.0, 20.0)
+# Distance from rest at the target, as a share of the move, by an integration of our own.
+AT_REST = 1e-8
+INTEGRATION = 1e-12
+MILLISECOND = 1_000_000
+
+
+def end_state(move: Move, request: Request) -> tuple[float, float]:
+    """Integrate a move's command with SciPy up to its end."""
+    switches, loads, slopes, last = pieces(
+        move.levels, request.load, move.duration, request.delivery.slew)
+    assert last == pytest.approx(move.levels[-1].load, rel=1e-12)
+    state = [request.state.stretch, request.state.rate]
+    ends = [*switches[1:], move.duration]
+    for begin, end, load, slope in zip(switches, ends, loads, slopes, strict=True):
+        if end > begin:
+            def motion(t, y, begin=begin, load=load, slope=slope):
+                force = load + slope * (t - begin)
+                return [y[1], float(acceleration(y[0], y[1], force, request.material))]
+            # LSODA switches to a stiff method where the chains are nearly extended.
+            state = solve_ivp(
+                motion, (begin, end), state, method='DOP853', rtol=INTEGRATION,
+                atol=INTEGRATION).y[:, -1]
+    return float(state[0]), float(state[1])
+
+
+def distance_from_rest(move: Move, request: Request) -> float:
+    """Return how far from rest at the target a move ends, as a share of the move."""
+    stretch, rate = end_state(move, request)
+    frequency = float(natural_frequency(request.target, request.material))
+    size = abs(request.target - request.state.stretch) + abs(request.state.rate) / frequency
+    return (abs(stretch - request.target) + abs(rate) / frequency) / size
+
+
+@pytest.mark.parametrize('name', ['two_step', 'robust', 'minimum_time'])
+@pytest.mark.parametrize(('start', 'target'), [(1.0, 1.1), (1.2, 1.4), (1.0, 0.6), (2.2, 0.5)])
+@pytest.mark.parametrize('delivery', [
+    Delivery(), Delivery(period=0.01), Delivery(period=0.13), Delivery(period=0.3),
+    Delivery(slew=200.0), Delivery(period=0.1, slew=400.0)], ids=str)
+def test_every_exact_shaper_comes_to_rest_at_the_target(name, start, target, delivery):
+    request = Request(State(start), target, PAPER, WIDE, delivery)
+    move = get_shaper(name)(request)
+    assert move.code is not Code.STEP
+    assert distance_from_rest(move, request) < AT_REST
+
+
+@pytest.mark.parametrize('slew', [5.0, 1.0, 0.3, 0.1, 0.05])
+def test_a_slow_amplifier_is_planned_through_its_ramps(slew):
+    request = Request(State(1.0), 1.1, PAPER, WIDE, Delivery(slew=slew))
+    for name in ('two_step', 'robust'):
+        move = get_shaper(name)(request)
+        assert distance_from_rest(move, request) < AT_REST
+        assert move.duration >= (move.levels[-1].load - request.load) / slew
+
+
+@pytest.mark.parametrize('share', [0.01, 0.1, 0.2, 0.27, 1.0 / 3.0])
+def test_a_plan_on_the_grid_is_exact_for_any_period_up_to_a_third_of_the_move(share):
+    for start, target in ((1.0, 1.1), (1.2, 1.4), (1.0, 0.6)):
+        ideal = get_shaper('two_step')(Request(State(start), target, PAPER))
+        period = share * ideal.duration
+        request = Request(State(start), target, PAPER, WIDE, Delivery(period=period))
+        move = get_shaper('two_step')(request)
+        for level in move.levels:
+            assert level.time / period == pytest.approx(round(level.time / period), abs=1e-9)
+        assert move.duration < ideal.duration + period * (1 + 1e-9)
+        assert distance_from_rest(move, request) < AT_REST
+
+
+@pytest.mark.parametrize('order', [1, 2, 3, 4])
+def test_a_chain_has_one_level_more_than_its_order_and_takes_about_as_many_half_periods(order):
+    request = Request(State(1.0), 1.4, PAPER, WIDE, order=order)
+    move = get_shaper('robust')(request)
+    single = get_shaper('two_step')(request)
+    assert len(move.levels) == order + 1
+    assert move.duration == pytest.approx(order * single.duration, rel=0.03)
+    assert distance_from_rest(move, request) < AT_REST
+
+
+def test_chains_of_a_small_undamped_move_have_binomial_levels():
+    # On a linear oscillator a chain of order n is n convolved ZV shapers.
+    material = NondimensionalParameters(zeta=0.0)
+    step = 1e-3
+    full = float(elastic_force(1.0 + step, material.j_lim))
+    for order, shares in ((2, [1, 3, 4]), (3, [1, 4, 7, 8])):
+        move = get_shaper('robust')(
+            Request(State(1.0), 1.0 + step, material, WIDE, order=order))
+        assert [x.load / full for x in move.levels] == pytest.approx(
+            [x / shares[-1] for x in shares], abs=1e-2)
+
+
+def test_minimum_time_is_faster_than_two_step_and_keeps_the_limits():
+    limits = Limits(-0.5, 1.2 * float(elastic_force(1.4, 5.0)))
+    request = Request(State(1.0), 1.4, PAPER, limits)
+    move = get_shaper('minimum_time')(request)
+    assert move.duration < get_shaper('two_step')(request).duration
+    for level in move.levels:
+        assert limits.minimum <= level.load <= limits.maximum
+
+
+@pytest.mark.parametrize('zeta', [2.2, 3.0, 6.0])
+def test_minimum_time_arrives_above_critical_damping_where_two_step_does_not(zeta):
+    material = NondimensionalParameters(zeta=zeta)
+    assert zeta > critical_zeta(1.1, material)
+    request = Request(State(1.0), 1.1, material, WIDE)
+    assert get_shaper('two_step')(request).code is Code.TOO_DAMPED
+    move = get_shaper('minimum_time')(request)
+    assert math.isfinite(move.duration)
+    assert distance_from_rest(move, request) < AT_REST
+
+
+def plan_or_reason(name: str, request: Request) -> tuple[Move, RefusedError | None]:
+    """Return a shaper's move, or an empty one and the refusal."""
+    try:
+        return get_shaper(name)(request), None
+    except RefusedError as error:
+        return Move(error.code, (), math.inf), error
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@given(
+    place=st.tuples(st.floats(0.05, 0.95), st.floats(0.05, 0.95)),
+    rate=st.floats(-4.0, 4.0),
+    zeta=st.one_of(st.just(0.0), st.floats(0.0, 4.0)),
+    j_lim=st.floats(0.5, 60.0),
+    room=st.floats(0.5, 20.0))
+def test_from_any_state_a_plan_is_at_rest_at_the_target_or_carries_a_reason(
+        place, rate, zeta, j_lim, room):
+    material = NondimensionalParameters(zeta, j_lim)
+    lower, upper = stretch_limits(j_lim)
+    start, target = (lower + (upper - lower) * x for x in place)
+    loads = [float(elastic_force(x, j_lim)) for x in (start, target)]
+    request = Request(
+        State(start, rate), target, material, Limits(min(loads) - room, max(loads) + room))
+    move, refusal = plan_or_reason('two_step', request)
+    if refusal is not None:
+        assert refusal.code in (Code.FLUX_LIMIT, Code.NOT_CONVERGED)
+        return
+    for level in move.levels:
+        assert request.limits.minimum <= level.load <= request.limits.maximum
+    if move.code in (Code.TWO_STEP, Code.MINIMUM_TIME):
+        assert distance_from_rest(move, request) < AT_REST
+    else:
+        assert move.code in (Code.HOLD, Code.TOO_DAMPED, Code.INDISTINGUISHABLE)
+        assert move.reason or move.code is Code.HOLD
+
+
+def test_too_little_room_for_the_grid_or_the_ramps_is_refused_with_what_is_needed():
+    tight = Limits(-0.011, 0.805)
+    moving = State(0.9998, 0.3189)
+    assert get_shaper('two_step')(Request(moving, 1.32375, PAPER, tight)).code is Code.TWO_STEP
+    with pytest.raises(RefusedError, match='expected a shorter command period'):
+        get_shaper('two_step')(Request(moving, 1.32375, PAPER, tight, Delivery(period=4.0)))
+    with pytest.raises(RefusedError, match='expected a slew limit of about'):
+        get_shaper('two_step')(Request(
+            State(1.0), 1.1, PAPER, WIDE, Delivery(slew=1e-4)))
+    with pytest.raises(RefusedError, match='needs a flux density of'):
+        get_shaper('zvd')(Request(State(1.0), 1.4, PAPER, Limits(-0.1, 0.5)))
+    with pytest.raises(RefusedError, match='room on both sides'):
+        get_shaper('minimum_time')(Request(
+            State(1.0), 1.1, PAPER, Limits(-1.0, float(elastic_force(1.1, 5.0)))))
+
+
+@pytest.mark.parametrize('name', list(SHAPERS))
+def test_every_shaper_refuses_targets_out_of_range(name):
+    for target in (0.1, 3.0, math.nan):
+        with pytest.raises(RefusedError, match='between the limits') as refusal:
+            get_shaper(name)(Request(State(1.0), target, PAPER))
+        assert refusal.value.code is Code.OUT_OF_RANGE
+
+
+def test_an_unknown_shaper_is_refused_with_the_known_ones():
+    with pytest.raises(BadInputError, match='expected one of two_step, robust'):
+        get_shaper('nothing')
+    with pytest.raises(BadInputError, match='order is 0'):
+        get_shaper('robust')(Request(State(1.0), 1.1, PAPER, order=0))
+    with pytest.raises(BadInputError, match='command period is -1'):
+        Delivery(period=-1.0)
+    with pytest.raises(BadInputError, match='slew limit is 0'):
+        Delivery(slew=0.0)
+
+
+def test_linear_shapers_leave_vibration_and_the_exact_ones_do_not():
+    for name, least, most in (('zv', 1e-2, 0.3), ('zvd', 3e-3, 0.3), ('ei', 3e-3, 0.3)):
+        request = Request(State(1.0), 1.4, PAPER)
+        move = get_shaper(name)(request)
+        assert move.code is Code.LINEAR
+        assert least < distance_from_rest(move, request) < most
+
+
+def test_a_sequence_begins_each_move_where_the_last_one_really_ended():
+    # The first spell is too short: the second move starts from a moving state.
+    first = get_shaper('two_step')(Request(State(1.0), 1.3, PAPER))
+    setpoints = [Setpoint(1.3, 0.5 * first.duration), Setpoint(1.1, 10.0)]
+    with pytest.raises(RefusedError, match='its span is'):
+        plan_sequence(setpoints, PAPER)
+    segments = plan_sequence(setpoints, PAPER, short_spell='continue', limits=WIDE)
+    assert segments[0].move.code is Code.SPELL_TOO_SHORT
+    assert abs(segments[1].start.rate) > 0.01
+    request = Request(segments[1].start, 1.1, PAPER, WIDE)
+    assert distance_from_rest(segments[1].move, request) < AT_REST
+
+
+@pytest.mark.parametrize('options', [
+    {}, {'period': MILLISECOND}, {'slew_limit': 20.0}, {'shaper': 'robust'},
+    {'shaper': 'minimum_time'}, {'period': MILLISECOND, 'slew_limit': 60.0}], ids=str)
+def test_pre_emption_and_stop_leave_no_vibration_behind(options):
+    slew = options.get('slew_limit', math.inf)
+    settings_ = Options(
+        flux_density_min=-0.5, flux_density_max=0.5, lead_time=MILLISECOND, **options)
+    planner = Planner(paper_actuator(), settings_)
+    plant = ActuatorSimulation(paper_actuator(), slew_limit=slew)
+    requests = {0: 1.4, 3: 0.9, 7: 1.2, 8: 1.2, 60: 1.3, 63: 'stop'}
+    samples = []
+    for time in range(0, 160):
+        now = time * MILLISECOND
+        request = requests.get(time)
+        if request == 'stop':
+            planner.stop(now)
+        elif request is not None:
+            planner.setpoint(request, now)
+        for level in planner.due(now):
+            assert plant.command(level.stamp, level.flux_density) == 0
+            assert level.stamp % options.get('period', 1) == 0
+            assert -0.5 <= level.flux_density <= 0.5
+        plant.advance(now)
+        predicted = planner.state(now)
+        assert predicted.stretch == pytest.approx(plant.stretch, abs=1e-9)
+        assert predicted.load * paper_actuator().flux_density_unit == pytest.approx(
+            plant.flux_density, abs=1e-9)
+        samples.append(plant.stretch)
+    arrivals = [x.arrival for x in planner.plan.segments]
+    assert arrivals[-1] is not None
+    assert np.ptp(samples[58:60]) < 1e-6
+    assert np.ptp(samples[-40:]) < 1e-6
