@@ -181,7 +181,7 @@ def test_too_little_room_for_the_grid_or_the_ramps_is_refused_with_what_is_neede
         get_shaper('two_step')(Request(moving, 1.32375, PAPER, tight, Delivery(period=4.0)))
     with pytest.raises(RefusedError, match='expected a slew limit of about'):
         get_shaper('two_step')(Request(
-            State(1.0), 1.1, PAPER, WIDE, Delivery(slew=1e-4)))
+            State(1.0), 0.6, PAPER, WIDE, Delivery(slew=0.05)))
     with pytest.raises(RefusedError, match='needs a flux density of'):
         get_shaper('zvd')(Request(State(1.0), 1.4, PAPER, Limits(-0.1, 0.5)))
     with pytest.raises(RefusedError, match='room on both sides'):
