@@ -184,9 +184,9 @@ def test_too_little_room_for_the_grid_or_the_ramps_is_refused_with_what_is_neede
             State(1.0), 0.6, PAPER, WIDE, Delivery(slew=0.05)))
     with pytest.raises(RefusedError, match='needs a flux density of'):
         get_shaper('zvd')(Request(State(1.0), 1.4, PAPER, Limits(-0.1, 0.5)))
+    holding = get_shaper('step')(Request(State(1.0), 1.1, PAPER)).levels[-1].load
     with pytest.raises(RefusedError, match='room on both sides'):
-        get_shaper('minimum_time')(Request(
-            State(1.0), 1.1, PAPER, Limits(-1.0, float(elastic_force(1.1, 5.0)))))
+        get_shaper('minimum_time')(Request(State(1.0), 1.1, PAPER, Limits(-1.0, holding)))
 
 
 @pytest.mark.parametrize('name', list(SHAPERS))
