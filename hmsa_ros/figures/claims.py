@@ -44,7 +44,7 @@ def lines() -> Iterator[str]:
     """
     for section in (
             _limits, _critical, _damping_time, _damping, _mismatch, _inequality, _residuals,
-            _cycles, _near_limit, _extensibility):
+            _settling, _cycles, _near_limit, _extensibility):
         yield from section()
 
 
@@ -175,22 +175,45 @@ def _residuals() -> Iterator[str]:
                f'{", ".join(f"{x:.0%}" for x in residuals[1])}')
 
 
+def _settling() -> Iterator[str]:
+    # Long spans: each move starts from rest and settles.
+    span = 300.0
+    yield 'unshaped, time until within 5 % of the step, from rest:'
+    for targets in (paper_data.EXPANSION, paper_data.DEEP_CONTRACTION):
+        for zeta in paper_data.ZETAS:
+            run = _unshaped(targets, NondimensionalParameters(zeta, 5.0), span=span)
+            times = (f'{end - begin:.1f}' for begin, end in _unsettled(run, span))
+            yield f'  {_names(targets)}, zeta {zeta:g}: {", ".join(times)}'
+
+
 def _cycles() -> Iterator[str]:
-    yield 'unshaped cycles until within 5 % of the step, spans of 10:'
+    yield 'unshaped, cycles until within 5 % of the step, spans of 10:'
     for j_lim in paper_data.J_LIMS:
         targets = _near_limit_targets(j_lim)
-        run, = paper_data.respond(
-            '', targets, NondimensionalParameters(0.2, j_lim), commands=('unshaped',),
-            samples=30_001)
-        counts = []
-        for i, (start, target) in enumerate(zip((1.0, *targets), targets, strict=False)):
-            begin, end = i * paper_data.SPAN, (i + 1) * paper_data.SPAN
-            outside = (
-                (run.time > begin) & (run.time < end)
-                & (np.abs(run.stretch - target) > _SETTLED * abs(target - start)))
-            settled = float(run.time[outside][-1])
-            counts.append(f'{run.turning_points(begin, settled) / 2:g}')
+        run = _unshaped(targets, NondimensionalParameters(0.2, j_lim))
+        counts = (f'{run.turning_points(*part) / 2:g}' for part in _unsettled(run, paper_data.SPAN))
         yield f'  J_lim {j_lim:g}, {_names(targets)}: {", ".join(counts)}'
+
+
+def _unshaped(
+        targets: Sequence[float], material: NondimensionalParameters, *,
+        span: float = paper_data.SPAN) -> Run:
+    """Return the response to plain steps, sampled densely."""
+    run, = paper_data.respond(
+        '', targets, material, commands=('unshaped',), span=span, samples=30_001)
+    return run
+
+
+def _unsettled(run: Run, span: float) -> list[tuple[float, float]]:
+    """Return for each setpoint when it begins and when the response is close for good."""
+    parts = []
+    for i, (start, target) in enumerate(zip((1.0, *run.targets), run.targets, strict=False)):
+        begin, end = i * span, (i + 1) * span
+        outside = (
+            (run.time > begin) & (run.time < end)
+            & (np.abs(run.stretch - target) > _SETTLED * abs(target - start)))
+        parts.append((begin, float(run.time[outside][-1])))
+    return parts
 
 
 def _near_limit() -> Iterator[str]:
