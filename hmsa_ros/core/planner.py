@@ -7,17 +7,17 @@ it converts messages and publishes what `Planner.due` hands out.
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 from hmsa_ros.core import kernels
 from hmsa_ros.core.delivery import Delivery, pieces
-from hmsa_ros.core.model import equilibrium_stretch
+from hmsa_ros.core.model import elastic_force, equilibrium_stretch
 from hmsa_ros.core.moves import Level, Limits, Move, State
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.sequence import plan_sequence, Segment, Setpoint
 from hmsa_ros.core.shapers import get_shaper
-from hmsa_ros.core.simulation import check_stretch, RTOL, simulate
+from hmsa_ros.core.simulation import check_stretch, longest_motion, RTOL, simulate
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.units import NANOSECONDS, Units
 
@@ -25,6 +25,8 @@ from hmsa_ros.core.units import NANOSECONDS, Units
 _AT_REST = 1e-6
 # How hard to brake where the hardest does not lead to a plan, from the nearest stop on.
 _BRAKE_SHARES = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.0)
+# How far inside the flux density limits a stop keeps where it has to, as a share.
+_INSIDE = 1e-3
 # Stamp of the level that is in force before the first request.
 _ALWAYS = -2**62
 
@@ -279,7 +281,7 @@ class Planner:
             setpoints.append(Setpoint(
                 stretch, (end - left) / NANOSECONDS / self._actuator.time_unit))
             left = end
-        return self._splice(begin, self._plan(begin, setpoints))
+        return self._splice(now, begin, self._plan(begin, setpoints))
 
     def setpoint(self, stretch: float, now: int) -> Plan:
         """
@@ -307,7 +309,7 @@ class Planner:
         begin = self._soonest(now)
         if self._is_target(stretch, begin):
             return self.plan
-        return self._splice(begin, self._plan(begin, [Setpoint(stretch, math.inf)]))
+        return self._splice(now, begin, self._plan(begin, [Setpoint(stretch, math.inf)]))
 
     def stop(self, now: int) -> Plan:
         """
@@ -330,14 +332,15 @@ class Planner:
         begin = self._soonest(now)
         state = self.state(begin)
         brake, time, stretch = self._brake(state, 1.0)
-        if not self._delivery.ideal and time > 0.0:
-            return self._splice(begin, self._gentle_stop(begin, state))
+        if (self._holdable(stretch) != stretch
+                or not self._delivery.ideal and time > 0.0):
+            return self._splice(now, begin, self._gentle_stop(begin, state))
         move = Move(Code.HOLD, tuple(
             [Level(0.0, brake)] * (time > 0.0)
             + [Level(time, float(kernels.elastic_force(stretch, 1.0 / self._material.j_lim)))]),
             time, 'stopped')
         end = State(stretch, 0.0, move.levels[-1].load)
-        return self._splice(begin, self._place(
+        return self._splice(now, begin, self._place(
             begin, [Segment(Setpoint(stretch, math.inf), 0.0, state, end, move)]))
 
     # -- what comes of them --------------------------------------------------------------------
@@ -389,10 +392,12 @@ class Planner:
         load = level.in_force / self._units.load
         if level.stamp == _ALWAYS:
             return State(level.stretch, 0.0, load)
+        end = level.flux_density / self._units.load
+        duration = (time - level.stamp) / NANOSECONDS / self._units.time
+        longest = self._delivery.ramp(end - load) + longest_motion(end, self._material)
         return self._follow(
-            State(level.stretch, level.rate * self._units.time, load),
-            level.flux_density / self._units.load,
-            (time - level.stamp) / NANOSECONDS / self._units.time)
+            State(level.stretch, level.rate * self._units.time, load), end,
+            min(duration, longest))
 
     def segment(self, now: int) -> tuple[int, PlannedSegment] | None:
         """
@@ -437,9 +442,10 @@ class Planner:
         return time if period == 0 else -(-time // period) * period
 
     def _check_stretch(self, stretch: float) -> None:
-        if not math.isfinite(stretch):
+        if not (math.isfinite(stretch) and stretch > 0.0):
             raise RefusedError(
-                Code.BAD_INPUT, f'stretch is {stretch}: expected a finite number')
+                Code.BAD_INPUT,
+                f'stretch is {stretch:g}: expected a finite number greater than 0')
 
     def _check_points(self, points: Sequence[tuple[float, int]]) -> None:
         if not points:
@@ -512,30 +518,47 @@ class Planner:
         return round(time * self._units.time * NANOSECONDS)
 
     def _splice(
-            self, begin: int,
+            self, now: int, begin: int,
             future: tuple[tuple[PlannedLevel, ...], tuple[PlannedSegment, ...]]) -> Plan:
         """Replace everything from a time on."""
         old = self.plan
-        kept = bisect_left([x.stamp for x in old.levels], begin)
+        stamps = [x.stamp for x in old.levels]
+        kept = bisect_left(stamps, begin)
         # What is over and handed out is forgotten, but for the level in force.
-        first = max(min(self._unsent, kept) - 1, 0)
-        segments = tuple(x for x in old.segments if x.begin < begin)
+        first = max(min(self._unsent, kept, bisect_right(stamps, now)) - 1, 0)
+        running = [x for x in old.segments if x.begin < begin]
+        over = max(bisect_right([x.begin for x in running], now) - 1, 0)
+        segments = tuple(
+            replace(x, arrival=None) if x.arrival is not None and x.arrival > begin else x
+            for x in running[over:])
         self._unsent = min(self._unsent, kept) - first
         self.plan = Plan(
-            old.number + 1, old.levels[first:kept] + future[0], segments[-1:] + future[1])
+            old.number + 1, old.levels[first:kept] + future[0], segments + future[1])
         return self.plan
+
+    def _holdable(self, stretch: float) -> float:
+        """Return the nearest stretch that a flux density inside the limits holds."""
+        load = float(elastic_force(stretch, self._material.j_lim))
+        least, most = self._limits.minimum, self._limits.maximum
+        if least <= load <= most:
+            return stretch
+        nearest = least if load < least else most
+        margin = _INSIDE * min(most - least, 1.0 + abs(nearest))
+        return float(equilibrium_stretch(
+            nearest + math.copysign(margin, nearest - load), self._material.j_lim))
 
     def _gentle_stop(
             self, begin: int, state: State
     ) -> tuple[tuple[PlannedLevel, ...], tuple[PlannedSegment, ...]]:
-        """Plan a stop on a grid or through ramps, which need room to be solved for."""
+        """Plan a stop that a single brake does not make: on a grid, through ramps, at a limit."""
         for share in _BRAKE_SHARES:
-            stretch = self._brake(state, share)[2]
+            stretch = self._holdable(self._brake(state, share)[2])
             try:
                 return self._plan(begin, [Setpoint(stretch, math.inf)], 'two_step')
-            except RefusedError as error:
-                refusal = error
-        raise refusal
+            except RefusedError:
+                continue
+        # Nothing stops it at once: let it settle.
+        return self._plan(begin, [Setpoint(self._holdable(state.stretch), math.inf)], 'step')
 
     def _brake(self, state: State, share: float) -> tuple[float, float, float]:
         """Return a load that brakes with a share of the limit, for how long, and until where."""
@@ -553,7 +576,8 @@ class Planner:
             # Unlimited: a load that stops within a fraction of a period.
             load = holding - math.copysign(
                 10.0 * abs(state.rate) * frequency + 10.0, state.rate)
-        load = holding + share * (load - holding)
+        if share < 1.0:
+            load = holding + share * (load - holding)
         status, time, stretch, _, _ = kernels.turning_point(
             self._work, state.stretch, state.rate, 1.0 if up else -1.0, load, 1.0,
             material.zeta, material.c1, i_j, RTOL)

@@ -10,7 +10,7 @@ from hmsa_ros.core.moves import Level, Limits, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.shapers import get_shaper
 from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.core.simulation import check_stretch, simulate
+from hmsa_ros.core.simulation import check_stretch, longest_motion, simulate
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.units import Units
 from hmsa_ros.errors import BadInputError
@@ -106,7 +106,7 @@ def plan_sequence(
         For the messages; default nondimensional.
     short_spell : {'refuse', 'continue'}
         For a span that ends before the move: refuse, or plan the next move from the state that
-        is really reached.
+        is really reached; the last move is then finished after its span.
 
     Returns
     -------
@@ -133,21 +133,25 @@ def plan_sequence(
     check_stretch(state.stretch, material.j_lim, 'start stretch')
     begin = 0.0
     segments = []
-    for setpoint in setpoints:
+    for number, setpoint in enumerate(setpoints, 1):
         move = _rounded(
             shape(Request(
                 state, setpoint.stretch, material, limits, delivery, order, units)),
             delivery)
-        if setpoint.span < move.duration < math.inf:
+        # Both are rounded: a span that the move fills exactly is long enough.
+        if setpoint.span * (1.0 + 1e-12) < move.duration < math.inf:
             if short_spell == 'refuse':
                 raise RefusedError(
                     Code.SPELL_TOO_SHORT,
                     f'the move from stretch {state.stretch:.6g} to {setpoint.stretch:g} takes '
                     f'{units.time_text(move.duration)}, its span is '
                     f'{units.time_text(setpoint.span)}: expected a span of at least the move')
-            kept = tuple(level for level in move.levels if level.time < setpoint.span)
+            levels, duration = move.levels, move.duration
+            if number < len(setpoints):
+                levels = tuple(x for x in levels if x.time < setpoint.span)
+                duration = math.inf
             move = Move(
-                Code.SPELL_TOO_SHORT, kept, math.inf,
+                Code.SPELL_TOO_SHORT, levels, duration,
                 f'the span {units.time_text(setpoint.span)} ends before stretch '
                 f'{setpoint.stretch:g} is reached, which takes '
                 f'{units.time_text(move.duration)}')
@@ -169,13 +173,14 @@ def _follow(
         state: State, move: Move, span: float, material: NondimensionalParameters,
         slew: float) -> State:
     """Return the state at the end of the span, or where the last ramp ends."""
-    end = span
-    if math.isinf(span):
-        end = move.levels[-1].time if math.isinf(move.duration) else move.duration
+    end = move.levels[-1].time if math.isinf(move.duration) else move.duration
+    if math.isfinite(span):
+        end = max(end, span)
     load = state.load
     if math.isnan(load):
         load = float(elastic_force(state.stretch, material.j_lim))
     switches, loads, slopes, last = pieces(move.levels, load, end, slew)
+    end = min(end, max(float(switches[-1]), 0.0) + longest_motion(last, material))
     stretch, rate = simulate(
         switches, loads, end, material, stretch=state.stretch, rate=state.rate, slopes=slopes)
     return State(float(stretch[0]), float(rate[0]), last)

@@ -12,7 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hmsa_ros.core import kernels
-from hmsa_ros.core.model import Array, equilibrium_stretch, stretch_limits
+from hmsa_ros.core.model import (
+    Array,
+    damping,
+    equilibrium_stretch,
+    mass,
+    natural_frequency,
+    stretch_limits,
+)
 from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.core.schedule import CommandSchedule
 from hmsa_ros.core.units import NANOSECONDS
@@ -20,6 +27,10 @@ from hmsa_ros.errors import BadInputError, HmsaError
 
 #: Relative tolerance of the plant's integration.
 RTOL = 1e-13
+# Time constants after which nothing is left of a motion, and periods after which nobody knows
+# its phase.
+_SETTLED = 40.0
+_MOST_PERIODS = 2000.0
 
 
 def simulate(
@@ -82,6 +93,35 @@ def simulate(
     if status != kernels.DONE:
         raise HmsaError('the integration ran out of steps: the load is too large to follow')
     return out[0], out[1]
+
+
+def longest_motion(load: float, material: NondimensionalParameters) -> float:
+    """
+    Return for how long motion under a constant load is worth following.
+
+    Parameters
+    ----------
+    load : float
+        Load beta.
+    material : NondimensionalParameters
+        zeta, J_lim and c1.
+
+    Returns
+    -------
+    float
+        Time after which it has settled, or, with next to no damping, some thousand periods.
+
+    """
+    stretch = equilibrium_stretch(load, material.j_lim)
+    frequency = float(natural_frequency(stretch, material))
+    longest = _MOST_PERIODS * 2.0 * math.pi / frequency
+    decay = damping(material) / (2.0 * float(mass(stretch, material.c1)))
+    if decay == 0.0:
+        return longest
+    if decay < frequency:
+        return min(longest, _SETTLED / decay)
+    # The slower of two decays.
+    return _SETTLED * 2.0 * decay / frequency ** 2
 
 
 def check_stretch(stretch: float, j_lim: float, name: str = 'stretch') -> None:
