@@ -261,10 +261,14 @@ class PlannerNode(Node):
 
 def _options(values: dict[str, Any]) -> Options:
     """Return the planning options that declared parameters describe."""
+    least, largest = float(values['flux_density_min']), float(values['flux_density_max'])
+    if not least < largest:
+        raise BadInputError(
+            f'parameter flux_density_min is {least:g} T: expected less than flux_density_max, '
+            f'which is {largest:g} T')
     return Options(
         shaper=str(values['shaper']), short_spell=str(values['short_spell']),
-        flux_density_min=float(values['flux_density_min']),
-        flux_density_max=float(values['flux_density_max']),
+        flux_density_min=least, flux_density_max=largest,
         lead_time=round(float(values['lead_time']) * NANOSECONDS),
         period=0 if values['command_mode'] == 'continuous'
         else round(float(values['command_period']) * NANOSECONDS),

@@ -5,12 +5,14 @@ One place for what every node's ``main`` does, so that a node file holds wiring 
 """
 
 from collections.abc import Callable, Sequence
+import re
 import sys
 
 import rclpy
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.logging import get_logger_level, LoggingSeverity, set_logger_level
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
@@ -70,17 +72,9 @@ def run(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
     ending = Ending()
     arguments = list(sys.argv[1:] if args is None else args)
     try:
-        rclpy.init(
-            args=['hmsa', *arguments], signal_handler_options=SignalHandlerOptions.NO)
-        unknown = rclpy.utilities.remove_ros_args(['hmsa', *arguments])[1:]
-        if unknown:
-            raise BadInputError(
-                f'unknown argument {unknown[0]!r}: expected nothing but --ros-args ...; '
-                'see --help')
+        _initialise(arguments)
     except BadInputError as error:
         rclpy.try_shutdown()
-        return _refuse(error, 2)
-    except Exception as error:  # rclpy raises errors of several unrelated classes here
         return _refuse(error, 2)
     node: Node | None = None
     status = 0
@@ -102,6 +96,27 @@ def run(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
         rclpy.try_shutdown()
     failure = getattr(node, 'failure', None)
     return _refuse(failure, 1) if failure is not None and not status else status
+
+
+def _initialise(arguments: Sequence[str]) -> None:
+    """Start rclpy, and refuse arguments that it or nobody understands."""
+    # What rcl says of bad arguments is in its error too, which is told below in one line.
+    set_logger_level('rcl', LoggingSeverity.FATAL)
+    try:
+        rclpy.init(
+            args=['hmsa', *arguments], signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # rclpy raises errors of several unrelated classes here
+        text = re.sub(r'^failed to initialize rcl: |, at \S+:\d+', '', str(error))
+        raise BadInputError(
+            f'arguments {" ".join(arguments)!r}: {text}; expected -p NAME:=VALUE, -r FROM:=TO, '
+            '--params-file FILE or another option of ROS 2') from error
+    finally:
+        if get_logger_level('rcl') == LoggingSeverity.FATAL:
+            set_logger_level('rcl', LoggingSeverity.UNSET)
+    unknown = rclpy.utilities.remove_ros_args(['hmsa', *arguments])[1:]
+    if unknown:
+        raise BadInputError(
+            f'unknown argument {unknown[0]!r}: expected nothing but --ros-args ...; see --help')
 
 
 def _refuse(error: Exception, status: int) -> int:
