@@ -92,8 +92,9 @@ PARAMETERS = (
     ParameterSpec(
         'play.wait_for_subscribers_timeout', 60.0, 'How long to wait for them.', 's', 0.0, 1e6),
     ParameterSpec(
-        'play.discovery_time', 0.5,
-        'Least time to wait for subscribers that are there already.', 's', 0.0, 3600.0),
+        'play.discovery_time', 3.5,
+        'How long to look for subscribers that are there already; not waited for in full when '
+        'every topic has one, or those in play.wait_for_subscribers do.', 's', 0.0, 3600.0),
     ParameterSpec('play.delay.sec', 0, 'Whole seconds to wait before playing.', 's', 0),
     ParameterSpec('play.delay.nsec', 0, 'Nanoseconds on top of them.', 'ns', 0, 999_999_999),
     ParameterSpec(
@@ -405,20 +406,23 @@ class Player(Node):
         names = self._names('play.wait_for_subscribers')
         begin = time.monotonic()
         limit = begin + self._values['play.wait_for_subscribers_timeout']
+        # Discovery may take three seconds, the period at which participants announce
+        # themselves; who has not been found by then is not there.
         settled = begin + self._values['play.discovery_time']
-        publishers = [*self._out.values(), *([self._clock_out] if self._clock_out else [])]
         next_clock = begin
         while self.context.ok() and not self._stopped:
             now = time.monotonic()
             if self._clock_out is not None and now >= next_clock:
                 self._send_clock(self._start)
                 next_clock = now + _CLOCK_WHILE_WAITING_SECONDS
-            missing = [name for name in names
-                       if not self._out[name].get_subscription_count()]
-            unmatched = any(
-                publisher.get_subscription_count() < self.count_subscribers(publisher.topic)
-                for publisher in publishers)
-            if not missing and now >= settled and (not unmatched or now >= limit):
+            counts = {name: sender.get_subscription_count()
+                      for name, sender in self._out.items()}
+            missing = [name for name in names if not counts[name]]
+            half_way = any(
+                sender.get_subscription_count() < self.count_subscribers(sender.topic)
+                for sender in (*self._out.values(), self._clock_out) if sender is not None)
+            found = not half_way and (bool(names) or all(counts.values()))
+            if not missing and (found or now >= settled):
                 return
             if missing and now >= limit:
                 raise HmsaError(
@@ -472,7 +476,7 @@ class Player(Node):
             if self._next_answers:
                 self._answer_next()
         outcome, _ = self._tick_until(self._end, tick, last=True)
-        if not outcome and self._clock_out is not None:
+        if not outcome and self._values['play.clock_publish_frequency'] > 0.0:
             self._send_clock(self._end)
         return outcome or 'end'
 
@@ -504,7 +508,10 @@ class Player(Node):
                             self._next_wanted -= 1
                             self._anchor = (when, time.monotonic())
                         return ''
-                    self._change.wait()
+                    # The clock stands still, but who comes now is to know it.
+                    if not self._change.wait(_CLOCK_WHILE_WAITING_SECONDS) \
+                            and self._clock_out is not None:
+                        self._send_clock(self._anchor[0])
                     continue
                 since, began = self._anchor
                 delay = began + (when - since) * 1e-9 / self._rate - time.monotonic()

@@ -1,0 +1,258 @@
+"""The player as a process, with subscribers in this one, over DDS."""
+
+import itertools
+import signal
+
+import pytest
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
+from rosbags.rosbag2 import Writer as RosbagsWriter
+from rosbags.rosbag2.enums import StoragePlugin
+from rosbags.typesys import get_typestore, Stores
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import MagneticField
+from std_msgs.msg import Float64
+from std_srvs.srv import Trigger
+
+from hmsa_ros.bag.definitions import message_definition, type_hash
+from hmsa_ros.bag.qos import Qos
+from hmsa_ros.bag.writer import BagWriter, Topic
+
+pytestmark = pytest.mark.ros
+FLOAT = 'std_msgs/msg/Float64'
+FIELD = 'sensor_msgs/msg/MagneticField'
+START = 1_700_000_000 * 10**9
+MS = 10**6
+RELIABLE = (Qos(),)
+
+
+def write_bag(folder, entries, profiles=RELIABLE):
+    """Write (topic, milliseconds, value) entries; topics with 'command' carry fields."""
+    with BagWriter(folder) as writer:
+        numbers = {}
+        for i, (name, milliseconds, value) in enumerate(entries):
+            if name not in numbers:
+                type_name = FIELD if 'command' in name else FLOAT
+                encoding, text = message_definition(type_name)
+                numbers[name] = writer.add_topic(Topic(
+                    name, type_name, text, encoding, profiles, type_hash(type_name)))
+            if 'command' in name:
+                message = MagneticField()
+                message.magnetic_field.z = value
+            else:
+                message = Float64(data=float(value))
+            writer.write([(numbers[name], START + round(milliseconds * MS), 1, i,
+                           serialize_message(message))])
+    return folder
+
+
+@pytest.fixture
+def play(start):
+    def play(bag, *parameters):
+        arguments = [f'storage.uri:={bag}', *parameters]
+        return start.hmsa('player', '--ros-args', *(
+            part for argument in arguments for part in ('-p', argument)))
+    return play
+
+
+def finish(ros, process, messages, count):
+    ros.spin_until(lambda: len(messages) >= count, f'{count} messages')
+    assert process.wait() == 0, process.output
+    assert 'Traceback' not in process.output
+
+
+def test_every_message_is_sent_in_order_and_the_process_ends(ros, play, tmp_path):
+    bag = write_bag(tmp_path / 'bag', [('/a', i, i) for i in range(500)])
+    got = ros.collect(Float64, '/a')
+    process = play(bag)
+    finish(ros, process, got, 500)
+    assert [message.data for message in got] == list(range(500))
+    assert '500 messages sent' in process.stdout
+
+
+def test_messages_of_equal_stamp_keep_their_order_over_topics(ros, play, tmp_path):
+    bag = write_bag(tmp_path / 'bag', [
+        ('/a' if i % 3 else '/b', i // 100, i) for i in range(600)])
+    got = []
+    for topic in ('/a', '/b'):
+        ros.node.create_subscription(
+            Float64, topic, lambda message, topic=topic: got.append((topic, message.data)), 1000)
+    process = play(bag, 'play.rate:=10.0')
+    finish(ros, process, got, 600)
+    for topic in ('/a', '/b'):
+        assert [value for name, value in got if name == topic] == [
+            i for i in range(600) if (i % 3 != 0) == (topic == '/a')]
+
+
+def test_commands_are_only_sent_if_asked_for_by_name(ros, play, tmp_path):
+    bag = write_bag(tmp_path / 'bag', [
+        entry for i in range(20)
+        for entry in (('/left/flux_density_command', i, 0.5), ('/a', i, i))])
+    commands = ros.collect(MagneticField, '/left/flux_density_command')
+    got = ros.collect(Float64, '/a')
+    process = play(bag)
+    finish(ros, process, got, 20)
+    assert not commands
+    assert 'it carries commands; name it in play.topics_to_filter' in process.output
+    process = play(bag, 'play.regex_to_filter:=.*')
+    finish(ros, process, got, 40)
+    assert not commands
+    process = play(bag, 'play.allow_commands:=[/left/flux_density_command]')
+    finish(ros, process, commands, 20)
+    assert {message.magnetic_field.z for message in commands} == {0.5}
+    process = play(bag, 'play.topics_to_filter:=[/left/flux_density_command]')
+    finish(ros, process, commands, 40)
+
+
+def test_the_clock_runs_before_and_with_the_messages(ros, play, tmp_path):
+    bag = write_bag(tmp_path / 'bag', [('/a', i, i) for i in range(100)])
+    events = []
+    ros.node.create_subscription(
+        Clock, '/clock', lambda message: events.append(
+            message.clock.sec * 10**9 + message.clock.nanosec),
+        QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT))
+    got = ros.collect(Float64, '/a')
+    process = play(bag, 'play.clock_publish_frequency:=1000.0', 'play.start_paused:=true')
+    ros.spin_until(lambda: events, 'the first /clock')
+    assert set(events) == {START}
+    assert not got
+    assert ros.call(Trigger, 'player/resume').success
+    finish(ros, process, got, 100)
+    assert events == sorted(events)
+    assert events[-1] == START + 99 * MS
+    assert len(set(events)) >= 99
+
+
+def test_the_clock_can_go_with_each_message(ros, play, tmp_path):
+    bag = write_bag(tmp_path / 'bag', [('/a', 3 * i, i) for i in range(50)])
+    times = []
+    ros.node.create_subscription(
+        Clock, '/clock', lambda message: times.append(
+            message.clock.sec * 10**9 + message.clock.nanosec),
+        QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT))
+    got = ros.collect(Float64, '/a')
+    process = play(bag, 'play.clock_publish_on_topic_publish:=true')
+    finish(ros, process, got, 50)
+    assert [key for key, _ in itertools.groupby(times)] == [
+        START + 3 * i * MS for i in range(50)]
+
+
+def test_pause_next_resume_and_stop(ros, play, tmp_path):
+    bag = write_bag(tmp_path / 'bag', [('/a', 200 * i, i) for i in range(1000)])
+    got = ros.collect(Float64, '/a')
+    process = play(bag, 'play.start_paused:=true')
+    assert ros.call(Trigger, 'player/is_paused').success
+    for i in range(3):
+        assert ros.call(Trigger, 'player/play_next').success
+        ros.spin_until(lambda i=i: len(got) == i + 1, f'message {i}')
+    assert ros.call(Trigger, 'player/toggle_paused').message == 'playing'
+    ros.spin_until(lambda: len(got) > 4, 'messages after resuming')
+    assert not ros.call(Trigger, 'player/play_next').success
+    assert ros.call(Trigger, 'player/pause').message == 'paused'
+    assert ros.call(Trigger, 'player/stop').success
+    assert process.wait() == 0, process.output
+    assert [message.data for message in got] == list(range(len(got)))
+
+
+def test_latched_messages_before_the_offset_are_sent_first(ros, play, tmp_path):
+    bag = write_bag(tmp_path / 'bag', [('/latched', i, i) for i in range(10)],
+                    (Qos(durability='transient_local'),))
+    got = ros.collect(Float64, '/latched', QoSProfile(
+        depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+    process = play(bag, 'play.start_offset.nsec:=7000000')
+    finish(ros, process, got, 4)
+    assert [message.data for message in got] == [6.0, 7.0, 8.0, 9.0]
+
+
+def test_offset_and_duration_cut_out_a_piece(ros, play, tmp_path):
+    bag = write_bag(tmp_path / 'bag', [('/a', i, i) for i in range(100)])
+    got = ros.collect(Float64, '/a')
+    process = play(bag, 'play.start_offset.nsec:=20000000',
+                   'play.playback_duration.sec:=0', 'play.playback_duration.nsec:=30000000')
+    finish(ros, process, got, 31)
+    assert [message.data for message in got] == list(range(20, 51))
+
+
+def test_a_loop_begins_again_until_it_is_stopped(ros, play, tmp_path):
+    bag = write_bag(tmp_path / 'bag', [('/a', i, i) for i in range(10)])
+    got = ros.collect(Float64, '/a')
+    process = play(bag, 'play.loop:=true')
+    ros.spin_until(lambda: len(got) > 35, 'the fourth round')
+    assert process.stop(signal.SIGINT) == 0, process.output
+    assert [message.data for message in got[:30]] == [*range(10)] * 3
+
+
+def test_rate_and_position_change_while_playing(ros, play, tmp_path):
+    bag = write_bag(tmp_path / 'bag', [('/a', 1000 * i, i) for i in range(1000)])
+    got = ros.collect(Float64, '/a')
+    process = play(bag)
+    ros.spin_until(lambda: got, 'the first message')
+    results = ros.set_parameters('player', [
+        Parameter('play.rate', value=500.0), Parameter('play.seek', value=900.0)])
+    assert all(result.successful for result in results)
+    finish(ros, process, got, 101)
+    values = [message.data for message in got]
+    assert values[-100:] == list(range(900, 1000))
+    assert len(values) < 200
+
+
+def test_a_rate_out_of_range_is_refused(ros, play, tmp_path):
+    bag = write_bag(tmp_path / 'bag', [('/a', 1000 * i, i) for i in range(1000)])
+    process = play(bag)
+    result, = ros.set_parameters('player', [Parameter('play.rate', value=-1.0)])
+    assert not result.successful
+    assert process.stop() == 0
+
+
+def test_it_waits_for_the_subscribers_it_is_told_to(ros, play, tmp_path):
+    bag = write_bag(tmp_path / 'bag', [('/a', i, i) for i in range(50)])
+    process = play(bag, 'play.wait_for_subscribers:=[a]')
+    ros.spin_until(lambda: ros.node.count_publishers('/a'), 'the publisher')
+    got = ros.collect(Float64, '/a')
+    finish(ros, process, got, 50)
+
+
+def test_a_subscriber_that_does_not_come_fails_the_run(play, tmp_path):
+    bag = write_bag(tmp_path / 'bag', [('/a', i, i) for i in range(5)])
+    process = play(bag, 'play.wait_for_subscribers:=[/a]',
+                   'play.wait_for_subscribers_timeout:=0.3')
+    assert process.wait() == 1
+    assert process.stderr.strip().splitlines()[-1].startswith(
+        'hmsa: error: no subscriber of /a within 0.3 s')
+
+
+def test_a_bag_of_rosbags_is_played(ros, play, tmp_path):
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with RosbagsWriter(
+            tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection('/a', FLOAT, typestore=store)
+        for i in range(50):
+            writer.write(connection, START + i * MS, store.serialize_cdr(
+                store.types[FLOAT](data=float(i)), FLOAT))
+    got = ros.collect(Float64, '/a')
+    finish(ros, play(tmp_path / 'bag' / 'bag.mcap'), got, 50)
+    assert [message.data for message in got] == list(range(50))
+
+
+def test_an_empty_bag_ends_at_once(play, tmp_path):
+    process = play(write_bag(tmp_path / 'bag', []))
+    assert process.wait() == 0, process.output
+    assert '0 messages sent' in process.stdout
+
+
+@pytest.mark.parametrize(('parameters', 'expected'), [
+    ((), 'parameter storage.uri is empty'),
+    (('storage.uri:=/none',), 'does not exist: expected the folder of a bag'),
+    (('storage.uri:={bag}', 'play.rate:=0.0'), 'play.rate'),
+    (('storage.uri:={bag}', 'play.regex_to_filter:="("'), 'expected a regular expression'),
+    (('storage.uri:={bag}', 'play.wait_for_subscribers:=[/b]'), 'expected topics that are sent'),
+])
+def test_bad_input_is_refused_in_one_line(start, tmp_path, parameters, expected):
+    bag = write_bag(tmp_path / 'bag', [('/a', 0, 0)])
+    process = start.hmsa('player', '--ros-args', *(
+        part for parameter in parameters for part in ('-p', parameter.format(bag=bag))))
+    assert process.wait() == 2
+    line, = process.stderr.strip().splitlines()
+    assert line.startswith('hmsa: error: ')
+    assert expected in line
