@@ -71,7 +71,7 @@ $(VENV)/.installed: setup.py setup.cfg pyproject.toml package.xml constraints.tx
 	"ensurepip; install them (on Debian and Ubuntu: python3-venv)" >&2; exit 1; }
 	@echo "Making the environment $(VENV), which takes some minutes the first time"
 	$(PYTHON) -m venv --clear $(VENV)
-	$(INSTALL) -e '.[ros,test]'
+	$(INSTALL) -e '.[ros,test,studies]'
 	@touch $@
 
 $(VENV)/.bench: $(VENV)/.installed

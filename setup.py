@@ -52,6 +52,10 @@ EXTRAS_REQUIRE = {
         'sympy>=1.12',
         'types-PyYAML',
     ],
+    # Parquet, beside CSV.
+    'studies': [
+        'pyarrow>=14.0',
+    ],
     'bench': [
         'casadi>=3.6',
     ],

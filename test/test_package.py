@@ -29,6 +29,8 @@ KEYS = {
 WITHOUT_KEY = {'ruff', 'types-PyYAML'}
 # Requirements whose module has another name.
 MODULES = {'PyYAML': 'yaml', 'mcap-ros2-support': 'mcap_ros2'}
+# What only a part of the package needs.
+OPTIONAL = {'pyarrow'}
 # Needed to install, or to be launched, not to be imported.
 NOT_IMPORTED = {'setuptools', 'ros2launch'}
 # What setup() was called with, without building anything.
@@ -132,7 +134,8 @@ def test_everything_imported_is_required_and_everything_required_is_imported(set
     python = {MODULES.get(name, name.lower()) for name in names(setup['install_requires'])}
     ros = {key for key in texts(manifest, 'exec_depend')
            if not key.startswith('python3-') and key not in KEYS.values()}
-    assert imported() == (python | ros) - NOT_IMPORTED
+    assert names(setup['extras_require']['studies']) == OPTIONAL
+    assert imported() == (python | ros | OPTIONAL) - NOT_IMPORTED
 
 
 def test_rclpy_and_messages_come_only_with_the_extra_for_machines_without_ros(setup):

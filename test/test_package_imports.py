@@ -39,8 +39,8 @@ def modules(package: str) -> list[str]:
             if path.stem != '__init__']
 
 
-@pytest.mark.parametrize('name', [*modules('core'), *modules('bag')])
-def test_physics_and_bags_import_without_ros(name):
+@pytest.mark.parametrize('name', [*modules('core'), *modules('bag'), *modules('studies')])
+def test_physics_bags_and_studies_import_without_ros(name):
     result = run(BLOCKED.format(blocked=ROS) + f'import {name}')
     assert (result.returncode, result.stderr) == (0, '')
 
@@ -63,7 +63,7 @@ sys.exit(main())
 
 
 @pytest.mark.parametrize('command', ['demo', 'plan', 'send', 'planner', 'plant', 'recorder',
-                                     'player', 'bag', 'figures'])
+                                     'player', 'bag', 'figures', 'robustness', 'sweep'])
 def test_every_command_of_the_interface_answers_help(command):
     result = run(f"""
 import sys

@@ -16,7 +16,7 @@ from hmsa_ros import __version__
 from hmsa_ros.cli.node import NODES
 from hmsa_ros.errors import BadInputError, HmsaError
 
-COMMANDS = ('demo', 'plan', 'send', 'node', 'bag', 'figures')
+COMMANDS = ('demo', 'plan', 'send', 'node', 'bag', 'figures', 'robustness', 'sweep')
 
 
 class Parser(argparse.ArgumentParser):

@@ -1,0 +1,248 @@
+"""``hmsa robustness``: what each shaper leaves of a move when the model is in error."""
+
+import argparse
+import json
+import math
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+from hmsa_ros.errors import BadInputError
+
+if TYPE_CHECKING:
+    from hmsa_ros.studies.robustness import Case, Result
+
+_MOVES = ((1.0, 1.1), (1.0, 1.4), (1.0, 0.7))
+
+
+def _move(text: str) -> tuple[float, float]:
+    start, _, target = text.partition(':')
+    try:
+        return float(start), float(target)
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f'{text!r}: expected START:TARGET, two stretches such as 1.0:1.4') from None
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    Add the command.
+
+    Parameters
+    ----------
+    subparsers : argparse action
+        Where to add it.
+
+    """
+    parser = subparsers.add_parser(
+        'robustness', help='compare the shapers where the model is in error',
+        description='Plan moves with each shaper and the nominal parameters, carry them out '
+                    'with shear modulus G, damping coefficient zeta and J_lim in error, and '
+                    'compare the residual: peak-to-peak stretch after arrival as a share of '
+                    'the step, without the steady offset. Prints a table; writes '
+                    'robustness.csv and a picture for each move, in place of files of these '
+                    'names.',
+        epilog='example: hmsa robustness --move 1.0:1.4 1.2:0.8 --errors 0.05 --order 2 3 4')
+    parser.add_argument(
+        '--move', nargs='+', type=_move, default=list(_MOVES), metavar='START:TARGET',
+        help='stretches at rest to move between (default 1.0:1.1 1.0:1.4 1.0:0.7)')
+    parser.add_argument(
+        '--shapers', metavar='NAME,...', help='names of shapers with commas (default all)')
+    parser.add_argument(
+        '--errors', type=float, default=0.1, metavar='E',
+        help='largest error in the table and the box, as a share (default 0.1); the curves go '
+             'to twice that')
+    parser.add_argument(
+        '--order', nargs='+', type=int, metavar='N',
+        help='orders of the robust shaper (default 2 3)')
+    parser.add_argument(
+        '--zeta', type=float, default=0.2, metavar='Z',
+        help='nominal nondimensional damping coefficient, at least 0 (default 0.2)')
+    parser.add_argument(
+        '--j-lim', type=float, default=5.0, metavar='J',
+        help='nominal chain limit of the Gent model, above 0 (default 5)')
+    parser.add_argument(
+        '--c1', type=float, default=2.0, metavar='C',
+        help='shape 2 H^2/L^2, above 0 (default 2)')
+    parser.add_argument(
+        '--out', type=Path, default=Path('robustness'), metavar='DIR',
+        help='folder to write to, made if need be (default robustness)')
+    parser.add_argument('--json', action='store_true', help='print JSON in full precision')
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """
+    Study, print and write.
+
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+        As parsed.
+
+    Returns
+    -------
+    int
+        Exit status.
+
+    Raises
+    ------
+    BadInputError
+        If an argument is out of range, or the folder cannot be written to.
+
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+    from hmsa_ros.core.parameters import NondimensionalParameters
+    from hmsa_ros.studies.robustness import candidates, Case, LARGEST, ORDERS, study
+
+    material = NondimensionalParameters(arguments.zeta, arguments.j_lim, arguments.c1)
+    shapers = None
+    if arguments.shapers is not None:
+        shapers = [name.strip() for name in arguments.shapers.split(',')]
+    compared = candidates(shapers, arguments.order or ORDERS)
+    cases = [
+        Case(start, target, material, box=arguments.errors,
+             span=max(arguments.errors, min(2.0 * arguments.errors, LARGEST)))
+        for start, target in dict.fromkeys(arguments.move)]
+    folder: Path = arguments.out
+    _make(folder)
+    studies: list[tuple[Case, list[Result]]] = []
+    console = Console(stderr=True)
+    with Progress(
+            TextColumn('studying'), BarColumn(), MofNCompleteColumn(), console=console,
+            transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task('', total=len(cases) * len(compared))
+        for case in cases:
+            studies.append((case, []))
+            for candidate in compared:
+                studies[-1][1].append(study(case, candidate))
+                progress.advance(task)
+    files = _write(folder, studies)
+    if arguments.json:
+        print(json.dumps({
+            'moves': [_record(case, results) for case, results in studies],
+            'files': [str(path) for path in files]}, indent=2))
+        return 0
+    for case, results in studies:
+        _print_table(case, results)
+    for path in files:
+        print(path)
+    return 0
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInputError(
+            f'cannot make the folder {folder}: {error.strerror or error}; expected a folder '
+            'with write permission (--out)') from error
+
+
+def _write(folder: Path, studies: 'list[tuple[Case, list[Result]]]') -> list[Path]:
+    """Write the numbers and the pictures."""
+    from hmsa_ros.figures.studies import draw_robustness
+    from hmsa_ros.figures.style import unwritable
+    from hmsa_ros.studies.robustness import write_csv
+
+    files = [folder / 'robustness.csv']
+    try:
+        write_csv(files[0], studies)
+    except OSError as error:
+        raise unwritable(files[0], error) from error
+    for case, results in studies:
+        files.append(folder / f'robustness_{case.start:g}_to_{case.target:g}.png')
+        draw_robustness(files[-1], case, results)
+    return files
+
+
+def _record(case: 'Case', results: 'list[Result]') -> dict[str, Any]:
+    """Return a case as the JSON output shows it; null where there is no such number."""
+    from hmsa_ros.studies.robustness import PARAMETERS
+
+    errors = case.errors().tolist()
+    records = []
+    for result in results:
+        record: dict[str, Any] = {
+            'shaper': result.candidate.shaper,
+            'order': result.candidate.order if result.candidate.shaper == 'robust' else None,
+            'label': result.candidate.label,
+            'status': str(result.code),
+            'reason': result.reason,
+        }
+        if result.move is not None:
+            record |= {
+                'levels': [[x.time, x.load] for x in result.move.levels],
+                'arrival': result.arrival,
+                'arrives': math.isfinite(result.move.duration),
+                'residual': _number(result.nominal),
+                'worst': {
+                    **{name: {
+                        'residual': _number(worst.residual),
+                        'error': getattr(worst.errors, PARAMETERS[name])}
+                        for name, worst in result.alone.items()},
+                    'box': {
+                        'residual': _number(result.worst.residual),
+                        'errors': {
+                            name: getattr(result.worst.errors, attribute)
+                            for name, attribute in PARAMETERS.items()}},
+                },
+                'curves': {
+                    name: {'errors': errors, 'residuals': [_number(x) for x in curve.tolist()]}
+                    for name, curve in result.curves.items()},
+            }
+        records.append(record)
+    return {
+        'start': case.start, 'target': case.target, 'zeta': case.material.zeta,
+        'j_lim': case.material.j_lim, 'c1': case.material.c1, 'box': case.box,
+        'shapers': records}
+
+
+def _number(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+def _print_table(case: 'Case', results: 'list[Result]') -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+
+    from hmsa_ros.studies.robustness import PARAMETERS, percent
+
+    error = f'{100.0 * case.box:g}'
+    table = Table(
+        box=SIMPLE_HEAD,
+        title=f'stretch {case.start:g} to {case.target:g}, nominal zeta '
+              f'{case.material.zeta:g}, J_lim {case.material.j_lim:g}, c1 {case.material.c1:g}',
+        caption='residual: peak-to-peak stretch after arrival in % of the step, without the '
+                f'steady offset; worst within {error} % of error, in the last column of all '
+                'three at once; arrival in L sqrt(rho/G)')
+    table.add_column('shaper', no_wrap=True)
+    for name in ('arrival', 'nominal', *PARAMETERS, 'all'):
+        table.add_column(name, justify='right', no_wrap=True)
+    for result in results:
+        if result.move is None:
+            table.add_row(result.candidate.name, *'------')
+            continue
+        arrival = f'{result.arrival:.3f}'
+        table.add_row(
+            result.candidate.name,
+            arrival if math.isfinite(result.move.duration) else f'({arrival})',
+            percent(result.nominal), *(percent(x.residual) for x in result.alone.values()),
+            percent(result.worst.residual))
+    console = Console()
+    console.print(table)
+    notes = [f'{x.candidate.name}: {x.reason}' for x in results if x.reason]
+    linear = [x.candidate.name for x in results if x.candidate.linear]
+    if linear:
+        notes.append(f'{", ".join(linear)}: linear, designed at the target')
+    if any(x.move is not None and math.isinf(x.move.duration) for x in results):
+        notes.append('an arrival in brackets is not one: where the motion is only approached, '
+                     'the residual counts from when the two-step command arrives, or from half '
+                     'a natural period on where there is none')
+    if any(math.isnan(x.worst.residual) for x in results if x.move is not None):
+        notes.append('a question mark stands for a motion too close to a limiting stretch to '
+                     'be followed')
+    for note in notes:
+        console.print(f'note: {note}', highlight=False, soft_wrap=True)

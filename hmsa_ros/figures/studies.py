@@ -1,0 +1,290 @@
+"""Pictures of the studies: robustness, sampled hardware, heavy damping."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+import numpy as np
+
+from hmsa_ros.core.model import critical_zeta, elastic_force
+from hmsa_ros.core.moves import Move, State
+from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.core.shapers.minimum_time import minimum_time
+from hmsa_ros.core.shapers.request import Request
+from hmsa_ros.core.shapers.step import step
+from hmsa_ros.figures import style
+from hmsa_ros.studies.damped import DampedStudy, LIMITS, limits_of, SETTLED
+from hmsa_ros.studies.residual import Errors, response
+from hmsa_ros.studies.robustness import Candidate, Case, PARAMETERS, percent, Result
+from hmsa_ros.studies.sampled import ideal_move, PROMISED, rounded_move, SampledStudy, solved_move
+
+# Residuals below this are drawn on it.
+_FLOOR = 1e-4
+# The same where rounding errors are shown.
+_EXACT = 1e-15
+_SYMBOLS = {'G': '$G$', 'zeta': r'$\zeta$', 'J_lim': r'$J_\mathrm{lim}$'}
+_CURVES: dict[str, dict[str, Any]] = {
+    'two_step': {'color': style.BLUE, 'linewidth': 1.9},
+    'minimum_time': {'color': style.PURPLE, 'linewidth': 1.3, 'linestyle': (0, (5, 1, 1, 1))},
+    'step': {'color': style.VERMILION, 'linewidth': 1.1, 'linestyle': (0, (4, 1.5))},
+    'zv': {'color': style.GREY, 'linewidth': 1.1, 'linestyle': (0, (1, 1))},
+    'zvd': {'color': style.GREY, 'linewidth': 1.1, 'linestyle': (0, (4, 1.5))},
+    'ei': {'color': style.BLACK, 'linewidth': 1.0, 'linestyle': (0, (6, 1, 1, 1, 1, 1))},
+}
+# Orders of the robust shaper, one after the other.
+_ORDERS: tuple[dict[str, Any], ...] = (
+    {'color': style.GREEN, 'linewidth': 1.9},
+    {'color': style.GREEN, 'linewidth': 1.2, 'linestyle': (0, (4, 1.5))},
+    {'color': style.ORANGE, 'linewidth': 1.2},
+    {'color': style.ORANGE, 'linewidth': 1.2, 'linestyle': (0, (4, 1.5))},
+    {'color': style.SKY_BLUE, 'linewidth': 1.2},
+    {'color': style.SKY_BLUE, 'linewidth': 1.2, 'linestyle': (0, (4, 1.5))},
+)
+
+
+def draw_robustness(path: str | Path, case: Case, results: Sequence[Result]) -> None:
+    """
+    Draw the residuals of one move: over each error alone, and the worst in the box.
+
+    Parameters
+    ----------
+    path : str or Path
+        PNG file to write; one of that name is replaced.
+    case : Case
+        What was studied.
+    results : sequence of Result
+        One a shaper.
+
+    Raises
+    ------
+    BadInputError
+        If the file cannot be written.
+
+    """
+    shown = [x for x in results if x.move is not None]
+    looks = _looks([x.candidate for x in shown])
+    errors = 100.0 * case.errors()
+    with style.picture(Path(path), 6.4) as figure:
+        figure.suptitle(
+            rf'Residual vibration, $\lambda$ = {case.start:g} to {case.target:g}; nominal '
+            rf'$\zeta$ = {case.material.zeta:g}, $J_\mathrm{{lim}}$ = {case.material.j_lim:g}, '
+            f'$c_1$ = {case.material.c1:g}', fontsize=10)
+        panels = figure.subplot_mosaic([['G', 'zeta'], ['J_lim', 'box']])
+        for name, letter in zip(PARAMETERS, 'abc', strict=True):
+            axes = panels[name]
+            for result, look in zip(shown, looks, strict=True):
+                axes.plot(
+                    errors, 100.0 * np.maximum(result.curves[name], _FLOOR),
+                    label=_label(result), **look)
+            axes.axvspan(-100.0 * case.box, 100.0 * case.box, color='#F2F2F2', zorder=0)
+            axes.set_yscale('log')
+            axes.set_ylim(100.0 * _FLOOR, 400.0)
+            axes.set_xlim(errors[0], errors[-1])
+            style.finish(
+                axes, f'error of {_SYMBOLS[name]} alone [%]', 'residual [% of the step]', letter)
+            axes.yaxis.minorticks_off()
+        _bars(panels['box'], case, shown, looks)
+        figure.legend(
+            *panels['G'].get_legend_handles_labels(), loc='outside lower center', ncols=2,
+            columnspacing=1.8)
+
+
+def _looks(candidates: Sequence[Candidate]) -> list[dict[str, Any]]:
+    orders = list(dict.fromkeys(x.order for x in candidates if x.shaper == 'robust'))
+    return [
+        _ORDERS[orders.index(x.order) % len(_ORDERS)] if x.shaper == 'robust'
+        else _CURVES.get(x.shaper, {'color': style.BLACK}) for x in candidates]
+
+
+def _label(result: Result) -> str:
+    """Name a curve; a shaper that fell back says to what."""
+    label = result.candidate.label
+    return f'{label}: {result.code}' if result.reason else label
+
+
+def _bars(
+        axes: Axes, case: Case, results: Sequence[Result],
+        looks: Sequence[dict[str, Any]]) -> None:
+    """Draw the worst in the box of all errors."""
+    worst = np.array([x.worst.residual for x in results])
+    lengths = 100.0 * np.nan_to_num(np.maximum(worst, _FLOOR), nan=_FLOOR)
+    places = np.arange(len(results))
+    axes.barh(
+        places, lengths, color=[x['color'] for x in looks],
+        height=0.62, zorder=2)
+    for place, length, value in zip(places, lengths, worst, strict=True):
+        axes.annotate(
+            percent(value), (length, place), xytext=(3, 0), textcoords='offset points',
+            va='center', fontsize=8)
+    axes.set_xscale('log')
+    axes.set_xlim(100.0 * _FLOOR, 1000.0)
+    axes.set_yticks(places, [x.candidate.name for x in results])
+    axes.set_ylim(len(results) - 0.4, -0.6)
+    style.finish(
+        axes, rf'worst, all three within $\pm${100.0 * case.box:g} % [% of the step]', '', 'd')
+    axes.xaxis.minorticks_off()
+    axes.yaxis.minorticks_off()
+    axes.grid(visible=False, axis='y')
+
+
+def draw_sampled(path: str | Path, study: SampledStudy, *, period: float = 0.28) -> None:
+    """
+    Draw residuals over the command period, and one period's commands and responses.
+
+    Parameters
+    ----------
+    path : str or Path
+        PNG file to write; one of that name is replaced.
+    study : SampledStudy
+        The residuals.
+    period : float
+        Of the example, as a share of tau_p; there is a command for it.
+
+    Raises
+    ------
+    BadInputError
+        If the file cannot be written.
+
+    """
+    with style.picture(Path(path), 3.9) as figure:
+        figure.suptitle(
+            rf'Commands every period $T$, $\lambda$ = {study.start:g} to {study.target:g}, '
+            rf'$\zeta$ = {study.material.zeta:g}, $J_\mathrm{{lim}}$ = '
+            rf'{study.material.j_lim:g}, $c_1$ = {study.material.c1:g}', fontsize=10)
+        panels = figure.subplot_mosaic(
+            [['residual', 'command'], ['residual', 'response']], height_ratios=[1.0, 1.3])
+        axes = panels['residual']
+        axes.plot(
+            study.periods, 100.0 * study.bound, label='rounded, at worst', color=style.VERMILION,
+            linewidth=0.8, linestyle=(0, (1, 1)))
+        axes.plot(
+            study.periods, 100.0 * np.maximum(study.rounded, _EXACT),
+            label='switch rounded to the grid', **{**style.UNSHAPED, 'linestyle': '-'})
+        axes.plot(
+            study.periods, 100.0 * np.maximum(study.solved, _EXACT),
+            label='solved on the grid', **style.SHAPED)
+        axes.axhline(1e-6, color=style.GREY, linewidth=0.8, linestyle=(0, (4, 2)))
+        axes.annotate(
+            r'$10^{-8}$ of the step', (study.periods[0], 1e-6), xytext=(4, 3),
+            textcoords='offset points', fontsize=8, color='#555555')
+        axes.axvline(PROMISED, color=style.GREY, linewidth=0.8, linestyle=(0, (1, 1.5)))
+        axes.annotate(
+            r'$\tau_p/3$', (PROMISED, 1e-9), xytext=(4, 0), textcoords='offset points',
+            fontsize=8, color='#555555')
+        axes.set_xscale('log')
+        axes.set_yscale('log')
+        axes.set_ylim(5e-14, 300.0)
+        style.finish(axes, r'command period $T/\tau_p$', 'residual [% of the step]', 'a')
+        ticks = [x for x in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0) if x >= study.periods[0]]
+        axes.set_xticks(ticks, [f'{x:g}' for x in ticks])
+        axes.xaxis.minorticks_off()
+        axes.yaxis.minorticks_off()
+        axes.set_xlim(study.periods[0], max(1.0, study.periods[-1]))
+
+        size = period * study.tau_p
+        solved = solved_move(study.start, study.target, study.material, size)
+        rounded = rounded_move(ideal_move(study.start, study.target, study.material), size)
+        end = 4.5 * study.tau_p
+        times = np.linspace(0.0, end, 1200)
+        looks = [(rounded, {**style.UNSHAPED, 'linestyle': '-'})]
+        if solved is not None:
+            looks.append((solved, style.SHAPED))
+        for move, look in looks:
+            _levels(panels['command'], move, end, look)
+            panels['response'].plot(
+                times, response(move, study.start, times, study.material, Errors()), **look)
+        axes = panels['command']
+        for number in range(int(1.6 * study.tau_p / size) + 1):
+            axes.axvline(number * size, **style.TARGET)
+        axes.set_xlim(-0.1 * study.tau_p, 1.6 * study.tau_p)
+        style.finish(
+            axes, r'time $\tau$', r'load $\beta$', 'b')
+        axes.set_title(rf'$T$ = {period:g} $\tau_p$, grid dotted', loc='right', fontsize=8)
+        axes = panels['response']
+        axes.axhline(study.target, **style.TARGET)
+        axes.set_xlim(0.0, end)
+        style.finish(axes, r'time $\tau$', r'stretch $\lambda$', 'c')
+        figure.align_ylabels([panels['command'], panels['response']])
+        figure.legend(
+            *panels['residual'].get_legend_handles_labels(), loc='outside lower center',
+            ncols=3, columnspacing=1.8)
+
+
+def _levels(axes: Axes, move: Move, end: float, look: dict[str, Any]) -> None:
+    """Draw the levels of a command."""
+    axes.step(
+        [*(x.time for x in move.levels), end],
+        [*(x.load for x in move.levels), move.levels[-1].load], where='post', **look)
+
+
+def draw_damped(path: str | Path, study: DampedStudy, *, zeta: float = 4.0) -> None:
+    """
+    Draw settling times over zeta, and one zeta's commands and responses.
+
+    Parameters
+    ----------
+    path : str or Path
+        PNG file to write; one of that name is replaced.
+    study : DampedStudy
+        The times.
+    zeta : float
+        Of the example.
+
+    Raises
+    ------
+    BadInputError
+        If the file cannot be written.
+
+    """
+    material = NondimensionalParameters(zeta)
+    holding = float(elastic_force(study.target, material.j_lim))
+    colours = (style.BLUE, style.GREEN)
+    names = [
+        rf'minimum time, ${least:g}\,\beta_1$ to ${most:g}\,\beta_1$' for least, most in LIMITS]
+    with style.picture(Path(path), 3.9) as figure:
+        figure.suptitle(
+            rf'Above critical damping ({float(critical_zeta(study.target, material)):.3f}), '
+            rf'$\lambda$ = {study.start:g} to {study.target:g}, $J_\mathrm{{lim}}$ = '
+            rf'{material.j_lim:g}, $c_1$ = {material.c1:g}', fontsize=10)
+        panels = figure.subplot_mosaic(
+            [['times', 'command'], ['times', 'response']], height_ratios=[1.0, 1.3])
+        axes = panels['times']
+        axes.plot(study.zetas, study.step, label='plain step', **style.UNSHAPED)
+        for row, colour in enumerate(colours):
+            axes.plot(
+                study.zetas, study.settled[row], color=colour, linewidth=1.8,
+                label=names[row])
+        axes.set_xlim(study.zetas[0], study.zetas[-1])
+        axes.set_ylim(0.0, None)
+        style.finish(
+            axes, r'damping coefficient $\zeta$',
+            f'time to within {100.0 * SETTLED:g} % of the step', 'a')
+
+        moves: list[tuple[Move, dict[str, Any]]] = [
+            (step(Request(State(study.start), study.target, material)), style.UNSHAPED)]
+        moves += [
+            (minimum_time(Request(
+                State(study.start), study.target, material,
+                limits_of(study.target, material, row))),
+             {'color': colour, 'linewidth': 1.6})
+            for row, colour in enumerate(colours)]
+        end = float(np.interp(zeta, study.zetas, study.step)) * 1.1
+        times = np.linspace(0.0, end, 800)
+        for move, look in moves:
+            _levels(panels['command'], Move(move.code, tuple(
+                type(x)(x.time, x.load / holding) for x in move.levels), 0.0), end, look)
+            panels['response'].plot(
+                times, response(move, study.start, times, material, Errors()), **look)
+        axes = panels['command']
+        axes.set_xlim(-0.02 * end, end)
+        style.finish(axes, '', r'load $\beta/\beta_1$', 'b')
+        axes.set_title(rf'$\zeta$ = {zeta:g}', loc='right', fontsize=8)
+        axes = panels['response']
+        axes.axhline(study.target, **style.TARGET)
+        axes.set_xlim(-0.02 * end, end)
+        style.finish(axes, r'time $\tau$', r'stretch $\lambda$', 'c')
+        figure.align_ylabels([panels['command'], panels['response']])
+        figure.legend(
+            *panels['times'].get_legend_handles_labels(), loc='outside lower center',
+            ncols=3, columnspacing=1.8)

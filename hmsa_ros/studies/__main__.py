@@ -1,0 +1,208 @@
+"""
+``python -m hmsa_ros.studies``: the pictures and tables of the documentation.
+
+Pictures are written to a folder; tables are printed in Markdown.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+import sys
+
+import numpy as np
+
+from hmsa_ros.cli import Parser, report
+from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.figures.studies import draw_damped, draw_robustness, draw_sampled
+from hmsa_ros.studies.damped import damped_study, DampedStudy, LIMITS
+from hmsa_ros.studies.robustness import Candidate, candidates, Case, PARAMETERS, percent, study
+from hmsa_ros.studies.sampled import sampled_study
+
+MOVES = ((1.0, 1.1), (1.0, 1.4), (1.0, 0.7))
+MATERIAL = NondimensionalParameters()
+#: Command periods in the table, as shares of tau_p; none divides it.
+PERIODS = (0.03, 0.07, 0.13, 0.23, 0.33, 0.45)
+ZETAS = (2.2, 3.0, 4.0, 5.0, 6.0)
+
+Table = list[tuple[str, ...]]
+
+
+def robustness_table(start: float, target: float) -> Table:
+    """
+    Return the comparison of all shapers for one move, errors up to 10 %.
+
+    Parameters
+    ----------
+    start, target : float
+        Stretches at rest.
+
+    Returns
+    -------
+    list of tuple of str
+        Header and rows.
+
+    """
+    case = Case(start, target, MATERIAL)
+    rows: Table = [(
+        'shaper', 'arrival', 'nominal', *(f'{name} ±10 %' for name in PARAMETERS),
+        'all ±10 %')]
+    for candidate in candidates():
+        result = study(case, candidate)
+        rows.append((
+            candidate.label,
+            f'{result.arrival:.3f}' if candidate.shaper != 'step' else 'never',
+            percent(result.nominal),
+            *(percent(worst.residual) for worst in result.alone.values()),
+            percent(result.worst.residual)))
+    return rows
+
+
+def single_error_table() -> Table:
+    """
+    Return residuals at single errors of G and zeta.
+
+    Returns
+    -------
+    list of tuple of str
+        Header and rows.
+
+    """
+    cases = [(name, error) for name in ('G', 'zeta') for error in (-0.1, -0.05, 0.05, 0.1)]
+    rows: Table = [('shaper, move', *(f'{name} {100 * x:+g} %' for name, x in cases))]
+    for candidate in (Candidate('two_step'), Candidate('robust')):
+        for start, target in MOVES:
+            case = Case(start, target, MATERIAL)
+            result = study(case, candidate)
+            errors = case.errors()
+            rows.append((f'{candidate.name}, {start:g} to {target:g}', *(
+                percent(float(result.curves[name][np.argmin(np.abs(errors - error))]))
+                for name, error in cases)))
+    return rows
+
+
+def sampled_table() -> Table:
+    """
+    Return residuals on sampled hardware.
+
+    Returns
+    -------
+    list of tuple of str
+        Header and rows.
+
+    """
+    rows: Table = [('command, move', *(f'T = {x:g} tau_p' for x in PERIODS))]
+    for start, target in MOVES:
+        found = sampled_study(start, target, MATERIAL, np.array(PERIODS))
+        move = f'{start:g} to {target:g}'
+        rows.append((f'solved on the grid, {move}', *map(percent, found.solved.tolist())))
+        rows.append((f'rounded, at worst, {move}', *map(percent, found.bound.tolist())))
+    return rows
+
+
+def damped_table(found: DampedStudy) -> Table:
+    """
+    Return times above critical damping.
+
+    Parameters
+    ----------
+    found : DampedStudy
+        At the values of zeta that the table is to show.
+
+    Returns
+    -------
+    list of tuple of str
+        Header and rows.
+
+    """
+    rows: Table = [('time to', *(f'zeta = {x:g}' for x in found.zetas))]
+    rows.append(('plain step: within 1 %', *(f'{x:.2f}' for x in found.step)))
+    for (least, most), settled, arrival in zip(
+            LIMITS, found.settled, found.arrival, strict=True):
+        name = f'minimum time, {least:g} to {most:g} beta_1'
+        rows.append((f'{name}: within 1 %', *(f'{x:.2f}' for x in settled)))
+        rows.append((f'{name}: rest', *(f'{x:.2f}' for x in arrival)))
+    return rows
+
+
+def tables() -> list[Table]:
+    """
+    Return all tables of the documentation.
+
+    Returns
+    -------
+    list of list of tuple of str
+        In their order there.
+
+    """
+    return [
+        *(robustness_table(*move) for move in MOVES), single_error_table(), sampled_table(),
+        damped_table(damped_study(1.0, 1.1, np.array(ZETAS)))]
+
+
+def pictures(folder: Path) -> list[Path]:
+    """
+    Draw all pictures of the documentation.
+
+    Parameters
+    ----------
+    folder : Path
+        Where to; it exists.
+
+    Returns
+    -------
+    list of Path
+        What was written.
+
+    """
+    case = Case(1.0, 1.4, MATERIAL)
+    written = [folder / 'robustness.png', folder / 'sampled.png', folder / 'damped.png']
+    draw_robustness(written[0], case, [study(case, x) for x in candidates()])
+    draw_sampled(written[1], sampled_study(
+        1.0, 1.4, MATERIAL, np.geomspace(0.041, 0.99, 700)))
+    draw_damped(written[2], damped_study(1.0, 1.1, np.linspace(2.2, 6.0, 77)))
+    return written
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Draw the pictures and print the tables.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Arguments without the program's name; default ``sys.argv[1:]``.
+
+    Returns
+    -------
+    int
+        Exit status.
+
+    """
+    parser = Parser(
+        prog='python -m hmsa_ros.studies',
+        description='Draw the pictures of docs/studies.md and print its tables.')
+    parser.add_argument(
+        '--out', type=Path, default=Path('docs', 'images'), metavar='DIR',
+        help='folder that exists, for the pictures (default docs/images)')
+    arguments = parser.parse_args(argv)
+    try:
+        if not arguments.out.is_dir():
+            raise BadInputError(
+                f'{arguments.out} is no folder: expected one that exists (--out)')
+        for table in tables():
+            for number, row in enumerate(table):
+                print(f'| {" | ".join(row)} |')
+                if number == 0:
+                    print(f'| --- |{" ---: |" * (len(row) - 1)}')
+            print()
+        for path in pictures(arguments.out):
+            print(path)
+    except BadInputError as error:
+        return report(error, 2)
+    except HmsaError as error:
+        return report(error, 1)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

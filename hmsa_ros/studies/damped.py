@@ -1,0 +1,161 @@
+"""
+Heavy damping: how long a move takes where no two-step command exists.
+
+Above critical damping the plain step creeps in without overshoot; the minimum-time command,
+which pushes and brakes within the load limits, arrives in finite time.
+"""
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from hmsa_ros.core.model import Array, critical_zeta, elastic_force, natural_frequency
+from hmsa_ros.core.moves import Limits, Move, State
+from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.core.shapers.minimum_time import minimum_time
+from hmsa_ros.core.shapers.request import Request
+from hmsa_ros.core.shapers.step import step
+from hmsa_ros.errors import HmsaError
+from hmsa_ros.studies.residual import Errors, response
+
+#: Deviation from the target, as a share of the step, at which a motion counts as settled.
+SETTLED = 0.01
+#: Load limits that are compared, in units of the target's own load.
+LIMITS = ((0.0, 1.2), (-2.0, 2.0))
+# e^-14 of the move is left of the slowest motion at the end.
+_DECADES = 14.0
+_SAMPLES = 6001
+
+
+@dataclass(frozen=True)
+class DampedStudy:
+    """
+    Times over zeta.
+
+    Attributes
+    ----------
+    start, target : float
+        Stretches at rest.
+    zetas : ndarray, shape (n,)
+        Damping coefficients.
+    step : ndarray, shape (n,)
+        Settling time of the plain step.
+    arrival : ndarray, shape (m, n)
+        Time at which the minimum-time command is at rest at the target, for each of `LIMITS`.
+    settled : ndarray, shape (m, n)
+        Its settling time.
+
+    """
+
+    start: float
+    target: float
+    zetas: Array
+    step: Array
+    arrival: Array
+    settled: Array
+
+
+def limits_of(target: float, material: NondimensionalParameters, number: int) -> Limits:
+    """
+    Return load limits.
+
+    Parameters
+    ----------
+    target : float
+        Stretch above 1, whose own load is the unit.
+    material : NondimensionalParameters
+        J_lim.
+    number : int
+        Index into `LIMITS`.
+
+    Returns
+    -------
+    Limits
+        As loads.
+
+    """
+    holding = float(elastic_force(target, material.j_lim))
+    least, most = LIMITS[number]
+    return Limits(least * holding, most * holding)
+
+
+def settling_time(
+        move: Move, start: float, target: float, material: NondimensionalParameters) -> float:
+    """
+    Return the time from which the stretch stays within 1 % of the step about the target.
+
+    Parameters
+    ----------
+    move : Move
+        The command.
+    start, target : float
+        Stretches at rest.
+    material : NondimensionalParameters
+        zeta, J_lim and c1, zeta above 0.
+
+    Returns
+    -------
+    float
+        From the start of the move.
+
+    Raises
+    ------
+    HmsaError
+        If it has not settled in the time in which small motion dies out.
+
+    """
+    frequency = float(natural_frequency(target, material))
+    ratio = material.zeta / float(critical_zeta(target, material))
+    decay = frequency * (
+        ratio if ratio < 1.0 else ratio - math.sqrt(ratio * ratio - 1.0))
+    times = np.linspace(0.0, move.levels[-1].time + _DECADES / decay, _SAMPLES)
+    away = np.abs(response(move, start, times, material, Errors()) - target)
+    band = SETTLED * abs(target - start)
+    outside = np.flatnonzero(away > band)
+    if outside.size == 0:
+        return 0.0
+    last = int(outside[-1])
+    if last + 1 == times.size:
+        raise HmsaError(
+            f'the move from stretch {start:g} to {target:g} has not settled in '
+            f'{times[-1]:.4g}: expected a command that leads there')
+    share = (away[last] - band) / (away[last] - away[last + 1])
+    return float(times[last] + share * (times[last + 1] - times[last]))
+
+
+def damped_study(start: float, target: float, zetas: Array) -> DampedStudy:
+    """
+    Compare the plain step with the minimum-time command over zeta.
+
+    Parameters
+    ----------
+    start, target : float
+        Stretches at rest, the target above 1.
+    zetas : ndarray, shape (n,)
+        Damping coefficients, above 0.
+
+    Returns
+    -------
+    DampedStudy
+        Times in L sqrt(rho/G).
+
+    Raises
+    ------
+    HmsaError
+        If a command cannot be had.
+
+    """
+    materials = [NondimensionalParameters(float(zeta)) for zeta in zetas]
+    plain = np.array([
+        settling_time(step(Request(State(start), target, x)), start, target, x)
+        for x in materials])
+    arrival = np.empty((len(LIMITS), len(materials)))
+    settled = np.empty_like(arrival)
+    for row in range(len(LIMITS)):
+        for column, material in enumerate(materials):
+            move = minimum_time(Request(
+                State(start), target, material, limits_of(target, material, row)))
+            arrival[row, column] = move.duration
+            settled[row, column] = settling_time(move, start, target, material)
+    return DampedStudy(start, target, np.asarray(zetas), plain, arrival, settled)

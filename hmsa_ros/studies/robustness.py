@@ -1,0 +1,378 @@
+"""
+Robustness: what each shaper leaves of a move when the model is in error.
+
+Each shaper plans with the nominal parameters; the plan is carried out by an actuator whose
+shear modulus G, damping coefficient and J_lim are others, each alone and all together
+anywhere in a box.
+"""
+
+from collections.abc import Iterator, Sequence
+import csv
+from dataclasses import dataclass, field
+from itertools import product
+import math
+from pathlib import Path
+
+import numpy as np
+
+from hmsa_ros.core.model import Array
+from hmsa_ros.core.moves import Limits, Move, State
+from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.core.shapers import get_shaper, SHAPERS
+from hmsa_ros.core.shapers.request import Request
+from hmsa_ros.core.simulation import check_stretch
+from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.studies.residual import arrival_of, Errors, residual, rest
+
+#: Parameters in error: name for a person, name in `Errors`.
+PARAMETERS = {'G': 'shear_modulus', 'zeta': 'zeta', 'J_lim': 'j_lim'}
+#: Orders of the robust shaper that are compared.
+ORDERS = (2, 3)
+#: A chain is of no use long before this order.
+MOST_ORDER = 100
+#: Values a parameter takes in the curves, besides the edges of the box.
+_POINTS = 41
+# Values a parameter takes in the box, edges and centre included.
+_BOX_POINTS = 9
+#: Largest error that is studied.
+LARGEST = 0.9
+
+_NAMES = {
+    'two_step': 'two-step', 'minimum_time': 'minimum time', 'step': 'plain step', 'zv': 'ZV',
+    'zvd': 'ZVD', 'ei': 'EI'}
+_LINEAR = ('zv', 'zvd', 'ei')
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """
+    A shaper to be compared.
+
+    Attributes
+    ----------
+    shaper : str
+        One of `SHAPERS`.
+    order : int
+        Of the robust shaper, 1 to `MOST_ORDER`; without meaning for the others.
+
+    Raises
+    ------
+    BadInputError
+        If there is no such shaper or the order is out of range.
+
+    """
+
+    shaper: str
+    order: int = 2
+
+    def __post_init__(self) -> None:
+        """Check both."""
+        get_shaper(self.shaper)
+        if not 1 <= self.order <= MOST_ORDER:
+            raise BadInputError(
+                f'order of the robust shaper is {self.order}: expected 1 to {MOST_ORDER}')
+
+    @property
+    def name(self) -> str:
+        """Name for a person."""
+        if self.shaper == 'robust':
+            return f'robust, order {self.order}'
+        return _NAMES.get(self.shaper, self.shaper)
+
+    @property
+    def linear(self) -> bool:
+        """Whether it is a shaper of linear theory, a reference for comparison."""
+        return self.shaper in _LINEAR
+
+    @property
+    def label(self) -> str:
+        """Name that says what a reference is designed for."""
+        return f'{self.name} (linear, designed at the target)' if self.linear else self.name
+
+
+@dataclass(frozen=True)
+class Case:
+    """
+    What is studied.
+
+    Attributes
+    ----------
+    start, target : float
+        Stretches at rest, inside the limits and apart.
+    material : NondimensionalParameters
+        The model.
+    limits : Limits
+        Admissible loads, in the model's units.
+    box : float
+        Half the width of the box of errors, above 0 to 0.9.
+    span : float
+        Largest error in the curves, at least ``box``, to 0.9.
+
+    Raises
+    ------
+    BadInputError
+        If a value is out of range.
+
+    """
+
+    start: float
+    target: float
+    material: NondimensionalParameters = field(default_factory=NondimensionalParameters)
+    limits: Limits = field(default_factory=Limits)
+    box: float = 0.1
+    span: float = 0.2
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        check_stretch(self.start, self.material.j_lim, 'start stretch')
+        check_stretch(self.target, self.material.j_lim, 'target stretch')
+        if abs(self.target - self.start) < 1e-6:
+            raise BadInputError(
+                f'the move from stretch {self.start:g} to {self.target:g} is none: expected '
+                'two stretches that differ')
+        if not 0.0 < self.box <= self.span <= LARGEST:
+            raise BadInputError(
+                f'errors of up to {self.box:g} in the box and {self.span:g} in the curves: '
+                f'expected numbers above 0 to {LARGEST:g}, the first not the larger one')
+
+    def errors(self) -> Array:
+        """
+        Return the errors of one parameter in the curves.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            Increasing, from -span to span, with 0 and both edges of the box.
+
+        """
+        grid = np.linspace(-self.span, self.span, _POINTS)
+        grid[_POINTS // 2] = 0.0
+        edges = np.array([-self.box, self.box])
+        apart = np.abs(grid[:, np.newaxis] - edges).min(axis=1) > 1e-9
+        return np.sort(np.concatenate([grid[apart], edges]))
+
+
+@dataclass(frozen=True)
+class Worst:
+    """
+    The largest residual among errors.
+
+    Attributes
+    ----------
+    residual : float
+        Peak-to-peak as a share of the step; NaN if a motion could not be followed.
+    errors : Errors
+        Where.
+
+    """
+
+    residual: float
+    errors: Errors
+
+
+@dataclass(frozen=True)
+class Result:
+    """
+    One shaper in one case.
+
+    Attributes
+    ----------
+    candidate : Candidate
+        Which shaper.
+    code : Code
+        What it answered; another one than its own where it fell back or refused.
+    reason : str
+        Why it did; empty if it did not.
+    move : Move or None
+        The command; None if refused. What follows is empty then, and the numbers NaN.
+    arrival : float
+        Time from which the residual counts, nominal.
+    nominal : float
+        Residual without errors.
+    curves : dict of str to ndarray
+        For each of `PARAMETERS`, the residual at `Case.errors` of it alone.
+    alone : dict of str to Worst
+        For each of `PARAMETERS`, the worst with it alone in error, up to the box's edges.
+    worst : Worst
+        In the box of all three.
+
+    """
+
+    candidate: Candidate
+    code: Code
+    reason: str
+    move: Move | None
+    arrival: float
+    nominal: float
+    curves: dict[str, Array]
+    alone: dict[str, Worst]
+    worst: Worst
+
+
+def candidates(
+        shapers: Sequence[str] | None = None,
+        orders: Sequence[int] = ORDERS) -> tuple[Candidate, ...]:
+    """
+    Return the shapers to compare.
+
+    Parameters
+    ----------
+    shapers : sequence of str, optional
+        Names; default all.
+    orders : sequence of int
+        The robust shaper enters once with each.
+
+    Returns
+    -------
+    tuple of Candidate
+        Each once, in the order given.
+
+    Raises
+    ------
+    BadInputError
+        If there is no such shaper or an order is out of range.
+
+    """
+    found = [
+        Candidate(name, order)
+        for name in (SHAPERS if shapers is None else shapers)
+        for order in (orders if name == 'robust' else (2,))]
+    return tuple(dict.fromkeys(found))
+
+
+def study(case: Case, candidate: Candidate) -> Result:
+    """
+    Plan a move with the nominal parameters and carry it out with others.
+
+    Parameters
+    ----------
+    case : Case
+        Move, model and errors.
+    candidate : Candidate
+        The shaper.
+
+    Returns
+    -------
+    Result
+        Also where the shaper refuses.
+
+    """
+    try:
+        move = get_shaper(candidate.shaper)(Request(
+            State(case.start), case.target, case.material, case.limits, order=candidate.order))
+    except RefusedError as error:
+        nothing = Worst(math.nan, Errors())
+        return Result(
+            candidate, error.code, str(error), None, math.nan, math.nan, {}, {}, nothing)
+    arrival = arrival_of(move, case.start, case.target, case.material)
+
+    def left(errors: Errors) -> float:
+        try:
+            return residual(
+                move, case.start, case.target, case.material, errors, arrival)
+        except BadInputError:
+            raise
+        except HmsaError:
+            # Too close to a limiting stretch to follow.
+            return math.nan
+
+    grid = case.errors()
+    curves, alone = {}, {}
+    for name, attribute in PARAMETERS.items():
+        each = [Errors(**{attribute: float(x)}) for x in grid]
+        curve = np.array([left(errors) for errors in each])
+        curves[name] = curve
+        inside = np.abs(grid) <= case.box
+        alone[name] = _worst(
+            curve[inside], [x for x, there in zip(each, inside, strict=True) if there])
+    steps = np.linspace(-case.box, case.box, _BOX_POINTS).tolist()
+    box = [Errors(*errors) for errors in product(steps, steps, steps)]
+    return Result(
+        candidate, move.code, move.reason, move, arrival, left(Errors()), curves, alone,
+        _worst(np.array([left(errors) for errors in box]), box))
+
+
+def _worst(residuals: Array, errors: Sequence[Errors]) -> Worst:
+    # argmax takes NaN for the largest, which it is here: nothing bounds it.
+    index = int(np.argmax(residuals))
+    return Worst(float(residuals[index]), errors[index])
+
+
+def percent(share: float) -> str:
+    """
+    Word a residual.
+
+    Parameters
+    ----------
+    share : float
+        Residual; NaN where a motion could not be followed.
+
+    Returns
+    -------
+    str
+        In percent, without the sign.
+
+    """
+    if math.isnan(share):
+        return '?'
+    if share < 1e-8:
+        return '<1e-6'
+    value = 100.0 * share
+    if value < 1e-3:
+        return f'{value:.0e}'
+    return f'{value:.{1 if value >= 1.0 else 2 if value >= 0.1 else 3}f}'
+
+
+_COLUMNS = (
+    'start', 'target', 'zeta', 'j_lim', 'c1', 'shaper', 'order', 'status', 'varied',
+    'error_G', 'error_zeta', 'error_J_lim', 'residual', 'offset')
+
+
+def write_csv(path: Path, studies: Sequence[tuple[Case, Sequence[Result]]]) -> None:
+    """
+    Write all residuals, one a row, in full double precision.
+
+    ``varied`` names the parameter that is in error, or is ``box`` for the worst in the box.
+    ``residual`` and ``offset`` are shares of the step; the offset is how far beyond the target
+    the actuator comes to rest.
+
+    Parameters
+    ----------
+    path : Path
+        File to write; one of that name is replaced.
+    studies : sequence of (Case, sequence of Result)
+        What was studied.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written.
+
+    """
+    with path.open('w', newline='', encoding='utf-8') as file:
+        writer = csv.writer(file, lineterminator='\n')
+        writer.writerow(_COLUMNS)
+        for case, results in studies:
+            for result in results:
+                writer.writerows(_rows(case, result))
+
+
+def _rows(case: Case, result: Result) -> Iterator[tuple[str | float, ...]]:
+    order: int | str = result.candidate.order if result.candidate.shaper == 'robust' else ''
+    fixed = (
+        case.start, case.target, case.material.zeta, case.material.j_lim, case.material.c1,
+        result.candidate.shaper, order, str(result.code))
+    if result.move is None:
+        yield *fixed, '', math.nan, math.nan, math.nan, math.nan, math.nan
+        return
+    points = [
+        (name, Errors(**{PARAMETERS[name]: error}), value)
+        for name, curve in result.curves.items()
+        for error, value in zip(case.errors().tolist(), curve.tolist(), strict=True)]
+    points.append(('box', result.worst.errors, result.worst.residual))
+    for name, errors, value in points:
+        offset = (
+            (rest(result.move, case.material, errors) - case.target)
+            / (case.target - case.start))
+        yield (*fixed, name, errors.shear_modulus, errors.zeta, errors.j_lim, value, offset)

@@ -1,0 +1,199 @@
+"""
+Sampled hardware: what a fixed command period leaves of a move.
+
+Either the two-step command is solved for on the grid, or the ideal one is taken and its switch
+put on the nearest point of the grid.
+"""
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from hmsa_ros.core.delivery import Delivery
+from hmsa_ros.core.model import Array
+from hmsa_ros.core.moves import Level, Move, State
+from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.core.shapers.request import Request
+from hmsa_ros.core.shapers.two_step import two_step
+from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.errors import HmsaError
+from hmsa_ros.studies.residual import Errors, residual
+
+#: Longest command period, as a share of tau_p, up to which the residual is to stay exact.
+PROMISED = 1.0 / 3.0
+
+
+@dataclass(frozen=True)
+class SampledStudy:
+    """
+    Residuals over the command period.
+
+    Attributes
+    ----------
+    start, target : float
+        Stretches at rest.
+    material : NondimensionalParameters
+        zeta, J_lim and c1.
+    tau_p : float
+        Of the ideal command.
+    periods : ndarray, shape (n,)
+        Command periods as shares of tau_p.
+    solved : ndarray, shape (n,)
+        Residual of the command solved on the grid; NaN where there is none.
+    rounded : ndarray, shape (n,)
+        Residual of the ideal command with its switch on the nearest point of the grid.
+    bound : ndarray, shape (n,)
+        The worse of the ideal command with its switch half a period early and late: what
+        rounding can do where the period is not tuned to tau_p.
+
+    """
+
+    start: float
+    target: float
+    material: NondimensionalParameters
+    tau_p: float
+    periods: Array
+    solved: Array
+    rounded: Array
+    bound: Array
+
+
+def ideal_move(start: float, target: float, material: NondimensionalParameters) -> Move:
+    """
+    Return the two-step command for ideal hardware.
+
+    Parameters
+    ----------
+    start, target : float
+        Stretches at rest.
+    material : NondimensionalParameters
+        zeta, J_lim and c1.
+
+    Returns
+    -------
+    Move
+        Two levels.
+
+    Raises
+    ------
+    HmsaError
+        If there is no two-step command.
+
+    """
+    move = two_step(Request(State(start), target, material))
+    if move.code is not Code.TWO_STEP:
+        raise HmsaError(
+            f'there is no two-step command from stretch {start:g} to {target:g} at zeta '
+            f'{material.zeta:g} ({move.code}): expected another move')
+    return move
+
+
+def switched_at(move: Move, time: float) -> Move:
+    """
+    Return a two-step command with another time of its switch.
+
+    Parameters
+    ----------
+    move : Move
+        Two levels.
+    time : float
+        When the second begins.
+
+    Returns
+    -------
+    Move
+        Over when it switches.
+
+    """
+    first, last = move.levels
+    return Move(move.code, (first, Level(time, last.load)), time)
+
+
+def rounded_move(move: Move, period: float) -> Move:
+    """
+    Return a two-step command with its switch on the nearest point of a grid.
+
+    Parameters
+    ----------
+    move : Move
+        Two levels.
+    period : float
+        Of the grid.
+
+    Returns
+    -------
+    Move
+        The first level holds for at least one period.
+
+    """
+    return switched_at(move, max(1, round(move.duration / period)) * period)
+
+
+def solved_move(
+        start: float, target: float, material: NondimensionalParameters,
+        period: float) -> Move | None:
+    """
+    Return the command solved for on a grid.
+
+    Parameters
+    ----------
+    start, target : float
+        Stretches at rest.
+    material : NondimensionalParameters
+        zeta, J_lim and c1.
+    period : float
+        Of the grid.
+
+    Returns
+    -------
+    Move or None
+        None if there is none.
+
+    """
+    try:
+        return two_step(Request(State(start), target, material, delivery=Delivery(period)))
+    except RefusedError:
+        return None
+
+
+def sampled_study(
+        start: float, target: float, material: NondimensionalParameters,
+        periods: Array) -> SampledStudy:
+    """
+    Compute residuals over the command period.
+
+    Parameters
+    ----------
+    start, target : float
+        Stretches at rest.
+    material : NondimensionalParameters
+        zeta, J_lim and c1.
+    periods : ndarray, shape (n,)
+        Command periods as shares of tau_p, greater than 0.
+
+    Returns
+    -------
+    SampledStudy
+        The residuals.
+
+    Raises
+    ------
+    HmsaError
+        If there is no two-step command.
+
+    """
+    ideal = ideal_move(start, target, material)
+    tau_p = ideal.duration
+
+    def left(move: Move | None) -> float:
+        if move is None:
+            return math.nan
+        return residual(move, start, target, material, Errors(), move.duration)
+
+    return SampledStudy(
+        start, target, material, tau_p, periods,
+        np.array([left(solved_move(start, target, material, x * tau_p)) for x in periods]),
+        np.array([left(rounded_move(ideal, x * tau_p)) for x in periods]),
+        np.array([max(left(switched_at(ideal, (1.0 + sign * 0.5 * x) * tau_p))
+                      for sign in (-1.0, 1.0)) for x in periods]))
