@@ -168,7 +168,8 @@ def plan_two_step_batch(
     except ValueError as error:
         raise BadInputError(f'the arrays do not broadcast against each other: {error}') from error
     shape = arrays[0].shape
-    columns = [np.ascontiguousarray(a).ravel() for a in arrays]
+    # Copies: NumPy warns of a broadcast array that Numba asks whether it may write to.
+    columns = [np.array(a).ravel() for a in arrays]
     status = np.empty(columns[0].size, dtype=np.int64)
     results = [np.empty(status.size) for _ in range(3)]
     kernels.two_step_batch(
