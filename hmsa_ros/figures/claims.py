@@ -176,29 +176,26 @@ def _residuals() -> Iterator[str]:
 
 
 def _settling() -> Iterator[str]:
-    # Long spans: each move starts from rest and settles.
-    span = 300.0
     yield 'unshaped, time until within 5 % of the step, from rest:'
     for targets in (paper_data.EXPANSION, paper_data.DEEP_CONTRACTION):
         for zeta in paper_data.ZETAS:
-            run = _unshaped(targets, NondimensionalParameters(zeta, 5.0), span=span)
-            times = (f'{end - begin:.1f}' for begin, end in _unsettled(run, span))
+            run = _unshaped(targets, NondimensionalParameters(zeta, 5.0), 600.0)
+            times = (f'{end - begin:.1f}' for begin, end in _unsettled(run, 600.0))
             yield f'  {_names(targets)}, zeta {zeta:g}: {", ".join(times)}'
 
 
 def _cycles() -> Iterator[str]:
-    yield 'unshaped, cycles until within 5 % of the step, spans of 10:'
+    yield 'unshaped, cycles until within 5 % of the step, from rest:'
     for j_lim in paper_data.J_LIMS:
         targets = _near_limit_targets(j_lim)
-        run = _unshaped(targets, NondimensionalParameters(0.2, j_lim))
-        counts = (f'{run.turning_points(*part) / 2:g}' for part in _unsettled(run, paper_data.SPAN))
+        run = _unshaped(targets, NondimensionalParameters(0.2, j_lim), 60.0)
+        counts = (f'{run.turning_points(*part) / 2:g}' for part in _unsettled(run, 60.0))
         yield f'  J_lim {j_lim:g}, {_names(targets)}: {", ".join(counts)}'
 
 
 def _unshaped(
-        targets: Sequence[float], material: NondimensionalParameters, *,
-        span: float = paper_data.SPAN) -> Run:
-    """Return the response to plain steps, sampled densely."""
+        targets: Sequence[float], material: NondimensionalParameters, span: float) -> Run:
+    """Return the response to plain steps with spans so long that each move starts from rest."""
     run, = paper_data.respond(
         '', targets, material, commands=('unshaped',), span=span, samples=30_001)
     return run
