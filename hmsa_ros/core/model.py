@@ -65,8 +65,10 @@ def elastic_energy(stretch: ArrayLike, j_lim: float) -> Array:
         psi, 0 at stretch 1; NaN outside the limits.
 
     """
+    stretch = _array(stretch)
     with np.errstate(invalid='ignore', divide='ignore'):
-        return np.asarray(-0.5 * j_lim * np.log(extensibility(stretch, j_lim)))
+        return np.asarray(-0.5 * j_lim * np.log1p(
+            -(stretch - 1.0) ** 2 * (stretch + 2.0) / (stretch * j_lim)))
 
 
 def elastic_force(stretch: ArrayLike, j_lim: float) -> Array:
