@@ -1,0 +1,159 @@
+"""
+Eq. 11 and the two-step command by other means than the package's: an oracle for its tests.
+
+The equation is typed as the paper prints it, SciPy integrates it, and the intermediate load is
+found by bracketing. Nothing here calls the package.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from itertools import pairwise
+import math
+
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+TOLERANCE = 1e-13
+
+
+def extension(stretch: float, j_lim: float) -> float:
+    """Return the factor in the braces of Eq. 11, which vanishes at the limiting stretches."""
+    return 1.0 - (2.0 / stretch + stretch ** 2 - 3.0) / j_lim
+
+
+def holding_load(stretch: float, j_lim: float) -> float:
+    """Return b^2 of Eq. 11 at rest."""
+    return (stretch ** 4 - stretch) / extension(stretch, j_lim) / stretch ** 3
+
+
+def stored_energy(stretch: float, j_lim: float) -> float:
+    """Return the elastic energy of Eq. 4 in units of G."""
+    return -0.5 * j_lim * math.log(extension(stretch, j_lim))
+
+
+def equation(
+        load: float, zeta: float, j_lim: float, c1: float
+) -> Callable[[float, Sequence[float]], list[float]]:
+    """Return the right-hand side of Eq. 11 with b^2 = load, of either sign."""
+    def right_hand_side(_: float, state: Sequence[float]) -> list[float]:
+        stretch, rate = state
+        cube = stretch ** 3
+        inertia = 1.0 + c1 * cube
+        return [rate, (
+            1.5 * rate ** 2 / (stretch * inertia)
+            - 3.0 * zeta * c1 * cube * rate / inertia
+            - 6.0 / inertia * (
+                (stretch ** 4 - stretch) / extension(stretch, j_lim) - load * cube))]
+    return right_hand_side
+
+
+def follow(
+        state: Sequence[float], pieces: Sequence[tuple[float, float]], zeta: float,
+        j_lim: float, c1: float, method: str = 'DOP853',
+        tolerance: float = TOLERANCE) -> tuple[float, float]:
+    """Return stretch and rate after pieces of (duration, load)."""
+    end = np.array(state, dtype=float)
+    for duration, load in pieces:
+        if duration > 0.0:
+            solution = solve_ivp(
+                equation(load, zeta, j_lim, c1), (0.0, duration), end, method=method,
+                rtol=tolerance, atol=tolerance)
+            assert solution.success, solution.message
+            end = solution.y[:, -1]
+    return float(end[0]), float(end[1])
+
+
+def samples(
+        state: Sequence[float], switches: Sequence[float], loads: Sequence[float],
+        times: Sequence[float], zeta: float, j_lim: float, c1: float) -> np.ndarray:
+    """Return stretch and rate (2, n) at times, each piece integrated from one to the next."""
+    edges = sorted({*switches, *times})
+    edges = [t for t in edges if t >= switches[0]]
+    found = {edges[0]: np.array(state, dtype=float)}
+    for begin, end in pairwise(edges):
+        load = loads[int(np.searchsorted(switches, begin, side='right')) - 1]
+        found[end] = np.array(
+            follow(found[begin], [(end - begin, load)], zeta, j_lim, c1))
+    return np.array([found[t] for t in times]).T
+
+
+def turning_point(
+        state: Sequence[float], load: float, direction: float, zeta: float, j_lim: float,
+        c1: float, longest: float = 200.0) -> tuple[float, float] | None:
+    """
+    Return time and stretch of the first turning point from motion in a direction.
+
+    The event of the dense output is only a guess: the time is improved by integrating to it
+    from the last true step.
+    """
+    right_hand_side = equation(load, zeta, j_lim, c1)
+
+    def rate(_: float, y: Sequence[float]) -> float:
+        return y[1]
+
+    rate.terminal = True
+    rate.direction = -direction
+    solution = solve_ivp(
+        right_hand_side, (0.0, longest), state, method='DOP853', rtol=TOLERANCE,
+        atol=TOLERANCE, events=rate)
+    if solution.status != 1:
+        return None
+    begin, from_state, time = solution.t[-2], solution.y[:, -2], solution.t[-1]
+    for _ in range(4):
+        end = follow(from_state, [(time - begin, load)], zeta, j_lim, c1)
+        change = -end[1] / right_hand_side(0.0, end)[1]
+        time += change
+        if abs(change) < 1e-14 * time:
+            break
+    return time, follow(from_state, [(time - begin, load)], zeta, j_lim, c1)[0]
+
+
+@cache
+def two_step(
+        start: float, target: float, zeta: float, j_lim: float, c1: float = 2.0
+) -> tuple[float, float, float]:
+    """Return beta_p, tau_p and beta_1 of a move from rest, by bracketing beta_p."""
+    direction = math.copysign(1.0, target - start)
+    held = holding_load(target, j_lim)
+    # Without damping the energy balance is exact; damping asks for more.
+    least = (stored_energy(target, j_lim) - stored_energy(start, j_lim)) / (target - start)
+
+    def miss(load: float) -> float:
+        found = turning_point((start, 0.0), load, direction, zeta, j_lim, c1)
+        # Without a turning point the motion creeps into the equilibrium of the load.
+        return -abs(target - start) if found is None else direction * (found[1] - target)
+
+    share = 1e-3
+    while miss(least + share * (held - least)) < 0.0:
+        share = 2.0 * share if share < 0.5 else 0.5 * (1.0 + share)
+        assert share < 0.9999, 'no load below the holding one overshoots'
+    most = least + share * (held - least)
+    # Without damping the least load is the solution itself, give or take its rounding.
+    least -= 1e-9 * (held - least)
+    load = brentq(miss, least, most, xtol=1e-15, rtol=1e-14)
+    time, _ = turning_point((start, 0.0), load, direction, zeta, j_lim, c1)
+    return load, time, held
+
+
+#: The paper's sequences: figure, zeta, J_lim, stretches; Fig. 9 ends near the limit.
+UPPER_LIMIT = {
+    j_lim: brentq(extension, 1.0, 10.0, args=(j_lim,), xtol=1e-15) for j_lim in (1.0, 3.0, 5.0)}
+SEQUENCES = (
+    ('fig_4_5', 0.2, 5.0, (1.10, 1.20, 1.40)),
+    ('fig_5', 0.2, 5.0, (1.15, 1.25, 1.35)),
+    ('fig_6', 0.2, 5.0, (0.90, 0.80, 0.70)),
+    ('fig_6_return', 0.2, 5.0, (0.85, 0.70, 0.85)),
+    *(('fig_7a', zeta, 5.0, (1.10, 1.20, 1.40)) for zeta in (0.02, 0.40, 1.10)),
+    *(('fig_7b', zeta, 5.0, (0.90, 0.80, 0.60)) for zeta in (0.02, 0.40, 1.10)),
+    *(('fig_9', 0.2, j_lim, (1.20, 1.40, 0.999 * UPPER_LIMIT[j_lim]))
+      for j_lim in (1.0, 3.0, 5.0)),
+)
+#: Every move of every sequence, and moves to 0.999 of the limit at the other dampings.
+MOVES = tuple(sorted({
+    *((start, target, zeta, j_lim)
+      for _, zeta, j_lim, stretches in SEQUENCES
+      for start, target in pairwise((1.0, *stretches))),
+    *((1.4, 0.999 * UPPER_LIMIT[j_lim], zeta, j_lim)
+      for j_lim in (1.0, 3.0, 5.0) for zeta in (0.02, 0.40, 1.10)),
+}))
