@@ -210,23 +210,42 @@ def test_command_supersedes_all_that_are_stamped_at_or_after_it(leading):
     leading.check([(a, 0.03), (b, 0.06), (e, 0.01)])
 
 
-@pytest.mark.parametrize('bad', [
-    (math.nan, 0.0, 0.0, 1), (0.0, 0.0, math.nan, 1), (0.0, 0.0, math.inf, 1),
-    (0.0, 0.0, -math.inf, 1), (1e-9, 0.0, 0.1, 1), (0.0, -0.1, 0.1, 1), (0.0, 0.0, 0.1, -1),
-    (0.0, 0.0, 1e300, 1),
-], ids=str)
-def test_bad_command_is_refused_and_the_run_goes_on(leading, bad):
-    x, y, z, sign = bad
-    leading.send(*COMMANDS)
-    # It would supersede them all.
+BAD = {
+    'nan_x': (math.nan, 0.0, 0.0, 1),
+    'nan_z': (0.0, 0.0, math.nan, 1),
+    'infinite': (0.0, 0.0, math.inf, 1),
+    'minus_infinite': (0.0, 0.0, -math.inf, 1),
+    'along_x': (1e-9, 0.0, 0.1, 1),
+    'along_y': (0.0, -0.1, 0.1, 1),
+    'negative_stamp': (0.0, 0.0, 0.1, -1),
+    'absurd': (0.0, 0.0, 1e300, 1),
+}
+
+
+def bad_command(name: str) -> Any:
+    """Return a bad command, which would supersede all others."""
+    x, y, z, sign = BAD[name]
     message = to_command(sign * START, z, 'coil')
     message.magnetic_field.x, message.magnetic_field.y = x, y
-    leading.publisher.publish(message)
+    return message
+
+
+@pytest.mark.parametrize('name', BAD)
+def test_bad_command_is_refused_and_the_run_goes_on(leading, name):
+    leading.send(*COMMANDS)
+    leading.publisher.publish(bad_command(name))
     leading.delivered()
     leading.run(END)
     leading.check(COMMANDS)
-    status = leading.diagnostics(received=len(COMMANDS) + 1, refused=1)
+
+
+def test_refused_commands_are_counted(leading):
+    for name in BAD:
+        leading.publisher.publish(bad_command(name))
+    leading.send(*COMMANDS)
+    status = leading.diagnostics(received=len(BAD) + len(COMMANDS), refused=len(BAD), late=0)
     assert status.level == DiagnosticStatus.WARN
+    assert status.message == f'0 commands late, {len(BAD)} refused'
 
 
 def test_load_too_large_to_follow_starts_the_simulation_again_and_is_reported(leading):

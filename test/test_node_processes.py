@@ -1,0 +1,194 @@
+"""Planner and plant as processes: how they end, how they refuse to start, and their loop."""
+
+from collections.abc import Iterator
+import re
+import signal
+from typing import Any
+
+import numpy as np
+import pytest
+from rclpy.qos import QoSProfile
+from std_srvs.srv import SetBool
+
+from hmsa_ros.cli import main
+from hmsa_ros.core.residual import residual_vibration
+from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.conversions import from_time, to_trajectory
+
+pytestmark = pytest.mark.ros
+
+MS = 1_000_000
+SPELL = 44 * MS
+# Residual vibration after arrival, as a share of the step.
+NO_VIBRATION = 1e-6
+NODES = ('planner', 'plant')
+
+# Arguments that refuse the start, and what the line on standard error says of them.
+BAD = {
+    'out_of_range': (
+        ['--ros-args', '-p', 'actuator.density:=-1.0'],
+        'parameter actuator.density is -1.0: expected float, 0.001 to 1e+06 kg/m^3'),
+    'not_finite': (
+        ['--ros-args', '-p', 'actuator.density:=.nan'],
+        'parameter actuator.density is nan: expected'),
+    'wrong_type': (
+        ['--ros-args', '-p', 'joint:=3'], 'parameter joint is 3: expected str'),
+    'beyond_the_limits': (
+        ['--ros-args', '-p', 'initial_stretch:=5.0'],
+        'initial stretch is 5: expected a stretch between the limits 0.2520 and 2.6940'),
+    'unknown_argument': (['--speed', '3'], '--speed'),
+    'unknown_ros_argument': (['--ros-args', '--speed'], "'--ros-args --speed'"),
+    'malformed_remapping': (['--ros-args', '-r', 'nonsense'], "'-r nonsense'"),
+    'missing_parameter_file': (
+        ['--ros-args', '--params-file', '/nowhere/planner.yaml'], '/nowhere/planner.yaml'),
+}
+BAD_OF_A_NODE = {
+    'planner': {
+        'unknown_choice': (
+            ['--ros-args', '-p', 'shaper:=zigzag'],
+            "parameter shaper is 'zigzag': expected one of two_step"),
+        'limits_out_of_order': (
+            ['--ros-args', '-p', 'flux_density_max:=-0.6'],
+            'flux_density_min is -0.5 T: expected less than flux_density_max'),
+    },
+    'plant': {
+        'two_clocks': (
+            ['--ros-args', '-p', 'publish_clock:=true', '-p', 'use_sim_time:=true'],
+            'publish_clock and use_sim_time are both true'),
+        'no_rate': (
+            ['--ros-args', '-p', 'publish_rate:=0.0'],
+            'parameter publish_rate is 0.0: expected float, 0.001 to 1e+06 Hz'),
+    },
+}
+
+
+@pytest.fixture
+def handlers() -> Iterator[None]:
+    """Give back the signal handlers that a node takes over."""
+    kept = {x: signal.getsignal(x) for x in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in kept.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize(('node', 'name'), [
+    (node, name) for node in NODES for name in (*BAD, *BAD_OF_A_NODE[node])])
+def test_bad_arguments_refuse_the_start_in_one_line_with_status_2(
+        ros_env, handlers, capfd, node, name):
+    arguments, fragment = {**BAD, **BAD_OF_A_NODE[node]}[name]
+    try:
+        status = main([node, *arguments])
+    except SystemExit as end:  # from the command line's own parser
+        status = end.code
+    out, err = capfd.readouterr()
+    assert status == 2
+    assert re.fullmatch(r'hmsa: error: .+\n', err)
+    assert fragment in err
+    assert out == ''
+
+
+@pytest.mark.parametrize('node', NODES)
+def test_process_that_refuses_to_start_says_why_and_has_no_traceback(start, node):
+    arguments, fragment = BAD['missing_parameter_file']
+    process = start.hmsa(node, *arguments)
+    assert process.wait() == 2
+    assert re.fullmatch(r'hmsa: error: .+\n', process.stderr)
+    assert fragment in process.stderr
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM], ids=['SIGINT', 'SIGTERM'])
+def test_signal_ends_planner_and_plant_at_work_with_status_0_and_no_word(ros, start, number):
+    # At work: samples flow, and a plan is being sent.
+    processes = [start.hmsa(node) for node in NODES]
+    samples = ros.collect(interface.JOINT_STATES.type, interface.JOINT_STATES.name)
+    commands = ros.collect(
+        interface.FLUX_DENSITY_COMMAND.type, interface.FLUX_DENSITY_COMMAND.name)
+    setpoints = ros.publisher(
+        interface.JOINT_TRAJECTORY.type,
+        interface.from_outside(interface.JOINT_TRAJECTORY.name, interface.PLANNER))
+    ros.spin_until(
+        lambda: ros.node.count_publishers(interface.FLUX_DENSITY_COMMAND.name), 'the planner')
+    setpoints.publish(to_trajectory(
+        [(1.1 + 0.1 * (k % 2), (k + 1) * SPELL) for k in range(1000)], 'actuator'))
+    ros.spin_until(lambda: samples and commands, 'samples and commands')
+    for process in processes:
+        process.popen.send_signal(number)
+    for process in processes:
+        assert process.wait() == 0
+        # A busy machine may make a command late, which is said as a warning.
+        assert not [
+            x for x in process.stderr.splitlines() if not x.startswith('[WARN]')]
+
+
+@pytest.mark.slow
+def test_loop_leaves_no_residual_vibration_beside_a_process_that_takes_a_core(
+        ros, start):
+    start.python('-c', 'while True: pass')
+    start.hmsa(
+        'plant', '--ros-args', '-p', 'publish_clock:=true', '-p', 'real_time_factor:=0.1',
+        '-p', 'start_paused:=true')
+    start.hmsa(
+        'planner', '--ros-args', '-p', 'use_sim_time:=true', '-p', 'lead_time:=0.1')
+
+    def collect(topic: interface.Topic, qos: QoSProfile | None = None) -> list[Any]:
+        messages: list[Any] = ros.collect(
+            topic.type, interface.from_outside(topic.name, 'planner'), qos or topic.qos)
+        return messages
+
+    samples = collect(interface.JOINT_STATES, QoSProfile(depth=100_000))
+    statuses = collect(interface.STATUS)
+    plans = collect(interface.PLAN)
+    reports = collect(interface.DIAGNOSTICS)
+    command = interface.FLUX_DENSITY_COMMAND.name
+    ros.spin_until(
+        lambda: ros.node.count_publishers(command) and ros.node.count_subscribers(command)
+        and ros.node.count_publishers(interface.JOINT_STATES.name), 'both nodes')
+    targets = (1.1, 1.2, 0.9, 1.4)
+    request = to_trajectory(
+        [(x, (k + 1) * SPELL) for k, x in enumerate(targets)], 'actuator', frame='a loop')
+    trajectories = ros.publisher(
+        interface.JOINT_TRAJECTORY.type, 'planner/joint_trajectory')
+
+    def values(status: Any) -> dict[str, str]:
+        return {x.key: x.value for x in status.values}
+
+    # Until the planner has heard the time it refuses, and says so.
+    ros.spin_until(lambda: statuses, 'the first status')
+    while True:
+        known = len(statuses)
+        trajectories.publish(request)
+        ros.spin_until(lambda known=known: len(statuses) > known, 'the verdict')
+        if values(statuses[-1])['code'] != 'no_time':
+            break
+    assert values(statuses[-1])['code'] == 'accepted'
+    ros.spin_until(lambda: plans, 'the plan')
+    ros.call(SetBool, 'plant/set_paused', SetBool.Request(data=False))
+    ros.spin_until(lambda: values(statuses[-1])['state'] == 'at_rest', 'rest')
+    begin = from_time(plans[-1].header.stamp)
+    end = begin + len(targets) * SPELL
+    ros.spin_until(lambda: from_time(samples[-1].header.stamp) >= end, 'the end of the sequence')
+
+    stamps = np.array([from_time(x.header.stamp) for x in samples])
+    np.testing.assert_array_equal(np.diff(stamps), MS)
+    stretches = [x.position[0] for x in samples]
+    # Two levels a setpoint: the second one holds it, from arrival on.
+    changes = [begin + from_time(x.time_from_start) for x in plans[-1].points]
+    assert len(changes) == 2 * len(targets)
+    previous = 1.0
+    for target, arrival, until in zip(
+            targets, changes[1::2], [*changes[2::2], end], strict=True):
+        assert residual_vibration(
+            stamps, stretches, arrival=arrival, end=until, step=target - previous
+        ) <= NO_VIBRATION
+        inside = (stamps >= arrival) & (stamps <= until)
+        assert np.array(stretches)[inside] == pytest.approx(
+            target, abs=NO_VIBRATION * abs(target - previous))
+        previous = target
+
+    def counts() -> dict[str, int]:
+        return {
+            status.name: int(values(status)['late']) for report in reports
+            for status in report.status if values(status).get('sent', '') != '0'}
+
+    ros.spin_until(lambda: len(counts()) == 2, 'diagnostics of both')
+    assert set(counts().values()) == {0}
