@@ -141,22 +141,3 @@ def finish(axes: Axes, x_label: str, y_label: str, letter: str = '') -> None:
             axis.set_minor_locator(AutoMinorLocator(2))
     axes.grid(visible=True, color='#E4E4E4', linewidth=0.5, zorder=0)
     axes.set_axisbelow(True)
-
-
-def legend_above(axes: Axes, columns: int, *, anchor: float = 1.0) -> None:
-    """
-    Put the legend above a panel, where it covers no data.
-
-    Parameters
-    ----------
-    axes : Axes
-        The panel.
-    columns : int
-        Entries side by side.
-    anchor : float
-        Height of the legend's lower edge, in heights of the panel.
-
-    """
-    axes.legend(
-        loc='lower right', bbox_to_anchor=(1.0, anchor), ncols=columns, borderaxespad=0.2,
-        columnspacing=1.4)
