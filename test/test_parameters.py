@@ -1,0 +1,259 @@
+"""Parameters: declared once, described, and the files under config/ held against them."""
+
+from importlib import import_module
+import math
+from pathlib import Path
+import pkgutil
+import re
+from typing import Any
+
+import pytest
+from rcl_interfaces.msg import ParameterType
+from rcl_interfaces.srv import DescribeParameters, ListParameters
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+import yaml
+
+from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
+from hmsa_ros.errors import BadInputError
+import hmsa_ros.nodes
+from hmsa_ros.nodes.parameters import ACTUATOR, actuator_from, declare, ParameterSpec
+from hmsa_ros.nodes.planner import PlannerNode
+from hmsa_ros.nodes.plant import PlantNode
+
+CONFIG = Path(__file__).resolve().parent.parent / 'config'
+DECLARED: dict[str, tuple[ParameterSpec, ...]] = {
+    module.name: declared for module in pkgutil.iter_modules(hmsa_ros.nodes.__path__)
+    if (declared := getattr(
+        import_module(f'hmsa_ros.nodes.{module.name}'), 'PARAMETERS', None))}
+# Numbers that are a ratio or a count.
+DIMENSIONLESS = {
+    'actuator.chain_limit', 'initial_stretch', 'real_time_factor', 'robust_order', 'play.rate',
+    'play.read_ahead_queue_size', 'record.queue_depth'}
+TYPES = {
+    bool: ParameterType.PARAMETER_BOOL, int: ParameterType.PARAMETER_INTEGER,
+    float: ParameterType.PARAMETER_DOUBLE, str: ParameterType.PARAMETER_STRING}
+
+every_node = pytest.mark.parametrize('node', DECLARED)
+
+
+def is_number(spec: ParameterSpec) -> bool:
+    """Return whether a parameter is a number."""
+    return isinstance(spec.default, (int, float)) and not isinstance(spec.default, bool)
+
+
+def in_file(node: str) -> dict[str, Any]:
+    """Return the parameters of a file under config/, groups joined by dots."""
+    def flat(values: dict[str, Any], prefix: str = '') -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for key, value in values.items():
+            found |= flat(value, f'{prefix}{key}.') if isinstance(value, dict) else {
+                prefix + key: value}
+        return found
+
+    content = yaml.safe_load((CONFIG / f'{node}.yaml').read_text())
+    assert list(content) == ['/**']
+    assert list(content['/**']) == ['ros__parameters']
+    return flat(content['/**']['ros__parameters'])
+
+
+def comments(node: str) -> dict[str, str]:
+    """Return the comment above each parameter of a file, on one line."""
+    found: dict[str, str] = {}
+    words: list[str] = []
+    for line in (CONFIG / f'{node}.yaml').read_text().splitlines():
+        if (text := line.strip()).startswith('#'):
+            words.append(text[1:].strip())
+        else:
+            found[text.partition(':')[0]] = ' '.join(words)
+            words = []
+    return found
+
+
+def test_all_four_nodes_declare_parameters():
+    assert set(DECLARED) == {'planner', 'plant', 'player', 'recorder'}
+
+
+@every_node
+def test_names_are_in_snake_case_and_each_is_there_once(node):
+    names = [x.name for x in DECLARED[node]]
+    assert len(set(names)) == len(names)
+    for name in names:
+        assert re.fullmatch(r'[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*', name)
+
+
+@every_node
+def test_each_parameter_is_described_in_a_sentence_and_has_its_unit(node):
+    for spec in DECLARED[node]:
+        assert re.fullmatch(r'[A-Z].*[^.]\.', spec.description), spec.name
+        assert bool(spec.unit) == (is_number(spec) and spec.name not in DIMENSIONLESS), spec.name
+
+
+@every_node
+def test_each_number_has_a_range_and_each_default_passes_its_own_check(node):
+    for spec in DECLARED[node]:
+        assert not is_number(spec) or spec.minimum is not None, spec.name
+        assert not isinstance(spec.default, float) or spec.maximum is not None, spec.name
+        spec.check(spec.default)
+
+
+@every_node
+def test_file_has_exactly_the_declared_parameters_with_their_defaults(node):
+    expected = {x.name: x.default for x in DECLARED[node]}
+    found = in_file(node)
+    assert found == expected
+    assert list(found) == list(expected)
+    assert {x: type(y) for x, y in found.items()} == {
+        x: type(y) for x, y in expected.items()}
+
+
+@every_node
+def test_file_says_of_each_parameter_what_it_is_and_in_which_unit(node):
+    text = comments(node)
+    for spec in DECLARED[node]:
+        assert spec.description in text[spec.name]
+        assert spec.unit in text[spec.name]
+
+
+@pytest.mark.parametrize('node', ['planner', 'plant'])
+def test_file_says_of_each_parameter_which_values_it_can_have(node):
+    text = comments(node)
+    for spec in DECLARED[node]:
+        if is_number(spec):
+            assert f'Range: {spec.range_text()}.' in text[spec.name]
+        if spec.choices:
+            assert f'One of: {", ".join(spec.choices)}.' in text[spec.name]
+        assert ('Can be set while running.' in text[spec.name]) is not spec.read_only
+
+
+@pytest.mark.ros
+@every_node
+def test_node_takes_its_file(make_ros, node):
+    side = make_ros(cli_args=['--ros-args', '--params-file', str(CONFIG / f'{node}.yaml')])
+    overrides = side.node._parameter_overrides
+    for spec in DECLARED[node]:
+        # A list that is empty in a file is no override at all.
+        assert spec.name in overrides or spec.default == []
+    assert declare(side.node, DECLARED[node]) == {x.name: x.default for x in DECLARED[node]}
+
+
+@pytest.mark.ros
+@every_node
+def test_descriptors_say_what_the_declaration_does(ros, serve, node):
+    def made() -> Node:
+        described = Node('described')
+        declare(described, DECLARED[node])
+        return described
+
+    serve(made)
+    specs = DECLARED[node]
+    answer = ros.call(
+        DescribeParameters, 'described/describe_parameters',
+        DescribeParameters.Request(names=[x.name for x in specs]))
+    for spec, descriptor in zip(specs, answer.descriptors, strict=True):
+        assert descriptor.name == spec.name
+        assert descriptor.read_only == spec.read_only
+        assert descriptor.description == (
+            f'{spec.description} [{spec.unit}]' if spec.unit else spec.description)
+        assert bool(descriptor.additional_constraints) == bool(spec.choices)
+        assert all(x in descriptor.additional_constraints for x in spec.choices)
+        if not isinstance(spec.default, list):
+            assert descriptor.type == TYPES[type(spec.default)]
+            assert not descriptor.dynamic_typing
+        ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
+        assert len(ranges) == is_number(spec)
+        for found in ranges:
+            assert spec.minimum in (None, found.from_value)
+            assert spec.maximum in (None, found.to_value)
+            assert found.from_value < found.to_value
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(('factory', 'node'), [(PlannerNode, 'planner'), (PlantNode, 'plant')])
+def test_node_offers_what_is_declared_and_nothing_else_of_its_own(ros, serve, factory, node):
+    serve(factory)
+    answer = ros.call(ListParameters, f'{node}/list_parameters')
+    of_ros = {'use_sim_time', 'start_type_description_service'}
+    assert set(answer.result.names) - of_ros == {x.name for x in DECLARED[node]}
+
+
+@pytest.mark.ros
+def test_value_out_of_range_is_refused_while_running_too(ros, serve):
+    serve(PlannerNode)
+    for name, value in (('robust_order', 17), ('flux_density_max', 1001.0)):
+        result, = ros.set_parameters('planner', [Parameter(name, value=value)])
+        assert not result.successful
+        assert name in result.reason
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(('given', 'message'), [
+    ('length:=-1.0', 'parameter length is -1.0: expected float, 0 to 10 m'),
+    ('length:=11.0', 'parameter length is 11.0: expected float, 0 to 10 m'),
+    ('length:=.nan', 'parameter length is nan: expected float, 0 to 10 m'),
+    ('length:=1', 'parameter length is 1: expected float, 0 to 10 m'),
+    ('length:=long', "parameter length is 'long': expected float, 0 to 10 m"),
+    ('count:=-1', 'parameter count is -1: expected int, at least 0'),
+    ('count:=1.5', 'parameter count is 1.5: expected int, at least 0'),
+    ('mode:=fast', "parameter mode is 'fast': expected one of slow, slower"),
+    ('mode:=[slow]', "parameter mode is ['slow']: expected str"),
+    ('offset:=.inf', 'parameter offset is inf: expected a finite number'),
+    ('names:=[1, 2]', 'parameter names is'),
+    ('names:=3', 'parameter names is 3: expected a list of strings'),
+])
+def test_bad_value_is_refused_with_what_was_got_and_expected(make_ros, given, message):
+    specs = (
+        ParameterSpec('length', 1.0, 'Length.', 'm', 0.0, 10.0),
+        ParameterSpec('count', 1, 'Count.', '', 0), ParameterSpec('offset', 0.0, 'Offset.'),
+        ParameterSpec('mode', 'slow', 'Mode.', choices=('slow', 'slower')),
+        ParameterSpec('names', [], 'Names.'))
+    side = make_ros(cli_args=['--ros-args', '-p', given])
+    with pytest.raises(BadInputError, match=re.escape(message)):
+        declare(side.node, specs)
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(('given', 'expected'), [
+    ([], []), (['-p', 'names:=[a, b]'], ['a', 'b']), (['-p', 'names:=a'], ['a']),
+    (['-p', 'names:=[]'], [])])
+def test_list_of_strings_can_be_empty_or_one(make_ros, given, expected):
+    side = make_ros(cli_args=['--ros-args', *given])
+    assert declare(side.node, [ParameterSpec('names', [], 'Names.')]) == {'names': expected}
+
+
+@pytest.mark.parametrize(('minimum', 'maximum', 'text'), [
+    (None, None, 'any value'), (0.0, None, 'at least 0 s'), (None, 2.5, 'at most 2.5 s'),
+    (0.0, 1e6, '0 to 1e+06 s')])
+def test_range_is_worded_with_its_unit(minimum, maximum, text):
+    assert ParameterSpec('x', 1.0, 'X.', 's', minimum, maximum).range_text() == text
+
+
+@pytest.mark.parametrize('value', [-0.1, 1.1, math.nan, math.inf])
+def test_check_refuses_what_lies_outside(value):
+    with pytest.raises(BadInputError, match='^parameter x is .*: expected'):
+        ParameterSpec('x', 1.0, 'X.', '', 0.0, 1.0).check(value)
+
+
+@pytest.mark.parametrize('value', [0.0, 0.5, 1.0])
+def test_check_takes_the_ends_of_the_range(value):
+    ParameterSpec('x', 1.0, 'X.', '', 0.0, 1.0).check(value)
+
+
+def test_actuator_of_the_defaults_is_that_of_the_paper():
+    assert actuator_from({x.name: x.default for x in ACTUATOR}) == paper_actuator()
+
+
+def test_actuator_has_each_parameter_where_it_belongs():
+    values = {x.name: float(k + 1) for k, x in enumerate(ACTUATOR)}
+    assert actuator_from(values) == ActuatorParameters(
+        shear_modulus=1.0, density=2.0, half_length=3.0, half_thickness=4.0, remanence=5.0,
+        chain_limit=6.0, damping_coefficient=7.0)
+    assert [x.name for x in ACTUATOR] == [
+        f'actuator.{x}' for x in ActuatorParameters.__dataclass_fields__]
+
+
+def test_planner_and_plant_describe_the_same_block():
+    common = {x.name: x for x in DECLARED['planner']}.items() & {
+        x.name: x for x in DECLARED['plant']}.items()
+    assert {name for name, _ in common} == {
+        *(x.name for x in ACTUATOR), 'joint', 'initial_stretch', 'slew_limit'}
