@@ -17,6 +17,7 @@ import threading
 import time
 from typing import Any
 
+from hypothesis import HealthCheck, settings
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -34,6 +35,10 @@ def pytest_configure(config: pytest.Config) -> None:
             'ignore:module .sre_:DeprecationWarning',  # lark, imported by rosidl_parser
     ):
         config.addinivalue_line('filterwarnings', warning)
+    # A deadline for an example would be a measure of this machine's speed.
+    settings.register_profile(
+        'gate', deadline=None, suppress_health_check=[HealthCheck.too_slow])
+    settings.load_profile('gate')
 
 
 def wait_until(
