@@ -261,12 +261,16 @@ class Recording:
             self._condition.notify()
         self._thread.join()
         try:
-            if last_words is not None:
-                self._writer.flush()
-                self._writer.custom_data.update(last_words(self.status()))
+            self._writer.flush()
+        except OSError as error:
+            self._error = self._error or _not_closed(error)
+            self._writer.drop_pending()
+        if last_words is not None:
+            self._writer.custom_data.update(last_words(self.status()))
+        try:
             self._writer.close()
         except OSError as error:
-            self._error = f'the bag could not be closed properly: {_reason(error)}'
+            self._error = self._error or _not_closed(error)
         return self.status()
 
     def _ask(self, action: Callable[[], str]) -> str:
@@ -297,7 +301,7 @@ class Recording:
                 closing = self._closing
             try:
                 if self._error:
-                    self._retry(closing)
+                    self._retry(now=False)
                 if not self._error:
                     self._take_items()
                 if time.monotonic() >= next_flush and not self._error:
@@ -306,7 +310,10 @@ class Recording:
                 self._fail(error)
             if time.monotonic() >= next_flush:
                 next_flush = time.monotonic() + period
-            if closing and (self._error or not self._items):
+            if closing and self._error:
+                # One last try; it may be the file alone that cannot grow any more.
+                self._retry(now=True)
+            if closing and (self._error or not self._items and self._rest is None):
                 self._give_up()
                 return
 
@@ -408,7 +415,7 @@ class Recording:
         self._writer.abandon()
         self._next_retry = time.monotonic() + RETRY_SECONDS
 
-    def _retry(self, now: bool) -> None:
+    def _retry(self, *, now: bool) -> None:
         """Try to go on in a new file."""
         if not now and time.monotonic() < self._next_retry:
             return
@@ -436,6 +443,11 @@ class Recording:
             self._items.clear()
             for message in left:
                 self._overflowed[message[0]] = self._overflowed.get(message[0], 0) + 1
+
+
+def _not_closed(error: OSError) -> str:
+    """Return the sentence for a bag that could not be closed."""
+    return f'the bag could not be closed properly: {_reason(error)}'
 
 
 def _reason(error: OSError) -> str:

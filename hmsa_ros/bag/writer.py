@@ -7,7 +7,9 @@ half way is undone. Message payloads are stored as given.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+import contextlib
 from dataclasses import dataclass, field
+import errno
 import itertools
 import os
 from pathlib import Path
@@ -21,6 +23,10 @@ from hmsa_ros.bag import metadata, qos, records
 from hmsa_ros.errors import BadInputError, BagError
 
 LIBRARY = f'hmsa_ros {__version__}'
+# Takes up space that is given back when the disk is full, so that the file can still get its
+# summary and the bag its metadata.
+RESERVE = '.reserve'
+_RESERVE_STEP = 256 * 1024
 # Name of the metadata record with the experiment.
 EXPERIMENT = 'hmsa_ros'
 MIN_FILE_SIZE = 1024
@@ -118,6 +124,7 @@ class _File:
     counts: dict[int, int] = field(default_factory=dict)
     start: int = 2**64 - 1
     end: int = 0
+    index_size: int = 0
 
 
 class BagWriter:
@@ -181,6 +188,7 @@ class BagWriter:
         self._chunk = _Chunk()
         self._file: _File | None = None
         self._next_number = 0
+        self._reserved = 0
         self._closed = False
         self.dropped: dict[str, int] = {}
         try:
@@ -408,11 +416,24 @@ class BagWriter:
         """
         self.abandon()
         self.folder.mkdir(parents=True, exist_ok=True)
+        # Not until what waits will fit: every try that fails later would leave a file behind.
+        disk = os.statvfs(self.folder)
+        if disk.f_bavail * disk.f_frsize < self._chunk.size * 5 // 4 + 2 * _RESERVE_STEP:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return self._open()
+
+    def drop_pending(self) -> None:
+        """Forget the messages that wait for the next flush, counting them in `dropped`."""
+        self._lose({topic: len(index) // 2 for topic, index in self._chunk.index.items()})
+        self._chunk = _Chunk()
 
     def abandon(self) -> None:
         """Give up the file after an `OSError`, closing it as well as can be done."""
         if self._file is None:
+            return
+        self._give_back_reserve()
+        if not self._file.counts:
+            self._discard(self._file)
             return
         try:
             self._check_still_there(self._file)
@@ -428,6 +449,33 @@ class BagWriter:
             # summary gets it from `hmsa bag recover`.
             if self._file is not None:
                 self._forget_file(self._file)
+
+    def _discard(self, file: _File) -> None:
+        """Remove a file without messages."""
+        os.close(file.descriptor)
+        self._file = None
+        self._next_number = file.number
+        with contextlib.suppress(OSError):
+            (self.folder / file.name).unlink()
+
+    def _reserve(self, size: int) -> None:
+        """Take up space on the disk for the end of the file."""
+        if size <= self._reserved:
+            return
+        size = -(-size // _RESERVE_STEP) * _RESERVE_STEP
+        descriptor = os.open(
+            self.folder / RESERVE, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        try:
+            os.posix_fallocate(descriptor, 0, size)
+        finally:
+            os.close(descriptor)
+        self._reserved = size
+
+    def _give_back_reserve(self) -> None:
+        """Give the space back."""
+        self._reserved = 0
+        with contextlib.suppress(OSError):
+            (self.folder / RESERVE).unlink()
 
     def close(self) -> None:
         """
@@ -446,9 +494,9 @@ class BagWriter:
             self._write_chunk()
             self._finish_file()
         finally:
-            self._lose({topic: len(index) // 2 for topic, index in self._chunk.index.items()})
-            self._chunk = _Chunk()
+            self.drop_pending()
             self.abandon()
+            self._give_back_reserve()
             if self.folder.is_dir():
                 metadata.write(self.folder, self._metadata())
 
@@ -490,12 +538,10 @@ class BagWriter:
             self._write_metadata_records(file)
             self._append(b''.join(self._declare(file, topic) for topic in self._topics))
             metadata.write(self.folder, self._metadata())
+            self._reserve(_RESERVE_STEP)
         except OSError:
-            # Nothing of use is in it.
-            os.close(descriptor)
-            (self.folder / name).unlink(missing_ok=True)
-            self._file = None
-            self._next_number = number
+            self._give_back_reserve()
+            self._discard(file)
             raise
         return name
 
@@ -556,11 +602,14 @@ class BagWriter:
             struct.pack('<Q', position - len(record)),
             records.text(preset.compression),
             struct.pack('<QQ', len(packed), len(content))))))
+        file.index_size += len(file.chunk_indexes[-1])
         file.start = min(file.start, chunk.start)
         file.end = max(file.end, chunk.end)
         for topic, index in chunk.index.items():
             file.counts[topic] = file.counts.get(topic, 0) + len(index) // 2
             self._counts[topic] = self._counts.get(topic, 0) + len(index) // 2
+        # Twice the custom data and the list of topics, and the index.
+        self._reserve(file.index_size + _RESERVE_STEP // 2)
 
     def _lose(self, counts: Mapping[int, int], *, written: bool = False) -> None:
         """Count messages that are not in the bag after all."""
@@ -586,6 +635,7 @@ class BagWriter:
         file = self._file
         if file is None:
             return
+        self._check_still_there(file)
         length, indexes = file.offset, len(file.metadata_indexes)
         try:
             self._write_metadata_records(file)

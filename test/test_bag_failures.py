@@ -1,0 +1,177 @@
+"""What becomes of a recording when the disk or the folder fails it."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+import os
+from pathlib import Path
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+
+import pytest
+from rosbags.rosbag2 import Reader as RosbagsReader
+
+from hmsa_ros.bag import metadata
+from hmsa_ros.bag.reader import BagReader
+from hmsa_ros.bag.recording import Limits, lost_by_topic, Recording
+from hmsa_ros.bag.recover import recover
+from hmsa_ros.bag.writer import BagWriter, Topic
+from hmsa_ros.errors import BadInputError, BagError
+
+TOPIC = Topic('/a', 'std_msgs/msg/UInt8', 'uint8 data\n')
+PAYLOAD = bytes((0, 1, 0, 0, 7))
+
+
+def message(i, size=0):
+    return (0, i, i, i, PAYLOAD + bytes(size))
+
+
+@contextmanager
+def file_limit() -> Iterator[None]:
+    """Let no file of this process grow beyond 300 kB, as a quota would."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
+
+
+def test_when_a_file_may_not_grow_the_next_takes_over(tmp_path):
+    reports = []
+    recording = Recording(
+        BagWriter(tmp_path / 'bag', chunk_size=20_000), Limits(flush_period=0.05),
+        lambda sentence, failure: reports.append((failure, sentence)))
+    recording.add_topic(TOPIC)
+    with file_limit():
+        recording.put([message(i, 100) for i in range(10_000)], 1_000_000)
+        status = recording.close()
+    assert not status.error
+    assert not lost_by_topic(status.overflowed, status.dropped)
+    assert any(failure and 'File too large' in sentence for failure, sentence in reports)
+    reader = BagReader(tmp_path / 'bag')
+    assert len(reader.files) > 3
+    assert [item.sequence for item in reader.messages()] == list(range(10_000))
+    assert not list((tmp_path / 'bag').glob('.*'))
+    assert recover(tmp_path / 'bag', tmp_path / 'recovered').message_count == 10_000
+
+
+def test_a_removed_folder_costs_what_was_in_it_and_that_is_counted(tmp_path, wait_until):
+    reports = []
+    recording = Recording(
+        BagWriter(tmp_path / 'bag'), Limits(flush_period=0.02),
+        lambda sentence, failure: reports.append((failure, sentence)))
+    recording.add_topic(TOPIC)
+    recording.put([message(i) for i in range(10)], 50)
+    wait_until(lambda: recording.status().written == {'/a': 10}, 'the first messages')
+    shutil.rmtree(tmp_path / 'bag')
+    wait_until(lambda: len(reports) == 2, 'the failure and its end')
+    recording.put([message(i) for i in range(10, 30)], 100)
+    status = recording.close()
+    assert [failure for failure, _ in reports] == [True, False]
+    assert 'is gone' in reports[0][1] or 'No such file' in reports[0][1]
+    assert status.dropped == {'/a': 10}
+    assert status.written == {'/a': 20}
+    assert [item.sequence for item in BagReader(tmp_path / 'bag').messages()] == list(
+        range(10, 30))
+
+
+def test_what_does_not_fit_into_memory_is_counted_by_topic(tmp_path):
+    recording = Recording(BagWriter(tmp_path / 'bag'), Limits(cache_size=10_000))
+    recording.add_topic(TOPIC)
+    recording.put([message(i) for i in range(1000)], 5000)
+    recording.put([message(i) for i in range(10)], 50)
+    status = recording.close()
+    assert status.overflowed == {'/a': 1000}
+    assert status.written == {'/a': 10}
+
+
+def test_a_writer_that_cannot_write_at_the_end_says_so(tmp_path):
+    recording = Recording(BagWriter(tmp_path / 'bag'), Limits(flush_period=60.0))
+    recording.add_topic(TOPIC)
+    recording.put([message(i) for i in range(10)], 50)
+    shutil.rmtree(tmp_path / 'bag')
+    (tmp_path / 'bag').write_text('in the way')
+    status = recording.close()
+    assert status.error
+    assert sum(lost_by_topic(status.overflowed, status.dropped).values()) == 10
+
+
+def test_after_the_end_nothing_more_is_done(tmp_path):
+    recording = Recording(BagWriter(tmp_path / 'bag'), Limits())
+    recording.close()
+    with pytest.raises(BagError, match='the recording has ended'):
+        recording.split()
+
+
+@pytest.mark.parametrize(('options', 'match'), [
+    ({'flush_period': 0.0}, 'expected above 0'),
+    ({'max_size': 1023}, 'at least 1024'),
+    ({'max_duration_ns': -1}, 'expected at least 0'),
+    ({'cache_size': 0}, 'at least 1 byte'),
+])
+def test_limits_out_of_range_are_refused(options, match):
+    with pytest.raises(BadInputError, match=match):
+        Limits(**options)
+
+
+def test_files_are_split_by_time_span(tmp_path):
+    recording = Recording(BagWriter(tmp_path / 'bag'), Limits(max_duration_ns=100))
+    recording.add_topic(TOPIC)
+    recording.put([message(i) for i in range(1000)], 5000)
+    recording.close()
+    stored = metadata.read(tmp_path / 'bag' / 'metadata.yaml')
+    assert {file.message_count for file in stored.files[:-1]} == {101}
+    assert sum(file.message_count for file in stored.files) == 1000
+
+
+def test_a_snapshot_reaches_back_as_far_as_asked_for(tmp_path):
+    recording = Recording(BagWriter(tmp_path / 'bag'), Limits(snapshot_ns=100))
+    recording.add_topic(TOPIC)
+    for i in range(500):
+        recording.put([message(i)], 5)
+    assert recording.snapshot() == '101 messages written'
+    recording.close()
+    assert [item.sequence for item in BagReader(tmp_path / 'bag').messages()] == list(
+        range(399, 500))
+
+
+# A writer that is killed: it says after each flush what is safe.
+WRITER = """
+import sys
+from hmsa_ros.bag.writer import BagWriter, Topic
+writer = BagWriter(sys.argv[1], preset=sys.argv[2])
+number = writer.add_topic(Topic('/a', 'std_msgs/msg/UInt8', 'uint8 data\\n'))
+i = 0
+while True:
+    writer.write([(number, i + j, 0, i + j, bytes((0, 1, 0, 0, 7))) for j in range(50)])
+    i += 50
+    writer.flush()
+    print(i, flush=True)
+"""
+
+
+@pytest.mark.slow
+def test_a_killed_writer_loses_nothing_it_has_flushed(tmp_path):
+    environment = {**os.environ, 'PYTHONPATH': str(Path(__file__).resolve().parent.parent)}
+    for attempt in range(50):
+        folder = tmp_path / f'bag{attempt}'
+        with subprocess.Popen(
+                [sys.executable, '-c', WRITER, str(folder), ('none', 'zstd_fast')[attempt % 2]],
+                stdout=subprocess.PIPE, env=environment, text=True) as process:
+            # A different number of flushes each time, and no more waiting: the kill hits at
+            # any moment of the next ones.
+            for _ in range(1 + 3 * attempt):
+                safe = int(process.stdout.readline())
+            process.kill()
+            rest = process.stdout.read().split()
+        safe = max([safe, *(int(line) for line in rest[:-1])])
+        result = recover(folder, tmp_path / f'recovered{attempt}')
+        assert result.message_count >= safe
+        with RosbagsReader(tmp_path / f'recovered{attempt}') as reader:
+            assert [stamp for _, stamp, _ in reader.messages()] == list(
+                range(result.message_count))
