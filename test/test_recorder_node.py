@@ -3,8 +3,9 @@
 import json
 from pathlib import Path
 import signal
+import subprocess
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import pytest
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -160,6 +161,56 @@ def test_a_bag_is_recovered_after_kill_9(record, ros, tmp_path):
     with AnyReader([tmp_path / 'recovered']) as other:
         assert [other.deserialize(data, connection.msgtype).data
                 for connection, _, data in other.messages()] == list(range(500))
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """Return a file system of three megabytes, most of it taken by the file "filler"."""
+    folder = tmp_path / 'disk'
+    folder.mkdir()
+    command = ['mount', '-t', 'tmpfs', '-o', 'size=3m', 'tmpfs', str(folder)]
+    if subprocess.run(command, check=False, capture_output=True).returncode:
+        pytest.skip('no permission to mount a small file system')
+    (folder / 'filler').write_bytes(bytes(3 * 2**20 // 2))
+    yield folder
+    subprocess.run(['umount', '--lazy', str(folder)], check=True)
+
+
+def test_a_full_disk_is_told_and_nothing_is_lost_when_there_is_room_again(
+        start, ros, small_disk):
+    recorder = Recorder(start, ros, small_disk / 'bag')
+    publisher = ros.publisher(Float64, '/a')
+    recorder.wait_for('subscribed', '1/1')
+    sent = 0
+
+    def send(condition):
+        nonlocal sent
+        if not condition():
+            for _ in range(20):
+                publisher.publish(Float64(data=float(sent)))
+                sent += 1
+        return condition()
+
+    def failing():
+        return any(status.level == DiagnosticStatus.ERROR
+                   and 'No space left on device' in status.message
+                   for message in recorder.diagnostics for status in message.status)
+
+    ros.spin_until(lambda: send(failing), 'the disk to be full')
+    assert 'No space left on device' in recorder.process.output
+    with AnyReader([small_disk / 'bag']) as other:
+        so_far = [other.deserialize(data, connection.msgtype).data
+                  for connection, _, data in other.messages()]
+    assert so_far == list(range(len(so_far)))
+    assert len(so_far) > 1000
+    (small_disk / 'filler').unlink()
+    recorder.process.wait_for_output('recording goes on in bag_1.mcap')
+    publisher.publish(Float64(data=float(sent)))
+    recorder.wait_for('written', str(sent + 1))
+    reader = recorder.end()
+    assert values(reader) == list(range(sent + 1))
+    assert lost_messages(reader.custom_data) == {'/a': 0}
+    assert reader.complete
 
 
 def test_an_existing_folder_is_refused_in_one_line(start, tmp_path):
