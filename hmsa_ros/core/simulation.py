@@ -211,6 +211,30 @@ class ActuatorSimulation:
         self.flux_density = flux_density
         self.schedule = CommandSchedule(flux_density)
 
+    def set_state(self, stretch: float, rate: float, flux_density: float) -> None:
+        """
+        Go on from another state, with no command ahead.
+
+        Parameters
+        ----------
+        stretch, rate : float
+            State; the rate in 1/s.
+        flux_density : float
+            In force, in T.
+
+        Raises
+        ------
+        BadInputError
+            If the stretch is outside the limits.
+
+        """
+        check_stretch(stretch, self._material.j_lim)
+        self.stretch = stretch
+        self._rate = rate * self.actuator.time_unit
+        self._step = 0.0
+        self.flux_density = flux_density
+        self.schedule = CommandSchedule(flux_density)
+
     @property
     def rate(self) -> float:
         """Stretch rate in 1/s."""
