@@ -40,7 +40,8 @@ BAD_INPUT = 7
 # A closer approach to an equilibrium than this share of the move counts as rest: what happens
 # below it is lost in rounding.
 _AT_REST = 1e-12
-# Sign of the deviation is decided by the linearised motion below this share of the move.
+# Sign of the deviation is decided by the linearised motion below this share of the move or of
+# the room to a limit.
 _LINEAR = 1e-6
 _MAX_STEPS = 200_000
 # One swing takes tens of steps, a creep into an equilibrium thousands.
@@ -358,14 +359,15 @@ def crosses(k, l, v, target, zeta, c1, i_j, rtol):  # noqa: E741
     mass = (target ** -3 + c1) / 6.0
     half = 0.25 * zeta * c1 / mass
     fast = -half - math.sqrt(max(half * half - elastic_stiffness(target, i_j) / mass, 0.0))
-    move = max(abs(l - target), abs(v / fast))
+    lower, upper = stretch_limits(i_j)
+    small = _LINEAR * max(abs(l - target), abs(v / fast), min(target - lower, upper - target))
     side = l - target
     h = 0.0
     for _ in range(_MAX_STEPS):
         x = l - target
         if x * side < 0.0 or x == 0.0:
             return True
-        if abs(x) < _LINEAR * move and abs(v) < _LINEAR * move * abs(fast):
+        if abs(x) < small and abs(v) < small * abs(fast):
             return (v - fast * x) * x < 0.0
         if h <= 0.0:
             h = _first_step(l, v, beta, zeta, c1, i_j, rtol)
@@ -465,7 +467,8 @@ def shoot(
         if high == math.inf and iteration > _NEWTON_PASSES:
             # Newton creeps along an excess that never ends: stride out to the bound.
             new = max(new, 4.0 * d)
-        relative = abs(new - d) / d
+        # Against beta_p, where that is the smaller one: close to a limit.
+        relative = abs(new - d) / min(d, 1.0 + abs(beta))
         if not low < new < high:
             lost = high < 8.0 * least
             closed = high - low <= 4e-16 * (abs(beta_1) + high)
@@ -490,7 +493,7 @@ def shoot(
                 new = 0.125 * high
             else:
                 new = 0.5 * (low + high)
-            relative = abs(new - d) / d
+            relative = abs(new - d) / min(d, 1.0 + abs(beta))
         if (tolerance <= rtol and relative <= enough and status == DONE
                 and abs(miss) <= 1e-6 * move):
             if new < least:
