@@ -1,0 +1,105 @@
+"""A recorded run: integrated again from the bag, and played to a second plant."""
+
+import json
+import re
+import time
+
+import pytest
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import MagneticField
+from std_srvs.srv import Trigger
+
+from hmsa_ros.bag.reader import read_messages
+from hmsa_ros.bag.verify import verify
+from hmsa_ros.bag.writer import BagWriter
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.nodes.conversions import to_command
+
+SAME = 1e-9
+
+
+def samples(bag):
+    """Return the recorded stretch by stamp."""
+    return {item.message.header.stamp.sec * 10**9 + item.message.header.stamp.nanosec:
+            item.message.position[0]
+            for item in read_messages(bag, ['/joint_states'])}
+
+
+@pytest.fixture
+def recorded_run(start, ros, tmp_path):
+    """Return the bag of a plant that followed five commands."""
+    bag = tmp_path / 'run'
+    start.hmsa('plant', '--ros-args', '-p', 'initial_stretch:=1.05')
+    recorder = start.hmsa(
+        'recorder', '--ros-args', '-p', f'storage.uri:={bag}', '-p',
+        'record.topics:=[joint_states, flux_density_command]')
+    publisher = ros.publisher(MagneticField, 'flux_density_command', QoSProfile(depth=100), 2)
+    recorder.wait_for_output('ready: subscribed to all 2 topics')
+    ros.spin_until(lambda: 'plant.actuator.remanence' in (bag / 'metadata.yaml').read_text(),
+                   "the plant's parameters in the bag")
+    begin = time.time_ns() + 200_000_000
+    for i, flux_density in enumerate((0.010, 0.012, 0.008, 0.011, 0.0)):
+        publisher.publish(to_command(begin + i * 20_000_000, flux_density, 'coil'))
+    ros.spin_until(lambda: time.time_ns() > begin + 200_000_000, 'the end of the motion')
+    assert recorder.stop() == 0, recorder.output
+    return bag
+
+
+@pytest.mark.ros
+def test_a_recorded_run_comes_out_again(recorded_run, start, tmp_path):
+    result, = verify(recorded_run)
+    assert result.command_count == 5
+    assert result.late_count == 0
+    assert result.sample_count > 200
+    stretches = samples(recorded_run).values()
+    assert max(stretches) - min(stretches) > 1e-3
+    assert result.largest_difference < SAME
+
+    process = start.hmsa('bag', 'verify', recorded_run, '--json')
+    assert process.wait() == 0, process.output
+    report = json.loads(process.stdout)
+    assert report['passed']
+    assert report['actuators'][0]['sample_count'] == result.sample_count
+    # Another actuator would have moved otherwise.
+    metadata = (recorded_run / 'metadata.yaml').read_text()
+    (recorded_run / 'metadata.yaml').write_text(re.sub(
+        r"(plant.actuator.density: )'([\d.e+]+)'", r"\1'900.0'", metadata))
+    process = start.hmsa('bag', 'verify', recorded_run)
+    assert process.wait() == 1, process.output
+    assert 'largest difference of the stretch' in process.stdout
+
+
+@pytest.mark.ros
+def test_a_second_plant_moves_the_same_when_the_bag_is_played(
+        recorded_run, start, ros, tmp_path):
+    start.hmsa('plant', '--ros-args', '-p', 'use_sim_time:=true', '-p',
+               'initial_stretch:=1.05', '-r', '__ns:=/again')
+    again = tmp_path / 'again'
+    recorder = start.hmsa(
+        'recorder', '--ros-args', '-p', f'storage.uri:={again}', '-p', 'use_sim_time:=true',
+        '-p', 'record.topics:=[/again/joint_states]')
+    player = start.hmsa(
+        'player', '--ros-args', '-p', f'storage.uri:={recorded_run}', '-p',
+        'play.topics_to_filter:=[/flux_density_command]', '-p',
+        'play.wait_for_subscribers:=[/flux_density_command]', '-p',
+        'play.clock_publish_frequency:=1000.0', '-p', 'play.start_paused:=true',
+        '-r', '/flux_density_command:=/again/flux_density_command')
+    recorder.wait_for_output('ready: subscribed to all 1 topics')
+    ros.call(Trigger, 'player/resume')
+    assert player.wait() == 0, player.output
+    assert recorder.stop() == 0, recorder.output
+    first = samples(recorded_run)
+    second = {
+        item.message.header.stamp.sec * 10**9 + item.message.header.stamp.nanosec:
+        item.message.position[0] for item in read_messages(again, ['/again/joint_states'])}
+    common = sorted(first.keys() & second.keys())
+    assert len(common) > 200
+    assert max(abs(first[stamp] - second[stamp]) for stamp in common) < SAME
+    moved = [first[stamp] for stamp in common]
+    assert max(moved) - min(moved) > 1e-3
+
+
+def test_a_bag_without_a_run_is_refused(tmp_path):
+    BagWriter(tmp_path / 'bag').close()
+    with pytest.raises(BadInputError, match='holds no pair of topics'):
+        verify(tmp_path / 'bag')
