@@ -1,0 +1,350 @@
+"""Damaged, foreign and old bags: a clear sentence, no traceback, and what can be read is read."""
+
+import contextlib
+import random
+import shutil
+import struct
+
+from hypothesis import given, HealthCheck, settings, strategies
+from mcap.writer import CompressionType, Writer
+import pytest
+from rosbags.rosbag2 import Reader as RosbagsReader
+import yaml
+
+from hmsa_ros.bag import metadata, qos, records
+from hmsa_ros.bag.definitions import message_definition, type_hash
+from hmsa_ros.bag.reader import BagReader, read_messages
+from hmsa_ros.bag.recover import recover
+from hmsa_ros.bag.writer import BagWriter, Topic
+from hmsa_ros.cli import main
+from hmsa_ros.errors import BadInputError, BagError
+
+FLOAT = 'std_msgs/msg/Float64'
+
+
+def payload(value):
+    return bytes((0, 1, 0, 0)) + struct.pack('<d', value)
+
+
+def write_bag(folder, count=400, preset='none'):
+    encoding, text = message_definition(FLOAT)
+    with BagWriter(folder, preset=preset, chunk_size=1000) as writer:
+        number = writer.add_topic(Topic(
+            '/a', FLOAT, text, encoding, (qos.Qos(),), type_hash(FLOAT)))
+        writer.write((number, i, i, i, payload(i)) for i in range(count))
+    return folder / f'{folder.name}_0.mcap'
+
+
+def write_with_mcap(path, count=400, **options):
+    """Write a file as other programs do."""
+    with path.open('wb') as file:
+        writer = Writer(file, chunk_size=1000, **options)
+        writer.start('ros2', 'test')
+        encoding, text = message_definition(FLOAT)
+        schema = writer.register_schema(FLOAT, encoding, text.encode())
+        channel = writer.register_channel('/a', 'cdr', schema, {})
+        for i in range(count):
+            writer.add_message(channel, i, payload(i), i)
+        writer.finish()
+    return path
+
+
+def stamps(path):
+    """Read a file and return reader and log times; the only errors are the package's own."""
+    reader = BagReader(path)
+    return reader, [message.log_time for message in reader.messages()]
+
+
+@pytest.mark.parametrize('preset', ['none', 'zstd_fast', 'lz4'])
+def test_a_file_cut_anywhere_is_read_up_to_the_cut(tmp_path, preset):
+    data = write_bag(tmp_path / 'bag', preset=preset).read_bytes()
+    cut = tmp_path / 'cut.mcap'
+    before = 0
+    # A thousand cuts over the three presets, the ends among them.
+    lengths = sorted({*random.Random(3).sample(range(len(data)), 330), *range(10),
+                      *range(len(data) - 10, len(data))})
+    for length in lengths:
+        cut.write_bytes(data[:length])
+        if length < len(records.MAGIC):
+            with pytest.raises(BadInputError, match='is empty|was cut off'):
+                BagReader(cut)
+            continue
+        reader, got = stamps(cut)
+        assert got == list(range(len(got)))
+        assert len(got) >= before
+        before = len(got)
+        assert not reader.complete
+        assert any('is not complete' in problem for problem in reader.problems)
+    assert before == 400
+
+
+def test_a_cut_bag_is_recovered_for_every_reader(tmp_path):
+    path = write_bag(tmp_path / 'bag')
+    data = path.read_bytes()
+    for i, length in enumerate((60, len(data) // 2, len(data) - 1)):
+        path.write_bytes(data[:length])
+        result = recover(tmp_path / 'bag', tmp_path / f'recovered{i}')
+        with RosbagsReader(tmp_path / f'recovered{i}') as reader:
+            assert [stamp for _, stamp, _ in reader.messages()] == list(
+                range(result.message_count))
+        assert result.problems
+    assert result.message_count == 400
+
+
+@pytest.mark.parametrize('preset', ['none', 'zstd_fast', 'lz4'])
+def test_a_flipped_byte_in_a_chunk_costs_that_chunk(tmp_path, preset):
+    path = write_bag(tmp_path / 'bag', preset=preset)
+    data = bytearray(path.read_bytes())
+    _, intact = stamps(path)
+    # Somewhere in the data of the second chunk.
+    chunks = [i for i in range(len(data) - 9) if data[i] == records.CHUNK
+              and struct.unpack_from('<Q', data, i + 1)[0] < 2000
+              and data[i + 9:i + 17] == struct.pack('<Q', data[i + 9])]
+    data[chunks[1] + 100] ^= 0x10
+    path.write_bytes(data)
+    reader, got = stamps(path)
+    assert 0 < len(got) < len(intact)
+    assert set(got) < set(intact)
+    problem, = reader.problems
+    assert 'chunk' in problem
+    assert 'passed over' in problem
+    assert reader.counts() == {'/a': len(got)}
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
+@given(strategies.data())
+def test_no_change_of_bytes_makes_the_reader_fail(tmp_path, data):
+    path = tmp_path / 'bag' / 'bag_0.mcap'
+    if not path.exists():
+        write_bag(tmp_path / 'bag', 100, preset='zstd_fast')
+    original = path.read_bytes()
+    changed = bytearray(original)
+    for _ in range(data.draw(strategies.integers(1, 4))):
+        position = data.draw(strategies.integers(0, len(changed) - 1))
+        changed[position] = data.draw(strategies.integers(0, 255))
+    end = data.draw(strategies.integers(0, len(changed)) | strategies.just(len(changed)))
+    copy = tmp_path / 'changed.mcap'
+    copy.write_bytes(changed[:end])
+    # Only the package's own errors, and only for what cannot be read at all.
+    with contextlib.suppress(BagError, BadInputError):
+        reader, got = stamps(copy)
+        reader.counts()
+        assert len(got) <= 100
+        list(read_messages(copy))
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
+@given(content=strategies.binary(max_size=300))
+def test_no_bytes_after_the_magic_make_the_reader_fail(tmp_path, content):
+    path = tmp_path / 'any.mcap'
+    path.write_bytes(records.MAGIC + content)
+    reader, _ = stamps(path)
+    reader.counts()
+
+
+@pytest.mark.parametrize('options', [
+    {'use_chunking': False},
+    {'compression': CompressionType.LZ4},
+    {'compression': CompressionType.ZSTD},
+    {'repeat_channels': False, 'repeat_schemas': False},
+    {'use_statistics': False, 'use_summary_offsets': False},
+    {'enable_crcs': False},
+])
+def test_what_other_writers_make_is_read(tmp_path, options):
+    path = write_with_mcap(tmp_path / 'other.mcap', **options)
+    reader, got = stamps(path)
+    assert got == list(range(400))
+    assert reader.counts() == {'/a': 400}
+    assert not reader.problems
+    assert [item.message.data for item in read_messages(path)] == list(range(400))
+
+
+def test_damage_outside_the_chunks_is_got_around_by_the_index(tmp_path):
+    path = write_bag(tmp_path / 'bag')
+    data = bytearray(path.read_bytes())
+    offset, indexes = len(records.MAGIC), []
+    while len(indexes) < 3:
+        opcode, length = records.PREFIX.unpack_from(data, offset)
+        if opcode == records.MESSAGE_INDEX:
+            indexes.append(offset)
+        offset += records.PREFIX.size + length
+    # Nothing after a record whose length is wrong can be found record by record.
+    struct.pack_into('<Q', data, indexes[-1] + 1, 2**40)
+    path.write_bytes(data)
+    reader, got = stamps(path)
+    assert got == list(range(400))
+    problem, = reader.problems
+    assert 'the chunks after it are found by the index' in problem
+
+
+def test_a_file_that_is_no_mcap_is_named(tmp_path, capsys):
+    for content, expected in (
+            (b'', 'is empty: expected an MCAP file'),
+            (b'#ROSBAG V2.0\n', 'is not an MCAP file'),
+            (records.MAGIC[:4], 'was cut off after 4 bytes')):
+        path = tmp_path / 'file.mcap'
+        path.write_bytes(content)
+        assert main(['bag', 'info', str(path)]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith('hmsa: error: ')
+        assert expected in error
+        assert error.count('\n') == 1
+
+
+def test_what_is_not_there_is_said(tmp_path, capsys):
+    (tmp_path / 'empty').mkdir()
+    (tmp_path / 'old').mkdir()
+    (tmp_path / 'old' / 'old_0.db3').write_bytes(b'')
+    for name, expected in (
+            ('none', 'does not exist'), ('empty', 'holds no .mcap file'),
+            ('old', 'holds an SQLite bag')):
+        assert main(['bag', 'info', str(tmp_path / name)]) == 2
+        assert expected in capsys.readouterr().err
+
+
+def test_a_missing_or_wrong_metadata_file_does_not_hide_the_messages(tmp_path):
+    write_bag(tmp_path / 'bag')
+    path = tmp_path / 'bag' / 'metadata.yaml'
+    text = path.read_text()
+    for content, expected in (
+            (None, 'is missing: the files themselves are read'),
+            ('a: [', 'is not YAML'),
+            ('a: 1', 'has no key rosbag2_bagfile_information'),
+            (text.replace('version: 9', 'version: 99'), 'is of version 99'),
+            (text.replace('message_count', 'count'), 'cannot be understood')):
+        if content is None:
+            path.unlink()
+        else:
+            path.write_text(content)
+        reader, got = stamps(tmp_path / 'bag')
+        assert got == list(range(400))
+        assert any(expected in problem for problem in reader.problems)
+
+
+@pytest.mark.parametrize('version', range(1, 9))
+def test_older_metadata_are_read(tmp_path, version):
+    write_bag(tmp_path / 'bag')
+    path = tmp_path / 'bag' / 'metadata.yaml'
+    content = yaml.safe_load(path.read_text())
+    inner = content['rosbag2_bagfile_information']
+    inner['version'] = version
+    for since, key in ((8, 'ros_distro'), (6, 'custom_data'), (5, 'files'),
+                       (3, 'compression_format'), (3, 'compression_mode')):
+        if version < since:
+            del inner[key]
+    for topic in inner['topics_with_message_count']:
+        entry = topic['topic_metadata']
+        entry['offered_qos_profiles'] = yaml.safe_dump(entry['offered_qos_profiles'])
+        if version < 7:
+            del entry['type_description_hash']
+        if version < 4:
+            del entry['offered_qos_profiles']
+    if version < 4:
+        inner['relative_file_paths'] = [f'bag/{name}' for name in inner['relative_file_paths']]
+    path.write_text(yaml.safe_dump(content))
+    reader, got = stamps(tmp_path / 'bag')
+    assert not reader.problems
+    assert got == list(range(400))
+    assert reader.metadata.version == version
+
+
+def test_two_bags_under_one_name_are_told_apart(tmp_path):
+    write_bag(tmp_path / 'bag')
+    other = write_bag(tmp_path / 'other')
+    shutil.copy(other, tmp_path / 'bag')
+    reader, got = stamps(tmp_path / 'bag')
+    assert len(got) == 400
+    assert any('also holds other_0.mcap' in problem for problem in reader.problems)
+    (tmp_path / 'bag' / 'metadata.yaml').unlink()
+    with pytest.raises(BadInputError, match=r'several bags \(bag, other\)'):
+        BagReader(tmp_path / 'bag')
+
+
+def test_a_file_named_in_the_metadata_that_is_missing_is_told(tmp_path):
+    with BagWriter(tmp_path / 'bag') as writer:
+        number = writer.add_topic(Topic('/a', FLOAT))
+        writer.write([(number, 1, 1, 1, payload(1))])
+        writer.split()
+        writer.write([(number, 2, 2, 2, payload(2))])
+    (tmp_path / 'bag' / 'bag_0.mcap').unlink()
+    reader, got = stamps(tmp_path / 'bag')
+    assert got == [2]
+    assert any('bag_0.mcap is missing' in problem for problem in reader.problems)
+
+
+def test_a_bag_of_no_messages_is_a_bag(tmp_path, capsys):
+    BagWriter(tmp_path / 'bag').close()
+    reader, got = stamps(tmp_path / 'bag')
+    assert (got, reader.start_time, reader.problems) == ([], None, [])
+    assert main(['bag', 'info', str(tmp_path / 'bag')]) == 0
+    assert 'messages  0' in capsys.readouterr().out
+
+
+def test_a_missing_schema_leaves_the_messages_raw(tmp_path):
+    path = tmp_path / 'raw.mcap'
+    with path.open('wb') as file:
+        writer = Writer(file)
+        writer.start('ros2', 'test')
+        channel = writer.register_channel('/a', 'cdr', 0, {})
+        writer.add_message(channel, 1, payload(1), 1)
+        writer.finish()
+    reader, got = stamps(path)
+    assert got == [1]
+    assert any('has no message definition' in problem for problem in reader.problems)
+    with pytest.raises(BagError, match='cannot be decoded'):
+        list(read_messages(path, ['/a']))
+    assert not list(read_messages(path))
+
+
+def test_a_definition_that_cannot_be_read_is_named(tmp_path):
+    with BagWriter(tmp_path / 'bag') as writer:
+        number = writer.add_topic(Topic('/a', 'x/msg/Y', 'nonsense ::: here\n'))
+        writer.write([(number, 1, 1, 1, payload(1))])
+    with pytest.raises(BagError, match='definition of x/msg/Y in the bag cannot be read'):
+        list(read_messages(tmp_path / 'bag', ['/a']))
+
+
+def test_a_payload_that_does_not_fit_is_named(tmp_path):
+    encoding, text = message_definition(FLOAT)
+    with BagWriter(tmp_path / 'bag') as writer:
+        number = writer.add_topic(Topic('/a', FLOAT, text, encoding))
+        writer.write([(number, 1, 1, 1, bytes((0, 1, 0, 0, 1)))])
+    with pytest.raises(BagError, match='does not decode as std_msgs/msg/Float64'):
+        list(read_messages(tmp_path / 'bag'))
+
+
+def test_a_topic_that_is_not_there_is_named(tmp_path):
+    write_bag(tmp_path / 'bag')
+    with pytest.raises(BadInputError, match='has no topic /b: expected one of /a'):
+        BagReader(tmp_path / 'bag').decoder('/b')
+
+
+def test_a_definition_that_is_not_installed_is_named():
+    with pytest.raises(BagError, match='no definition of message type no_such/msg/Type found'):
+        message_definition('no_such/msg/Type')
+    with pytest.raises(BagError, match='expected a name such as'):
+        message_definition('wrong')
+    assert type_hash('no_such/msg/Type') == ''
+
+
+def test_info_and_recover_tell_of_damage_without_failing(tmp_path, capsys):
+    path = write_bag(tmp_path / 'bag')
+    path.write_bytes(path.read_bytes()[:-200])
+    assert main(['bag', 'info', str(tmp_path / 'bag')]) == 0
+    assert 'is not complete' in capsys.readouterr().out
+    assert main(['bag', 'recover', str(tmp_path / 'bag'), '--out', str(tmp_path / 'new')]) == 0
+    assert '400 messages recovered' in capsys.readouterr().out
+    assert main(['bag', 'recover', str(tmp_path / 'bag'), '--out', str(tmp_path / 'new')]) == 2
+    assert 'exists' in capsys.readouterr().err
+
+
+def test_profiles_out_of_range_are_refused():
+    with pytest.raises(BagError, match='expected one of'):
+        qos.Qos(reliability='sure')
+    with pytest.raises(BagError, match='expected at least 0'):
+        qos.Qos(depth=-1)
+
+
+def test_metadata_that_cannot_be_opened_are_named(tmp_path):
+    with pytest.raises(BagError, match='cannot be read'):
+        metadata.read(tmp_path)
