@@ -11,10 +11,14 @@ import sys
 import numpy as np
 
 from hmsa_ros.cli import Parser, report
+from hmsa_ros.core.moves import State
 from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.core.shapers import SHAPERS
+from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.figures.studies import draw_damped, draw_robustness, draw_sampled
 from hmsa_ros.studies.damped import damped_study, DampedStudy, LIMITS
+from hmsa_ros.studies.residual import Errors, residual
 from hmsa_ros.studies.robustness import Candidate, candidates, Case, PARAMETERS, percent, study
 from hmsa_ros.studies.sampled import sampled_study
 
@@ -71,11 +75,12 @@ def single_error_table() -> Table:
     rows: Table = [('shaper, move', *(f'{name} {100 * x:+g} %' for name, x in cases))]
     for candidate in (Candidate('two_step'), Candidate('robust')):
         for start, target in MOVES:
-            case = Case(start, target, MATERIAL)
-            result = study(case, candidate)
-            errors = case.errors()
+            move = SHAPERS[candidate.shaper](Request(
+                State(start), target, MATERIAL, order=candidate.order))
             rows.append((f'{candidate.name}, {start:g} to {target:g}', *(
-                percent(float(result.curves[name][np.argmin(np.abs(errors - error))]))
+                percent(residual(
+                    move, start, target, MATERIAL, Errors(**{PARAMETERS[name]: error}),
+                    move.duration))
                 for name, error in cases)))
     return rows
 

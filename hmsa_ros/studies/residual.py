@@ -23,8 +23,8 @@ from hmsa_ros.errors import BadInputError
 # Peak-to-peak of a decaying motion stands after one period, or once it has died out.
 _PERIODS = 2.0
 _DECADES = 12.0
-# 250 samples a period miss 1e-4 of an extremum.
-_SAMPLES = 501
+# 150 samples a period miss 2e-4 of an extremum.
+_SAMPLES = 301
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,221 @@
+"""``hmsa robustness`` and ``hmsa sweep``: what users type, see and get."""
+
+import builtins
+import csv
+import io
+import json
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+
+from hmsa_ros.cli import main
+
+ROOT = Path(__file__).resolve().parent.parent
+PNG = b'\x89PNG\r\n\x1a\n'
+HEADER = 'start,target,zeta,j_lim,c1,status,beta_p,b_p,tau_p,beta_1,b_1'
+
+
+@pytest.fixture
+def run(capsys, tmp_path, monkeypatch):
+    """Return a runner of ``hmsa`` in an empty folder: status, standard output and error."""
+    monkeypatch.chdir(tmp_path)
+
+    def run_words(*words):
+        try:
+            status = main([str(word) for word in words])
+        except SystemExit as end:
+            status = end.code
+        return status, *capsys.readouterr()
+
+    return run_words
+
+
+@pytest.fixture
+def refused(run):
+    """Return a runner that expects bad input and returns the one line about it."""
+    def run_words(*words):
+        status, out, err = run(*words)
+        assert (status, out, err.count('\n')) == (2, '', 1)
+        assert err.startswith('hmsa: error: ')
+        return err
+
+    return run_words
+
+
+# --- robustness
+
+
+def test_robustness_prints_a_table_and_names_its_files(run, tmp_path):
+    status, out, err = run(
+        'robustness', '--move', '1.0:1.4', '1:0.9', '--shapers', 'two_step,robust,zv',
+        '--order', 2, 4, '--out', 'new/folder')
+    assert (status, err) == (0, '')
+    for words in ('stretch 1 to 1.4', 'stretch 1 to 0.9', 'two-step', 'robust, order 2',
+                  'robust, order 4', 'ZV', 'within 10 %', 'without the',
+                  'ZV: linear, designed at the target'):
+        assert words in out
+    assert 'robust, order 3' not in out
+    files = out.split()[-3:]
+    assert files == [f'new/folder/robustness{x}' for x in (
+        '.csv', '_1_to_1.4.png', '_1_to_0.9.png')]
+    rows = list(csv.DictReader((tmp_path / files[0]).read_text().splitlines()))
+    assert {x['shaper'] for x in rows} == {'two_step', 'robust', 'zv'}
+    assert all((tmp_path / x).read_bytes().startswith(PNG) for x in files[1:])
+
+
+def test_robustness_as_json_has_everything_in_full_precision(run):
+    status, out, err = run(
+        'robustness', '--move', '1:1.1', '--shapers', 'two_step,step', '--errors', 0.05, '--json')
+    assert (status, err) == (0, '')
+    made = json.loads(out)
+    move = made['moves'][0]
+    assert (move['start'], move['target'], move['zeta'], move['box']) == (1.0, 1.1, 0.2, 0.05)
+    shaped, plain = move['shapers']
+    assert shaped['levels'][0] == [0.0, pytest.approx(0.160094186, abs=1e-9)]
+    assert shaped['arrival'] == pytest.approx(1.315749737, abs=1e-9)
+    assert shaped['residual'] < 1e-8
+    assert 100.0 * shaped['worst']['G']['residual'] == pytest.approx(5.8, abs=0.05)
+    assert shaped['worst']['G']['error'] == -0.05
+    curve = shaped['curves']['zeta']
+    assert len(curve['errors']) == len(curve['residuals'])
+    assert (curve['errors'][0], curve['errors'][-1]) == (-0.1, 0.1)
+    assert (plain['arrives'], shaped['arrives']) == (False, True)
+    assert plain['arrival'] == shaped['arrival']
+    assert [Path(x).name for x in made['files']] == [
+        'robustness.csv', 'robustness_1_to_1.1.png']
+
+
+def test_robustness_says_what_could_not_be_had(run):
+    status, out, _ = run(
+        'robustness', '--move', '1:1.1', '--shapers', 'two_step,zv', '--zeta', 3)
+    assert status == 0
+    assert 'note: two-step: zeta 3 is too damped' in out
+    assert 'arrival in brackets' in out
+
+
+@pytest.mark.parametrize(('words', 'message'), [
+    (['--move', '1.4'], "'1.4': expected START:TARGET"),
+    (['--move', 'a:b'], "'a:b'"),
+    (['--move', '1:1'], 'two stretches that differ'),
+    (['--move', '1:9'], 'target stretch is 9'),
+    (['--move', '1:nan'], 'target stretch is nan'),
+    (['--shapers', 'zvdd'], "'zvdd' is unknown"),
+    (['--shapers', ''], "'' is unknown"),
+    (['--errors', '0'], 'expected numbers above 0'),
+    (['--errors', '1'], 'to 0.9'),
+    (['--errors', 'nan'], 'nan'),
+    (['--order', '0'], 'expected 1 to 100'),
+    (['--order', '2.5'], "'2.5'"),
+    (['--zeta', '-1'], 'zeta is -1'),
+    (['--j-lim', '0'], 'j_lim is 0'),
+])
+def test_robustness_refuses_bad_input_in_one_line(refused, tmp_path, words, message):
+    assert message in refused('robustness', *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_robustness_needs_a_folder_it_can_write_to(refused, tmp_path):
+    (tmp_path / 'file').write_text('')
+    assert '--out' in refused('robustness', '--out', 'file')
+    (tmp_path / 'folder' / 'robustness.csv').mkdir(parents=True)
+    assert 'cannot write folder/robustness.csv' in refused(
+        'robustness', '--move', '1:1.1', '--shapers', 'step', '--out', 'folder')
+
+
+# --- sweep
+
+
+def test_sweep_writes_csv_to_standard_output(run):
+    status, out, err = run('sweep', '--zeta', '0:0.4:3', '--target', '1.1,3')
+    assert status == 0
+    assert out.splitlines()[0] == HEADER
+    rows = list(csv.DictReader(io.StringIO(out)))
+    assert [x['status'] for x in rows] == ['two_step', 'two_step', 'two_step'] + [
+        'out_of_range'] * 3
+    assert rows[1]['beta_p'] == repr(float(rows[1]['beta_p']))
+    assert float(rows[1]['beta_p']) == pytest.approx(0.160094186, abs=1e-9)
+    assert rows[4]['tau_p'] == 'nan'
+    assert err == '6 plans: 3 two_step, 3 out_of_range\n'
+
+
+def test_sweep_of_cases_writes_a_file_and_names_it(run, tmp_path):
+    (tmp_path / 'cases.csv').write_text('target,start\n1.4,1.2\n0.9,1.0\n')
+    status, out, _ = run('sweep', '--cases', 'cases.csv', '--zeta', '0.2,0.3', '--out', 'o.csv')
+    assert (status, out) == (0, 'o.csv\n')
+    rows = list(csv.DictReader((tmp_path / 'o.csv').read_text().splitlines()))
+    assert [(x['start'], x['target'], x['zeta']) for x in rows] == [
+        ('1.2', '1.4', '0.2'), ('1.2', '1.4', '0.3'), ('1.0', '0.9', '0.2'),
+        ('1.0', '0.9', '0.3')]
+    assert float(rows[0]['tau_p']) == pytest.approx(1.351529739, abs=1e-9)
+
+
+def test_sweep_writes_parquet(run, tmp_path):
+    parquet = pytest.importorskip('pyarrow.parquet')
+    status, out, _ = run('sweep', '--zeta', '0:2:10', '--out', 'o.PARQUET')
+    assert (status, out) == (0, 'o.PARQUET\n')
+    table = parquet.read_table(tmp_path / 'o.PARQUET')
+    assert ','.join(table.column_names) == HEADER
+    assert table['status'].to_pylist() == ['two_step'] * 10
+
+
+def test_sweep_says_how_to_get_parquet_where_it_is_missing(refused, tmp_path, monkeypatch):
+    real = builtins.__import__
+
+    def without_pyarrow(name, *rest):
+        if name.partition('.')[0] == 'pyarrow':
+            raise ModuleNotFoundError(name)
+        return real(name, *rest)
+
+    monkeypatch.setattr(builtins, '__import__', without_pyarrow)
+    line = refused('sweep', '--out', 'o.parquet')
+    assert 'hmsa_ros[studies]' in line
+    assert '.csv' in line
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(('words', 'message'), [
+    (['--zeta', '0:2'], "zeta is '0:2'"),
+    (['--zeta', 'nan'], 'value nan'),
+    (['--zeta', '0:nan:3'], 'finite ends'),
+    (['--target', '0'], 'greater than 0'),
+    (['--j-lim', 'log:0:1:3'], 'logarithmic'),
+    (['--zeta', '0:1:4000', '--j-lim', '1:2:4000'], '16,000,000 points'),
+    (['--zeta', '0:1:99999999999'], '99,999,999,999 points'),
+    (['--cases', 'none.csv'], 'cannot read none.csv: No such file'),
+    (['--cases', '.'], 'cannot read .: Is a directory'),
+    (['--out', 'o.txt'], '.csv or .parquet'),
+    (['--out', 'none/o.csv'], 'cannot write none/o.csv: No such file'),
+    (['--out', 'none/o.parquet'], 'none/o.parquet'),
+    (['--rate', '1'], '--rate'),
+])
+def test_sweep_refuses_bad_input_in_one_line(refused, tmp_path, words, message):
+    if 'none/o.parquet' in words:
+        pytest.importorskip('pyarrow')
+    assert message in refused('sweep', *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_sweep_refuses_tables_that_do_not_fit(refused, tmp_path):
+    path = tmp_path / 'cases.csv'
+    path.write_text('target,flux\n1.1,2\n')
+    assert "column 'flux'" in refused('sweep', '--cases', 'cases.csv')
+    path.write_text('target\n1.1\n')
+    assert 'target is a column of the cases' in refused(
+        'sweep', '--cases', 'cases.csv', '--target', '1.2')
+    (tmp_path / 'folder.csv').mkdir()
+    assert 'is a folder' in refused('sweep', '--out', 'folder.csv')
+
+
+def test_sweep_ends_quietly_when_its_reader_has_gone():
+    # A real process: the pipe is closed after the first line.
+    with subprocess.Popen(
+            [sys.executable, '-m', 'hmsa_ros', 'sweep', '--zeta', '0:1.9:50000'], cwd=ROOT,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert process.stdout.readline() == HEADER + '\n'
+        process.stdout.close()
+        assert process.stderr.read() == ''
+    assert process.returncode == 0
