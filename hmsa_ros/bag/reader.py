@@ -16,7 +16,9 @@ that was cut off gives everything up to the cut, a damaged chunk costs that chun
 
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterator
+import contextlib
 from dataclasses import dataclass, field
+import io
 import os
 from pathlib import Path
 import re
@@ -398,7 +400,7 @@ class BagReader:
                     fields = records.Fields(content, 'chunk index')
                     fields.take(16)
                     start = fields.number(8)
-                    if start < offset:
+                    if not offset <= start < file.size:
                         continue
                     head = os.pread(descriptor, prefix_size + _HEAD_BYTES, start)
                     if len(head) < prefix_size or head[0] != records.CHUNK:
@@ -681,9 +683,12 @@ def _make_decoder(info: TopicInfo) -> Callable[[bytes], Any]:
     # A decoder of its own: the library keeps decoders by schema number, which differs between
     # the files of a bag.
     try:
-        decode = DecoderFactory().decoder_for(info.encoding, Schema(
-            id=1, name=info.type, encoding=info.definition_encoding,
-            data=info.definition.encode()))
+        # Its parser prints before it raises.
+        with contextlib.redirect_stderr(io.StringIO()), \
+                contextlib.redirect_stdout(io.StringIO()):
+            decode = DecoderFactory().decoder_for(info.encoding, Schema(
+                id=1, name=info.type, encoding=info.definition_encoding,
+                data=info.definition.encode()))
     except Exception as error:  # the parser raises errors of many unrelated classes
         raise BagError(f'the definition of {info.type} in the bag cannot be read: '
                        f'{error}') from error

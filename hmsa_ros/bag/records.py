@@ -327,17 +327,17 @@ def decompress(data: bytes, compression: str, size: int) -> bytes:
     elif compression == 'zstd':
         import zstandard
         try:
-            # The frame says its size: believed only if it is what the chunk says, before
-            # any memory is taken for it.
+            # A frame may say its own size: believed only if it is what the chunk says. No more
+            # memory than that is taken, whatever the data would unfold to.
             if zstandard.frame_content_size(data) not in (size, -1):
                 raise BagError('a chunk does not decompress to the size it says')
-            content = zstandard.ZstdDecompressor().decompressobj().decompress(data)
+            content = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
         except zstandard.ZstdError as error:
             raise BagError(f'a chunk does not decompress: {error}') from error
     elif compression == 'lz4':
         import lz4.frame
         try:
-            content = lz4.frame.decompress(data)
+            content = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
         except RuntimeError as error:
             raise BagError(f'a chunk does not decompress: {error}') from error
     else:
