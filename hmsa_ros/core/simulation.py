@@ -70,10 +70,8 @@ def simulate(
         If the integration does not get through.
 
     """
-    switches = np.atleast_1d(np.asarray(switches, dtype=np.float64))
-    loads = np.atleast_1d(np.asarray(loads, dtype=np.float64))
-    times = np.atleast_1d(np.asarray(times, dtype=np.float64))
-    ramps = np.zeros_like(loads) if slopes is None else np.asarray(slopes, dtype=np.float64)
+    switches, loads, times = _vector(switches), _vector(loads), _vector(times)
+    ramps = np.zeros_like(loads) if slopes is None else _vector(slopes)
     if not (switches.ndim == 1 and switches.size and switches.shape == loads.shape
             == ramps.shape and times.ndim == 1):
         raise BadInputError(
@@ -93,6 +91,11 @@ def simulate(
     if status != kernels.DONE:
         raise HmsaError('the integration ran out of steps: the load is too large to follow')
     return out[0], out[1]
+
+
+def _vector(values: ArrayLike) -> Array:
+    """Return a contiguous copy: any other layout would have the kernels compiled anew."""
+    return np.array(values, dtype=np.float64, ndmin=1, order='C')
 
 
 def longest_motion(load: float, material: NondimensionalParameters) -> float:

@@ -6,19 +6,25 @@ loads for some tenths of one. Set-up commands run this module, and a planner cal
 before it takes requests.
 """
 
+from dataclasses import replace
 import sys
 from time import perf_counter
 
 import numpy as np
 
-from hmsa_ros.core.delivery import Delivery
-from hmsa_ros.core.moves import Limits, State
-from hmsa_ros.core.parameters import NondimensionalParameters
-from hmsa_ros.core.shapers.minimum_time import minimum_time
-from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.core.shapers.two_step import two_step
-from hmsa_ros.core.simulation import simulate
+from hmsa_ros.core.parameters import paper_actuator
+from hmsa_ros.core.planner import Options, Planner
+from hmsa_ros.core.simulation import ActuatorSimulation
 from hmsa_ros.core.two_step import plan_two_step_batch
+
+_MILLISECOND = 1_000_000
+# What reaches every kernel with every type of argument.
+_DELIVERIES = (
+    Options(flux_density_min=-0.5, flux_density_max=0.5),
+    Options(shaper='minimum_time'),
+    Options(shaper='robust', slew_limit=100.0),
+    Options(shaper='zvd', period=_MILLISECOND),
+)
 
 
 def warm_up(*, batch: bool = False) -> float:
@@ -37,12 +43,15 @@ def warm_up(*, batch: bool = False) -> float:
 
     """
     begin = perf_counter()
-    material = NondimensionalParameters()
-    limits = Limits(-2.0, 2.0)
-    two_step(Request(State(1.0), 1.1, material, limits, Delivery(slew=10.0)))
-    two_step(Request(State(1.05, 0.5), 1.1, material, limits))
-    minimum_time(Request(State(1.0), 1.1, material, limits))
-    simulate([0.0], [0.1], [0.0, 1.0], material)
+    for options in _DELIVERIES:
+        planner = Planner(paper_actuator(), replace(options, lead_time=0))
+        plant = ActuatorSimulation(paper_actuator())
+        for now, stretch in ((0, 1.2), (_MILLISECOND, 1.1)):
+            planner.setpoint(stretch, now)
+            for level in planner.due(now):
+                plant.command(level.stamp, level.flux_density)
+            plant.advance(now + _MILLISECOND)
+        planner.stop(2 * _MILLISECOND)
     if batch:
         plan_two_step_batch(1.0, np.array([1.1, 1.2]))
     return perf_counter() - begin

@@ -14,6 +14,7 @@ from std_srvs.srv import SetBool, Trigger
 from hmsa_ros.core.pacer import Pacer
 from hmsa_ros.core.simulation import ActuatorSimulation
 from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.core.warmup import warm_up
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.nodes import conversions, interface
 from hmsa_ros.nodes.parameters import (
@@ -75,6 +76,7 @@ class PlantNode(Node):
             raise BadInputError(
                 'publish_clock and use_sim_time are both true: expected a plant that either '
                 'leads simulated time or follows it')
+        warm_up()
         start = round(values['start_time'] * NANOSECONDS) if self._authority else 0
         self._simulation = ActuatorSimulation(
             actuator_from(values), time=start, stretch=values['initial_stretch'],

@@ -1,0 +1,49 @@
+"""What a running planner must never do: compile."""
+
+import json
+import subprocess
+import sys
+
+PROGRAM = '''
+import json
+from hmsa_ros.core import kernels
+from hmsa_ros.core.parameters import paper_actuator
+from hmsa_ros.core.planner import Options, Planner
+from hmsa_ros.core.simulation import ActuatorSimulation
+from hmsa_ros.core.warmup import warm_up
+
+def signatures():
+    return {
+        name: len(kernel.signatures) for name, kernel in vars(kernels).items()
+        if hasattr(kernel, 'signatures')}
+
+warm_up()
+before = signatures()
+millisecond = 1_000_000
+for options in (
+        {}, {'period': millisecond}, {'slew_limit': 30.0}, {'shaper': 'robust'},
+        {'shaper': 'minimum_time'}, {'shaper': 'ei'}, {'shaper': 'step'},
+        {'period': millisecond, 'slew_limit': 100.0}, {'short_spell': 'continue'}):
+    planner = Planner(paper_actuator(), Options(
+        flux_density_min=-0.5, flux_density_max=0.5, lead_time=0, **options))
+    plant = ActuatorSimulation(
+        paper_actuator(), slew_limit=options.get('slew_limit', float('inf')))
+    planner.request([(1.1, 44 * millisecond), (0.9, 88 * millisecond)], None, 0)
+    for now in range(0, 120 * millisecond, millisecond):
+        if now == 3 * millisecond:
+            planner.setpoint(1.3, now)
+        if now == 5 * millisecond:
+            planner.stop(now)
+        for level in planner.due(now):
+            plant.command(level.stamp, level.flux_density)
+        plant.advance(now)
+print(json.dumps([before, signatures()]))
+'''
+
+
+def test_after_the_warm_up_no_kernel_is_compiled_for_another_type_of_argument():
+    done = subprocess.run(
+        [sys.executable, '-c', PROGRAM], capture_output=True, text=True, check=True)
+    before, after = json.loads(done.stdout)
+    assert before['two_step'] == before['advance'] == before['trajectory'] == 1
+    assert after == before
