@@ -4,7 +4,7 @@ import json
 import subprocess
 import sys
 
-PROGRAM = '''
+PROGRAM = """
 import json
 from hmsa_ros.core import kernels
 from hmsa_ros.core.parameters import paper_actuator
@@ -38,7 +38,7 @@ for options in (
             plant.command(level.stamp, level.flux_density)
         plant.advance(now)
 print(json.dumps([before, signatures()]))
-'''
+"""
 
 
 def test_after_the_warm_up_no_kernel_is_compiled_for_another_type_of_argument():
