@@ -1,0 +1,122 @@
+"""
+Measure speed and accuracy.
+
+    python -m benchmarks [planner|plant|recorder ...] [--quick] [--json FILE] [--markdown FILE]
+
+Without a name all are run; the recorder's takes some minutes.
+"""
+
+import argparse
+import importlib.util
+import json
+from pathlib import Path
+import sys
+import tempfile
+from typing import Any
+
+from rich.console import Console
+
+from benchmarks.measure import machine, Report
+
+# Of a table that goes to a file.
+_WIDTH = 120
+
+NAMES = ('planner', 'plant', 'recorder')
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """
+    Run benchmarks and print their tables.
+
+    Parameters
+    ----------
+    arguments : list of str, optional
+        Default those of the command line.
+
+    Returns
+    -------
+    int
+        Exit status: 0, or that of the recorder's benchmark.
+
+    """
+    parser = argparse.ArgumentParser(
+        prog='python -m benchmarks', description='Measure speed and accuracy.')
+    parser.add_argument('names', nargs='*', metavar='NAME',
+                        help=f'{", ".join(NAMES)}; default all')
+    parser.add_argument('--quick', action='store_true',
+                        help='little of everything: shows that it runs, not how fast')
+    parser.add_argument('--json', type=Path, metavar='FILE', help='write all figures to a file')
+    parser.add_argument('--markdown', type=Path, metavar='FILE', help='write the tables to a file')
+    options = parser.parse_args(arguments)
+    names = options.names or NAMES
+    for name in names:
+        if name not in NAMES:
+            parser.error(f'there is no benchmark {name!r}: expected {", ".join(NAMES)}')
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=_WIDTH)
+    host = machine()
+    where = (f'{host["processor"]}, {host["cores"]} cores, Python {host["python"]}, Numba '
+             f'{host["numba"]}, SciPy {host["scipy"]}; load average {host["load_average"]:.1f} '
+             'at the start')
+    console.print(where)
+    if host['load_average'] > 0.5:
+        console.print('Other processes are running: trust the ratios, least times above all.')
+    reports: list[Report] = []
+    remarks: list[str] = []
+    record: dict[str, Any] = {'machine': host}
+    status = 0
+
+    def add(report: Report) -> None:
+        report.show(console)
+        reports.append(report)
+        record[report.key] = report.record()
+
+    if 'planner' in names:
+        from benchmarks import bench_planner
+
+        add(bench_planner.compare(quick=options.quick))
+        for line in bench_planner.summary(reports[-1]):
+            console.print(line)
+            remarks.append(line)
+        add(bench_planner.choices(quick=options.quick))
+        add(bench_planner.start_up(quick=options.quick))
+    if 'plant' in names:
+        from benchmarks import bench_plant
+
+        add(bench_plant.compare(quick=options.quick))
+    if 'recorder' in names:
+        status = _recorder(options.quick, record)
+    if options.json:
+        options.json.write_text(json.dumps(record, indent=2) + '\n', encoding='utf-8')
+    if options.markdown:
+        pages = [where + '.', '', *(f'* {x}' for x in remarks), '',
+                 *(report.markdown() for report in reports)]
+        options.markdown.write_text('\n'.join(pages), encoding='utf-8')
+    return status
+
+
+def _recorder(quick: bool, record: dict[str, Any]) -> int:
+    """Run the recorder's benchmark, a program of its own, where ROS 2 is installed."""
+    if importlib.util.find_spec('rclpy') is None:
+        print('recorder: ROS 2 (rclpy) is not installed')
+        return 0
+    from benchmarks import bench_recorder
+
+    before = sys.argv
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / 'recorder.json'
+        sys.argv = [bench_recorder.__file__, '--json', str(file)]
+        if quick:
+            sys.argv += ['--seconds', '2', '--search-seconds', '1']
+        try:
+            status = bench_recorder.main()
+        finally:
+            sys.argv = before
+        if file.exists():
+            record['recorder'] = json.loads(file.read_text(encoding='utf-8'))
+    return int(status)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

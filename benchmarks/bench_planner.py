@@ -1,0 +1,351 @@
+"""
+The two-step command: this package against what else would compute it.
+
+All solve the same nine moves, the paper's steps up and down in stretch and what lies between.
+Errors are those of beta_p against solutions in 40-digit arithmetic (`benchmarks.reference`).
+Where a contender has a tolerance of its own, the loosest one is taken that keeps the error
+below a limit, so that times compare at equal accuracy.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+import os
+from pathlib import Path
+import statistics
+import subprocess
+import sys
+import tempfile
+from time import perf_counter
+
+import numba
+import numpy as np
+
+from benchmarks import contenders
+from benchmarks.measure import Contender, loosest, race, Report, Row, stopwatch
+from benchmarks.reference import Actuator, two_step
+from hmsa_ros.core import kernels
+from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.core.two_step import HOLD_TOLERANCE, plan_two_step, plan_two_step_batch
+
+MOVES = [(1.0, 1.1), (1.1, 1.2), (1.2, 1.4), (1.0, 0.9), (0.9, 0.8), (0.8, 0.7), (1.0, 0.85),
+         (0.85, 0.7), (0.7, 0.85)]
+ACTUATOR = Actuator(zeta=0.2, j_lim=5.0, c1=2.0)
+MATERIAL = NondimensionalParameters(zeta=0.2, j_lim=5.0, c1=2.0)
+#: Error that contenders have to keep.
+LIMIT = 1e-10
+#: The cheapest that keeps it.
+POLYNOMIALS = contenders.Collocation(elements=2, degree=7)
+#: Tolerance of the first pass, as in the kernel.
+COARSE = kernels._COARSE
+NOT_INSTALLED = 'not installed'
+ROOT = Path(__file__).resolve().parent.parent
+
+Loads = Callable[[], list[float]]
+
+
+class Reference:
+    """The nine loads beta_p, to more digits than a double has."""
+
+    def __init__(self) -> None:
+        """Solve."""
+        self._loads = [two_step(start, target, ACTUATOR)[0] for start, target in MOVES]
+
+    def error(self, loads: list[float]) -> float:
+        """
+        Compare loads.
+
+        Parameters
+        ----------
+        loads : list of float
+            beta_p of each move.
+
+        Returns
+        -------
+        float
+            Largest relative error.
+
+        """
+        return max(
+            float(abs(type(exact)(load) / exact - 1))
+            for load, exact in zip(loads, self._loads, strict=True))
+
+
+def _all(solve: contenders.Solver) -> Loads:
+    return lambda: [solve(start, target)[0] for start, target in MOVES]
+
+
+def _contender(
+        name: str, setting: str, solve: contenders.Solver, reference: Reference) -> Contender:
+    loads = _all(solve)
+    return Contender(
+        name, setting, stopwatch(loads, len(MOVES)), reference.error(loads()))
+
+
+def _ours(reference: Reference) -> list[Contender]:
+    def public(rtol: float) -> contenders.Solver:
+        def solve(start: float, target: float) -> tuple[float, float]:
+            plan = plan_two_step(start, target, MATERIAL, rtol=rtol)
+            return plan.beta_p, plan.tau_p
+        return solve
+
+    def bare(rtol: float) -> contenders.Solver:
+        work = kernels.work_space()
+
+        def solve(start: float, target: float) -> tuple[float, float]:
+            return kernels.two_step(
+                work, start, 0.0, target, 0.2, 2.0, 0.2, -np.inf, np.inf, rtol,
+                HOLD_TOLERANCE)[1:3]
+        return solve
+
+    return [
+        _contender(name, f'rtol {rtol:g}', make(rtol), reference)
+        for make, name in ((public, 'plan_two_step'), (bare, 'its kernel alone'))
+        for rtol in (1e-10, 1e-12)]
+
+
+def _batches(reference: Reference, copies: int) -> list[Contender]:
+    """Time the batch function on one thread and on all."""
+    start, target = np.tile(np.array(MOVES), (copies, 1)).T
+    found = []
+    for rtol in (1e-10, 1e-12):
+        for threads in sorted({1, numba.config.NUMBA_NUM_THREADS}):
+            def work(rtol: float = rtol, threads: int = threads) -> np.ndarray:
+                numba.set_num_threads(threads)
+                return plan_two_step_batch(start, target, rtol=rtol).beta_p
+
+            loads = [float(x) for x in work()[:len(MOVES)]]
+            found.append(Contender(
+                f'plan_two_step_batch, {_threads(threads)}', f'rtol {rtol:g}',
+                stopwatch(work, start.size), reference.error(loads)))
+    return found
+
+
+def _threads(count: int) -> str:
+    return '1 thread' if count == 1 else f'{count} threads'
+
+
+def _external(
+        name: str, program: contenders.External, reference: Reference, repeats: int,
+        limit: float, *, start: float = 1e-8) -> Contender:
+    """Time a program at the loosest tolerance that keeps an error."""
+    errors: dict[float, float] = {}
+
+    def error(tolerance: float) -> float:
+        errors[tolerance] = reference.error(program.run(tolerance, 1)[0])
+        return errors[tolerance]
+
+    tolerance = loosest(error, limit, start=start)
+
+    def clock() -> tuple[float, float]:
+        return program.run(tolerance, repeats)[1:]
+
+    return Contender(name, f'tolerance {tolerance:.0e}', clock, errors[tolerance])
+
+
+def _c_programs(
+        directory: Path, reference: Reference, repeats: int, ours: float
+) -> list[Contender]:
+    found = []
+    for limit in sorted({LIMIT, ours}, reverse=True):
+        for name, options in (
+                ('C -O2, plainly written', []),
+                ("C -O2, this package's choices", ['-DGUESS=2', f'-DCOARSE={COARSE}'])):
+            program = contenders.compile_c(directory, f'c{len(found)}', options)
+            found.append(_external(
+                name, contenders.External([str(program)], ACTUATOR, MOVES), reference, repeats,
+                limit))
+    return found
+
+
+def compare(*, quick: bool = False) -> Report:
+    """
+    Measure all that is there.
+
+    Parameters
+    ----------
+    quick : bool
+        Little of everything: shows that it runs, not how fast.
+
+    Returns
+    -------
+    Report
+        Times per plan.
+
+    """
+    rounds = 1 if quick else 15
+    reference = Reference()
+    rows: list[Row] = []
+    entries = _ours(reference) + _batches(reference, 10 if quick else 400)
+    ours = entries[0].error
+    missing = []
+    with tempfile.TemporaryDirectory() as folder:
+        if contenders.compiler():
+            entries += _c_programs(Path(folder), reference, 10 if quick else 1000, ours)
+        else:
+            missing.append('C')
+        for name, make in (('CasADi, collocation, Newton', contenders.with_rootfinder),
+                           ('CasADi, collocation, IPOPT', contenders.with_ipopt)):
+            solve = make(ACTUATOR, POLYNOMIALS)
+            if solve is None:
+                missing.append(name)
+            else:
+                entries.append(_contender(
+                    name, f'{POLYNOMIALS.elements} elements, degree {POLYNOMIALS.degree}',
+                    solve, reference))
+        tolerance = loosest(
+            lambda x: reference.error(_all(contenders.with_scipy(ACTUATOR, x))()), LIMIT,
+            start=1e-10)
+        entries.append(_contender(
+            'SciPy, DOP853 and brentq', f'tolerance {tolerance:.0e}',
+            contenders.with_scipy(ACTUATOR, tolerance), reference))
+        rows += race(entries, rounds)
+        if contenders.octave() is None:
+            missing.append('GNU Octave, ode45 and fzero')
+        elif quick:
+            rows.append(Row('GNU Octave, ode45 and fzero', note='left out: takes a minute'))
+        else:
+            program = contenders.External(
+                [contenders.octave() or '', str(contenders.HERE / 'two_step.m')], ACTUATOR,
+                MOVES)
+            rows += race([_external(
+                'GNU Octave, ode45 and fzero', program, reference, 2, LIMIT, start=1e-10)], 1)
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    rows += [Row(name, note=NOT_INSTALLED) for name in missing]
+    return Report(
+        'planner', 'Two-step plans: nine moves, zeta 0.2, J_lim 5, c1 2', 'time per plan',
+        'error in beta_p', rows)
+
+
+def summary(report: Report) -> list[str]:
+    """
+    Say what the table holds about the batch function.
+
+    Parameters
+    ----------
+    report : Report
+        Of `compare`.
+
+    Returns
+    -------
+    list of str
+        Lines.
+
+    """
+    lines = []
+    batches = [x for x in report.rows if x.name.startswith('plan_two_step_batch')]
+    for one in (x for x in batches if x.name.endswith('1 thread')):
+        lines.append(f'batch, {one.setting}, 1 thread: {1.0 / one.least:,.0f} plans/s')
+        for row in batches:
+            if row.setting == one.setting and row is not one:
+                threads = int(row.name.split()[-2])
+                share = 100.0 * one.least / (threads * row.least)
+                lines.append(
+                    f'batch, {row.setting}, {threads} threads: {1.0 / row.least:,.0f} plans/s, '
+                    f'{share:.0f} % of {threads} times one thread')
+    return lines
+
+
+# What each choice in the kernel is worth, shown in the C program, which has switches for them.
+_GUESSES = (('half way', '0'), ('undamped energy', '1'), ('energy and damping', '2'))
+CHOICES = [
+    *((f'guess: {guess}', [f'-DGUESS={key}', *option], passes)
+      for guess, key in reversed(_GUESSES)
+      for option, passes in (
+          ([], 'all passes fine'), (['-DCOARSE=1e-7'], 'first at 1e-7'),
+          (['-DCOARSE=1e-5'], 'first at 1e-5'))),
+    *((f'guess: {guess}; secant', [f'-DGUESS={key}', '-DSECANT'], 'all passes fine')
+      for guess, key in reversed(_GUESSES)),
+]
+
+
+def choices(*, quick: bool = False) -> Report:
+    """
+    Measure what guess, derivatives and coarse passes do, in C.
+
+    Parameters
+    ----------
+    quick : bool
+        Little of everything.
+
+    Returns
+    -------
+    Report
+        Times per plan, each at the loosest tolerance that keeps the error.
+
+    """
+    title = 'What the choices are worth, in the C program; error below 1e-11'
+    if contenders.compiler() is None:
+        return Report('choices', title, 'time per plan', 'error in beta_p',
+                      [Row('C', note=NOT_INSTALLED)])
+    reference = Reference()
+    with tempfile.TemporaryDirectory() as folder:
+        entries = []
+        for number, (name, options, passes) in enumerate(CHOICES[:2] if quick else CHOICES):
+            program = contenders.compile_c(Path(folder), f'c{number}', options)
+            entry = _external(
+                name, contenders.External([str(program)], ACTUATOR, MOVES), reference,
+                10 if quick else 1000, 1e-11)
+            entries.append(replace(entry, setting=passes))
+        rows = race(entries, 1 if quick else 10)
+    return Report('choices', title, 'time per plan', 'error in beta_p', rows)
+
+
+_FIRST = (
+    'from time import perf_counter; begin = perf_counter()\n'
+    'from hmsa_ros.core.parameters import NondimensionalParameters\n'
+    'from hmsa_ros.core.two_step import plan_two_step\n'
+    'imported = perf_counter()\n'
+    'plan_two_step(1.0, 1.1, NondimensionalParameters())\n'
+    'print(imported - begin, perf_counter() - imported)\n')
+
+
+def _children() -> float:
+    times = os.times()
+    return times.children_user + times.children_system
+
+
+def _process(code: list[str], cache: str | None = None) -> list[float]:
+    """Return time from start to end and processor time of Python, and the numbers it prints."""
+    environment = dict(os.environ)
+    if cache is not None:
+        environment['NUMBA_CACHE_DIR'] = cache
+    before = _children()
+    begin = perf_counter()
+    done = subprocess.run(
+        [sys.executable, *code], cwd=ROOT, env=environment, check=True, capture_output=True,
+        text=True, timeout=600.0)
+    span = perf_counter() - begin
+    printed = [float(x) for x in done.stdout.split() if x.replace('.', '', 1).isdigit()]
+    return [span, _children() - before, *printed]
+
+
+def start_up(*, quick: bool = False) -> Report:
+    """
+    Measure the first plan of a new process, with the compiled kernels cached and without.
+
+    Parameters
+    ----------
+    quick : bool
+        Little of everything, and no compilation.
+
+    Returns
+    -------
+    Report
+        Times of a process.
+
+    """
+    _process(['-c', _FIRST])
+    runs = [_process(['-c', _FIRST]) for _ in range(1 if quick else 9)]
+    names = ('new process, first plan, from start to end', 'of that, processor time',
+             'of that, importing', 'of that, the first plan')
+    rows = [Row(name, '', min(times), statistics.median(times))
+            for name, times in zip(names, zip(*runs, strict=True), strict=True)]
+    if not quick:
+        for name, code, part in (
+                ('without cache: the first plan', ['-c', _FIRST], 3),
+                ('without cache: all kernels, with the warm-up command',
+                 ['-m', 'hmsa_ros.core.warmup'], 0)):
+            with tempfile.TemporaryDirectory() as cache:
+                time = _process(code, cache)[part]
+            rows.append(Row(name, '', time, time))
+    return Report('start', 'Start', 'time', 'error', rows)

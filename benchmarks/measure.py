@@ -1,0 +1,303 @@
+"""Timing of several things side by side, and their table."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+import os
+import platform
+import statistics
+from time import perf_counter
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+# Headings of columns that hold no numbers.
+_TEXT = ('', 'setting', 'remark')
+
+Clock = Callable[[], tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Row:
+    """
+    One measured line of a table.
+
+    Attributes
+    ----------
+    name : str
+        What was measured.
+    setting : str
+        Its tolerance or what else was set.
+    least, median : float or None
+        Seconds for one unit of work; None where it could not be measured.
+    error : float or None
+        Largest error.
+    note : str
+        What else is to be said.
+
+    """
+
+    name: str
+    setting: str = ''
+    least: float | None = None
+    median: float | None = None
+    error: float | None = None
+    note: str = ''
+
+
+@dataclass(frozen=True)
+class Contender:
+    """
+    Something to be timed.
+
+    Attributes
+    ----------
+    name : str
+        What it is.
+    setting : str
+        Its tolerance or what else was set.
+    clock : callable
+        Runs for a while; returns the least and the median seconds for one unit of work.
+    error : float
+        Its largest error.
+
+    """
+
+    name: str
+    setting: str
+    clock: Clock
+    error: float
+
+
+def stopwatch(work: Callable[[], object], units: float, *, least: float = 0.1) -> Clock:
+    """
+    Make a clock of a function.
+
+    Parameters
+    ----------
+    work : callable
+        Called again and again.
+    units : float
+        Units of work that one call does.
+    least : float
+        Seconds that one run of the clock takes at least; one call is made at least.
+
+    Returns
+    -------
+    callable
+        For a `Contender`.
+
+    """
+    def clock() -> tuple[float, float]:
+        spans = []
+        end = perf_counter() + least
+        while not spans or perf_counter() < end:
+            begin = perf_counter()
+            work()
+            spans.append((perf_counter() - begin) / units)
+        return min(spans), statistics.median(spans)
+
+    return clock
+
+
+def race(contenders: Sequence[Contender], rounds: int) -> list[Row]:
+    """
+    Time contenders by turns, so that what disturbs the machine meets all of them.
+
+    Parameters
+    ----------
+    contenders : sequence of Contender
+        In the order of the table.
+    rounds : int
+        How many turns each gets, at least 1.
+
+    Returns
+    -------
+    list of Row
+        Least of all turns and median of their medians.
+
+    """
+    turns: list[list[tuple[float, float]]] = [[] for _ in contenders]
+    for _ in range(rounds):
+        for contender, times in zip(contenders, turns, strict=True):
+            times.append(contender.clock())
+    return [
+        Row(x.name, x.setting, min(t[0] for t in times),
+            statistics.median(t[1] for t in times), x.error)
+        for x, times in zip(contenders, turns, strict=True)]
+
+
+def loosest(
+        errors: Callable[[float], float], limit: float, *, start: float = 1e-6,
+        end: float = 1e-14) -> float:
+    """
+    Find the loosest tolerance that keeps an error.
+
+    Parameters
+    ----------
+    errors : callable
+        Error by tolerance; NaN where it fails.
+    limit : float
+        Error to keep.
+    start, end : float
+        Tolerances to try between, three a decade.
+
+    Returns
+    -------
+    float
+        Tolerance.
+
+    Raises
+    ------
+    ArithmeticError
+        If none keeps the error.
+
+    """
+    tolerance = start
+    while tolerance >= 0.99 * end:
+        if errors(tolerance) <= limit:
+            return tolerance
+        tolerance *= 10.0 ** (-1.0 / 3.0)
+    raise ArithmeticError(f'no tolerance down to {end:g} keeps an error of {limit:g}')
+
+
+def text_of_time(seconds: float | None) -> str:
+    """
+    Return a time with a unit that suits it.
+
+    Parameters
+    ----------
+    seconds : float or None
+        None for not measured.
+
+    Returns
+    -------
+    str
+        Three digits.
+
+    """
+    if seconds is None:
+        return '-'
+    for factor, unit in ((1.0, 's'), (1e3, 'ms'), (1e6, 'us')):
+        if seconds * factor >= 1.0:
+            return f'{seconds * factor:.3g} {unit}'
+    return f'{seconds * 1e9:.3g} ns'
+
+
+@dataclass(frozen=True)
+class Report:
+    """
+    A table of rows.
+
+    Attributes
+    ----------
+    key : str
+        Name in the JSON file.
+    title : str
+        What is compared.
+    unit : str
+        Heading of the times.
+    error : str
+        Heading of the errors.
+    rows : list of Row
+        The first one is what the others are compared to.
+
+    """
+
+    key: str
+    title: str
+    unit: str
+    error: str
+    rows: list[Row]
+
+    def _cells(self) -> tuple[list[str], list[list[str]]]:
+        head = ['', 'setting', self.unit, 'median', 'ratio', self.error, 'remark']
+        base = self.rows[0].least
+        body = []
+        for row in self.rows:
+            ratio = '-'
+            if row.least is not None and base is not None:
+                ratio = f'{row.least / base:.3g}'
+                if row.least / base >= 1000.0:
+                    ratio = f'{row.least / base:,.0f}'
+            error = '-' if row.error is None else f'{row.error:.1e}'
+            body.append([
+                row.name, row.setting, text_of_time(row.least), text_of_time(row.median), ratio,
+                error, row.note])
+        # A column that says nothing is left out.
+        used = [i for i in range(len(head))
+                if i == 0 or any(cells[i] not in ('', '-') for cells in body)]
+        return [head[i] for i in used], [[cells[i] for i in used] for cells in body]
+
+    def show(self, console: Console) -> None:
+        """
+        Print the table.
+
+        Parameters
+        ----------
+        console : Console
+            Where to.
+
+        """
+        head, body = self._cells()
+        table = Table(title=self.title, title_justify='left')
+        for name in head:
+            table.add_column(name, justify='left' if name in _TEXT else 'right')
+        for cells in body:
+            table.add_row(*cells)
+        console.print(table)
+
+    def markdown(self) -> str:
+        """
+        Return the table for a page of the documentation.
+
+        Returns
+        -------
+        str
+            Title and table.
+
+        """
+        head, body = self._cells()
+        rule = ['---' if name in _TEXT else '--:' for name in head]
+        lines = ['| ' + ' | '.join(cells) + ' |' for cells in [head, rule, *body]]
+        return '\n'.join([f'**{self.title}**', '', *lines, ''])
+
+    def record(self) -> dict[str, Any]:
+        """
+        Return the report for a JSON file.
+
+        Returns
+        -------
+        dict
+            Times in seconds.
+
+        """
+        return asdict(self)
+
+
+def machine() -> dict[str, Any]:
+    """
+    Say what it was measured on.
+
+    Returns
+    -------
+    dict
+        Processor, cores, versions and the load average at this moment.
+
+    """
+    import numba
+    import numpy
+    import scipy
+
+    processor = platform.processor() or platform.machine()
+    try:
+        with open('/proc/cpuinfo', encoding='utf-8') as file:
+            names = [x.split(':', 1)[1].strip() for x in file if x.startswith('model name')]
+        processor = names[0] if names else processor
+    except OSError:
+        pass  # Not Linux: the plain name has to do.
+    load = os.getloadavg()[0] if hasattr(os, 'getloadavg') else float('nan')
+    return {
+        'processor': processor, 'cores': os.cpu_count(), 'load_average': load,
+        'python': platform.python_version(), 'numba': numba.__version__,
+        'numpy': numpy.__version__, 'scipy': scipy.__version__}

@@ -1,0 +1,146 @@
+"""The benchmarks run and what they compare is right; how fast it is is not tested."""
+
+from decimal import Decimal
+import importlib.util
+import json
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from benchmarks import __main__ as program
+from benchmarks import bench_planner, bench_plant, contenders
+from benchmarks.measure import Contender, loosest, race, Report, Row, text_of_time
+from benchmarks.reference import Actuator, response, two_step
+
+ACTUATOR = Actuator(zeta=0.2, j_lim=5.0, c1=2.0)
+
+
+def energy(stretch, j_lim):
+    return -j_lim / 2 * (1 - (2 / stretch + stretch ** 2 - 3) / j_lim).ln()
+
+
+@pytest.mark.parametrize(('start', 'target'), [(1.0, 1.1), (1.2, 1.4), (0.9, 0.7)])
+def test_reference_agrees_with_the_energy_balance_without_damping(start, target):
+    load, _ = two_step(start, target, Actuator(zeta=0.0))
+    j_lim = Decimal(5)
+    exact = (energy(Decimal(target), j_lim) - energy(Decimal(start), j_lim)) / (
+        Decimal(target) - Decimal(start))
+    assert abs(load / exact - 1) < Decimal('1e-24')
+
+
+def test_reference_agrees_with_scipy_on_the_damped_response():
+    loads = [contenders.holding_load(1.3, 5.0), contenders.holding_load(0.8, 5.0)]
+    times = [0.5, 1.0, 1.7, 2.0, 3.1]
+    found = response([0.0, 1.7], loads, times, 1.1, ACTUATOR)
+    state = [1.1, 0.0]
+    expected = []
+    for load, samples, begin in ((loads[0], times[:3], 0.0), (loads[1], times[3:], 1.7)):
+        solution = solve_ivp(
+            lambda _, y, load=load: (y[1], contenders.acceleration(*y, load, ACTUATOR)),
+            (begin, samples[-1]), state, method='DOP853', t_eval=samples, rtol=1e-13,
+            atol=1e-13)
+        expected += list(solution.y[0])
+        state = solution.y[:, -1]
+    np.testing.assert_allclose([float(x) for x in found], expected, rtol=0.0, atol=1e-11)
+
+
+def test_reference_gives_up_where_the_load_never_turns():
+    with pytest.raises(ArithmeticError, match='no turning point'):
+        two_step(1.0, 1.1, Actuator(zeta=20.0))
+
+
+@pytest.mark.parametrize('options', [
+    [], ['-DSECANT'], ['-DGUESS=0'], ['-DGUESS=2', '-DCOARSE=1e-5'],
+    ['-DGUESS=2', '-DCOARSE=1e-7']], ids=' '.join)
+def test_c_program_solves_the_moves_with_every_choice(options, tmp_path):
+    if contenders.compiler() is None:
+        pytest.skip('no C compiler')
+    file = contenders.compile_c(tmp_path, 'two_step', options)
+    loads, least, median = contenders.External(
+        [str(file)], ACTUATOR, bench_planner.MOVES).run(1e-13, 3)
+    assert bench_planner.Reference().error(loads) < 1e-12
+    assert 0.0 < least <= median
+
+
+@pytest.mark.parametrize('make', [contenders.with_rootfinder, contenders.with_ipopt])
+def test_collocation_solves_the_moves(make):
+    solve = make(ACTUATOR, contenders.Collocation(elements=2, degree=9))
+    if solve is None:
+        pytest.skip('no CasADi')
+    loads = [solve(*move)[0] for move in bench_planner.MOVES]
+    assert bench_planner.Reference().error(loads) < 1e-11
+
+
+@pytest.mark.slow
+def test_quick_run_prints_and_writes_what_it_measured(tmp_path, capsys):
+    file, page = tmp_path / 'figures.json', tmp_path / 'tables.md'
+    assert program.main(
+        ['planner', 'plant', '--quick', '--json', str(file), '--markdown', str(page)]) == 0
+    printed = capsys.readouterr().out
+    record = json.loads(file.read_text())
+    planner = {(x['name'], x['setting']): x for x in record['planner']['rows']}
+    for row in planner.values():
+        assert row['note'] or row['error'] < bench_planner.LIMIT
+        assert row['note'] or 0.0 < row['least'] <= row['median']
+    assert ('plan_two_step', 'rtol 1e-10') in planner
+    if importlib.util.find_spec('casadi') is None:
+        assert planner['CasADi, collocation, IPOPT', '']['note'] == 'not installed'
+    assert all(x['error'] <= bench_plant.LIMIT for x in record['plant']['rows'])
+    assert len(record['start']['rows']) == 4
+    for report in ('planner', 'plant', 'start', 'choices'):
+        assert record[report]['title'] in page.read_text()
+        assert record[report]['title'] in printed
+
+
+def test_unknown_benchmark_is_refused_in_one_line(capsys):
+    with pytest.raises(SystemExit) as error:
+        program.main(['plan'])
+    assert error.value.code == 2
+    assert "no benchmark 'plan'" in capsys.readouterr().err
+
+
+def test_race_takes_turns_and_keeps_the_least():
+    turns = []
+
+    def clock(name, times):
+        def run():
+            turns.append(name)
+            return times.pop(0)
+        return run
+
+    rows = race([
+        Contender('a', '', clock('a', [(2.0, 3.0), (1.0, 4.0), (5.0, 9.0)]), 0.0),
+        Contender('b', '', clock('b', [(7.0, 8.0)] * 3), 0.0)], 3)
+    assert turns == ['a', 'b'] * 3
+    assert [(x.least, x.median) for x in rows] == [(1.0, 4.0), (7.0, 8.0)]
+
+
+def test_loosest_tolerance_keeps_the_error_and_the_next_one_does_not():
+    tolerance = loosest(lambda x: 3.0 * x, 1e-9)
+    assert 3.0 * tolerance <= 1e-9 < 3.0 * tolerance * 10.0 ** (1.0 / 3.0)
+
+
+def test_loosest_tolerance_says_when_there_is_none():
+    with pytest.raises(ArithmeticError, match='no tolerance'):
+        loosest(lambda _: math.nan, 1e-9)
+
+
+def test_table_compares_to_its_first_row_and_leaves_empty_columns_out():
+    report = Report('x', 'Title', 'time', 'error', [
+        Row('ours', 'fine', 2e-6, 3e-6), Row('theirs', 'coarse', 5e-3, 6e-3),
+        Row('other', note='not installed')])
+    assert report.markdown().splitlines() == [
+        '**Title**', '',
+        '|  | setting | time | median | ratio | remark |',
+        '| --- | --- | --: | --: | --: | --- |',
+        '| ours | fine | 2 us | 3 us | 1 |  |',
+        '| theirs | coarse | 5 ms | 6 ms | 2,500 |  |',
+        '| other |  | - | - | - | not installed |']
+
+
+@pytest.mark.parametrize(('seconds', 'text'), [
+    (None, '-'), (1.5, '1.5 s'), (0.0123, '12.3 ms'), (7.61e-6, '7.61 us'), (3e-8, '30 ns')])
+def test_times_are_written_with_a_unit_that_suits_them(seconds, text):
+    assert text_of_time(seconds) == text
