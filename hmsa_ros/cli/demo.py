@@ -97,7 +97,7 @@ def _print_table(result: 'DemoResult') -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(box=SIMPLE, caption=(
+    table = Table(box=SIMPLE, collapse_padding=True, pad_edge=False, caption=(
         'b and tau nondimensional as in the paper; residual: peak-to-peak stretch after '
         'arrival, share of the step; unshaped: simulated on the same plant'))
     for name in ('target', 'b_p', 'tau_p', 'b_1', 'arrival ms', 'residual', 'unshaped'):
