@@ -239,6 +239,11 @@ class _ReadAhead:
                 self._condition.notify_all()
             yield from batch
 
+    def wait(self) -> None:
+        """Wait for the first messages, or the end if there are none."""
+        with self._condition:
+            self._condition.wait_for(lambda: self._batches or self._ended)
+
     def stop(self) -> None:
         """Read no further."""
         with self._condition:
@@ -444,14 +449,16 @@ class Player(Node):
     def _play(self, start: int) -> bool:
         """Play from a time on; return whether the end was reached."""
         while True:
-            self._send_latched(start)
-            with self._change:
-                self._position = start
-                self._anchor = (start, time.monotonic())
             source = _ReadAhead(
                 self._reader.messages(self._out.keys(), start=start, end=self._end + 1),
                 self._values['play.read_ahead_queue_size'])
             try:
+                self._send_latched(start)
+                # Time runs from when there is something to send.
+                source.wait()
+                with self._change:
+                    self._position = start
+                    self._anchor = (start, time.monotonic())
                 outcome = self._send_all(source, start)
             finally:
                 source.stop()
