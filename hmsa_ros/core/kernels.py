@@ -48,7 +48,7 @@ _MAX_STEPS = 200_000
 _MAX_TURN_STEPS = 20_000
 _MAX_ITERATIONS = 80
 _COARSE = 1e-5
-# Closer to a limiting stretch than rounding lets this tolerance be kept, motion is not followed.
+# Closer to a limiting stretch than rounding lets this tolerance be kept, motion is not resolved.
 _RESOLVED = 1e-8
 _FARTHEST = 1e3
 _NEWTON_PASSES = 8
@@ -236,8 +236,9 @@ def advance(k, l, v, s, r, beta, slope, p, q, duration, zeta, c1, i_j, rtol, h):
     """
     Integrate over a duration under the load ``beta + slope t``.
 
-    ``h`` is the step length to begin with, 0 for none known. Returns status, state,
-    sensitivities and the step length to go on with.
+    ``h`` is the step length to begin with, 0 for none known. Motion that meets a limiting
+    stretch too hard to be resolved turns there, in no time and without loss. Returns status,
+    state, sensitivities and the step length to go on with.
     """
     if h <= 0.0:
         h = _first_step(l, v, beta, zeta, c1, i_j, rtol)
@@ -248,6 +249,8 @@ def advance(k, l, v, s, r, beta, slope, p, q, duration, zeta, c1, i_j, rtol, h):
             return DONE, l, v, s, r, h
         step = min(h, left)
         rate = math.sqrt(elastic_stiffness(l, i_j) / ((l ** -3 + c1) / 6.0))
+        if _attainable(0.0, l, v, rate) > _RESOLVED and v * (l - 1.0) > 0.0:
+            v, s, r = -v, -s, -r
         new_l, new_v, new_s, new_r, error = _step(
             k, l, v, s, r, beta + slope * done, slope, p + q * done, q, step, zeta, c1, i_j,
             _attainable(rtol, l, v, rate))
