@@ -45,7 +45,7 @@ def add_parser(subparsers: Any) -> None:
         help='shape 2 H^2/L^2, above 0 (default 2)')
     parser.add_argument(
         '--shaper', default='two_step', metavar='NAME',
-        help='two_step or step (default two_step)')
+        help='two_step (default), robust, minimum_time, step, zv, zvd or ei')
     parser.add_argument('--json', action='store_true', help='print JSON in full precision')
     parser.set_defaults(run=run)
 

@@ -172,6 +172,7 @@ def _durations(
     state, material, target = request.state, request.material, request.target
     i_j = 1.0 / material.j_lim
     constants = (material.zeta, material.c1, i_j)
+    limits = kernels.stretch_limits(i_j)
 
     def follow(start: State, time: float) -> State:
         _, stretch, rate, _, _, _ = kernels.advance(
@@ -185,10 +186,8 @@ def _durations(
         status, time, stretch, _, _ = kernels.turning_point(
             work, start.stretch, start.rate, direction, brake, 1.0, *constants, _RTOL)
         if status != kernels.DONE:
-            raise RefusedError(
-                Code.NOT_CONVERGED,
-                f'the motion towards stretch {target:g} does not come to a stop under '
-                f'{request.units.load_text(brake)}')
+            # Too hard against a limiting stretch to be followed: far beyond the target.
+            return 0.0, limits[1] if direction > 0.0 else limits[0]
         return time, stretch
 
     begin = 0.0

@@ -1,5 +1,6 @@
 """The two-step command, on ideal and on real hardware."""
 
+from collections.abc import Callable, Sequence
 import math
 
 from hmsa_ros.core.moves import Level, Move
@@ -12,6 +13,9 @@ from hmsa_ros.core.two_step import plan_two_step
 # How many later half periods are tried where the first that fits gives no solution.
 _LATER = 6
 _SHORTEST_STRIDE = 0.02
+
+# A command and the time at which it is at rest; None if there is none.
+Attempt = tuple[tuple[Level, ...], float] | None
 
 
 def two_step(request: Request) -> Move:
@@ -81,21 +85,33 @@ def _sampled(request: Request, first: Level, last: Level) -> Move:
     Place the command on the grid: one level, and another for its last period.
 
     The share of the last period that the ideal command spends at beta_1 gives the first guess.
+    Where that is too far off, the solution is followed from the grid that the ideal command
+    fits exactly.
     """
     period = request.delivery.period
     tau_p = last.time
     least = max(2, math.ceil(tau_p / period - 1e-9))
     # Ramps may need a longer move than steps.
     for count in range(least, least + 4):
-        share = min(count - tau_p / period, 1.0)
-        between = Level(
-            (count - 1) * period, first.load + share * (last.load - first.load))
-        levels = (Level(0.0, first.load), between, Level(count * period, last.load))
-        found = solve(
-            Template.of(levels, [('load', 0), ('load', 1)]), request.state, request.load,
-            request.target, request.material, request.delivery.slew)
-        if found is not None and all(
-                request.limits.minimum <= x.load <= request.limits.maximum for x in found[0]):
+        fitting = tau_p / count
+
+        def stretched(
+                levels: tuple[Level, ...], share: float, aim: float, *, count: int = count,
+                fitting: float = fitting) -> Attempt:
+            each = fitting + aim * (period - fitting)
+            late = min(count - tau_p / each, 1.0)
+            between = levels[1].load
+            if share == 0.0:
+                between = first.load + late * (last.load - first.load)
+            guess = (levels[0], Level((count - 1) * each, between),
+                     Level(count * each, last.load))
+            return solve(
+                Template.of(guess, [('load', 0), ('load', 1)]), request.state, request.load,
+                request.target, request.material, request.delivery.slew)
+
+        exact = (first, Level((count - 1) * fitting, first.load), last)
+        found = _follow(exact, stretched)
+        if found is not None and _inside(request, found[0]):
             return Move(Code.TWO_STEP, *found)
     raise RefusedError(
         Code.NO_TWO_STEP,
@@ -116,14 +132,23 @@ def _ramped(request: Request, first: Level, last: Level) -> Move:
     start, change = request.load, last.load - request.load
     decay = abs((last.load - first.load) / (first.load - start)) if first.load != start else 1.0
     least = 1 + 2 * max(0, math.ceil(0.5 * (abs(change) / slew / (2.0 * last.time) - 1.0)))
+
+    def slower(levels: tuple[Level, ...], share: float, aim: float) -> Attempt:
+        # The ramps lengthen about their middles, so that the second one begins earlier.
+        shift = 0.5 * (aim - share) / slew * (
+            abs(levels[0].load - start) - abs(levels[1].load - levels[0].load))
+        guess = (levels[0], Level(levels[1].time + shift, levels[1].load))
+        return solve(
+            Template.of(guess, [('load', 0), ('time', 1)]), request.state, start,
+            request.target, request.material, slew / aim)
+
     for half_periods in range(least, least + 2 * _LATER, 2):
         between = first.load
         if half_periods > 1:
             between = start + change / (1.0 + decay ** half_periods)
         ideal = (Level(0.0, between), Level(half_periods * last.time, last.load))
-        found = _follow_slew(request, ideal, slew)
-        if found is not None and all(
-                request.limits.minimum <= x.load <= request.limits.maximum for x in found[0]):
+        found = _follow(ideal, slower)
+        if found is not None and _inside(request, found[0]):
             return Move(Code.TWO_STEP, *found)
     raise RefusedError(
         Code.SLEW_LIMIT,
@@ -133,24 +158,27 @@ def _ramped(request: Request, first: Level, last: Level) -> Move:
         f'{request.units.time_text(1.0)}')
 
 
-def _follow_slew(
-        request: Request, ideal: tuple[Level, Level],
-        slew: float) -> tuple[tuple[Level, ...], float] | None:
-    """Follow a command for steps to one for ramps, in smaller strides where it must be."""
-    found: tuple[tuple[Level, ...], float] = (ideal, ideal[-1].time)
+def _inside(request: Request, levels: Sequence[Level]) -> bool:
+    return all(
+        request.limits.minimum <= x.load <= request.limits.maximum for x in levels)
+
+
+def _follow(
+        levels: tuple[Level, ...],
+        closer: Callable[[tuple[Level, ...], float, float], Attempt]) -> Attempt:
+    """
+    Follow a command from ideal to real hardware, in smaller strides where it must be.
+
+    ``closer(levels, share, aim)`` solves for the hardware at ``aim`` of the way, from levels
+    that are right at ``share`` of it.
+    """
+    found: Attempt = None
     share, stride = 0.0, 1.0
     while share < 1.0:
         aim = min(1.0, share + stride)
-        levels = found[0]
-        # The ramps lengthen about their middles, so that the second one begins earlier.
-        shift = 0.5 * (aim - share) / slew * (
-            abs(levels[0].load - request.load) - abs(levels[1].load - levels[0].load))
-        guess = (levels[0], Level(levels[1].time + shift, levels[1].load))
-        closer = solve(
-            Template.of(guess, [('load', 0), ('time', 1)]), request.state, request.load,
-            request.target, request.material, slew / aim)
-        if closer is not None:
-            found, share = closer, aim
+        attempt = closer(levels, share, aim)
+        if attempt is not None:
+            found, levels, share = attempt, attempt[0], aim
         elif stride > _SHORTEST_STRIDE:
             stride *= 0.5
         else:
