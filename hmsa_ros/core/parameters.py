@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, fields
 import math
+import sys
 
 from scipy.constants import mu_0
 
@@ -17,7 +18,8 @@ def _check(record: object) -> None:
         if not isinstance(value, (int, float)) or isinstance(value, bool):
             raise BadInputError(f'{field.name} is {value!r}: expected a number')
         zero_allowed = field.name in _ZERO_ALLOWED
-        if not math.isfinite(value) or value < 0.0 or (value == 0.0 and not zero_allowed):
+        # Compared, since a whole number may be too large to convert.
+        if not 0.0 <= value <= sys.float_info.max or (value == 0.0 and not zero_allowed):
             least = 'of at least 0' if zero_allowed else 'greater than 0'
             raise BadInputError(f'{field.name} is {value!r}: expected a finite number {least}')
         object.__setattr__(record, field.name, float(value))
