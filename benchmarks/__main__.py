@@ -1,7 +1,7 @@
 """
 Measure speed and accuracy.
 
-    python -m benchmarks [planner|plant|recorder ...] [--quick] [--json FILE] [--markdown FILE]
+    python -m benchmarks [planner|plant|preemption|recorder ...] [--quick] [--json FILE] [--markdown FILE]
 
 Without a name all are run; the recorder's takes some minutes.
 """
@@ -21,7 +21,7 @@ from benchmarks.measure import machine, Report
 # Of a table that goes to a file.
 _WIDTH = 120
 
-NAMES = ('planner', 'plant', 'recorder')
+NAMES = ('planner', 'plant', 'preemption', 'recorder')
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -85,7 +85,11 @@ def main(arguments: list[str] | None = None) -> int:
         from benchmarks import bench_plant
 
         add(bench_plant.compare(quick=options.quick))
-    if 'recorder' in names:
+    if 'preemption' in names and _has_ros('preemption'):
+        from benchmarks import bench_preemption
+
+        add(bench_preemption.compare(quick=options.quick))
+    if 'recorder' in names and _has_ros('recorder'):
         status = _recorder(options.quick, record)
     if options.json:
         options.json.write_text(json.dumps(record, indent=2) + '\n', encoding='utf-8')
@@ -96,11 +100,16 @@ def main(arguments: list[str] | None = None) -> int:
     return status
 
 
-def _recorder(quick: bool, record: dict[str, Any]) -> int:
-    """Run the recorder's benchmark, a program of its own, where ROS 2 is installed."""
+def _has_ros(name: str) -> bool:
+    """Tell whether ROS 2 is installed, and say so if it is not."""
     if importlib.util.find_spec('rclpy') is None:
-        print('recorder: ROS 2 (rclpy) is not installed')
-        return 0
+        print(f'{name}: ROS 2 (rclpy) is not installed')
+        return False
+    return True
+
+
+def _recorder(quick: bool, record: dict[str, Any]) -> int:
+    """Run the recorder's benchmark, a program of its own."""
     from benchmarks import bench_recorder
 
     before = sys.argv

@@ -1,0 +1,166 @@
+"""
+Pre-emption: from a request that reaches the planner node to its first command.
+
+The actuator is moving all the time: each setpoint comes 3 ms after the last one, when half of
+the move is done, so every plan starts from a moving state. The node's own time is the
+processor's in its callback, which plans, publishes the first command, the plan and the verdict.
+The round trip is by the clock on the wall and adds DDS on this host, in both directions, and the
+executors of two processes.
+"""
+
+import os
+from statistics import median
+import subprocess
+import sys
+from time import monotonic, perf_counter, thread_time
+
+import numpy as np
+
+from benchmarks.measure import Report, Row
+
+MODES = (
+    ('two_step', {}),
+    ('robust', {'shaper': 'robust'}),
+    ('minimum_time', {'shaper': 'minimum_time'}),
+    ('two_step on a grid of 1 ms', {'command_mode': 'sampled'}),
+    ('two_step through ramps of 50 T/s', {'slew_limit': '50.0'}),
+)
+_SPACING_NS = 3_000_000
+_TARGETS = np.random.default_rng(1).uniform(0.8, 1.4, 4096)
+
+
+def compare(*, quick: bool = False) -> Report:
+    """
+    Measure all modes.
+
+    Parameters
+    ----------
+    quick : bool
+        Few requests: shows that it runs, not how fast.
+
+    Returns
+    -------
+    Report
+        The column of times is the 99th percentile.
+
+    """
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    count = 20 if quick else 2000
+    rows = [own_time(name, parameters, count) for name, parameters in MODES]
+    rows.append(round_trip(count // 4))
+    return Report(
+        'preemption', f'Pre-emption of a moving actuator, {count} requests a mode', '99 %', '',
+        rows)
+
+
+def own_time(name: str, parameters: dict[str, str], count: int) -> Row:
+    """
+    Time the node's callback.
+
+    Parameters
+    ----------
+    name : str
+        For the table.
+    parameters : dict of str to str
+        Of the planner.
+    count : int
+        Number of requests.
+
+    Returns
+    -------
+    Row
+        99th percentile, median and largest.
+
+    """
+    import rclpy
+    from rosgraph_msgs.msg import Clock
+    from std_msgs.msg import Float64
+
+    from hmsa_ros.nodes.conversions import to_time
+    from hmsa_ros.nodes.planner import PlannerNode
+
+    words = ['hmsa', '--ros-args', '-p', 'use_sim_time:=true']
+    for key, value in parameters.items():
+        words += ['-p', f'{key}:={value}']
+    rclpy.init(args=words)
+    try:
+        node = PlannerNode()
+        source = node._time_source
+        spans = []
+        for i in range(count):
+            # Simulated time, handed in as /clock would: requests lie 3 ms apart in it.
+            source.clock_callback(Clock(clock=to_time(10**9 + i * _SPACING_NS)))
+            message = Float64(data=float(_TARGETS[i % _TARGETS.size]))
+            begin = thread_time()
+            node._on_setpoint(message)
+            spans.append(thread_time() - begin)
+            node._on_poll()
+        refused = node._refused
+        node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+    return _row(name, "the node's own time", spans, f'; {refused} refused' if refused else '')
+
+
+def round_trip(count: int) -> Row:
+    """
+    Time a setpoint's way to the planner process and its command's way back.
+
+    Parameters
+    ----------
+    count : int
+        Number of requests.
+
+    Returns
+    -------
+    Row
+        99th percentile, median and largest.
+
+    """
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+
+    from hmsa_ros.nodes import interface
+
+    planner = subprocess.Popen([sys.executable, '-m', 'hmsa_ros', 'planner'])
+    rclpy.init(args=[])
+    try:
+        node = rclpy.create_node('preemption')
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        received: list[float] = []
+        command = interface.FLUX_DENSITY_COMMAND
+        node.create_subscription(
+            command.type, command.name, lambda _: received.append(perf_counter()), command.qos)
+        setpoint = interface.SETPOINT
+        publisher = node.create_publisher(
+            setpoint.type, interface.from_outside(setpoint.name, interface.PLANNER),
+            setpoint.qos)
+        deadline = monotonic() + 30.0
+        while publisher.get_subscription_count() == 0 or not node.count_publishers(command.name):
+            executor.spin_once(timeout_sec=0.05)
+            if monotonic() > deadline:
+                raise TimeoutError('the planner has not come up within 30 s')
+        spans = []
+        for i in range(count):
+            received.clear()
+            begin = perf_counter()
+            publisher.publish(setpoint.type(data=float(_TARGETS[i % _TARGETS.size])))
+            deadline = monotonic() + 5.0
+            while not received and monotonic() < deadline:
+                executor.spin_once(timeout_sec=0.05)
+            if received:
+                spans.append(received[0] - begin)
+        executor.shutdown()
+        node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+        planner.terminate()
+        planner.wait()
+    return _row('two_step', 'round trip over DDS, two processes', spans, '')
+
+
+def _row(name: str, setting: str, spans: list[float], more: str) -> Row:
+    return Row(
+        name, setting, float(np.percentile(spans, 99)), median(spans), None,
+        f'largest {1e3 * max(spans):.2f} ms of {len(spans)}{more}')
