@@ -15,6 +15,7 @@ from trajectory_msgs.msg import JointTrajectory
 from hmsa_ros.core.model import equilibrium_stretch
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.planner import Options, PlannedLevel, Planner
+from hmsa_ros.errors import HmsaError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import (
     from_command,
@@ -397,6 +398,21 @@ def test_bad_setpoint_is_refused_with_a_reason_and_the_running_plan_goes_on(
     status = planner.verdict(code, plan=1)
     assert status.level == ERROR
     assert fragment in status.message
+    planner.check()
+
+
+def test_plan_that_cannot_be_computed_is_a_refusal_too(bench, monkeypatch):
+    def fails(*_: Any) -> None:
+        raise HmsaError('the integration ran out of steps')
+
+    planner = bench()
+    planner.request(*SEQUENCE)
+    with monkeypatch.context() as patch:
+        patch.setattr(Planner, 'setpoint', fails)
+        planner.setpoints.publish(Float64(data=1.2))
+        status = planner.verdict('not_converged', plan=1)
+    assert (status.level, status.message) == (ERROR, 'the integration ran out of steps')
+    planner.run(END)
     planner.check()
 
 

@@ -249,7 +249,7 @@ def test_refused_commands_are_counted(leading):
 
 
 def test_load_too_large_to_follow_starts_the_simulation_again_and_is_reported(leading):
-    leading.send((START + 5 * MS, 1e6), (START + 50 * MS, 0.1))
+    leading.send((START + 5 * MS, 1e8), (START + 50 * MS, 0.1))
     leading.run(END)
     assert leading.diagnostics(failed=1).level == DiagnosticStatus.ERROR
     assert leading.samples[-1].position[0] == 1.0

@@ -20,7 +20,7 @@ from hmsa_ros.core.shapers import SHAPERS
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.core.warmup import warm_up
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.nodes import conversions, interface
 from hmsa_ros.nodes.parameters import (
     ACTUATOR,
@@ -149,8 +149,10 @@ class PlannerNode(Node):
                     'simulated time has not started: expected messages on /clock (start the '
                     'simulator, or set use_sim_time to false)')
             taken = plan(now)
-        except BadInputError as error:
-            code = error.code if isinstance(error, RefusedError) else Code.BAD_INPUT
+        except HmsaError as error:
+            code = Code.BAD_INPUT if isinstance(error, BadInputError) else Code.NOT_CONVERGED
+            if isinstance(error, RefusedError):
+                code = error.code
             self._refused += 1
             self._verdict = (DiagnosticStatus.ERROR, str(error), str(code), request)
             self.get_logger().error(f'request refused ({code}): {error}')
