@@ -1,9 +1,10 @@
 """
 Measure speed and accuracy.
 
-    python -m benchmarks [planner|plant|preemption|recorder ...] [--quick] [--json FILE] [--markdown FILE]
+    python -m benchmarks [NAME ...] [--quick] [--json FILE] [--markdown FILE]
 
-Without a name all are run; the recorder's takes some minutes.
+NAME is planner, plant, preemption or recorder; without one all are run. The recorder's takes
+some minutes.
 """
 
 import argparse
