@@ -5,7 +5,8 @@ How exactly a bag is played.
 
 A bag of equally spaced messages is played; for each speed the error of the sending times
 against the bag's own spacing is printed, by the source stamps that the middleware puts on each
-message. The first message is where time is counted from.
+message. The first message is where time is counted from. Before and after, the same is measured
+of a loop that only sleeps: what the machine itself allows at that moment.
 """
 
 import argparse
@@ -63,6 +64,21 @@ def receive():
     rclpy.try_shutdown()
 
 
+def sleep_only(rate, seconds):
+    """Sleep until each time of a grid; return how late each wake-up is."""
+    late, begin = [], time.monotonic()
+    for i in range(round(rate * seconds)):
+        time.sleep(max(0.0, begin + i / rate - time.monotonic()))
+        late.append(time.monotonic() - begin - i / rate)
+    return sorted(late)
+
+
+def figures(errors):
+    """Return median, p99 and largest of sorted errors as text."""
+    return '  '.join(f'{error * 1e3:7.3f} ms' for error in (
+        errors[len(errors) // 2], errors[len(errors) * 99 // 100], errors[-1]))
+
+
 def play(folder, speed):
     """Play a bag at a speed; return the stamps and numbers received."""
     import struct
@@ -95,9 +111,11 @@ def main():
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     sys.path.insert(0, str(ROOT))
     head = (f'{"speed":>6} {"msg/s":>7} {"sent":>7} {"received":>8} {"in order":>8} '
-            f'{"median":>9} {"p99":>9} {"largest":>9}')
+            f'{"median":>10}  {"p99":>10}  {"largest":>10}')
     print(head)
     print('-' * len(head))
+    sleeping = f'{"only sleeping":>14} {"":>24} '
+    print(sleeping + figures(sleep_only(options.rate, options.seconds / 3)))
     good = True
     with tempfile.TemporaryDirectory() as folder:
         bag = Path(folder) / 'bag'
@@ -111,9 +129,9 @@ def main():
             order = numbers == list(range(count))
             p99 = errors[len(errors) * 99 // 100]
             print(f'{speed:6g} {options.rate * speed:7.0f} {count:7} {len(numbers):8} '
-                  f'{"yes" if order else "no":>8} {errors[len(errors) // 2] * 1e3:6.3f} ms '
-                  f'{p99 * 1e3:6.3f} ms {errors[-1] * 1e3:6.3f} ms')
+                  f'{"yes" if order else "no":>8} {figures(errors)}')
             good &= order and (speed != 1.0 or p99 < 1e-3)
+    print(sleeping + figures(sleep_only(options.rate, options.seconds / 3)))
     return 0 if good else 1
 
 
