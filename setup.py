@@ -30,6 +30,7 @@ INSTALL_REQUIRES = [
     'mcap-ros2-support>=0.5',
     'numba>=0.60',
     'numpy>=1.26',
+    'plotly>=5.15',
     'rich>=13.0',
     'scipy>=1.11',
     'zstandard>=0.18',

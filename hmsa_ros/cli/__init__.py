@@ -16,7 +16,7 @@ from hmsa_ros import __version__
 from hmsa_ros.cli.node import NODES
 from hmsa_ros.errors import BadInputError, HmsaError
 
-COMMANDS = ('demo', 'plan', 'send', 'node', 'bag', 'figures', 'robustness', 'sweep')
+COMMANDS = ('demo', 'plan', 'send', 'node', 'bag', 'report', 'figures', 'robustness', 'sweep')
 
 
 class Parser(argparse.ArgumentParser):
@@ -78,9 +78,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         status: int = arguments.run(arguments)
         return status
     except BadInputError as error:
-        return report(error, 2)
+        return complain(error, 2)
     except HmsaError as error:
-        return report(error, 1)
+        return complain(error, 1)
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
@@ -109,7 +109,7 @@ def split_ros_args(words: list[str]) -> list[str]:
     return words
 
 
-def report(error: Exception, status: int) -> int:
+def complain(error: Exception, status: int) -> int:
     """
     Print an error as one line on standard error.
 

@@ -41,6 +41,9 @@ EQUILIBRIUM: dict[str, Any] = {
 #: Width of a picture in inches: two columns of a journal.
 WIDTH = 7.2
 _RESOLUTION = 200
+_METADATA: dict[str, dict[str, Any]] = {
+    'png': {'Software': None},
+    'pdf': {'Creator': None, 'Producer': None, 'CreationDate': None}}
 _SETTINGS: dict[str, Any] = {
     'font.family': 'DejaVu Sans',
     'font.size': 9,
@@ -59,13 +62,17 @@ _SETTINGS: dict[str, Any] = {
     'lines.solid_capstyle': 'round',
     'savefig.dpi': _RESOLUTION,
     'path.simplify': True,
+    # Letters stay letters, which journals ask for.
+    'pdf.fonttype': 42,
 }
 
 
 @contextmanager
-def picture(path: Path, height: float, *, width: float = WIDTH) -> Iterator[Figure]:
+def picture(
+        path: Path, height: float, *, width: float = WIDTH,
+        kind: str = 'png') -> Iterator[Figure]:
     """
-    Draw a picture and write it as PNG.
+    Draw a picture and write it.
 
     Parameters
     ----------
@@ -73,6 +80,8 @@ def picture(path: Path, height: float, *, width: float = WIDTH) -> Iterator[Figu
         File to write; one of that name is replaced.
     height, width : float
         Size in inches.
+    kind : {'png', 'pdf'}
+        Format.
 
     Yields
     ------
@@ -90,8 +99,8 @@ def picture(path: Path, height: float, *, width: float = WIDTH) -> Iterator[Figu
         FigureCanvasAgg(figure)
         yield figure
         try:
-            # Without the entry that names matplotlib's version.
-            figure.savefig(path, format='png', metadata={'Software': None})
+            # Without the entries that name matplotlib's version and the time.
+            figure.savefig(path, format=kind, metadata=_METADATA[kind])
         except OSError as error:
             raise unwritable(path, error) from error
 

@@ -16,16 +16,14 @@ import numpy as np
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 
-from hmsa_ros.bag.reader import read_messages
-from hmsa_ros.core.model import signed_root
 from hmsa_ros.core.parameters import paper_actuator
-from hmsa_ros.core.residual import residual_vibration
-from hmsa_ros.core.simulation import unshaped
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.ending import Ending
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import from_time
+from hmsa_ros.report.evaluation import evaluate, Move, MoveResult
+from hmsa_ros.report.reading import read_runs
 from hmsa_ros.session.client import PlannerClient
 from hmsa_ros.session.processes import NodeProcess, Session
 
@@ -33,7 +31,7 @@ from hmsa_ros.session.processes import NodeProcess, Session
 SEQUENCE = ((1.10, 10.0), (1.20, 10.0), (1.40, 10.0))
 REAL_TIME_FACTOR = 0.0125
 PUBLISH_RATE = 20_000.0
-LEAD_TIME = 0.005
+LEAD_TIME = 0.01
 #: Largest residual vibration, as a share of the step, of a setpoint that counts as held.
 LARGEST_RESIDUAL = 1e-6
 _START_SECONDS = 20.0
@@ -44,38 +42,17 @@ _TOPICS = (
 
 
 @dataclass(frozen=True)
-class SetpointResult:
+class SetpointResult(MoveResult):
     """
     What became of one setpoint, from the bag.
 
     Attributes
     ----------
-    stretch : float
-        Target.
-    b_p, tau_p, b_1 : float
-        Of the commands that were recorded, nondimensional as in the paper.
-    begin, arrival, end : float
-        In s of the sequence.
-    error : float
-        Largest distance from the target after arrival, as a share of the step.
-    residual, residual_unshaped : float
-        Peak-to-peak stretch after arrival as a share of the step: recorded, and simulated for
-        plain steps on the same plant.
     reached : bool
         Whether error and residual are within `LARGEST_RESIDUAL`.
 
     """
 
-    stretch: float
-    b_p: float
-    tau_p: float
-    b_1: float
-    begin: float
-    arrival: float
-    end: float
-    error: float
-    residual: float
-    residual_unshaped: float
     reached: bool
 
 
@@ -278,52 +255,25 @@ def _evaluate(bag: Path, picture: Path, exits: dict[str, int]) -> DemoResult:
     """Read the run back from the bag, measure it and draw it."""
     from hmsa_ros.figures.run import draw_run
 
-    actuator = paper_actuator()
-    joint_states, commands = [], []
-    for topic, _, _, message in read_messages(bag, ['/joint_states', '/flux_density_command']):
-        if topic == '/joint_states':
-            joint_states.append((
-                from_time(message.header.stamp), message.position[0], message.velocity[0]))
-        else:
-            commands.append((from_time(message.header.stamp), message.magnetic_field.z))
-    if len(commands) != 2 * len(SEQUENCE):
+    run, = read_runs(bag, actuator=paper_actuator())
+    levels = run.commands
+    if len(levels) != 2 * len(SEQUENCE):
         raise HmsaError(
-            f'the bag holds {len(commands)} commands: expected {2 * len(SEQUENCE)}')
-    samples = np.array(joint_states)
-    begin = commands[0][0]
-    time = (samples[:, 0] - begin) / NANOSECONDS
-    stretch, rate = samples[:, 1], samples[:, 2]
-    begins = [(stamp - begin) / NANOSECONDS for stamp, _ in commands[::2]]
-    arrivals = [(stamp - begin) / NANOSECONDS for stamp, _ in commands[1::2]]
-    ends = [*begins[1:], begins[-1] + SEQUENCE[-1][1] * actuator.time_unit]
-    targets = [target for target, _ in SEQUENCE]
-
-    unit = actuator.time_unit
-    material = actuator.nondimensional
-    plain_stretch, plain_rate = np.full_like(time, 1.0), np.zeros_like(time)
-    running = time >= 0.0
-    plain_stretch[running], plain_rate[running] = unshaped(
-        targets, [x / unit for x in begins], time[running] / unit, material)
-
-    loads = [value / actuator.flux_density_unit for _, value in commands]
-    results = []
-    previous = 1.0
-    for i, target in enumerate(targets):
-        window = {'arrival': arrivals[i], 'end': ends[i], 'step': target - previous}
-        after = (time >= arrivals[i]) & (time <= ends[i])
-        error = float(np.max(np.abs(stretch[after] - target)) / abs(target - previous))
-        residual = residual_vibration(time, stretch, **window)
-        results.append(SetpointResult(
-            stretch=target, b_p=float(signed_root(loads[2 * i])),
-            tau_p=(arrivals[i] - begins[i]) / unit, b_1=float(signed_root(loads[2 * i + 1])),
-            begin=begins[i], arrival=arrivals[i], end=ends[i], error=error, residual=residual,
-            residual_unshaped=residual_vibration(time, plain_stretch, **window),
-            reached=max(error, residual) <= LARGEST_RESIDUAL))
-        previous = target
+            f'the bag holds {len(levels)} commands: expected {2 * len(SEQUENCE)}')
+    begins = [x.stamp for x in levels[::2]]
+    last = begins[-1] + SEQUENCE[-1][1] * paper_actuator().time_unit * NANOSECONDS
+    moves = [
+        Move(target, levels[2 * i].stamp, levels[2 * i + 1].stamp, end,
+             (levels[2 * i].flux_density, levels[2 * i + 1].flux_density))
+        for i, ((target, _), end) in enumerate(
+            zip(SEQUENCE, [*begins[1:], round(last)], strict=True))]
+    evaluation = evaluate(run, moves)
+    results = tuple(
+        SetpointResult(**asdict(x), reached=max(x.error, x.residual) <= LARGEST_RESIDUAL)
+        for x in evaluation.results)
     draw_run(
-        picture, time=time, stretch=stretch, rate=rate,
-        command_time=np.array([x - begin for x, _ in commands]) / NANOSECONDS,
-        command=np.array([value for _, value in commands]),
-        unshaped=(plain_stretch, plain_rate / unit),
-        targets=list(zip(targets, begins, arrivals, ends, strict=True)))
-    return DemoResult(tuple(results), exits, bag, picture)
+        picture, time=evaluation.time, stretch=run.stretch, rate=run.rate,
+        command_time=np.array([evaluation.seconds(x.stamp) for x in levels]),
+        command=np.array([x.flux_density for x in levels]), unshaped=evaluation.unshaped,
+        targets=[(x.stretch, x.begin, x.arrival, x.end) for x in results])
+    return DemoResult(results, exits, bag, picture)

@@ -1,0 +1,153 @@
+"""``hmsa report``: what happened in a run, as one HTML page or a picture."""
+
+import argparse
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+from hmsa_ros.errors import BadInputError
+
+if TYPE_CHECKING:
+    from hmsa_ros.report.reading import Run
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    Add the command.
+
+    Parameters
+    ----------
+    subparsers : argparse action
+        Where to add it.
+
+    """
+    parser = subparsers.add_parser(
+        'report', help='show what happened in a run, from its bag',
+        description='Show what happened in a run as one HTML page that needs no network: '
+                    'response, command, phase plane, residuals against plain steps, plan '
+                    'against run, timing and losses. Any bag with joint states and flux density '
+                    'commands will do, in any namespace; several bags are shown together.',
+        epilog='example: hmsa report hmsa_demo/run --out run.html --pdf run.pdf')
+    parser.add_argument(
+        'bags', nargs='+', type=Path, metavar='BAG', help='folder of a bag, or an .mcap file')
+    parser.add_argument(
+        '--out', type=Path, metavar='FILE',
+        help="page to write; one of that name is replaced (default: the first bag's name and "
+             '_report.html, in this folder)')
+    parser.add_argument('--png', type=Path, metavar='FILE', help='picture to write as well')
+    parser.add_argument(
+        '--pdf', type=Path, metavar='FILE', help='picture to write as well, for a paper')
+    parser.add_argument(
+        '--params', type=Path, metavar='FILE',
+        help='parameter file (YAML) of the actuator as it really is (default: what the bag '
+             'tells)')
+    parser.add_argument(
+        '--joint', default='', metavar='NAME',
+        help='the actuator in the joint states (default: what the planner calls it)')
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """
+    Read, evaluate and write.
+
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+        As parsed.
+
+    Returns
+    -------
+    int
+        Exit status.
+
+    Raises
+    ------
+    HmsaError
+        If a bag cannot be read or a file cannot be written.
+
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    bags: list[Path] = arguments.bags
+    out = arguments.out or Path(f'{bags[0].resolve().stem}_report.html')
+    targets = [x for x in (out, arguments.png, arguments.pdf) if x is not None]
+    _check_targets(targets, bags)
+
+    from hmsa_ros.report.charts import Part, RUN_COLOURS
+    from hmsa_ros.report.evaluation import evaluate, timing
+    from hmsa_ros.report.page import page
+    from hmsa_ros.report.reading import read_actuator, read_runs
+
+    actuator = None if arguments.params is None else read_actuator(arguments.params)
+    with Progress(
+            TextColumn('{task.description:<28}'), BarColumn(), TextColumn(
+                '{task.percentage:>3.0f} %'), TimeElapsedColumn(),
+            console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task('starting', total=1.0)
+        runs: list[Run] = []
+        for bag in bags:
+            runs += read_runs(
+                bag, actuator=actuator, joint=arguments.joint,
+                progress=lambda what, share: progress.update(
+                    task, description=what, completed=share))
+        parts = []
+        for i, each in enumerate(_labelled(runs)):
+            progress.update(task, description='evaluating', completed=i / len(runs))
+            parts.append(Part(
+                each, evaluate(each), timing(each),
+                RUN_COLOURS[i % len(RUN_COLOURS)] if len(runs) > 1 else ''))
+        progress.update(task, description='writing', completed=1.0)
+        _write(out, page(parts))
+        for path, kind in ((arguments.png, 'png'), (arguments.pdf, 'pdf')):
+            if path is not None:
+                from hmsa_ros.report.picture import draw
+                draw(path, parts, kind)
+    for target in targets:
+        print(target)
+    return 0
+
+
+def _labelled(runs: 'list[Run]') -> 'list[Run]':
+    """Return the runs with labels of their own."""
+    from dataclasses import replace
+
+    labels = [x.label for x in runs]
+    if len(set(labels)) == len(labels):
+        return runs
+    # Bags of one name lie in different folders, unless one is named twice.
+    labels = [
+        f'{run.path.resolve().parent.name}/{run.label}' if labels.count(run.label) > 1
+        else run.label for run in runs]
+    return [
+        replace(run, label=label if labels.count(label) == 1 else f'{label} ({i})')
+        for i, (run, label) in enumerate(zip(runs, labels, strict=True), 1)]
+
+
+def _check_targets(targets: list[Path], bags: list[Path]) -> None:
+    """Refuse what cannot be written before the bags are read."""
+    if len({x.resolve() for x in targets}) < len(targets):
+        raise BadInputError(
+            'two of --out, --png and --pdf are one file: expected different files')
+    for target in targets:
+        if target.is_dir():
+            raise BadInputError(f'cannot write {target}: it is a folder; expected a file')
+        if target.suffix in ('.mcap', '.yaml') or any(
+                target.resolve() == bag.resolve() for bag in bags):
+            raise BadInputError(
+                f'cannot write {target}: it may be part of a bag; expected a name such as '
+                'report.html')
+        if not target.resolve().parent.is_dir():
+            raise BadInputError(
+                f'cannot write {target}: {target.parent} is no folder; expected one that '
+                'exists')
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a page."""
+    try:
+        path.write_text(text, encoding='utf-8')
+    except OSError as error:
+        raise BadInputError(
+            f'cannot write {path}: {error.strerror or error}; expected a folder with write '
+            'permission') from error

@@ -1,0 +1,623 @@
+"""
+The figures of a report, as plain data for Plotly.
+
+Curves are thinned out to what a screen can show, peaks kept. Colours are those of
+`hmsa_ros.figures.style`; the page replaces them by lighter ones in dark mode.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import html
+import math
+from typing import Any
+
+import numpy as np
+
+from hmsa_ros.core.model import Array
+from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.report.evaluation import Evaluation, MoveResult, Timing
+from hmsa_ros.report.reading import Run
+
+# Okabe and Ito's palette, told apart with every kind of colour vision.
+BLUE, ORANGE, GREEN, PURPLE = '#0072B2', '#E69F00', '#009E73', '#CC79A7'
+SKY_BLUE, VERMILION, BLACK, GREY = '#56B4E9', '#D55E00', '#000000', '#8A8A8A'
+RUN_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY_BLUE, VERMILION, BLACK)
+#: The same where the background is dark.
+DARK = {
+    BLUE: '#4DABE8', ORANGE: '#F2B93B', GREEN: '#2FC79A', PURPLE: '#E5A0C6',
+    SKY_BLUE: '#9AD6F7', VERMILION: '#FF8A4A', BLACK: '#F0F0F0', GREY: '#9A9A9A'}
+
+#: Intervals of a curve of which the least and the largest value are kept: more than a screen
+#: has columns.
+BUCKETS = 2000
+#: Panels of arrivals.
+MOST_PANELS = 12
+_PANEL_BUCKETS = 300
+_MOST_PHASE_POINTS = 20_000
+_PHASE_GRID = 1000.0
+# Of an arrival's panel: how long before and after, in durations of the move, and how many
+# percent of the step at least.
+_BEFORE, _AFTER, _LEAST_PERCENT = 0.6, 3.0, 5.0
+# Of what a panel holds beyond what it shows at first.
+_PANEL_SPAN = 20.0
+# Runs shorter than this are drawn in ms.
+_LONGEST_IN_MS = 2.0
+_DIGITS = 9
+
+
+@dataclass(frozen=True)
+class Part:
+    """
+    One run of a report.
+
+    Attributes
+    ----------
+    run : Run
+        As read from a bag.
+    evaluation : Evaluation
+        Its measures.
+    timing : Timing
+        When commands and samples came.
+    colour : str
+        In the figures; empty for a run on its own, whose curves differ in colour.
+
+    """
+
+    run: Run
+    evaluation: Evaluation
+    timing: Timing
+    colour: str = ''
+
+
+@dataclass(frozen=True)
+class TimeUnit:
+    """Unit of the time axes: its size in s and its name."""
+
+    size: float
+    name: str
+
+    def of(self, seconds: Any) -> Array:
+        """Return times in this unit."""
+        return np.asarray(seconds, dtype=np.float64) / self.size
+
+
+@dataclass(frozen=True)
+class Figure:
+    """
+    One figure.
+
+    Attributes
+    ----------
+    key : str
+        Identifies its place in the page.
+    alt : str
+        What it shows, for who cannot see it.
+    height : int
+        In pixels.
+    data, layout : list and dict
+        As Plotly takes them, without colours of text and lines.
+
+    """
+
+    key: str
+    alt: str
+    height: int
+    data: list[dict[str, Any]]
+    layout: dict[str, Any]
+
+
+def time_unit(parts: Sequence[Part]) -> TimeUnit:
+    """
+    Return the unit for the time axes.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        Runs to show.
+
+    Returns
+    -------
+    TimeUnit
+        Milliseconds for short runs.
+
+    """
+    longest = max(
+        float(np.max(np.abs(x.evaluation.time[[0, -1]]))) for x in parts)
+    return TimeUnit(1e-3, 'ms') if longest <= _LONGEST_IN_MS else TimeUnit(1.0, 's')
+
+
+def decimate(x: Array, y: Array, buckets: int = BUCKETS) -> tuple[Array, Array]:
+    """
+    Thin out a curve, keeping the least and the largest value of every interval.
+
+    Parameters
+    ----------
+    x, y : ndarray, shape (n,)
+        The curve; points that are not finite are left out.
+    buckets : int
+        Number of intervals of equally many points.
+
+    Returns
+    -------
+    x, y : ndarray, shape (m,)
+        Unchanged if there are few points, else at most two for each interval and the ends.
+
+    """
+    finite = np.isfinite(y)
+    if not finite.all():
+        x, y = x[finite], y[finite]
+    keep = _extremes(y, buckets)
+    return (x, y) if keep is None else (x[keep], y[keep])
+
+
+def _extremes(y: Array, buckets: int) -> Any:
+    """Return where the ends and the extremes of each interval are; None to keep all."""
+    size = -(-len(y) // buckets)
+    if size <= 2:
+        return None
+    whole = len(y) // size * size
+    begins = np.arange(0, whole, size)
+    rows = y[:whole].reshape(-1, size)
+    keep = [begins + rows.argmin(axis=1), begins + rows.argmax(axis=1), [0, len(y) - 1]]
+    if whole < len(y):
+        rest = y[whole:]
+        keep.append([whole + int(rest.argmin()), whole + int(rest.argmax())])
+    return np.unique(np.concatenate(keep))
+
+
+def numbers(values: Any) -> list[float | None]:
+    """
+    Return numbers for JSON.
+
+    Parameters
+    ----------
+    values : array_like
+        Numbers.
+
+    Returns
+    -------
+    list of float or None
+        To nine significant digits; None for what is not finite.
+
+    """
+    return [float(f'{x:.{_DIGITS}g}') if math.isfinite(x) else None
+            for x in np.asarray(values, dtype=np.float64).tolist()]
+
+
+def text(words: str) -> str:
+    """Return words as Plotly shows them, which takes some marks for HTML."""
+    return html.escape(words, quote=False)
+
+
+def _curve(
+        name: str, x: Any, y: Any, group: str, *, mode: str = 'lines', **style: Any
+) -> dict[str, Any]:
+    """Return a curve; its style is the line's, but for the names of a trace's own settings."""
+    own: dict[str, Any] = {k: style.pop(k) for k in (
+        'marker', 'showlegend', 'visible', 'xaxis', 'yaxis', 'hovertemplate', 'opacity')
+        if k in style}
+    trace = {
+        'type': 'scatter', 'mode': mode, 'name': text(name), 'legendgroup': group,
+        'x': numbers(x), 'y': numbers(y), **own}
+    if 'lines' in mode:
+        # Plotly's own thinning bends lines at rest by a pixel or two.
+        trace['line'] = {'simplify': False, **style}
+    return trace
+
+
+def _names(part: Part, what: str) -> tuple[str, str]:
+    """Return a curve's name in the legend and the group that one click hides."""
+    alone = not part.colour
+    return (what if alone else f'{part.run.label}: {what}'), \
+        (what if alone else f'{part.run.label} {what}')
+
+
+# What each kind of curve looks like, everywhere: colour, and what tells it apart without.
+_KINDS: dict[str, dict[str, Any]] = {
+    'recorded': {'color': BLUE, 'width': 2.2},
+    'plain steps': {'color': VERMILION, 'width': 1.2, 'dash': '5px,2px'},
+    'plan': {'color': BLACK, 'width': 1.4, 'dash': '1px,3px'},
+    'command': {'color': BLUE, 'width': 2.0, 'shape': 'hv'},
+    'field in force': {'color': GREEN, 'width': 1.4, 'dash': '7px,2px,1px,2px'},
+}
+
+
+def _kind(part: Part, kind: str, **more: Any) -> dict[str, Any]:
+    style = {**_KINDS[kind], **more}
+    if part.colour:
+        style['color'] = part.colour
+        if kind in ('plain steps', 'plan'):
+            # Several runs are compared first of all by what was recorded.
+            style.setdefault('visible', 'legendonly')
+    return style
+
+
+def _axis(title: str, **more: Any) -> dict[str, Any]:
+    return {'title': {'text': title}, 'exponentformat': 'power', **more}
+
+
+def response(parts: Sequence[Part], unit: TimeUnit) -> Figure:
+    """
+    Return setpoints, response and command over time.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        Runs to show.
+    unit : TimeUnit
+        Of the time axis.
+
+    Returns
+    -------
+    Figure
+        Command above, stretch below.
+
+    """
+    data = []
+    for part in parts:
+        run, found = part.run, part.evaluation
+        name, group = _names(part, 'plain steps')
+        data.append(_curve(
+            name, *decimate(unit.of(found.time), found.unshaped[0]), group,
+            **_kind(part, 'plain steps')))
+        name, group = _names(part, 'recorded')
+        data.append(_curve(
+            name, *decimate(unit.of(found.time), run.stretch), group,
+            **_kind(part, 'recorded')))
+        name, group = _names(part, 'plan')
+        data.append(_curve(
+            name, *decimate(unit.of(found.time), found.predicted[0]), group,
+            **_kind(part, 'plan')))
+        if found.results:
+            name, group = _names(part, 'target')
+            spans = [(x.begin, x.end, math.nan) for x in found.results]
+            data.append(_curve(
+                name, unit.of(np.ravel(spans)),
+                np.ravel([(x.stretch, x.stretch, math.nan) for x in found.results]), group,
+                color=GREY, width=1.2, dash='2px,2px'))
+            name, group = _names(part, 'planned arrival')
+            data.append(_curve(
+                name, unit.of([x.arrival for x in found.results]),
+                [x.stretch for x in found.results], group, mode='markers',
+                marker={'symbol': 'diamond-open', 'size': 9, 'color': part.colour or BLACK}))
+        data += _commands(part, unit)
+    return Figure(
+        'response', 'Flux density command and stretch over time', 560, data, {
+            'xaxis': _axis(f'time from the first command [{unit.name}]', anchor='y'),
+            'yaxis': _axis('stretch λ [1]', domain=[0.0, 0.6]),
+            'yaxis2': _axis('flux density B [mT]', domain=[0.68, 1.0], anchor='x')})
+
+
+def _commands(part: Part, unit: TimeUnit) -> list[dict[str, Any]]:
+    """Return the curves of the flux density."""
+    run, found = part.run, part.evaluation
+    data = []
+    if found.levels:
+        times = [found.seconds(x.stamp) for x in found.levels]
+        values = [x.flux_density * 1e3 for x in found.levels]
+        # The last level holds to the end of the record.
+        times.append(max(times[-1], float(found.time[-1])))
+        values.append(values[-1])
+        if found.time[0] < times[0] and math.isfinite(run.flux_density[0]):
+            times.insert(0, float(found.time[0]))
+            values.insert(0, float(run.flux_density[0]) * 1e3)
+        switches = {x.stamp for x in found.levels}
+        sizes = [6 if round(x * NANOSECONDS) + found.zero in switches else 0 for x in times]
+        name, group = _names(part, 'command')
+        data.append(_curve(
+            name, unit.of(times), values, group, mode='lines+markers', yaxis='y2',
+            marker={'size': sizes}, **_kind(part, 'command')))
+        if part.colour:
+            data[-1]['showlegend'] = False
+            data[-1]['legendgroup'] = _names(part, 'recorded')[1]
+        place = np.searchsorted([x.stamp for x in found.levels], run.time, side='right') - 1
+        expected = np.array([*(x.flux_density for x in found.levels)])[np.maximum(place, 0)]
+        follows = np.abs(run.flux_density - expected)[place >= 0]
+        if np.nanmax(follows, initial=0.0) <= 1e-9 * np.max(np.abs(expected)):
+            return data
+    if np.isfinite(run.flux_density).any():
+        name, group = _names(part, 'field in force')
+        x, y = decimate(unit.of(found.time), run.flux_density * 1e3)
+        data.append(_curve(name, x, y, group, yaxis='y2', **_kind(part, 'field in force')))
+    return data
+
+
+def phase(parts: Sequence[Part]) -> tuple[Figure, float]:
+    """
+    Return the phase plane with the equilibria.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        Runs to show.
+
+    Returns
+    -------
+    figure : Figure
+        Stretch rate over stretch.
+    shown : float
+        Smallest share of a run that is drawn: what moves on and on fills the plane.
+
+    """
+    data, shown = [], 1.0
+    for part in parts:
+        run, found = part.run, part.evaluation
+        for kind, (stretch, rate) in (
+                ('plain steps', found.unshaped), ('recorded', (run.stretch, run.rate))):
+            x, y, share = _orbit(stretch, rate)
+            shown = min(shown, share)
+            name, group = _names(part, kind)
+            data.append(_curve(name, x, y, group, **_kind(part, kind)))
+        name, group = _names(part, 'equilibrium')
+        places = sorted({x.stretch for x in found.results})
+        data.append(_curve(
+            name, [found.start], [0.0], group, mode='markers', showlegend=False,
+            marker={'symbol': 'circle-open', 'size': 9, 'color': part.colour or BLACK}))
+        data.append(_curve(
+            name, places, [0.0] * len(places), group, mode='markers',
+            marker={'symbol': 'circle', 'size': 8, 'color': part.colour or BLACK}))
+    return Figure(
+        'phase', 'Stretch rate over stretch, with the equilibria', 480, data, {
+            'xaxis': _axis('stretch λ [1]', range=_room(data, 'x')),
+            'yaxis': _axis('stretch rate dλ/dt [1/s]', range=_room(data, 'y'))}), shown
+
+
+def _room(data: Sequence[dict[str, Any]], key: str) -> list[float | None]:
+    """Return the range of an axis that leaves room around all curves."""
+    values = [x for trace in data for x in trace[key] if x is not None]
+    margin = 0.04 * (max(values) - min(values) or 1.0)
+    return numbers([min(values) - margin, max(values) + margin])
+
+
+def _orbit(stretch: Array, rate: Array) -> tuple[Array, Array, float]:
+    """Return a curve in the plane without the points that lie on the one before."""
+    finite = np.isfinite(stretch) & np.isfinite(rate)
+    x, y = stretch[finite], rate[finite]
+    if not len(x):
+        return x, y, 1.0
+    scale = [max(float(np.ptp(z)), 1e-12) / _PHASE_GRID for z in (x, y)]
+    cells = np.stack([np.floor(x / scale[0]), np.floor(y / scale[1])])
+    keep = np.append(True, np.any(np.diff(cells, axis=1) != 0.0, axis=0))
+    keep[-1] = True
+    places = np.flatnonzero(keep)
+    share = 1.0
+    if len(places) > _MOST_PHASE_POINTS:
+        share = _MOST_PHASE_POINTS / len(places)
+        places = places[:_MOST_PHASE_POINTS]
+    return x[places], y[places], share
+
+
+def panels(parts: Sequence[Part]) -> list[tuple[int, str]]:
+    """
+    Choose the arrivals to show.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        Runs to show; setpoints of the same number are shown together.
+
+    Returns
+    -------
+    list of (int, str)
+        Number of the setpoint from 0 on, and the panel's title.
+
+    """
+    count = max((len(x.evaluation.results) for x in parts), default=0)
+    ranked = sorted(range(count), key=lambda i: -max(
+        (x.residual for x in _results(parts, i) if math.isfinite(x.residual)), default=0.0))
+    return [(i, _panel_title(parts, i)) for i in sorted(ranked[:MOST_PANELS])]
+
+
+def _results(parts: Sequence[Part], number: int) -> list[MoveResult]:
+    """Return the results of one setpoint in all runs that have it."""
+    return [x.evaluation.results[number] for x in parts
+            if number < len(x.evaluation.results)]
+
+
+def _panel_title(parts: Sequence[Part], number: int) -> str:
+    results = _results(parts, number)
+    targets = ', '.join(dict.fromkeys(f'{x.stretch:.6g}' for x in results))
+    left = ', '.join(percent(x.residual) for x in results)
+    return f'{number + 1}. to {targets}: residual {left}'
+
+
+def percent(share: float, digits: int = 3) -> str:
+    """
+    Return a share in percent.
+
+    Parameters
+    ----------
+    share : float
+        Not in percent.
+    digits : int
+        Significant ones.
+
+    Returns
+    -------
+    str
+        With the unit; a dash for what is not known.
+
+    """
+    return f'{100.0 * share:.{digits}g} %' if math.isfinite(share) else '–'
+
+
+def arrival(parts: Sequence[Part], number: int) -> Figure:
+    """
+    Return the zoom on one arrival.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        Runs to show.
+    number : int
+        Which setpoint, from 0 on.
+
+    Returns
+    -------
+    Figure
+        Distance from the target in percent of the step over the time after arrival.
+
+    """
+    data = []
+    view, height = [0.0, 0.0], _LEAST_PERCENT
+    results = [x for x in _results(parts, number) if x.end > x.begin]
+    unit = TimeUnit(1e-3, 'ms') if max(
+        (x.arrival - x.begin for x in results), default=1.0) < 1.0 else TimeUnit(1.0, 's')
+    for part in parts:
+        run, found = part.run, part.evaluation
+        if number >= len(found.results):
+            continue
+        result = found.results[number]
+        step = result.stretch - (
+            found.results[number - 1].stretch if number else found.start)
+        duration = max(result.arrival - result.begin, 1e-9)
+        inside = (found.time >= result.begin) & (
+            found.time <= min(result.end, result.arrival + _PANEL_SPAN * duration))
+        time = unit.of(found.time[inside] - result.arrival)
+        view = [min(view[0], -_BEFORE * float(unit.of(duration))), max(
+            view[1], float(unit.of(min(result.end - result.arrival, _AFTER * duration))))]
+        if math.isfinite(result.error):
+            height = max(height, 110.0 * result.error)
+        for kind, stretch in (
+                ('plain steps', found.unshaped[0]), ('recorded', run.stretch),
+                ('plan', found.predicted[0])):
+            name, group = _names(part, kind)
+            data.append(_curve(
+                name, *decimate(
+                    time, 100.0 * (stretch[inside] - result.stretch) / abs(step),
+                    _PANEL_BUCKETS), group, **_kind(part, kind)))
+    height = min(height, 150.0)
+    title = _panel_title(parts, number)
+    return Figure(
+        f'arrival{number}', f'Setpoint {title}', 300, data, {
+            'xaxis': _axis(f'time after arrival [{unit.name}]', range=numbers(view)),
+            'yaxis': _axis('distance from target [% of step]', range=[-height, height]),
+            'shapes': [{
+                'type': 'line', 'x0': 0, 'x1': 0, 'yref': 'paper', 'y0': 0, 'y1': 1,
+                'line': {'color': GREY, 'width': 1, 'dash': '2px,2px'}}]})
+
+
+def residuals(parts: Sequence[Part]) -> Figure:
+    """
+    Return the residuals of all setpoints, shaped against plain steps.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        Runs to show.
+
+    Returns
+    -------
+    Figure
+        In percent of the step, on a logarithmic axis.
+
+    """
+    data = []
+    for part in parts:
+        results = part.evaluation.results
+        for what, values, symbol in (
+                ('plain steps', [x.residual_unshaped for x in results], 'square-open'),
+                ('recorded', [x.residual for x in results], 'circle')):
+            name, group = _names(part, what)
+            data.append(_curve(
+                name, np.arange(1, len(results) + 1),
+                # A logarithmic axis has no place for 0.
+                [100.0 * x if x > 0.0 else math.nan for x in values], group, mode='markers',
+                marker={
+                    'symbol': symbol, 'size': 10, 'line': {'width': 2},
+                    'color': part.colour or _KINDS[what]['color']}))
+    count = max((len(x.evaluation.results) for x in parts), default=0)
+    axis = _axis('setpoint', range=[0.5, count + 0.5])
+    if count <= MOST_PANELS:
+        axis |= {'tickmode': 'array', 'tickvals': list(range(1, count + 1)), 'ticktext': [
+            f'{i + 1}: ' + '/'.join(dict.fromkeys(
+                f'{x.stretch:.5g}' for x in _results(parts, i))) for i in range(count)]}
+    return Figure(
+        'residuals', 'Residual vibration of each setpoint, recorded and for plain steps', 340,
+        data, {
+            'xaxis': axis,
+            'yaxis': _axis(
+                'residual [% of step]', type='log')})
+
+
+def prediction(parts: Sequence[Part], unit: TimeUnit) -> Figure:
+    """
+    Return the distance between what was planned and what was recorded.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        Runs to show.
+    unit : TimeUnit
+        Of the time axis.
+
+    Returns
+    -------
+    Figure
+        Recorded minus predicted stretch over time; no curves without a plan.
+
+    """
+    data = []
+    for part in parts:
+        found = part.evaluation
+        difference = part.run.stretch - found.predicted[0]
+        if np.isfinite(difference).any():
+            name, group = _names(part, 'recorded')
+            data.append(_curve(
+                name if part.colour else 'recorded − predicted',
+                *decimate(unit.of(found.time), difference), group,
+                **_kind(part, 'recorded', width=1.2)))
+    return Figure(
+        'prediction', 'Recorded minus predicted stretch over time', 300, data, {
+            'xaxis': _axis(f'time from the first command [{unit.name}]'),
+            'yaxis': _axis('recorded − predicted stretch [1]')})
+
+
+def timings(parts: Sequence[Part], unit: TimeUnit) -> Figure:
+    """
+    Return when commands and samples came.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        Runs to show.
+    unit : TimeUnit
+        Of the time axis.
+
+    Returns
+    -------
+    Figure
+        Lead of the commands, delay of the samples, and their intervals.
+
+    """
+    data = []
+    for part in parts:
+        run, found, timing = part.run, part.evaluation, part.timing
+        time = unit.of(found.time)
+        if len(timing.lead):
+            name, group = _names(part, 'command lead')
+            data.append(_curve(
+                name, unit.of([found.seconds(x.stamp) for x in run.commands]),
+                timing.lead * 1e3, group, mode='markers', yaxis='y3',
+                marker={'size': 7, 'color': part.colour or BLUE, 'symbol': 'circle'}))
+        name, group = _names(part, 'sample delay')
+        colour = part.colour or VERMILION
+        if len(timing.delay):
+            data.append(_curve(
+                name, *decimate(time, timing.delay * 1e3), group, yaxis='y2', color=colour,
+                width=1.2))
+        name, group = _names(part, 'interval as recorded')
+        data.append(_curve(
+            name, *decimate(time[1:], timing.arrival_interval * 1e3), group, color=colour,
+            width=0.8, dash='2px,1px', opacity=0.8))
+        name, group = _names(part, 'interval of the stamps')
+        data.append(_curve(
+            name, *decimate(time[1:], timing.interval * 1e3), group,
+            color=part.colour or BLACK, width=1.6))
+    return Figure(
+        'timing', 'Lead of the commands, delay and interval of the samples', 640, data, {
+            'xaxis': _axis(f'time from the first command [{unit.name}]', anchor='y'),
+            'yaxis': _axis('sample interval [ms]', domain=[0.0, 0.28], rangemode='tozero'),
+            'yaxis2': _axis('sample delay [ms]', domain=[0.36, 0.64], anchor='x'),
+            'yaxis3': _axis(
+                'command lead [ms]', domain=[0.72, 1.0], anchor='x', rangemode='tozero')})

@@ -1,0 +1,542 @@
+"""
+What a run amounts to: its setpoints, what was left of the vibration, and what was predicted.
+
+Times are in s from the first command of the run; stamps stay integer nanoseconds.
+"""
+
+from bisect import bisect_left
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from hmsa_ros.core.delivery import pieces
+from hmsa_ros.core.model import (
+    Array,
+    elastic_force,
+    equilibrium_stretch,
+    natural_frequency,
+    signed_root,
+    stretch_limits,
+)
+from hmsa_ros.core.moves import Level as PlannedLoad
+from hmsa_ros.core.parameters import ActuatorParameters
+from hmsa_ros.core.residual import residual_vibration
+from hmsa_ros.core.simulation import simulate
+from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.report.reading import Level, Run, Times
+
+# Stretches that differ by less are one setpoint: what comes back from a flux density in double
+# precision is some 1e-12 off.
+_SAME = 1e-6
+# Stretch rates below this share of the natural frequency are rest, to a planner's precision.
+_AT_REST = 1e-3
+# Clocks further apart than this are different clocks.
+_SAME_CLOCK = 60.0
+
+
+@dataclass(frozen=True)
+class Move:
+    """
+    One setpoint, as it was commanded.
+
+    Attributes
+    ----------
+    stretch : float
+        Target.
+    begin, arrival, end : int
+        Stamps in ns: of the first command, of planned rest at the target, and until when the
+        target was held.
+    flux_densities : tuple of float
+        Commanded levels in T, the last one holds the target.
+
+    Raises
+    ------
+    BadInputError
+        If the times are not in order or there is no level.
+
+    """
+
+    stretch: float
+    begin: int
+    arrival: int
+    end: int
+    flux_densities: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        """Check the order."""
+        if not self.begin <= self.arrival <= self.end or not self.flux_densities:
+            raise BadInputError(
+                f'a move from {self.begin} to {self.arrival} until {self.end} ns with '
+                f'{len(self.flux_densities)} levels: expected times in order and a level')
+
+
+@dataclass(frozen=True)
+class MoveResult:
+    """
+    What became of one setpoint.
+
+    Attributes
+    ----------
+    stretch : float
+        Target.
+    b_p, tau_p, b_1 : float
+        First and last level and the time between begin and arrival, nondimensional as in the
+        paper.
+    begin, arrival, end : float
+        In s of the run.
+    error : float
+        Largest distance from the target after arrival, as a share of the step.
+    residual, residual_unshaped : float
+        Peak-to-peak stretch after arrival as a share of the step: recorded, and simulated for
+        plain steps on the same plant. NaN where there are no samples.
+
+    """
+
+    stretch: float
+    b_p: float
+    tau_p: float
+    b_1: float
+    begin: float
+    arrival: float
+    end: float
+    error: float
+    residual: float
+    residual_unshaped: float
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """
+    A run, measured.
+
+    Attributes
+    ----------
+    zero : int
+        Stamp in ns of time 0: the first command, or the first sample without one.
+    time : ndarray, shape (n,)
+        Times of the samples in s.
+    start : float
+        Stretch at rest before the first move.
+    levels : tuple of Level
+        Commands that came into force, by stamp.
+    moves : tuple of Move
+        Setpoints.
+    results : tuple of MoveResult
+        One a move.
+    unshaped : tuple of ndarray, shape (n,)
+        Stretch, and stretch rate in 1/s, simulated for plain steps; NaN without a move.
+    plan : tuple of Level
+        Changes of level that were planned and not planned anew, by stamp.
+    predicted : tuple of ndarray, shape (n,)
+        Stretch, and stretch rate in 1/s, by the plan; NaN before and without one.
+
+    """
+
+    zero: int
+    time: Array
+    start: float
+    levels: tuple[Level, ...]
+    moves: tuple[Move, ...]
+    results: tuple[MoveResult, ...]
+    unshaped: tuple[Array, Array]
+    plan: tuple[Level, ...]
+    predicted: tuple[Array, Array]
+
+    def seconds(self, stamp: int) -> float:
+        """Return a stamp in s of the run."""
+        return (stamp - self.zero) / NANOSECONDS
+
+
+def evaluate(run: Run, moves: Sequence[Move] | None = None) -> Evaluation:
+    """
+    Measure a run.
+
+    Parameters
+    ----------
+    run : Run
+        As read from a bag.
+    moves : sequence of Move, optional
+        Setpoints; default what `find_moves` finds.
+
+    Returns
+    -------
+    Evaluation
+        The measures.
+
+    Raises
+    ------
+    HmsaError
+        If the plain steps cannot be simulated.
+
+    """
+    levels = in_force((x,) for x in run.commands)
+    plan = in_force(run.plans)
+    start = _start(run, levels, plan)
+    found = tuple(find_moves(run, levels, plan) if moves is None else moves)
+    zero = levels[0].stamp if levels else int(run.time[0])
+    time = (run.time - zero) / NANOSECONDS
+    unshaped = _unshaped(run, time, found, zero, start)
+    results = []
+    previous = start
+    for move in found:
+        results.append(_measure(run, time, unshaped[0], move, move.stretch - previous, zero))
+        previous = move.stretch
+    return Evaluation(
+        zero, time, start, levels, found, tuple(results), unshaped, plan, _predict(run, plan))
+
+
+def in_force(messages: Iterable[Sequence[Level]]) -> tuple[Level, ...]:
+    """
+    Return the changes of level that were left when each message had replaced what it replaces.
+
+    Parameters
+    ----------
+    messages : iterable of sequence of Level
+        In the order received; each supersedes all levels stamped at or after its first.
+
+    Returns
+    -------
+    tuple of Level
+        By stamp.
+
+    """
+    levels: list[Level] = []
+    for message in messages:
+        ordered = sorted(message, key=lambda x: x.stamp)
+        if ordered:
+            del levels[bisect_left(levels, ordered[0].stamp, key=lambda x: x.stamp):]
+            levels += ordered
+    return tuple(levels)
+
+
+def find_moves(
+        run: Run, levels: Sequence[Level], plan: Sequence[Level]) -> list[Move]:
+    """
+    Tell the setpoints of a run by its commands.
+
+    A setpoint is reached with the level that holds it. Which levels do is told, in this order,
+    by the stretches that were asked for (the level whose equilibrium is one of them; or the
+    point of the plan that is at rest at one of them), and else by how long a level lasts: at
+    least a period of the actuator.
+
+    Parameters
+    ----------
+    run : Run
+        As read from a bag.
+    levels, plan : sequence of Level
+        As `in_force` returns them.
+
+    Returns
+    -------
+    list of Move
+        In order; those not finished when the recording ended are left out.
+
+    """
+    last = int(run.time[-1])
+    asked = _asked(run)
+    unit = run.planner.flux_density_unit
+    material = run.planner.nondimensional
+    balance = equilibrium_stretch([x.flux_density / unit for x in levels], material.j_lim)
+    period = 2.0 * math.pi / natural_frequency(balance, material) * run.planner.time_unit
+    predicted = {x.stamp: x for x in plan}
+
+    def by_equilibrium(i: int, _: float) -> float | None:
+        return _nearest(asked, float(balance[i]))
+
+    def by_plan(i: int, previous: float) -> float | None:
+        point = predicted.get(levels[i].stamp)
+        if point is None or abs(point.rate) * period[i] > 2.0 * math.pi * _AT_REST:
+            return None
+        near = _nearest(asked, point.stretch)
+        return near if near is not None and abs(near - previous) > _SAME else None
+
+    def by_duration(i: int, _: float) -> float | None:
+        until = levels[i + 1].stamp if i + 1 < len(levels) else last
+        lasts = (until - levels[i].stamp) / NANOSECONDS >= period[i]
+        return float(balance[i]) if lasts else None
+
+    for target_of in (by_equilibrium, by_plan, by_duration):
+        moves = _group(run, levels, period, target_of, _start(run, levels, plan), last)
+        if moves:
+            return moves
+    return []
+
+
+def _group(
+        run: Run, levels: Sequence[Level], period: Array,
+        target_of: Callable[[int, float], float | None], start: float,
+        last: int) -> list[Move]:
+    """Return the moves that end with the levels that hold a target."""
+    found: list[tuple[int, int, float]] = []
+    begin, previous = 0, start
+    for i in range(len(levels)):
+        target = target_of(i, previous)
+        if target is None:
+            continue
+        # The same level again, or one that holds what is held, is no move.
+        if abs(target - previous) > _SAME:
+            found.append((begin, i, target))
+        begin, previous = i + 1, target
+    slew = run.number('plant.slew_limit') or run.number('planner.slew_limit')
+    moves = []
+    for n, (first, hold, target) in enumerate(found):
+        stamp = levels[first].stamp
+        end = levels[hold + 1].stamp if hold + 1 < len(levels) else _held_until(
+            run, stamp, target, len(found) - n, last)
+        arrival = levels[hold].stamp
+        if first == hold:
+            # A plain step has no arrival: half a period on, when a shaped one would arrive.
+            arrival += round(0.5 * period[hold] * NANOSECONDS)
+        elif slew:
+            change = abs(levels[hold].flux_density - levels[hold - 1].flux_density)
+            arrival += round(change / slew * NANOSECONDS)
+        if arrival < min(end, last):
+            moves.append(Move(target, stamp, arrival, end, tuple(
+                x.flux_density for x in levels[first:hold + 1])))
+    return moves
+
+
+def _held_until(run: Run, begin: int, target: float, left: int, last: int) -> int:
+    """Return until when the last setpoint was asked for, at most the end of the record."""
+    for request in reversed(run.requests):
+        stretch, duration = request.points[-1] if request.points else (math.nan, None)
+        if request.sent <= begin and abs(stretch - target) < _SAME:
+            if duration is not None and request.stamp:
+                return min(request.stamp + duration, last)
+            if duration is not None and left == 1 and len(request.points) > 1:
+                # From the point before, which is when this move began.
+                return min(begin + duration - (request.points[-2][1] or 0), last)
+            if duration is not None and len(request.points) == 1:
+                return min(begin + duration, last)
+            break
+    return last
+
+
+def _asked(run: Run) -> list[float]:
+    """Return the stretches that were asked for, sorted."""
+    asked = {x for request in run.requests for x, _ in request.points}
+    for verdict in run.verdicts:
+        # Rounded for the message: a request says it better.
+        if math.isfinite(verdict.stretch) and _nearest(sorted(asked), verdict.stretch) is None:
+            asked.add(verdict.stretch)
+    return sorted(asked)
+
+
+def _nearest(values: Sequence[float], value: float) -> float | None:
+    """Return the one of some sorted values that is the same to within rounding."""
+    i = bisect_left(values, value - _SAME)
+    return values[i] if i < len(values) and values[i] <= value + _SAME else None
+
+
+def _start(run: Run, levels: Sequence[Level], plan: Sequence[Level]) -> float:
+    """Return the stretch before the first move: planned if that is known, else recorded."""
+    if plan and levels and plan[0].stamp == levels[0].stamp:
+        return plan[0].stretch
+    stamp = levels[0].stamp if levels else int(run.time[0])
+    before = max(int(np.searchsorted(run.time, stamp, side='right')) - 1, 0)
+    return float(run.stretch[before])
+
+
+def _unshaped(
+        run: Run, time: Array, moves: Sequence[Move], zero: int,
+        start: float) -> tuple[Array, Array]:
+    """Simulate plain steps to the levels that held the targets."""
+    stretch, rate = np.full_like(time, start), np.zeros_like(time)
+    if not moves:
+        return np.full_like(time, np.nan), np.full_like(time, np.nan)
+    unit = run.plant.time_unit
+    begins = [(x.begin - zero) / NANOSECONDS for x in moves]
+    running = time >= begins[0]
+    lower, upper = stretch_limits(run.plant.chain_limit)
+    margin = 1e-6 * (upper - lower)
+    stretch[running], nondimensional_rate = simulate(
+        [x / unit for x in begins],
+        [x.flux_densities[-1] / run.plant.flux_density_unit for x in moves],
+        time[running] / unit, run.plant.nondimensional,
+        stretch=min(max(start, lower + margin), upper - margin))
+    rate[running] = nondimensional_rate / unit
+    return stretch, rate
+
+
+def _measure(
+        run: Run, time: Array, unshaped: Array, move: Move, step: float, zero: int) -> MoveResult:
+    """Measure one setpoint."""
+    begin, arrival, end = (
+        (x - zero) / NANOSECONDS for x in (move.begin, move.arrival, move.end))
+    window = {'arrival': arrival, 'end': end, 'step': step}
+    after = (time >= arrival) & (time <= end)
+    error = residual = plain = math.nan
+    if np.count_nonzero(after) >= 2 and step != 0.0:
+        error = float(np.max(np.abs(run.stretch[after] - move.stretch)) / abs(step))
+        residual = residual_vibration(time, run.stretch, **window)
+        plain = residual_vibration(time, unshaped, **window)
+    unit = run.planner.flux_density_unit
+    return MoveResult(
+        stretch=move.stretch, b_p=float(signed_root(move.flux_densities[0] / unit)),
+        tau_p=(arrival - begin) / run.planner.time_unit,
+        b_1=float(signed_root(move.flux_densities[-1] / unit)), begin=begin, arrival=arrival,
+        end=end, error=error, residual=residual, residual_unshaped=plain)
+
+
+def _predict(run: Run, plan: Sequence[Level]) -> tuple[Array, Array]:
+    """Return what the plan predicts for the samples: stretch and rate, from point to point."""
+    predicted = np.full((2, len(run.time)), np.nan)
+    if not plan:
+        return predicted[0], predicted[1]
+    actuator: ActuatorParameters = run.planner
+    material = actuator.nondimensional
+    slew = run.number('planner.slew_limit') / actuator.flux_density_unit * actuator.time_unit
+    load = float(elastic_force(plan[0].stretch, material.j_lim))
+    for i, point in enumerate(plan):
+        until = plan[i + 1].stamp if i + 1 < len(plan) else max(int(run.time[-1]), point.stamp)
+        duration = (until - point.stamp) / NANOSECONDS / actuator.time_unit
+        if not slew:
+            load = point.flux_density / actuator.flux_density_unit
+        switches, loads, slopes, load = pieces(
+            (PlannedLoad(0.0, point.flux_density / actuator.flux_density_unit),), load,
+            duration, slew or math.inf)
+        part = slice(
+            int(np.searchsorted(run.time, point.stamp)), int(np.searchsorted(
+                run.time, until, side='right' if i + 1 == len(plan) else 'left')))
+        if part.start == part.stop:
+            continue
+        try:
+            predicted[:, part] = simulate(
+                switches, loads,
+                (run.time[part] - point.stamp) / NANOSECONDS / actuator.time_unit, material,
+                stretch=point.stretch, rate=point.rate * actuator.time_unit, slopes=slopes)
+        except HmsaError:
+            # A plan of other parameters than are known here: nothing to compare.
+            continue
+    return predicted[0], predicted[1] / actuator.time_unit
+
+
+@dataclass(frozen=True)
+class PlanPoint:
+    """
+    A change of level in the plan, and what was recorded there.
+
+    Attributes
+    ----------
+    time : float
+        In s of the run.
+    planned, commanded : float
+        Flux density in T; NaN if no command has this stamp.
+    stretch, rate : float
+        Predicted for the first sample from then on; the rate in 1/s. NaN if there is none.
+    recorded_stretch, recorded_rate : float
+        That sample.
+    deviation : float
+        Largest distance of the recorded from the predicted stretch until the next point.
+
+    """
+
+    time: float
+    planned: float
+    commanded: float
+    stretch: float
+    rate: float
+    recorded_stretch: float
+    recorded_rate: float
+    deviation: float
+
+
+def plan_points(run: Run, evaluation: Evaluation) -> list[PlanPoint]:
+    """
+    Compare the plan with what was recorded.
+
+    Parameters
+    ----------
+    run : Run
+        As read from a bag.
+    evaluation : Evaluation
+        Of that run.
+
+    Returns
+    -------
+    list of PlanPoint
+        By time.
+
+    """
+    commanded = {x.stamp: x.flux_density for x in evaluation.levels}
+    stretch, rate = evaluation.predicted
+    firsts = [int(np.searchsorted(run.time, x.stamp)) for x in evaluation.plan]
+    points = []
+    for point, first, until in zip(
+            evaluation.plan, firsts, [*firsts[1:], len(run.time)], strict=True):
+        values = [math.nan] * 5
+        if first < until:
+            values = [float(x[first]) for x in (stretch, rate, run.stretch, run.rate)]
+            values.append(float(np.max(np.abs(
+                run.stretch[first:until] - stretch[first:until]))))
+        points.append(PlanPoint(
+            evaluation.seconds(point.stamp), point.flux_density,
+            commanded.get(point.stamp, math.nan), *values))
+    return points
+
+
+@dataclass(frozen=True)
+class Timing:
+    """
+    When commands and samples came.
+
+    Attributes
+    ----------
+    lead : ndarray, shape (m,)
+        How far ahead of its stamp each command was recorded, in s; below 0 for a late one.
+        Empty if the recorder kept another clock than the stamps.
+    delay : ndarray, shape (n,)
+        How long after its stamp each sample was recorded, in s; empty likewise.
+    interval : ndarray, shape (n - 1,)
+        Between the stamps of two samples, in s.
+    arrival_interval : ndarray, shape (n - 1,)
+        Between the times at which they were recorded, in s.
+    missing : int
+        Samples that gaps in the stamps have room for.
+
+    """
+
+    lead: Array
+    delay: Array
+    interval: Array
+    arrival_interval: Array
+    missing: int
+
+    @property
+    def late(self) -> int:
+        """Commands that were recorded after the time from which they apply."""
+        return int(np.count_nonzero(self.lead < 0.0))
+
+
+def timing(run: Run) -> Timing:
+    """
+    Return when commands and samples came.
+
+    Parameters
+    ----------
+    run : Run
+        As read from a bag.
+
+    Returns
+    -------
+    Timing
+        In s.
+
+    """
+    delay = _seconds(run.logged - run.time)
+    interval = _seconds(np.diff(run.time))
+    lead = _seconds(np.array([x.stamp - x.sent for x in run.commands], dtype=np.int64))
+    if abs(float(np.median(delay))) > _SAME_CLOCK:
+        delay, lead = np.empty(0), np.empty(0)
+    usual = float(np.median(interval)) if len(interval) else math.inf
+    gaps = np.rint(interval / usual) - 1.0
+    return Timing(
+        lead, delay, interval, _seconds(np.diff(run.logged)),
+        int(np.sum(gaps[gaps > 0.0])) if len(interval) else 0)
+
+
+def _seconds(nanoseconds: Times) -> Array:
+    return np.asarray(nanoseconds / NANOSECONDS, dtype=np.float64)

@@ -1,0 +1,443 @@
+"""
+A report as one HTML page that needs nothing else: no network, no other file.
+
+What the page may load is nailed down in its content security policy, too.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from html import escape
+import json
+import math
+
+import numpy as np
+
+from hmsa_ros import __version__
+from hmsa_ros.core.model import critical_zeta, stretch_limits
+from hmsa_ros.core.parameters import ActuatorParameters
+from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.errors import HmsaError
+from hmsa_ros.report import charts
+from hmsa_ros.report.assets import SCRIPT, STYLE
+from hmsa_ros.report.charts import Figure, Part, percent, TimeUnit
+from hmsa_ros.report.evaluation import plan_points
+from hmsa_ros.report.reading import ACTUATOR_FIELDS, Run
+
+_POLICY = (
+    "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
+    'img-src data: blob:; font-src data:')
+_UNITS = {
+    'shear_modulus': 'Pa', 'density': 'kg/m³', 'half_length': 'm', 'half_thickness': 'm',
+    'remanence': 'T', 'chain_limit': '1', 'damping_coefficient': 'N s/m'}
+# Plans and requests of long runs are cut here; the figures show all of them.
+_MOST_ROWS = 1000
+# Stamps beyond this many seconds are dates.
+_A_DATE = 1e8
+
+
+@dataclass(frozen=True)
+class Cell:
+    """
+    A cell of a table.
+
+    Attributes
+    ----------
+    shown : str
+        What is read.
+    value : float or None
+        What is copied, in full precision; None for what is shown.
+
+    """
+
+    shown: str
+    value: float | None = None
+
+
+_Row = list[Cell | str]
+
+
+def page(parts: Sequence[Part]) -> str:
+    """
+    Return a report.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        Runs, evaluated; at least one.
+
+    Returns
+    -------
+    str
+        HTML.
+
+    Raises
+    ------
+    HmsaError
+        If Plotly is not installed.
+
+    """
+    unit = charts.time_unit(parts)
+    figures: list[Figure] = []
+
+    def place(figure: Figure, heading: str = '') -> str:
+        figures.append(figure)
+        title = f'<h3>{escape(heading)}</h3>' if heading else ''
+        return (
+            f'<figure>{title}<div class="plot" id="{figure.key}" role="img" '
+            f'aria-label="{escape(figure.alt)}" style="height:{figure.height}px"></div></figure>')
+
+    phase, shown = charts.phase(parts)
+    panels = charts.panels(parts)
+    count = max(len(x.evaluation.results) for x in parts)
+    planned = any(x.evaluation.plan for x in parts)
+    sections = [
+        ('setpoints', 'Setpoints', _setpoints(parts)),
+        ('response-section', 'Command and response', _text(
+            'Above, the flux density commanded: a dot where the level switches. Below, the '
+            'stretch: recorded, predicted by the plan, and simulated for plain steps to the '
+            'levels that hold the targets. Drag to zoom, double-click to go back, click in the '
+            'legend to hide.') + place(charts.response(parts, unit))),
+        ('phase-section', 'Phase plane', _text(
+            'Stretch rate over stretch. Filled dots are the equilibria of the setpoints, the '
+            'open one is where the run starts.' + (
+                '' if shown == 1.0 else f' Only the first {shown:.0%} of the longest curve is '
+                'drawn: what follows covers the same ground.')) + place(phase)),
+    ]
+    if panels:
+        sections += [
+            ('arrivals', 'Arrivals', _text(
+                'Distance from the target in percent of the step, over the time since planned '
+                'arrival. The residual is what is left of the vibration: peak to peak from '
+                'arrival to the next move.' + (
+                    '' if count <= len(panels) else
+                    f' The {len(panels)} of {count} setpoints with the largest residual; the '
+                    'table has all.'))
+             + '<div class="grid">' + ''.join(
+                 place(charts.arrival(parts, i), title) for i, title in panels) + '</div>'),
+            ('residual-section', 'Shaped against unshaped', _text(
+                'Residual of each setpoint as recorded, and as it would have been with plain '
+                'steps (simulated). The axis is logarithmic.')
+             + place(charts.residuals(parts))),
+        ]
+    if planned:
+        sections.append(('plan-section', 'Plan against run', _text(
+            'The plan predicts stretch and rate from each change of level to the next; here is '
+            'how far the recording is from it.') + place(charts.prediction(parts, unit))
+            + _plan(parts, unit)))
+    sections += [
+        ('timing-section', 'Timing', _text(
+            'Lead: how far ahead of the time it applies a command was recorded; below 0 it came '
+            'late. Delay: how long after its stamp a sample was recorded. Times are those of '
+            "the recorder's clock.") + place(charts.timings(parts, unit)) + _timing(parts)),
+        ('losses', 'Messages and losses', _losses(parts)),
+        ('parameters', 'Parameters', _parameters(parts)),
+    ]
+    requests = _requests(parts, unit)
+    if requests:
+        sections.insert(1, ('requests', 'Requests', requests))
+    names = ', '.join(x.run.label for x in parts)
+    data = json.dumps(
+        {'figures': [{'key': x.key, 'data': x.data, 'layout': x.layout} for x in figures],
+         'dark': charts.DARK}, separators=(',', ':'), allow_nan=False)
+    body = [
+        f'<h1>{escape(names)}</h1>', ''.join(_source(x.run) for x in parts), _tiles(parts),
+        _notes(parts),
+        '<nav aria-label="Sections">' + ''.join(
+            f'<a href="#{key}">{escape(title)}</a>' for key, title, _ in sections) + '</nav>',
+        *(f'<section id="{key}"><h2>{escape(title)}</h2>{content}</section>'
+          for key, title, content in sections),
+        f'<footer class="soft"><p>Written by hmsa_ros {__version__}. Each curve shows the least '
+        f'and the largest value in each of {charts.BUCKETS} intervals, so that no peak is '
+        'lost.</p></footer>']
+    return '\n'.join([
+        '<!DOCTYPE html>', '<html lang="en">', '<head>', '<meta charset="utf-8">',
+        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        '<link rel="icon" href="data:,">',
+        f'<title>{escape(names)} – run report</title>', f'<style>{STYLE}</style>', '</head>',
+        '<body>', *body,
+        # Inside a script only "</" could end it.
+        '<script type="application/json" id="report-data">' + data.replace('</', '<\\/')
+        + '</script>',
+        f'<script>{_plotly()}</script>', f'<script>{SCRIPT}</script>', '</body>', '</html>', ''])
+
+
+def _plotly() -> str:
+    """Return the library that draws."""
+    try:
+        from plotly.offline import get_plotlyjs  # type: ignore[import-untyped]
+
+        script: str = get_plotlyjs()
+    except (ImportError, OSError) as error:
+        raise HmsaError(
+            f'the page cannot be drawn without Plotly ({error}): install it with '
+            '"pip install plotly"') from error
+    # The closing tag may stand in its strings; in JavaScript the two spellings are one.
+    return script.replace('</script', '<\\/script')
+
+
+def _text(words: str) -> str:
+    return f'<p class="soft">{escape(words)}</p>'
+
+
+def _time(nanoseconds: int) -> str:
+    """Return a time as a date, or as seconds where it is simulated."""
+    seconds = nanoseconds / NANOSECONDS
+    if seconds < _A_DATE:
+        return f'{seconds:.6f} s (simulated time)'
+    return datetime.fromtimestamp(seconds).astimezone().isoformat(' ', 'seconds')
+
+
+def _source(run: Run) -> str:
+    """Return where a run is from."""
+    return (
+        f'<p class="soft"><b>{escape(run.label)}</b>: {escape(str(run.path))}, samples on '
+        f'{escape(run.topics["joint_states"])} from {_time(int(run.time[0]))}, '
+        f'{(run.time[-1] - run.time[0]) / NANOSECONDS:.6g} s</p>')
+
+
+def _tiles(parts: Sequence[Part]) -> str:
+    """Return the figures that say most."""
+    def all_runs(texts: Iterable[str]) -> str:
+        return ' · '.join(texts)
+
+    def largest(values: Iterable[float]) -> float:
+        return max((x for x in values if math.isfinite(x)), default=math.nan)
+
+    residual = [largest(x.residual for x in part.evaluation.results) for part in parts]
+    plain = [largest(x.residual_unshaped for x in part.evaluation.results) for part in parts]
+    tiles = [
+        ('setpoints', all_runs(str(len(x.evaluation.results)) for x in parts)),
+        ('largest residual, share of the step', all_runs(map(percent, residual))),
+        ('the same with plain steps', all_runs(map(percent, plain))),
+        ('commands', all_runs(
+            f'{len(x.run.commands)}' + (
+                f' ({x.timing.late} late)' if len(x.timing.lead) else '') for x in parts)),
+        ('samples a second', all_runs(
+            f'{1.0 / np.median(x.timing.interval):.6g}' if len(x.timing.interval) else '–'
+            for x in parts)),
+        ('messages lost', all_runs(
+            'not told' if x.run.summary.lost is None else str(x.run.summary.lost)
+            for x in parts)),
+    ]
+    return '<div class="tiles">' + ''.join(
+        f'<div><b>{escape(value)}</b><span>{escape(name)}</span></div>'
+        for name, value in tiles) + '</div>'
+
+
+def _notes(parts: Sequence[Part]) -> str:
+    """Return what a reader should know."""
+    notes = [
+        f'{x.run.label}: {note}' if len(parts) > 1 else note
+        for x in parts for note in _notes_of(x)]
+    if not notes:
+        return ''
+    return '<ul class="notes">' + ''.join(f'<li>{escape(x)}</li>' for x in notes) + '</ul>'
+
+
+def _notes_of(part: Part) -> Iterable[str]:
+    """Return the notes on one run."""
+    yield from part.run.notes
+    if part.run.commands and not part.evaluation.results:
+        yield ('No setpoint could be told from the commands: none of them holds a stretch that '
+               'was asked for, or lasts a period of the actuator.')
+    if not len(part.timing.lead) and part.run.commands:
+        yield ('The recorder kept another clock than the stamps: how far ahead commands were '
+               'sent is not known (record with use_sim_time where time is simulated).')
+    if part.timing.missing:
+        yield f'The stamps of the samples have gaps with room for {part.timing.missing} more.'
+    for verdict in part.run.verdicts:
+        if verdict.level == 'error':
+            yield f'The planner refused a request ({verdict.code}): {verdict.message}'
+
+
+# Tables --------------------------------------------------------------------------------------
+
+def _table(
+        key: str, caption: str, header: Sequence[str],
+        rows: Sequence[_Row]) -> str:
+    """Return a table with a button that copies it."""
+    if header[0] == 'run' and len({row[0] for row in rows}) <= 1:
+        # A run on its own needs no name in every row.
+        header, rows = header[1:], [row[1:] for row in rows]
+    numeric = [any(
+        isinstance(row[i], Cell) for row in rows) for i in range(len(header))]
+    kinds = [' class="number"' if x else '' for x in numeric]
+    lines = [
+        f'<button type="button" data-table="{key}">Copy table</button>',
+        f'<div class="scroll"><table id="{key}"><caption>{escape(caption)}</caption><thead><tr>',
+        *(f'<th scope="col"{kind}>{escape(x)}</th>'
+          for x, kind in zip(header, kinds, strict=True)), '</tr></thead><tbody>']
+    for row in rows:
+        lines.append('<tr>')
+        for cell, kind in zip(row, kinds, strict=True):
+            if isinstance(cell, str):
+                lines.append(f'<td{kind}>{escape(cell)}</td>')
+            else:
+                value = '' if cell.value is None else f' data-value="{cell.value!r}"'
+                lines.append(f'<td{kind}{value}>{escape(cell.shown)}</td>')
+        lines.append('</tr>')
+    return ''.join([*lines, '</tbody></table></div>'])
+
+
+def _cell(value: float, form: str = '.6g') -> Cell:
+    """Return a number as a cell."""
+    value = float(value)
+    return Cell(f'{value:{form}}', value) if math.isfinite(value) else Cell('–', math.nan)
+
+
+def _percent(share: float) -> Cell:
+    """Return a share as a cell in percent."""
+    return _cell(100.0 * share, '.3g')
+
+
+def _setpoints(parts: Sequence[Part]) -> str:
+    """Return the table of what became of the setpoints."""
+    rows: list[_Row] = []
+    for part in parts:
+        for i, (move, x) in enumerate(zip(
+                part.evaluation.moves, part.evaluation.results, strict=True), 1):
+            levels = len(move.flux_densities)
+            rows.append([
+                part.run.label, Cell(str(i), i), _cell(x.stretch), _cell(x.b_p, '.5f'),
+                _cell(x.tau_p, '.5f'), _cell(x.b_1, '.5f'), _cell(x.begin * 1e3, '.3f'),
+                _cell(x.arrival * 1e3, '.3f'), _cell(x.end * 1e3, '.3f'), _percent(x.error),
+                _percent(x.residual), _percent(x.residual_unshaped),
+                'plain step' if levels == 1 else f'{levels} levels'])
+    if not rows:
+        return _text('No setpoint was carried out while the samples were recorded.')
+    header = [
+        'run', 'setpoint', 'target λ [1]', 'b_p [1]', 'tau_p [1]', 'b_1 [1]', 'begin [ms]',
+        'arrival [ms]', 'until [ms]', 'largest error [%]', 'residual [%]', 'plain steps [%]',
+        'command']
+    return _table(
+        'setpoint-table', 'b and tau nondimensional as in the paper: of the first level, the '
+        'time until arrival, and of the level that holds the target. Error and residual in '
+        'percent of the step, from arrival on; times from the first command.',
+        header, rows)
+
+
+def _requests(parts: Sequence[Part], unit: TimeUnit) -> str:
+    """Return the table of verdicts."""
+    rows: list[_Row] = []
+    for part in parts:
+        before = None
+        for x in part.run.verdicts:
+            if (x.code, x.message) != before and x.code != 'none':
+                before = x.code, x.message
+                rows.append([
+                    part.run.label,
+                    _cell(unit.of(part.evaluation.seconds(x.sent)).item(), '.3f'), x.level,
+                    x.code, x.message])
+    if not rows:
+        return ''
+    return _table(
+        'request-table', 'What the planner said of the requests.',
+        ['run', f'time [{unit.name}]', 'level', 'code', 'message'], rows[:_MOST_ROWS])
+
+
+def _plan(parts: Sequence[Part], unit: TimeUnit) -> str:
+    """Return the table of planned changes of level."""
+    rows: list[_Row] = []
+    for part in parts:
+        for x in plan_points(part.run, part.evaluation):
+            rows.append([
+                part.run.label, _cell(unit.of(x.time).item(), '.4f'),
+                _cell(x.planned * 1e3, '.4f'), _cell(x.commanded * 1e3, '.4f'),
+                _cell(x.stretch, '.7f'), _cell(x.recorded_stretch, '.7f'),
+                _cell(x.rate, '.4g'), _cell(x.recorded_rate, '.4g'),
+                _cell(x.deviation, '.2e')])
+    return _table(
+        'plan-table', 'Each change of level: flux density planned and commanded; stretch and '
+        'rate of the first sample from then on; and the largest distance of the recorded from '
+        'the predicted stretch until the next change.',
+        ['run', f'time [{unit.name}]', 'B planned [mT]', 'B commanded [mT]', 'λ planned [1]',
+         'λ recorded [1]', 'rate planned [1/s]', 'rate recorded [1/s]', 'largest |Δλ| [1]'],
+        rows[:_MOST_ROWS])
+
+
+def _timing(parts: Sequence[Part]) -> str:
+    """Return the table of times."""
+    rows: list[_Row] = []
+    for part in parts:
+        x = part.timing
+        for name, values in (
+                ('command lead', x.lead), ('sample delay', x.delay),
+                ('interval of the stamps', x.interval),
+                ('interval of the recorded samples', x.arrival_interval)):
+            if len(values):
+                low, middle, high, top = np.quantile(values, [0.0, 0.5, 0.99, 1.0]) * 1e3
+                rows.append([
+                    part.run.label, name, Cell(str(len(values)), len(values)),
+                    *(_cell(y, '.4f') for y in (low, middle, high, top)),
+                    _cell(float(np.std(values)) * 1e3, '.4f')])
+    return _table(
+        'timing-table', 'Jitter is the standard deviation.',
+        ['run', 'quantity', 'count', 'least [ms]', 'median [ms]', '99 % [ms]', 'largest [ms]',
+         'jitter [ms]'], rows)
+
+
+def _losses(parts: Sequence[Part]) -> str:
+    """Return the table of topics."""
+    rows: list[_Row] = []
+    told = True
+    for part in dict.fromkeys(x.run.path for x in parts):
+        run = next(x.run for x in parts if x.run.path == part)
+        told = told and run.summary.lost is not None
+        for topic in run.summary.topics:
+            rows.append([
+                run.label, topic.name, topic.type, Cell(str(topic.count), topic.count),
+                _cell(math.nan if topic.rate is None else topic.rate, '.1f'),
+                Cell('not told' if topic.lost is None else str(topic.lost),
+                     math.nan if topic.lost is None else topic.lost)])
+    words = '' if told else _text(
+        'A recorder that counts what it misses stores that in the bag (hmsa recorder does); '
+        'where it is not told, gaps in the stamps of the samples are all there is to go by.')
+    return words + _table(
+        'loss-table', 'What is in the bags.',
+        ['bag', 'topic', 'type', 'messages', 'a second', 'lost'], rows)
+
+
+def _parameters(parts: Sequence[Part]) -> str:
+    """Return the table of parameters."""
+    header = ['parameter', 'unit']
+    columns: list[ActuatorParameters] = []
+    for part in parts:
+        run = part.run
+        source = '' if run.parameters_known else ' (unknown: example block)'
+        prefix = f'{run.label}: ' if len(parts) > 1 else ''
+        if run.plant == run.planner:
+            header.append(f'{prefix}actuator{source}')
+            columns.append(run.plant)
+        else:
+            header += [f'{prefix}plant', f'{prefix}as planned']
+            columns += [run.plant, run.planner]
+    rows: list[_Row] = [
+        [name.replace('_', ' '), _UNITS[name], *(_cell(getattr(x, name)) for x in columns)]
+        for name in ACTUATOR_FIELDS]
+    groups = [x.nondimensional for x in columns]
+    limits = [stretch_limits(x.chain_limit) for x in columns]
+    rows += [
+        ['zeta', '1', *(_cell(x.zeta) for x in groups)],
+        ['critical zeta about stretch 1', '1', *(
+            _cell(float(critical_zeta(1.0, x))) for x in groups)],
+        ['J_lim', '1', *(_cell(x.j_lim) for x in groups)],
+        ['c1', '1', *(_cell(x.c1) for x in groups)],
+        ['time unit', 'ms', *(_cell(x.time_unit * 1e3) for x in columns)],
+        ['flux density of load 1', 'mT', *(_cell(x.flux_density_unit * 1e3) for x in columns)],
+        ['least stretch', '1', *(_cell(x) for x, _ in limits)],
+        ['largest stretch', '1', *(_cell(x) for _, x in limits)],
+    ]
+    words = '' if all(x.run.parameters_known for x in parts) else _text(
+        'Unknown: the bag does not tell the parameters, and the example block of the paper '
+        'stands in.')
+    recorded: list[_Row] = [
+        [part.run.label, key, json.dumps(value)] for part in parts
+        for key, value in part.run.parameters.items()]
+    more = '' if not recorded else (
+        '<details><summary>All parameters that were recorded</summary>' + _table(
+            'recorded-table', 'As the nodes had them.', ['run', 'parameter', 'value'], recorded)
+        + '</details>')
+    return words + _table(
+        'parameter-table', 'The block, and what follows from it.', header, rows) + more

@@ -1,0 +1,655 @@
+"""
+A run, read from a bag.
+
+Topics are found by the end of their name and their type, so that any namespace will do; the
+bag may come from this package's recorder, from rosbag2, from a simulated plant or from a coil.
+"""
+
+from array import array
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+import json
+import math
+from pathlib import Path
+import struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmsa_ros.bag.info import BagSummary, summarize
+from hmsa_ros.bag.reader import BagReader, Message
+from hmsa_ros.core.model import Array
+from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
+from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.errors import BadInputError, BagError
+
+Times = NDArray[np.int64]
+
+JOINT_STATES = 'joint_states'
+COMMAND = 'flux_density_command'
+PLAN = 'planner/plan'
+TRAJECTORY = 'planner/joint_trajectory'
+SETPOINT = 'planner/setpoint'
+STATUS = 'planner/status'
+TYPES = {
+    JOINT_STATES: 'sensor_msgs/msg/JointState',
+    COMMAND: 'sensor_msgs/msg/MagneticField',
+    PLAN: 'trajectory_msgs/msg/JointTrajectory',
+    TRAJECTORY: 'trajectory_msgs/msg/JointTrajectory',
+    SETPOINT: 'std_msgs/msg/Float64',
+    STATUS: 'diagnostic_msgs/msg/DiagnosticStatus',
+}
+#: Fields of `ActuatorParameters`, as the nodes' parameters name them.
+ACTUATOR_FIELDS = (
+    'shear_modulus', 'density', 'half_length', 'half_thickness', 'remanence', 'chain_limit',
+    'damping_coefficient')
+_DEFAULT_JOINT = 'actuator'
+# Between two calls of the progress.
+_PROGRESS_MESSAGES = 20_000
+_LITTLE_ENDIAN = b'\x00\x01'
+_LEVELS = ('ok', 'warning', 'error')
+
+
+@dataclass(frozen=True)
+class Level:
+    """
+    A command, or a change of level in a plan.
+
+    Attributes
+    ----------
+    stamp : int
+        Time in ns from which it applies.
+    flux_density : float
+        In T.
+    sent : int
+        Time in ns at which it was recorded.
+    stretch, rate : float
+        Predicted at the stamp, the rate in 1/s; NaN for a command.
+
+    """
+
+    stamp: int
+    flux_density: float
+    sent: int
+    stretch: float = math.nan
+    rate: float = math.nan
+
+
+@dataclass(frozen=True)
+class Request:
+    """
+    What the planner was asked for.
+
+    Attributes
+    ----------
+    sent : int
+        Time in ns at which it was recorded.
+    stamp : int
+        Start of the sequence in ns; 0 for at once.
+    points : tuple of (float, int or None)
+        Stretch, and time in ns from the start until which it lasts; None for a setpoint that
+        is held until the next.
+
+    """
+
+    sent: int
+    stamp: int
+    points: tuple[tuple[float, int | None], ...]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """
+    What the planner said of a request.
+
+    Attributes
+    ----------
+    sent : int
+        Time in ns at which it was recorded.
+    level : str
+        ``'ok'``, ``'warning'`` or ``'error'``.
+    code, message : str
+        As published.
+    stretch : float
+        Target of the setpoint under way; NaN if there is none.
+
+    """
+
+    sent: int
+    level: str
+    code: str
+    message: str
+    stretch: float
+
+
+@dataclass(frozen=True)
+class Run:
+    """
+    What a bag holds of one actuator.
+
+    Attributes
+    ----------
+    label : str
+        Name for people.
+    path : Path
+        The bag.
+    summary : BagSummary
+        The bag in figures.
+    topics : dict of str to str
+        Topic of each role (`JOINT_STATES`, `COMMAND`, ...) that the bag has.
+    time : ndarray of int64, shape (n,)
+        Stamps of the samples in ns, increasing.
+    logged : ndarray of int64, shape (n,)
+        When they were recorded, in ns.
+    stretch, rate, flux_density : ndarray, shape (n,)
+        Samples; the rate in 1/s, from the stretch if it was not recorded; the flux density in
+        T, NaN if it was not recorded.
+    commands : tuple of Level
+        In the order they were recorded.
+    plans : tuple of tuple of Level
+        Plans in the order they were recorded.
+    requests : tuple of Request
+        In the order they were recorded.
+    verdicts : tuple of Verdict
+        In the order they were recorded, each once.
+    parameters : dict of str to object
+        Parameters of the nodes as recorded, by ``'node.name'``.
+    plant, planner : ActuatorParameters
+        The block as it was, and as the planner took it to be.
+    parameters_known : bool
+        Whether the bag, or the caller, told of the block.
+    notes : tuple of str
+        What a reader should know, one sentence each.
+
+    """
+
+    label: str
+    path: Path
+    summary: BagSummary
+    topics: dict[str, str]
+    time: Times
+    logged: Times
+    stretch: Array
+    rate: Array
+    flux_density: Array
+    commands: tuple[Level, ...]
+    plans: tuple[tuple[Level, ...], ...]
+    requests: tuple[Request, ...]
+    verdicts: tuple[Verdict, ...]
+    parameters: dict[str, object]
+    plant: ActuatorParameters
+    planner: ActuatorParameters
+    parameters_known: bool
+    notes: tuple[str, ...]
+
+    def number(self, name: str) -> float:
+        """
+        Return a recorded parameter that is a number.
+
+        Parameters
+        ----------
+        name : str
+            For example ``'planner.slew_limit'``.
+
+        Returns
+        -------
+        float
+            0 if it was not recorded.
+
+        """
+        value = self.parameters.get(name)
+        return float(value) if isinstance(value, (int, float)) else 0.0
+
+
+def read_runs(
+        path: str | Path, *, actuator: ActuatorParameters | None = None, joint: str = '',
+        progress: Callable[[str, float], None] = lambda what, share: None) -> list[Run]:
+    """
+    Read a bag: one run for each namespace with joint states and commands.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder of a bag, or an ``.mcap`` file.
+    actuator : ActuatorParameters, optional
+        The block, where the bag does not tell.
+    joint : str
+        Name of the actuator in the joint states; default what the planner calls it.
+    progress : callable
+        Called with what is going on and the share that is done.
+
+    Returns
+    -------
+    list of Run
+        At least one, in order of namespace.
+
+    Raises
+    ------
+    BadInputError
+        If there is no bag, or it has no samples of an actuator.
+
+    """
+    path = Path(path)
+    reader = BagReader(path)
+    spaces = _namespaces(reader)
+    found = {topic: (space, role) for space, topics in spaces.items()
+             for role, topic in topics.items()}
+    collected: dict[str, _Collected] = {space: _Collected() for space in spaces}
+    notes: list[str] = []
+    decoders: dict[str, Callable[[bytes], Any]] = {}
+    for topic, (space, role) in found.items():
+        try:
+            decoders[topic] = reader.decoder(topic)
+        except BagError as error:
+            raise BadInputError(f'{path} cannot be evaluated: {error}') from error
+        if role == JOINT_STATES:
+            collected[space].samples = _SampleReader(decoders[topic])
+    begin, end = reader.start_time or 0, reader.end_time or 0
+    for i, message in enumerate(reader.messages(list(found))):
+        if i % _PROGRESS_MESSAGES == 0:
+            progress(f'reading {path.name}', (message.log_time - begin) / max(end - begin, 1))
+        space, role = found[message.topic]
+        try:
+            collected[space].take(role, message, decoders[message.topic])
+        except BagError as error:
+            if len(notes) < 20:
+                notes.append(f'{error}: left out')
+    summary = summarize(path)
+    notes += [*summary.problems]
+    label = path.resolve().stem if path.is_file() else path.resolve().name
+    runs, reasons = [], []
+    for space, topics in sorted(spaces.items()):
+        name = label if len(spaces) == 1 else f'{label} {space or "/"}'
+        try:
+            runs.append(collected[space].finish(
+                name, path, summary, topics, notes, reader.custom_data, actuator, joint))
+        except BadInputError as error:
+            reasons.append(error)
+    if not runs:
+        raise reasons[0]
+    return runs
+
+
+def _namespaces(reader: BagReader) -> dict[str, dict[str, str]]:
+    """Return the topics of each actuator, by namespace and role."""
+    names: dict[str, list[tuple[str, str]]] = {role: [] for role in TYPES}
+    for topic in reader.topics.values():
+        for role, kind in TYPES.items():
+            if topic.type == kind and f'/{topic.name}'.endswith(f'/{role}'):
+                names[role].append((topic.name[:-len(role)].rstrip('/'), topic.name))
+    missing = [f'.../{role} ({TYPES[role]})' for role in (JOINT_STATES, COMMAND)
+               if not names[role]]
+    if missing:
+        has = ', '.join(sorted(reader.topics)) or 'none: the bag is empty'
+        raise BadInputError(
+            f'{reader.path} has no topic {" and no topic ".join(missing)}: expected a bag of a '
+            f'run; its topics are {has}')
+    spaces: dict[str, dict[str, str]] = {}
+    for space, name in names[JOINT_STATES]:
+        topics = {JOINT_STATES: name}
+        for role in TYPES:
+            same = [x for where, x in names[role] if where == space]
+            if same:
+                topics[role] = same[0]
+            elif len(names[role]) == 1 and len(names[JOINT_STATES]) == 1:
+                # Planner and plant in namespaces of their own, remapped to each other.
+                topics[role] = names[role][0][1]
+        if COMMAND in topics:
+            spaces[space] = topics
+    if not spaces:
+        raise BadInputError(
+            f'{reader.path} has joint states and commands in different namespaces: expected '
+            f'{COMMAND} beside one of '
+            + ', '.join(name for _, name in names[JOINT_STATES]))
+    return spaces
+
+
+class _Collected:
+    """What has been read of one actuator so far."""
+
+    samples: '_SampleReader'
+
+    def __init__(self) -> None:
+        self.commands: list[Level] = []
+        self.refused = 0
+        self.plans: list[tuple[Level, ...]] = []
+        self.joint = ''
+        self.requests: list[Request] = []
+        self.verdicts: list[Verdict] = []
+
+    def take(self, role: str, message: Message, decode: Callable[[bytes], Any]) -> None:
+        """Take in a message."""
+        if role == JOINT_STATES:
+            self.samples.take(message.log_time, message.data)
+            return
+        content, sent = decode(message.data), message.log_time
+        if role == COMMAND:
+            field = content.magnetic_field
+            if math.isfinite(field.x + field.y + field.z) and field.x == 0.0 == field.y:
+                self.commands.append(
+                    Level(_ns(content.header.stamp) or sent, float(field.z), sent))
+            else:
+                self.refused += 1
+        elif role == PLAN:
+            start = _ns(content.header.stamp)
+            self.joint = next(iter(content.joint_names), '')
+            self.plans.append(tuple(
+                Level(start + _ns(x.time_from_start), float(x.effort[0]), sent,
+                      float(x.positions[0]), float(x.velocities[0]))
+                for x in content.points if x.positions and x.velocities and x.effort))
+        elif role == TRAJECTORY:
+            self.requests.append(Request(sent, _ns(content.header.stamp), tuple(
+                (float(x.positions[0]), _ns(x.time_from_start))
+                for x in content.points if len(x.positions) == 1)))
+        elif role == SETPOINT:
+            self.requests.append(Request(sent, 0, ((float(content.data), None),)))
+        else:
+            self._take_status(content, sent)
+
+    def _take_status(self, content: Any, sent: int) -> None:
+        values = {x.key: x.value for x in content.values}
+        try:
+            stretch = float(values.get('stretch', ''))
+        except ValueError:
+            stretch = math.nan
+        level = content.level[0] if isinstance(content.level, bytes) else int(content.level)
+        self.verdicts.append(Verdict(
+            sent, _LEVELS[min(level, 2)], values.get('code', ''), content.message, stretch))
+
+    def finish(
+            self, label: str, path: Path, summary: BagSummary, topics: dict[str, str],
+            notes: Iterable[str], custom_data: Mapping[str, str],
+            actuator: ActuatorParameters | None, joint: str) -> Run:
+        """Return the run."""
+        notes = list(notes)
+        parameters = _parameters(custom_data)
+        named = joint or self.joint or str(parameters.get('planner.joint', ''))
+        time, logged, stretch, rate, flux_density = self.samples.arrays(
+            f'{path}: {topics[JOINT_STATES]}', named, required=bool(joint))
+        if not self.commands:
+            notes.append(
+                f'{topics[COMMAND]} holds no command: there is no setpoint to evaluate.')
+        if self.refused:
+            notes.append(
+                f'{self.refused} commands are not finite or not along z: left out, as the plant '
+                'does.')
+        notes += self.samples.notes
+        plant, planner, known, more = _actuators(parameters, actuator)
+        return Run(
+            label, path, summary, topics, time, logged, stretch, rate, flux_density,
+            tuple(self.commands), tuple(self.plans), tuple(self.requests),
+            tuple(self.verdicts), parameters, plant, planner, known, (*notes, *more))
+
+
+def _parameters(custom_data: Mapping[str, str]) -> dict[str, object]:
+    """Return the parameters of the nodes that the recorder stored."""
+    parameters: dict[str, object] = {}
+    for key, text in custom_data.items():
+        node, _, name = key.partition('.')
+        if name and f'{node}.use_sim_time' in custom_data:
+            try:
+                parameters[key] = json.loads(text)
+            except ValueError:
+                parameters[key] = text
+    return parameters
+
+
+def _actuators(
+        parameters: Mapping[str, object], given: ActuatorParameters | None
+) -> tuple[ActuatorParameters, ActuatorParameters, bool, list[str]]:
+    """Return the block of the plant and of the planner, whether they are known, and notes."""
+    found: dict[str, ActuatorParameters] = {}
+    notes = []
+    for node in ('plant', 'planner'):
+        values = {x: parameters.get(f'{node}.actuator.{x}') for x in ACTUATOR_FIELDS}
+        if all(isinstance(x, (int, float)) for x in values.values()):
+            try:
+                found[node] = ActuatorParameters(**values)  # type: ignore[arg-type]
+            except BadInputError as error:
+                notes.append(f'The parameters of the {node} in the bag cannot be used: {error}.')
+    known = given is not None or bool(found)
+    if not known:
+        notes.append(
+            "The bag does not tell the actuator's parameters: those of the paper's example "
+            'block are taken, so that what is simulated here (plain steps, prediction, '
+            'equilibria, b and tau) may not be your actuator; name a parameter file with '
+            '--params.')
+    plant = given or found.get('plant') or found.get('planner') or paper_actuator()
+    planner = found.get('planner') or plant
+    if plant != planner:
+        notes.append(
+            'The planner took other parameters for the actuator than the plant has: see the '
+            'table of parameters.')
+    return plant, planner, known, notes
+
+
+# Names, and how many positions, velocities and efforts.
+_Shape = tuple[tuple[str, ...], int, int, int]
+
+
+class _Columns:
+    """Samples of one shape: log time and stamp, and the numbers, row after row."""
+
+    def __init__(self) -> None:
+        self.times = array('q')
+        self.numbers = array('d')
+
+
+class _SampleReader:
+    """
+    Reads joint states, quickly where they all have one layout.
+
+    Decoding field by field takes longer than everything else together. Joint states of one
+    sender differ in their numbers only, so that the places of these are worked out once for
+    each length and the rest is compared.
+    """
+
+    def __init__(self, decode: Callable[[bytes], Any]) -> None:
+        self._decode = decode
+        self._layouts: dict[int, _Layout | None] = {}
+        self._columns: dict[_Shape, _Columns] = {}
+        self.notes: list[str] = []
+
+    def take(self, logged: int, data: bytes) -> None:
+        """Take in a sample."""
+        length = len(data)
+        if length not in self._layouts:
+            self._layouts[length] = _Layout.find(data, self._decode)
+        layout = self._layouts[length]
+        if layout is not None and layout.fits(data):
+            sec, nanosec = layout.stamp.unpack_from(data, 4)
+            self._put(logged, sec * NANOSECONDS + nanosec, layout.names, [
+                x.unpack_from(data, offset) for x, offset in layout.numbers])
+            return
+        message = self._decode(data)
+        self._put(logged, _ns(message.header.stamp), tuple(message.name), [
+            tuple(x) for x in (message.position, message.velocity, message.effort)])
+
+    def _put(
+            self, logged: int, stamp: int, names: tuple[str, ...],
+            numbers: list[tuple[float, ...]]) -> None:
+        position, velocity, effort = map(len, numbers)
+        shape = (names, position, velocity, effort)
+        columns = self._columns.get(shape)
+        if columns is None:
+            columns = self._columns[shape] = _Columns()
+        columns.times.extend((logged, stamp))
+        for values in numbers:
+            columns.numbers.extend(values)
+
+    def arrays(
+            self, where: str, joint: str, *, required: bool
+    ) -> tuple[Times, Times, Array, Array, Array]:
+        """Return stamps, log times, stretch, rate and flux density of one joint."""
+        if not self._columns:
+            raise BadInputError(f'{where} holds no message: expected samples of the actuator')
+        joint = self._joint(where, joint, required)
+        parts = []
+        for (names, *widths), columns in self._columns.items():
+            place = names.index(joint) if joint in names else 0
+            if names and joint not in names or place >= widths[0]:
+                continue
+            times = np.array(columns.times).reshape(-1, 2)
+            numbers = np.array(columns.numbers).reshape(len(times), -1)
+            picked = [
+                numbers[:, sum(widths[:i]) + place] if place < width
+                else np.full(len(times), np.nan) for i, width in enumerate(widths)]
+            parts.append((times[:, 0], times[:, 1], *picked))
+        if not parts:
+            raise BadInputError(
+                f'{where} holds no position of joint {joint!r}: expected the stretch')
+        logged, stamps, stretch, rate, flux_density = (
+            np.concatenate(x) for x in zip(*parts, strict=True))
+        order = np.argsort(logged, kind='stable')
+        return self._tidy(
+            where, *(x[order] for x in (stamps, logged, stretch, rate, flux_density)))
+
+    def _joint(self, where: str, joint: str, required: bool) -> str:
+        names = {x for shape in self._columns for x in shape[0]}
+        if joint in names or not names:
+            return joint
+        if required:
+            raise BadInputError(
+                f'{where} has no joint {joint!r}: expected one of {", ".join(sorted(names))}')
+        if _DEFAULT_JOINT in names:
+            return _DEFAULT_JOINT
+        if len(names) == 1:
+            return names.pop()
+        raise BadInputError(
+            f'{where} has the joints {", ".join(sorted(names))}: expected one; name it with '
+            '--joint')
+
+    def _tidy(
+            self, where: str, stamps: Times, logged: Times, stretch: Array, rate: Array,
+            flux_density: Array) -> tuple[Times, Times, Array, Array, Array]:
+        """Leave out what cannot be drawn, sort by stamp and complete the rate."""
+        if not stamps.any():
+            stamps = logged.copy()
+            self.notes.append(
+                'The samples carry no stamps: the times at which they were recorded are taken.')
+        if np.any(np.diff(stamps) < 0):
+            self.notes.append(
+                'The stamps of the samples jump back: the samples are sorted by stamp. Was the '
+                'clock reset in the run?')
+        order = np.argsort(stamps, kind='stable')
+        # Of samples with one stamp the first counts, so that time increases.
+        order = order[np.append(True, np.diff(stamps[order]) > 0)]
+        good = order[np.isfinite(stretch[order])]
+        if len(good) < len(order):
+            self.notes.append(
+                f'{len(order) - len(good)} samples are not finite numbers: left out.')
+        if not len(good):
+            raise BadInputError(
+                f'{where} holds no finite position: expected the stretch as a number')
+        stamps, logged, stretch, rate, flux_density = (
+            x[good] for x in (stamps, logged, stretch, rate, flux_density))
+        if not np.all(np.isfinite(rate)):
+            self.notes.append(
+                'Stretch rates were not recorded: they are differences of the stretch.')
+            rate = np.gradient(stretch, (stamps - stamps[0]) / NANOSECONDS) \
+                if len(stamps) > 1 else np.zeros_like(stretch)
+        return stamps, logged, stretch, rate, flux_density
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where the numbers of a joint state lie, and the bytes between them."""
+
+    stamp: struct.Struct
+    numbers: tuple[tuple[struct.Struct, int], ...]
+    constant: tuple[tuple[int, int, bytes], ...]
+    names: tuple[str, ...]
+
+    def fits(self, data: bytes) -> bool:
+        """Return whether a payload of the same length has this layout."""
+        return all(data[i:j] == x for i, j, x in self.constant)
+
+    @classmethod
+    def find(cls, data: bytes, decode: Callable[[bytes], Any]) -> '_Layout | None':
+        """Return the layout of a payload, None if it is not the usual one."""
+        if data[:2] != _LITTLE_ENDIAN:
+            return None
+        message = decode(data)
+        place = 12
+
+        def count() -> int:
+            nonlocal place
+            place += -place % 4
+            number: int = struct.unpack_from('<I', data, place)[0]
+            place += 4
+            return number
+
+        numbers, constant, begin = [], [(0, 4, data[:4])], 12
+        try:
+            place += count()
+            for _ in range(count()):
+                length = count()
+                place += length
+            for values in (message.position, message.velocity, message.effort):
+                number = count()
+                # Doubles are aligned to 8 from the end of the encapsulation on.
+                start = place + (4 - place) % 8 if number else place
+                constant.append((begin, place, data[begin:place]))
+                numbers.append((struct.Struct(f'<{number}d'), start))
+                place = begin = start + 8 * number
+                if list(numbers[-1][0].unpack_from(data, start)) != list(values):
+                    return None
+        except struct.error:
+            return None
+        return cls(struct.Struct('<iI'), tuple(numbers), tuple(constant), tuple(message.name))
+
+
+def _ns(stamp: Any) -> int:
+    """Return a stamp or a duration in ns."""
+    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+
+
+def read_actuator(path: Path) -> ActuatorParameters:
+    """
+    Read the block from a parameter file of the nodes.
+
+    Parameters
+    ----------
+    path : Path
+        YAML as ROS 2 has it.
+
+    Returns
+    -------
+    ActuatorParameters
+        What the file leaves out is taken from the paper's example block, as the nodes do.
+
+    Raises
+    ------
+    BadInputError
+        If the file cannot be read or sets no parameter of the actuator.
+
+    """
+    import yaml
+
+    try:
+        document = yaml.safe_load(path.read_text(encoding='utf-8'))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        reason = getattr(error, 'strerror', None) or ' '.join(str(error).split())
+        raise BadInputError(
+            f'{path} cannot be read ({reason}): expected a parameter file (YAML)') from error
+    found: dict[str, Any] = {}
+    _flatten(document, '', found)
+    values = {field: found[key] for field in ACTUATOR_FIELDS for key in found
+              if key.endswith(f'actuator.{field}')}
+    if not values:
+        raise BadInputError(
+            f'{path} sets no parameter of the actuator: expected some of '
+            + ', '.join(f'actuator.{x}' for x in ACTUATOR_FIELDS))
+    default = paper_actuator()
+    return ActuatorParameters(**{
+        x: values.get(x, getattr(default, x)) for x in ACTUATOR_FIELDS})
+
+
+def _flatten(value: object, name: str, found: dict[str, Any]) -> None:
+    """Collect the values of nested mappings by dotted name."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            _flatten(inner, f'{name}.{key}' if name else str(key), found)
+    else:
+        found[name] = value
