@@ -1,10 +1,12 @@
 """
 Measure speed and accuracy.
 
-    python -m benchmarks [NAME ...] [--quick] [--json FILE] [--markdown FILE]
+    python -m benchmarks [NAME ...] [--quick] [--json FILE] [--page FILE]
 
 NAME is planner, plant, preemption or recorder; without one all are run. The recorder's takes
 some minutes.
+A page is a Markdown file with marks ``<!-- begin NAME -->`` and ``<!-- end NAME -->``, between
+which a table is put.
 """
 
 import argparse
@@ -47,7 +49,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument('--quick', action='store_true',
                         help='little of everything: shows that it runs, not how fast')
     parser.add_argument('--json', type=Path, metavar='FILE', help='write all figures to a file')
-    parser.add_argument('--markdown', type=Path, metavar='FILE', help='write the tables to a file')
+    parser.add_argument('--page', type=Path, metavar='FILE',
+                        help='renew the tables of a page of the documentation')
     options = parser.parse_args(arguments)
     names = options.names or NAMES
     for name in names:
@@ -94,11 +97,38 @@ def main(arguments: list[str] | None = None) -> int:
         status = _recorder(options.quick, record)
     if options.json:
         options.json.write_text(json.dumps(record, indent=2) + '\n', encoding='utf-8')
-    if options.markdown:
-        pages = [where + '.', '', *(f'* {x}' for x in remarks), '',
-                 *(report.markdown() for report in reports)]
-        options.markdown.write_text('\n'.join(pages), encoding='utf-8')
+    if options.page:
+        texts = {report.key: report.markdown() for report in reports}
+        texts['machine'] = '\n'.join([where + '.', '', *(f'* {x}' for x in remarks)])
+        page = renewed(options.page.read_text(encoding='utf-8'), texts)
+        options.page.write_text(page, encoding='utf-8')
     return status
+
+
+def renewed(page: str, texts: dict[str, str]) -> str:
+    """
+    Replace what stands between the marks of a page.
+
+    Parameters
+    ----------
+    page : str
+        Markdown.
+    texts : dict of str
+        By the name in the marks; names that the page has not are left out.
+
+    Returns
+    -------
+    str
+        The page, outside the marks unchanged.
+
+    """
+    for name, text in texts.items():
+        begin, end = f'<!-- begin {name} -->', f'<!-- end {name} -->'
+        head, mark, rest = page.partition(begin)
+        _, last, tail = rest.partition(end)
+        if mark and last:
+            page = f'{head}{begin}\n{text.strip()}\n{end}{tail}'
+    return page
 
 
 def _has_ros(name: str) -> bool:

@@ -75,9 +75,11 @@ def test_collocation_solves_the_moves(make):
 
 @pytest.mark.slow
 def test_quick_run_prints_and_writes_what_it_measured(tmp_path, capsys):
-    file, page = tmp_path / 'figures.json', tmp_path / 'tables.md'
+    file, page = tmp_path / 'figures.json', tmp_path / 'page.md'
+    names = ('machine', 'planner', 'plant', 'start', 'choices')
+    page.write_text(''.join(f'<!-- begin {x} -->\n<!-- end {x} -->\n' for x in names))
     assert program.main(
-        ['planner', 'plant', '--quick', '--json', str(file), '--markdown', str(page)]) == 0
+        ['planner', 'plant', '--quick', '--json', str(file), '--page', str(page)]) == 0
     printed = capsys.readouterr().out
     record = json.loads(file.read_text())
     planner = {(x['name'], x['setting']): x for x in record['planner']['rows']}
@@ -89,9 +91,22 @@ def test_quick_run_prints_and_writes_what_it_measured(tmp_path, capsys):
         assert planner['CasADi, collocation, IPOPT', '']['note'] == 'not installed'
     assert all(x['error'] <= bench_plant.LIMIT for x in record['plant']['rows'])
     assert len(record['start']['rows']) == 4
-    for report in ('planner', 'plant', 'start', 'choices'):
+    assert 'plans/s' in page.read_text()
+    for report in names[1:]:
         assert record[report]['title'] in page.read_text()
         assert record[report]['title'] in printed
+
+
+def test_tables_of_a_page_are_renewed_and_nothing_else():
+    page = 'a\n<!-- begin x -->\nold\n<!-- end x -->\nb <!-- begin y --> c\n'
+    assert program.renewed(page, {'x': 'new\n', 'y': 'lost', 'z': 'lost'}) == (
+        'a\n<!-- begin x -->\nnew\n<!-- end x -->\nb <!-- begin y --> c\n')
+
+
+@pytest.mark.parametrize('name', ['machine', 'planner', 'plant', 'start', 'choices'])
+def test_page_about_the_method_has_marks_for_each_table(name):
+    page = (contenders.HERE.parent / 'docs' / 'method.md').read_text(encoding='utf-8')
+    assert page.count(f'<!-- begin {name} -->') == page.count(f'<!-- end {name} -->') == 1
 
 
 def test_unknown_benchmark_is_refused_in_one_line(capsys):
