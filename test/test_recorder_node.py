@@ -348,7 +348,11 @@ def test_simulated_time_is_waited_for_and_stamped(record, ros):
     clock.publish(message)
     publisher.publish(Float64(data=2.0))
     recorder.wait_for('received', '2')
-    first, second = recorder.end().messages()
+    message.clock.sec = 50
+    clock.publish(message)
+    ros.spin_until((recorder.folder / 'bag_1.mcap').exists, 'a new file for the new time')
+    reader = recorder.end()
+    first, second = reader.messages()
     assert first.log_time // 10**9 == 100
     assert second.log_time == 200 * 10**9 + message.clock.nanosec
     assert second.publish_time > 10**18

@@ -207,6 +207,12 @@ class Recording:
         """
         return self._ask(self._split)
 
+    def split_soon(self) -> None:
+        """Go on in a new file after all that has been put so far; returns at once."""
+        with self._condition:
+            self._items.append(_Request(self._split))
+            self._condition.notify()
+
     def snapshot(self) -> str:
         """
         Write what is kept in memory.

@@ -5,6 +5,7 @@ The node's own executor serves discovery, services and diagnostics. Messages tak
 `Capture` takes them off their subscriptions in a thread, `Recording` writes them in another.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 import datetime
@@ -180,6 +181,15 @@ class Recorder(Node):
     """
     ROS 2 node that records.
 
+    Attributes
+    ----------
+    folder : pathlib.Path
+        The bag's folder.
+    failure : BagError or None
+        Why recording failed.
+    finished : bool
+        Whether it has, so that the process ends.
+
     Raises
     ------
     BadInputError
@@ -203,6 +213,8 @@ class Recorder(Node):
         self._setpoints: list[dict[str, Any]] = []
         self._said_ready = False
         self._closed = False
+        self.failure: BagError | None = None
+        self.finished = False
         limits = Limits(
             values['storage.flush_period'], values['storage.max_bagfile_size'],
             values['storage.max_bagfile_duration'] * 10**9, values['storage.max_cache_size'],
@@ -264,8 +276,8 @@ class Recorder(Node):
     def _on_poll(self) -> None:
         """Look for new topics, new publishers, and parameters of the experiment's nodes."""
         if self._capture.error is not None:
-            error, self._capture.error = self._capture.error, None
-            self.get_logger().error(f'receiving has ended: {error!r}')
+            self.failure = BagError(f'receiving has ended: {self._capture.error!r}')
+            self.finished = True
         if self._sim_time is not None and not self._sim_time.started:
             return
         for name, types in self.get_topic_names_and_types():
@@ -283,8 +295,8 @@ class Recorder(Node):
         if not infos:
             return
         offered = tuple(sorted((stored(info.qos_profile) for info in infos), key=repr))
-        if known is not None and offered == known.offered:
-            return
+        if known is not None and not Counter(offered) - Counter(known.offered):
+            return  # nobody is new; who has left does not change what was recorded
         type_name = known.type if known is not None else infos[0].topic_type
         if len(types) > 1 and known is None:
             self._refuse(f'{name}#', f'topic {name} has the types {", ".join(types)}: '
@@ -354,6 +366,10 @@ class Recorder(Node):
                 for message in messages:
                     stamp = deserialize_message(message.data, ClockMessage).clock
                     clock.add(message.received_ns, stamp.sec * 10**9 + stamp.nanosec)
+                if clock.jumped_back:
+                    # A simulation began anew: in a file of its own it stays readable.
+                    clock.jumped_back = False
+                    self._recording.split_soon()
             else:
                 self._take_in(key, messages)
 
@@ -522,7 +538,7 @@ class Recorder(Node):
         for name, count in sorted(lost.items()):
             if count:
                 print(f'hmsa recorder: lost {count} of {name}', flush=True)
-        if status.error:
+        if status.error and self.failure is None:
             self.failure = BagError(status.error)
 
 

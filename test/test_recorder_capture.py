@@ -1,0 +1,72 @@
+"""Taking raw messages off subscriptions, and the simulated time they are stamped with."""
+
+from pathlib import Path
+
+import pytest
+from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
+from std_msgs.msg import Float64
+
+from hmsa_ros.nodes.capture import Capture, RawSubscription, SimulatedTime
+
+TALKER = Path(__file__).parent / 'talker.py'
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize('direct', [True, False])
+def test_messages_are_taken_with_stamps_and_numbers(
+        ros, start, wait_until, monkeypatch, direct):
+    if not direct:
+        # As where rcl's library is not found.
+        monkeypatch.setattr(RawSubscription, '_taker_tried', True)
+        monkeypatch.setattr(RawSubscription, '_taker', None)
+    assert RawSubscription.tells_publishers() == direct
+    got = []
+    capture = Capture(ros.node, lambda taken: got.extend(
+        message for key, messages in taken for message in messages if key == 'a'))
+    capture.add('a', RawSubscription(ros.node, Float64, '/a', QoSProfile(depth=1000)))
+    capture.start()
+    start.python(TALKER, '/a', '300', '--rate', '2000').wait_for_output('done')
+    wait_until(lambda: len(got) == 300, '300 messages')
+    capture.stop()
+    assert capture.error is None
+    assert [deserialize_message(message.data, Float64).data for message in got] == list(
+        range(300))
+    assert [message.sequence for message in got] == list(
+        range(got[0].sequence, got[0].sequence + 300))
+    assert all(0 <= message.received_ns - message.source_ns < 60e9 for message in got)
+    assert {len(message.publisher) for message in got} == ({16} if direct else {0})
+    assert len({message.publisher for message in got}) == 1
+
+
+@pytest.mark.ros
+def test_an_error_in_the_thread_is_kept(ros, start, wait_until):
+    def fail(taken):
+        raise ValueError('no')
+
+    capture = Capture(ros.node, fail)
+    capture.add('a', RawSubscription(ros.node, Float64, '/a', QoSProfile(depth=10)))
+    capture.start()
+    start.python(TALKER, '/a', '1').wait_for_output('done')
+    wait_until(lambda: capture.error is not None, 'the error')
+    capture.stop()
+    assert isinstance(capture.error, ValueError)
+
+
+def test_simulated_time_is_that_of_the_last_tick_before():
+    clock = SimulatedTime()
+    assert not clock.started
+    for received, time in ((100, 1000), (200, 2000), (300, 500)):
+        clock.add(received, time)
+    assert clock.started
+    assert [clock.at(moment) for moment in (50, 100, 199, 200, 299, 300, 400)] == [
+        1000, 1000, 1000, 2000, 2000, 500, 500]
+    assert clock.jumped_back
+
+
+def test_old_ticks_are_forgotten():
+    clock = SimulatedTime()
+    for i in range(100_001):
+        clock.add(i, 10 * i)
+    assert clock.at(100_000) == 1_000_000
+    assert clock.at(0) == 500_000
