@@ -35,7 +35,9 @@ class Rig:
     def __init__(self, *, zeta=0.2, stretch=1.0, tick=2 * MS, **options):
         self.actuator = paper_actuator(NondimensionalParameters(zeta=zeta))
         self.planner = Planner(self.actuator, Options(**options), stretch=stretch)
-        self.simulation = ActuatorSimulation(self.actuator, time=START, stretch=stretch)
+        self.simulation = ActuatorSimulation(
+            self.actuator, time=START, stretch=stretch,
+            slew_limit=options.get('slew_limit', math.inf))
         self.now = START
         self.tick = tick
         self.sent = []
@@ -389,12 +391,15 @@ def test_the_same_target_after_another_one_is_a_new_request():
         st.floats(1.0, 60.0)), min_size=1, max_size=8),
     zeta=st.sampled_from([0.02, 0.2, 1.1]),
     short_spell=st.sampled_from(['refuse', 'continue']),
-    lead=st.sampled_from([0, 1, 10, 50]))
+    lead=st.sampled_from([0, 1, 10, 50]),
+    hardware=st.sampled_from([
+        {}, {}, {'period': MS}, {'period': 2_500_000}, {'slew_limit': 100.0},
+        {'period': MS, 'slew_limit': 20.0}]))
 def test_whatever_is_asked_the_actuator_does_what_is_predicted(
-        steps, zeta, short_spell, lead):
+        steps, zeta, short_spell, lead, hardware):
     rig = Rig(
         zeta=zeta, short_spell=short_spell, lead_time=lead * MS, flux_density_min=-0.5,
-        flux_density_max=0.5)
+        flux_density_max=0.5, **hardware)
     for kind, wait, first, second, span in steps:
         points = [(first, span), (second, 2 * span)]
         before = rig.planner.plan
@@ -436,6 +441,15 @@ def test_short_spells_are_continued_from_where_the_actuator_is():
     assert [x.arrival for x in plan.segments[:2]] == [None, None]
     rig.wait(120)
     assert rig.at_rest(1.3)
+
+
+def test_a_spell_within_one_command_period_is_refused():
+    rig = Rig(period=10 * MS)
+    rig.setpoint(1.1)
+    plan = rig.planner.plan
+    refused(Code.SPELL_TOO_SHORT, 'stretch 1.3 begins and ends within one command period of '
+            '0.01 s', lambda: rig.request([(1.2, 31), (1.3, 32), (1.1, 80)]))
+    assert rig.planner.plan is plan
 
 
 def test_a_last_spell_too_short_is_finished():

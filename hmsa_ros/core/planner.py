@@ -278,6 +278,11 @@ class Planner:
         setpoints = []
         left = begin
         for stretch, end in ahead:
+            if end == left:
+                raise RefusedError(
+                    Code.SPELL_TOO_SHORT,
+                    f'stretch {stretch:g} begins and ends within one command period of '
+                    f'{self.options.period / NANOSECONDS:g} s: expected a longer span')
             setpoints.append(Setpoint(
                 stretch, (end - left) / NANOSECONDS / self._actuator.time_unit))
             left = end
