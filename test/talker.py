@@ -8,10 +8,12 @@ It waits for its subscribers, sends, prints "done" and stays until it is told to
 """
 
 import argparse
+import contextlib
 import sys
 import time
 
 import rclpy
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float64
@@ -45,10 +47,8 @@ def main():
             time.sleep(delay)
         publisher.publish(Float64(data=options.first + i))
     print('done', flush=True)
-    try:
+    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node)
-    except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
-        pass
     return 0
 
 

@@ -7,6 +7,7 @@ The node's own executor serves discovery, services and diagnostics. Messages tak
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+import contextlib
 from dataclasses import dataclass, field
 import datetime
 from importlib import import_module
@@ -93,6 +94,10 @@ PARAMETERS = (
     ParameterSpec(
         'record.queue_depth', 10_000,
         'Messages of a topic that the middleware keeps until they are taken.', '', 1, 1_000_000),
+    ParameterSpec(
+        'record.nice', -10,
+        'Niceness of the process, below 0 to come before others on a busy machine, where the '
+        'system grants that; 0 for an ordinary process.', '', -20, 19),
     ParameterSpec(
         'record.snapshot_mode', False,
         'Whether messages are only kept in memory until ~/snapshot is called.'),
@@ -201,6 +206,7 @@ class Recorder(Node):
         super().__init__(interface.RECORDER)
         self._parameters_in = declare(self, PARAMETERS)
         values = self._parameters_in
+        _set_nice(values['record.nice'])
         self._selection = Selection(
             tuple(map(self._full_name, values['record.topics'])), values['record.all_topics'],
             values['record.regex'], tuple(map(self._full_name, values['record.exclude_topics'])),
@@ -607,6 +613,14 @@ class _Followed:
         """
         return {f'{self._prefix}.{name}': json.dumps(
             parameter_value_to_python(value), default=list) for name, value in values}
+
+
+def _set_nice(nice: int) -> None:
+    """Set the niceness of all threads, those of the middleware too, if it is granted."""
+    if nice:
+        for thread in os.listdir('/proc/self/task'):
+            with contextlib.suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, int(thread), nice)
 
 
 def message_class(type_name: str) -> type[Any]:
