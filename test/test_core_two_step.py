@@ -577,7 +577,7 @@ def test_bad_rows_carry_their_code_and_spoil_no_other():
             assert_row_is_single(batch, rows, i)
 
 
-def test_batches_broadcast():
+def test_batches_broadcast_their_arguments():
     batch = plan_two_step_batch([[1.0], [1.2]], [1.1, 1.3, 1.4], zeta=0.2)
     assert batch.status.shape == batch.beta_p.shape == (2, 3)
     assert batch.beta_p[1, 2] == plan_two_step(1.2, 1.4, PAPER).beta_p
