@@ -127,7 +127,7 @@ def renewed(page: str, texts: dict[str, str]) -> str:
         head, mark, rest = page.partition(begin)
         _, last, tail = rest.partition(end)
         if mark and last:
-            page = f'{head}{begin}\n{text.strip()}\n{end}{tail}'
+            page = f'{head}{begin}\n\n{text.strip()}\n\n{end}{tail}'
     return page
 
 

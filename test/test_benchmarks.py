@@ -100,7 +100,7 @@ def test_quick_run_prints_and_writes_what_it_measured(tmp_path, capsys):
 def test_tables_of_a_page_are_renewed_and_nothing_else():
     page = 'a\n<!-- begin x -->\nold\n<!-- end x -->\nb <!-- begin y --> c\n'
     assert program.renewed(page, {'x': 'new\n', 'y': 'lost', 'z': 'lost'}) == (
-        'a\n<!-- begin x -->\nnew\n<!-- end x -->\nb <!-- begin y --> c\n')
+        'a\n<!-- begin x -->\n\nnew\n\n<!-- end x -->\nb <!-- begin y --> c\n')
 
 
 @pytest.mark.parametrize('name', ['machine', 'planner', 'plant', 'start', 'choices'])
