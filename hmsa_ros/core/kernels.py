@@ -47,7 +47,7 @@ _MAX_STEPS = 200_000
 # One swing takes tens of steps, a creep into an equilibrium thousands.
 _MAX_TURN_STEPS = 20_000
 _MAX_ITERATIONS = 80
-_COARSE = 1e-5
+_COARSE = 1e-7
 # Closer to a limiting stretch than rounding lets this tolerance be kept, motion is not resolved.
 _RESOLVED = 1e-8
 _FARTHEST = 1e3
@@ -56,12 +56,17 @@ _NEWTON_PASSES = 8
 _MAX_STUCK = 4
 
 
+# Fused multiply-add, but nothing that would treat NaN as impossible: it ends bad steps.
+_FAST = {'contract', 'nsz'}
+_compiled = njit(cache=True, error_model='numpy', fastmath=_FAST)
+
+
 def work_space() -> NDArray[np.float64]:
     """Return the working space that the integration needs, one for each thread."""
     return np.empty((STAGES, 4))
 
 
-@njit(cache=True, error_model='numpy', inline='always')
+@njit(cache=True, error_model='numpy', fastmath=_FAST, inline='always')
 def _derivative(l, v, s, r, beta, p, zeta, c1, i_j):  # noqa: E741
     """
     Right-hand side of Eq. 11 and of its variational equation.
@@ -91,7 +96,7 @@ def _derivative(l, v, s, r, beta, p, zeta, c1, i_j):  # noqa: E741
     return v, a, r, a_l * s + a_v * r + 6.0 * l3 * i_inertia * p
 
 
-@njit(cache=True, error_model='numpy')
+@_compiled
 def _step(k, l, v, s, r, beta, slope, p, q, h, zeta, c1, i_j, rtol):  # noqa: E741
     """
     One DOP853 step of length ``h``; ``k`` (12, 4) is working space.
@@ -134,14 +139,14 @@ def _step(k, l, v, s, r, beta, slope, p, q, h, zeta, c1, i_j, rtol):  # noqa: E7
     return new_l, new_v, s + h * d2, r + h * d3, error
 
 
-@njit(cache=True, error_model='numpy')
+@_compiled
 def elastic_force(l, i_j):  # noqa: E741
     """Return the load that balances the stretch at rest, psi'(l)."""
     return (l - 1.0) * (l * l + l + 1.0) / (l * (
         l - (l - 1.0) * (l - 1.0) * (l + 2.0) * i_j))
 
 
-@njit(cache=True, error_model='numpy')
+@_compiled
 def elastic_stiffness(l, i_j):  # noqa: E741
     """Return psi''(l)."""
     g = 1.0 - (l - 1.0) * (l - 1.0) * (l + 2.0) * i_j / l
@@ -149,19 +154,19 @@ def elastic_stiffness(l, i_j):  # noqa: E741
     return (1.0 + 2.0 / l ** 3) / g + 2.0 * f * f * i_j / (g * g)
 
 
-@njit(cache=True, error_model='numpy')
+@_compiled
 def elastic_energy(l, i_j):  # noqa: E741
     """Return psi(l), zero at l = 1."""
     return -0.5 / i_j * math.log1p(-(l - 1.0) * (l - 1.0) * (l + 2.0) * i_j / l)
 
 
-@njit(cache=True, error_model='numpy')
+@_compiled
 def critical_zeta(l, c1, i_j):  # noqa: E741
     """Return the damping that is critical for small motion about a stretch."""
     return 4.0 / c1 * math.sqrt((l ** -3 + c1) / 6.0 * elastic_stiffness(l, i_j))
 
 
-@njit(cache=True, error_model='numpy')
+@_compiled
 def stretch_limits(i_j):
     """Return the lower and the upper limiting stretch, the roots of g."""
     p = 1.0 / i_j + 3.0
@@ -175,7 +180,7 @@ def stretch_limits(i_j):
     return lower, upper
 
 
-@njit(cache=True, error_model='numpy')
+@_compiled
 def equilibrium_stretch(beta, i_j):
     """Return the stretch at which a constant load is in balance; psi' is monotone."""
     lower, upper = stretch_limits(i_j)
@@ -204,14 +209,14 @@ def equilibrium_stretch(beta, i_j):
     return l
 
 
-@njit(cache=True, error_model='numpy')
+@_compiled
 def _first_step(l, v, beta, zeta, c1, i_j, rtol):  # noqa: E741
     """Return a first step length: a fixed phase of the local oscillation."""
     rate = math.sqrt(elastic_stiffness(l, i_j) / ((l ** -3 + c1) / 6.0))
     return 4.0 * rtol ** 0.125 / (rate + 3.0 * zeta)
 
 
-@njit(cache=True, error_model='numpy', inline='always')
+@njit(cache=True, error_model='numpy', fastmath=_FAST, inline='always')
 def _attainable(rtol, l, v, frequency):  # noqa: E741
     """
     Return a tolerance that rounding lets a step keep.
@@ -223,7 +228,7 @@ def _attainable(rtol, l, v, frequency):  # noqa: E741
     return max(rtol, 3e-16 * l * frequency / (1.0 + abs(v)))
 
 
-@njit(cache=True, error_model='numpy')
+@_compiled
 def _resize(h, error):
     """Return the next step length from the error of the last one."""
     if not error < math.inf:
@@ -231,7 +236,7 @@ def _resize(h, error):
     return h * min(6.0, max(0.2, 0.9 * max(error, 1e-12) ** -0.125))
 
 
-@njit(cache=True, error_model='numpy')
+@_compiled
 def advance(k, l, v, s, r, beta, slope, p, q, duration, zeta, c1, i_j, rtol, h):  # noqa: E741
     """
     Integrate over a duration under the load ``beta + slope t``.
@@ -264,7 +269,7 @@ def advance(k, l, v, s, r, beta, slope, p, q, duration, zeta, c1, i_j, rtol, h):
     return STUCK, l, v, s, r, h
 
 
-@njit(cache=True, error_model='numpy')
+@_compiled
 def turning_point(k, l, v, direction, beta, move, zeta, c1, i_j, rtol):  # noqa: E741
     """
     Follow a constant load to the first turning point that is reached in a direction.
@@ -306,7 +311,7 @@ def turning_point(k, l, v, direction, beta, move, zeta, c1, i_j, rtol):  # noqa:
     return STUCK, t, l, s, 0.0
 
 
-@njit(cache=True, error_model='numpy')
+@_compiled
 def _land(k, l, v, s, r, t, direction, beta, h, end_v, zeta, c1, i_j, rtol):  # noqa: E741
     """
     Find the turning point inside a step that passes it.
@@ -347,7 +352,7 @@ def _land(k, l, v, s, r, t, direction, beta, h, end_v, zeta, c1, i_j, rtol):  # 
     return DONE, t + dt + left, new_l, new_s, -new_r / a
 
 
-@njit(cache=True, error_model='numpy')
+@_compiled
 def crosses(k, l, v, target, zeta, c1, i_j, rtol):  # noqa: E741
     """
     Return whether the response to the target's own load passes the target.
@@ -382,7 +387,7 @@ def crosses(k, l, v, target, zeta, c1, i_j, rtol):  # noqa: E741
     return False
 
 
-@njit(cache=True, error_model='numpy')
+@_compiled
 def _guess(l, v, target, direction, beta_1, zeta, c1, i_j):  # noqa: E741
     """
     Return a first guess of ``direction * (beta_1 - beta_p)``.
@@ -407,7 +412,7 @@ def _guess(l, v, target, direction, beta_1, zeta, c1, i_j):  # noqa: E741
     return delta * 2.0 * decay / (1.0 + decay)
 
 
-@njit(cache=True, error_model='numpy')
+@_compiled
 def shoot(
         k, l, v, target, direction, beta_min, beta_max, zeta, c1, i_j, rtol):  # noqa: E741
     """
@@ -516,7 +521,7 @@ def shoot(
     return NOT_CONVERGED, math.nan, math.nan, beta_1, iteration
 
 
-@njit(cache=True, error_model='numpy')
+@_compiled
 def two_step(k, l, v, target, zeta, c1, i_j, beta_min, beta_max, rtol, hold):  # noqa: E741
     """
     Plan one move: the fastest single intermediate load that ends at rest at the target.
@@ -555,7 +560,7 @@ def two_step(k, l, v, target, zeta, c1, i_j, beta_min, beta_max, rtol, hold):  #
     return status, beta_p, tau_p, beta_1, passes
 
 
-@njit(cache=True, error_model='numpy', parallel=True)
+@njit(cache=True, error_model='numpy', fastmath=_FAST, parallel=True)
 def two_step_batch(
         start, rate, target, zeta, c1, j_lim, beta_min, beta_max, rtol, hold, status,
         beta_p, tau_p, beta_1):
@@ -571,7 +576,7 @@ def two_step_batch(
             beta_max, rtol, hold)
 
 
-@njit(cache=True, error_model='numpy')
+@_compiled
 def trajectory(
         l, v, switches, betas, slopes, times, zeta, c1, i_j, rtol, stretch,  # noqa: E741
         rates):
@@ -608,7 +613,7 @@ def trajectory(
     return DONE
 
 
-@njit(cache=True, error_model='numpy')
+@_compiled
 def respond(
         l, v, durations, loads, slopes, d_durations, d_loads, zeta, c1, i_j, rtol,  # noqa: E741
         jacobian):

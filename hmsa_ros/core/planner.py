@@ -24,7 +24,7 @@ from hmsa_ros.core.units import NANOSECONDS, Units
 # Stretch rates below this share of the natural frequency are rounding, not motion.
 _AT_REST = 1e-6
 # How hard to brake where the hardest does not lead to a plan, from the nearest stop on.
-_BRAKE_SHARES = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.0)
+_BRAKE_SHARES = (0.5, 0.1, 0.02, 0.0)
 # How far inside the flux density limits a stop keeps where it has to, as a share.
 _INSIDE = 1e-3
 # Stamp of the level that is in force before the first request.
@@ -96,12 +96,15 @@ class Plan:
         By stamp; the first may lie in the past.
     segments : tuple of PlannedSegment
         By time.
+    kept : int
+        How many of them, the first ones, belong to earlier requests.
 
     """
 
     number: int
     levels: tuple[PlannedLevel, ...]
     segments: tuple[PlannedSegment, ...]
+    kept: int = 0
 
 
 @dataclass(frozen=True)
@@ -173,6 +176,7 @@ class Planner:
         self._work = kernels.work_space()
         self._units = Units(actuator.time_unit, actuator.flux_density_unit, ' s', ' T')
         self.set_options(options)
+        self._initial = stretch
         self._rest(stretch, 0)
 
     def set_options(self, options: Options) -> None:
@@ -206,21 +210,14 @@ class Planner:
         self.plan = Plan(number, (level,), ())
         self._unsent = 1
 
-    def restart(self, now: int) -> None:
+    def restart(self) -> None:
         """
-        Drop all plans and hold the level in force, after the clock has jumped back.
+        Drop all plans, after the clock has jumped back.
 
-        The actuator is taken to be at rest where that level holds it.
-
-        Parameters
-        ----------
-        now : int
-            Time in ns before the jump.
-
+        Time begins again for a simulation that begins again: the actuator is taken to be at
+        rest where it was before the first request.
         """
-        load = self._level(now).flux_density / self._units.load
-        self._rest(
-            float(equilibrium_stretch(load, self._material.j_lim)), self.plan.number)
+        self._rest(self._initial, self.plan.number)
 
     # -- requests ------------------------------------------------------------------------------
 
@@ -538,7 +535,8 @@ class Planner:
             for x in running[over:])
         self._unsent = min(self._unsent, kept) - first
         self.plan = Plan(
-            old.number + 1, old.levels[first:kept] + future[0], segments + future[1])
+            old.number + 1, old.levels[first:kept] + future[0], segments + future[1],
+            len(segments))
         return self.plan
 
     def _holdable(self, stretch: float) -> float:

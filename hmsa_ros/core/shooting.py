@@ -153,6 +153,8 @@ def solve(
             change = np.asarray(-np.linalg.solve(jacobian, error), dtype=np.float64)
         except np.linalg.LinAlgError:
             return None
+        if not np.all(np.isfinite(change)):
+            return None
         share = 1.0
         while share > _LEAST_SHARE:
             trial = template.moved(share * change)

@@ -42,6 +42,24 @@ class Units:
         """
         return f'{value * self.time:.4g}{self.time_name}'
 
+    def slew_text(self, value: float) -> str:
+        """
+        Word a rate of change of the load.
+
+        Parameters
+        ----------
+        value : float
+            Load beta per unit of nondimensional time.
+
+        Returns
+        -------
+        str
+            With four significant digits, as in ``'20 T/s'``.
+
+        """
+        unit = f'{self.load_name}/{self.time_name.strip()}' if self.time_name else ''
+        return f'{value * self.load / self.time:.4g}{unit}'
+
     def load_text(self, value: float) -> str:
         """
         Word a load.

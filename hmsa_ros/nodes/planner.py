@@ -110,7 +110,6 @@ class PlannerNode(Node):
             JumpThreshold(
                 min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False),
             post_callback=self._on_jump)
-        self._last_now = 0
         self._publish_status()
 
     def _publisher(self, topic: interface.Topic):  # type: ignore[no-untyped-def]
@@ -180,7 +179,6 @@ class PlannerNode(Node):
 
     def _on_poll(self) -> None:
         now = self._now()
-        self._last_now = now
         self._send_due(now)
         progress = self._progress_at(now)
         if progress != self._progress:
@@ -201,11 +199,12 @@ class PlannerNode(Node):
 
     def _on_jump(self, jump: TimeJump) -> None:
         if jump.delta.nanoseconds < 0:
-            self._planner.restart(self._last_now)
+            self._planner.restart()
             self._verdict = (
                 DiagnosticStatus.WARN,
                 f'the clock jumped back by {-jump.delta.nanoseconds / NANOSECONDS:.3f} s: the '
-                'plan is dropped, the last level holds', 'clock_jumped', '')
+                'plan is dropped and the actuator taken to be at its initial stretch',
+                'clock_jumped', '')
             self.get_logger().warning(self._verdict[1])
             self._publish_status()
 
@@ -214,10 +213,11 @@ class PlannerNode(Node):
     def _progress_at(self, now: int) -> tuple[object, ...]:
         """Return state, place in the sequence and target; what a change of is published."""
         found = self._planner.segment(now)
-        count = len(self._planner.plan.segments)
-        if found is None:
+        plan = self._planner.plan
+        count = len(plan.segments) - plan.kept
+        if found is None or found[0] < plan.kept:
             return ('waiting' if count else 'idle', 0, count, '')
-        index, segment = found
+        index, segment = found[0] - plan.kept, found[1]
         last = index == count - 1
         if segment.arrival is None:
             state = 'settling' if last else 'moving'

@@ -11,8 +11,10 @@ from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.two_step import plan_two_step
 
 # How many later half periods are tried where the first that fits gives no solution.
-_LATER = 6
-_SHORTEST_STRIDE = 0.02
+_LATER = 4
+# Ramps slower than this are refused without a search, which would take seconds.
+_MOST_HALF_PERIODS = 40
+_SHORTEST_STRIDE = 0.05
 
 # A command and the time at which it is at rest; None if there is none.
 Attempt = tuple[tuple[Level, ...], float] | None
@@ -130,7 +132,9 @@ def _ramped(request: Request, first: Level, last: Level) -> Move:
     """
     slew = request.delivery.slew
     start, change = request.load, last.load - request.load
-    decay = abs((last.load - first.load) / (first.load - start)) if first.load != start else 1.0
+    decay = 1.0
+    if first.load != start:
+        decay = min(1.0, abs((last.load - first.load) / (first.load - start)))
     least = 1 + 2 * max(0, math.ceil(0.5 * (abs(change) / slew / (2.0 * last.time) - 1.0)))
 
     def slower(levels: tuple[Level, ...], share: float, aim: float) -> Attempt:
@@ -142,7 +146,8 @@ def _ramped(request: Request, first: Level, last: Level) -> Move:
             Template.of(guess, [('load', 0), ('time', 1)]), request.state, start,
             request.target, request.material, slew / aim)
 
-    for half_periods in range(least, least + 2 * _LATER, 2):
+    most = min(least + 2 * _LATER, _MOST_HALF_PERIODS)
+    for half_periods in range(least, most, 2):
         between = first.load
         if half_periods > 1:
             between = start + change / (1.0 + decay ** half_periods)
@@ -152,10 +157,9 @@ def _ramped(request: Request, first: Level, last: Level) -> Move:
             return Move(Code.TWO_STEP, *found)
     raise RefusedError(
         Code.SLEW_LIMIT,
-        f'no command through ramps of {request.units.load_text(slew)} in '
-        f'{request.units.time_text(1.0)} brings stretch {request.target:g} to rest: expected '
-        f'a slew limit of about {request.units.load_text(abs(change) / last.time)} in '
-        f'{request.units.time_text(1.0)}')
+        f'no command through ramps of {request.units.slew_text(slew)} brings stretch '
+        f'{request.target:g} to rest: expected a slew limit of about '
+        f'{request.units.slew_text(abs(change) / last.time)}')
 
 
 def _inside(request: Request, levels: Sequence[Level]) -> bool:
