@@ -5,6 +5,8 @@ Every message is one sentence that says what was wrong, what was got, what was e
 where it is not obvious, how to mend it.
 """
 
+import sys
+
 
 class HmsaError(Exception):
     """
@@ -25,3 +27,25 @@ class BadInputError(HmsaError, ValueError):
 
 class BagError(HmsaError):
     """A recording that cannot be read or written."""
+
+
+def complain(error: Exception, status: int) -> int:
+    """
+    Print an error as one line on standard error.
+
+    Parameters
+    ----------
+    error : Exception
+        What happened.
+    status : int
+        Exit status to pass on.
+
+    Returns
+    -------
+    int
+        ``status``.
+
+    """
+    line = ' '.join(str(error).split())
+    print(f'hmsa: error: {line}', file=sys.stderr)
+    return status

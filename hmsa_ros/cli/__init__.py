@@ -14,7 +14,7 @@ from typing import NoReturn
 
 from hmsa_ros import __version__
 from hmsa_ros.cli.node import NODES
-from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.errors import BadInputError, complain, HmsaError
 
 COMMANDS = ('demo', 'plan', 'send', 'node', 'bag', 'report', 'figures', 'robustness', 'sweep')
 
@@ -107,25 +107,3 @@ def split_ros_args(words: list[str]) -> list[str]:
     if '--ros-args' in words and words[0] in NODES:
         return words[:words.index('--ros-args')]
     return words
-
-
-def complain(error: Exception, status: int) -> int:
-    """
-    Print an error as one line on standard error.
-
-    Parameters
-    ----------
-    error : Exception
-        What happened.
-    status : int
-        Exit status to pass on.
-
-    Returns
-    -------
-    int
-        ``status``.
-
-    """
-    line = ' '.join(str(error).split())
-    print(f'hmsa: error: {line}', file=sys.stderr)
-    return status

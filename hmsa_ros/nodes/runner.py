@@ -18,7 +18,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from hmsa_ros.ending import Ending
-from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.errors import BadInputError, complain, HmsaError
 
 # EventsExecutor.spin() without a time limit busy-loops and delivers nothing on this rclpy
 # (7.1); waiting for a future that never completes, a slice at a time, behaves as documented.
@@ -75,16 +75,16 @@ def run(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
         _initialise(arguments)
     except BadInputError as error:
         rclpy.try_shutdown()
-        return _refuse(error, 2)
+        return complain(error, 2)
     node: Node | None = None
     status = 0
     try:
         node = factory()
         spin(node, lambda: ending.asked or getattr(node, 'finished', False))
     except (BadInputError, ParameterException) as error:
-        status = _refuse(error, 2)
+        status = complain(error, 2)
     except HmsaError as error:
-        status = _refuse(error, 1)
+        status = complain(error, 1)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
@@ -95,7 +95,7 @@ def run(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
             node.destroy_node()
         rclpy.try_shutdown()
     failure = getattr(node, 'failure', None)
-    return _refuse(failure, 1) if failure is not None and not status else status
+    return complain(failure, 1) if failure is not None and not status else status
 
 
 def _initialise(arguments: Sequence[str]) -> None:
@@ -117,10 +117,3 @@ def _initialise(arguments: Sequence[str]) -> None:
     if unknown:
         raise BadInputError(
             f'unknown argument {unknown[0]!r}: expected nothing but --ros-args ...; see --help')
-
-
-def _refuse(error: Exception, status: int) -> int:
-    """Print an error as one line and return the exit status."""
-    line = ' '.join(str(error).split())
-    print(f'hmsa: error: {line}', file=sys.stderr)
-    return status

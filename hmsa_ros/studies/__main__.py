@@ -10,12 +10,12 @@ import sys
 
 import numpy as np
 
-from hmsa_ros.cli import Parser, report
+from hmsa_ros.cli import Parser
 from hmsa_ros.core.moves import State
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.shapers import SHAPERS
 from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.errors import BadInputError, complain, HmsaError
 from hmsa_ros.figures.studies import draw_damped, draw_robustness, draw_sampled
 from hmsa_ros.studies.damped import damped_study, DampedStudy, LIMITS
 from hmsa_ros.studies.residual import Errors, residual
@@ -203,9 +203,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         for path in pictures(arguments.out):
             print(path)
     except BadInputError as error:
-        return report(error, 2)
+        return complain(error, 2)
     except HmsaError as error:
-        return report(error, 1)
+        return complain(error, 1)
     return 0
 
 
