@@ -42,9 +42,9 @@ figure { margin: 0.5rem 0; min-width: 0; }
   display: grid; gap: 0.5rem 1rem;
   grid-template-columns: repeat(auto-fit, minmax(min(20rem, 100%), 1fr));
 }
-.scroll { overflow-x: auto; max-width: 100%; }
+.scroll { overflow: auto; max-width: 100%; }
+.long { max-height: 30rem; border-bottom: 1px solid var(--line); }
 table { border-collapse: collapse; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
-caption { text-align: left; color: var(--soft); padding-bottom: 0.3rem; }
 th, td { padding: 0.25rem 0.7rem; border-bottom: 1px solid var(--line); text-align: left;
   white-space: nowrap; }
 th { background: var(--panel); font-weight: 600; vertical-align: bottom; white-space: normal; }
@@ -54,10 +54,17 @@ button {
   border: 1px solid var(--line); border-radius: 0.4rem; padding: 0.25rem 0.8rem;
   margin: 0.4rem 0; cursor: pointer;
 }
-button:focus-visible, a:focus-visible { outline: 2px solid var(--accent); outline-offset: 2px; }
+button:focus-visible, a:focus-visible, .scroll:focus-visible {
+  outline: 2px solid var(--accent); outline-offset: 2px;
+}
 details { margin: 0.6rem 0; }
 summary { cursor: pointer; color: var(--accent); }
-@media print { button, nav, .modebar-container { display: none; } figure { break-inside: avoid; } }
+thead th { position: sticky; top: 0; }
+@media print {
+  button, nav, .modebar-container { display: none; }
+  figure { break-inside: avoid; }
+  .scroll, .long { overflow: visible; max-height: none; }
+}
 """
 
 SCRIPT = """

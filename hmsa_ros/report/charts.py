@@ -33,8 +33,10 @@ BUCKETS = 2000
 #: Panels of arrivals.
 MOST_PANELS = 12
 _PANEL_BUCKETS = 300
-_MOST_PHASE_POINTS = 20_000
+_MOST_PHASE_POINTS = 8_000
 _PHASE_GRID = 1000.0
+# Markers are smaller where there are more of them.
+_MANY_MARKERS = 100
 # Of an arrival's panel: how long before and after, in durations of the move, and how many
 # percent of the step at least.
 _BEFORE, _AFTER, _LEAST_PERCENT = 0.6, 3.0, 5.0
@@ -194,7 +196,7 @@ def _curve(
 ) -> dict[str, Any]:
     """Return a curve; its style is the line's, but for the names of a trace's own settings."""
     own: dict[str, Any] = {k: style.pop(k) for k in (
-        'marker', 'showlegend', 'visible', 'xaxis', 'yaxis', 'hovertemplate', 'opacity')
+        'marker', 'visible', 'xaxis', 'yaxis', 'hovertemplate', 'opacity')
         if k in style}
     trace = {
         'type': 'scatter', 'mode': mode, 'name': text(name), 'legendgroup': group,
@@ -206,12 +208,24 @@ def _curve(
 
 
 def _names(part: Part, what: str) -> tuple[str, str]:
-    """Return a curve's name in the legend and the group that one click hides."""
-    alone = not part.colour
-    return (what if alone else f'{part.run.label}: {what}'), \
-        (what if alone else f'{part.run.label} {what}')
+    """Return a curve's name and the group that a click in the legend hides."""
+    if not part.colour:
+        return what, what
+    name = f'{part.run.label}: {what}'
+    return name, (name if what in _SIMULATED else part.run.label)
 
 
+def _grouped(data: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return curves with each group once in the legend."""
+    seen: set[str] = set()
+    for trace in data:
+        trace['showlegend'] = trace['legendgroup'] not in seen
+        seen.add(trace['legendgroup'])
+    return data
+
+
+# Of several runs what was recorded is compared; what is simulated is shown on a click.
+_SIMULATED = ('plain steps', 'plan')
 # What each kind of curve looks like, everywhere: colour, and what tells it apart without.
 _KINDS: dict[str, dict[str, Any]] = {
     'recorded': {'color': BLUE, 'width': 2.2},
@@ -226,9 +240,8 @@ def _kind(part: Part, kind: str, **more: Any) -> dict[str, Any]:
     style = {**_KINDS[kind], **more}
     if part.colour:
         style['color'] = part.colour
-        if kind in ('plain steps', 'plan'):
-            # Several runs are compared first of all by what was recorded.
-            style.setdefault('visible', 'legendonly')
+        if kind in _SIMULATED:
+            style['visible'] = 'legendonly'
     return style
 
 
@@ -279,10 +292,12 @@ def response(parts: Sequence[Part], unit: TimeUnit) -> Figure:
             data.append(_curve(
                 name, unit.of([x.arrival for x in found.results]),
                 [x.stretch for x in found.results], group, mode='markers',
-                marker={'symbol': 'diamond-open', 'size': 9, 'color': part.colour or BLACK}))
+                marker={
+                    'symbol': 'diamond-open', 'size': _size(9, found.results),
+                    'color': part.colour or BLACK}))
         data += _commands(part, unit)
     return Figure(
-        'response', 'Flux density command and stretch over time', 560, data, {
+        'response', 'Flux density command and stretch over time', 560, _grouped(data), {
             'xaxis': _axis(f'time from the first command [{unit.name}]', anchor='y'),
             'yaxis': _axis('stretch λ [1]', domain=[0.0, 0.6]),
             'yaxis2': _axis('flux density B [mT]', domain=[0.68, 1.0], anchor='x')})
@@ -302,14 +317,12 @@ def _commands(part: Part, unit: TimeUnit) -> list[dict[str, Any]]:
             times.insert(0, float(found.time[0]))
             values.insert(0, float(run.flux_density[0]) * 1e3)
         switches = {x.stamp for x in found.levels}
-        sizes = [6 if round(x * NANOSECONDS) + found.zero in switches else 0 for x in times]
+        size = 6 if len(found.levels) <= _MANY_MARKERS else 3
+        sizes = [size if round(x * NANOSECONDS) + found.zero in switches else 0 for x in times]
         name, group = _names(part, 'command')
         data.append(_curve(
             name, unit.of(times), values, group, mode='lines+markers', yaxis='y2',
             marker={'size': sizes}, **_kind(part, 'command')))
-        if part.colour:
-            data[-1]['showlegend'] = False
-            data[-1]['legendgroup'] = _names(part, 'recorded')[1]
         place = np.searchsorted([x.stamp for x in found.levels], run.time, side='right') - 1
         expected = np.array([*(x.flux_density for x in found.levels)])[np.maximum(place, 0)]
         follows = np.abs(run.flux_density - expected)[place >= 0]
@@ -320,6 +333,11 @@ def _commands(part: Part, unit: TimeUnit) -> list[dict[str, Any]]:
         x, y = decimate(unit.of(found.time), run.flux_density * 1e3)
         data.append(_curve(name, x, y, group, yaxis='y2', **_kind(part, 'field in force')))
     return data
+
+
+def _size(usual: int, results: Sequence[MoveResult]) -> int:
+    """Return the size of markers, one for each result."""
+    return usual if len(results) <= _MANY_MARKERS else usual // 2
 
 
 def phase(parts: Sequence[Part]) -> tuple[Figure, float]:
@@ -351,20 +369,22 @@ def phase(parts: Sequence[Part]) -> tuple[Figure, float]:
         name, group = _names(part, 'equilibrium')
         places = sorted({x.stretch for x in found.results})
         data.append(_curve(
-            name, [found.start], [0.0], group, mode='markers', showlegend=False,
-            marker={'symbol': 'circle-open', 'size': 9, 'color': part.colour or BLACK}))
-        data.append(_curve(
             name, places, [0.0] * len(places), group, mode='markers',
             marker={'symbol': 'circle', 'size': 8, 'color': part.colour or BLACK}))
+        data.append(_curve(
+            name, [found.start], [0.0], group, mode='markers',
+            marker={'symbol': 'circle-open', 'size': 9, 'color': part.colour or BLACK}))
     return Figure(
-        'phase', 'Stretch rate over stretch, with the equilibria', 480, data, {
+        'phase', 'Stretch rate over stretch, with the equilibria', 480, _grouped(data), {
             'xaxis': _axis('stretch λ [1]', range=_room(data, 'x')),
             'yaxis': _axis('stretch rate dλ/dt [1/s]', range=_room(data, 'y'))}), shown
 
 
 def _room(data: Sequence[dict[str, Any]], key: str) -> list[float | None]:
     """Return the range of an axis that leaves room around all curves."""
-    values = [x for trace in data for x in trace[key] if x is not None]
+    values = [
+        x for trace in data if trace.get('visible', True) is True
+        for x in trace[key] if x is not None]
     margin = 0.04 * (max(values) - min(values) or 1.0)
     return numbers([min(values) - margin, max(values) + margin])
 
@@ -481,6 +501,8 @@ def arrival(parts: Sequence[Part], number: int) -> Figure:
         for kind, stretch in (
                 ('plain steps', found.unshaped[0]), ('recorded', run.stretch),
                 ('plan', found.predicted[0])):
+            if part.colour and kind in _SIMULATED:
+                continue
             name, group = _names(part, kind)
             data.append(_curve(
                 name, *decimate(
@@ -489,7 +511,7 @@ def arrival(parts: Sequence[Part], number: int) -> Figure:
     height = min(height, 150.0)
     title = _panel_title(parts, number)
     return Figure(
-        f'arrival{number}', f'Setpoint {title}', 300, data, {
+        f'arrival{number}', f'Setpoint {title}', 300, _grouped(data), {
             'xaxis': _axis(f'time after arrival [{unit.name}]', range=numbers(view)),
             'yaxis': _axis('distance from target [% of step]', range=[-height, height]),
             'shapes': [{
@@ -516,16 +538,18 @@ def residuals(parts: Sequence[Part]) -> Figure:
     for part in parts:
         results = part.evaluation.results
         for what, values, symbol in (
-                ('plain steps', [x.residual_unshaped for x in results], 'square-open'),
-                ('recorded', [x.residual for x in results], 'circle')):
+                ('recorded', [x.residual for x in results], 'circle'),
+                ('plain steps', [x.residual_unshaped for x in results], 'square-open')):
             name, group = _names(part, what)
             data.append(_curve(
                 name, np.arange(1, len(results) + 1),
                 # A logarithmic axis has no place for 0.
                 [100.0 * x if x > 0.0 else math.nan for x in values], group, mode='markers',
                 marker={
-                    'symbol': symbol, 'size': 10, 'line': {'width': 2},
+                    'symbol': symbol, 'size': _size(10, results), 'line': {'width': 1.5},
                     'color': part.colour or _KINDS[what]['color']}))
+            # Here both are results: one click for both.
+            data[-1]['legendgroup'] = part.run.label if part.colour else group
     count = max((len(x.evaluation.results) for x in parts), default=0)
     axis = _axis('setpoint', range=[0.5, count + 0.5])
     if count <= MOST_PANELS:
@@ -534,10 +558,19 @@ def residuals(parts: Sequence[Part]) -> Figure:
                 f'{x.stretch:.5g}' for x in _results(parts, i))) for i in range(count)]}
     return Figure(
         'residuals', 'Residual vibration of each setpoint, recorded and for plain steps', 340,
-        data, {
+        _grouped(data), {
             'xaxis': axis,
-            'yaxis': _axis(
-                'residual [% of step]', type='log')})
+            'yaxis': _axis('residual [% of step]', type='log', **_decades(data))})
+
+
+def _decades(data: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return range and ticks of a logarithmic axis: whole decades, so that one is named."""
+    values = [math.log10(x) for trace in data for x in trace['y'] if x is not None]
+    if not values:
+        return {}
+    low, high = math.floor(min(values)), math.ceil(max(values))
+    return {
+        'range': [low - 0.2, max(high, low + 1) + 0.2], 'dtick': max(1, -(-(high - low) // 6))}
 
 
 def prediction(parts: Sequence[Part], unit: TimeUnit) -> Figure:
@@ -568,7 +601,7 @@ def prediction(parts: Sequence[Part], unit: TimeUnit) -> Figure:
                 *decimate(unit.of(found.time), difference), group,
                 **_kind(part, 'recorded', width=1.2)))
     return Figure(
-        'prediction', 'Recorded minus predicted stretch over time', 300, data, {
+        'prediction', 'Recorded minus predicted stretch over time', 300, _grouped(data), {
             'xaxis': _axis(f'time from the first command [{unit.name}]'),
             'yaxis': _axis('recorded − predicted stretch [1]')})
 
@@ -615,7 +648,7 @@ def timings(parts: Sequence[Part], unit: TimeUnit) -> Figure:
             name, *decimate(time[1:], timing.interval * 1e3), group,
             color=part.colour or BLACK, width=1.6))
     return Figure(
-        'timing', 'Lead of the commands, delay and interval of the samples', 640, data, {
+        'timing', 'Lead of the commands, delay and interval of the samples', 640, _grouped(data), {
             'xaxis': _axis(f'time from the first command [{unit.name}]', anchor='y'),
             'yaxis': _axis('sample interval [ms]', domain=[0.0, 0.28], rangemode='tozero'),
             'yaxis2': _axis('sample delay [ms]', domain=[0.36, 0.64], anchor='x'),

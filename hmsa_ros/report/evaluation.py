@@ -531,10 +531,11 @@ def timing(run: Run) -> Timing:
     lead = _seconds(np.array([x.stamp - x.sent for x in run.commands], dtype=np.int64))
     if abs(float(np.median(delay))) > _SAME_CLOCK:
         delay, lead = np.empty(0), np.empty(0)
+    recorded: Times = np.sort(run.logged)
     usual = float(np.median(interval)) if len(interval) else math.inf
     gaps = np.rint(interval / usual) - 1.0
     return Timing(
-        lead, delay, interval, _seconds(np.diff(run.logged)),
+        lead, delay, interval, _seconds(np.diff(recorded)),
         int(np.sum(gaps[gaps > 0.0])) if len(interval) else 0)
 
 

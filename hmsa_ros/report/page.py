@@ -32,6 +32,8 @@ _UNITS = {
     'remanence': 'T', 'chain_limit': '1', 'damping_coefficient': 'N s/m'}
 # Plans and requests of long runs are cut here; the figures show all of them.
 _MOST_ROWS = 1000
+# Longer tables scroll.
+_LONG_TABLE = 25
 # Stamps beyond this many seconds are dates.
 _A_DATE = 1e8
 
@@ -92,12 +94,14 @@ def page(parts: Sequence[Part]) -> str:
     count = max(len(x.evaluation.results) for x in parts)
     planned = any(x.evaluation.plan for x in parts)
     sections = [
-        ('setpoints', 'Setpoints', _setpoints(parts)),
         ('response-section', 'Command and response', _text(
             'Above, the flux density commanded: a dot where the level switches. Below, the '
             'stretch: recorded, predicted by the plan, and simulated for plain steps to the '
             'levels that hold the targets. Drag to zoom, double-click to go back, click in the '
-            'legend to hide.') + place(charts.response(parts, unit))),
+            'legend to hide.' + (
+                '' if len(parts) == 1 else ' What is simulated is hidden until its name is '
+                'clicked.')) + place(charts.response(parts, unit))),
+        ('setpoints', 'Setpoints', _setpoints(parts)),
         ('phase-section', 'Phase plane', _text(
             'Stretch rate over stretch. Filled dots are the equilibria of the setpoints, the '
             'open one is where the run starts.' + (
@@ -135,7 +139,7 @@ def page(parts: Sequence[Part]) -> str:
     ]
     requests = _requests(parts, unit)
     if requests:
-        sections.insert(1, ('requests', 'Requests', requests))
+        sections.insert(-2, ('requests', 'Requests', requests))
     names = ', '.join(x.run.label for x in parts)
     data = json.dumps(
         {'figures': [{'key': x.key, 'data': x.data, 'layout': x.layout} for x in figures],
@@ -199,31 +203,26 @@ def _source(run: Run) -> str:
 
 def _tiles(parts: Sequence[Part]) -> str:
     """Return the figures that say most."""
-    def all_runs(texts: Iterable[str]) -> str:
-        return ' · '.join(texts)
-
     def largest(values: Iterable[float]) -> float:
         return max((x for x in values if math.isfinite(x)), default=math.nan)
 
-    residual = [largest(x.residual for x in part.evaluation.results) for part in parts]
-    plain = [largest(x.residual_unshaped for x in part.evaluation.results) for part in parts]
-    tiles = [
-        ('setpoints', all_runs(str(len(x.evaluation.results)) for x in parts)),
-        ('largest residual, share of the step', all_runs(map(percent, residual))),
-        ('the same with plain steps', all_runs(map(percent, plain))),
-        ('commands', all_runs(
-            f'{len(x.run.commands)}' + (
-                f' ({x.timing.late} late)' if len(x.timing.lead) else '') for x in parts)),
-        ('samples a second', all_runs(
-            f'{1.0 / np.median(x.timing.interval):.6g}' if len(x.timing.interval) else '–'
-            for x in parts)),
-        ('messages lost', all_runs(
-            'not told' if x.run.summary.lost is None else str(x.run.summary.lost)
-            for x in parts)),
-    ]
-    return '<div class="tiles">' + ''.join(
-        f'<div><b>{escape(value)}</b><span>{escape(name)}</span></div>'
-        for name, value in tiles) + '</div>'
+    header = [
+        'setpoints', 'largest residual, share of the step', 'the same with plain steps',
+        'commands', 'samples a second', 'messages lost']
+    rows = [[
+        str(len(x.evaluation.results)),
+        percent(largest(y.residual for y in x.evaluation.results)),
+        percent(largest(y.residual_unshaped for y in x.evaluation.results)),
+        f'{len(x.run.commands)}' + (f' ({x.timing.late} late)' if len(x.timing.lead) else ''),
+        f'{1.0 / np.median(x.timing.interval):.6g}' if len(x.timing.interval) else '–',
+        'not told' if x.run.summary.lost is None else str(x.run.summary.lost)] for x in parts]
+    if len(parts) == 1:
+        return '<div class="tiles">' + ''.join(
+            f'<div><b>{escape(value)}</b><span>{escape(name)}</span></div>'
+            for name, value in zip(header, rows[0], strict=True)) + '</div>'
+    return _table(
+        'run-table', 'The runs.', ['run', *header],
+        [[x.run.label, *row] for x, row in zip(parts, rows, strict=True)])
 
 
 def _notes(parts: Sequence[Part]) -> str:
@@ -258,15 +257,18 @@ def _table(
         key: str, caption: str, header: Sequence[str],
         rows: Sequence[_Row]) -> str:
     """Return a table with a button that copies it."""
-    if header[0] == 'run' and len({row[0] for row in rows}) <= 1:
+    if header[0] in ('run', 'bag') and len({row[0] for row in rows}) <= 1:
         # A run on its own needs no name in every row.
         header, rows = header[1:], [row[1:] for row in rows]
     numeric = [any(
         isinstance(row[i], Cell) for row in rows) for i in range(len(header))]
     kinds = [' class="number"' if x else '' for x in numeric]
+    long = ' long' if len(rows) > _LONG_TABLE else ''
     lines = [
-        f'<button type="button" data-table="{key}">Copy table</button>',
-        f'<div class="scroll"><table id="{key}"><caption>{escape(caption)}</caption><thead><tr>',
+        f'<p class="soft" id="{key}-caption">{escape(caption)}</p>',
+        f'<div class="scroll{long}" tabindex="0" role="region" '
+        f'aria-labelledby="{key}-caption">'
+        f'<table id="{key}" aria-labelledby="{key}-caption"><thead><tr>',
         *(f'<th scope="col"{kind}>{escape(x)}</th>'
           for x, kind in zip(header, kinds, strict=True)), '</tr></thead><tbody>']
     for row in rows:
@@ -278,7 +280,9 @@ def _table(
                 value = '' if cell.value is None else f' data-value="{cell.value!r}"'
                 lines.append(f'<td{kind}{value}>{escape(cell.shown)}</td>')
         lines.append('</tr>')
-    return ''.join([*lines, '</tbody></table></div>'])
+    return ''.join([
+        *lines, '</tbody></table></div>',
+        f'<button type="button" data-table="{key}">Copy table</button>'])
 
 
 def _cell(value: float, form: str = '.6g') -> Cell:

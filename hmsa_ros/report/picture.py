@@ -61,7 +61,8 @@ def draw(path: Path, parts: Sequence[Part], kind: str) -> None:
             _draw_run(axes, part, unit, colour)
             for i in shown:
                 if i < len(part.evaluation.results):
-                    _draw_arrival(axes[f'arrival{i}'], part, i, colour)
+                    _draw_arrival(
+                        axes[f'arrival{i}'], part, i, _height(parts, i), colour)
         begin = float(unit.of(min(x.evaluation.time[0] for x in parts)))
         end = float(unit.of(max(x.evaluation.time[-1] for x in parts)))
         for key in ('command', 'response'):
@@ -89,10 +90,6 @@ def _styled(kind: dict[str, Any], colour: str) -> dict[str, Any]:
     return {**kind, 'color': colour} if colour else kind
 
 
-def _label(part: Part, what: str, colour: str) -> str:
-    return f'{part.run.label}: {what}' if colour else what
-
-
 def _draw_run(axes: dict[str, Axes], part: Part, unit: TimeUnit, colour: str) -> None:
     run, found = part.run, part.evaluation
     time = unit.of(found.time)
@@ -109,13 +106,14 @@ def _draw_run(axes: dict[str, Axes], part: Part, unit: TimeUnit, colour: str) ->
         axes['response'].plot(
             unit.of([x.begin, x.end]), [x.stretch, x.stretch], **style.TARGET,
             label='target' if i == 0 else None)
-    axes['response'].plot(
-        *decimate(time, found.unshaped[0]), **_styled(style.UNSHAPED, colour),
-        label=_label(part, 'plain steps', colour))
+    if not colour:
+        # Several runs are compared by what was recorded.
+        axes['response'].plot(
+            *decimate(time, found.unshaped[0]), **style.UNSHAPED, label='plain steps')
+        axes['phase'].plot(*found.unshaped, **style.UNSHAPED)
     axes['response'].plot(
         *decimate(time, run.stretch), **_styled(style.SHAPED, colour),
-        label=_label(part, 'recorded', colour))
-    axes['phase'].plot(*found.unshaped, **_styled(style.UNSHAPED, colour))
+        label=run.label if colour else 'recorded')
     axes['phase'].plot(run.stretch, run.rate, **_styled(style.SHAPED, colour))
     places = sorted({x.stretch for x in found.results})
     if places:
@@ -123,7 +121,8 @@ def _draw_run(axes: dict[str, Axes], part: Part, unit: TimeUnit, colour: str) ->
             places, [0.0] * len(places), label='equilibrium', **style.EQUILIBRIUM)
 
 
-def _draw_arrival(panel: Axes, part: Part, number: int, colour: str) -> None:
+def _draw_arrival(
+        panel: Axes, part: Part, number: int, height: float, colour: str) -> None:
     """Draw the zoom on one arrival, in ms and percent of the step."""
     found = part.evaluation
     x = found.results[number]
@@ -132,21 +131,29 @@ def _draw_arrival(panel: Axes, part: Part, number: int, colour: str) -> None:
     view = (-_BEFORE * duration, min(x.end - x.arrival, _AFTER * duration))
     inside = (found.time >= x.arrival + view[0]) & (found.time <= x.arrival + view[1])
     time = (found.time[inside] - x.arrival) * 1e3
-    for stretch, kind in (
-            (found.unshaped[0], style.UNSHAPED), (part.run.stretch, style.SHAPED)):
+    curves = [(part.run.stretch, style.SHAPED)]
+    if not colour:
+        curves.append((found.unshaped[0], style.UNSHAPED))
+    for stretch, kind in curves:
         panel.plot(
             *decimate(time, 100.0 * (stretch[inside] - x.stretch) / step),
             **_styled(kind, colour))
     panel.axvline(0.0, **style.TARGET)
-    height = _LEAST_PERCENT
-    if math.isfinite(x.error):
-        height = min(max(height, 110.0 * x.error), 150.0)
-    low, high = panel.get_ylim() if colour and len(panel.lines) > 3 else (0.0, 0.0)
-    panel.set_ylim(min(-height, max(low, -150.0)), max(height, min(high, 150.0)))
+    panel.set_ylim(-height, height)
+
+
+def _height(parts: Sequence[Part], number: int) -> float:
+    """Return how far an arrival's panel reaches from 0, in percent."""
+    errors = [
+        x.evaluation.results[number].error for x in parts if number < len(x.evaluation.results)]
+    return min(150.0, max(
+        [_LEAST_PERCENT, *(110.0 * x for x in errors if math.isfinite(x))]))
 
 
 def _title(parts: Sequence[Part], number: int) -> str:
     results = [
         x.evaluation.results[number] for x in parts if number < len(x.evaluation.results)]
     targets = '/'.join(dict.fromkeys(f'{x.stretch:.5g}' for x in results))
-    return f'to {targets}: residual ' + ', '.join(percent(x.residual, 2) for x in results)
+    if len(parts) > 1:
+        return f'to {targets}'
+    return f'to {targets}: residual {percent(results[0].residual, 2)}'

@@ -45,6 +45,8 @@ ACTUATOR_FIELDS = (
     'shear_modulus', 'density', 'half_length', 'half_thickness', 'remanence', 'chain_limit',
     'damping_coefficient')
 _DEFAULT_JOINT = 'actuator'
+# Samples may overtake one another on their way; further back goes only a clock, in ns.
+_CLOCK_JUMP = 100_000_000
 # Between two calls of the progress.
 _PROGRESS_MESSAGES = 20_000
 _LITTLE_ENDIAN = b'\x00\x01'
@@ -481,7 +483,29 @@ class _SampleReader:
     def arrays(
             self, where: str, joint: str, *, required: bool
     ) -> tuple[Times, Times, Array, Array, Array]:
-        """Return stamps, log times, stretch, rate and flux density of one joint."""
+        """
+        Return stamps, log times, stretch, rate and flux density of one joint.
+
+        Parameters
+        ----------
+        where : str
+            What is read, for the messages.
+        joint : str
+            Its name; empty if it is not known.
+        required : bool
+            Whether another joint will not do.
+
+        Returns
+        -------
+        tuple of ndarray
+            Increasing in their stamps.
+
+        Raises
+        ------
+        BadInputError
+            If there is no such joint, or none of its samples can be used.
+
+        """
         if not self._columns:
             raise BadInputError(f'{where} holds no message: expected samples of the actuator')
         joint = self._joint(where, joint, required)
@@ -528,7 +552,7 @@ class _SampleReader:
             stamps = logged.copy()
             self.notes.append(
                 'The samples carry no stamps: the times at which they were recorded are taken.')
-        if np.any(np.diff(stamps) < 0):
+        if np.any(np.diff(stamps) < -_CLOCK_JUMP):
             self.notes.append(
                 'The stamps of the samples jump back: the samples are sorted by stamp. Was the '
                 'clock reset in the run?')

@@ -1,0 +1,776 @@
+"""The report: what it says against what is in the bag, and that the page needs nothing else."""
+
+from dataclasses import asdict, replace
+from html.parser import HTMLParser
+import json
+import math
+import re
+import subprocess
+import sys
+
+import numpy as np
+import plotly.graph_objects
+import pytest
+from rosbags.rosbag2 import Writer as RosbagsWriter
+from rosbags.rosbag2.enums import StoragePlugin
+from rosbags.typesys import get_typestore, Stores
+
+from hmsa_ros.bag.definitions import message_definition
+from hmsa_ros.bag.writer import BagWriter, Topic
+from hmsa_ros.cli import main
+from hmsa_ros.core.parameters import NondimensionalParameters, paper_actuator
+from hmsa_ros.core.planner import Options, Planner
+from hmsa_ros.core.residual import residual_vibration
+from hmsa_ros.core.simulation import ActuatorSimulation, simulate
+from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.report import charts
+from hmsa_ros.report.evaluation import evaluate, in_force, plan_points, timing
+from hmsa_ros.report.page import page
+from hmsa_ros.report.reading import (
+    ACTUATOR_FIELDS,
+    COMMAND,
+    JOINT_STATES,
+    Level,
+    PLAN,
+    read_runs,
+    STATUS,
+    TRAJECTORY,
+    TYPES,
+)
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+ACTUATOR = paper_actuator()
+UNIT = ACTUATOR.time_unit
+SEQUENCE = ((1.1, 10.0), (1.2, 10.0), (1.4, 10.0))
+START = 2 * NANOSECONDS
+PERIOD = 50_000
+LEAD = 5_000_000
+# What the integration leaves of a motion that has come to rest, as a share of the step.
+ROUNDING = 1e-6
+SAME = 1e-9
+
+
+def stamp(time):
+    return STORE.types['builtin_interfaces/msg/Time'](
+        sec=time // NANOSECONDS, nanosec=time % NANOSECONDS)
+
+
+def header(time):
+    return STORE.types['std_msgs/msg/Header'](stamp=stamp(time), frame_id='coil')
+
+
+def joint_state(time, stretch, rate, flux_density, names=('actuator',)):
+    return STORE.types[TYPES[JOINT_STATES]](
+        header=header(time), name=list(names), position=np.atleast_1d(stretch).astype(float),
+        velocity=np.atleast_1d(rate).astype(float),
+        effort=np.atleast_1d(flux_density).astype(float))
+
+
+def command(time, value, x=0.0):
+    return STORE.types[TYPES[COMMAND]](
+        header=header(time),
+        magnetic_field=STORE.types['geometry_msgs/msg/Vector3'](x=x, y=0.0, z=value),
+        magnetic_field_covariance=np.zeros(9))
+
+
+def trajectory(time, points):
+    """Return a trajectory of (time from start, position[, velocity, effort])."""
+    return STORE.types[TYPES[PLAN]](
+        header=header(time), joint_names=['actuator'], points=[
+            STORE.types['trajectory_msgs/msg/JointTrajectoryPoint'](
+                positions=np.array(values[:1], dtype=float),
+                velocities=np.array(values[1:2], dtype=float), accelerations=np.zeros(0),
+                effort=np.array(values[2:], dtype=float),
+                time_from_start=STORE.types['builtin_interfaces/msg/Duration'](
+                    sec=after // NANOSECONDS, nanosec=after % NANOSECONDS))
+            for after, *values in points])
+
+
+def status(level, code, message, stretch=''):
+    value = STORE.types['diagnostic_msgs/msg/KeyValue']
+    return STORE.types[TYPES[STATUS]](
+        level=level, name='planner: request', message=message, hardware_id='actuator',
+        values=[value(key='code', value=code), value(key='stretch', value=stretch)])
+
+
+def parameters(**nodes):
+    """Return what the recorder stores of the nodes' actuators."""
+    return {
+        f'{node}.{name}': json.dumps(value) for node, actuator in nodes.items()
+        for name, value in {
+            'use_sim_time': False,
+            **{f'actuator.{x}': getattr(actuator, x) for x in ACTUATOR_FIELDS}}.items()}
+
+
+def simulated(
+        sequence=SEQUENCE, *, space='', plant=ACTUATOR, period=PERIOD, shaper='two_step',
+        slew=0.0, noise=0.0, extra=0.0):
+    """Return the messages of a run: (log time, topic, type, message)."""
+    planner = Planner(ACTUATOR, Options(
+        shaper=shaper, lead_time=LEAD, slew_limit=slew or math.inf, flux_density_min=-0.5,
+        flux_density_max=0.5))
+    simulation = ActuatorSimulation(plant, time=START, slew_limit=slew or math.inf)
+    ends = np.cumsum([round(span * UNIT * NANOSECONDS) for _, span in sequence]).tolist()
+    points = [(x, end) for (x, _), end in zip(sequence, ends, strict=True)]
+    plan = planner.request(points, None, START)
+    levels = [x for x in plan.levels if x.stamp >= 0]
+    random = np.random.default_rng(1)
+    messages = [
+        (START, f'{space}/planner/joint_trajectory', TYPES[TRAJECTORY],
+         trajectory(0, [(end, x) for x, end in points])),
+        (START, f'{space}/planner/plan', TYPES[PLAN], trajectory(levels[0].stamp, [
+            (x.stamp - levels[0].stamp, x.stretch, x.rate, x.flux_density) for x in levels])),
+        (START, f'{space}/planner/status', TYPES[STATUS], status(0, 'accepted', 'accepted'))]
+    for level in levels:
+        messages.append((
+            level.stamp - LEAD, f'{space}/flux_density_command', TYPES[COMMAND],
+            command(level.stamp, level.flux_density)))
+        simulation.command(level.stamp, level.flux_density)
+    last = START + LEAD + ends[-1] + round(extra * NANOSECONDS)
+    for time in range(START, last + period, period):
+        simulation.advance(time)
+        stretch = simulation.stretch + noise * random.standard_normal()
+        messages.append((time, f'{space}/joint_states', TYPES[JOINT_STATES], joint_state(
+            time, stretch, simulation.rate, simulation.flux_density)))
+    return messages
+
+
+def write(folder, messages, **custom_data):
+    """Write a bag as this package's recorder does."""
+    with BagWriter(folder, custom_data=custom_data) as writer:
+        numbers = {}
+        for _, topic, kind, _ in messages:
+            if topic not in numbers:
+                encoding, text = message_definition(kind)
+                numbers[topic] = writer.add_topic(Topic(topic, kind, text, encoding))
+        writer.write(
+            (numbers[topic], time, time, i, bytes(STORE.serialize_cdr(message, kind)))
+            for i, (time, topic, kind, message) in enumerate(
+                sorted(messages, key=lambda x: x[0])))
+    return folder
+
+
+def without(messages, *roles):
+    return [x for x in messages if not x[1].endswith(roles)]
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    """Return the bag of the paper's sequence."""
+    lost = {'/joint_states': 0, '/flux_density_command': 2}
+    return write(
+        tmp_path_factory.mktemp('report') / 'run', simulated(),
+        **parameters(planner=ACTUATOR, plant=ACTUATOR), lost=json.dumps(lost))
+
+
+def parts_of(*bags, **options):
+    runs = [run for bag in bags for run in read_runs(bag, **options)]
+    return [
+        charts.Part(run, evaluate(run), timing(run), colour if len(runs) > 1 else '')
+        for run, colour in zip(runs, charts.RUN_COLOURS, strict=False)]
+
+
+def one(folder, messages, **custom_data):
+    """Write a bag and return its run, evaluated."""
+    part, = parts_of(write(folder, messages, **custom_data))
+    return part
+
+
+class Page(HTMLParser):
+    """What a page consists of."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.tables, self.scripts, self.ids, self.words = [], {}, [], [], []
+        self._stack, self._row = [], None
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        attrs = dict(attrs)
+        self.tags.append((tag, attrs))
+        self._stack.append(tag)
+        if 'id' in attrs:
+            self.ids.append(attrs['id'])
+        if tag == 'table':
+            self.tables[attrs['id']] = []
+            self._row = self.tables[attrs['id']]
+        elif tag == 'tr':
+            self._row.append([])
+        elif tag in ('td', 'th'):
+            self._row[-1].append([attrs.get('data-value'), ''])
+        elif tag == 'script':
+            self.scripts.append([attrs, ''])
+
+    def handle_endtag(self, tag):
+        if tag in self._stack:
+            while self._stack.pop() != tag:
+                pass
+
+    def handle_data(self, data):
+        if self._stack and self._stack[-1] in ('td', 'th'):
+            self._row[-1][-1][1] += data
+        elif self._stack and self._stack[-1] == 'script':
+            self.scripts[-1][1] += data
+        elif self._stack and self._stack[-1] != 'style':
+            self.words.append(data)
+
+    def table(self, key):
+        """Return a table's rows as dicts of (full value or None, text shown)."""
+        header, *rows = self.tables[key]
+        return [dict(zip([x for _, x in header], map(tuple, row), strict=True)) for row in rows]
+
+    def value(self, key, row, column):
+        return float(self.table(key)[row][column][0])
+
+    @property
+    def figures(self):
+        data, = (x for attrs, x in self.scripts if attrs.get('id') == 'report-data')
+        return {x['key']: x for x in json.loads(data)['figures']}
+
+    def trace(self, figure, name):
+        found, = (x for x in self.figures[figure]['data'] if x['name'] == name)
+        return found
+
+
+@pytest.fixture(scope='module')
+def report(bag):
+    """Return the page of the paper's sequence."""
+    return Page(page(parts_of(bag)))
+
+
+# What is read and measured -------------------------------------------------------------------
+
+def test_samples_and_commands_are_read_as_another_reader_reads_them(bag):
+    run, = read_runs(bag)
+    messages = simulated()
+    samples = [x for _, topic, _, x in messages if topic == '/joint_states']
+    assert run.stretch.tolist() == [x.position[0] for x in samples]
+    assert run.rate.tolist() == [x.velocity[0] for x in samples]
+    assert run.flux_density.tolist() == [x.effort[0] for x in samples]
+    assert np.all(np.diff(run.time) == PERIOD)
+    assert run.time[0] == START
+    commands = [x for _, topic, _, x in messages if topic == '/flux_density_command']
+    assert [x.flux_density for x in run.commands] == [x.magnetic_field.z for x in commands]
+    assert [x.stamp - x.sent for x in run.commands] == [LEAD] * 6
+    assert run.parameters_known
+    assert run.notes == ()
+
+
+def test_setpoints_are_found_and_measured_as_the_demo_measures_them(bag):
+    part, = parts_of(bag)
+    result = part.evaluation.results
+    assert [x.stretch for x in result] == [1.1, 1.2, 1.4]
+    # Known values of the paper's first and third move.
+    assert result[0].tau_p == pytest.approx(1.315749737, abs=1e-6)
+    assert result[2].b_p ** 2 == pytest.approx(0.778278436, abs=1e-6)
+    assert result[0].b_1 ** 2 == pytest.approx(0.275104307, abs=1e-6)
+    assert [x.begin for x in result] == pytest.approx([0.0, 10 * UNIT, 20 * UNIT], abs=2e-9)
+    assert result[-1].end == pytest.approx(30 * UNIT, abs=5e-9)
+    previous = 1.0
+    for x in result:
+        # By definition, without what the report is made of.
+        time = (part.run.time - part.run.commands[0].stamp) / NANOSECONDS
+        assert x.residual == residual_vibration(
+            time, part.run.stretch, arrival=x.arrival, end=x.end, step=x.stretch - previous)
+        assert x.residual < ROUNDING
+        assert 1.0 < x.residual_unshaped < 1.5
+        previous = x.stretch
+
+
+def test_the_demo_and_the_report_say_the_same_of_one_bag(bag, tmp_path):
+    from hmsa_ros.session.demo import _evaluate
+
+    demo = _evaluate(bag, tmp_path / 'run.png', {})
+    part, = parts_of(bag)
+    for ours, theirs in zip(part.evaluation.results, demo.setpoints, strict=True):
+        expected = asdict(theirs)
+        assert expected.pop('reached')
+        assert asdict(ours) == pytest.approx(expected, rel=SAME, abs=2e-9)
+
+
+@pytest.mark.parametrize('shaper', ['robust', 'minimum_time', 'zv', 'step'])
+def test_setpoints_are_found_whatever_the_shaper(tmp_path, shaper):
+    part = one(
+        tmp_path / 'bag', simulated(shaper=shaper),
+        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    assert [x.stretch for x in part.evaluation.results] == [1.1, 1.2, 1.4]
+    residual = max(x.residual for x in part.evaluation.results)
+    if shaper in ('robust', 'minimum_time'):
+        assert residual < ROUNDING
+    else:
+        assert residual > 1e-3
+
+
+def test_without_the_requests_setpoints_are_told_by_the_levels_that_last(tmp_path, bag):
+    messages = without(simulated(), 'joint_trajectory', 'status', 'plan')
+    part = one(tmp_path / 'bag', messages, **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    expected, = parts_of(bag)
+    for ours, theirs in zip(
+            part.evaluation.results, expected.evaluation.results, strict=True):
+        assert ours.stretch == pytest.approx(theirs.stretch, abs=SAME)
+        assert ours.arrival == theirs.arrival
+    assert part.evaluation.plan == ()
+    assert 'plan-section' not in Page(page([part])).ids
+
+
+def test_unknown_parameters_are_said_to_be_unknown_and_the_plan_still_tells_the_setpoints(
+        tmp_path):
+    other = paper_actuator(NondimensionalParameters(zeta=0.1, j_lim=8.0))
+    part = one(tmp_path / 'bag', simulated())
+    assert not part.run.parameters_known
+    assert 'unknown' in ' '.join(Page(page([part])).words)
+    assert any('--params' in x for x in part.run.notes)
+    run = replace(part.run, planner=other, plant=other)
+    # By an equilibrium of the wrong block no level holds what was asked for.
+    assert [x.stretch for x in evaluate(run).results] == [1.1, 1.2, 1.4]
+
+
+def test_plain_steps_are_simulated_with_the_plant_that_was_recorded(tmp_path):
+    plant = replace(ACTUATOR, shear_modulus=1.1 * ACTUATOR.shear_modulus)
+    part = one(
+        tmp_path / 'bag', simulated(plant=plant), **parameters(planner=ACTUATOR, plant=plant))
+    found = part.evaluation
+    assert max(x.residual for x in found.results) > 0.01
+    assert any('other parameters' in x for x in part.run.notes)
+    time = found.time[found.time >= 0.0]
+    loads = [x.flux_density / plant.flux_density_unit for x in part.run.commands[1::2]]
+    stretch, _ = simulate(
+        [x.begin / plant.time_unit for x in found.results], loads, time / plant.time_unit,
+        plant.nondimensional)
+    assert np.max(np.abs(found.unshaped[0][found.time >= 0.0] - stretch)) < SAME
+
+
+@pytest.mark.parametrize('slew', [0.0, 20.0])
+def test_the_plan_predicts_a_plant_that_is_as_planned(tmp_path, slew):
+    known = parameters(planner=ACTUATOR, plant=ACTUATOR)
+    if slew:
+        known |= {'planner.slew_limit': str(slew), 'plant.slew_limit': str(slew)}
+    part = one(tmp_path / 'bag', simulated(slew=slew), **known)
+    difference = part.run.stretch - part.evaluation.predicted[0]
+    assert np.count_nonzero(np.isfinite(difference)) > 2000
+    assert np.nanmax(np.abs(difference)) < SAME
+    points = plan_points(part.run, part.evaluation)
+    assert [x.planned for x in points] == [x.commanded for x in points]
+    assert max(x.deviation for x in points) < SAME
+    assert max(x.residual for x in part.evaluation.results) < ROUNDING
+
+
+def test_a_later_command_supersedes_those_stamped_at_or_after_it():
+    first = [Level(10, 1.0, 0), Level(20, 2.0, 0), Level(30, 3.0, 0)]
+    assert [(x.stamp, x.flux_density) for x in in_force(
+        [*([x] for x in first), [Level(20, 4.0, 5)]])] == [(10, 1.0), (20, 4.0)]
+    assert [x.stamp for x in in_force([first, [Level(25, 4.0, 5), Level(40, 5.0, 5)]])] == [
+        10, 20, 25, 40]
+
+
+def test_timing_tells_lead_lateness_delay_and_gaps(tmp_path):
+    messages = simulated()
+    changed = []
+    for i, (time, topic, kind, message) in enumerate(messages):
+        late = 3_000_000 if topic == '/joint_states' else 0
+        if topic == '/flux_density_command' and i == 4:
+            late = LEAD + 2_000_000
+        if topic != '/joint_states' or not 500 <= i < 510:
+            changed.append((time + late, topic, kind, message))
+    part = one(tmp_path / 'bag', changed, **parameters(plant=ACTUATOR))
+    assert part.timing.late == 1
+    assert sorted(part.timing.lead) == pytest.approx([-0.002] + [0.005] * 5)
+    assert part.timing.delay == pytest.approx(np.full(len(part.run.time), 0.003))
+    assert part.timing.missing == 10
+    report = Page(page([part]))
+    row, = (x for x in report.table('timing-table') if x['quantity'][1] == 'command lead')
+    assert float(row['least [ms]'][0]) == pytest.approx(-2.0)
+    assert '6 (1 late)' in ' '.join(report.words)
+
+
+def test_a_recorder_on_another_clock_leaves_lead_and_delay_open(tmp_path):
+    ahead = 1_700_000_000 * NANOSECONDS
+    messages = [(time + ahead, *rest) for time, *rest in simulated()]
+    part = one(tmp_path / 'bag', messages, **parameters(plant=ACTUATOR))
+    assert len(part.timing.lead) == len(part.timing.delay) == 0
+    assert [x.stretch for x in part.evaluation.results] == [1.1, 1.2, 1.4]
+    assert 'another clock' in ' '.join(Page(page([part])).words)
+
+
+# Bags of all kinds ---------------------------------------------------------------------------
+
+def test_a_bag_that_rosbags_wrote_will_do(tmp_path, bag):
+    with RosbagsWriter(
+            tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connections = {}
+        for time, topic, kind, message in sorted(simulated(), key=lambda x: x[0]):
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
+            writer.write(connections[topic], time, STORE.serialize_cdr(message, kind))
+    part, = parts_of(tmp_path / 'bag')
+    expected, = parts_of(bag)
+    assert part.evaluation.results == expected.evaluation.results
+    assert part.run.summary.lost is None
+    assert 'not told' in ' '.join(Page(page([part])).words)
+
+
+def test_each_namespace_of_a_bag_is_a_run(tmp_path):
+    messages = simulated(space='/left') + simulated(((1.3, 10.0),), space='/right')
+    runs = parts_of(write(tmp_path / 'bag', messages))
+    assert [x.run.label for x in runs] == ['bag /left', 'bag /right']
+    assert [[y.stretch for y in x.evaluation.results] for x in runs] == [
+        [1.1, 1.2, 1.4], [1.3]]
+
+
+def test_the_actuator_is_found_among_other_joints(tmp_path):
+    messages = []
+    for time, topic, kind, message in without(simulated(), 'plan'):
+        if topic == '/joint_states':
+            names = ('wheel', 'actuator') if time % (2 * PERIOD) else ('actuator', 'arm')
+            place = names.index('actuator')
+            values = np.full((3, 2), 99.0)
+            values[:, place] = message.position[0], message.velocity[0], message.effort[0]
+            messages.append((time, topic, kind, joint_state(time, *values, names)))
+        else:
+            messages.append((time, topic, kind, message))
+    folder = write(tmp_path / 'bag', messages)
+    run, = read_runs(folder)
+    assert run.stretch.tolist() == [
+        x.position[0] for _, topic, _, x in simulated() if topic == '/joint_states']
+    with pytest.raises(BadInputError, match=r"no joint 'leg': expected one of actuator, arm"):
+        read_runs(folder, joint='leg')
+
+
+def test_hardware_that_measures_neither_rate_nor_field_will_do(tmp_path):
+    part = one(tmp_path / 'bag', [
+        (time, topic, kind, joint_state(time, message.position, [], [])
+         if topic == '/joint_states' else message)
+        for time, topic, kind, message in without(simulated(noise=1e-4), 'plan', 'status')])
+    assert any('rates were not recorded' in x for x in part.run.notes)
+    assert [x.stretch for x in part.evaluation.results] == [1.1, 1.2, 1.4]
+    moving = (part.evaluation.time > 0.001) & (part.evaluation.time < 0.004)
+    assert np.median(part.run.rate[moving]) == pytest.approx(25.0, abs=5.0)
+    assert 1e-3 < part.evaluation.results[0].residual < 0.02
+    assert 'NaN' not in Page(page([part])).scripts[0][1]
+
+
+def test_broken_samples_and_commands_are_left_out_and_told(tmp_path):
+    messages = [
+        x if i != 300 else (*x[:3], joint_state(x[0], math.nan, 0.0, 0.0))
+        for i, x in enumerate(simulated())]
+    messages.append((START, '/flux_density_command', TYPES[COMMAND], command(START, 1.0, 5.0)))
+    part = one(tmp_path / 'bag', messages, **parameters(plant=ACTUATOR))
+    assert len(part.run.time) == len(without(simulated(), 'plan', 'status', 'y', 'command')) - 1
+    assert len(part.run.commands) == 6
+    notes = ' '.join(part.run.notes)
+    assert '1 samples are not finite' in notes
+    assert '1 commands are not finite or not along z' in notes
+
+
+def test_a_clock_that_jumps_back_is_told(tmp_path):
+    messages = simulated()
+    samples = [x for x in messages if x[1] == '/joint_states']
+    again = [(x[0] + 10 * NANOSECONDS, *x[1:]) for x in samples[:100]]
+    part = one(tmp_path / 'bag', messages + again, **parameters(plant=ACTUATOR))
+    assert np.all(np.diff(part.run.time) > 0)
+    assert any('jump back' in x for x in part.run.notes)
+
+
+def test_a_run_without_commands_shows_the_response_alone(tmp_path):
+    part = one(tmp_path / 'bag', [
+        x for x in simulated() if not x[1].endswith('command')] + [
+            (START, '/flux_density_command', TYPES[COMMAND], command(START, 1.0, 5.0))])
+    report = Page(page([part]))
+    assert part.evaluation.results == ()
+    assert 'holds no command' in ' '.join(report.words)
+    assert 'arrivals' not in report.ids
+    assert len(report.trace('response', 'recorded')['y']) > 100
+
+
+def test_a_move_that_the_recording_cut_off_is_left_out(tmp_path):
+    messages = [x for x in simulated() if x[0] < START + LEAD + round(0.088 * NANOSECONDS)]
+    part = one(tmp_path / 'bag', messages, **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    assert [x.stretch for x in part.evaluation.results] == [1.1, 1.2]
+
+
+def test_a_refused_request_is_told_with_its_reason(tmp_path):
+    messages = [*simulated(), (
+        START + 1000, '/planner/status', TYPES[STATUS],
+        status(2, 'out_of_range', 'target stretch is 9 <script>', '1.1'))]
+    text = page([one(tmp_path / 'bag', messages, **parameters(plant=ACTUATOR))])
+    report = Page(text)
+    assert report.table('request-table')[1]['code'][1] == 'out_of_range'
+    assert '<script>alert' not in text
+    assert '9 &lt;script&gt;' in text
+
+
+# The page ------------------------------------------------------------------------------------
+
+def test_the_page_fetches_nothing(report, bag):
+    assert not [x for x in report.tags if x[0] in ('iframe', 'object', 'embed', 'img', 'base')]
+    for tag, attributes in report.tags:
+        assert 'src' not in attributes, tag
+        for name in ('href', 'action', 'data', 'poster', 'srcset'):
+            assert re.match(r'#|data:', attributes.get(name, '#')), (tag, attributes)
+    policy, = (x['content'] for tag, x in report.tags
+               if x.get('http-equiv') == 'Content-Security-Policy')
+    assert "default-src 'none'" in policy
+    assert 'http' not in policy
+    style, = re.findall(r'<style>(.*?)</style>', page(parts_of(bag)), re.DOTALL)
+    assert 'url(' not in style
+    assert '@import' not in style
+    own = report.scripts[0][1] + report.scripts[2][1]
+    assert 'http' not in own
+    assert 'fetch(' not in own
+
+
+def test_plotly_is_in_the_page_whole(report):
+    from plotly.offline import get_plotlyjs
+
+    assert len(report.scripts) == 3
+    assert report.scripts[1][1].replace('<\\/script', '</script') == get_plotlyjs()
+
+
+def test_every_figure_has_its_place_a_description_and_units(report):
+    figures = report.figures
+    assert set(figures) == {
+        'response', 'phase', 'arrival0', 'arrival1', 'arrival2', 'residuals', 'prediction',
+        'timing'}
+    places = {x['id']: x for tag, x in report.tags if x.get('class') == 'plot'}
+    assert set(places) == set(figures)
+    assert all(x['role'] == 'img' and x['aria-label'] for x in places.values())
+    assert len(report.ids) == len(set(report.ids))
+    for figure in figures.values():
+        # Plotly's own check of names and values.
+        plotly.graph_objects.Figure(data=figure['data'], layout=figure['layout'])
+        for name, axis in figure['layout'].items():
+            if re.match('[xy]axis', name):
+                title = axis['title']['text']
+                assert re.search(r'\[.+\]$', title) or title == 'setpoint'
+
+
+def test_curves_are_what_was_recorded(report, bag):
+    run, = read_runs(bag)
+    recorded = report.trace('response', 'recorded')
+    zero = run.commands[0].stamp
+    # Fewer samples than a screen could show: all of them, to nine digits.
+    assert recorded['x'] == pytest.approx(((run.time - zero) / 1e6).tolist(), rel=1e-8)
+    assert recorded['y'] == pytest.approx(run.stretch.tolist(), rel=1e-8)
+    sent = report.trace('response', 'command')
+    assert sent['x'][1:7] == pytest.approx([(x.stamp - zero) / 1e6 for x in run.commands])
+    assert sent['y'][1:7] == pytest.approx([x.flux_density * 1e3 for x in run.commands])
+    assert [x > 0 for x in sent['marker']['size']] == [False, *[True] * 6, False]
+    assert sent['line']['shape'] == 'hv'
+    equilibria = [x for x in report.figures['phase']['data'] if x['name'] == 'equilibrium']
+    assert equilibria[0]['x'] == [1.1, 1.2, 1.4]
+    assert equilibria[0]['y'] == [0, 0, 0]
+
+
+def test_an_arrival_is_shown_in_percent_of_its_step(report, bag):
+    part, = parts_of(bag)
+    x = part.evaluation.results[1]
+    curve = report.trace('arrival1', 'recorded')
+    assert curve['y'][0] == pytest.approx(-100.0, abs=0.1)
+    after = [y for t, y in zip(curve['x'], curve['y'], strict=True) if t >= 0]
+    assert max(after) - min(after) == pytest.approx(100.0 * x.residual, rel=0.5)
+    assert f'residual {100.0 * x.residual:.3g} %' in ' '.join(report.words)
+
+
+def test_the_table_has_the_measures_in_full_precision(report, bag):
+    part, = parts_of(bag)
+    for i, x in enumerate(part.evaluation.results):
+        for column, value in (
+                ('target λ [1]', x.stretch), ('b_p [1]', x.b_p), ('tau_p [1]', x.tau_p),
+                ('b_1 [1]', x.b_1), ('begin [ms]', x.begin * 1e3),
+                ('arrival [ms]', x.arrival * 1e3), ('until [ms]', x.end * 1e3),
+                ('largest error [%]', 100.0 * x.error), ('residual [%]', 100.0 * x.residual),
+                ('plain steps [%]', 100.0 * x.residual_unshaped)):
+            assert report.value('setpoint-table', i, column) == value
+    assert [x['command'][1] for x in report.table('setpoint-table')] == ['2 levels'] * 3
+    buttons = {x['data-table'] for tag, x in report.tags if tag == 'button'}
+    assert buttons == set(report.tables)
+
+
+def test_losses_and_parameters_are_those_of_the_bag(report):
+    losses = {x['topic'][1]: x for x in report.table('loss-table')}
+    assert losses['/flux_density_command']['lost'] == ('2', '2')
+    assert losses['/flux_density_command']['messages'] == ('6', '6')
+    values = {x['parameter'][1]: float(x['actuator'][0]) for x in report.table('parameter-table')}
+    assert values['shear modulus'] == ACTUATOR.shear_modulus
+    assert values['zeta'] == ACTUATOR.nondimensional.zeta
+    assert values['time unit'] == UNIT * 1e3
+    recorded = {x['parameter'][1]: x['value'][1] for x in report.table('recorded-table')}
+    assert recorded['plant.actuator.density'] == '1900.0'
+
+
+def test_several_bags_lie_over_each_other_in_colours_of_their_own(tmp_path, bag):
+    other = write(
+        tmp_path / 'other', simulated(plant=replace(ACTUATOR, density=2100.0)),
+        **parameters(planner=ACTUATOR, plant=replace(ACTUATOR, density=2100.0)))
+    report = Page(page(parts_of(bag, other)))
+    curves = [report.trace('response', f'{name}: recorded') for name in ('run', 'other')]
+    assert curves[0]['line']['color'] != curves[1]['line']['color']
+    assert curves[0]['legendgroup'] != curves[1]['legendgroup']
+    rows = report.table('setpoint-table')
+    assert [x['run'][1] for x in rows] == ['run'] * 3 + ['other'] * 3
+    assert float(rows[3]['residual [%]'][0]) > 1.0
+
+
+def test_names_from_a_bag_cannot_become_markup(tmp_path):
+    name = 'a<b onload=x>&amp;"'
+    text = page(parts_of(write(tmp_path / name, simulated(), **parameters(plant=ACTUATOR))))
+    report = Page(text)
+    assert not [x for tag, x in report.tags if 'onload' in x]
+    assert name in report.words
+    assert '</script' not in report.scripts[0][1].lower()
+
+
+def test_thinning_out_keeps_every_peak_and_the_ends():
+    random = np.random.default_rng(2)
+    x = np.arange(600_001.0)
+    y = np.sin(x / 1e3) + 1e-3 * random.standard_normal(len(x))
+    y[123_456], y[432_100], y[600_000] = 5.0, -7.0, 3.0
+    thin_x, thin_y = charts.decimate(x, y)
+    assert len(thin_x) <= 2 * charts.BUCKETS + 4
+    assert np.all(np.diff(thin_x) > 0)
+    assert set(zip(thin_x, thin_y, strict=True)) <= set(zip(x, y, strict=True))
+    assert thin_y[thin_x == 123_456] == 5.0
+    assert thin_y[thin_x == 432_100] == -7.0
+    assert (thin_x[0], thin_x[-1]) == (0.0, 600_000.0)
+    # The envelope in each of some coarser intervals is the whole curve's.
+    for begin in range(0, 600_000, 30_000):
+        inside = (thin_x >= begin) & (thin_x < begin + 30_000)
+        assert np.max(thin_y[inside]) >= np.max(y[begin:begin + 30_000]) - 1e-3
+        assert np.min(thin_y[inside]) <= np.min(y[begin:begin + 30_000]) + 1e-3
+
+
+@pytest.mark.parametrize('count', [0, 1, 2, 3999, 4001, 6001])
+def test_thinning_out_takes_any_number_of_points(count):
+    x = np.arange(float(count))
+    thin_x, thin_y = charts.decimate(x, x ** 2)
+    assert np.array_equal(thin_y, thin_x ** 2)
+    if count:
+        assert (thin_x[0], thin_x[-1]) == (0.0, count - 1.0)
+
+
+def test_of_many_arrivals_the_worst_are_shown_and_the_table_has_all(tmp_path):
+    sequence = tuple((1.1 if i % 2 else 1.2, 8.0) for i in range(20))
+    part = one(
+        tmp_path / 'bag', simulated(sequence, period=200_000, noise=1e-5),
+        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    report = Page(page([part]))
+    shown = sorted(int(x.removeprefix('arrival')) for x in report.figures
+                   if x.startswith('arrival'))
+    ranked = sorted(range(20), key=lambda i: -part.evaluation.results[i].residual)
+    assert shown == sorted(ranked[:charts.MOST_PANELS])
+    assert len(report.table('setpoint-table')) == 20
+
+
+# The command ---------------------------------------------------------------------------------
+
+def test_the_command_writes_page_and_pictures_and_names_them(bag, tmp_path, capsys):
+    names = [tmp_path / x for x in ('run.html', 'run.png', 'run.pdf')]
+    out, png, pdf = map(str, names)
+    assert main(['report', str(bag), '--out', out, '--png', png, '--pdf', pdf]) == 0
+    assert capsys.readouterr().out.split() == [out, png, pdf]
+    assert names[0].read_text(encoding='utf-8').startswith('<!DOCTYPE html>')
+    assert names[1].read_bytes().startswith(b'\x89PNG')
+    drawn = names[2].read_bytes()
+    assert drawn.startswith(b'%PDF')
+    # Lines, not pixels.
+    assert b'/Subtype /Image' not in drawn
+    main(['report', str(bag), '--out', out, '--pdf', pdf])
+    assert names[2].read_bytes() == drawn
+
+
+def test_the_page_is_named_after_the_bag_and_bags_of_one_name_are_told_apart(
+        bag, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name in ('a', 'b'):
+        write(tmp_path / name / 'bag', simulated(((1.1, 10.0),)))
+    assert main(['report', 'a/bag', 'b/bag', 'b/bag']) == 0
+    assert capsys.readouterr().out == 'bag_report.html\n'
+    words = Page((tmp_path / 'bag_report.html').read_text(encoding='utf-8')).words
+    assert 'a/bag, b/bag (2), b/bag (3)' in words
+
+
+def test_a_parameter_file_says_what_the_block_really_is(tmp_path):
+    file = tmp_path / 'block.yaml'
+    file.write_text(
+        '/**:\n  ros__parameters:\n    actuator:\n      shear_modulus: 2.0e+4\n'
+        '    actuator.density: 2000.0\n')
+    folder = write(tmp_path / 'bag', simulated())
+    out = tmp_path / 'out.html'
+    assert main(['report', str(folder), '--params', str(file), '--out', str(out)]) == 0
+    report = Page(out.read_text(encoding='utf-8'))
+    values = {x['parameter'][1]: float(x['actuator'][0])
+              for x in report.table('parameter-table')}
+    assert (values['shear modulus'], values['density']) == (2.0e4, 2000.0)
+    assert values['half length'] == ACTUATOR.half_length
+
+
+def _bad(tmp_path, case):
+    """Return arguments that cannot be used and what is said of them."""
+    good = tmp_path / 'good'
+    write(good, simulated(((1.1, 10.0),)))
+    if case == 'nothing there':
+        return [str(tmp_path / 'nothing')], 'does not exist'
+    if case == 'not a bag':
+        (tmp_path / 'text.mcap').write_text('not a bag')
+        return [str(tmp_path / 'text.mcap')], 'is not an MCAP file'
+    if case == 'no topics':
+        write(tmp_path / 'bag', [
+            (1, '/chatter', 'std_msgs/msg/Float64',
+             STORE.types['std_msgs/msg/Float64'](data=1.0))])
+        return [str(tmp_path / 'bag')], 'has no topic .../joint_states'
+    if case == 'empty':
+        write(tmp_path / 'bag', [])
+        return [str(tmp_path / 'bag')], 'has no topic'
+    if case == 'no samples':
+        with BagWriter(tmp_path / 'bag') as writer:
+            for role in (JOINT_STATES, COMMAND):
+                encoding, text = message_definition(TYPES[role])
+                writer.add_topic(Topic(f'/{role}', TYPES[role], text, encoding))
+        return [str(tmp_path / 'bag')], 'no message'
+    if case == 'no folder to write to':
+        return [str(good), '--out', str(tmp_path / 'no' / 'x.html')], 'is no folder'
+    if case == 'a folder to write':
+        return [str(good), '--out', str(tmp_path)], 'it is a folder'
+    if case == 'a bag to write':
+        return [str(good), '--out', str(good / 'good_0.mcap')], 'may be part of a bag'
+    if case == 'two files of one name':
+        return [str(good), '--png', 'x.html', '--out', 'x.html'], 'are one file'
+    if case == 'a full disk':
+        return [str(good), '--out', '/dev/full'], 'cannot write /dev/full'
+    (tmp_path / 'bad.yaml').write_text('a: [1')
+    return [str(good), '--params', str(tmp_path / 'bad.yaml')], 'expected a parameter file'
+
+
+@pytest.mark.parametrize('case', [
+    'nothing there', 'not a bag', 'no topics', 'empty', 'no samples', 'no folder to write to',
+    'a folder to write', 'a bag to write', 'two files of one name', 'a full disk',
+    'bad parameters'])
+def test_bad_input_is_answered_in_one_line_with_status_2(tmp_path, monkeypatch, capsys, case):
+    words, said = _bad(tmp_path, case)
+    monkeypatch.chdir(tmp_path)
+    assert main(['report', *words]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ''
+    last, = (x for x in captured.err.splitlines() if 'error' in x)
+    assert last.startswith('hmsa: error: ')
+    assert said in last
+    assert not list(tmp_path.glob('*.html'))
+
+
+def test_the_report_is_made_without_ros(bag, tmp_path):
+    blocked = """
+import sys
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition('.')[0] in ('rclpy', 'sensor_msgs', 'std_msgs', 'rosgraph_msgs'):
+            raise ModuleNotFoundError('blocked: ' + name, name=name)
+sys.meta_path.insert(0, Blocker())
+from hmsa_ros.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+    done = subprocess.run(
+        [sys.executable, '-W', 'error', '-c', blocked, 'report', str(bag), '--out',
+         str(tmp_path / 'x.html')], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
