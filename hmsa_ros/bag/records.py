@@ -206,7 +206,25 @@ class Fields:
         self.offset = 0
 
     def take(self, length: int) -> bytes:
-        """Return the next bytes."""
+        """
+        Return the next bytes.
+
+        Parameters
+        ----------
+        length : int
+            How many.
+
+        Returns
+        -------
+        bytes
+            A copy of them.
+
+        Raises
+        ------
+        BagError
+            If the record ends before.
+
+        """
         end = self.offset + length
         if length < 0 or end > len(self._data):
             raise BagError(f'a {self._what} record ends early')
@@ -223,7 +241,20 @@ class Fields:
         return self.take(self.number(4)).decode('utf-8', 'surrogateescape')
 
     def text_map(self) -> dict[str, str]:
-        """Return the next map of strings."""
+        """
+        Return the next map of strings.
+
+        Returns
+        -------
+        dict of str to str
+            In the order of the record.
+
+        Raises
+        ------
+        BagError
+            If the record ends before.
+
+        """
         end = self.number(4) + self.offset
         if end > len(self._data):
             raise BagError(f'a {self._what} record ends early')

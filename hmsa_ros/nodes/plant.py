@@ -171,8 +171,7 @@ class PlantNode(Node):
             simulation.reset()
             simulation.time = self._next_sample
         self._next_sample += self._period
-        if self._clock_publisher is not None:
-            self._publish_clock(monotonic_ns())
+        self._publish_clock(monotonic_ns())
         stretch, rate = simulation.stretch, simulation.rate
         self._joint_states.publish(conversions.to_joint_state(
             simulation.time, self._joint, stretch, rate, simulation.flux_density))
@@ -180,8 +179,8 @@ class PlantNode(Node):
         self._stretch_rate.publish(Float64(data=rate))
 
     def _publish_clock(self, steady: int) -> None:
-        assert self._clock_publisher is not None
-        self._clock_publisher.publish(conversions.to_clock(self._simulation.time))
+        if self._clock_publisher is not None:
+            self._clock_publisher.publish(conversions.to_clock(self._simulation.time))
         self._clock_published = steady
 
     # -- commands and services -----------------------------------------------------------------

@@ -72,6 +72,9 @@ class Verdict:
             int(values.get('setpoint', 0)), int(values.get('setpoints', 0)))
 
 
+_SILENCE = Verdict(0, 'no word of the planner yet', '', '', '', 0, 0)
+
+
 class PlannerClient:
     """
     Talks to one planner; a context manager.
@@ -105,7 +108,7 @@ class PlannerClient:
             raise BadInputError(f'namespace {namespace!r}: {error}') from error
         self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self.node)
-        self._verdict: Verdict | None = None
+        self._verdict: Verdict = _SILENCE
         topic = interface.STATUS
         self.node.create_subscription(
             topic.type, interface.from_outside(topic.name, interface.PLANNER),
@@ -176,7 +179,8 @@ class PlannerClient:
         """
         where = self._namespace or '/'
         self.spin_until(
-            lambda: self._verdict is not None and self._publisher.get_subscription_count() > 0,
+            lambda: self._verdict is not _SILENCE
+            and self._publisher.get_subscription_count() > 0,
             f'no planner in namespace {where}; start one with hmsa planner, with the same '
             'ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE as here', each)
 
@@ -212,9 +216,8 @@ class PlannerClient:
             points.append((stretch, round(end * NANOSECONDS)))
         self._publisher.publish(to_trajectory(points, self._joint, frame=request))
         self.spin_until(
-            lambda: self._verdict is not None and self._verdict.request == request,
+            lambda: self._verdict.request == request,
             'the planner gave no verdict')
-        assert self._verdict is not None
         if self._verdict.level >= DiagnosticStatus.ERROR[0]:
             raise BadInputError(f'the planner refused: {self._verdict.message}')
         return self._verdict
@@ -245,12 +248,8 @@ class PlannerClient:
             If another request took its place, or it takes too long.
 
         """
-        def current() -> Verdict:
-            assert self._verdict is not None
-            return self._verdict
-
         def done() -> bool:
-            now = current()
+            now = self._verdict
             if now.request != verdict.request:
                 raise HmsaError(
                     f'the sequence was not carried out: another request came in between '
@@ -259,6 +258,6 @@ class PlannerClient:
 
         self.spin_until(
             done, 'the sequence has not come to its end',
-            None if each is None else lambda: each(current()),
+            None if each is None else lambda: each(self._verdict),
             timeout)
-        return current()
+        return self._verdict
