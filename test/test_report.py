@@ -27,6 +27,7 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.report import charts
 from hmsa_ros.report.evaluation import evaluate, in_force, plan_points, timing
 from hmsa_ros.report.page import page
+from hmsa_ros.report.picture import draw
 from hmsa_ros.report.reading import (
     ACTUATOR_FIELDS,
     COMMAND,
@@ -34,6 +35,7 @@ from hmsa_ros.report.reading import (
     Level,
     PLAN,
     read_runs,
+    SETPOINT,
     STATUS,
     TRAJECTORY,
     TYPES,
@@ -136,9 +138,9 @@ def simulated(
     return messages
 
 
-def write(folder, messages, **custom_data):
+def write(folder, messages, *, chunk_size=2**20, **custom_data):
     """Write a bag as this package's recorder does."""
-    with BagWriter(folder, custom_data=custom_data) as writer:
+    with BagWriter(folder, custom_data=custom_data, chunk_size=chunk_size) as writer:
         numbers = {}
         for _, topic, kind, _ in messages:
             if topic not in numbers:
@@ -499,6 +501,43 @@ def test_a_refused_request_is_told_with_its_reason(tmp_path):
     assert report.table('request-table')[1]['code'][1] == 'out_of_range'
     assert '<script>alert' not in text
     assert '9 &lt;script&gt;' in text
+
+
+def test_a_request_that_is_not_a_number_hides_no_setpoint(tmp_path):
+    setpoint = STORE.types[TYPES[SETPOINT]](data=math.nan)
+    part = one(
+        tmp_path / 'bag',
+        [*simulated(), (START + 1, '/planner/setpoint', TYPES[SETPOINT], setpoint)],
+        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    assert [x.stretch for x in part.evaluation.results] == [1.1, 1.2, 1.4]
+
+
+@pytest.mark.parametrize(('samples', 'levels', 'setpoints'), [
+    (1, [0.02, 0.035], 0), (2, [0.02], 0), (100, [0.02, 0.035], 0), (2000, [1e3], 1),
+    (2000, [1e300], 1), (2000, [], 0)])
+def test_odd_recordings_are_shown_for_what_they_are(tmp_path, samples, levels, setpoints):
+    messages = [x for x in simulated() if x[1] == '/joint_states'][:samples]
+    messages += [
+        (START, '/flux_density_command', TYPES[COMMAND],
+         command(START + LEAD + i * 6_000_000, value)) for i, value in enumerate(levels)]
+    if not levels:
+        messages.append(
+            (START, '/flux_density_command', TYPES[COMMAND], command(START, math.inf)))
+    part = one(tmp_path / 'bag', messages, **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    assert len(part.evaluation.results) == setpoints
+    report = Page(page([part]))
+    assert len(report.trace('response', 'recorded')['y']) == samples
+    draw(tmp_path / 'run.pdf', [part], 'pdf')
+    assert (tmp_path / 'run.pdf').read_bytes().startswith(b'%PDF')
+
+
+def test_a_bag_that_was_cut_off_is_shown_up_to_the_cut_and_says_so(tmp_path, bag):
+    folder = write(tmp_path / 'run', simulated(), chunk_size=10_000)
+    whole = (folder / 'run_0.mcap').read_bytes()
+    (tmp_path / 'cut.mcap').write_bytes(whole[:len(whole) // 2])
+    part, = parts_of(tmp_path / 'cut.mcap')
+    assert 100 < len(part.run.time) < len(read_runs(bag)[0].time)
+    assert 'is not complete' in ' '.join(Page(page([part])).words)
 
 
 # The page ------------------------------------------------------------------------------------

@@ -127,7 +127,8 @@ class Evaluation:
     results : tuple of MoveResult
         One a move.
     unshaped : tuple of ndarray, shape (n,)
-        Stretch, and stretch rate in 1/s, simulated for plain steps; NaN without a move.
+        Stretch, and stretch rate in 1/s, simulated for plain steps; NaN without a move, and
+        where they are too large to follow.
     plan : tuple of Level
         Changes of level that were planned and not planned anew, by stamp.
     predicted : tuple of ndarray, shape (n,)
@@ -165,11 +166,6 @@ def evaluate(run: Run, moves: Sequence[Move] | None = None) -> Evaluation:
     -------
     Evaluation
         The measures.
-
-    Raises
-    ------
-    HmsaError
-        If the plain steps cannot be simulated.
 
     """
     levels = in_force((x,) for x in run.commands)
@@ -317,7 +313,7 @@ def _held_until(run: Run, begin: int, target: float, left: int, last: int) -> in
 
 def _asked(run: Run) -> list[float]:
     """Return the stretches that were asked for, sorted."""
-    asked = {x for request in run.requests for x, _ in request.points}
+    asked = {x for request in run.requests for x, _ in request.points if math.isfinite(x)}
     for verdict in run.verdicts:
         # Rounded for the message: a request says it better.
         if math.isfinite(verdict.stretch) and _nearest(sorted(asked), verdict.stretch) is None:
@@ -352,11 +348,14 @@ def _unshaped(
     running = time >= begins[0]
     lower, upper = stretch_limits(run.plant.chain_limit)
     margin = 1e-6 * (upper - lower)
-    stretch[running], nondimensional_rate = simulate(
-        [x / unit for x in begins],
-        [x.flux_densities[-1] / run.plant.flux_density_unit for x in moves],
-        time[running] / unit, run.plant.nondimensional,
-        stretch=min(max(start, lower + margin), upper - margin))
+    try:
+        stretch[running], nondimensional_rate = simulate(
+            [x / unit for x in begins],
+            [x.flux_densities[-1] / run.plant.flux_density_unit for x in moves],
+            time[running] / unit, run.plant.nondimensional,
+            stretch=min(max(start, lower + margin), upper - margin))
+    except HmsaError:
+        return np.full_like(time, np.nan), np.full_like(time, np.nan)
     rate[running] = nondimensional_rate / unit
     return stretch, rate
 

@@ -241,6 +241,8 @@ def _notes_of(part: Part) -> Iterable[str]:
     if part.run.commands and not part.evaluation.results:
         yield ('No setpoint could be told from the commands: none of them holds a stretch that '
                'was asked for, or lasts a period of the actuator.')
+    if part.evaluation.results and not np.isfinite(part.evaluation.unshaped[0]).any():
+        yield 'Plain steps cannot be simulated: the levels are too large to follow.'
     if not len(part.timing.lead) and part.run.commands:
         yield ('The recorder kept another clock than the stamps: how far ahead commands were '
                'sent is not known (record with use_sim_time where time is simulated).')
