@@ -63,7 +63,7 @@ sys.exit(main())
 
 
 @pytest.mark.parametrize('command', ['demo', 'plan', 'send', 'planner', 'plant', 'recorder',
-                                     'player', 'bag', 'figures', 'robustness', 'sweep'])
+                                     'player', 'bag', 'figures', 'report', 'robustness', 'sweep'])
 def test_every_command_of_the_interface_answers_help(command):
     result = run(f"""
 import sys

@@ -80,10 +80,11 @@ def run(arguments: argparse.Namespace) -> int:
     from hmsa_ros.report.reading import read_actuator, read_runs
 
     actuator = None if arguments.params is None else read_actuator(arguments.params)
+    console = Console(stderr=True)
     with Progress(
             TextColumn('{task.description:<28}'), BarColumn(), TextColumn(
                 '{task.percentage:>3.0f} %'), TimeElapsedColumn(),
-            console=Console(stderr=True), transient=True) as progress:
+            console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task('starting', total=1.0)
         runs: list[Run] = []
         for bag in bags:
