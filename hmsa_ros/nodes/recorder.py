@@ -15,6 +15,7 @@ import json
 import os
 from pathlib import Path
 import re
+import threading
 import time
 from typing import Any
 
@@ -95,9 +96,9 @@ PARAMETERS = (
         'record.queue_depth', 10_000,
         'Messages of a topic that the middleware keeps until they are taken.', '', 1, 1_000_000),
     ParameterSpec(
-        'record.nice', -10,
-        'Niceness of the process, below 0 to come before others on a busy machine, where the '
-        'system grants that; 0 for an ordinary process.', '', -20, 19),
+        'record.realtime_priority', 1,
+        'Real-time priority of the threads that receive, where the system grants it; 0 for '
+        'ordinary threads.', '', 0, 99),
     ParameterSpec(
         'record.snapshot_mode', False,
         'Whether messages are only kept in memory until ~/snapshot is called.'),
@@ -206,7 +207,7 @@ class Recorder(Node):
         super().__init__(interface.RECORDER)
         self._parameters_in = declare(self, PARAMETERS)
         values = self._parameters_in
-        _set_nice(values['record.nice'])
+        self._priority: int = values['record.realtime_priority']
         self._selection = Selection(
             tuple(map(self._full_name, values['record.topics'])), values['record.all_topics'],
             values['record.regex'], tuple(map(self._full_name, values['record.exclude_topics'])),
@@ -248,6 +249,7 @@ class Recorder(Node):
                            reliability=ReliabilityPolicy.BEST_EFFORT))
             self._capture.add(self._sim_time, self._clock_subscription)
         self._capture.start()
+        self._hurry()
         self._diagnostics = self.create_publisher(
             interface.DIAGNOSTICS.type, interface.DIAGNOSTICS.name, interface.DIAGNOSTICS.qos)
         for name, callback in (
@@ -271,6 +273,12 @@ class Recorder(Node):
         self.create_timer(max(interval, 1e-3), self._on_poll, clock=steady)
         self.create_timer(DIAGNOSTICS_SECONDS, self._on_diagnostics, clock=steady)
         self.get_logger().info(f'recording to {self.folder}')
+
+    def _hurry(self) -> None:
+        """Have the threads that receive run before others."""
+        _hurry(self._priority, (
+            thread.native_id for thread in threading.enumerate()
+            if thread.native_id is not None and thread.name != self._capture.name))
 
     def _full_name(self, name: str) -> str:
         """Return the full, remapped name of a topic or node."""
@@ -615,12 +623,28 @@ class _Followed:
             parameter_value_to_python(value), default=list) for name, value in values}
 
 
-def _set_nice(nice: int) -> None:
-    """Set the niceness of all threads, those of the middleware too, if it is granted."""
-    if nice:
-        for thread in os.listdir('/proc/self/task'):
+def _hurry(priority: int, own: Iterable[int]) -> None:
+    """
+    Have the middleware's threads run before all ordinary processes, if that is granted.
+
+    Its queues hold some milliseconds of a fast stream. A receiving thread that has to wait for
+    the processor longer than that loses messages before anything here could count on them.
+
+    Parameters
+    ----------
+    priority : int
+        Real-time priority; 0 to leave things as they are.
+    own : iterable of int
+        Threads of Python that receive nothing.
+
+    """
+    if not priority:
+        return
+    ordinary = set(own)
+    for thread in map(int, os.listdir('/proc/self/task')):
+        if thread not in ordinary:
             with contextlib.suppress(OSError):
-                os.setpriority(os.PRIO_PROCESS, int(thread), nice)
+                os.sched_setscheduler(thread, os.SCHED_RR, os.sched_param(priority))
 
 
 def message_class(type_name: str) -> type[Any]:
