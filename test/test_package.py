@@ -25,8 +25,8 @@ KEYS = {
     'lz4': 'mcap-ros2-support', 'mcap': 'mcap-ros2-support',
     'mcap-ros2-support': 'mcap-ros2-support', 'zstandard': 'mcap-ros2-support',
     'PyYAML': 'python3-yaml', 'rosbags': 'python3-rosbags-pip'}
-# ruff and type stubs have no key.
-WITHOUT_KEY = {'ruff', 'types-PyYAML'}
+# No key: ruff, type stubs, and plotly, without which only the page of a report is missing.
+WITHOUT_KEY = {'plotly', 'ruff', 'types-PyYAML'}
 # Requirements whose module has another name.
 MODULES = {'PyYAML': 'yaml', 'mcap-ros2-support': 'mcap_ros2'}
 # What only a part of the package needs.
