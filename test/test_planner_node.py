@@ -8,6 +8,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 from rclpy.parameter import Parameter
+from sensor_msgs.msg import MagneticField
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
@@ -157,6 +158,11 @@ def bench(ros: Any, serve: Any, make_clock: Any) -> Callable[..., Bench]:
             **remapped: str) -> Bench:
         served = serve(PlannerNode, '-p', 'use_sim_time:=true', *arguments)
         made = Bench(ros, make_clock(ros, served), prefix, remapped)
+        # Known to the graph is not matched yet, and what is sent before that is lost.
+        ros.spin_until(
+            lambda: all(
+                x.get_subscription_count() for x in served.nodes[0].publishers
+                if x.msg_type is MagneticField), 'the match of the commands')
         if now:
             made.at(now)
         return made
