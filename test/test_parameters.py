@@ -29,7 +29,8 @@ DECLARED: dict[str, tuple[ParameterSpec, ...]] = {
 # Numbers that are a ratio or a count.
 DIMENSIONLESS = {
     'actuator.chain_limit', 'initial_stretch', 'real_time_factor', 'robust_order', 'play.rate',
-    'play.read_ahead_queue_size', 'play.realtime_priority', 'record.realtime_priority', 'record.queue_depth'}
+    'play.read_ahead_queue_size', 'play.realtime_priority', 'record.queue_depth',
+    'record.realtime_priority'}
 TYPES = {
     bool: ParameterType.PARAMETER_BOOL, int: ParameterType.PARAMETER_INTEGER,
     float: ParameterType.PARAMETER_DOUBLE, str: ParameterType.PARAMETER_STRING}
