@@ -49,6 +49,9 @@ DIAGNOSTICS_SECONDS = 1.0
 _FINE_SECONDS = 0.01
 _POLL_SECONDS = 0.02
 _CLOCK_WHILE_WAITING_SECONDS = 0.1
+# Reliable messages that found the receiver's queue full are sent again when a heartbeat of
+# Fast DDS asks for them, every 3 s: the wait at the end has to last for several, in slices.
+_ACKNOWLEDGED_SECONDS = 0.5
 _BATCH = 100
 
 PARAMETERS = (
@@ -106,7 +109,7 @@ PARAMETERS = (
         'Real-time priority of the thread that sends, where the system grants it; 0 for an '
         'ordinary thread.', '', 0, 99),
     ParameterSpec(
-        'play.wait_acked_timeout.sec', 5,
+        'play.wait_acked_timeout.sec', 20,
         'Whole seconds to wait at the end for reliable subscribers, negative for not at all.',
         's', -1),
     ParameterSpec(
@@ -573,11 +576,18 @@ class Player(Node):
     def _finish(self) -> None:
         """Wait for reliable subscribers and say what was sent."""
         limit = self._span('play.wait_acked_timeout')
+        waiting = list(self._out.values()) if limit >= 0 else []
         end = time.monotonic() + limit * 1e-9
-        for sender in self._out.values():
-            left = end - time.monotonic()
-            if limit >= 0 and left > 0.0 and self.context.ok():
-                sender.wait_for_all_acked(Duration(nanoseconds=round(left * 1e9)))
+        while waiting and self.context.ok() and not self._stopped:
+            left = max(0.0, min(end - time.monotonic(), _ACKNOWLEDGED_SECONDS))
+            if waiting[0].wait_for_all_acked(Duration(nanoseconds=round(left * 1e9))):
+                del waiting[0]
+            elif time.monotonic() >= end:
+                self.get_logger().warning(
+                    'not every subscriber of ' + ', '.join(sender.topic for sender in waiting)
+                    + f' acknowledged every message within {limit * 1e-9:g} s; with a larger '
+                    'play.wait_acked_timeout.sec they get more time')
+                break
         print(f'hmsa player: {self._sent} messages sent', flush=True)
 
     # Services and parameters, in the executor's thread ---------------------------------------
