@@ -1,11 +1,13 @@
 """
-Names, types and quality of service of every topic and service.
+Names, types, quality of service and meaning of every topic and service.
 
 All names are relative or private, so that namespaces and remapping work; only ``/clock`` and
-``/diagnostics`` are absolute, as ROS has them.
+``/diagnostics`` are absolute, as ROS has them. The reference in the documentation is made from
+what stands here.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -33,47 +35,118 @@ CLOCK = QoSProfile(
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic: its name, message class and quality of service."""
+    """
+    A topic.
+
+    Attributes
+    ----------
+    name : str
+        Relative or private.
+    type : type
+        Message class.
+    qos : rclpy.qos.QoSProfile
+        Of publishers and subscribers alike.
+    meaning : str
+        What a message says, in one or two sentences.
+    publishers, subscribers : tuple of str
+        Nodes of this package that send and take it.
+
+    """
 
     name: str
     type: type[Any]
     qos: QoSProfile
+    meaning: str = ''
+    publishers: tuple[str, ...] = ()
+    subscribers: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Service:
-    """A service: its name and service class."""
+    """
+    A service.
+
+    Attributes
+    ----------
+    name : str
+        Private to the node that serves it.
+    type : type
+        Service class.
+    meaning : mapping of str to str
+        What a call does, in one or two sentences, by the node that serves it.
+
+    """
 
     name: str
     type: type[Any]
+    meaning: Mapping[str, str] = field(default_factory=dict)
 
 
 PLANNER = 'planner'
 PLANT = 'plant'
 RECORDER = 'recorder'
 PLAYER = 'player'
+NODES = (PLANNER, PLANT, RECORDER, PLAYER)
 
-JOINT_TRAJECTORY = Topic('~/joint_trajectory', JointTrajectory, RELIABLE)
-SETPOINT = Topic('~/setpoint', Float64, RELIABLE)
-PLAN = Topic('~/plan', JointTrajectory, LATCHED)
-STATUS = Topic('~/status', DiagnosticStatus, LATCHED)
-FLUX_DENSITY_COMMAND = Topic('flux_density_command', MagneticField, COMMAND)
-JOINT_STATES = Topic('joint_states', JointState, SAMPLES)
-STRETCH = Topic('stretch', Float64, SAMPLES)
-STRETCH_RATE = Topic('stretch_rate', Float64, SAMPLES)
-CLOCK_TOPIC = Topic('/clock', Clock, CLOCK)
-DIAGNOSTICS = Topic('/diagnostics', DiagnosticArray, RELIABLE)
+JOINT_TRAJECTORY = Topic(
+    '~/joint_trajectory', JointTrajectory, RELIABLE,
+    'A sequence of setpoints. By its `time_from_start` each point is at rest at its `positions`, '
+    "having left the one before at that one's. Stamp 0 starts now; with a stamp ahead the "
+    'running plan is kept until then; a sequence that began in the past is joined where it is.',
+    subscribers=(PLANNER, RECORDER))
+SETPOINT = Topic(
+    '~/setpoint', Float64, RELIABLE,
+    'One stretch to go to now, held until the next request.',
+    subscribers=(PLANNER, RECORDER))
+PLAN = Topic(
+    '~/plan', JointTrajectory, LATCHED,
+    'The plan: a point at each change of level, with the stretch and rate predicted there and '
+    'the flux density from then on.', publishers=(PLANNER,))
+STATUS = Topic(
+    '~/status', DiagnosticStatus, LATCHED,
+    'The verdict on the last request, with a code and a sentence, and how far its sequence has '
+    'come.', publishers=(PLANNER,))
+FLUX_DENSITY_COMMAND = Topic(
+    'flux_density_command', MagneticField, COMMAND,
+    'The shaped command. From its stamp on, which may lie ahead, z is the flux density in tesla; '
+    'x and y are 0. A message supersedes all earlier ones stamped at or after it.',
+    publishers=(PLANNER,), subscribers=(PLANT,))
+JOINT_STATES = Topic(
+    'joint_states', JointState, SAMPLES,
+    'Samples of the actuator: position is stretch, velocity stretch rate in 1/s, effort the flux '
+    'density in force in tesla.', publishers=(PLANT,))
+STRETCH = Topic(
+    'stretch', Float64, SAMPLES, 'The stretch alone, to plot and to echo.', publishers=(PLANT,))
+STRETCH_RATE = Topic(
+    'stretch_rate', Float64, SAMPLES, 'The stretch rate alone, in 1/s.', publishers=(PLANT,))
+CLOCK_TOPIC = Topic(
+    '/clock', Clock, CLOCK,
+    'Simulated time, from the plant or the player if a parameter makes it the authority.',
+    publishers=(PLANT, PLAYER))
+DIAGNOSTICS = Topic(
+    '/diagnostics', DiagnosticArray, RELIABLE,
+    'Counters and health, once a second.', publishers=NODES)
 
-STOP = Service('~/stop', Trigger)
-RESET = Service('~/reset', Trigger)
-STEP = Service('~/step', Trigger)
-SET_PAUSED = Service('~/set_paused', SetBool)
-PAUSE = Service('~/pause', Trigger)
-RESUME = Service('~/resume', Trigger)
-TOGGLE_PAUSED = Service('~/toggle_paused', Trigger)
-IS_PAUSED = Service('~/is_paused', Trigger)
-PLAY_NEXT = Service('~/play_next', Trigger)
-SPLIT_BAGFILE = Service('~/split_bagfile', Trigger)
+STOP = Service('~/stop', Trigger, {
+    PLANNER: 'Drops the rest of the sequence and comes to rest without vibration.',
+    PLAYER: 'Ends playing.'})
+RESET = Service('~/reset', Trigger, {
+    PLANT: 'Puts the actuator back to its initial state; time goes on.'})
+STEP = Service('~/step', Trigger, {PLANT: 'Advances a paused plant by one sample.'})
+SET_PAUSED = Service('~/set_paused', SetBool, {PLANT: 'Stops simulated time, or lets it run.'})
+PAUSE = Service('~/pause', Trigger, {
+    RECORDER: 'Stops writing; what arrives meanwhile is left out.', PLAYER: 'Holds playing.'})
+RESUME = Service('~/resume', Trigger, {
+    RECORDER: 'Writes again.', PLAYER: 'Goes on playing.'})
+TOGGLE_PAUSED = Service('~/toggle_paused', Trigger, {PLAYER: 'Holds playing, or goes on.'})
+IS_PAUSED = Service('~/is_paused', Trigger, {
+    RECORDER: '`success` says whether it is paused.',
+    PLAYER: '`success` says whether it is paused.'})
+PLAY_NEXT = Service('~/play_next', Trigger, {PLAYER: 'Sends one message of a paused bag.'})
+SNAPSHOT = Service('~/snapshot', Trigger, {
+    RECORDER: 'Writes what a recorder in snapshot mode holds in memory.'})
+SPLIT_BAGFILE = Service('~/split_bagfile', Trigger, {
+    RECORDER: 'Closes the file and goes on in a new one.'})
 
 
 def from_outside(name: str, node: str) -> str:
