@@ -1,5 +1,6 @@
 """Verdicts on a move or on a request, and the error that carries one."""
 
+from collections.abc import Mapping
 from enum import Enum
 
 from hmsa_ros.errors import BadInputError
@@ -36,6 +37,63 @@ class Code(str, Enum):
     def __str__(self) -> str:
         """Return the value."""
         return self.value
+
+
+#: What each code means and what to do about it; the documentation shows it.
+EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
+    Code.TWO_STEP: ('The two-step command: beta_p until tau_p, then beta_1.', ''),
+    Code.STEP: ('One step to the level that holds the target; it rings.', ''),
+    Code.HOLD: ('The actuator is there already and is held.', ''),
+    Code.ROBUST: ('A chain of two-step commands, which forgives errors of the model.', ''),
+    Code.MINIMUM_TIME: ('Full push, full brake, then the level that holds the target.', ''),
+    Code.LINEAR: ('A linear input shaper designed at the target; some vibration is left.', ''),
+    Code.TOO_DAMPED: (
+        'The actuator is damped so heavily that it does not overshoot: no two-step command '
+        'exists, and a plain step, which does not ring either, takes its place.',
+        'Nothing needs mending; the shaper minimum_time arrives sooner.'),
+    Code.INDISTINGUISHABLE: (
+        'So close to critical damping beta_p and beta_1 differ by less than the digits of a '
+        'double; a plain step takes the place of the two.',
+        'Nothing needs mending; the shaper minimum_time arrives sooner.'),
+    Code.OUT_OF_RANGE: (
+        'The stretch lies at or beyond a limit of the polymer chains (J_lim).',
+        'Ask for a stretch inside the interval that the message names, or correct '
+        'actuator.chain_limit.'),
+    Code.FLUX_LIMIT: (
+        'The move needs more flux density than the coil may give.',
+        'Ask for a nearer stretch, go there in several setpoints, or widen flux_density_min '
+        'and flux_density_max if the coil allows it.'),
+    Code.SLEW_LIMIT: (
+        'The amplifier ramps too slowly for a command that leaves no vibration.',
+        'Raise slew_limit if the amplifier can do it, or ask for a smaller move.'),
+    Code.SPELL_TOO_SHORT: (
+        'A setpoint ends before the move to it does.',
+        'Give the setpoint at least the time that the message names, or set short_spell to '
+        'continue, which plans the next move from wherever the actuator is by then.'),
+    Code.NO_TWO_STEP: (
+        'From this state of motion no two-step command leads to the target at rest.',
+        'Wait until the actuator rests, or use the shaper minimum_time.'),
+    Code.NOT_CONVERGED: (
+        'The search for the plan did not end.',
+        'Check the parameters of the actuator; report it with the request and the parameters '
+        'if they are right.'),
+    Code.BAD_INPUT: (
+        'The request cannot be read: a number is not finite, or a field is missing or too many.',
+        'Correct what the message names.'),
+    Code.UNKNOWN_JOINT: (
+        'The trajectory names other joints than the planner has.',
+        'Use the names in the parameters joint or joints of the planner.'),
+    Code.NOT_INCREASING: (
+        'The times of the points do not increase.',
+        'Give each point a larger time_from_start than the one before.'),
+    Code.IN_THE_PAST: (
+        'The whole sequence lies in the past by the clock of the planner.',
+        'Stamp with the same clock as the planner: use_sim_time must agree on both sides. '
+        'Stamp 0 means now.'),
+    Code.NO_TIME: (
+        'The planner follows simulated time, and no message has come on /clock yet.',
+        'Start what publishes /clock, or set use_sim_time to false.'),
+}
 
 
 class RefusedError(BadInputError):
