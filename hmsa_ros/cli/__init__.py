@@ -16,7 +16,8 @@ from hmsa_ros import __version__
 from hmsa_ros.cli.node import NODES
 from hmsa_ros.errors import BadInputError, complain, HmsaError
 
-COMMANDS = ('demo', 'plan', 'send', 'node', 'bag', 'report', 'figures', 'robustness', 'sweep')
+COMMANDS = (
+    'demo', 'init', 'plan', 'send', 'node', 'bag', 'report', 'figures', 'robustness', 'sweep')
 
 
 class Parser(argparse.ArgumentParser):

@@ -1,0 +1,362 @@
+"""``hmsa init``: a parameter file for one's own actuator, with what follows from it."""
+
+import argparse
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+import json
+import math
+from pathlib import Path
+import sys
+from typing import Any, TYPE_CHECKING
+
+from hmsa_ros.cli.quantities import (
+    BY_KEY,
+    check_joints,
+    DAMPING,
+    default_of,
+    NEEDED,
+    QUANTITIES,
+    Quantity,
+)
+from hmsa_ros.errors import BadInputError
+
+if TYPE_CHECKING:
+    from hmsa_ros.core.parameters import ActuatorParameters
+    from hmsa_ros.core.scales import Coil, Scales
+
+_JOINT = 'actuator'
+_FILE = Path('actuator.yaml')
+_FOLLOWS = {'half_thickness': 'as --half-length', 'flux_min': 'minus --flux-max'}
+# The coil's reach that is hardly a motion.
+_HARDLY = 0.01
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    Add the command.
+
+    Parameters
+    ----------
+    subparsers : argparse action
+        Where to add it.
+
+    """
+    parser = subparsers.add_parser(
+        'init', help="write a parameter file for one's own actuator",
+        description="Write a parameter file for one's own actuator, which planner and plant "
+                    'take by --params-file, and print what follows from it: times, damping, '
+                    'flux densities and reach. What no option gives is asked for. Numbers are '
+                    'in SI units, or have their unit behind them: 10mm, "50 kPa".',
+        epilog='example: hmsa init --half-length 5mm --half-thickness 5mm --shear-modulus 30kPa '
+               '--density 1.9g/cm3 --remanence 80mT --j-lim 20 --zeta 0.1 --flux-max 200mT '
+               '--out my_actuator.yaml')
+    for quantity in QUANTITIES:
+        unit = f' [{quantity.unit}]' if quantity.unit else ''
+        default = _FOLLOWS.get(quantity.key) or f'{quantity.default:g}'
+        parser.add_argument(
+            quantity.option, type=_reader(quantity), metavar='X', dest=quantity.key,
+            help=f'{quantity.text}{unit} (default {default})')
+    parser.add_argument(
+        DAMPING.option, type=_reader(DAMPING), metavar='X', dest=DAMPING.key,
+        help=f'{DAMPING.text} [{DAMPING.unit}], in place of --zeta')
+    parser.add_argument(
+        '--joint', nargs='+', metavar='NAME',
+        help=f'name of the joint (default {_JOINT}); several names for several actuators alike')
+    parser.add_argument(
+        '--out', type=Path, default=_FILE, metavar='FILE',
+        help=f'file to write (default {_FILE})')
+    parser.add_argument('--force', action='store_true', help='replace a file of that name')
+    parser.add_argument(
+        '--yes', action='store_true', help='ask nothing: take the defaults for what is not given')
+    parser.add_argument('--json', action='store_true', help='print one JSON object')
+    parser.set_defaults(run=run)
+
+
+def _reader(quantity: Quantity) -> Callable[[str], float]:
+    """Return the reader of an option's value."""
+    def read(text: str) -> float:
+        try:
+            return quantity.parse(text)
+        except BadInputError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+    return read
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """
+    Ask, write and print.
+
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+        As parsed.
+
+    Returns
+    -------
+    int
+        Exit status.
+
+    Raises
+    ------
+    BadInputError
+        If a number is missing or out of range, or the file exists or cannot be written.
+
+    """
+    path: Path = arguments.out
+    if not arguments.force and path.exists():
+        raise BadInputError(f'{path} exists: name another file with --out, or add --force')
+    if not path.resolve().parent.is_dir():
+        raise BadInputError(
+            f'cannot write {path}: {path.parent} is no folder; expected one that exists (--out)')
+    if arguments.zeta is not None and arguments.damping is not None:
+        raise BadInputError('both --zeta and --damping are given: expected one of them')
+    given = {key: getattr(arguments, key) for key in (*BY_KEY, DAMPING.key)
+             if getattr(arguments, key) is not None}
+    joints: list[str] = arguments.joint or []
+    check_joints(joints)
+    missing = [key for key in NEEDED
+               if key not in given and not (key == 'zeta' and DAMPING.key in given)]
+    if missing and not arguments.yes:
+        if not sys.stdin.isatty():
+            raise BadInputError(
+                'standard input is no terminal to ask on, and '
+                f'{", ".join(BY_KEY[x].option for x in missing)} '
+                f'{"is" if len(missing) == 1 else "are"} not given: give them, or add --yes for '
+                'the defaults')
+        given, joints = _ask(given, joints)
+    for key, quantity in BY_KEY.items():
+        if key not in given and not (key == 'zeta' and DAMPING.key in given):
+            given[key] = default_of(quantity, given)
+    actuator, coil = _records(given)
+
+    from hmsa_ros.core.scales import scales
+
+    found = scales(actuator, coil)
+    doubts = _doubts(given, found)
+    joints = joints or [_JOINT]
+    _write(path, file_text(path, actuator, coil, joints, found))
+    for doubt in doubts:
+        print(f'hmsa: warning: {doubt}', file=sys.stderr)
+    if arguments.json:
+        print(json.dumps({
+            'file': str(path), 'joints': joints, 'parameters': _parameters(actuator, coil),
+            'scales': {key: None if isinstance(x, float) and math.isnan(x) else x
+                       for key, x in asdict(found).items()},
+            'warnings': doubts}, indent=2))
+        return 0
+    for line in table(found, coil):
+        print(line)
+    print(f'\n{path} written; to use it:')
+    for node in ('plant', 'planner'):
+        print(f'  hmsa {node} --ros-args --params-file {path}')
+    return 0
+
+
+def _ask(
+        given: Mapping[str, float], joints: list[str]) -> tuple[dict[str, float], list[str]]:
+    """Ask for what is not given."""
+    answers = dict(given)
+    print(
+        'Numbers are in the unit shown, or have another behind them: 10 mm, 50 kPa. Enter takes '
+        'what stands in brackets.', file=sys.stderr)
+    for quantity in QUANTITIES:
+        key = quantity.key
+        if key in answers or (key == 'zeta' and DAMPING.key in answers):
+            continue
+        default = default_of(quantity, answers)
+        while True:
+            words = quantity.text + (', or c in N s/m with its unit' if key == 'zeta' else '')
+            text = _answer(f'{words} [{quantity.show(default)}]: ')
+            try:
+                if key == 'zeta' and text.replace(' ', '').endswith('Ns/m'):
+                    answers[DAMPING.key] = DAMPING.parse(text)
+                    break
+                value = quantity.parse(text) if text else default
+            except BadInputError as error:
+                print(f'  {error}', file=sys.stderr)
+                continue
+            doubt = quantity.doubt(value)
+            if doubt and text:
+                # Once more, with the number as it is for what Enter takes.
+                print(f'  {doubt}', file=sys.stderr)
+                default = value
+                continue
+            answers[key] = value
+            break
+    while not joints:
+        text = _answer(f'name of the joint, or several with spaces between [{_JOINT}]: ')
+        names = text.split() or [_JOINT]
+        try:
+            check_joints(names)
+        except BadInputError as error:
+            print(f'  {error}', file=sys.stderr)
+            continue
+        joints = names
+    return answers, joints
+
+
+def _answer(question: str) -> str:
+    """Ask on the terminal; what is printed there is no result."""
+    print(question, end='', file=sys.stderr, flush=True)
+    line = sys.stdin.readline()
+    if not line:
+        print(file=sys.stderr)
+        raise BadInputError('the answers ended before the last question: nothing is written')
+    return line.strip()
+
+
+def _records(given: Mapping[str, float]) -> 'tuple[ActuatorParameters, Coil]':
+    """Return the block and its coil."""
+    from hmsa_ros.core.parameters import ActuatorParameters
+    from hmsa_ros.core.scales import Coil
+
+    damping = given.get(DAMPING.key)
+    if damping is None:
+        damping = (
+            8.0 * given['zeta'] * given['half_length'] * given['half_thickness']
+            * math.sqrt(given['density'] * given['shear_modulus']))
+    block = {x.parameter.partition('.')[2]: given[x.key] for x in QUANTITIES
+             if x.parameter.startswith('actuator.')}
+    return (
+        ActuatorParameters(**block, damping_coefficient=damping),
+        Coil(given['flux_min'], given['flux_max'], given['slew_limit']))
+
+
+def _doubts(given: Mapping[str, float], found: 'Scales') -> list[str]:
+    """Return what is implausible, a sentence each."""
+    values = {**given, 'zeta': found.zeta}
+    doubts = [x for quantity in QUANTITIES if (x := quantity.doubt(values[quantity.key]))]
+    if found.zeta >= found.critical_zeta:
+        doubts.append(
+            f'zeta {found.zeta:g} is above the critical {found.critical_zeta:g}: small motion '
+            'about rest does not oscillate, and there is no two-step command for it')
+    if max(abs(x - 1.0) for x in found.held) < _HARDLY:
+        doubts.append(
+            f'the coil stretches the block to {found.held[0]:.6g} to {found.held[1]:.6g} only: '
+            f'a stretch of 1.1 or 0.9 takes some {0.3 * found.flux_density_unit:.3g} T')
+    ratio = given['half_thickness'] / given['half_length']
+    if not 0.05 <= ratio <= 20.0:
+        doubts.append(
+            f'half thickness over half length is {ratio:.3g}: the model is of a block whose '
+            'sides are of one order, and a thin film or a long rod bends instead')
+    return doubts
+
+
+def table(found: 'Scales', coil: 'Coil') -> list[str]:
+    """
+    Return what follows from the parameters, a line each.
+
+    Parameters
+    ----------
+    found : Scales
+        As worked out.
+    coil : Coil
+        For which.
+
+    Returns
+    -------
+    list of str
+        Aligned.
+
+    """
+    rows = [
+        ('time unit L sqrt(rho/G)', _time(found.time_unit)),
+        ('natural frequency at rest', f'{found.frequency:.5g} Hz'),
+        ('damping', f'{found.damping:.4g} N s/m, zeta {found.zeta:.4g}'),
+        ('critical damping at rest',
+         f'{found.critical_damping:.4g} N s/m, zeta {found.critical_zeta:.4g}'),
+        ('limiting stretches', '{:.4f} and {:.4f}'.format(*found.stretch_limits)),
+        *((f'flux density for {stretch:g}', f'{1e3 * flux:.4g} mT' + (
+            '' if coil.flux_density_min <= flux <= coil.flux_density_max
+            else ' (more than the coil has)')) for stretch, flux in found.flux_densities),
+        ('coil holds stretches', _range(found.held)),
+        ('two steps reach from rest',
+         'nothing' if found.reached == (1.0, 1.0) else _range(found.reached)),
+        ('a move from rest', 'none in two steps' if math.isnan(found.duration)
+         else f'{_time(found.duration)} to {found.target:.6g}'),
+    ]
+    return [f'{name:<26} {value}' for name, value in rows]
+
+
+def _range(ends: tuple[float, float]) -> str:
+    return f'{ends[0]:.6g} to {ends[1]:.6g}'
+
+
+def _time(seconds: float) -> str:
+    """Return a time in a unit that suits it."""
+    for size, unit in ((1.0, 's'), (1e-3, 'ms')):
+        if seconds >= size:
+            return f'{seconds / size:.4g} {unit}'
+    return f'{seconds * 1e6:.4g} us'
+
+
+def file_text(
+        path: Path, actuator: 'ActuatorParameters', coil: 'Coil', joints: list[str],
+        found: 'Scales') -> str:
+    """
+    Return the parameter file.
+
+    Parameters
+    ----------
+    path : Path
+        Its name, for the comments.
+    actuator : ActuatorParameters
+        The block.
+    coil : Coil
+        Its coil.
+    joints : list of str
+        Names of the joints.
+    found : Scales
+        What follows, for the comments.
+
+    Returns
+    -------
+    str
+        YAML as ROS 2 has it.
+
+    """
+    lines = [
+        '# Parameters of an actuator for planner and plant, written by hmsa init:',
+        f'#   hmsa plant --ros-args --params-file {path.name}',
+        f'#   hmsa planner --ros-args --params-file {path.name}',
+        '#', '# What follows from them (worked out once: hmsa init does it anew):',
+        *(f'#   {line}' for line in table(found, coil)),
+        '/**:', '  ros__parameters:']
+    texts = {x.parameter: (x.text, x.unit) for x in (*QUANTITIES, DAMPING)}
+    for name, value in _parameters(actuator, coil).items():
+        text, unit = texts[name]
+        lines += [f'    # {text[0].upper()}{text[1:]}{f" [{unit}]" if unit else ""}.',
+                  f'    {name}: {_number(value)}']
+    if len(joints) == 1:
+        lines += ['    # Name of the joint in trajectories and joint states.',
+                  f"    joint: '{joints[0]}'"]
+    else:
+        names = ', '.join(f"'{x}'" for x in joints)
+        lines += [
+            '    # Names of the joints; all are alike but for what is set for one, such as',
+            f'    # {joints[0]}.actuator.remanence: {_number(actuator.remanence)}',
+            f'    joints: [{names}]']
+    return '\n'.join(lines) + '\n'
+
+
+def _parameters(actuator: 'ActuatorParameters', coil: 'Coil') -> dict[str, float]:
+    """Return the nodes' parameters by name."""
+    return {
+        **{f'actuator.{name}': value for name, value in asdict(actuator).items()},
+        **asdict(coil)}
+
+
+def _number(value: float) -> str:
+    """Return a number that every reader of YAML takes for a float."""
+    text = repr(float(value))
+    mantissa, letter, exponent = text.partition('e')
+    return f'{mantissa}.0e{exponent}' if letter and '.' not in mantissa else text
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding='utf-8')
+    except OSError as error:
+        raise BadInputError(
+            f'cannot write {path}: {error.strerror or error}; expected a folder with write '
+            'permission (--out)') from error

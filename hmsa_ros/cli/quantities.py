@@ -1,0 +1,256 @@
+"""
+What ``hmsa init`` asks for: names, units, defaults, limits, and what is usual.
+
+Nothing slow is imported here, since the options of the command line are made of it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+import math
+import re
+
+from hmsa_ros.errors import BadInputError
+
+_UNITS: dict[str, dict[str, float]] = {
+    'm': {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'µm': 1e-6},
+    'Pa': {'Pa': 1.0, 'kPa': 1e3, 'MPa': 1e6, 'GPa': 1e9},
+    'kg/m^3': {'kg/m^3': 1.0, 'kg/m3': 1.0, 'g/cm^3': 1e3, 'g/cm3': 1e3},
+    'T': {'T': 1.0, 'mT': 1e-3},
+    'T/s': {'T/s': 1.0, 'mT/s': 1e-3},
+    '': {},
+    'N s/m': {'N s/m': 1.0, 'Ns/m': 1.0},
+}
+_NUMBER = re.compile(r'\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*')
+_NAME = re.compile(r'[A-Za-z](?:_?[A-Za-z0-9])*_?')
+
+_REVIEW = 'Wu et al., Multifunctional Materials 3 (2020) 042003'
+_ZHAO = 'Zhao et al., J. Mech. Phys. Solids 124 (2019) 244'
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """
+    A number that is asked for.
+
+    Attributes
+    ----------
+    key : str
+        Name in the code and, with hyphens, of the option.
+    parameter : str
+        Name of the nodes' parameter.
+    text : str
+        What it is.
+    unit : str
+        SI unit; empty for a dimensionless number.
+    default : float or None
+        None where it follows from another, see `default_of`.
+    least, largest : float
+        What the nodes take.
+    usual : tuple of float
+        What is usual; beyond it a warning is given.
+    source : str
+        Why that is usual, for the warning.
+    hints : tuple of (float, float, str)
+        Ranges with a guess at what went wrong there.
+
+    """
+
+    key: str
+    parameter: str
+    text: str
+    unit: str
+    default: float | None
+    least: float
+    largest: float
+    usual: tuple[float, float]
+    source: str
+    hints: tuple[tuple[float, float, str], ...] = ()
+
+    @property
+    def option(self) -> str:
+        """Return the option's name."""
+        return '--' + self.key.replace('_', '-')
+
+    def parse(self, text: str) -> float:
+        """
+        Read a number, with a unit behind it or in SI units.
+
+        Parameters
+        ----------
+        text : str
+            For example ``'0.01'`` or ``'10 mm'``.
+
+        Returns
+        -------
+        float
+            In SI units.
+
+        Raises
+        ------
+        BadInputError
+            If it is no number, has another unit or is out of range.
+
+        """
+        found = _NUMBER.fullmatch(text)
+        units = _UNITS[self.unit]
+        if found is None:
+            example = f' with or without a unit ({", ".join(units)})' if units else ''
+            raise BadInputError(f'{self.words} is {text!r}: expected a number{example}')
+        number, unit = found.groups()
+        if unit and unit not in units:
+            raise BadInputError(
+                f'{self.words} has the unit {unit!r}: expected '
+                + (f'one of {", ".join(units)}' if units else 'a number without a unit'))
+        value = float(number) * (units[unit] if unit else 1.0)
+        if not self.least <= value <= self.largest:
+            raise BadInputError(
+                f'{self.words} is {self.show(value)}: expected {self.least:g} to '
+                f'{self.largest:g}{self._unit}')
+        return value
+
+    @property
+    def words(self) -> str:
+        """Return the name as words."""
+        return self.key.replace('_', ' ')
+
+    @property
+    def _unit(self) -> str:
+        return f' {self.unit}' if self.unit else ''
+
+    def show(self, value: float) -> str:
+        """Return a value with its unit."""
+        return f'{value:g}{self._unit}'
+
+    def doubt(self, value: float) -> str | None:
+        """
+        Return what is implausible about a value.
+
+        Parameters
+        ----------
+        value : float
+            In SI units.
+
+        Returns
+        -------
+        str or None
+            A sentence with the usual range and where it is from; None for a usual value.
+
+        """
+        low, high = self.usual
+        if low <= value <= high:
+            return None
+        hint = next((f' ({words})' for begin, end, words in self.hints
+                     if begin <= value <= end), '')
+        return (
+            f'{self.words} {self.show(value)} is not usual{hint}: usual are {low:g} to '
+            f'{high:g}{self._unit}, {self.source}')
+
+
+QUANTITIES: tuple[Quantity, ...] = (
+    Quantity(
+        'half_length', 'actuator.half_length',
+        'half length L of the block, across the field', 'm', 0.01, 1e-9, 1e3, (1e-5, 0.1),
+        f'from printed swimmers to moulded grippers in {_REVIEW}',
+        ((0.5, 1e3, 'was it meant in mm?'),)),
+    Quantity(
+        'half_thickness', 'actuator.half_thickness',
+        'half thickness H of the block, along the field', 'm', None, 1e-9, 1e3, (1e-5, 0.1),
+        f'from printed swimmers to moulded grippers in {_REVIEW}',
+        ((0.5, 1e3, 'was it meant in mm?'),)),
+    Quantity(
+        'shear_modulus', 'actuator.shear_modulus', 'shear modulus G', 'Pa', 1e4, 1e-3, 1e12,
+        (1e3, 3e6),
+        f'from silicone gels to filled rubber; 303 kPa in {_ZHAO}',
+        ((1e10, 1e12, 'metals have 25 to 80 GPa'), (1e8, 1e10, 'that is a hard plastic'),
+         (1.0, 999.0, 'was it meant in kPa?'), (0.0, 1.0, 'was it meant in MPa?'))),
+    Quantity(
+        'density', 'actuator.density', 'density rho', 'kg/m^3', 1900.0, 1e-3, 1e6,
+        (900.0, 4000.0),
+        'silicone of 1000 to 1200 kg/m^3 with up to 40 % by volume of NdFeB powder of '
+        '7600 kg/m^3',
+        ((0.8, 1.3, 'that is air, or was it meant in g/cm^3?'),
+         (1.3, 10.0, 'was it meant in g/cm^3?'), (7000.0, 9000.0, 'that is solid metal'))),
+    Quantity(
+        'remanence', 'actuator.remanence', 'residual flux density Br along the thickness', 'T',
+        0.1, 1e-9, 1e3, (0.005, 0.4),
+        'isotropic NdFeB powder of 0.7 to 0.9 T diluted to 1 to 40 % by volume; 0.143 T in '
+        + _ZHAO,
+        ((1.5, 1e3, 'the strongest sintered NdFeB magnets, grade N55, have 1.5 T; was it meant '
+          'in mT?'), (0.9, 1.5, 'that is a solid magnet'))),
+    Quantity(
+        'j_lim', 'actuator.chain_limit',
+        "limit J_lim of the chains' extension in the Gent model", '', 5.0, 1e-3, 1e9,
+        (0.5, 200.0),
+        'Gent, Rubber Chem. Technol. 69 (1996) 59, fits rubber with some 30 to 100; the paper '
+        'takes 1 to 5'),
+    Quantity(
+        'zeta', '', 'damping zeta, c/(8 L H sqrt(rho G))', '', 0.2, 0.0, 1e12, (0.005, 2.0),
+        'where the paper takes 0.02 to 1.1'),
+    Quantity(
+        'flux_max', 'flux_density_max', "coil's largest flux density", 'T', 0.5, -1e3, 1e3,
+        (1e-3, 2.0),
+        'from Helmholtz coils, some 1 to 50 mT, to electromagnets, whose iron saturates near '
+        '2 T', ((2.0, 1e3, 'was it meant in mT?'),)),
+    Quantity(
+        'flux_min', 'flux_density_min',
+        "coil's least flux density, negative in the other direction", 'T', None, -1e3, 1e3,
+        (-2.0, 0.0), 'since at 0 T the block is at rest, and coils reach some 2 T',
+        ((-1e3, -2.0, 'was it meant in mT?'),)),
+    Quantity(
+        'slew_limit', 'slew_limit', "rate of the amplifier's ramps, 0 for steps", 'T/s', 0.0,
+        0.0, 1e12, (0.0, math.inf), ''),
+)
+BY_KEY: Mapping[str, Quantity] = {x.key: x for x in QUANTITIES}
+#: In place of zeta.
+DAMPING = Quantity(
+    'damping', 'actuator.damping_coefficient', 'damping coefficient c', 'N s/m', None, 0.0, 1e12,
+    (0.0, math.inf), '')
+#: What nobody can know but the user: asked for, or given, or left to --yes.
+NEEDED = ('half_length', 'half_thickness', 'shear_modulus', 'density', 'remanence', 'j_lim',
+          'zeta', 'flux_max')
+
+
+def default_of(quantity: Quantity, given: Mapping[str, float]) -> float:
+    """
+    Return what is taken for a quantity that is not given.
+
+    Parameters
+    ----------
+    quantity : Quantity
+        Which.
+    given : mapping of str to float
+        Those before it in `QUANTITIES`.
+
+    Returns
+    -------
+    float
+        In SI units: a cube, and a coil that is as strong in either direction, unless told.
+
+    """
+    if quantity.default is not None:
+        return quantity.default
+    return given['half_length'] if quantity.key == 'half_thickness' else -abs(given['flux_max'])
+
+
+def check_joints(names: list[str]) -> None:
+    """
+    Refuse names that ROS does not take.
+
+    Parameters
+    ----------
+    names : list of str
+        Names of joints.
+
+    Raises
+    ------
+    BadInputError
+        If one is no ROS name or stands there twice.
+
+    """
+    for name in names:
+        if not _NAME.fullmatch(name):
+            raise BadInputError(
+                f'joint {name!r}: expected letters, digits and single underscores, beginning '
+                'with a letter')
+        if names.count(name) > 1:
+            raise BadInputError(f'joint {name!r} is named twice: expected different names')

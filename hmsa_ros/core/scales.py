@@ -1,0 +1,189 @@
+"""What follows from an actuator's parameters: times, damping, flux densities and reach."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from hmsa_ros.core.model import (
+    critical_zeta,
+    elastic_force,
+    equilibrium_stretch,
+    natural_frequency,
+    stretch_limits,
+)
+from hmsa_ros.core.parameters import ActuatorParameters
+from hmsa_ros.core.status import Code
+from hmsa_ros.core.two_step import CODES, plan_two_step, plan_two_step_batch
+from hmsa_ros.errors import BadInputError
+
+#: Stretches whose flux density is told, where the material allows them.
+STRETCHES = (0.6, 0.8, 0.9, 1.05, 1.1, 1.2, 1.4, 2.0)
+#: Stretch of the move whose duration is told, where the coil allows it.
+USUAL_TARGET = 1.1
+# Search for the reach: points of the first look on either side, and halvings after it.
+_LOOK = 400
+_HALVINGS = 50
+
+
+@dataclass(frozen=True)
+class Coil:
+    """
+    What the coil and its amplifier can do.
+
+    Attributes
+    ----------
+    flux_density_min, flux_density_max : float
+        Range of the flux density in T, not empty.
+    slew_limit : float
+        Rate of the amplifier's ramps in T/s; 0 for steps.
+
+    Raises
+    ------
+    BadInputError
+        If the range is empty or a value is not finite or out of range.
+
+    """
+
+    flux_density_min: float
+    flux_density_max: float
+    slew_limit: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the range."""
+        if not -math.inf < self.flux_density_min < self.flux_density_max < math.inf:
+            raise BadInputError(
+                f'flux densities from {self.flux_density_min:g} to {self.flux_density_max:g} T: '
+                'expected the least below the largest')
+        if not 0.0 <= self.slew_limit < math.inf:
+            raise BadInputError(
+                f'slew limit is {self.slew_limit:g} T/s: expected 0 for steps, or more')
+
+
+@dataclass(frozen=True)
+class Scales:
+    """
+    What follows from an actuator's parameters and its coil.
+
+    Attributes
+    ----------
+    time_unit : float
+        L sqrt(rho/G) in s.
+    frequency : float
+        Undamped natural frequency about rest, stretch 1, in Hz.
+    zeta, critical_zeta : float
+        Nondimensional damping, and that above which small motion about rest does not oscillate.
+    damping, critical_damping : float
+        The same as coefficients in N s/m.
+    flux_density_unit : float
+        Flux density of the load 1, mu0 G/Br in T.
+    flux_densities : tuple of (float, float)
+        Stretches, and the flux density in T that holds each.
+    stretch_limits : tuple of float
+        Stretches at which the chains are fully extended.
+    held : tuple of float
+        Lowest and highest stretch that the coil can hold.
+    reached : tuple of float
+        Lowest and highest stretch that the two-step command reaches from rest within the coil's
+        range; 1 on a side where there is none.
+    target, duration : float
+        Stretch of a usual move from rest and how long the two-step command takes, in s; both
+        NaN where there is none.
+
+    """
+
+    time_unit: float
+    frequency: float
+    zeta: float
+    critical_zeta: float
+    damping: float
+    critical_damping: float
+    flux_density_unit: float
+    flux_densities: tuple[tuple[float, float], ...]
+    stretch_limits: tuple[float, float]
+    held: tuple[float, float]
+    reached: tuple[float, float]
+    target: float
+    duration: float
+
+
+def scales(actuator: ActuatorParameters, coil: Coil) -> Scales:
+    """
+    Work out what follows from an actuator's parameters.
+
+    Parameters
+    ----------
+    actuator : ActuatorParameters
+        The block.
+    coil : Coil
+        Its coil. Ramps (``slew_limit``) are left out of account.
+
+    Returns
+    -------
+    Scales
+        Times, damping, flux densities and reach.
+
+    """
+    material = actuator.nondimensional
+    unit = actuator.flux_density_unit
+    loads = coil.flux_density_min / unit, coil.flux_density_max / unit
+    lower, upper = stretch_limits(material.j_lim)
+    held = tuple(float(equilibrium_stretch(x, material.j_lim)) for x in loads)
+
+    def duration(target: float) -> float:
+        plan = plan_two_step(1.0, target, material, load_limits=loads)
+        within = loads[0] <= min(plan.beta_p, plan.beta_1) and max(
+            plan.beta_p, plan.beta_1) <= loads[1]
+        return plan.tau_p if plan.code is Code.TWO_STEP and within else math.nan
+
+    def reach(end: float) -> float:
+        # Fractions of the way out, so that the stretches near rest are looked at closely.
+        targets = 1.0 + (end - 1.0) * np.linspace(0.0, 1.0, _LOOK + 1)[1:] ** 2
+        plans = plan_two_step_batch(
+            1.0, targets, zeta=material.zeta, j_lim=material.j_lim, c1=material.c1,
+            load_limits=loads)
+        both = np.stack([plans.beta_p, plans.beta_1])
+        good = np.array([CODES[x] is Code.TWO_STEP for x in plans.status.tolist()]) & np.all(
+            (both >= loads[0]) & (both <= loads[1]), axis=0)
+        found = np.flatnonzero(good)
+        if not len(found):
+            return 1.0
+        last = int(found[-1])
+        beyond = targets[last + 1] if last + 1 < len(targets) else end
+        return _boundary(
+            lambda x: math.isfinite(duration(x)), float(targets[last]), float(beyond))
+
+    reached = tuple(reach(x) if abs(x - 1.0) > 1e-12 else 1.0 for x in held)
+    # Else half of the way, or all of it, on the side that reaches further.
+    end = max(reached, key=lambda x: abs(math.log(x)))
+    target = next((x for x in (USUAL_TARGET, 0.5 * (1.0 + end), end)
+                   if x != 1.0 and math.isfinite(duration(x))), math.nan)
+    tau = duration(target) if math.isfinite(target) else math.nan
+    critical = float(critical_zeta(1.0, material))
+    per_zeta = 8.0 * actuator.half_length * actuator.half_thickness * math.sqrt(
+        actuator.density * actuator.shear_modulus)
+    return Scales(
+        time_unit=actuator.time_unit,
+        frequency=float(natural_frequency(1.0, material)) / (2.0 * math.pi) / actuator.time_unit,
+        zeta=material.zeta, critical_zeta=critical, damping=actuator.damping_coefficient,
+        critical_damping=critical * per_zeta, flux_density_unit=unit,
+        flux_densities=tuple(
+            (x, float(elastic_force(x, material.j_lim)) * unit)
+            for x in STRETCHES if lower < x < upper),
+        stretch_limits=(lower, upper), held=(held[0], held[1]),
+        reached=(reached[0], reached[1]), target=target,
+        duration=tau * actuator.time_unit)
+
+
+def _boundary(holds: Callable[[float], bool], inside: float, outside: float) -> float:
+    """Return the last place on the way to ``outside`` at which a condition holds."""
+    if holds(outside):
+        return outside
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (inside + outside)
+        if holds(middle):
+            inside = middle
+        else:
+            outside = middle
+    return inside

@@ -1,0 +1,348 @@
+"""The parameter file of one's own actuator: asking, what follows, what is implausible."""
+
+from dataclasses import replace
+import json
+import math
+import os
+from pathlib import Path
+import pty
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import yaml
+
+from hmsa_ros.cli import main
+from hmsa_ros.cli.quantities import BY_KEY, DAMPING, NEEDED, QUANTITIES
+from hmsa_ros.core.model import elastic_force, natural_frequency
+from hmsa_ros.core.parameters import NondimensionalParameters, paper_actuator
+from hmsa_ros.core.scales import Coil, scales
+from hmsa_ros.core.simulation import simulate
+from hmsa_ros.core.two_step import plan_two_step
+from hmsa_ros.errors import BadInputError
+
+ROOT = Path(__file__).resolve().parent.parent
+PAPER = paper_actuator()
+COIL = Coil(-0.5, 0.5)
+OWN = ['--half-length', '5mm', '--half-thickness', '4 mm', '--shear-modulus', '30kPa',
+       '--density', '1.9 g/cm3', '--remanence', '80mT', '--j-lim', '20', '--zeta', '0.1',
+       '--flux-max', '200mT']
+
+
+@pytest.fixture
+def run(capsys, tmp_path, monkeypatch):
+    """Return a runner of ``hmsa init`` in an empty folder: status, standard output and error."""
+    monkeypatch.chdir(tmp_path)
+
+    def run_words(*words):
+        try:
+            status = main(['init', *map(str, words)])
+        except SystemExit as end:
+            status = end.code
+        return status, *capsys.readouterr()
+
+    return run_words
+
+
+def parameters(path):
+    return yaml.safe_load(path.read_text())['/**']['ros__parameters']
+
+
+# What follows --------------------------------------------------------------------------------
+
+def test_scales_are_those_of_the_equations():
+    found = scales(PAPER, COIL)
+    assert found.time_unit == PAPER.time_unit
+    material = PAPER.nondimensional
+    assert found.frequency == pytest.approx(
+        float(natural_frequency(1.0, material)) / (2 * math.pi * PAPER.time_unit), rel=1e-12)
+    # About rest, from the linearised Eq. 11: sqrt(6).
+    assert found.critical_zeta == pytest.approx(math.sqrt(6.0), rel=1e-12)
+    critical = replace(PAPER, damping_coefficient=found.critical_damping)
+    assert critical.nondimensional.zeta == pytest.approx(found.critical_zeta, rel=1e-12)
+    for stretch, flux in found.flux_densities:
+        load = flux * PAPER.remanence / (4e-7 * math.pi * PAPER.shear_modulus)
+        assert load == pytest.approx(float(elastic_force(stretch, 5.0)), rel=1e-9)
+    for end, limit in zip(found.held, (-0.5, 0.5), strict=True):
+        assert float(elastic_force(end, 5.0)) * PAPER.flux_density_unit == pytest.approx(limit)
+    assert found.target == 1.1
+    assert found.duration == plan_two_step(1.0, 1.1, material).tau_p * PAPER.time_unit
+
+
+def test_the_frequency_is_that_of_small_motion():
+    material = NondimensionalParameters(zeta=0.0)
+    actuator = paper_actuator(material)
+    time = np.linspace(0.0, 60.0, 60_001)
+    stretch, _ = simulate([0.0], [1e-5], time, material)
+    middle = stretch - stretch.mean()
+    rises = time[:-1][(middle[:-1] < 0.0) & (middle[1:] >= 0.0)]
+    period = np.mean(np.diff(rises)) * actuator.time_unit
+    assert scales(actuator, COIL).frequency == pytest.approx(1.0 / period, rel=1e-3)
+
+
+@pytest.mark.parametrize(('zeta', 'limits'), [
+    (0.2, (-0.1, 0.05)), (0.0, (-0.5, 0.5)), (0.2, (0.0, 0.2)), (2.3, (-0.1, 0.1))])
+def test_reach_is_where_two_steps_end_to_be_within_the_coils_range(zeta, limits):
+    actuator = paper_actuator(NondimensionalParameters(zeta))
+    found = scales(actuator, Coil(*limits))
+    loads = [x / actuator.flux_density_unit for x in limits]
+
+    def reached(stretch):
+        plan = plan_two_step(1.0, stretch, actuator.nondimensional, load_limits=tuple(loads))
+        return plan.code == 'two_step' and all(
+            loads[0] <= x <= loads[1] for x in (plan.beta_p, plan.beta_1))
+
+    for end in found.reached:
+        if end == 1.0:
+            continue
+        assert reached(1.0 + (end - 1.0) * (1.0 - 1e-4))
+        assert not reached(1.0 + (end - 1.0) * (1.0 + 1e-4))
+    # Nothing on the side on which the coil does nothing.
+    assert (found.reached[0] == 1.0) == (limits[0] == 0.0)
+
+
+def test_without_a_two_step_command_there_is_no_duration():
+    found = scales(paper_actuator(NondimensionalParameters(zeta=50.0)), COIL)
+    assert found.reached == (1.0, 1.0)
+    assert math.isnan(found.target)
+    assert math.isnan(found.duration)
+
+
+@pytest.mark.parametrize('values', [
+    (0.1, 0.1), (0.2, 0.1), (math.nan, 0.1), (-math.inf, 0.1), (0.0, 0.1, -1.0)])
+def test_coils_that_cannot_be_are_refused(values):
+    with pytest.raises(BadInputError, match='expected'):
+        Coil(*values)
+
+
+# The file ------------------------------------------------------------------------------------
+
+def test_the_file_has_what_was_given_in_si_units(run, tmp_path):
+    status, out, err = run(*OWN, '--out', 'own.yaml')
+    assert (status, err) == (0, '')
+    found = parameters(tmp_path / 'own.yaml')
+    damping = found.pop('actuator.damping_coefficient')
+    assert found == {
+        'actuator.half_length': 0.005, 'actuator.half_thickness': 0.004,
+        'actuator.shear_modulus': 30e3, 'actuator.density': 1900.0, 'actuator.remanence': 0.08,
+        'actuator.chain_limit': 20.0, 'flux_density_min': -0.2, 'flux_density_max': 0.2,
+        'slew_limit': 0.0, 'joint': 'actuator'}
+    assert damping == pytest.approx(8 * 0.1 * 0.005 * 0.004 * math.sqrt(1900 * 30e3))
+    assert 'hmsa planner --ros-args --params-file own.yaml' in out
+    for line in out.splitlines()[:10]:
+        assert f'#   {line}' in (tmp_path / 'own.yaml').read_text()
+
+
+def test_defaults_are_the_papers_block(run, tmp_path):
+    assert run('--yes')[0] == 0
+    found = parameters(tmp_path / 'actuator.yaml')
+    for name in PAPER.__dataclass_fields__:
+        assert found[f'actuator.{name}'] == pytest.approx(getattr(PAPER, name), rel=1e-15)
+
+
+def test_json_says_everything_there_is(run, tmp_path):
+    status, out, _ = run('--yes', '--json', '--half-length', '2e-3', '--joint', 'left', 'right')
+    assert status == 0
+    made = json.loads(out)
+    assert made['file'] == 'actuator.yaml'
+    assert made['joints'] == ['left', 'right']
+    # A cube, unless told.
+    assert made['parameters']['actuator.half_thickness'] == 2e-3
+    assert made['scales']['duration'] == pytest.approx(0.005735 / 5, rel=1e-3)
+    assert made['warnings'] == []
+    text = (tmp_path / 'actuator.yaml').read_text()
+    assert parameters(tmp_path / 'actuator.yaml')['joints'] == ['left', 'right']
+    assert '# left.actuator.remanence: 0.1\n' in text
+
+
+def test_every_number_is_a_float_to_every_reader_of_yaml(run, tmp_path):
+    assert run('--yes', '--half-length', '1e-7', '--damping', '1e-9', '--shear-modulus',
+               '1e12')[0] == 0
+    for name, value in parameters(tmp_path / 'actuator.yaml').items():
+        assert isinstance(value, str if name == 'joint' else float), name
+
+
+def test_a_file_that_exists_is_kept_unless_forced(run, tmp_path):
+    (tmp_path / 'actuator.yaml').write_text('mine')
+    status, out, err = run('--yes')
+    assert (status, out) == (2, '')
+    assert 'actuator.yaml exists: name another file with --out, or add --force' in err
+    assert (tmp_path / 'actuator.yaml').read_text() == 'mine'
+    assert run('--yes', '--force')[0] == 0
+    assert 'shear_modulus' in (tmp_path / 'actuator.yaml').read_text()
+
+
+@pytest.mark.parametrize(('words', 'said'), [
+    (['--density', 'heavy'], "density is 'heavy': expected a number with or without a unit"),
+    (['--density', '5 mm'], "unit 'mm': expected one of kg/m^3"),
+    (['--half-length', '0'], 'half length is 0 m: expected 1e-09 to 1000 m'),
+    (['--half-length=-1mm'], 'half length is -0.001 m'),
+    (['--shear-modulus', 'nan'], "shear modulus is 'nan'"),
+    (['--remanence', '1e999'], 'remanence is inf T'),
+    (['--j-lim', '5 Pa'], "unit 'Pa': expected a number without a unit"),
+    (['--zeta', '1', '--damping', '1'], 'both --zeta and --damping'),
+    (['--flux-min', '0.5'], 'expected the least below the largest'),
+    (['--joint', '1st'], "joint '1st': expected letters"),
+    (['--joint', 'a__b'], "joint 'a__b'"),
+    (['--joint', 'a', 'a'], 'named twice'),
+    (['--out', 'no/where.yaml'], 'is no folder'),
+    (['--out', '/dev/full', '--force'], 'cannot write /dev/full'),
+])
+def test_bad_input_is_answered_in_one_line_and_writes_nothing(run, tmp_path, words, said):
+    status, out, err = run('--yes', *words)
+    assert (status, out) == (2, '')
+    assert re.fullmatch(r'hmsa: error: [^\n]+\n', err)
+    assert said in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_a_terminal_it_says_what_is_missing(tmp_path):
+    done = subprocess.run(
+        [sys.executable, '-m', 'hmsa_ros', 'init', *OWN[:-2], '--out', tmp_path / 'x.yaml'],
+        cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr == (
+        'hmsa: error: standard input is no terminal to ask on, and --flux-max is not given: '
+        'give them, or add --yes for the defaults\n')
+    assert not (tmp_path / 'x.yaml').exists()
+
+
+# What is implausible -------------------------------------------------------------------------
+
+@pytest.mark.parametrize(('words', 'said'), [
+    (['--shear-modulus', '79 GPa'], 'metals have'),
+    (['--shear-modulus', '30'], 'meant in kPa'),
+    (['--density', '1.2'], 'that is air'),
+    (['--density', '1.9'], 'meant in g/cm^3'),
+    (['--remanence', '1.6'], 'N55'),
+    (['--remanence', '80'], 'meant in mT'),
+    (['--half-thickness', '5'], 'half thickness 5 m is not usual (was it meant in mm?)'),
+    (['--half-length', '5'], 'half length 5 m is not usual (was it meant in mm?)'),
+    (['--half-thickness', '0.1mm'], 'thin film'),
+    (['--flux-max', '50'], 'flux max 50 T is not usual (was it meant in mT?)'),
+    (['--flux-min', '0.01'], 'flux min 0.01 T is not usual'),
+    (['--zeta', '3'], 'zeta 3 is above the critical 2.44949'),
+    (['--damping', '20'], 'zeta 5.73539'),
+    (['--j-lim', '1000'], 'Gent'),
+    (['--flux-max', '1mT'], 'a stretch of 1.1 or 0.9 takes some'),
+])
+def test_what_is_implausible_is_warned_of_with_the_usual_range(run, tmp_path, words, said):
+    status, out, err = run('--yes', '--json', *words)
+    assert status == 0
+    warnings = json.loads(out)['warnings']
+    assert any(said in x for x in warnings)
+    assert err == ''.join(f'hmsa: warning: {x}\n' for x in warnings)
+    assert (tmp_path / 'actuator.yaml').exists()
+
+
+def test_usual_numbers_are_not_warned_of():
+    for quantity in QUANTITIES:
+        low, high = quantity.usual
+        assert low < high
+        assert quantity.least <= low
+        assert quantity.doubt(low) is None
+        if quantity.default is not None:
+            assert quantity.doubt(quantity.default) is None
+        if math.isfinite(high):
+            assert quantity.doubt(math.nextafter(high, math.inf)).endswith(quantity.source)
+            assert str(f'{high:g}') in quantity.doubt(math.nextafter(high, math.inf))
+
+
+def test_numbers_are_taken_in_the_range_that_the_nodes_take():
+    specs = pytest.importorskip('hmsa_ros.nodes.parameters').ACTUATOR
+    from hmsa_ros.nodes.planner import PARAMETERS
+    declared = {x.name: x for x in (*specs, *PARAMETERS)}
+    for quantity in (*QUANTITIES, DAMPING):
+        if quantity.parameter:
+            spec = declared[quantity.parameter]
+            assert (quantity.least, quantity.largest) == (spec.minimum, spec.maximum)
+            assert quantity.unit == spec.unit
+    assert set(NEEDED) <= set(BY_KEY)
+
+
+# Asking --------------------------------------------------------------------------------------
+
+def ask(folder, answers, *words):
+    """Run it on a terminal of its own and return status, what it showed and its output."""
+    ours, theirs = pty.openpty()
+    with subprocess.Popen(
+            [sys.executable, '-m', 'hmsa_ros', 'init', *words], stdin=theirs,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder,
+            env={**os.environ, 'PYTHONPATH': str(ROOT)}) as process:
+        os.close(theirs)
+        os.write(ours, answers.encode())
+        out, err = process.communicate(timeout=100)
+    os.close(ours)
+    return process.returncode, out, err
+
+
+def test_it_asks_with_units_and_defaults_and_takes_no_for_an_answer(tmp_path):
+    # A typing error, steel that is thought better of, an odd size that is meant, defaults.
+    answers = '5 mn\n5 mm\n\n79 GPa\n30 kPa\n\n0.08\n20\n0.02 N s/m\n0.2\n\n\nleft right\n'
+    status, out, err = ask(tmp_path, answers)
+    assert status == 0, err
+    assert "unit 'mn': expected one of m, cm, mm" in err
+    assert 'half thickness H of the block, along the field [0.005 m]: ' in err
+    assert 'metals have' in err
+    assert 'shear modulus G [7.9e+10 Pa]: ' in err
+    assert 'time unit' in out
+    found = parameters(tmp_path / 'actuator.yaml')
+    assert found['actuator.half_thickness'] == 0.005
+    assert found['actuator.shear_modulus'] == 30e3
+    assert found['actuator.damping_coefficient'] == 0.02
+    assert found['flux_density_min'] == -0.2
+    assert found['joints'] == ['left', 'right']
+
+
+def test_what_is_given_is_not_asked_for(tmp_path):
+    status, _, err = ask(tmp_path, '', *OWN)
+    assert (status, err) == (0, '')
+    status, _, err = ask(tmp_path, '0.1\n\n\n\n', *OWN[:-2], '--force')
+    assert status == 0
+    questions = [x.rpartition('\n')[2].partition(' [')[0] for x in err.split(']: ')[:-1]]
+    assert questions == [
+        "coil's largest flux density",
+        "coil's least flux density, negative in the other direction",
+        "rate of the amplifier's ramps, 0 for steps",
+        'name of the joint, or several with spaces between']
+    assert parameters(tmp_path / 'actuator.yaml')['flux_density_max'] == 0.1
+
+
+def test_answers_that_end_early_write_nothing(tmp_path):
+    status, _, err = ask(tmp_path, '5 mm\n\x04')
+    assert status == 2
+    assert 'the answers ended before the last question' in err
+    assert list(tmp_path.iterdir()) == []
+
+
+# Used ----------------------------------------------------------------------------------------
+
+@pytest.mark.ros
+def test_planner_and_plant_take_the_file_and_arrive_when_it_says(start, tmp_path, run):
+    status, out, _ = run(*OWN, '--json', '--joint', 'finger')
+    assert status == 0
+    made = json.loads(out)
+    file = str(tmp_path / 'actuator.yaml')
+    arguments = ['--ros-args', '--params-file', file]
+    start.hmsa('plant', *arguments)
+    start.hmsa('planner', *arguments)
+    recorder = start.hmsa(
+        'recorder', '--ros-args', '-p', f'storage.uri:={tmp_path / "bag"}',
+        '-p', 'record.all_topics:=true')
+    recorder.wait_for_output('/planner/plan')
+    recorder.wait_for_output('/joint_states')
+    target = made['scales']['target']
+    send = start.hmsa('send', f'{target}:0.2', '--joint', 'finger', '--wait')
+    assert send.wait(60.0) == 0, send.output
+    assert recorder.stop() == 0, recorder.output
+    from hmsa_ros.report.evaluation import evaluate
+    from hmsa_ros.report.reading import read_runs
+
+    run_, = read_runs(tmp_path / 'bag')
+    result, = evaluate(run_).results
+    assert result.stretch == pytest.approx(target)
+    assert result.arrival - result.begin == pytest.approx(made['scales']['duration'], abs=1e-8)
+    assert result.residual < 1e-6
+    assert run_.plant.shear_modulus == 30e3
