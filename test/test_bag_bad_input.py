@@ -346,5 +346,5 @@ def test_profiles_out_of_range_are_refused():
 
 
 def test_metadata_that_cannot_be_opened_are_named(tmp_path):
-    with pytest.raises(BagError, match='cannot be read'):
+    with pytest.raises(BagError, match='is no file'):
         metadata.read(tmp_path)

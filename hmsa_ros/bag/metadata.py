@@ -8,14 +8,13 @@ from typing import Any
 
 import yaml
 
-from hmsa_ros.bag import qos
+from hmsa_ros.bag import limits, qos
 from hmsa_ros.errors import BagError
 
 FILE_NAME = 'metadata.yaml'
 VERSION = 9
 # What rosbag2 writes as the start of a bag without a message.
 NO_TIME = 9223372036854775807
-_Loader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 _Dumper: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 
 
@@ -231,13 +230,19 @@ def read(path: Path) -> BagMetadata:
 
     """
     try:
-        text = path.read_text(encoding='utf-8')
+        # A stranger's bag may have anything under this name: a pipe, a device, a link to one.
+        if not path.is_file():
+            raise BagError(f'{path} is no file: expected the metadata of a bag')
+        with path.open('rb') as file:
+            data = file.read(limits.YAML_SIZE + 1)
+        text = data.decode('utf-8')
     except (OSError, UnicodeDecodeError) as error:
         raise BagError(f'{path} cannot be read: {error}') from error
     try:
-        content = yaml.load(text, _Loader)
-    except yaml.YAMLError as error:
-        raise BagError(f'{path} is not YAML: expected the metadata of a bag') from error
+        content = limits.load_yaml(text)
+    except BagError as error:
+        raise BagError(f'{path} cannot be used ({error}): expected the metadata of a '
+                       'bag') from error
     if not isinstance(content, dict) or 'rosbag2_bagfile_information' not in content:
         raise BagError(f'{path} has no key rosbag2_bagfile_information: expected the metadata '
                        'of a bag')
@@ -292,7 +297,7 @@ def from_map(content: Any, source: str) -> BagMetadata:
             str(content.get('compression_mode') or ''))
     except BagError:
         raise
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         what = f'key {error} is missing' if isinstance(error, KeyError) else str(error)
         raise BagError(f'{source} cannot be understood ({what}): expected the metadata of a '
                        'bag') from error

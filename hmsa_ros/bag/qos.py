@@ -10,6 +10,7 @@ from typing import Any
 
 import yaml
 
+from hmsa_ros.bag import limits
 from hmsa_ros.errors import BagError
 
 HISTORIES = ('system_default', 'keep_last', 'keep_all', 'unknown')
@@ -154,12 +155,13 @@ def from_stored(value: Any) -> tuple[Qos, ...]:
 
     """
     try:
-        items = yaml.load(value, _Loader) if isinstance(value, str) else value
+        items = limits.load_yaml(value) if isinstance(value, str) else value
         return tuple(_from_map(item) for item in items or ())
-    except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
+    except (BagError, KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        what = str(error) if isinstance(error, BagError) else type(error).__name__
         raise BagError(
-            f'offered_qos_profiles cannot be read ({type(error).__name__}): expected a YAML '
-            'list of profiles') from error
+            f'offered_qos_profiles cannot be read ({what}): expected a YAML list of '
+            'profiles') from error
 
 
 def _from_map(item: Mapping[str, Any]) -> Qos:
@@ -174,7 +176,3 @@ def _from_map(item: Mapping[str, Any]) -> Qos:
         liveliness=_name(item['liveliness'], LIVELINESSES),
         lease_ns=_time_from_map(item['liveliness_lease_duration']),
         avoid_ros_namespace_conventions=bool(item['avoid_ros_namespace_conventions']))
-
-
-# The C parser is some ten times faster; not every installation of PyYAML has it.
-_Loader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)

@@ -12,13 +12,18 @@ written. ``message`` has the fields of the message type as attributes
 
 What cannot be read is passed over and told in `BagReader.problems`, one sentence each: a file
 that was cut off gives everything up to the cut, a damaged chunk costs that chunk.
+
+A bag may come from anybody: what it says of sizes is held against `hmsa_ros.bag.limits` before
+memory is taken, only files in its own folder are read, and nothing in it is ever run.
 """
 
-from bisect import bisect_left
+from array import array
 from collections.abc import Callable, Collection, Iterator
 import contextlib
 from dataclasses import dataclass, field
+import heapq
 import io
+from itertools import islice
 import os
 from pathlib import Path
 import re
@@ -26,14 +31,16 @@ import struct
 from typing import Any, NamedTuple
 import zlib
 
-from hmsa_ros.bag import metadata, qos, records
+from hmsa_ros.bag import limits, metadata, qos, records
 from hmsa_ros.errors import BadInputError, BagError
 
 # Messages outside chunks are grouped, so that they are handled like chunks.
 _RUN_BYTES = 512 * 1024
-# No chunk that a writer makes on purpose is larger; a damaged length would take the memory.
-MAX_CHUNK = 2**31
 _HEAD_BYTES = 64
+# A field that is an array of messages.
+_NESTED = re.compile(r'^\s*(?:[A-Z]\w*|\w+/[\w/]+)\s*\[', re.MULTILINE)
+# Later than any log time.
+_NEVER = 2**64
 
 
 class Message(NamedTuple):
@@ -108,7 +115,7 @@ class _File:
     schemas: dict[int, records.Schema] = field(default_factory=dict)
     channels: dict[int, records.Channel] = field(default_factory=dict)
     blocks: list[_Block] = field(default_factory=list)
-    metadata: list[tuple[str, dict[str, str]]] = field(default_factory=list)
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     counts: dict[int, int] | None = None
 
 
@@ -120,6 +127,9 @@ class BagReader:
     ----------
     path : path
         Folder of a bag, or one ``.mcap`` file.
+    max_chunk_size : int
+        Largest content of a chunk, and largest message, in bytes; what is larger is passed
+        over. Reading takes a few times as much memory at most.
 
     Attributes
     ----------
@@ -145,9 +155,17 @@ class BagReader:
 
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(
+            self, path: str | os.PathLike[str], *,
+            max_chunk_size: int = limits.CHUNK_SIZE) -> None:
+        if max_chunk_size < 1:
+            raise BadInputError(
+                f'largest chunk is {max_chunk_size} bytes: expected at least 1')
         self.path = Path(path)
+        self._max_chunk_size = max_chunk_size
         self.problems: list[str] = []
+        self._known_problems: set[str] = set()
+        self._kept = 0
         self.metadata: metadata.BagMetadata | None = None
         paths = self._find_files()
         self._files: list[_File] = []
@@ -162,7 +180,7 @@ class BagReader:
             raise BadInputError(f'no file of {self.path} can be read: ' + self.problems[0])
         self.files = tuple(file.path for file in self._files)
         self.records = {
-            name: values for file in self._files for name, values in file.metadata}
+            name: values for file in self._files for name, values in file.metadata.items()}
         self.topics: dict[str, TopicInfo] = {}
         for file in self._files:
             for channel in file.channels.values():
@@ -173,8 +191,12 @@ class BagReader:
 
     def _problem(self, sentence: str) -> None:
         """Note what could not be read, once."""
-        if sentence not in self.problems:
-            self.problems.append(sentence)
+        if sentence in self._known_problems or len(self._known_problems) > limits.PROBLEMS:
+            return
+        self._known_problems.add(sentence)
+        self.problems.append(
+            limits.printable(sentence) if len(self._known_problems) <= limits.PROBLEMS
+            else 'there are more problems, which are not told')
 
     def _find_files(self) -> list[Path]:
         """Return the files of the bag in order."""
@@ -190,7 +212,8 @@ class BagReader:
                     f'{path} does not exist: expected the folder of a bag or an .mcap file')
             present = sorted(
                 (entry for entry in path.iterdir()
-                 if entry.name.endswith('.mcap') and entry.is_file()), key=_file_order)
+                 if entry.name.endswith('.mcap') and self._is_own_file(entry)),
+                key=_file_order)
         except OSError as error:
             raise BadInputError(
                 f'{path} cannot be read ({error.strerror}): expected a bag') from error
@@ -227,6 +250,17 @@ class BagReader:
                 f'({", ".join(stems)}): expected one bag; name one .mcap file')
         return present
 
+    def _is_own_file(self, entry: Path) -> bool:
+        """Return whether an entry of the folder is a file that lies in it."""
+        if not entry.is_file():
+            return False
+        if entry.resolve().parent != self.path.resolve():
+            self._problem(
+                f'{entry} is a link to {entry.resolve()}, out of the folder of the bag: passed '
+                'over; name that file to read it')
+            return False
+        return True
+
     def _listed_files(self) -> list[Path]:
         """Return the files that the metadata name and that are there."""
         path = self.path / metadata.FILE_NAME
@@ -247,15 +281,19 @@ class BagReader:
                 f'{self.path} is compressed by rosbag2 in mode '
                 f'{self.metadata.compression_mode}: expected MCAP with compressed chunks; '
                 'convert it with "ros2 bag convert"')
-        found = []
+        found: dict[Path, None] = {}
         for file in self.metadata.files:
             # Up to version 3 paths begin with the folder; none leads out of it.
-            candidate = self.path / Path(file.path).name
-            if candidate.is_file():
-                found.append(candidate)
-            else:
-                self._problem(f'{candidate} is missing, though {metadata.FILE_NAME} names it')
-        return found
+            candidate = self.path / Path(file.path.replace('\0', '')).name
+            try:
+                if self._is_own_file(candidate):
+                    found[candidate] = None
+                elif not candidate.is_file():
+                    self._problem(
+                        f'{candidate} is missing, though {metadata.FILE_NAME} names it')
+            except OSError as error:
+                self._problem(f'{candidate} cannot be read: {error.strerror}')
+        return list(found)
 
     # Scanning --------------------------------------------------------------------------------
 
@@ -299,9 +337,15 @@ class BagReader:
             if end > file.size or opcode == 0:
                 break
             try:
+                if len(file.blocks) > limits.CHUNKS:
+                    self._problem(
+                        f'{file.path.name} has more than {limits.CHUNKS} chunks: the rest is '
+                        'passed over')
+                    break
                 if opcode == records.MESSAGE:
                     if length < records.MESSAGE_FIXED:
                         raise BagError('a message record ends early')
+                    self._check_size(length, 'message')
                     log_time = records.MESSAGE_HEAD.unpack_from(head)[4]
                     if run and offset - run[0] >= _RUN_BYTES:
                         end_run()
@@ -314,13 +358,15 @@ class BagReader:
                 end_run()
                 if opcode == records.CHUNK:
                     chunk = records.read_chunk_head(head[prefix_size:], length)
-                    if max(chunk.size, chunk.data_length) > MAX_CHUNK:
-                        raise BagError('a chunk is larger than 2 GiB')
+                    self._check_size(max(chunk.size, chunk.data_length), 'chunk')
                     file.blocks.append(_Block(
                         number, offset + prefix_size, length, chunk.start, chunk.end, chunk))
                 elif opcode in (records.HEADER, records.SCHEMA, records.CHANNEL,
                                 records.METADATA, records.STATISTICS):
-                    self._note(file, opcode, os.pread(
+                    if length > limits.RECORD_SIZE:
+                        raise BagError(f'a record of {length} bytes is larger than '
+                                       f'{limits.RECORD_SIZE} bytes')
+                    self._note(file, opcode, _read_exactly(
                         descriptor, length, offset + prefix_size))
                 elif opcode == records.FOOTER:
                     file.complete = os.pread(
@@ -328,6 +374,7 @@ class BagReader:
                     offset = end
                     break
             except BagError as error:
+                end_run()
                 self._problem(f'{file.path.name}: {error}, at byte {offset}: passed over')
             offset = end
         end_run()
@@ -336,16 +383,43 @@ class BagReader:
         elif file.blocks and not file.channels:
             self._channels_in_chunks(descriptor, file)
 
+    def _check_size(self, size: int, what: str) -> None:
+        """Refuse what is larger than the memory it may take."""
+        if size > self._max_chunk_size:
+            raise BagError(f'a {what} of {size} bytes is larger than the {self._max_chunk_size} '
+                           'bytes allowed')
+
+    def _keep(self, size: int) -> None:
+        """Count what is kept of the small records, and refuse too much of it."""
+        if self._kept + size > limits.KEPT_SIZE:
+            raise BagError(f'schemas, channels and metadata are larger than '
+                           f'{limits.KEPT_SIZE} bytes')
+        self._kept += size
+
     def _note(self, file: _File, opcode: int, content: bytes) -> None:
         """Take in a small record."""
         if opcode == records.SCHEMA:
+            if int.from_bytes(content[:2], 'little') in file.schemas:
+                return
             schema = records.read_schema(content)
-            file.schemas.setdefault(schema.id, schema)
+            if len(schema.data) > limits.DEFINITION_SIZE:
+                raise BagError(
+                    f'the definition of {schema.name} has {len(schema.data)} bytes, more than '
+                    f'{limits.DEFINITION_SIZE}')
+            self._keep(len(content))
+            file.schemas[schema.id] = schema
         elif opcode == records.CHANNEL:
+            if int.from_bytes(content[:2], 'little') in file.channels:
+                return
             channel = records.read_channel(content)
-            file.channels.setdefault(channel.id, channel)
+            self._keep(len(content))
+            file.channels[channel.id] = channel
         elif opcode == records.METADATA:
-            file.metadata.append(records.read_metadata(content))
+            name, values = records.read_metadata(content)
+            if name not in file.metadata:
+                # Of several with one name the last counts, so the others take no memory.
+                self._keep(min(len(content), limits.RECORD_SIZE))
+            file.metadata[name] = values
         elif opcode == records.HEADER:
             file.profile, file.library = records.read_header(content)
         else:
@@ -383,6 +457,7 @@ class BagReader:
             return []
         position = struct.unpack_from('<Q', tail, records.PREFIX.size)[0]
         blocks: list[_Block] = []
+        seen: set[int] = set()
         prefix_size = records.PREFIX.size
         while 0 < position < file.size - tail_size:
             head = os.pread(descriptor, prefix_size, position)
@@ -391,22 +466,27 @@ class BagReader:
             opcode, length = records.PREFIX.unpack(head)
             if position + prefix_size + length > file.size:
                 break
-            content = os.pread(descriptor, length, position + prefix_size)
-            position += prefix_size + length
+            begin = position + prefix_size
+            position = begin + length
             try:
+                if length > limits.RECORD_SIZE or len(blocks) > limits.CHUNKS:
+                    raise BagError('a record is too large')
+                content = os.pread(descriptor, length, begin)
                 if opcode in (records.SCHEMA, records.CHANNEL, records.STATISTICS):
                     self._note(file, opcode, content)
                 elif opcode == records.CHUNK_INDEX:
                     fields = records.Fields(content, 'chunk index')
                     fields.take(16)
                     start = fields.number(8)
-                    if not offset <= start < file.size:
+                    if not offset <= start < file.size or start in seen:
                         continue
+                    seen.add(start)
                     head = os.pread(descriptor, prefix_size + _HEAD_BYTES, start)
                     if len(head) < prefix_size or head[0] != records.CHUNK:
                         continue
                     chunk_length = records.PREFIX.unpack_from(head)[1]
                     chunk = records.read_chunk_head(head[prefix_size:], chunk_length)
+                    self._check_size(max(chunk.size, chunk.data_length), 'chunk')
                     if start + prefix_size + chunk_length <= file.size:
                         blocks.append(_Block(
                             number, start + prefix_size, chunk_length, chunk.start, chunk.end,
@@ -499,7 +579,8 @@ class BagReader:
 
     def messages(
             self, topics: Collection[str] | None = None, *, start: int | None = None,
-            end: int | None = None) -> Iterator[Message]:
+            end: int | None = None,
+            cancelled: Callable[[], bool] = lambda: False) -> Iterator[Message]:
         """
         Return the messages in order of log time.
 
@@ -509,6 +590,8 @@ class BagReader:
             Only these topics; default all.
         start, end : int, optional
             Only log times of at least ``start`` and less than ``end``, in nanoseconds.
+        cancelled : callable
+            Asked before each chunk; the messages end when it says yes.
 
         Yields
         ------
@@ -521,22 +604,24 @@ class BagReader:
              if (start is None or block.end >= start) and (end is None or block.start < end)),
             key=lambda block: (block.start, block.file, block.offset))
         wanted = None if topics is None else frozenset(topics)
-        pending: list[tuple[int, int, int, int, Message]] = []
+        span = (0 if start is None else start), (_NEVER if end is None else end)
+        most = limits.CHUNKS_AT_ONCE * self._max_chunk_size
+        active: list[_Cursor] = []
         for i, block in enumerate(blocks):
-            pending += (
-                (message.log_time, block.file, block.offset, j, message)
-                for j, message in enumerate(self._block_messages(block, wanted))
-                if (start is None or message.log_time >= start)
-                and (end is None or message.log_time < end))
-            # Nearly sorted already, which the sort makes use of.
-            pending.sort(key=_sort_key)
-            if i + 1 < len(blocks):
-                ready = bisect_left(pending, blocks[i + 1].start, key=lambda item: item[0])
-            else:
-                ready = len(pending)
-            for item in pending[:ready]:
-                yield item[4]
-            del pending[:ready]
+            if cancelled():
+                return
+            if sum(len(cursor.content) for cursor in active) + _content_size(block) > most:
+                # Every chunk so far reaches beyond the start of this one.
+                self._problem(
+                    f'{self._files[block.file].path.name}: more than {most} bytes of chunks '
+                    f'overlap in time, at byte {block.offset}: passed over')
+                continue
+            cursor = self._cursor(block, wanted, span)
+            if cursor is not None:
+                cursor.sort()
+                active.append(cursor)
+            yield from _merge(active, blocks[i + 1].start if i + 1 < len(blocks) else _NEVER)
+            active = [cursor for cursor in active if cursor.left]
 
     def stored_messages(self) -> Iterator[Message]:
         """
@@ -550,7 +635,9 @@ class BagReader:
         """
         for file in self._files:
             for block in file.blocks:
-                yield from self._block_messages(block, None)
+                cursor = self._cursor(block, None, (0, _NEVER))
+                if cursor is not None:
+                    yield from cursor.take(_NEVER)
 
     def counts(self) -> dict[str, int]:
         """
@@ -571,8 +658,9 @@ class BagReader:
                         result[channel.topic] += count
             else:
                 for block in file.blocks:
-                    for message in self._block_messages(block, None):
-                        result[message.topic] += 1
+                    cursor = self._cursor(block, None, (0, _NEVER))
+                    for name, count in cursor.counts().items() if cursor is not None else ():
+                        result[name] += count
         return result
 
     def _damaged(self, number: int) -> bool:
@@ -592,42 +680,46 @@ class BagReader:
             raise BagError('a chunk is damaged (its CRC differs)')
         return content
 
-    def _block_messages(
-            self, block: _Block, topics: Collection[str] | None) -> Iterator[Message]:
+    def _cursor(
+            self, block: _Block, topics: Collection[str] | None,
+            span: tuple[int, int]) -> '_Cursor | None':
         """Return the messages of a chunk or run in the order stored; tell of damage."""
         file = self._files[block.file]
-        names: dict[int, str | None] = {}
         try:
             descriptor = os.open(file.path, os.O_RDONLY | os.O_CLOEXEC)
         except OSError as error:
             self._problem(f'{file.path.name} cannot be read any more: {error.strerror}')
-            return
+            return None
         try:
             content = self._content(descriptor, block)
-        except BagError as error:
+        except (BagError, OSError) as error:
             self._problem(f'{file.path.name}: {error}, at byte {block.offset}: passed over')
-            return
+            return None
         finally:
             os.close(descriptor)
-        unpack, head_size = records.MESSAGE_HEAD.unpack_from, records.MESSAGE_HEAD.size
+        # Places, not messages: a chunk of many small messages would take ten times its size.
+        times, places = array('Q'), array('Q')
+        names: dict[int, str | None] = {}
+        wanted: set[int] = set()
+        first, beyond = span
+        unpack, prefix_size = records.MESSAGE_HEAD.unpack_from, records.PREFIX.size
         try:
             for opcode, start, end in _inner_records(content):
                 if opcode != records.MESSAGE:
                     if opcode in (records.SCHEMA, records.CHANNEL):
                         self._note(file, opcode, content[start:end])
                     continue
-                _, _, channel_id, sequence, log_time, publish_time = unpack(
-                    content, start - records.PREFIX.size)
-                name = names.get(channel_id, '')
-                if name == '':
+                _, _, channel_id, _, log_time, _ = unpack(content, start - prefix_size)
+                if channel_id not in names:
                     name = names[channel_id] = self._topic_of(file, channel_id)
-                if name is None or (topics is not None and name not in topics):
-                    continue
-                yield Message(
-                    name, log_time, publish_time, sequence,
-                    content[start - records.PREFIX.size + head_size:end])
+                    if name is not None and (topics is None or name in topics):
+                        wanted.add(channel_id)
+                if channel_id in wanted and first <= log_time < beyond:
+                    times.append(log_time)
+                    places.append(start - prefix_size)
         except BagError as error:
             self._problem(f'{file.path.name}: {error}, at byte {block.offset}: passed over')
+        return _Cursor((block.file, block.offset), content, names, times, places)
 
     def _topic_of(self, file: _File, channel_id: int) -> str | None:
         """Return the topic of a channel, None if its messages are passed over."""
@@ -676,6 +768,94 @@ class BagReader:
         return _make_decoder(info)
 
 
+class _Cursor:
+    """
+    A place among the messages of a chunk or run.
+
+    Parameters
+    ----------
+    key : tuple of int
+        Where it was written; of equal stamps the smaller comes first.
+    content : bytes
+        Of the chunk.
+    names : mapping of int to str
+        Topics by channel.
+    times, places : array of int
+        Log time and offset in the content of each message.
+
+    """
+
+    def __init__(
+            self, key: tuple[int, int], content: bytes, names: dict[int, str | None],
+            times: 'array[int]', places: 'array[int]') -> None:
+        self.key = key
+        self.content = content
+        self._names = names
+        self._times = times
+        self._places = places
+        self._next = 0
+
+    def sort(self) -> None:
+        """Put the messages in order of time; equal ones stay as they are."""
+        times = self._times
+        # Nearly always they are in order already.
+        if any(later < earlier for earlier, later in zip(times, islice(times, 1, None),
+                                                         strict=False)):
+            order = sorted(range(len(times)), key=times.__getitem__)
+            self._times = array('Q', (times[i] for i in order))
+            self._places = array('Q', (self._places[i] for i in order))
+
+    @property
+    def left(self) -> bool:
+        """Return whether there is a next message."""
+        return self._next < len(self._times)
+
+    @property
+    def time(self) -> int:
+        """Return the log time of the next message."""
+        return self._times[self._next]
+
+    def take(self, limit: int) -> Iterator[Message]:
+        """Return the next messages, up to a log time; that is for messages in order."""
+        unpack, head_size = records.MESSAGE_HEAD.unpack_from, records.MESSAGE_HEAD.size
+        prefix_size = records.PREFIX.size
+        content, names = self.content, self._names
+        while self._next < len(self._times) and self._times[self._next] < limit:
+            place = self._places[self._next]
+            self._next += 1
+            _, length, channel_id, sequence, log_time, publish_time = unpack(content, place)
+            yield Message(
+                names[channel_id] or '', log_time, publish_time, sequence,
+                content[place + head_size:place + prefix_size + length])
+
+    def counts(self) -> dict[str, int]:
+        """Return the number of messages by topic."""
+        result: dict[str, int] = {}
+        for place in self._places:
+            name = self._names[records.MESSAGE_HEAD.unpack_from(self.content, place)[2]] or ''
+            result[name] = result.get(name, 0) + 1
+        return result
+
+
+def _content_size(block: _Block) -> int:
+    """Return the length of a block's content."""
+    return block.length if block.chunk is None else block.chunk.size
+
+
+def _merge(cursors: list[_Cursor], limit: int) -> Iterator[Message]:
+    """Return the messages of several chunks up to a log time, in order."""
+    heap = [(cursor.time, cursor.key, cursor) for cursor in cursors
+            if cursor.left and cursor.time < limit]
+    heapq.heapify(heap)
+    while heap:
+        _, key, cursor = heapq.heappop(heap)
+        # Up to the next message of another chunk; where they are equal, key decides.
+        until = limit if not heap else min(limit, heap[0][0] + (key < heap[0][1]))
+        yield from cursor.take(until)
+        if cursor.left and cursor.time < limit:
+            heapq.heappush(heap, (cursor.time, key, cursor))
+
+
 def _make_decoder(info: TopicInfo) -> Callable[[bytes], Any]:
     """Return the decoder of a topic."""
     from mcap.records import Schema
@@ -698,7 +878,15 @@ def _make_decoder(info: TopicInfo) -> Callable[[bytes], Any]:
             f'expected CDR with a ros2msg definition, got {info.encoding!r} with '
             f'{info.definition_encoding or "no definition"!r}')
 
+    # Arrays of primitive values take what they say of their length; those of messages may take
+    # a hundred times as much.
+    most = limits.DECODED_SIZE if _NESTED.search(info.definition) else limits.CHUNK_SIZE
+
     def checked(data: bytes) -> Any:
+        if len(data) > most:
+            raise BagError(
+                f'a message of topic {info.name} has {len(data)} bytes: expected at most {most} '
+                f'of a message of type {info.type} to be decoded')
         try:
             return decode(data)
         except Exception as error:
@@ -752,11 +940,6 @@ def read_messages(
         if decode is not None:
             yield DecodedMessage(
                 topic, message.log_time, message.publish_time, decode(message.data))
-
-
-def _sort_key(item: tuple[int, int, int, int, Message]) -> tuple[int, int, int, int]:
-    """Return stamp and position."""
-    return item[:4]
 
 
 def _inner_records(content: bytes) -> Iterator[tuple[int, int, int]]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import struct
 import zlib
 
+from hmsa_ros.bag import limits
 from hmsa_ros.errors import BagError
 
 MAGIC = b'\x89MCAP0\r\n'
@@ -121,7 +122,7 @@ def text(value: str) -> bytes:
         Encoded.
 
     """
-    data = value.encode('utf-8', 'surrogateescape')
+    data = value.encode('utf-8', 'backslashreplace')
     return struct.pack('<I', len(data)) + data
 
 
@@ -237,8 +238,8 @@ class Fields:
         return int.from_bytes(self.take(size), 'little')
 
     def text(self) -> str:
-        """Return the next string; bytes that are not UTF-8 are kept as surrogates."""
-        return self.take(self.number(4)).decode('utf-8', 'surrogateescape')
+        """Return the next string; bytes that are not UTF-8 are told by their codes."""
+        return self.take(self.number(4)).decode('utf-8', 'backslashreplace')
 
     def text_map(self) -> dict[str, str]:
         """
@@ -252,14 +253,17 @@ class Fields:
         Raises
         ------
         BagError
-            If the record ends before.
+            If the record ends before, or has too many of them.
 
         """
         end = self.number(4) + self.offset
         if end > len(self._data):
             raise BagError(f'a {self._what} record ends early')
-        values = {}
+        values: dict[str, str] = {}
         while self.offset < end:
+            if len(values) >= limits.MAP_ENTRIES:
+                raise BagError(
+                    f'a {self._what} record has more than {limits.MAP_ENTRIES} entries')
             key = self.text()
             values[key] = self.text()
         return values

@@ -1,0 +1,110 @@
+"""
+What a bag may cost whoever reads it.
+
+A bag may come from anybody. Its lengths and counts are held against these limits before memory
+is taken for them, its YAML is counted before it is built, and its texts are made printable
+before they reach a terminal.
+"""
+
+from typing import Any
+
+import yaml
+
+from hmsa_ros.errors import BagError
+
+MEBIBYTE = 2**20
+#: Largest content of a chunk, and largest message; what a reader may be told otherwise.
+CHUNK_SIZE = 128 * MEBIBYTE
+#: Content of chunks that overlap in time, as a multiple of the largest chunk.
+CHUNKS_AT_ONCE = 4
+#: Chunks of a file; with rosbag2's usual chunks that is more than a terabyte.
+CHUNKS = 2_000_000
+#: Record of a schema, a channel, statistics or metadata.
+RECORD_SIZE = 16 * MEBIBYTE
+#: All schemas, channels and metadata that are kept of a bag.
+KEPT_SIZE = 64 * MEBIBYTE
+#: Definition of a message type with all it depends on.
+DEFINITION_SIZE = 2 * MEBIBYTE
+#: Entries of a map in a record.
+MAP_ENTRIES = 100_000
+#: Message to be decoded whose type has arrays of messages: each may take a hundred times its
+#: bytes in Python.
+DECODED_SIZE = 8 * MEBIBYTE
+#: File ``metadata.yaml``.
+YAML_SIZE = 16 * MEBIBYTE
+#: Values, lists and maps in a YAML text.
+YAML_NODES = 300_000
+#: Lists and maps inside each other.
+YAML_DEPTH = 30
+#: Sentences about what cannot be read.
+PROBLEMS = 200
+# The C parser is some ten times faster; not every installation of PyYAML has it.
+_Loader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+
+
+def load_yaml(text: str) -> Any:
+    """
+    Build what a YAML text says, from plain values only.
+
+    Parameters
+    ----------
+    text : str
+        From a bag.
+
+    Returns
+    -------
+    object
+        Plain lists, maps and scalars.
+
+    Raises
+    ------
+    BagError
+        If it is not YAML, is too large, is nested too deep, or uses anchors: with them a few
+        lines unfold to more than fits into any memory.
+
+    """
+    if len(text) > YAML_SIZE:
+        raise BagError(f'it has {len(text)} characters, expected at most {YAML_SIZE}')
+    nodes = depth = 0
+    try:
+        for event in yaml.parse(text, Loader=_Loader):
+            if isinstance(event, yaml.AliasEvent):
+                raise BagError('it uses YAML anchors, expected plain YAML')
+            if isinstance(event, yaml.NodeEvent):
+                nodes += 1
+                if nodes > YAML_NODES:
+                    raise BagError(f'it has more than {YAML_NODES} values')
+            if isinstance(event, yaml.CollectionStartEvent):
+                depth += 1
+                if depth > YAML_DEPTH:
+                    raise BagError(f'it is nested deeper than {YAML_DEPTH}')
+            elif isinstance(event, yaml.CollectionEndEvent):
+                depth -= 1
+        return yaml.load(text, _Loader)
+    except BagError:
+        raise
+    except Exception as error:  # values that do not fit their tags raise errors of any class
+        raise BagError('it is not YAML') from error
+
+
+def printable(text: str) -> str:
+    """
+    Return a text from a bag as it may be shown.
+
+    Parameters
+    ----------
+    text : str
+        Any text.
+
+    Returns
+    -------
+    str
+        Control characters, which can take over a terminal, and what is no character at all are
+        written as their codes.
+
+    """
+    if text.isprintable():
+        return text
+    return ''.join(
+        character if character.isprintable()
+        else character.encode('unicode_escape').decode() for character in text)
