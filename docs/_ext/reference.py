@@ -423,11 +423,10 @@ class Topics(Generated):
                     f'topic {topic.name} in hmsa_ros.nodes.interface has no meaning, or no '
                     'publishers and subscribers: expected both beside its name')
             rows.append((
-                f'`{topic.name}`', f'`{type_name(topic.type)}`',
-                ', '.join(topic.publishers) or 'you', ', '.join(topic.subscribers) or 'you',
-                qos_text(topic.qos), topic.meaning))
-        return table(
-            ('name', 'type', 'sent by', 'taken by', 'quality of service', 'meaning'), rows)
+                f'`{topic.name}`<br>`{type_name(topic.type)}`',
+                f'{topic.meaning}<br>*From {" and ".join(topic.publishers) or "you"} to '
+                f'{" and ".join(topic.subscribers) or "you"}; {qos_text(topic.qos)}.*'))
+        return table(('name and type', 'meaning'), rows)
 
 
 class Services(Generated):
@@ -442,8 +441,8 @@ class Services(Generated):
                     f'service {service.name} in hmsa_ros.nodes.interface has no meaning: '
                     'expected one for each node that serves it')
         return table(
-            ('node', 'name', 'type', 'a call'),
-            ((node, f'`{service.name}`', f'`{type_name(service.type)}`', service.meaning[node])
+            ('node', 'name and type', 'a call'),
+            ((node, f'`{service.name}`<br>`{type_name(service.type)}`', service.meaning[node])
              for node in interface.NODES for service in services if node in service.meaning))
 
 
@@ -466,13 +465,14 @@ class Parameters(Generated):
                 shown = '[' + ', '.join(default) + ']'
             else:
                 shown = str(default).lower()
+            details = [
+                type(default).__name__ if not isinstance(default, list) else 'list of str',
+                *([] if limits == 'any value' else [limits]),
+                *([] if spec.read_only else ['can be set while running'])]
             rows.append((
                 f'`{spec.name}`', f'`{shown}`' + (f' {spec.unit}' if spec.unit else ''),
-                type(default).__name__ if not isinstance(default, list) else 'list of str',
-                '' if limits == 'any value' else limits,
-                'no' if spec.read_only else 'yes', spec.description))
-        return table(
-            ('name', 'default', 'type', 'range', 'changes while running', 'meaning'), rows)
+                f'{spec.description}<br>*{"; ".join(details)}*'))
+        return table(('name', 'default', 'meaning'), rows)
 
 
 class Codes(Generated):
