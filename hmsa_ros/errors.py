@@ -47,5 +47,28 @@ def complain(error: Exception, status: int) -> int:
 
     """
     line = ' '.join(str(error).split())
-    print(f'hmsa: error: {line}', file=sys.stderr)
+    print(f'hmsa: error: {printable(line)}', file=sys.stderr)
     return status
+
+
+def printable(text: str) -> str:
+    """
+    Return a text from elsewhere as it may be shown.
+
+    Parameters
+    ----------
+    text : str
+        Any text.
+
+    Returns
+    -------
+    str
+        Control characters, which can take over a terminal, and what is no character at all are
+        written as their codes.
+
+    """
+    if text.isprintable():
+        return text
+    return ''.join(
+        character if character.isprintable()
+        else character.encode('unicode_escape').decode() for character in text)

@@ -56,12 +56,25 @@ def test_an_error_in_the_thread_is_kept(ros, start, wait_until):
 def test_simulated_time_is_that_of_the_last_tick_before():
     clock = SimulatedTime()
     assert not clock.started
-    for received, time in ((100, 1000), (200, 2000), (300, 500)):
-        clock.add(received, time)
+    assert [clock.add(received, time)
+            for received, time in ((100, 1000), (200, 2000), (300, 500))] == [None, None, 2000]
     assert clock.started
     assert [clock.at(moment) for moment in (50, 100, 199, 200, 299, 300, 400)] == [
         1000, 1000, 1000, 2000, 2000, 500, 500]
-    assert clock.jumped_back
+    assert clock.jumps == 1
+
+
+def test_of_two_clocks_the_first_is_followed_until_it_falls_silent():
+    clock, second = SimulatedTime(), 10**9
+    for i in range(5):
+        clock.add(i * second // 10, 1000 + i, b'first')
+        assert clock.add(i * second // 10 + 1, 5, b'second') is None
+    assert (clock.ignored, clock.jumps) == (5, 0)
+    assert clock.at(second) == 1004
+    assert clock.add(2 * second, 7, b'second') == 1004
+    assert clock.at(2 * second) == 7
+    clock.add(2 * second + 1, 1006, b'first')
+    assert clock.at(2 * second + 1) == 7
 
 
 def test_old_ticks_are_forgotten():

@@ -378,9 +378,9 @@ def test_the_experiment_goes_into_the_bag(record, ros, make_ros):
     ros.spin_until(noted, 'parameters and setpoints in the bag')
     reader = recorder.end()
     assert reader.custom_data['actuator'] == 'A3'
-    assert reader.custom_data['planner.zeta'] == '0.1'
+    assert reader.custom_data['/planner.zeta'] == '0.1'
     assert json.loads(reader.custom_data['setpoints'])[0]['points'] == [[[1.1], 0.0]]
-    assert reader.records['hmsa_ros']['planner.zeta'] == '0.1'
+    assert reader.records['hmsa_ros']['/planner.zeta'] == '0.1'
     assert 'version' in reader.records['hmsa_ros']
     planner.destroy_node()
 

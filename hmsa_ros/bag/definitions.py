@@ -38,6 +38,25 @@ def share_folders() -> list[Path]:
     return [Path(prefix) / 'share' for prefix in [*prefixes, sys.prefix]]
 
 
+def is_interface_package(name: str) -> bool:
+    """
+    Return whether an installed package of the environment has a name.
+
+    Parameters
+    ----------
+    name : str
+        For example ``'sensor_msgs'``.
+
+    Returns
+    -------
+    bool
+        False for what only happens to be a Python module.
+
+    """
+    return re.fullmatch(r'[A-Za-z]\w*', name) is not None and any(
+        (folder / name / 'package.xml').is_file() for folder in share_folders())
+
+
 def _split(type_name: str) -> tuple[str, str]:
     """Split 'pkg/msg/Name' or 'pkg/Name'."""
     parts = type_name.split('/')

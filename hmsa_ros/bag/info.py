@@ -6,7 +6,10 @@ import datetime
 import json
 import os
 
+from hmsa_ros.bag import limits
+from hmsa_ros.bag.experiment import node_parameters, parameter_key
 from hmsa_ros.bag.reader import BagReader
+from hmsa_ros.errors import printable
 
 
 @dataclass(frozen=True)
@@ -93,7 +96,9 @@ class BagSummary:
         return sum(counts) if counts else None
 
 
-def summarize(path: str | os.PathLike[str]) -> BagSummary:
+def summarize(
+        path: str | os.PathLike[str], *,
+        max_chunk_size: int = limits.CHUNK_SIZE) -> BagSummary:
     """
     Read a bag's figures.
 
@@ -101,6 +106,8 @@ def summarize(path: str | os.PathLike[str]) -> BagSummary:
     ----------
     path : path
         Folder of a bag, or one ``.mcap`` file.
+    max_chunk_size : int
+        As for `BagReader`.
 
     Returns
     -------
@@ -113,7 +120,7 @@ def summarize(path: str | os.PathLike[str]) -> BagSummary:
         If there is no bag.
 
     """
-    reader = BagReader(path)
+    reader = BagReader(path, max_chunk_size=max_chunk_size)
     counts = reader.counts()
     start, end = reader.start_time, reader.end_time
     seconds = 0.0 if start is None or end is None else (end - start) * 1e-9
@@ -125,10 +132,10 @@ def summarize(path: str | os.PathLike[str]) -> BagSummary:
         '/'.join(sorted({profile.reliability for profile in info.profiles})),
         '/'.join(sorted({profile.durability for profile in info.profiles})))
         for name, info in sorted(reader.topics.items()))
-    nodes = {key.partition('.')[0] for key in reader.custom_data
-             if key.endswith('.use_sim_time')}
-    parameters = {key: value for key, value in reader.custom_data.items()
-                  if key.partition('.')[0] in nodes}
+    parameters = {
+        parameter_key(node, name): value
+        for node, values in node_parameters(reader.custom_data).items()
+        for name, value in values.items()}
     return BagSummary(
         str(path), tuple((file.name, file.stat().st_size) for file in reader.files), start, end,
         topics, parameters,
@@ -208,7 +215,7 @@ def to_text(summary: BagSummary) -> str:
         Several lines.
 
     """
-    return '\n'.join(_lines(summary))
+    return '\n'.join(map(printable, _lines(summary)))
 
 
 def _lines(summary: BagSummary) -> Iterator[str]:

@@ -2,8 +2,7 @@
 What a bag may cost whoever reads it.
 
 A bag may come from anybody. Its lengths and counts are held against these limits before memory
-is taken for them, its YAML is counted before it is built, and its texts are made printable
-before they reach a terminal.
+is taken for them, and its YAML is counted before it is built.
 """
 
 from typing import Any
@@ -85,26 +84,3 @@ def load_yaml(text: str) -> Any:
         raise
     except Exception as error:  # values that do not fit their tags raise errors of any class
         raise BagError('it is not YAML') from error
-
-
-def printable(text: str) -> str:
-    """
-    Return a text from a bag as it may be shown.
-
-    Parameters
-    ----------
-    text : str
-        Any text.
-
-    Returns
-    -------
-    str
-        Control characters, which can take over a terminal, and what is no character at all are
-        written as their codes.
-
-    """
-    if text.isprintable():
-        return text
-    return ''.join(
-        character if character.isprintable()
-        else character.encode('unicode_escape').decode() for character in text)

@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 import zlib
 
 from hmsa_ros.bag import limits, metadata, qos, records
-from hmsa_ros.errors import BadInputError, BagError
+from hmsa_ros.errors import BadInputError, BagError, printable
 
 # Messages outside chunks are grouped, so that they are handled like chunks.
 _RUN_BYTES = 512 * 1024
@@ -195,7 +195,7 @@ class BagReader:
             return
         self._known_problems.add(sentence)
         self.problems.append(
-            limits.printable(sentence) if len(self._known_problems) <= limits.PROBLEMS
+            printable(sentence) if len(self._known_problems) <= limits.PROBLEMS
             else 'there are more problems, which are not told')
 
     def _find_files(self) -> list[Path]:

@@ -207,10 +207,14 @@ class Recording:
         """
         return self._ask(self._split)
 
-    def split_soon(self) -> None:
-        """Go on in a new file after all that has been put so far; returns at once."""
+    def begin_anew(self) -> None:
+        """
+        Go on in a new file, if this one has messages; returns at once.
+
+        For when time has jumped back: a snapshot does not reach back beyond it either.
+        """
         with self._condition:
-            self._items.append(_Request(self._split))
+            self._items.append(_Request(self._begin_anew))
             self._condition.notify()
 
     def snapshot(self) -> str:
@@ -399,6 +403,12 @@ class Recording:
     def _split(self) -> str:
         """Go on in a new file."""
         return self._writer.split()
+
+    def _begin_anew(self) -> str:
+        """Go on in a new file, without what is kept for a snapshot."""
+        while self._ring:
+            self._release(self._ring.popleft()[1])
+        return self._writer.file_name if self._writer.is_file_empty else self._writer.split()
 
     @staticmethod
     def _answer(request: _Request) -> None:

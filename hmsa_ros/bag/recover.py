@@ -2,14 +2,12 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
 import os
 
+from hmsa_ros.bag import limits
 from hmsa_ros.bag.reader import BagReader
 from hmsa_ros.bag.writer import BagWriter, Topic
 from hmsa_ros.errors import BagError
-
-_BATCH = 5000
 
 
 @dataclass(frozen=True)
@@ -33,7 +31,9 @@ class Recovered:
     problems: tuple[str, ...]
 
 
-def recover(path: str | os.PathLike[str], out: str | os.PathLike[str]) -> Recovered:
+def recover(
+        path: str | os.PathLike[str], out: str | os.PathLike[str], *,
+        max_chunk_size: int = limits.CHUNK_SIZE) -> Recovered:
     """
     Write everything that can be read of a bag to a new one, and check that by reading it.
 
@@ -43,6 +43,8 @@ def recover(path: str | os.PathLike[str], out: str | os.PathLike[str]) -> Recove
         Folder of a bag, or one ``.mcap`` file.
     out : path
         Folder of the new bag; must not exist.
+    max_chunk_size : int
+        As for `BagReader`.
 
     Returns
     -------
@@ -57,7 +59,7 @@ def recover(path: str | os.PathLike[str], out: str | os.PathLike[str]) -> Recove
         If it cannot be written, or does not read back the same.
 
     """
-    reader = BagReader(path)
+    reader = BagReader(path, max_chunk_size=max_chunk_size)
     try:
         with BagWriter(out, custom_data=reader.custom_data) as writer:
             numbers: dict[str, int] = {}
@@ -71,13 +73,11 @@ def recover(path: str | os.PathLike[str], out: str | os.PathLike[str]) -> Recove
 
             for topic in reader.topics:
                 numbers[topic] = _add(reader, writer, topic)
-            stream = entries()
-            while batch := list(islice(stream, _BATCH)):
-                writer.write(batch)
+            writer.write(entries())
         expected = writer.topic_counts()
     except OSError as error:
         raise BagError(f'{out} cannot be written: {error.strerror or error}') from error
-    check = BagReader(out)
+    check = BagReader(out, max_chunk_size=max_chunk_size + limits.CHUNK_SIZE)
     found = dict.fromkeys(check.topics, 0)
     for message in check.messages():
         found[message.topic] += 1

@@ -2,7 +2,8 @@
 Checking a recorded run against the model: the recorded commands, integrated once more.
 
 Parameters are taken from the bag, the state from its first sample; from there on every sample
-of the stretch must come out again.
+of the stretch must come out again. One bag may hold plants in several namespaces, and each of
+them several joints.
 """
 
 from collections.abc import Mapping
@@ -12,6 +13,8 @@ import math
 import os
 from typing import Any
 
+from hmsa_ros.bag import limits
+from hmsa_ros.bag.experiment import parameters_of
 from hmsa_ros.bag.reader import BagReader
 from hmsa_ros.errors import BadInputError
 
@@ -49,7 +52,23 @@ class Verification:
     where: float
 
 
-def verify(path: str | os.PathLike[str]) -> list[Verification]:
+@dataclass(frozen=True)
+class _Pair:
+    """Where to find an actuator: its topics, and its joint, empty for the first."""
+
+    states: str
+    commands: str
+    joint: str
+
+    @property
+    def space(self) -> str:
+        """Return the namespace."""
+        return self.states[:self.states.rindex('/')]
+
+
+def verify(
+        path: str | os.PathLike[str], *,
+        max_chunk_size: int = limits.CHUNK_SIZE) -> list[Verification]:
     """
     Integrate the recorded commands and compare with the recorded stretch.
 
@@ -57,6 +76,8 @@ def verify(path: str | os.PathLike[str]) -> list[Verification]:
     ----------
     path : path
         Folder of a bag, or one ``.mcap`` file.
+    max_chunk_size : int
+        As for `BagReader`.
 
     Returns
     -------
@@ -66,25 +87,42 @@ def verify(path: str | os.PathLike[str]) -> list[Verification]:
     Raises
     ------
     BadInputError
-        If the bag has no commands with the response to them, or does not tell the actuator's
-        parameters.
+        If the bag has no commands with the response to them, does not tell the actuator's
+        parameters, or holds several runs after each other.
     HmsaError
         If the integration does not get through.
 
     """
-    reader = BagReader(path)
-    pairs = [(name, _beside(name, COMMAND)) for name in reader.topics
-             if name.rsplit('/', 1)[-1] == STATES and _beside(name, COMMAND) in reader.topics]
+    reader = BagReader(path, max_chunk_size=max_chunk_size)
+    jumps = reader.custom_data.get('time_jumps', '0')
+    if jumps != '0' and len(reader.files) > 1:
+        raise BadInputError(
+            f'in {path} time jumped back {jumps} times: expected one run; name one of its files, '
+            f'for example {reader.files[0]}')
+    pairs = _pairs(reader)
     if not pairs:
         raise BadInputError(
             f'{path} holds no pair of topics {STATES} and {COMMAND}: expected a recorded run of '
             'the plant; it has ' + (', '.join(reader.topics) or 'no topics'))
-    return [_verify(reader, states, commands) for states, commands in pairs]
+    return [_verify(reader, pair) for pair in pairs]
 
 
-def _beside(topic: str, name: str) -> str:
-    """Return the topic of another name in the same namespace."""
-    return topic[:topic.rindex('/') + 1] + name
+def _pairs(reader: BagReader) -> list[_Pair]:
+    """Return the actuators with joint states and commands."""
+    pairs = []
+    for states in reader.topics:
+        space, slash, name = states.rpartition('/')
+        if name != STATES or not slash:
+            continue
+        if f'{space}/{COMMAND}' in reader.topics:
+            pairs.append(_Pair(states, f'{space}/{COMMAND}', ''))
+            continue
+        # A plant of several joints has their commands one level deeper.
+        for topic in reader.topics:
+            above, _, last = topic.rpartition('/')
+            if last == COMMAND and above.rpartition('/')[0] == space:
+                pairs.append(_Pair(states, topic, above.rpartition('/')[2]))
+    return pairs
 
 
 def _stamp(message: Any) -> int:
@@ -93,10 +131,11 @@ def _stamp(message: Any) -> int:
     return int(stamp.sec) * _NANOSECONDS + int(stamp.nanosec)
 
 
-def _verify(reader: BagReader, states: str, commands: str) -> Verification:
+def _verify(reader: BagReader, pair: _Pair) -> Verification:
     """Compare one actuator."""
     from hmsa_ros.core.simulation import ActuatorSimulation
     simulation: ActuatorSimulation | None = None
+    states, commands = pair.states, pair.commands
     decode_state, decode_command = reader.decoder(states), reader.decoder(commands)
     ahead: list[tuple[int, float]] = []
     samples = applied = late = 0
@@ -112,16 +151,17 @@ def _verify(reader: BagReader, states: str, commands: str) -> Verification:
                 late += simulation.command(stamp or simulation.time, flux_density) > 0
             continue
         sample = decode_state(message.data)
-        stamp, stretch = _stamp(sample), float(sample.position[0])
+        stamp = _stamp(sample)
+        stretch, rate, effort = _sample(pair, sample)
         samples += 1
         if simulation is None:
             first = stamp
-            simulation = _start(reader.custom_data, stamp)
-            simulation.set_state(stretch, float(sample.velocity[0]), float(sample.effort[0]))
-            for command_stamp, flux_density in ahead:
+            simulation = _start(reader.custom_data, pair, stamp)
+            simulation.set_state(stretch, rate, effort)
+            for command_stamp, command_level in ahead:
                 # What had taken effect by the first sample is in force with it.
                 if command_stamp > stamp:
-                    simulation.command(command_stamp, flux_density)
+                    simulation.command(command_stamp, command_level)
             continue
         simulation.advance(stamp)
         difference = abs(simulation.stretch - stretch)
@@ -133,21 +173,35 @@ def _verify(reader: BagReader, states: str, commands: str) -> Verification:
     return Verification(states, commands, samples, applied, late, largest, where * 1e-9)
 
 
-def _start(custom_data: Mapping[str, str], time: int) -> Any:
+def _sample(pair: _Pair, sample: Any) -> tuple[float, float, float]:
+    """Return stretch, rate and flux density of the joint."""
+    try:
+        i = list(sample.name).index(pair.joint) if pair.joint else 0
+        return float(sample.position[i]), float(sample.velocity[i]), float(sample.effort[i])
+    except (IndexError, ValueError):
+        raise BadInputError(
+            f'a message of {pair.states} has no position, velocity and effort of '
+            f'{pair.joint or "a joint"}: expected the samples of a plant') from None
+
+
+def _start(custom_data: Mapping[str, str], pair: _Pair, time: int) -> Any:
     """Return the simulation of the recorded actuator."""
     from hmsa_ros.core.parameters import ActuatorParameters
     from hmsa_ros.core.simulation import ActuatorSimulation
-    values = {}
-    for field in fields(ActuatorParameters):
-        if not field.init:
-            continue
-        key = f'plant.actuator.{field.name}'
+    texts = parameters_of(custom_data, 'plant', pair.space)
+
+    def number(name: str) -> float:
+        # What is set for a joint goes before what is set for all.
+        text = texts.get(f'{pair.joint}.{name}', texts.get(name))
         try:
-            values[field.name] = float(json.loads(custom_data[key]))
-        except (KeyError, TypeError, ValueError):
+            return float(json.loads(text or ''))
+        except (TypeError, ValueError):
             raise BadInputError(
-                f'the bag does not tell parameter {key}: expected a bag recorded while the '
-                'plant was running') from None
-    slew_limit = float(json.loads(custom_data.get('plant.slew_limit', '0')))
+                f'the bag does not tell parameter {name} of node {pair.space}/plant: expected a '
+                'bag recorded while the plant was running') from None
+
+    values = {field.name: number(f'actuator.{field.name}')
+              for field in fields(ActuatorParameters) if field.init}
+    slew_limit = number('slew_limit') if 'slew_limit' in texts else 0.0
     return ActuatorSimulation(
         ActuatorParameters(**values), time=time, slew_limit=slew_limit or math.inf)

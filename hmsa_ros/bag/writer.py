@@ -27,6 +27,8 @@ LIBRARY = f'hmsa_ros {__version__}'
 # summary and the bag its metadata.
 RESERVE = '.reserve'
 _RESERVE_STEP = 256 * 1024
+# Metadata records that a file may have in any case.
+_NOTES_SIZE = 2**20
 # Name of the metadata record with the experiment.
 EXPERIMENT = 'hmsa_ros'
 MIN_FILE_SIZE = 1024
@@ -125,6 +127,7 @@ class _File:
     start: int = 2**64 - 1
     end: int = 0
     index_size: int = 0
+    notes_size: int = 0
 
 
 class BagWriter:
@@ -247,6 +250,11 @@ class BagWriter:
         return sum(self._counts.values())
 
     @property
+    def is_file_empty(self) -> bool:
+        """Return whether the file being written has no message yet."""
+        return not self._chunk.count and (self._file is None or not self._file.counts)
+
+    @property
     def pending_count(self) -> int:
         """Return how many messages wait for the next flush."""
         return self._chunk.count
@@ -340,7 +348,10 @@ class BagWriter:
 
     def note(self, values: Mapping[str, str]) -> None:
         """
-        Add to the custom data, in the file and in ``metadata.yaml``.
+        Add to the custom data, in ``metadata.yaml`` and in the file.
+
+        In the file they come at the end in any case, and at once as long as such records are a
+        small part of it.
 
         Parameters
         ----------
@@ -354,11 +365,15 @@ class BagWriter:
 
         """
         self.custom_data.update(values)
-        if self._file is None:
+        file = self._file
+        if file is None:
             return
         data = records.metadata(EXPERIMENT, {'version': __version__, **self.custom_data})
-        self._file.metadata_indexes.append(
-            records.metadata_index(self._append(data), len(data), EXPERIMENT))
+        # Each record tells all, so that many of them would be more than the messages are.
+        if file.notes_size + len(data) <= max(_NOTES_SIZE, file.offset // 16):
+            file.metadata_indexes.append(
+                records.metadata_index(self._append(data), len(data), EXPERIMENT))
+            file.notes_size += len(data)
         metadata.write(self.folder, self._metadata())
 
     def flush(self) -> None:

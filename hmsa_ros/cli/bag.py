@@ -6,7 +6,10 @@ import json
 import sys
 from typing import Any
 
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.bag.limits import CHUNK_SIZE, MEBIBYTE
+from hmsa_ros.errors import BadInputError, printable
+
+_LARGEST_CHUNK = 65536
 
 
 def add_parser(subparsers: Any) -> None:
@@ -46,6 +49,10 @@ def add_parser(subparsers: Any) -> None:
         help='largest difference of the stretch that passes (default %(default)g)')
     verify.add_argument('--json', action='store_true', help='print one JSON object')
     verify.set_defaults(run=run, action=_verify)
+    for action in (info, recover, verify):
+        action.add_argument(
+            '--max-chunk', type=float, default=CHUNK_SIZE / MEBIBYTE, metavar='MIB',
+            help='largest chunk or message that is read, in MiB (default %(default)g)')
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -63,6 +70,11 @@ def run(arguments: argparse.Namespace) -> int:
         Exit status.
 
     """
+    if not 0.0 < arguments.max_chunk <= _LARGEST_CHUNK:
+        raise BadInputError(
+            f'largest chunk is {arguments.max_chunk:g} MiB: expected more than 0 and at most '
+            f'{_LARGEST_CHUNK} MiB')
+    arguments.max_chunk_size = max(1, round(arguments.max_chunk * MEBIBYTE))
     status: int = arguments.action(arguments)
     return status
 
@@ -70,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _info(arguments: argparse.Namespace) -> int:
     """Print what is in a bag."""
     from hmsa_ros.bag.info import summarize, to_json, to_text
-    summary = summarize(arguments.bag)
+    summary = summarize(arguments.bag, max_chunk_size=arguments.max_chunk_size)
     print(to_json(summary) if arguments.json else to_text(summary))
     return 0
 
@@ -80,7 +92,7 @@ def _verify(arguments: argparse.Namespace) -> int:
     from hmsa_ros.bag.verify import verify
     if not arguments.tolerance >= 0.0:
         raise BadInputError(f'tolerance is {arguments.tolerance:g}: expected at least 0')
-    results = verify(arguments.bag)
+    results = verify(arguments.bag, max_chunk_size=arguments.max_chunk_size)
     passed = all(result.largest_difference <= arguments.tolerance for result in results)
     if arguments.json:
         print(json.dumps({
@@ -88,16 +100,17 @@ def _verify(arguments: argparse.Namespace) -> int:
             'actuators': [asdict(result) for result in results]}, indent=2))
     else:
         for result in results:
-            print(f'{result.states}: {result.sample_count} samples, {result.command_count} '
-                  f'commands ({result.late_count} late), largest difference of the stretch '
-                  f'{result.largest_difference:.3g} at {result.where:.6f} s')
+            print(printable(
+                f'{result.states}: {result.sample_count} samples, {result.command_count} '
+                f'commands of {result.commands} ({result.late_count} late), largest difference '
+                f'of the stretch {result.largest_difference:.3g} at {result.where:.6f} s'))
     return 0 if passed else 1
 
 
 def _recover(arguments: argparse.Namespace) -> int:
     """Write a new bag."""
     from hmsa_ros.bag.recover import recover
-    result = recover(arguments.bag, arguments.out)
+    result = recover(arguments.bag, arguments.out, max_chunk_size=arguments.max_chunk_size)
     for problem in result.problems:
         print(f'hmsa: note: {problem}', file=sys.stderr)
     print(f'{result.message_count} messages recovered to {result.folder}')

@@ -25,6 +25,8 @@ _BATCH = 2000
 # for one wait. Stamps come from the middleware, so this does not blur them.
 _REST_SECONDS = 0.001
 _WAIT_NS = 200_000_000
+# A publisher of /clock that has been silent for so long gives way to another.
+_SILENCE_NS = 1_000_000_000
 
 
 class Taken(NamedTuple):
@@ -347,20 +349,32 @@ class SimulatedTime:
     Tells the simulated time at which a message was received.
 
     The time of a message is that of the last ``/clock`` message received before it, by the
-    stamps of the middleware, however late either is taken.
+    stamps of the middleware, however late either is taken. Of several publishers of ``/clock``
+    the first one is followed until it falls silent: a time that goes to and fro between two
+    simulations is none.
+
+    Attributes
+    ----------
+    jumps : int
+        How often time has jumped back.
+    ignored : int
+        Messages of other publishers than the one that is followed.
+
     """
 
     def __init__(self) -> None:
         self._received: list[int] = []
         self._times: list[int] = []
-        self.jumped_back = False
+        self._publisher = b''
+        self.jumps = 0
+        self.ignored = 0
 
     @property
     def started(self) -> bool:
         """Return whether a ``/clock`` message has come."""
         return bool(self._times)
 
-    def add(self, received_ns: int, time_ns: int) -> None:
+    def add(self, received_ns: int, time_ns: int, publisher: bytes = b'') -> int | None:
         """
         Take in a ``/clock`` message.
 
@@ -370,14 +384,29 @@ class SimulatedTime:
             When it was received, in system time.
         time_ns : int
             What it says.
+        publisher : bytes
+            Who sent it.
+
+        Returns
+        -------
+        int or None
+            The time before, if time has jumped back with this message.
 
         """
-        if self._times and time_ns < self._times[-1]:
-            self.jumped_back = True
+        before = self._times[-1] if self._times else time_ns
+        if self._times and publisher != self._publisher \
+                and received_ns - self._received[-1] < _SILENCE_NS:
+            self.ignored += 1
+            return None
+        self._publisher = publisher
         self._received.append(received_ns)
         self._times.append(time_ns)
         if len(self._times) > 100_000:
             del self._received[:50_000], self._times[:50_000]
+        if time_ns < before:
+            self.jumps += 1
+            return before
+        return None
 
     def at(self, received_ns: int) -> int:
         """

@@ -5,7 +5,8 @@ The node's own executor serves discovery, services and diagnostics. Messages tak
 `Capture` takes them off their subscriptions in a thread, `Recording` writes them in another.
 """
 
-from collections import Counter
+from bisect import bisect_left
+from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
 import contextlib
 from dataclasses import dataclass, field
@@ -33,7 +34,8 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Trigger
 
 from hmsa_ros import __version__
-from hmsa_ros.bag.definitions import message_definition, type_hash
+from hmsa_ros.bag.definitions import is_interface_package, message_definition, type_hash
+from hmsa_ros.bag.experiment import parameter_key
 from hmsa_ros.bag.qos import Qos
 from hmsa_ros.bag.recording import Limits, lost_by_topic, Message, Recording, Status
 from hmsa_ros.bag.writer import BagWriter, parse_custom_data, PRESETS, Topic
@@ -45,8 +47,11 @@ from hmsa_ros.nodes.qos import stored, subscription
 from hmsa_ros.nodes.runner import run
 
 DIAGNOSTICS_SECONDS = 1.0
-# Setpoints kept for the bag's custom data.
+# Setpoints kept for the bag's custom data: how many, and of what length altogether.
 MAX_SETPOINTS = 1000
+_SETPOINTS_LENGTH = 2**18
+# Nodes whose parameters are asked for.
+_MAX_NODES = 256
 
 PARAMETERS = (
     ParameterSpec(
@@ -106,8 +111,15 @@ PARAMETERS = (
         'record.snapshot_duration', 10.0, 'Time that a snapshot reaches back.', 's', 1e-3, 1e6),
     ParameterSpec(
         'experiment.nodes', [interface.PLANNER, interface.PLANT],
-        'Nodes whose parameters are stored in the bag.'),
+        'Nodes whose parameters are stored in the bag; a name without slash is that of a node '
+        'in any namespace.'),
 )
+
+
+# Topics with setpoints, by the last part of their names.
+_SETPOINTS = {
+    topic.name.rsplit('/', 1)[-1]: topic
+    for topic in (interface.JOINT_TRAJECTORY, interface.SETPOINT)}
 
 
 @dataclass(frozen=True)
@@ -217,7 +229,9 @@ class Recorder(Node):
         self._paused = values['record.start_paused']
         self._sim_time = SimulatedTime() if self.get_parameter('use_sim_time').value else None
         self._experiment: dict[str, str] = {'hmsa_ros.version': __version__}
-        self._setpoints: list[dict[str, Any]] = []
+        self._setpoints: deque[str] = deque(maxlen=MAX_SETPOINTS)
+        self._setpoints_noted = True
+        self._setpoint_topics: set[str] = set()
         self._said_ready = False
         self._closed = False
         self.failure: BagError | None = None
@@ -258,14 +272,11 @@ class Recorder(Node):
                 (interface.SPLIT_BAGFILE.name, self._on_split),
                 ('~/snapshot', self._on_snapshot)):
             self.create_service(Trigger, name, callback)
-        for topic in (interface.JOINT_TRAJECTORY, interface.SETPOINT):
-            name = interface.from_outside(topic.name, interface.PLANNER)
-            self.create_subscription(
-                topic.type, name, lambda message, name=name: self._on_setpoint(name, message),
-                topic.qos)
-        self._followed = {
-            self._full_name(name): _Followed(self, self._full_name(name))
-            for name in self._parameters_in['experiment.nodes']}
+        for topic in _SETPOINTS.values():
+            # From the start, so that the first one is not missed; others when they are found.
+            self._follow_setpoints(topic, self._full_name(
+                interface.from_outside(topic.name, interface.PLANNER)))
+        self._followed: dict[str, _Followed] = {}
         self.create_subscription(
             ParameterEvent, '/parameter_events', self._on_parameter_event, 100)
         interval = (self._parameters_in['record.topic_polling_interval.sec']
@@ -294,12 +305,35 @@ class Recorder(Node):
             self.finished = True
         if self._sim_time is not None and not self._sim_time.started:
             return
+        self._find_nodes()
         for name, types in self.get_topic_names_and_types():
             if self._selection.wants(name):
                 self._look_at(name, types)
+            topic = _SETPOINTS.get(name.rsplit('/', 1)[-1])
+            if topic is not None and _type_name(topic.type) in types and any(
+                    name.startswith(f'{node}/') for node in self._followed):
+                self._follow_setpoints(topic, name)
         self._say_ready()
         for followed in self._followed.values():
             followed.poll(self._note)
+
+    def _find_nodes(self) -> None:
+        """Look for nodes whose parameters are to be stored."""
+        wanted = self._parameters_in['experiment.nodes']
+        bare = {name for name in wanted if '/' not in name}
+        full = {self._full_name(name) for name in wanted if '/' in name}
+        for name, namespace in self.get_node_names_and_namespaces():
+            node = f'{namespace.rstrip("/")}/{name}'
+            if (name in bare or node in full) and node not in self._followed \
+                    and len(self._followed) < _MAX_NODES:
+                self._followed[node] = _Followed(self, node)
+
+    def _follow_setpoints(self, topic: interface.Topic, name: str) -> None:
+        """Store the setpoints that are sent on a topic."""
+        if name not in self._setpoint_topics:
+            self._setpoint_topics.add(name)
+            self.create_subscription(
+                topic.type, name, lambda message: self._on_setpoint(name, message), topic.qos)
 
     def _look_at(self, name: str, types: Sequence[str]) -> None:
         """Subscribe to a topic, or again if its publishers ask for it."""
@@ -375,17 +409,38 @@ class Recorder(Node):
     def _deliver(self, taken: Sequence[tuple[Any, list[Taken]]]) -> None:
         """Stamp, count and pass on what has been received."""
         clock = self._sim_time
+        if clock is not None and taken[0][0] is clock:
+            for message in taken[0][1]:
+                stamp = deserialize_message(message.data, ClockMessage).clock
+                now = stamp.sec * 10**9 + stamp.nanosec
+                before = clock.add(message.received_ns, now, message.publisher)
+                if before is not None:
+                    # What came before the jump belongs to the file so far.
+                    taken = self._take_in_until(message.received_ns, taken)
+                    self._begin_anew(before, now)
+            taken = taken[1:]
         for key, messages in taken:
-            if key is clock and clock is not None:
-                for message in messages:
-                    stamp = deserialize_message(message.data, ClockMessage).clock
-                    clock.add(message.received_ns, stamp.sec * 10**9 + stamp.nanosec)
-                if clock.jumped_back:
-                    # A simulation began anew: in a file of its own it stays readable.
-                    clock.jumped_back = False
-                    self._recording.split_soon()
-            else:
-                self._take_in(key, messages)
+            self._take_in(key, messages)
+
+    def _take_in_until(
+            self, moment: int,
+            taken: Sequence[tuple[Any, list[Taken]]]) -> list[tuple[Any, list[Taken]]]:
+        """Take in what was received before a moment; return the rest, the clock as it was."""
+        rest = [taken[0]]
+        for key, messages in taken[1:]:
+            count = bisect_left(messages, moment, key=lambda message: message.received_ns)
+            self._take_in(key, messages[:count])
+            rest.append((key, messages[count:]))
+        return rest
+
+    def _begin_anew(self, before: int, now: int) -> None:
+        """Go on in a new file: a simulation began anew, or a bag is played in a loop."""
+        self.get_logger().warning(
+            f'simulated time jumped back from {before * 1e-9:.3f} s to {now * 1e-9:.3f} s: '
+            'recording goes on in a new file')
+        self._recording.begin_anew()
+        if self._sim_time is not None:
+            self._note({'time_jumps': str(self._sim_time.jumps)})
 
     def _take_in(self, topic: _Recorded, messages: list[Taken]) -> None:
         """Count gaps and hand the messages to the writer."""
@@ -434,8 +489,22 @@ class Recorder(Node):
                 for point in message.points]
         else:
             entry['stretch'] = message.data
-        self._setpoints = [*self._setpoints, entry][-MAX_SETPOINTS:]
-        self._note({'setpoints': json.dumps(self._setpoints)})
+        text = json.dumps(entry)
+        self._setpoints.append(text)
+        self._setpoints_noted = False
+
+    def _note_setpoints(self) -> None:
+        """Store the latest setpoints, as many as are of a reasonable length."""
+        if self._setpoints_noted:
+            return
+        self._setpoints_noted = True
+        length, latest = 0, deque[str]()
+        for text in reversed(self._setpoints):
+            length += len(text)
+            if latest and length > _SETPOINTS_LENGTH:
+                break
+            latest.appendleft(text)
+        self._note({'setpoints': f'[{", ".join(latest)}]'})
 
     def _on_parameter_event(self, event: ParameterEvent) -> None:
         """Store a change of a parameter of the experiment's nodes."""
@@ -495,17 +564,29 @@ class Recorder(Node):
         missed = {topic.name: topic.missed for topic in list(self._topics.values())}
         return lost_by_topic(missed, status.overflowed, status.dropped)
 
+    def _lost_text(self, lost: Mapping[str, int]) -> str:
+        """Return the number of lost messages of every topic as it is stored."""
+        return json.dumps({**dict.fromkeys(list(self._topics), 0), **lost})
+
     def _on_diagnostics(self) -> None:
         """Publish the state."""
         status = self._recording.status()
         lost = self._lost(status)
         total = sum(lost.values())
+        self._note_setpoints()
+        # In the bag at once, so that it is known after a crash too.
+        self._note({'lost': self._lost_text(lost)})
         state = ('paused' if self._paused else 'waiting for /clock'
                  if self._sim_time is not None and not self._sim_time.started else 'recording')
         if status.error:
             level, text = DiagnosticStatus.ERROR, status.error
         elif total:
             level, text = DiagnosticStatus.WARN, f'{state}, {total} messages lost'
+        elif self._sim_time is not None and (
+                self._sim_time.ignored or self.count_publishers(interface.CLOCK_TOPIC.name) > 1):
+            level, text = DiagnosticStatus.WARN, (
+                f'{state}; {self.count_publishers(interface.CLOCK_TOPIC.name)} publishers of '
+                '/clock, the first one is followed')
         else:
             level, text = DiagnosticStatus.OK, state
         values = {
@@ -517,6 +598,9 @@ class Recorder(Node):
             'written': str(sum(status.written.values())),
             'lost': str(total),
             'queued_bytes': str(status.queued_bytes),
+            **({} if self._sim_time is None else {
+                'time_jumps': str(self._sim_time.jumps),
+                'clock_ignored': str(self._sim_time.ignored)}),
             **{f'lost.{name}': str(count) for name, count in lost.items() if count},
         }
         message = DiagnosticArray()
@@ -542,9 +626,9 @@ class Recorder(Node):
             return
         self._closed = True
         self._capture.stop()
-        status = self._recording.close(lambda last: {
-            'lost': json.dumps({
-                **dict.fromkeys(self._topics, 0), **self._lost(last)})})
+        self._note_setpoints()
+        status = self._recording.close(
+            lambda last: {'lost': self._lost_text(self._lost(last))})
         lost = self._lost(status)
         written = sum(status.written.values())
         print(f'hmsa recorder: {written} messages of {len(self._topics)} topics in '
@@ -570,7 +654,7 @@ class _Followed:
     """
 
     def __init__(self, node: Node, name: str) -> None:
-        self._prefix = name.rsplit('/', 1)[-1]
+        self._name = name
         self._list = node.create_client(ListParameters, f'{name}/list_parameters')
         self._get = node.create_client(GetParameters, f'{name}/get_parameters')
         self._future: Any = None
@@ -616,10 +700,10 @@ class _Followed:
         Returns
         -------
         dict of str to str
-            Node name, dot and parameter name; the value as JSON.
+            Keys as `parameter_key` gives them; the value as JSON.
 
         """
-        return {f'{self._prefix}.{name}': json.dumps(
+        return {parameter_key(self._name, name): json.dumps(
             parameter_value_to_python(value), default=list) for name, value in values}
 
 
@@ -647,6 +731,12 @@ def _hurry(priority: int, own: Iterable[int]) -> None:
                 os.sched_setscheduler(thread, os.SCHED_RR, os.sched_param(priority))
 
 
+def _type_name(message_type: type[Any]) -> str:
+    """Return the name of a message class's type."""
+    package, folder, *_ = message_type.__module__.split('.')
+    return f'{package}/{folder}/{message_type.__name__}'
+
+
 def message_class(type_name: str) -> type[Any]:
     """
     Return the class of a message type.
@@ -670,6 +760,9 @@ def message_class(type_name: str) -> type[Any]:
     parts = type_name.split('/')
     try:
         package, folder, name = parts
+        # The name may come from anybody's bag: nothing but an interface is ever imported.
+        if folder not in ('msg', 'srv', 'action') or not is_interface_package(package):
+            raise ImportError(type_name)
         message_class: type[Any] = getattr(import_module(f'{package}.{folder}'), name)
     except (ValueError, ImportError, AttributeError) as error:
         raise BagError(

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hmsa_ros.bag.experiment import parameters_of
 from hmsa_ros.bag.info import BagSummary, summarize
 from hmsa_ros.bag.reader import BagReader, Message
 from hmsa_ros.core.model import Array
@@ -365,7 +366,7 @@ class _Collected:
             actuator: ActuatorParameters | None, joint: str) -> Run:
         """Return the run."""
         notes = list(notes)
-        parameters = _parameters(custom_data)
+        parameters = _parameters(custom_data, topics[JOINT_STATES][:-len(JOINT_STATES)])
         named = joint or self.joint or str(parameters.get('planner.joint', ''))
         time, logged, stretch, rate, flux_density = self.samples.arrays(
             f'{path}: {topics[JOINT_STATES]}', named, required=bool(joint))
@@ -384,16 +385,15 @@ class _Collected:
             tuple(self.verdicts), parameters, plant, planner, known, (*notes, *more))
 
 
-def _parameters(custom_data: Mapping[str, str]) -> dict[str, object]:
-    """Return the parameters of the nodes that the recorder stored."""
+def _parameters(custom_data: Mapping[str, str], space: str) -> dict[str, object]:
+    """Return the parameters of the nodes in a namespace that the recorder stored."""
     parameters: dict[str, object] = {}
-    for key, text in custom_data.items():
-        node, _, name = key.partition('.')
-        if name and f'{node}.use_sim_time' in custom_data:
+    for node in ('planner', 'plant'):
+        for name, text in parameters_of(custom_data, node, space).items():
             try:
-                parameters[key] = json.loads(text)
+                parameters[f'{node}.{name}'] = json.loads(text)
             except ValueError:
-                parameters[key] = text
+                parameters[f'{node}.{name}'] = text
     return parameters
 
 

@@ -1,0 +1,83 @@
+"""
+What a bag tells of the experiment: the parameters of its nodes.
+
+The recorder stores them as custom data under the node's full name, a dot and the parameter's
+name (``/left/plant.actuator.density``), the value as JSON. Bags of version 0.1 have the last
+part of the node's name only (``plant.actuator.density``).
+"""
+
+from collections.abc import Mapping
+
+
+def parameter_key(node: str, name: str) -> str:
+    """
+    Return the key of custom data for a parameter.
+
+    Parameters
+    ----------
+    node : str
+        Full name of the node.
+    name : str
+        Name of the parameter.
+
+    Returns
+    -------
+    str
+        For example ``'/left/plant.actuator.density'``.
+
+    """
+    return f'{node}.{name}'
+
+
+def node_parameters(custom_data: Mapping[str, str]) -> dict[str, dict[str, str]]:
+    """
+    Return the parameters of each node.
+
+    Parameters
+    ----------
+    custom_data : mapping of str to str
+        Of a bag.
+
+    Returns
+    -------
+    dict of str to dict of str to str
+        Values as JSON by parameter, by node: its full name, or in a bag of version 0.1 the last
+        part of it.
+
+    """
+    # Every node has this parameter, and no other custom data end with it.
+    nodes = {key.partition('.')[0] for key in custom_data if key.endswith('.use_sim_time')}
+    result: dict[str, dict[str, str]] = {}
+    for key, value in custom_data.items():
+        node, _, name = key.partition('.')
+        if node in nodes and name:
+            result.setdefault(node, {})[name] = value
+    return result
+
+
+def parameters_of(custom_data: Mapping[str, str], node: str, space: str) -> dict[str, str]:
+    """
+    Return the parameters of the node that belongs to a namespace.
+
+    Parameters
+    ----------
+    custom_data : mapping of str to str
+        Of a bag.
+    node : str
+        Last part of the node's name, for example ``'plant'``.
+    space : str
+        Namespace of the topics in question, for example ``'/left'``; empty for the root.
+
+    Returns
+    -------
+    dict of str to str
+        Values as JSON by parameter: of the node in that namespace, or else of the only node of
+        that name; empty if there is none or it is not clear which.
+
+    """
+    nodes = node_parameters(custom_data)
+    exact = nodes.get(f'{space.rstrip("/")}/{node}')
+    if exact is not None:
+        return exact
+    alike = [values for name, values in nodes.items() if name.rsplit('/', 1)[-1] == node]
+    return alike[0] if len(alike) == 1 else {}
