@@ -9,9 +9,10 @@ are asked for by name, in ``play.topics_to_filter`` or ``play.allow_commands``.
 """
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 import contextlib
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 import os
 import re
@@ -31,8 +32,9 @@ from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Trigger
 
+from hmsa_ros.bag.limits import CHUNK_SIZE
 from hmsa_ros.bag.reader import BagReader, Message, TopicInfo
-from hmsa_ros.errors import BadInputError, BagError, HmsaError
+from hmsa_ros.errors import BadInputError, BagError, HmsaError, printable
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.parameters import declare, ParameterSpec
 from hmsa_ros.nodes.qos import publisher
@@ -53,9 +55,18 @@ _CLOCK_WHILE_WAITING_SECONDS = 0.1
 # Fast DDS asks for them, every 3 s: the wait at the end has to last for several, in slices.
 _ACKNOWLEDGED_SECONDS = 0.5
 _BATCH = 100
+# Read ahead at most, whatever the number of messages: they may be large.
+_READ_AHEAD_BYTES = 64 * 2**20
+# A loop over a bag of a single moment would send without pause.
+_SHORTEST_ROUND_SECONDS = 0.1
+# What a builtin_interfaces/Time can hold.
+_LATEST_CLOCK = 2**31 * 10**9
 
 PARAMETERS = (
     ParameterSpec('storage.uri', '', 'Folder of the bag, or an .mcap file.'),
+    ParameterSpec(
+        'storage.max_chunk_size', CHUNK_SIZE,
+        'Largest chunk or message that is read; larger ones are passed over.', 'B', 1),
     ParameterSpec('play.rate', 1.0, 'Speed as a multiple of the recorded one.', '', 1e-3, 1e3,
                   read_only=False),
     ParameterSpec('play.loop', False, 'Whether to begin again at the end.'),
@@ -199,19 +210,21 @@ class _ReadAhead:
 
     Parameters
     ----------
-    messages : iterable of Message
-        What to read.
+    read : callable
+        Returns the messages; gets a function that says whether nobody wants more of them.
     size : int
         How many messages to keep ready.
 
     """
 
-    def __init__(self, messages: Iterable[Message], size: int) -> None:
-        self._messages = iter(messages)
+    def __init__(
+            self, read: Callable[[Callable[[], bool]], Iterator[Message]], size: int) -> None:
+        self._messages = read(lambda: self._ended)
         self._size = size
         self._condition = threading.Condition()
-        self._batches: deque[list[Message]] = deque()
+        self._batches: deque[tuple[list[Message], int]] = deque()
         self._count = 0
+        self._bytes = 0
         self._ended = False
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name='read ahead', daemon=True)
@@ -220,14 +233,25 @@ class _ReadAhead:
     def _run(self) -> None:
         """Read until the end or until nobody wants more."""
         try:
-            while batch := list(islice(self._messages, min(_BATCH, self._size))):
+            more = True
+            while more:
+                batch, size = [], 0
+                for message in islice(self._messages, min(_BATCH, self._size)):
+                    batch.append(message)
+                    size += len(message.data)
+                    if size > _READ_AHEAD_BYTES // 8:
+                        break
+                more = bool(batch)
                 with self._condition:
-                    self._condition.wait_for(lambda: self._count < self._size or self._ended)
+                    self._condition.wait_for(lambda: self._ended or (
+                        self._count < self._size and self._bytes < _READ_AHEAD_BYTES))
                     if self._ended:
                         return
-                    self._batches.append(batch)
-                    self._count += len(batch)
-                    self._condition.notify_all()
+                    if batch:
+                        self._batches.append((batch, size))
+                        self._count += len(batch)
+                        self._bytes += size
+                        self._condition.notify_all()
         except BaseException as error:  # raised again where the messages are taken
             self._error = error
         finally:
@@ -243,15 +267,17 @@ class _ReadAhead:
                     if self._error is not None:
                         raise self._error
                     return
-                batch = self._batches.popleft()
+                batch, size = self._batches.popleft()
                 self._count -= len(batch)
+                self._bytes -= size
                 self._condition.notify_all()
             yield from batch
 
-    def wait(self) -> None:
-        """Wait for the first messages, or the end if there are none."""
+    def wait(self, cancelled: Callable[[], bool]) -> None:
+        """Wait for the first messages, or the end if there are none or nobody waits."""
         with self._condition:
-            self._condition.wait_for(lambda: self._batches or self._ended)
+            while not (self._batches or self._ended or cancelled()):
+                self._condition.wait(_POLL_SECONDS)
 
     def stop(self) -> None:
         """Read no further."""
@@ -289,9 +315,10 @@ class Player(Node):
                 'for example -p storage.uri:=run1')
         self.failure: HmsaError | None = None
         self.finished = False
-        self._reader = BagReader(values['storage.uri'])
-        for problem in self._reader.problems:
-            self.get_logger().warning(problem)
+        self._reader = BagReader(
+            values['storage.uri'], max_chunk_size=values['storage.max_chunk_size'])
+        self._problems_told = 0
+        self._tell_problems()
         self._filter = Filter(
             self._names('play.topics_to_filter'), values['play.regex_to_filter'],
             self._names('play.exclude_topics_to_filter'),
@@ -316,6 +343,10 @@ class Player(Node):
         self._clock_out: Any = None
         if values['play.clock_publish_frequency'] > 0.0 \
                 or values['play.clock_publish_on_topic_publish']:
+            if max(self._start, self._end) >= _LATEST_CLOCK:
+                raise BadInputError(
+                    f'{self._reader.path} reaches to {self._end * 1e-9:.0f} s: expected less '
+                    f'than {_LATEST_CLOCK // 10**9} s for /clock')
             # First of all, so that nodes that wait for it can get ready.
             self._clock_out = self.create_publisher(
                 ClockMessage, interface.CLOCK_TOPIC.name, interface.CLOCK_TOPIC.qos)
@@ -344,16 +375,22 @@ class Player(Node):
                 continue
             reason = self._left_out(name, info)
             if reason:
-                self.get_logger().warning(f'topic {name} is left out: {reason}')
+                self.get_logger().warning(printable(f'topic {name} is left out: {reason}'))
                 continue
-            result[name] = self.create_publisher(
-                message_class(info.type), name, publisher(info.profiles))
+            try:
+                result[name] = self.create_publisher(
+                    message_class(info.type), name, publisher(info.profiles))
+            except Exception as error:
+                # A name or a quality of service that no publisher can have.
+                self.get_logger().warning(printable(
+                    f'topic {name} is left out: it cannot be published '
+                    f'({" ".join(str(error).split())})'))
         missing = [name for name in (*self._filter.topics, *self._filter.allow_commands)
                    if name not in self._reader.topics]
         if missing:
-            self.get_logger().warning(
+            self.get_logger().warning(printable(
                 f'the bag has no topic {", ".join(missing)}; it has '
-                + (', '.join(self._reader.topics) or 'none'))
+                + (', '.join(self._reader.topics) or 'none')))
         waited = [name for name in self._names('play.wait_for_subscribers')
                   if name not in result]
         if waited:
@@ -406,7 +443,7 @@ class Player(Node):
         try:
             self._wait_for_subscribers()
             self._get_going()
-            while self._play(self._start) and self._values['play.loop'] and self._out:
+            while self._round() and self._values['play.loop']:
                 pass
             self._finish()
         except HmsaError as error:
@@ -420,6 +457,21 @@ class Player(Node):
                 for answer in self._next_answers:
                     answer.set()
             self.finished = True
+
+    def _tell_problems(self) -> None:
+        """Log what could not be read of the bag, each once."""
+        for problem in self._reader.problems[self._problems_told:]:
+            self.get_logger().warning(problem)
+        self._problems_told = len(self._reader.problems)
+
+    def _round(self) -> bool:
+        """Play from the start to the end; return whether it makes sense to do so again."""
+        begin, sent = time.monotonic(), self._sent
+        if not self._play(self._start) or self._sent == sent:
+            return False
+        with self._change:
+            return not (self._values['play.loop'] and self._change.wait_for(
+                lambda: self._stopped, begin + _SHORTEST_ROUND_SECONDS - time.monotonic()))
 
     def _wait_for_subscribers(self) -> None:
         """Wait until who is to receive the messages is there."""
@@ -465,12 +517,11 @@ class Player(Node):
         """Play from a time on; return whether the end was reached."""
         while True:
             source = _ReadAhead(
-                self._reader.messages(self._out.keys(), start=start, end=self._end + 1),
-                self._values['play.read_ahead_queue_size'])
+                partial(self._read, start), self._values['play.read_ahead_queue_size'])
             try:
                 self._send_latched(start)
                 # Time runs from when there is something to send.
-                source.wait()
+                source.wait(self._interrupted)
                 with self._change:
                     self._position = start
                     self._anchor = (start, time.monotonic())
@@ -481,6 +532,15 @@ class Player(Node):
                 return outcome == 'end'
             with self._change:
                 start, self._seek = self._seek or self._first, None
+
+    def _read(self, start: int, cancelled: Callable[[], bool]) -> Iterator[Message]:
+        """Return the messages to send from a time on."""
+        return self._reader.messages(
+            self._out.keys(), start=start, end=self._end + 1, cancelled=cancelled)
+
+    def _interrupted(self) -> bool:
+        """Return whether what is going on has been given up."""
+        return self._stopped or self._seek is not None
 
     def _send_all(self, messages: Iterable[Message], start: int) -> str:
         """Send messages, each at its time; return 'end', 'seek' or 'stop'."""
@@ -560,9 +620,16 @@ class Player(Node):
                    for profile in self._reader.topics[name].profiles)}
         if not depths or start <= self._first:
             return
-        kept = {name: deque[Message](maxlen=depth) for name, depth in depths.items()}
-        for message in self._reader.messages(depths.keys(), end=start):
-            kept[message.topic].append(message)
+        kept = {name: deque[Message]() for name in depths}
+        size = 0
+        for message in self._reader.messages(
+                depths.keys(), end=start, cancelled=self._interrupted):
+            latest = kept[message.topic]
+            latest.append(message)
+            size += len(message.data)
+            while len(latest) > depths[message.topic] or (
+                    size > _READ_AHEAD_BYTES and len(latest) > 1):
+                size -= len(latest.popleft().data)
         for message in sorted((message for messages in kept.values() for message in messages),
                               key=lambda message: message.log_time):
             self._out[message.topic].publish(message.data)
@@ -575,6 +642,7 @@ class Player(Node):
 
     def _finish(self) -> None:
         """Wait for reliable subscribers and say what was sent."""
+        self._tell_problems()
         limit = self._span('play.wait_acked_timeout')
         waiting = list(self._out.values()) if limit >= 0 else []
         end = time.monotonic() + limit * 1e-9
@@ -678,6 +746,11 @@ class Player(Node):
                     specs[parameter.name].check(parameter.value)
                 except BadInputError as error:
                     return SetParametersResult(successful=False, reason=str(error))
+            length = (self._end - self._first) * 1e-9
+            if parameter.name == 'play.seek' and parameter.value > length:
+                return SetParametersResult(
+                    successful=False, reason=f'parameter play.seek is {parameter.value:g}: '
+                    f'expected at most {length:g} s, where playing ends')
         for parameter in parameters:
             if parameter.name == 'play.rate':
                 self._set_rate(parameter.value)

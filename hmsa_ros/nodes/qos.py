@@ -16,6 +16,8 @@ from hmsa_ros.bag.qos import Qos
 # Depth of a republished topic whose recorded depth is unknown, as it is where publishers are
 # discovered over DDS.
 PUBLISHER_DEPTH = 1000
+# Recorded depths are believed up to here: the middleware sets memory aside for them.
+MAX_DEPTH = 100_000
 
 
 def stored(profile: QoSProfile) -> Qos:
@@ -87,10 +89,10 @@ def publisher(recorded: Sequence[Qos]) -> QoSProfile:
     latched = any(profile.durability == 'transient_local' for profile in recorded)
     reliable = not recorded or any(
         profile.reliability in ('reliable', 'system_default') for profile in recorded)
-    depth = max((profile.depth for profile in recorded), default=0)
+    depth = min(MAX_DEPTH, max((profile.depth for profile in recorded), default=0))
     profile = QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
-        depth=depth or (len(recorded) if latched else PUBLISHER_DEPTH),
+        depth=depth or (min(MAX_DEPTH, len(recorded)) if latched else PUBLISHER_DEPTH),
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE)
     alike = set(recorded)
