@@ -46,6 +46,7 @@ EXTRAS_REQUIRE = {
     'test': [
         'hypothesis>=6.98',
         'mypy>=1.9',
+        'pyte>=0.8',
         'pytest>=7.4',
         'pytest-timeout>=2.2',
         'rosbags>=0.10',

@@ -17,7 +17,8 @@ from hmsa_ros.cli.node import NODES
 from hmsa_ros.errors import BadInputError, complain, HmsaError
 
 COMMANDS = (
-    'demo', 'init', 'plan', 'send', 'node', 'bag', 'report', 'figures', 'robustness', 'sweep')
+    'demo', 'init', 'plan', 'send', 'watch', 'node', 'bag', 'report', 'figures', 'robustness',
+    'sweep')
 
 
 class Parser(argparse.ArgumentParser):

@@ -1,0 +1,215 @@
+"""``hmsa watch``: what goes on, live in the terminal."""
+
+import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
+import json
+import os
+import select
+import sys
+from time import monotonic
+from typing import Any, TYPE_CHECKING
+
+from hmsa_ros.ending import Ending
+from hmsa_ros.errors import BadInputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from hmsa_ros.watch.listener import Listener
+    from hmsa_ros.watch.scene import Scene
+
+# Between two lines where there is no terminal, and between two looks meanwhile, in s.
+_LINE_SECONDS = 1.0
+_LOOK_SECONDS = 0.1
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    Add the command.
+
+    Parameters
+    ----------
+    subparsers : argparse action
+        Where to add it.
+
+    """
+    parser = subparsers.add_parser(
+        'watch', help='show live what goes on, in the terminal',
+        description='Show live, in a terminal of any size: stretch against target, command, '
+                    'progress of the plan, the verdict on the last request, and losses. q or '
+                    'Ctrl-C ends. Without a terminal it prints a line each second.',
+        epilog='example: hmsa watch --joint actuator --span 5')
+    parser.add_argument(
+        '--namespace', default='', metavar='NS', help='namespace of planner and plant')
+    parser.add_argument(
+        '--joint', nargs='+', default=[], metavar='NAME', help='joints to show (default all)')
+    parser.add_argument(
+        '--span', type=float, default=10.0, metavar='S',
+        help='time that the charts reach back (default 10 s)')
+    parser.add_argument(
+        '--rate', type=float, default=5.0, metavar='HZ',
+        help='how often the view is renewed, 0.1 to 30 (default 5)')
+    parser.add_argument(
+        '--once', action='store_true', help='print one view and end; 1 if there is nothing')
+    parser.add_argument(
+        '--timeout', type=float, default=5.0, metavar='S',
+        help='patience of --once (default 5 s)')
+    parser.add_argument(
+        '--json', action='store_true', help='print a JSON object a second, on a line each')
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """
+    Watch until told to end.
+
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+        As parsed.
+
+    Returns
+    -------
+    int
+        Exit status.
+
+    Raises
+    ------
+    BadInputError
+        If an option is out of range.
+
+    """
+    for name, least, largest in (('span', 0.1, 3600.0), ('rate', 0.1, 30.0),
+                                 ('timeout', 0.0, 1e6)):
+        value = getattr(arguments, name)
+        if not least <= value <= largest:
+            raise BadInputError(f'{name} is {value:g}: expected {least:g} to {largest:g}')
+
+    from rich.console import Console
+
+    from hmsa_ros.watch.listener import Listener
+
+    console = Console(highlight=False)
+    with Listener(
+            namespace=arguments.namespace, joints=arguments.joint,
+            span=arguments.span) as listener:
+        ending = Ending()
+        if arguments.once:
+            return _once(listener, console, arguments, ending)
+        if arguments.json or not console.is_terminal or console.is_dumb_terminal:
+            return _lines(listener, arguments.json, ending)
+        return _live(listener, console, arguments, ending)
+
+
+def _once(
+        listener: 'Listener', console: 'Console', arguments: argparse.Namespace,
+        ending: Ending) -> int:
+    """Print one view as soon as everything is there, or when patience ends."""
+    end = monotonic() + arguments.timeout
+    scene = listener.look()
+    # Two looks, so that the samples' rate can be told.
+    while not (scene.joints and scene.request and scene.sample_rate > 0.0):
+        if monotonic() >= end or ending.asked:
+            break
+        _wait(_LOOK_SECONDS)
+        scene = listener.look()
+    if arguments.json:
+        from hmsa_ros.watch.screen import as_json
+        print(json.dumps(as_json(scene)))
+    else:
+        for line in _screen(console, arguments.span).lines(
+                scene, console.width, console.height):
+            console.print(line)
+    return 0 if scene.joints or scene.request else 1
+
+
+def _lines(listener: 'Listener', as_objects: bool, ending: Ending) -> int:
+    """Print a line each second."""
+    from hmsa_ros.watch.screen import as_json, line
+
+    due = monotonic() + _LINE_SECONDS
+    while not ending.asked:
+        _wait(min(_LOOK_SECONDS, max(due - monotonic(), 0.0)))
+        scene = listener.look()
+        if monotonic() >= due:
+            due += _LINE_SECONDS
+            print(json.dumps(as_json(scene)) if as_objects else line(scene), flush=True)
+    return 0
+
+
+def _wait(seconds: float) -> None:
+    """Let time pass."""
+    select.select([], [], [], seconds)
+
+
+def _screen(console: 'Console', span: float) -> Any:
+    from hmsa_ros.watch.screen import Screen
+    return Screen(span, unicode=console.encoding.lower().startswith('utf'))
+
+
+def _live(
+        listener: 'Listener', console: 'Console', arguments: argparse.Namespace,
+        ending: Ending) -> int:
+    """Show the view until a key or a signal ends it."""
+    from rich.console import Console, ConsoleOptions
+    from rich.live import Live
+    from rich.segment import Segment
+
+    screen = _screen(console, arguments.span)
+    now: list[Scene] = [listener.look()]
+
+    class View:
+        """The scene, laid out anew for the size that the terminal has by now."""
+
+        def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Any]:
+            height = options.height or console.height
+            for i, line in enumerate(screen.lines(now[0], options.max_width, height)):
+                if i:
+                    yield Segment.line()
+                yield from line.render(console)
+
+    with _keys() as key_pressed, Live(
+            View(), console=console, screen=True, auto_refresh=False) as live:
+        due = monotonic()
+        while not ending.asked:
+            due = max(due + 1.0 / arguments.rate, monotonic())
+            while monotonic() < due:
+                if key_pressed(min(_LOOK_SECONDS, max(due - monotonic(), 0.0))) in ('q', 'Q'):
+                    return 0
+                now[0] = listener.look()
+            live.refresh()
+    return 0
+
+
+@contextmanager
+def _keys() -> Iterator[Any]:
+    """Give keys as they are pressed, without showing them; the terminal is left as it was."""
+    if not sys.stdin.isatty():
+        def none(seconds: float) -> str:
+            _wait(seconds)
+            return ''
+        yield none
+        return
+    import termios
+
+    file = sys.stdin.fileno()
+    before = termios.tcgetattr(file)
+    settings = termios.tcgetattr(file)
+    settings[3] &= ~(termios.ICANON | termios.ECHO)
+    # A stopped process would leave its screen behind.
+    settings[6][termios.VSUSP] = b'\0'
+
+    def key(seconds: float) -> str:
+        ready, _, _ = select.select([file], [], [], seconds)
+        if not ready:
+            return ''
+        pressed = os.read(file, 1)
+        # A terminal that is gone ends the view, too.
+        return pressed.decode('ascii', 'ignore') if pressed else 'q'
+
+    try:
+        termios.tcsetattr(file, termios.TCSADRAIN, settings)
+        yield key
+    finally:
+        termios.tcsetattr(file, termios.TCSADRAIN, before)

@@ -1,0 +1,317 @@
+"""
+Gathers what goes on from ROS, by looking a few times a second.
+
+No executor serves the subscriptions: what has arrived is taken from the middleware at each look,
+so that a thousand samples a second wake nobody up.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+import math
+import re
+from time import monotonic
+from typing import Any
+from uuid import uuid4
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+import numpy as np
+import rclpy
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import JointState, MagneticField
+from trajectory_msgs.msg import JointTrajectory
+
+from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.conversions import from_time
+from hmsa_ros.watch.scene import History, Joint, Report, Request, Scene
+
+# Of the samples since the last look no more than these are kept: all of them at 1 kHz.
+_SAMPLES = 200
+_SAMPLE_QOS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=_SAMPLES, reliability=ReliabilityPolicy.BEST_EFFORT)
+_REPORT_QOS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+# Between two looks at the graph, and how long discovery may take before its result counts.
+_GRAPH_SECONDS = 1.0
+_DISCOVERY_SECONDS = 1.5
+# Samples that stay away for so long are waited for, and the window of their rate.
+_QUIET_SECONDS = 2.0
+_RATE_SECONDS = 1.0
+# Reports of nodes that have ended are dropped after a while.
+_FORGET_SECONDS = 30.0
+_NUMBER = re.compile(r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?')
+
+
+@dataclass
+class _Commands:
+    """Commands of one joint, until they apply."""
+
+    subscription: Any
+    ahead: dict[int, float] = field(default_factory=dict)
+    in_force: float = math.nan
+
+    def take(self, stamp: int, value: float) -> None:
+        """Take in a command, which supersedes those stamped at or after it."""
+        self.ahead = {x: y for x, y in self.ahead.items() if x < stamp}
+        self.ahead[stamp] = value
+
+    def at(self, stamp: int | None) -> float:
+        """Return what has been commanded for a time; without one the newest."""
+        for each in sorted(self.ahead):
+            if stamp is None or each <= stamp:
+                self.in_force = self.ahead.pop(each)
+        return self.in_force
+
+
+class Listener:
+    """
+    Looks at planner, plant and the rest of one namespace; a context manager.
+
+    Parameters
+    ----------
+    namespace : str
+        Where to look.
+    joints : sequence of str
+        Joints to show; empty for all.
+    span : float
+        How far back the charts reach, in s.
+
+    """
+
+    def __init__(
+            self, *, namespace: str = '', joints: Sequence[str] = (),
+            span: float = 10.0) -> None:
+        """Create a node of our own in a context of our own."""
+        self._wanted = tuple(joints)
+        self._span = span
+        self._context = rclpy.Context()
+        # Signals stay Python's.
+        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            self._node: Node = rclpy.create_node(
+                f'watch_{uuid4().hex[:8]}', namespace=namespace, context=self._context,
+                enable_rosout=False, start_parameter_services=False)
+        except Exception as error:  # rclpy has several classes for a bad name
+            rclpy.try_shutdown(context=self._context)
+            raise BadInputError(f'namespace {namespace!r}: {error}') from error
+        self._domain = int(self._context.get_domain_id())
+        self._samples = self._subscribe(interface.JOINT_STATES, _SAMPLE_QOS)
+        self._status = self._subscribe(interface.STATUS)
+        self._plan = self._subscribe(interface.PLAN)
+        self._diagnostics = self._subscribe(interface.DIAGNOSTICS, _REPORT_QOS)
+        self._commands: dict[str, _Commands] = {}
+        self._joints: dict[str, Joint] = {}
+        self._reports: dict[str, tuple[float, Report]] = {}
+        self._request: Request | None = None
+        self._targets: tuple[float, ...] = ()
+        self._planned_joints: tuple[str, ...] = ()
+        self._plan_span: tuple[int, int] | None = None
+        self._begin = self._looked = monotonic()
+        self._graph_at = -math.inf
+        self._senders = {'samples': 0, 'planner': 0}
+        self._stamp: int | None = None
+        self._arrived = -math.inf
+        self._rate = math.nan
+        self._counted: tuple[float, int] | None = None
+
+    def __enter__(self) -> 'Listener':
+        """Return the listener."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave the graph."""
+        self._node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+    def _subscribe(self, topic: interface.Topic, qos: QoSProfile | None = None) -> Any:
+        return self._node.create_subscription(
+            topic.type, interface.from_outside(topic.name, interface.PLANNER), lambda _: None,
+            qos or topic.qos)
+
+    @staticmethod
+    def _drain(subscription: Any, kind: type[Any]) -> Iterator[tuple[Any, Any]]:
+        """Take what has arrived."""
+        with subscription.handle:
+            while (taken := subscription.handle.take_message(kind, False)) is not None:
+                yield taken
+
+    def look(self) -> Scene:
+        """
+        Take what has arrived since the last look.
+
+        Returns
+        -------
+        Scene
+            What is seen now.
+
+        """
+        now = monotonic()
+        if now - self._graph_at >= _GRAPH_SECONDS:
+            self._graph_at = now
+            self._look_at_graph()
+        self._take_planner()
+        self._take_samples(now)
+        self._take_commands()
+        self._take_reports(now)
+        for name, joint in self._joints.items():
+            joint.target = self._target_of(name)
+            if math.isfinite(joint.target):
+                joint.targets.put(self._looked, now, np.array([joint.target]))
+        self._looked = now
+        shown = [x for x in self._joints.values() if not self._wanted or x.name in self._wanted]
+        return Scene(
+            where=f'domain {self._domain}  {self._node.get_namespace()}', now=now,
+            stamp=math.nan if self._stamp is None else self._stamp / NANOSECONDS,
+            age=now - self._arrived if self._stamp is not None else math.nan,
+            sample_rate=self._rate, joints=shown, request=self._request,
+            progress=self._progress(), waiting=self._waiting(now, len(shown)),
+            reports=[x for _, (_, x) in sorted(self._reports.items())])
+
+    # -- what is taken -------------------------------------------------------------------------
+
+    def _look_at_graph(self) -> None:
+        node = self._node
+        self._senders = {
+            'samples': node.count_publishers(self._samples.topic_name),
+            'planner': node.count_publishers(self._status.topic_name)}
+        space = node.get_namespace().rstrip('/')
+        end = f'/{interface.FLUX_DENSITY_COMMAND.name}'
+        for name, _ in node.get_topic_names_and_types():
+            if name.startswith(f'{space}/') and name.endswith(end):
+                joint = name[len(space):-len(end)].strip('/')
+                if '/' not in joint and joint not in self._commands:
+                    self._commands[joint] = _Commands(node.create_subscription(
+                        MagneticField, name, lambda _: None, _REPORT_QOS))
+
+    def _take_planner(self) -> None:
+        for message, _ in self._drain(self._plan, JointTrajectory):
+            self._planned_joints = tuple(message.joint_names)
+            start = from_time(message.header.stamp)
+            times = [from_time(x.time_from_start) for x in message.points]
+            self._plan_span = (start, start + max(times)) if times else None
+        for message, _ in self._drain(self._status, DiagnosticStatus):
+            values = {x.key: x.value for x in message.values}
+            self._targets = tuple(float(x) for x in _NUMBER.findall(values.get('stretch', '')))
+            if not self._planned_joints and message.hardware_id:
+                self._planned_joints = (message.hardware_id,)
+            self._request = Request(
+                message.level[0], message.message, values.get('code', ''),
+                values.get('state', ''), _whole(values.get('setpoint')),
+                _whole(values.get('setpoints')))
+
+    def _take_samples(self, now: float) -> None:
+        taken: dict[tuple[str, ...], list[JointState]] = {}
+        last = None
+        for message, info in self._drain(self._samples, JointState):
+            taken.setdefault(tuple(message.name), []).append(message)
+            last = message, info
+        if last is None:
+            if now - self._arrived > _QUIET_SECONDS:
+                self._rate, self._counted = math.nan, None
+            return
+        self._arrived = now
+        self._stamp = from_time(last[0].header.stamp)
+        number = int(last[1].get('publication_sequence_number') or 0)
+        if self._counted is None or number < self._counted[1]:
+            self._counted = now, number
+        elif now - self._counted[0] >= _RATE_SECONDS:
+            self._rate = (number - self._counted[1]) / (now - self._counted[0])
+            self._counted = now, number
+        for names, messages in taken.items():
+            self._put(now, names, messages)
+
+    def _put(self, now: float, names: tuple[str, ...], messages: list[JointState]) -> None:
+        newest = messages[-1]
+        messages = [x for x in messages if len(x.position) == len(names)]
+        if not messages:
+            return
+        stretches = np.array([x.position for x in messages], dtype=np.float64)
+        for i, name in enumerate(names):
+            joint = self._joints.get(name)
+            if joint is None:
+                joint = self._joints[name] = Joint(
+                    name, History(self._span), History(self._span))
+            joint.stretch = float(stretches[-1, i])
+            joint.rate = newest.velocity[i] if i < len(newest.velocity) else math.nan
+            joint.flux_density = newest.effort[i] if i < len(newest.effort) else math.nan
+            finite = stretches[np.isfinite(stretches[:, i]), i]
+            if len(finite):
+                joint.stretches.put(self._looked, now, finite)
+
+    def _take_commands(self) -> None:
+        for name, commands in self._commands.items():
+            for message, _ in self._drain(commands.subscription, MagneticField):
+                commands.take(from_time(message.header.stamp), message.magnetic_field.z)
+            value = commands.at(self._stamp)
+            joint = self._joints.get(name or self._only_joint())
+            if joint is not None:
+                joint.commanded = value
+
+    def _only_joint(self) -> str:
+        """Return the joint that topics without its name are of."""
+        for names in (self._planned_joints, tuple(self._joints)):
+            if len(names) == 1:
+                return names[0]
+        return ''
+
+    def _take_reports(self, now: float) -> None:
+        for message, _ in self._drain(self._diagnostics, DiagnosticArray):
+            for status in message.status:
+                name = status.name.partition(':')[0].strip().rpartition('/')[2]
+                # A robot's diagnostics are of many other things.
+                if name not in interface.NODES and status.hardware_id not in self._joints:
+                    continue
+                counts = {x.key: int(x.value) for x in status.values
+                          if '.' not in x.key and x.value.isdigit()}
+                self._reports[status.name] = now, Report(
+                    name, status.level[0], status.message, counts)
+        for key, (when, report) in list(self._reports.items()):
+            report.age = now - when
+            if report.age > _FORGET_SECONDS:
+                del self._reports[key]
+
+    # -- what follows --------------------------------------------------------------------------
+
+    def _target_of(self, name: str) -> float:
+        if name in self._planned_joints and len(self._targets) == len(self._planned_joints):
+            return self._targets[self._planned_joints.index(name)]
+        return math.nan
+
+    def _progress(self) -> float:
+        if self._plan_span is None or self._stamp is None:
+            return math.nan
+        begin, end = self._plan_span
+        if end <= begin:
+            return float(self._stamp >= end)
+        return min(max((self._stamp - begin) / (end - begin), 0.0), 1.0)
+
+    def _waiting(self, now: float, shown: int) -> list[str]:
+        """Return what is missing, with what may be the reason."""
+        if now - self._begin < _DISCOVERY_SECONDS:
+            return [] if shown or self._request else ['looking around']
+        where = f'on domain {self._domain}'
+        if self._node.get_namespace() != '/':
+            where += f' in namespace {self._node.get_namespace()}'
+        mend = ('is it running, with the same ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE '
+                'as here?')
+        sentences = []
+        if not self._senders['samples']:
+            sentences.append(f'no plant or driver that sends joint states seen {where}: {mend}')
+        elif now - self._arrived > _QUIET_SECONDS:
+            quiet = now - max(self._arrived, self._begin)
+            sentences.append(
+                f'nothing on {self._samples.topic_name} for {quiet:.0f} s: is the plant paused?')
+        elif not shown:
+            sentences.append(
+                f'no joint {" or ".join(self._wanted)} on {self._samples.topic_name}: it has '
+                + ', '.join(list(self._joints)[:8]))
+        if not self._senders['planner']:
+            sentences.append(f'no planner seen {where}: {mend}')
+        return sentences
+
+
+def _whole(text: str | None) -> int:
+    return int(text) if text and text.isdigit() else 0

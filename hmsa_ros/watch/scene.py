@@ -1,0 +1,213 @@
+"""What is seen of a run at one moment."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+import math
+
+import numpy as np
+
+from hmsa_ros.core.model import Array
+
+#: What diagnostics and verdicts call their levels.
+LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
+
+
+class History:
+    """
+    The least and the largest value in each of the last slots of time.
+
+    Nothing between two looks is lost that a chart could show: peaks are kept.
+
+    Parameters
+    ----------
+    span : float
+        How far back it reaches, in s.
+    slots : int
+        How many slots that is.
+
+    """
+
+    def __init__(self, span: float, slots: int = 480) -> None:
+        """Begin empty."""
+        self._slot = span / slots
+        self._low = np.full(slots, np.nan)
+        self._high = np.full(slots, np.nan)
+        self._newest = 0
+
+    def put(self, before: float, now: float, values: Array) -> None:
+        """
+        Take in samples that arrived between two looks, evenly as far as is known.
+
+        Parameters
+        ----------
+        before, now : float
+            Times of the looks in s.
+        values : ndarray
+            In order.
+
+        """
+        self._advance(now)
+        count = len(self._low)
+        times = before + (now - before) * np.arange(1, len(values) + 1) / max(len(values), 1)
+        slots = np.floor(times / self._slot).astype(np.int64)
+        for slot in np.unique(slots[slots > self._newest - count]).tolist():
+            part = values[slots == slot]
+            place = slot % count
+            self._low[place] = np.fmin(self._low[place], part.min())
+            self._high[place] = np.fmax(self._high[place], part.max())
+
+    def _advance(self, now: float) -> None:
+        newest = math.floor(now / self._slot)
+        gone = min(newest - self._newest, len(self._low))
+        for slot in range(newest - gone + 1, newest + 1):
+            self._low[slot % len(self._low)] = np.nan
+            self._high[slot % len(self._high)] = np.nan
+        self._newest = max(newest, self._newest)
+
+    def ranges(self, now: float, columns: int) -> tuple[Array, Array]:
+        """
+        Return the range of values in each column of a chart.
+
+        Parameters
+        ----------
+        now : float
+            Time of the right edge in s.
+        columns : int
+            At least 1.
+
+        Returns
+        -------
+        low, high : ndarray, shape (columns,)
+            Oldest first; NaN where there was no value.
+
+        """
+        self._advance(now)
+        count = len(self._low)
+        order = np.arange(self._newest - count + 1, self._newest + 1) % count
+        begins = np.linspace(0, count, columns, endpoint=False).astype(np.int64)
+        # NaN is passed over; a column without any value gives NaN.
+        return np.fmin.reduceat(self._low[order], begins), np.fmax.reduceat(
+            self._high[order], begins)
+
+
+@dataclass
+class Joint:
+    """
+    One actuator.
+
+    Attributes
+    ----------
+    name : str
+        Of the joint.
+    stretch, rate, flux_density : float
+        Newest sample; the rate in 1/s, the flux density in force in T. NaN if not known.
+    target : float
+        Stretch that is asked for.
+    commanded : float
+        Newest commanded flux density in T.
+    stretches, targets : History
+        Of the chart.
+
+    """
+
+    name: str
+    stretches: History
+    targets: History
+    stretch: float = math.nan
+    rate: float = math.nan
+    flux_density: float = math.nan
+    target: float = math.nan
+    commanded: float = math.nan
+
+
+@dataclass
+class Request:
+    """
+    What the planner says of its last request.
+
+    Attributes
+    ----------
+    level : int
+        Index of `LEVELS`.
+    message, code, state : str
+        Sentence, code, and progress (idle, waiting, moving, holding, settling, at_rest).
+    setpoint, setpoints : int
+        Which one is under way, from 1, and how many there are.
+
+    """
+
+    level: int
+    message: str
+    code: str
+    state: str
+    setpoint: int
+    setpoints: int
+
+
+@dataclass
+class Report:
+    """
+    What a node says of its health.
+
+    Attributes
+    ----------
+    name : str
+        Who says it.
+    level : int
+        Index of `LEVELS`.
+    message : str
+        Its sentence.
+    counts : dict of str to int
+        Its counters.
+    age : float
+        In s, since it was said.
+
+    """
+
+    name: str
+    level: int
+    message: str
+    counts: dict[str, int]
+    age: float = 0.0
+
+
+@dataclass
+class Scene:
+    """
+    What is seen at one moment.
+
+    Attributes
+    ----------
+    where : str
+        Domain and namespace, in words.
+    now : float
+        Time of this look, in s of a clock that only goes on.
+    stamp : float
+        Of the newest sample, in s; NaN without one.
+    age : float
+        Since the newest sample arrived, in s; NaN without one.
+    sample_rate : float
+        Samples that arrived a second; NaN without one.
+    joints : list of Joint
+        In the order of the samples.
+    request : Request or None
+        What the planner says; None before it does.
+    progress : float
+        Share of the plan that is done; NaN without a plan.
+    reports : list of Report
+        By name.
+    waiting : list of str
+        What is waited for, a sentence each.
+
+    """
+
+    where: str
+    now: float = 0.0
+    stamp: float = math.nan
+    age: float = math.nan
+    sample_rate: float = math.nan
+    joints: Sequence[Joint] = field(default_factory=list)
+    request: Request | None = None
+    progress: float = math.nan
+    reports: Sequence[Report] = field(default_factory=list)
+    waiting: Sequence[str] = field(default_factory=list)

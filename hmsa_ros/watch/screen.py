@@ -1,0 +1,300 @@
+"""The scene as text: a screen for a terminal, a line for a log, or JSON for a program."""
+
+from collections.abc import Mapping
+import math
+from typing import Any
+
+import numpy as np
+from rich.cells import cell_len
+from rich.text import Text
+
+from hmsa_ros.core.model import Array
+from hmsa_ros.watch.chart import dots, limits, strip
+from hmsa_ros.watch.scene import Joint, LEVELS, Report, Scene
+
+#: Counters that tell of trouble: shown before the others, and in a line.
+TROUBLES = ('late', 'replanned', 'lost', 'refused', 'failed', 'timeouts')
+# Levels by word and colour, never by colour alone.
+_STYLES = ('green', 'yellow', 'bold red', 'yellow')
+_VALUE, _TARGET, _SOFT, _WAITING = 'cyan', 'magenta', 'dim', 'bold yellow'
+# Width of the axis beside a chart.
+_GUTTER = 10
+# Rows of a joint with a chart of its own: two of text and at least so many of the chart.
+_TEXT_ROWS, _CHART_ROWS, _MOST_CHART_ROWS = 2, 3, 24
+# What is around the lines of a table: its head, and how many joints are not shown.
+_ENDS = 2
+# Smallest range of a chart's axis.
+_LEAST_RANGE = 1e-3
+_MOST_REPORTS = 4
+# A node that reports once a second and has not for so long is silent, in s.
+SILENT_AFTER = 3.5
+
+
+def number(value: float, form: str = '.5f') -> str:
+    """Return a number as text; a question mark where it is not known."""
+    return f'{value:{form}}' if math.isfinite(value) else '?'
+
+
+def _millitesla(value: float) -> str:
+    return f'{1e3 * value:+.3f} mT' if math.isfinite(value) else '?'
+
+
+def _off(joint: Joint) -> str:
+    return number(joint.stretch - joint.target, '+.1e')
+
+
+class Screen:
+    """
+    Shows scenes on a terminal.
+
+    Parameters
+    ----------
+    span : float
+        Of the charts, in s.
+    unicode : bool
+        Whether the terminal shows more than ASCII.
+
+    """
+
+    def __init__(self, span: float, *, unicode: bool = True) -> None:
+        """Take the settings."""
+        self._span = span
+        self._unicode = unicode
+
+    def lines(self, scene: Scene, width: int, height: int) -> list[Text]:
+        """
+        Return a frame.
+
+        Parameters
+        ----------
+        scene : Scene
+            What to show.
+        width, height : int
+            Size of the terminal in characters.
+
+        Returns
+        -------
+        list of Text
+            At most ``height`` lines of at most ``width``.
+
+        """
+        foot = self._foot(scene, width)
+        head = [self._head(scene, width)]
+        room = height - len(head) - len(foot)
+        lines = [*head, *self._joints(scene, width, max(room, 1)), *foot][:max(height, 1)]
+        for line in lines:
+            line.no_wrap, line.overflow = True, 'crop'
+            line.truncate(width)
+        return lines
+
+    # -- parts ---------------------------------------------------------------------------------
+
+    def _head(self, scene: Scene, width: int) -> Text:
+        left = f'hmsa watch  {scene.where}'
+        right = '' if math.isnan(scene.stamp) else f'{_time(scene.stamp)}  '
+        if math.isfinite(scene.sample_rate):
+            right += f'{scene.sample_rate:.0f} samples/s  '
+        right += 'q ends'
+        space = max(width - cell_len(left) - len(right), 2)
+        return Text(left + ' ' * space + right, style='bold')
+
+    def _foot(self, scene: Scene, width: int) -> list[Text]:
+        lines = [Text(('─' if self._unicode else '-') * width, style=_SOFT)]
+        request = scene.request
+        if request is not None:
+            count = f'setpoint {request.setpoint} of {request.setpoints}  ' \
+                if request.setpoints else ''
+            line = Text(f'plan     {count}{request.state.replace("_", " ")}')
+            if math.isfinite(scene.progress):
+                line.append('  ').append(self._bar(scene.progress, max(width - 60, 10)))
+                line.append(f' {100.0 * scene.progress:.0f} %')
+            lines.append(line)
+            lines.append(_judged('verdict', request.level, request.message))
+        for report in scene.reports[:_MOST_REPORTS]:
+            silent = report.age > SILENT_AFTER
+            lines.append(_judged(
+                report.name, 3 if silent else report.level,
+                (f'silent for {report.age:.0f} s' if silent else report.message)
+                + _counts(report)))
+        for sentence in scene.waiting:
+            lines += [Text(row, style=_WAITING) for row in _wrapped(sentence, width)]
+        return lines
+
+    def _bar(self, share: float, width: int) -> str:
+        done = round(min(max(share, 0.0), 1.0) * width)
+        full, empty = ('━', '┄') if self._unicode else ('#', '.')
+        return full * done + empty * (width - done)
+
+    def _joints(self, scene: Scene, width: int, room: int) -> list[Text]:
+        joints = scene.joints
+        if not joints:
+            return []
+        each = room // len(joints)
+        if each < _TEXT_ROWS + _CHART_ROWS and len(joints) > 1:
+            return self._table(scene, width, room)
+        rows = min(each - _TEXT_ROWS, _MOST_CHART_ROWS)
+        lines: list[Text] = []
+        for joint in joints:
+            lines += self._joint(joint, scene.now, width, max(rows, 1))[:each]
+        return lines
+
+    def _joint(self, joint: Joint, now: float, width: int, rows: int) -> list[Text]:
+        first = Text(f'{joint.name}  ', style='bold')
+        first.append(f'stretch {number(joint.stretch)}', style=_VALUE)
+        first.append(f'  target {number(joint.target)}', style=_TARGET)
+        first.append(f'  off {_off(joint)}', style='not bold')
+        first.append(f'  rate {number(joint.rate, "+.3f")} 1/s', style='not bold')
+        second = Text(
+            f'flux density {_millitesla(joint.flux_density)}, '
+            f'commanded {_millitesla(joint.commanded)}')
+        columns = max(width - _GUTTER, 1) * dots(self._unicode)[0]
+        value, target = self._history(joint, now, columns)
+        drawn = strip(
+            value, target, rows, limits(*value, *target, least=_LEAST_RANGE),
+            braille=self._unicode)
+        lines = []
+        for i, (row, alone) in enumerate(zip(drawn.rows, drawn.targets, strict=True)):
+            label = {0: f'{drawn.high:.4f}', rows - 1: f'{drawn.low:.4f}'}.get(i, '')
+            line = Text(f'{label:>{_GUTTER - 2}} ', style=_SOFT)
+            line.append('│' if self._unicode else '|')
+            lines.append(line.append(_coloured(row, alone)))
+        second.append(f'   {self._span:g} s across', style=_SOFT)
+        return [first, second, *lines]
+
+    def _history(
+            self, joint: Joint, now: float, columns: int
+    ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        return joint.stretches.ranges(now, columns), joint.targets.ranges(now, columns)
+
+    def _table(self, scene: Scene, width: int, room: int) -> list[Text]:
+        """Return a line for each joint, with a chart of one row at its end."""
+        wide = min(max(len(x.name) for x in scene.joints), 16)
+        lines = [Text(
+            f'{"joint":<{wide}} {"stretch":>8} {"target":>8} {"off":>8} {"flux density":>13}',
+            style=_SOFT)]
+        if room <= _ENDS:
+            # Too small for more than the joints themselves.
+            lines = []
+        shown = list(scene.joints)
+        if len(shown) > room - len(lines):
+            shown = shown[:max(room - len(lines) - 1, 0)]
+        for joint in shown:
+            line = Text(f'{joint.name[:wide]:<{wide}} ')
+            line.append(f'{number(joint.stretch):>8}', style=_VALUE)
+            line.append(f' {number(joint.target):>8}', style=_TARGET)
+            line.append(f' {_off(joint):>8} {_millitesla(joint.flux_density):>13} ')
+            across = (width - cell_len(line.plain)) * dots(self._unicode)[0]
+            if across > 0:
+                value, target = self._history(joint, scene.now, across)
+                drawn = strip(
+                    value, target, 1, limits(*value, *target, least=_LEAST_RANGE),
+                    braille=self._unicode)
+                line.append(_coloured(drawn.rows[0], drawn.targets[0]))
+            lines.append(line)
+        hidden = len(scene.joints) - len(shown)
+        if hidden:
+            lines.append(Text(
+                f'and {hidden} more: name some with --joint', style=_SOFT))
+        return lines
+
+
+def _coloured(row: str, alone: tuple[int, ...]) -> Text:
+    """Return a row of a chart, the target in its own colour."""
+    text = Text(row, style=_VALUE)
+    for column in alone:
+        text.stylize(_TARGET, column, column + 1)
+    return text
+
+
+def _judged(name: str, level: int, message: str) -> Text:
+    level = min(max(level, 0), len(LEVELS) - 1)
+    line = Text(f'{name:<8} ')
+    line.append(f'{LEVELS[level]:<5} ', style=_STYLES[level])
+    return line.append(message)
+
+
+def _counts(report: Report) -> str:
+    names = sorted(report.counts, key=lambda x: x not in TROUBLES)
+    return ''.join(f', {name.replace("_", " ")} {report.counts[name]}' for name in names)
+
+
+def _wrapped(sentence: str, width: int) -> list[str]:
+    from textwrap import wrap
+    return wrap(sentence, max(width, 10))
+
+
+def _time(stamp: float) -> str:
+    """Return a stamp: of a wall clock as the time of day, of a simulation in seconds."""
+    if stamp < 1e8:
+        return f'{stamp:.3f} s (simulated)'
+    from datetime import datetime
+    return datetime.fromtimestamp(stamp).strftime('%H:%M:%S')
+
+
+def line(scene: Scene) -> str:
+    """
+    Return a scene as one line of plain text.
+
+    Parameters
+    ----------
+    scene : Scene
+        What to show.
+
+    Returns
+    -------
+    str
+        Without a line end.
+
+    """
+    parts = [] if math.isnan(scene.stamp) else [_time(scene.stamp)]
+    parts += [
+        f'{x.name} {number(x.stretch)} (target {number(x.target)}, '
+        f'{_millitesla(x.flux_density)})' for x in scene.joints]
+    if scene.request is not None:
+        request = scene.request
+        count = f' {request.setpoint}/{request.setpoints}' if request.setpoints else ''
+        parts.append(
+            f'{request.state.replace("_", " ")}{count}, {LEVELS[min(request.level, 3)]} '
+            f'{request.message}')
+    for report in scene.reports:
+        troubles = [f'{x} {report.counts[x]}' for x in TROUBLES if report.counts.get(x)]
+        if troubles or report.level:
+            parts.append(f'{report.name}: ' + ', '.join([report.message, *troubles]))
+    parts += scene.waiting
+    return '; '.join(parts)
+
+
+def as_json(scene: Scene) -> Mapping[str, Any]:
+    """
+    Return a scene for JSON.
+
+    Parameters
+    ----------
+    scene : Scene
+        What to show.
+
+    Returns
+    -------
+    dict
+        With None for what is not known.
+
+    """
+    def known(value: float) -> float | None:
+        return float(value) if np.isfinite(value) else None
+
+    return {
+        'where': scene.where, 'stamp': known(scene.stamp), 'age': known(scene.age),
+        'sample_rate': known(scene.sample_rate),
+        'joints': [{
+            'name': x.name, 'stretch': known(x.stretch), 'stretch_rate': known(x.rate),
+            'flux_density': known(x.flux_density), 'target': known(x.target),
+            'flux_density_command': known(x.commanded)} for x in scene.joints],
+        'request': None if scene.request is None else {
+            'level': LEVELS[min(scene.request.level, 3)], 'message': scene.request.message,
+            'code': scene.request.code, 'state': scene.request.state,
+            'setpoint': scene.request.setpoint, 'setpoints': scene.request.setpoints},
+        'progress': known(scene.progress),
+        'reports': [{
+            'name': x.name, 'level': LEVELS[min(x.level, 3)], 'message': x.message,
+            'counts': x.counts, 'age': x.age} for x in scene.reports],
+        'waiting': list(scene.waiting)}
