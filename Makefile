@@ -48,13 +48,22 @@ bench: $(VENV)/.bench env ## measure speed and accuracy
 figures: env ## draw Figures 2 to 10 of the paper into figures/
 	$(BIN)/hmsa figures --out figures $(ARGS)
 
+.PHONY: docs
+docs: env ## build the documentation into docs/_build/html, warnings as errors
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html $(ARGS)
+	@echo "docs/_build/html/index.html"
+
+.PHONY: graph
+graph: env ## draw docs/images/graph.svg anew, when a topic has changed
+	$(BIN)/python scripts/draw_graph.py
+
 .PHONY: constraints
 constraints: ## write constraints.txt anew, with each of $(PYTHONS)
 	$(PYTHON) scripts/make_constraints.py $(PYTHONS)
 
 .PHONY: clean
 clean: ## remove the environment, builds and caches
-	rm -rf $(VENV) build install log dist figures *.egg-info
+	rm -rf $(VENV) build install log dist figures docs/_build *.egg-info
 	rm -rf .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
@@ -71,7 +80,7 @@ $(VENV)/.installed: setup.py setup.cfg pyproject.toml package.xml constraints.tx
 	"ensurepip; install them (on Debian and Ubuntu: python3-venv)" >&2; exit 1; }
 	@echo "Making the environment $(VENV), which takes some minutes the first time"
 	$(PYTHON) -m venv --clear $(VENV)
-	$(INSTALL) -e '.[ros,test,studies]'
+	$(INSTALL) -e '.[ros,test,studies,docs]'
 	@touch $@
 
 $(VENV)/.bench: $(VENV)/.installed

@@ -62,9 +62,10 @@ EXTRAS_REQUIRE = {
         'casadi>=3.6',
     ],
     'docs': [
-        'myst-parser>=2.0',
+        'furo>=2024.8',
+        'myst-parser>=4.0',
         'numpydoc>=1.6',
-        'sphinx>=7.2',
+        'sphinx>=8.1',
     ],
 }
 

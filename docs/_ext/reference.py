@@ -423,10 +423,11 @@ class Topics(Generated):
                     f'topic {topic.name} in hmsa_ros.nodes.interface has no meaning, or no '
                     'publishers and subscribers: expected both beside its name')
             rows.append((
-                f'`{topic.name}`<br>`{type_name(topic.type)}`',
+                f'`{topic.name}`',
                 f'{topic.meaning}<br>*From {" and ".join(topic.publishers) or "you"} to '
-                f'{" and ".join(topic.subscribers) or "you"}; {qos_text(topic.qos)}.*'))
-        return table(('name and type', 'meaning'), rows)
+                f'{" and ".join(topic.subscribers) or "you"}: `{type_name(topic.type)}`, '
+                f'{qos_text(topic.qos)}.*'))
+        return table(('name', 'meaning'), rows)
 
 
 class Services(Generated):
@@ -441,8 +442,9 @@ class Services(Generated):
                     f'service {service.name} in hmsa_ros.nodes.interface has no meaning: '
                     'expected one for each node that serves it')
         return table(
-            ('node', 'name and type', 'a call'),
-            ((node, f'`{service.name}`<br>`{type_name(service.type)}`', service.meaning[node])
+            ('node', 'name', 'meaning'),
+            ((node, f'`{service.name}`',
+              f'{service.meaning[node]}<br>*`{type_name(service.type)}`*')
              for node in interface.NODES for service in services if node in service.meaning))
 
 
@@ -470,9 +472,10 @@ class Parameters(Generated):
                 *([] if limits == 'any value' else [limits]),
                 *([] if spec.read_only else ['can be set while running'])]
             rows.append((
-                f'`{spec.name}`', f'`{shown}`' + (f' {spec.unit}' if spec.unit else ''),
-                f'{spec.description}<br>*{"; ".join(details)}*'))
-        return table(('name', 'default', 'meaning'), rows)
+                f'`{spec.name}`',
+                f'{spec.description}<br>*Default `{shown}`'
+                + (f' {spec.unit}' if spec.unit else '') + f'; {"; ".join(details)}.*'))
+        return table(('name', 'meaning'), rows)
 
 
 class Codes(Generated):

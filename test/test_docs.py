@@ -1,0 +1,169 @@
+"""The pages: built with warnings as errors, and every block in them run or checked."""
+
+from collections.abc import Mapping
+from importlib import import_module
+from pathlib import Path
+import subprocess
+import sys
+import time
+
+from documents import (
+    alike,
+    Block,
+    blocks,
+    check,
+    commands,
+    console,
+    Failure,
+    fault,
+    INSTALLATION,
+    pages,
+    REPOSITORY,
+    ROOT,
+    run_page,
+    Session,
+)
+import pytest
+
+PAGES = pages()
+RUNNING = [page for page in PAGES if any(block.runs for block in blocks(page))]
+
+
+def name_of(page: Path) -> str:
+    """Return a page as it reads from the root of the repository."""
+    return str(page.relative_to(ROOT))
+
+
+def a_block(language: str, text: str, marker: str = '') -> Block:
+    """Return a block of some page."""
+    return Block(ROOT / 'README.md', 1, language, marker, text)
+
+
+@pytest.mark.parametrize('page', PAGES, ids=name_of)
+def test_every_block_of_the_page_is_run_or_checked(page):
+    found = blocks(page)
+    before = [None, *found]
+    assert [f'{block.place} {reason}' for block, previous in zip(found, before, strict=False)
+            if (reason := fault(block, previous))] == []
+    for block in found:
+        if not block.runs:
+            check(block)
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+@pytest.mark.parametrize('page', RUNNING, ids=name_of)
+def test_page_does_what_it_says(
+        page: Path, ros_env: Mapping[str, str], tmp_path: Path,
+        capsys: pytest.CaptureFixture[str]):
+    began = time.monotonic()
+    count = run_page(page, tmp_path, ros_env)
+    with capsys.disabled():
+        print(f'\n{name_of(page)}: ran {count} blocks in {time.monotonic() - began:.1f} s')
+
+
+def test_pages_are_built_without_a_warning(tmp_path):
+    built = subprocess.run(
+        [sys.executable, '-m', 'sphinx', '-W', '--keep-going', '-q', '-b', 'html',
+         '-d', str(tmp_path / 'doctrees'), str(ROOT / 'docs'), str(tmp_path / 'html')],
+        capture_output=True, text=True, check=False)
+    assert (built.returncode, built.stderr) == (0, '')
+    topics = (tmp_path / 'html' / 'reference' / 'topics.html').read_text(encoding='utf-8')
+    assert 'flux_density_command' in topics
+    assert '~/split_bagfile' in topics
+    parameters = (tmp_path / 'html' / 'reference' / 'parameters.html').read_text(encoding='utf-8')
+    for node in ('planner', 'plant', 'recorder', 'player'):
+        for spec in import_module(f'hmsa_ros.nodes.{node}').PARAMETERS:
+            assert f'>{spec.name}<' in parameters
+    theory = (tmp_path / 'html' / 'theory.html').read_text(encoding='utf-8')
+    assert '<math' in theory
+    assert '<script src="http' not in theory
+
+
+def test_graph_shows_the_topics_as_they_are():
+    drawn = subprocess.run(
+        [sys.executable, str(ROOT / 'scripts' / 'draw_graph.py'), '--check'],
+        capture_output=True, text=True, check=False)
+    assert drawn.stderr == ''
+
+
+def test_a_block_that_fails_is_told_with_what_it_printed(tmp_path):
+    session = Session(tmp_path, {})
+    try:
+        assert session.run('bash', 'x=3; echo $x', 'here') == '3\n'
+        assert session.run('bash', 'echo $((x + 1))', 'here') == '4\n'
+        assert session.run('python', 'y = 1\nprint(y)', 'here') == '1\n'
+        with pytest.raises(Failure, match=r'there: status 1(?s:.)*ZeroDivisionError'):
+            session.run('python', 'y / 0', 'there')
+        with pytest.raises(Failure, match='there: status 7'):
+            session.run('bash', '(exit 7)\necho not reached', 'there')
+    finally:
+        session.close()
+
+
+def test_a_background_process_that_fails_is_told_at_the_end_of_the_page(tmp_path):
+    session = Session(tmp_path, {})
+    session.run('bash', '(exit 3) &', 'here')
+    with pytest.raises(Failure, match='ended with status 3'):
+        session.close()
+
+
+def test_output_is_compared_word_by_word_and_number_by_number():
+    assert alike('a 1.3157 5e-08 yes', 'a 1.31575 9.1e-08 yes')
+    assert not alike('a 1.31 yes', 'a 1.35 yes')
+    assert not alike('a 1 yes', 'a 1 no')
+    assert not alike('a', 'a b')
+    assert alike('a ... d', 'a b c d')
+    assert not alike('a ... e', 'a b c d')
+
+
+def test_commands_are_found_behind_pipes_variables_and_continued_lines():
+    assert commands('A=1 ros2 topic list | grep x &\nros2 run a \\\n  b # c') == [
+        ['ros2', 'topic', 'list'], ['grep', 'x'], ['ros2', 'run', 'a', 'b']]
+
+
+def test_console_blocks_are_commands_with_their_output():
+    assert console(a_block('console', '$ a \\\n  b\nout\n$ c\n')) == [
+        ('a \\\n  b', 'out'), ('c', '')]
+
+
+@pytest.mark.parametrize(('text', 'reason'), [
+    ('ros2 run hmsa_ros plnner', 'no executable'),
+    ('ros2 run hmsa_ros plant --ros-args -p publish_clk:=true', "'publish_clk' is not declared"),
+    ('ros2 run hmsa_ros hmsa send', 'hmsa does not understand'),
+    ('ros2 launch hmsa_ros demo.launch.py recrd:=true', "no argument 'recrd'"),
+    ('ros2 launch hmsa_ros demo.launch.py record:=maybe', "record cannot be 'maybe'"),
+    ('ros2 launch hmsa_ros nothing.launch.py', 'no launch file'),
+    ("ros2 topic pub --once /planner/setpoint std_msgs/msg/Float64 '{dta: 1}'", "no field 'dta'"),
+    ("ros2 topic pub /planner/setpoint std_msgs/msg/Float32 '{data: 1}'", 'has type Float64'),
+    ("ros2 topic pub /planner/setpont std_msgs/msg/Float64 '{data: 1}'", 'no topic'),
+    ('ros2 topic echo /stretsh', 'no topic'),
+    ('ros2 service call /planner/stp std_srvs/srv/Trigger', 'no service'),
+    ('ros2 param set /planner shapr zvd', "'shapr' is not declared"),
+    ('ros2 param set /plnner shaper zvd', 'no node'),
+    ('frobnicate', 'no program'),
+    ('echo "', 'unexpected EOF'),
+])
+def test_a_wrong_name_in_a_block_for_an_installation_is_found(text, reason):
+    with pytest.raises(Failure, match=reason):
+        check(a_block('bash', text, INSTALLATION))
+
+
+@pytest.mark.parametrize(('language', 'marker', 'text', 'reason'), [
+    ('bash', REPOSITORY, 'make tset', "no target 'tset'"),
+    ('bash', REPOSITORY, "pip install '.[rso]'", "no extra 'rso'"),
+    ('bash', REPOSITORY, '.ci/rn', 'no file'),
+    ('yaml', '', '/**:\n  ros__parameters:\n    lead_tme: 1.0\n', "'lead_tme' is not declared"),
+    ('yaml', '', 'a: [', 'expected'),
+    ('json', '', '{', 'Expecting'),
+])
+def test_a_wrong_name_in_any_other_block_is_found(language, marker, text, reason):
+    with pytest.raises(Failure, match=reason):
+        check(a_block(language, text, marker))
+
+
+@pytest.mark.parametrize(('language', 'marker', 'reason'), [
+    ('', '', 'no language'), ('bash', 'skip', "marked 'skip'"), ('python', 'skip', 'marked'),
+    ('ini', '', "is in 'ini'"), ('{code-block}', '', 'is in')])
+def test_a_block_cannot_be_left_out(language, marker, reason):
+    assert reason in fault(a_block(language, 'x', marker), None)
