@@ -545,6 +545,9 @@ class Player(Node):
     def _send_all(self, messages: Iterable[Message], start: int) -> str:
         """Send messages, each at its time; return 'end', 'seek' or 'stop'."""
         tick = start
+        if self._values['play.clock_publish_frequency'] > 0.0:
+            # Before the first message: in a loop, time jumps back with this.
+            self._send_clock(start)
         on_publish = self._values['play.clock_publish_on_topic_publish']
         for message in messages:
             outcome, tick = self._tick_until(message.log_time, tick, last=False)
@@ -566,7 +569,7 @@ class Player(Node):
         """Wait until a time of the bag, with the clock's ticks before it."""
         frequency = self._values['play.clock_publish_frequency']
         if frequency > 0.0:
-            while tick < when:
+            while tick <= when:
                 outcome = self._wait(tick, message=False)
                 if outcome:
                     return outcome, tick
