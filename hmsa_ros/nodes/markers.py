@@ -1,0 +1,325 @@
+"""
+The actuators as markers for a 3-D view: pure functions from states to messages.
+
+Each joint has a namespace of its own with fixed identifiers, so that a message replaces the one
+before. The plant shows what is, the planner where it is to go. Both place their joints alike:
+in rows along x, a new row along y after `ROW` of them, the origin in their middle.
+
+A block keeps its volume: along the field, which is z, it measures 2 H times the stretch, across
+it 2 L over the square root of the stretch. The magnetisation moves with the material, so that
+the remanence in the deformed block is Br times the stretch. It and the applied field are arrows
+of one scale: as long as H for each Br, upwards where positive.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+import math
+
+from builtin_interfaces.msg import Duration, Time
+from geometry_msgs.msg import Point, Pose, Quaternion, Vector3
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from hmsa_ros.core.parameters import ActuatorParameters
+from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.errors import BadInputError
+
+#: Identifiers of a joint's markers, the same in every message.
+BLOCK, MAGNETISATION, FIELD, LABEL, TARGET = range(5)
+#: Joints side by side before the next row begins.
+ROW = 8
+#: From block to block, in half lengths of the largest: a block pressed flat to half its
+#: thickness is 2.83 half lengths wide, and its field stands beside it.
+PITCH = 6.0
+#: From the middle of a block to its field, in half lengths.
+BESIDE = 2.0
+
+# Okabe and Ito's palette: orange, blue, vermilion, grey. What is seen through is the material.
+_BLOCK_COLOUR = (0.90, 0.62, 0.00, 0.55)
+_MAGNETISATION_COLOUR = (0.00, 0.45, 0.70, 1.0)
+_FIELD_COLOUR = (0.84, 0.37, 0.00, 1.0)
+_LABEL_COLOUR = (0.75, 0.75, 0.75, 1.0)
+_TARGET_COLOUR = (0.34, 0.71, 0.91, 0.25)
+
+
+@dataclass(frozen=True)
+class Block:
+    """
+    What stays the same of a joint while it moves.
+
+    Attributes
+    ----------
+    joint : str
+        Its name, the namespace of its markers.
+    half_length, half_thickness : float
+        L and H in m, greater than 0.
+    remanence : float
+        Br in T, greater than 0.
+
+    Raises
+    ------
+    BadInputError
+        If the name is empty or a value is not finite and greater than 0.
+
+    """
+
+    joint: str
+    half_length: float
+    half_thickness: float
+    remanence: float
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if not self.joint:
+            raise BadInputError('joint is empty: expected a name')
+        for name in ('half_length', 'half_thickness', 'remanence'):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise BadInputError(
+                    f'{name} of {self.joint} is {value!r}: expected a finite number greater '
+                    'than 0')
+
+    @classmethod
+    def of(cls, joint: str, actuator: ActuatorParameters) -> 'Block':
+        """
+        Return the block of a joint's parameters.
+
+        Parameters
+        ----------
+        joint : str
+            Name of the joint.
+        actuator : ActuatorParameters
+            In SI units.
+
+        Returns
+        -------
+        Block
+            Its part that can be seen.
+
+        """
+        return cls(
+            joint, actuator.half_length, actuator.half_thickness, actuator.remanence)
+
+    def size(self, stretch: float) -> tuple[float, float, float]:
+        """
+        Return the block's size at a stretch, which leaves its volume as it is.
+
+        Parameters
+        ----------
+        stretch : float
+            Along z, greater than 0.
+
+        Returns
+        -------
+        tuple of float
+            2 l, 2 l and 2 h in m.
+
+        """
+        side = 2.0 * self.half_length / math.sqrt(stretch)
+        return side, side, 2.0 * self.half_thickness * stretch
+
+
+@dataclass(frozen=True)
+class State:
+    """
+    What a joint does at a moment.
+
+    Attributes
+    ----------
+    stretch : float
+        Greater than 0.
+    flux_density : float
+        Applied along z, in T.
+
+    """
+
+    stretch: float
+    flux_density: float
+
+
+@dataclass(frozen=True)
+class Scene:
+    """
+    Where and how large joints are shown.
+
+    Attributes
+    ----------
+    blocks : tuple of Block
+        One a joint, in the order of the parameter ``joints``.
+    frame : str
+        Frame of the markers.
+    scale : float
+        Metres shown for a metre, greater than 0; 1 is true to size.
+    lifetime : float
+        Seconds after which a viewer drops what was not sent again, 0 for never.
+
+    Raises
+    ------
+    BadInputError
+        If a number is not finite or out of range.
+
+    """
+
+    blocks: tuple[Block, ...]
+    frame: str
+    scale: float = 1.0
+    lifetime: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if not (math.isfinite(self.scale) and self.scale > 0.0):
+            raise BadInputError(
+                f'scale is {self.scale!r}: expected a finite number greater than 0')
+        if not (math.isfinite(self.lifetime) and self.lifetime >= 0.0):
+            raise BadInputError(
+                f'lifetime is {self.lifetime!r}: expected a finite number of at least 0 s')
+
+    def places(self) -> list[tuple[float, float]]:
+        """
+        Return the middles of the blocks.
+
+        Returns
+        -------
+        list of (float, float)
+            x and y in m, before scaling; the middle of all of them is the origin.
+
+        """
+        pitch = PITCH * max((block.half_length for block in self.blocks), default=0.0)
+        count = len(self.blocks)
+        columns, rows = min(count, ROW), -(-count // ROW)
+        return [
+            (pitch * (number % ROW - (columns - 1) / 2),
+             pitch * ((rows - 1) / 2 - number // ROW))
+            for number in range(count)]
+
+    def states(self, stamp: int, states: Sequence[State]) -> MarkerArray:
+        """
+        Return the markers of all joints as they are.
+
+        Parameters
+        ----------
+        stamp : int
+            Time of the states in ns.
+        states : sequence of State
+            One a block.
+
+        Returns
+        -------
+        visualization_msgs.msg.MarkerArray
+            For each joint its block, the arrows of magnetisation and field, and its name with
+            the stretch. Without a field its arrow is deleted.
+
+        """
+        markers: list[Marker] = []
+        for block, place, state in zip(self.blocks, self.places(), states, strict=True):
+            markers += self._state(stamp, block, place, state)
+        return MarkerArray(markers=markers)
+
+    def targets(self, stamp: int, stretches: Sequence[float | None]) -> MarkerArray:
+        """
+        Return the blocks as they are to become, seen through.
+
+        Parameters
+        ----------
+        stamp : int
+            Time in ns.
+        stretches : sequence of float or None
+            One a block; None deletes its marker.
+
+        Returns
+        -------
+        visualization_msgs.msg.MarkerArray
+            One marker a joint.
+
+        """
+        markers = []
+        for block, place, stretch in zip(self.blocks, self.places(), stretches, strict=True):
+            if stretch is None:
+                markers.append(self._marker(stamp, block, TARGET, Marker.CUBE, None))
+            else:
+                markers.append(self._cube(
+                    stamp, block, TARGET, place, block.size(stretch), _TARGET_COLOUR))
+        return MarkerArray(markers=markers)
+
+    def nothing(self) -> MarkerArray:
+        """
+        Return the message that removes every marker of its topic.
+
+        Returns
+        -------
+        visualization_msgs.msg.MarkerArray
+            One marker that asks for it.
+
+        """
+        return MarkerArray(markers=[
+            Marker(header=Header(frame_id=self.frame), action=Marker.DELETEALL)])
+
+    def _state(
+            self, stamp: int, block: Block, place: tuple[float, float],
+            state: State) -> Iterable[Marker]:
+        size = block.size(state.stretch)
+        unit = block.half_thickness / block.remanence
+        beside = (place[0] + BESIDE * block.half_length, place[1])
+        yield self._cube(stamp, block, BLOCK, place, size, _BLOCK_COLOUR)
+        yield self._arrow(
+            stamp, block, MAGNETISATION, place, unit * block.remanence * state.stretch,
+            _MAGNETISATION_COLOUR)
+        yield self._arrow(
+            stamp, block, FIELD, beside, unit * state.flux_density, _FIELD_COLOUR)
+        label = self._marker(stamp, block, LABEL, Marker.TEXT_VIEW_FACING, _LABEL_COLOUR)
+        label.pose = self._pose(place, size[2] / 2 + 0.8 * block.half_thickness)
+        label.scale = Vector3(z=0.4 * block.half_length * self.scale)
+        label.text = f'{block.joint} {state.stretch:.4f}'
+        yield label
+
+    def _cube(
+            self, stamp: int, block: Block, number: int, place: tuple[float, float],
+            size: tuple[float, float, float],
+            colour: tuple[float, float, float, float]) -> Marker:
+        marker = self._marker(stamp, block, number, Marker.CUBE, colour)
+        marker.pose = self._pose(place, 0.0)
+        marker.scale = Vector3(
+            x=size[0] * self.scale, y=size[1] * self.scale, z=size[2] * self.scale)
+        return marker
+
+    def _arrow(
+            self, stamp: int, block: Block, number: int, place: tuple[float, float],
+            length: float, colour: tuple[float, float, float, float]) -> Marker:
+        """Return an arrow along z about the block's middle, downwards for a negative length."""
+        if length == 0.0:
+            # An arrow of no length has no direction, which viewers complain of.
+            return self._marker(stamp, block, number, Marker.ARROW, None)
+        marker = self._marker(stamp, block, number, Marker.ARROW, colour)
+        half = length / 2 * self.scale
+        x, y = place[0] * self.scale, place[1] * self.scale
+        marker.pose = Pose(orientation=Quaternion(w=1.0))
+        marker.points = [Point(x=x, y=y, z=-half), Point(x=x, y=y, z=half)]
+        # Diameters of shaft and head, and the head's length, no longer than half the arrow.
+        thickness = 0.12 * block.half_length * self.scale
+        marker.scale = Vector3(
+            x=thickness, y=2.5 * thickness, z=min(3.0 * thickness, abs(half)))
+        return marker
+
+    def _marker(
+            self, stamp: int, block: Block, number: int, kind: int,
+            colour: tuple[float, float, float, float] | None) -> Marker:
+        """Return a marker without a place; without a colour it deletes the one before."""
+        sec, nanosec = divmod(stamp, NANOSECONDS)
+        marker = Marker(
+            header=Header(stamp=Time(sec=sec, nanosec=nanosec), frame_id=self.frame),
+            ns=block.joint, id=number, type=kind)
+        if colour is None:
+            marker.action = Marker.DELETE
+            return marker
+        marker.action = Marker.ADD
+        red, green, blue, alpha = colour
+        marker.color = ColorRGBA(r=red, g=green, b=blue, a=alpha)
+        sec, nanosec = divmod(round(self.lifetime * NANOSECONDS), NANOSECONDS)
+        marker.lifetime = Duration(sec=sec, nanosec=nanosec)
+        return marker
+
+    def _pose(self, place: tuple[float, float], height: float) -> Pose:
+        return Pose(
+            position=Point(
+                x=place[0] * self.scale, y=place[1] * self.scale, z=height * self.scale),
+            orientation=Quaternion(w=1.0))

@@ -1,0 +1,169 @@
+"""The actuators as markers: geometry, signs, places and identifiers."""
+
+from itertools import pairwise
+import math
+
+from hypothesis import given, strategies
+import pytest
+from visualization_msgs.msg import Marker, MarkerArray
+
+from hmsa_ros.core.parameters import paper_actuator
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.nodes.markers import (
+    BLOCK,
+    Block,
+    FIELD,
+    LABEL,
+    MAGNETISATION,
+    Scene,
+    State,
+    TARGET,
+)
+
+ACTUATOR = paper_actuator()
+STRETCHES = strategies.floats(0.3, 3.0)
+# Floating-point rounding of a few operations.
+ROUNDING = 1e-12
+
+
+def scene(*joints: str, **options: object) -> Scene:
+    """Return a scene of blocks as in the paper."""
+    return Scene(tuple(Block.of(joint, ACTUATOR) for joint in joints), 'coil', **options)
+
+
+def of(markers: MarkerArray, number: int, joint: str = 'actuator') -> Marker:
+    """Return the one marker of a joint that has an identifier."""
+    found = [x for x in markers.markers if (x.ns, x.id) == (joint, number)]
+    assert len(found) == 1
+    return found[0]
+
+
+def length(marker: Marker) -> float:
+    """Return the signed length of an arrow along z, held to be vertical."""
+    start, end = marker.points
+    assert (start.x, start.y) == (end.x, end.y)
+    return float(end.z - start.z)
+
+
+@given(STRETCHES, strategies.floats(1e-3, 1e3))
+def test_block_keeps_its_volume_and_is_the_stretch_times_as_thick(stretch, scale):
+    block = of(scene('actuator', scale=scale).states(0, [State(stretch, 0.0)]), BLOCK)
+    rest = (2 * ACTUATOR.half_length) ** 2 * 2 * ACTUATOR.half_thickness
+    assert block.scale.x * block.scale.y * block.scale.z == pytest.approx(
+        rest * scale ** 3, rel=ROUNDING)
+    assert block.scale.x == block.scale.y
+    assert block.scale.z == pytest.approx(
+        2 * ACTUATOR.half_thickness * stretch * scale, rel=ROUNDING)
+
+
+def test_block_is_true_to_size_unless_told_otherwise():
+    block = of(scene('actuator').states(0, [State(1.0, 0.0)]), BLOCK)
+    assert block.type == Marker.CUBE
+    assert (block.scale.x, block.scale.y, block.scale.z) == (0.02, 0.02, 0.02)
+
+
+@pytest.mark.parametrize('flux_density', [0.12, -0.12])
+def test_field_points_where_its_sign_says_and_magnetisation_always_up(flux_density):
+    markers = scene('actuator').states(0, [State(1.1, flux_density)])
+    field, magnetisation = of(markers, FIELD), of(markers, MAGNETISATION)
+    assert math.copysign(1.0, length(field)) == math.copysign(1.0, flux_density)
+    assert length(magnetisation) > 0.0
+
+
+def test_field_and_magnetisation_are_drawn_to_one_scale():
+    stretch, flux_density = 1.3, -0.25
+    markers = scene('actuator').states(0, [State(stretch, flux_density)])
+    # The remanence moves with the material: Br times the stretch.
+    assert length(of(markers, FIELD)) / flux_density == pytest.approx(
+        length(of(markers, MAGNETISATION)) / (ACTUATOR.remanence * stretch), rel=ROUNDING)
+
+
+def test_field_stands_beside_the_block_and_magnetisation_inside_it():
+    markers = scene('actuator').states(0, [State(0.6, -0.2)])
+    side = of(markers, BLOCK).scale.x
+    assert of(markers, FIELD).points[0].x > side / 2
+    assert of(markers, MAGNETISATION).points[0].x == 0.0
+    assert length(of(markers, MAGNETISATION)) < of(markers, BLOCK).scale.z
+
+
+def test_without_a_field_its_arrow_is_deleted_not_drawn_without_a_direction():
+    markers = scene('actuator').states(0, [State(1.0, 0.0)])
+    assert of(markers, FIELD).action == Marker.DELETE
+    assert of(markers, MAGNETISATION).action == Marker.ADD
+
+
+def test_head_of_a_short_arrow_is_no_longer_than_half_of_it():
+    field = of(scene('actuator').states(0, [State(1.0, 1e-5)]), FIELD)
+    assert 0.0 < field.scale.z <= length(field) / 2 * (1 + ROUNDING)
+
+
+def test_target_has_the_size_of_the_block_that_reaches_it():
+    targets = scene('actuator').targets(0, [1.4])
+    block = of(scene('actuator').states(0, [State(1.4, 0.1)]), BLOCK)
+    assert of(targets, TARGET).scale == block.scale
+    assert of(targets, TARGET).pose == block.pose
+    assert of(targets, TARGET).color.a < block.color.a
+
+
+def test_no_target_deletes_the_one_before():
+    assert of(scene('actuator').targets(0, [None]), TARGET).action == Marker.DELETE
+
+
+def test_label_names_the_joint_and_its_stretch():
+    label = of(scene('left').states(0, [State(1.1, 0.0)]), LABEL, 'left')
+    assert label.type == Marker.TEXT_VIEW_FACING
+    assert label.text == 'left 1.1000'
+
+
+def test_joints_stand_side_by_side_without_touching_about_the_origin():
+    joints = [f'joint_{i}' for i in range(20)]
+    places = scene(*joints).places()
+    assert len(set(places)) == len(joints)
+    widest = Block.of('x', ACTUATOR).size(0.5)[0]
+    for row in range(0, 20, 8):
+        for (x, y), (next_x, next_y) in pairwise(places[row:row + 8]):
+            assert y == next_y
+            assert next_x - x > widest
+    assert sum(x for x, _ in places[:8]) == pytest.approx(0.0, abs=ROUNDING)
+    assert places[0][1] == -places[-1][1] > 0.0
+
+
+def test_each_joint_has_a_namespace_and_identifiers_that_stay():
+    two = scene('left', 'right', scale=10.0)
+    first = two.states(1, [State(1.0, 0.1), State(1.1, 0.2)])
+    second = two.states(2, [State(1.2, 0.0), State(0.9, -0.2)])
+    keys = [(x.ns, x.id) for x in first.markers]
+    assert keys == [(x.ns, x.id) for x in second.markers]
+    assert len(set(keys)) == len(keys) == 8
+    targets = {(x.ns, x.id) for x in two.targets(1, [1.0, 1.0]).markers}
+    assert not targets & set(keys)
+
+
+def test_markers_are_stamped_in_the_frame_and_live_as_long_as_told():
+    for marker in scene('actuator', lifetime=1.5).states(
+            2_500_000_000, [State(1.0, 0.1)]).markers:
+        assert marker.header.frame_id == 'coil'
+        assert (marker.header.stamp.sec, marker.header.stamp.nanosec) == (2, 500_000_000)
+        assert (marker.lifetime.sec, marker.lifetime.nanosec) == (1, 500_000_000)
+        assert abs(marker.pose.orientation.w) == 1.0
+
+
+def test_nothing_removes_all():
+    assert [x.action for x in scene('actuator').nothing().markers] == [Marker.DELETEALL]
+
+
+@pytest.mark.parametrize(('arguments', 'what'), [
+    (('', 0.01, 0.01, 0.1), 'joint is empty'),
+    (('a', 0.0, 0.01, 0.1), 'half_length of a is 0.0'),
+    (('a', 0.01, math.nan, 0.1), 'half_thickness of a is nan'),
+    (('a', 0.01, 0.01, -0.1), 'remanence of a is -0.1'),
+])
+def test_block_that_cannot_be_drawn_is_refused(arguments, what):
+    with pytest.raises(BadInputError, match=what):
+        Block(*arguments)
+
+
+@pytest.mark.parametrize('options', [{'scale': 0.0}, {'scale': math.inf}, {'lifetime': -1.0}])
+def test_scene_that_cannot_be_drawn_is_refused(options):
+    with pytest.raises(BadInputError, match='expected a finite number'):
+        scene('actuator', **options)
