@@ -615,11 +615,11 @@ class BagReader:
                 self._problem(
                     f'{self._files[block.file].path.name}: more than {most} bytes of chunks '
                     f'overlap in time, at byte {block.offset}: passed over')
-                continue
-            cursor = self._cursor(block, wanted, span)
-            if cursor is not None:
-                cursor.sort()
-                active.append(cursor)
+            else:
+                cursor = self._cursor(block, wanted, span)
+                if cursor is not None:
+                    cursor.sort()
+                    active.append(cursor)
             yield from _merge(active, blocks[i + 1].start if i + 1 < len(blocks) else _NEVER)
             active = [cursor for cursor in active if cursor.left]
 

@@ -1,0 +1,300 @@
+"""Bags made to do harm: nothing is run, nothing outside is read or written, memory stays flat."""
+
+import json
+import os
+from pathlib import Path
+import struct
+import subprocess
+import sys
+
+import lz4.frame
+import pytest
+import yaml
+import zstandard
+
+from hmsa_ros.bag import limits, metadata, records
+from hmsa_ros.bag.definitions import message_definition
+from hmsa_ros.bag.reader import BagReader, read_messages
+from hmsa_ros.bag.recover import recover
+from hmsa_ros.bag.writer import BagWriter, Topic
+from hmsa_ros.cli import main
+from hmsa_ros.errors import BadInputError, BagError
+
+ROOT = Path(__file__).resolve().parent.parent
+FLOAT = 'std_msgs/msg/Float64'
+PAYLOAD = bytes((0, 1, 0, 0)) + bytes(8)
+MEGA = 2**20
+BEGIN = records.MAGIC + records.header('ros2', 'a stranger')
+END = records.data_end() + records.footer(0, 0, b'') + records.MAGIC
+DECLARED = records.schema(records.Schema(1, FLOAT, 'ros2msg', b'float64 data\n')) + (
+    records.channel(records.Channel(1, 1, '/a', 'cdr', {})))
+
+# Reads a bag in every way there is, with no more memory than it is given.
+READER = """
+import resource, sys
+from hmsa_ros.bag.info import summarize, to_json, to_text
+from hmsa_ros.bag.reader import BagReader
+from hmsa_ros.bag.recover import recover
+from hmsa_ros.errors import HmsaError
+import lz4.frame, mcap_ros2.decoder, zstandard
+resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[3]) * 2**20,) * 2)
+try:
+    reader = BagReader(sys.argv[1], max_chunk_size=int(sys.argv[2]) * 2**20)
+    count = sum(1 for _ in reader.messages())
+    print(count, *reader.problems, sep='\\n')
+    reader.counts()
+    to_json(summarize(sys.argv[1])), to_text(summarize(sys.argv[1]))
+    for topic in reader.topics:
+        try:
+            decode = reader.decoder(topic)
+            for message in reader.messages([topic]):
+                decode(message.data)
+        except HmsaError as error:
+            print(error)
+except HmsaError as error:
+    print(error)
+"""
+
+
+def read_apart(path, *, chunk=4, memory=300):
+    """Read a bag in a process of few mebibytes; return what it said."""
+    result = subprocess.run(
+        [sys.executable, '-c', READER, str(path), str(chunk), str(memory)], check=False,
+        capture_output=True, text=True, env={**os.environ, 'PYTHONPATH': str(ROOT)})
+    assert result.returncode == 0, result.stderr
+    assert not result.stderr
+    return result.stdout
+
+
+def message(data=PAYLOAD, time=1):
+    return records.MESSAGE_HEAD.pack(
+        records.MESSAGE, records.MESSAGE_FIXED + len(data), 1, 0, time, time) + data
+
+
+def chunk(packed, size, compression='zstd', start=1, end=1):
+    return records.chunk_head(start, end, size, 0, compression, len(packed)) + packed
+
+
+def zstd_of_zeros(size):
+    return zstandard.ZstdCompressor().compress(bytes(size))
+
+
+def many_small_messages(size):
+    one = message(b'')
+    return one * (size // len(one))
+
+
+def hostile_files():
+    """Return name, content and an expected sentence of each."""
+    zeros = zstd_of_zeros(512 * MEGA)
+    small = many_small_messages(4 * MEGA)
+    overlapping = chunk(zstandard.ZstdCompressor().compress(small), len(small), end=10**9)
+    large_schema = records.schema(records.Schema(2, 'x/msg/Y', 'ros2msg', b'#' * 3 * MEGA))
+    packed_schema = zstandard.ZstdCompressor().compress(large_schema)
+    nested = b'A[] a\n' + b'=' * 80 + b'\nMSG: x/A\n'
+    many = struct.pack('<I', 10 * MEGA) + bytes(10 * MEGA)
+    yield 'zstd bomb', chunk(zeros, 512 * MEGA), 'larger than the 4194304 bytes allowed'
+    yield 'zstd bomb that lies', chunk(zeros, MEGA), 'does not decompress to the size it says'
+    yield 'lz4 bomb that lies', chunk(
+        lz4.frame.compress(bytes(512 * MEGA)), MEGA, 'lz4'), 'bytes of content: it says 1048576'
+    yield 'declared size beyond all memory', chunk(zeros, 2**62), 'bytes allowed'
+    yield 'zstd frame of unknown size', chunk(
+        zstandard.ZstdCompressor(write_content_size=False).compress(bytes(64 * MEGA)),
+        3 * MEGA), 'does not decompress'
+    yield 'many chunks at once', overlapping * 20, 'overlap in time'
+    yield 'large record', records.PREFIX.pack(records.METADATA, 2**40), 'is not complete'
+    yield 'large definition', large_schema, 'bytes, more than'
+    yield 'large definitions in chunks', chunk(
+        packed_schema, len(large_schema)), 'bytes, more than'
+    yield 'metadata of many entries', records.metadata(
+        'hmsa_ros', {str(i): '' for i in range(150_000)}), 'more than 100000 entries'
+    yield 'statistics that lie', records.record(records.STATISTICS, struct.pack(
+        '<QHIIIIQQI', 2**63, 1, 1, 0, 0, 1, 0, 0, 2**32 - 1)), 'statistics record ends early'
+    yield 'many channels', b''.join(
+        records.channel(records.Channel(i, 9, f'/{i}', 'cdr', {})) for i in range(2, 2000)
+        ), 'more problems, which are not told'
+    yield 'message of many messages', records.schema(records.Schema(
+        1, 'x/msg/Y', 'ros2msg', nested)) + records.channel(
+        records.Channel(1, 1, '/a', 'cdr', {})) + message(PAYLOAD[:4] + many), (
+        'expected at most 8388608')
+    yield 'definition within itself', records.schema(records.Schema(
+        1, 'x/msg/Y', 'ros2msg', b'Y y\n')) + records.channel(
+        records.Channel(1, 1, '/a', 'cdr', {})) + message(), 'does not decode'
+
+
+def test_sizes_that_lie_take_no_memory(tmp_path):
+    for name, content, expected in hostile_files():
+        path = tmp_path / f'{name}.mcap'
+        path.write_bytes(BEGIN + content + DECLARED + message() + END)
+        output = read_apart(path, chunk=16 if name == 'message of many messages' else 4)
+        assert expected in output, f'{name}: {output}'
+        if name != 'large record':
+            # What comes after it is read all the same.
+            assert int(output.split('\n', 1)[0]) >= 1, f'{name}: {output}'
+
+
+def test_a_file_with_holes_takes_no_memory(tmp_path):
+    path = tmp_path / 'holes.mcap'
+    for opcode in (records.MESSAGE, records.CHUNK, records.SCHEMA, records.METADATA):
+        with path.open('wb') as file:
+            file.write(BEGIN + DECLARED + message() + records.PREFIX.pack(opcode, 2**36))
+            file.truncate(2**36 + 2**20)
+        output = read_apart(path)
+        assert int(output.split('\n', 1)[0]) == 1
+        assert 'passed over' in output or 'is not complete' in output
+
+
+def test_a_large_chunk_is_read_when_it_is_allowed(tmp_path):
+    content = message(bytes(20 * MEGA))
+    path = tmp_path / 'large.mcap'
+    path.write_bytes(BEGIN + DECLARED + chunk(
+        zstandard.ZstdCompressor().compress(content), len(content)) + END)
+    assert [len(x.data) for x in BagReader(path).messages()] == [20 * MEGA]
+    reader = BagReader(path, max_chunk_size=MEGA)
+    assert not list(reader.messages())
+    assert 'larger than the 1048576 bytes allowed' in reader.problems[0]
+    assert main(['bag', 'recover', str(path), '--out', str(tmp_path / 'a'), '--max-chunk', '1']
+                ) == 0
+    assert BagReader(tmp_path / 'a').counts() == {'/a': 0}
+    assert main(['bag', 'recover', str(path), '--out', str(tmp_path / 'b')]) == 0
+    assert BagReader(tmp_path / 'b').counts() == {'/a': 1}
+    for wrong in ('0', '-1', 'nan', '1e9'):
+        assert main(['bag', 'info', str(path), '--max-chunk', wrong]) == 2
+
+
+def good_bag(folder):
+    encoding, text = message_definition(FLOAT)
+    with BagWriter(folder) as writer:
+        number = writer.add_topic(Topic('/a', FLOAT, text, encoding))
+        writer.write([(number, 1, 1, 1, PAYLOAD)])
+    return folder
+
+
+YAML_BOMBS = {
+    'aliases': 'a: &a [x, x, x, x, x, x, x, x, x]\n' + ''.join(
+        f'{b}: &{b} [{", ".join([f"*{a}"] * 9)}]\n' for a, b in zip('abcdefgh', 'bcdefghi',
+                                                                   strict=True)),
+    'depth': 'a: ' + '[' * 100_000,
+    'number of values': 'a: [' + 'x,' * 400_000 + ']',
+    'length': '#' * (limits.YAML_SIZE + 1),
+    'object': 'rosbag2_bagfile_information: !!python/object/apply:os.system ["touch {there}"]',
+    'date': 'rosbag2_bagfile_information: 2001-99-99',
+    'integer': 'a: ' + '9' * 10_000,
+    'integer tag': 'a: !!int ""',
+    'infinity': 'rosbag2_bagfile_information: {version: .inf}',
+    'bytes': b'\xff\xfe\x00',
+}
+
+
+@pytest.mark.parametrize('name', YAML_BOMBS)
+def test_metadata_made_to_do_harm_are_left_aside(tmp_path, name):
+    bag = good_bag(tmp_path / 'bag')
+    there = tmp_path / 'there'
+    bomb = YAML_BOMBS[name]
+    if isinstance(bomb, str):
+        bomb = bomb.replace('{there}', str(there)).encode()
+    (bag / 'metadata.yaml').write_bytes(bomb)
+    output = read_apart(bag)
+    assert output.startswith('1\n')
+    assert 'the files themselves are read' in output
+    assert not there.exists()
+
+
+def test_metadata_that_are_no_file_are_left_aside(tmp_path):
+    bag = good_bag(tmp_path / 'bag')
+    (bag / 'metadata.yaml').unlink()
+    for make in (os.mkfifo, lambda path: path.symlink_to('/dev/zero'),
+                 lambda path: path.symlink_to(path)):
+        make(bag / 'metadata.yaml')
+        assert read_apart(bag).startswith('1\n')
+        (bag / 'metadata.yaml').unlink()
+
+
+def test_files_outside_the_folder_are_not_read(tmp_path):
+    bag, other = good_bag(tmp_path / 'bag'), good_bag(tmp_path / 'other')
+    path = bag / 'metadata.yaml'
+    content = yaml.safe_load(path.read_text())
+    inner = content['rosbag2_bagfile_information']
+    for outside in (str(other / 'other_0.mcap'), '../other/other_0.mcap', '..', '', '/',
+                    'a\0b', '/dev/zero'):
+        inner['relative_file_paths'] = [outside]
+        inner['files'][0]['path'] = outside
+        path.write_text(yaml.safe_dump(content))
+        reader = BagReader(bag)
+        assert reader.files == (bag / 'bag_0.mcap',)
+    (bag / 'bag_0.mcap').unlink()
+    (bag / 'bag_0.mcap').symlink_to(other / 'other_0.mcap')
+    with pytest.raises(BadInputError, match='holds no .mcap file'):
+        BagReader(bag)
+    # A link that stays inside, and one that is named itself, are what they seem.
+    (other / 'other_1.mcap').symlink_to('other_0.mcap')
+    assert len(BagReader(other / 'other_1.mcap').files) == 1
+    assert len(BagReader(bag / 'bag_0.mcap').files) == 1
+
+
+def test_one_file_named_many_times_is_read_once(tmp_path):
+    bag = good_bag(tmp_path / 'bag')
+    content = yaml.safe_load((bag / 'metadata.yaml').read_text())
+    content['rosbag2_bagfile_information']['files'] *= 1000
+    (bag / 'metadata.yaml').write_text(yaml.dump(content, Dumper=NoAliases))
+    assert len(list(BagReader(bag).messages())) == 1
+
+
+class NoAliases(yaml.SafeDumper):
+    def ignore_aliases(self, data):
+        return True
+
+
+def test_profiles_made_to_do_harm_are_left_aside(tmp_path):
+    path = tmp_path / 'bag.mcap'
+    for bomb in YAML_BOMBS.values():
+        text = bomb.decode('latin-1') if isinstance(bomb, bytes) else bomb
+        path.write_bytes(BEGIN + records.schema(
+            records.Schema(1, FLOAT, 'ros2msg', b'float64 data\n')) + records.channel(
+            records.Channel(1, 1, '/a', 'cdr', {'offered_qos_profiles': text[:2 * MEGA]}))
+            + message() + END)
+        output = read_apart(path)
+        assert output.startswith('1\n')
+
+
+def test_what_would_take_over_a_terminal_is_shown_as_codes(tmp_path, capsys):
+    path = tmp_path / 'bag.mcap'
+    topic = records.Channel(1, 1, '/a\x1b[2Jb', 'cdr', {})
+    data = records.channel(topic).replace(b'[2Jb', b'[2J\xff')
+    path.write_bytes(BEGIN + DECLARED[:DECLARED.index(records.channel(
+        records.Channel(1, 1, '/a', 'cdr', {})))] + data + message() + records.metadata(
+        'hmsa_ros', {'note\x07': 'two\nlines \x9b31m'}) + END)
+    assert main(['bag', 'info', str(path)]) == 0
+    shown = capsys.readouterr().out
+    assert '/a\\x1b[2J\\xff' in shown
+    assert 'note\\x07 = two\\nlines \\x9b31m' in shown
+    assert main(['bag', 'info', '--json', str(path)]) == 0
+    assert json.loads(capsys.readouterr().out)['topics'][0]['count'] == 1
+    with pytest.raises(BadInputError):
+        BagReader(path).decoder('/none\x1b')
+    assert main(['bag', 'verify', str(path)]) == 2
+    assert '\x1b' not in capsys.readouterr().err
+    assert recover(path, tmp_path / 'new').message_count == 1
+    assert list(read_messages(tmp_path / 'new'))
+
+
+def test_a_type_name_imports_nothing_but_interfaces():
+    from hmsa_ros.nodes.recorder import message_class
+    assert message_class(FLOAT).__name__ == 'Float64'
+    for name in ('antigravity/msg/A', 'os/path/join', 'this/msg/A', '../x/msg/A', 'std_msgs',
+                 'std_msgs/os/A', 'std_msgs/msg/', 'std_msgs/msg/../A', '\0/msg/A'):
+        with pytest.raises(BagError, match='is not installed'):
+            message_class(name)
+    assert not {'antigravity', 'this'} & sys.modules.keys()
+
+
+def test_problems_are_told_but_not_without_end(tmp_path):
+    bag = good_bag(tmp_path / 'bag')
+    content = yaml.safe_load((bag / 'metadata.yaml').read_text())
+    content['rosbag2_bagfile_information']['files'] = [
+        {**content['rosbag2_bagfile_information']['files'][0], 'path': f'x{i}.mcap'}
+        for i in range(2000)]
+    (bag / 'metadata.yaml').write_text(yaml.dump(content, Dumper=NoAliases))
+    reader = BagReader(bag)
+    assert len(reader.problems) == limits.PROBLEMS + 1
+    assert metadata.read(bag / 'metadata.yaml').message_count == 1
