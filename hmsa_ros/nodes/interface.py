@@ -6,8 +6,8 @@ All names are relative or private, so that namespaces and remapping work; only `
 what stands here.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -28,6 +28,10 @@ SAMPLES = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL)
+# The changes of level that took effect last, for who comes late.
+CHANGES = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL)
 CLOCK = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -111,10 +115,15 @@ FLUX_DENSITY_COMMAND = Topic(
     'The shaped command. From its stamp on, which may lie ahead, z is the flux density in tesla; '
     'x and y are 0. A message supersedes all earlier ones stamped at or after it.',
     publishers=(PLANNER,), subscribers=(PLANT,))
+FLUX_DENSITY_APPLIED = Topic(
+    'flux_density_applied', MagneticField, CHANGES,
+    'What became of the commands: one message at each change of level that takes effect, stamped '
+    'with the time at which it really did; z is the level from then on in tesla.',
+    publishers=(PLANT,), subscribers=(PLANNER,))
 JOINT_STATES = Topic(
     'joint_states', JointState, SAMPLES,
     'Samples of the actuator: position is stretch, velocity stretch rate in 1/s, effort the flux '
-    'density in force in tesla.', publishers=(PLANT,))
+    'density in force in tesla.', publishers=(PLANT,), subscribers=(PLANNER,))
 STRETCH = Topic(
     'stretch', Float64, SAMPLES, 'The stretch alone, to plot and to echo.', publishers=(PLANT,))
 STRETCH_RATE = Topic(
@@ -147,6 +156,33 @@ SNAPSHOT = Service('~/snapshot', Trigger, {
     RECORDER: 'Writes what a recorder in snapshot mode holds in memory.'})
 SPLIT_BAGFILE = Service('~/split_bagfile', Trigger, {
     RECORDER: 'Closes the file and goes on in a new one.'})
+
+
+def of_joint(topic: Topic, joint: str, joints: Sequence[str]) -> Topic:
+    """
+    Return the topic of one joint.
+
+    Parameters
+    ----------
+    topic : Topic
+        As declared here.
+    joint : str
+        Name of the joint.
+    joints : sequence of str
+        All joints of the node.
+
+    Returns
+    -------
+    Topic
+        With the joint before the name, as in ``left/flux_density_command`` or
+        ``~/left/setpoint``; the same where there is only one joint.
+
+    """
+    if len(joints) == 1:
+        return topic
+    name = topic.name
+    return replace(
+        topic, name=f'~/{joint}/{name[2:]}' if name.startswith('~/') else f'{joint}/{name}')
 
 
 def from_outside(name: str, node: str) -> str:

@@ -162,16 +162,35 @@ def declare(node: Node, specs: Iterable[ParameterSpec]) -> Mapping[str, Any]:
             if isinstance(spec.default, list):
                 value = _as_list(spec.name, value)
         except ParameterException as error:
-            override = node._parameter_overrides.get(spec.name)
-            got = 'a value of another kind' if override is None else repr(override.value)
-            expected = type(spec.default).__name__
-            if spec.minimum is not None or spec.maximum is not None:
-                expected += f', {spec.range_text()}'
-            raise BadInputError(
-                f'parameter {spec.name} is {got}: expected {expected}') from error
+            raise refusal(node, spec) from error
         spec.check(value)
         values[spec.name] = value
     return values
+
+
+def refusal(node: Node, spec: ParameterSpec) -> BadInputError:
+    """
+    Return the error for a start value that rclpy has refused.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        On which it was to be declared.
+    spec : ParameterSpec
+        What was to be declared.
+
+    Returns
+    -------
+    BadInputError
+        To raise.
+
+    """
+    override = node._parameter_overrides.get(spec.name)
+    got = 'a value of another kind' if override is None else repr(override.value)
+    expected = type(spec.default).__name__
+    if spec.minimum is not None or spec.maximum is not None:
+        expected += f', {spec.range_text()}'
+    return BadInputError(f'parameter {spec.name} is {got}: expected {expected}')
 
 
 def _as_list(name: str, value: Any) -> list[str]:

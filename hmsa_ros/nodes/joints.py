@@ -1,0 +1,191 @@
+"""
+Joints of one node: their names, and parameters that hold for all of them or for one.
+
+A parameter of the actuator is declared once for all joints. Where the parameter ``joints`` names
+them, each may have a value of its own beside it: ``left.actuator.remanence`` overrides
+``actuator.remanence`` for the joint ``left``, and is not set unless somebody sets it.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+import re
+from typing import Any
+
+from rclpy.exceptions import ParameterException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.nodes.parameters import declare, JOINT, ParameterSpec, refusal
+
+JOINTS = ParameterSpec(
+    'joints', [],
+    'Names of the joints where there are several, or where one has parameters of its own, as '
+    'left.actuator.remanence; empty for the one named by joint.')
+
+# A token of a ROS name: the joint is a part of the names of its topics.
+_TOKEN = re.compile(r'[A-Za-z][A-Za-z0-9_]*')
+_TYPES = {
+    bool: Parameter.Type.BOOL, int: Parameter.Type.INTEGER, float: Parameter.Type.DOUBLE,
+    str: Parameter.Type.STRING}
+
+
+def joint_names(values: Mapping[str, Any]) -> tuple[str, ...]:
+    """
+    Return the joints that declared parameters name.
+
+    Parameters
+    ----------
+    values : mapping of str to object
+        With ``joint`` and ``joints``.
+
+    Returns
+    -------
+    tuple of str
+        At least one, all different.
+
+    Raises
+    ------
+    BadInputError
+        If a name cannot be a part of a topic's name, or is there twice.
+
+    """
+    names = tuple(values[JOINTS.name]) or (str(values[JOINT.name]),)
+    if not values[JOINTS.name]:
+        return names
+    for name in names:
+        if not _TOKEN.fullmatch(name) or '__' in name or name.endswith('_'):
+            raise BadInputError(
+                f'parameter joints names {name!r}: expected letters, digits and single '
+                'underscores between them, a letter first')
+    for name in names:
+        if names.count(name) > 1:
+            raise BadInputError(
+                f'parameter joints names {name!r} {names.count(name)} times: expected each '
+                'joint once')
+    return names
+
+
+@dataclass(frozen=True)
+class JointParameters:
+    """
+    Values of a node's parameters, for all joints and for each.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The joints.
+    specs : mapping of str to ParameterSpec
+        All that is declared, by full name.
+    values : mapping of str to object
+        By full name; an override that is not set is missing.
+    own : frozenset of str
+        Parameters that a joint may have a value of its own for.
+
+    """
+
+    names: tuple[str, ...]
+    specs: Mapping[str, ParameterSpec]
+    values: Mapping[str, Any]
+    own: frozenset[str]
+
+    def __getitem__(self, name: str) -> Any:
+        """Return the value for all joints."""
+        return self.values[name]
+
+    def of(self, joint: str) -> dict[str, Any]:
+        """
+        Return the values that hold for one joint.
+
+        Parameters
+        ----------
+        joint : str
+            Its name.
+
+        Returns
+        -------
+        dict of str to object
+            By name without the joint, its own values before those for all.
+
+        """
+        return {
+            name: self.values.get(f'{joint}.{name}', self.values[name])
+            if name in self.own else self.values[name]
+            for name in self.specs if name in self.values
+            and (name in self.own or not self._is_override(name))}
+
+    def _is_override(self, name: str) -> bool:
+        joint, _, rest = name.partition('.')
+        return joint in self.names and rest in self.own
+
+    def changed(self, parameters: Iterable[Parameter]) -> 'JointParameters':
+        """
+        Return what comes of setting parameters, each checked on its own.
+
+        Parameters
+        ----------
+        parameters : iterable of rclpy.parameter.Parameter
+            Those that were not declared here are passed over.
+
+        Returns
+        -------
+        JointParameters
+            A copy.
+
+        Raises
+        ------
+        BadInputError
+            If a value is out of its range.
+
+        """
+        values = dict(self.values)
+        for parameter in parameters:
+            if parameter.name in self.specs:
+                self.specs[parameter.name].check(parameter.value)
+                values[parameter.name] = parameter.value
+        return replace(self, values=values)
+
+
+def declare_joints(
+        node: Node, specs: Sequence[ParameterSpec],
+        own: Sequence[ParameterSpec]) -> JointParameters:
+    """
+    Declare a node's parameters, and those in which joints may differ once more for each.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Node to declare on.
+    specs : sequence of ParameterSpec
+        All of the node's, ``joint`` and ``joints`` among them.
+    own : sequence of ParameterSpec
+        Those of them that a joint may have a value of its own for.
+
+    Returns
+    -------
+    JointParameters
+        Their values.
+
+    Raises
+    ------
+    BadInputError
+        If a value has the wrong type or is out of range, or a joint's name cannot be one.
+
+    """
+    values = dict(declare(node, specs))
+    names = joint_names(values)
+    declared = {spec.name: spec for spec in specs}
+    for joint in names if values[JOINTS.name] else ():
+        for general in own:
+            spec = replace(general, name=f'{joint}.{general.name}')
+            declared[spec.name] = spec
+            try:
+                value = node.declare_parameter(
+                    spec.name, _TYPES[type(spec.default)], spec.descriptor()).value
+            except ParameterException as error:
+                raise refusal(node, spec) from error
+            if value is not None:
+                spec.check(value)
+                values[spec.name] = value
+    return JointParameters(
+        names, declared, values, frozenset(spec.name for spec in own))
