@@ -143,7 +143,7 @@ def test_defaults_are_the_papers_block(run, tmp_path):
 
 
 def test_json_says_everything_there_is(run, tmp_path):
-    status, out, _ = run('--yes', '--json', '--half-length', '2e-3', '--joint', 'left', 'right')
+    status, out, _ = run('--yes', '--json', '--half-length', '2e-3', '--joint', 'left,right')
     assert status == 0
     made = json.loads(out)
     assert made['file'] == 'actuator.yaml'
@@ -186,7 +186,7 @@ def test_a_file_that_exists_is_kept_unless_forced(run, tmp_path):
     (['--flux-min', '0.5'], 'expected the least below the largest'),
     (['--joint', '1st'], "joint '1st': expected letters"),
     (['--joint', 'a__b'], "joint 'a__b'"),
-    (['--joint', 'a', 'a'], 'named twice'),
+    (['--joint', 'a,a'], 'named twice'),
     (['--out', 'no/where.yaml'], 'is no folder'),
     (['--out', '/dev/full', '--force'], 'cannot write /dev/full'),
 ])
@@ -306,7 +306,7 @@ def test_what_is_given_is_not_asked_for(tmp_path):
         "coil's largest flux density",
         "coil's least flux density, negative in the other direction",
         "rate of the amplifier's ramps, 0 for steps",
-        'name of the joint, or several with spaces between']
+        'name of the joint, or several with commas between']
     assert parameters(tmp_path / 'actuator.yaml')['flux_density_max'] == 0.1
 
 

@@ -25,11 +25,18 @@ from hmsa_ros.core.simulation import ActuatorSimulation, simulate
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.report import charts
-from hmsa_ros.report.evaluation import evaluate, in_force, plan_points, timing
+from hmsa_ros.report.evaluation import (
+    evaluate,
+    in_force,
+    plan_points,
+    timing,
+    without_repeats,
+)
 from hmsa_ros.report.page import page
 from hmsa_ros.report.picture import draw
 from hmsa_ros.report.reading import (
     ACTUATOR_FIELDS,
+    APPLIED,
     COMMAND,
     JOINT_STATES,
     Level,
@@ -396,6 +403,127 @@ def test_a_recorder_on_another_clock_leaves_lead_and_delay_open(tmp_path):
     assert 'another clock' in ' '.join(Page(page([part])).words)
 
 
+def applied(messages, late=0, space=''):
+    """Return what a plant tells of the commands: the level at the start and each change."""
+    topic, kind = f'{space}/{APPLIED}', TYPES[APPLIED]
+    return [(START, topic, kind, command(START, 0.0))] + [
+        (time + LEAD, topic, kind, command(time + LEAD + late, x.magnetic_field.z))
+        for time, where, _, x in messages if where == f'{space}/{COMMAND}']
+
+
+def test_commands_that_are_repeated_change_nothing_but_their_number(tmp_path, bag):
+    messages = simulated()
+    commands = [x for x in messages if x[1].endswith(COMMAND)]
+    repeats = []
+    for time in range(START + 1_000_000, START + 120_000_000, 10_000_000):
+        due = [x for x in commands if x[0] <= time]
+        if due:
+            repeats.append((time, *due[-1][1:3], command(
+                time + LEAD, due[-1][3].magnetic_field.z)))
+    assert len(repeats) > 8
+    part = one(
+        tmp_path / 'bag', messages + repeats, **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    expected, = parts_of(bag)
+    assert part.evaluation.levels == expected.evaluation.levels
+    assert part.evaluation.results == expected.evaluation.results
+    assert part.timing.repeats == len(repeats)
+    assert np.array_equal(part.timing.lead, expected.timing.lead)
+    report = Page(page([part]))
+    sent = report.trace('response', 'command')
+    assert sum(x > 0 for x in sent['marker']['size']) == 6
+    assert len(report.trace('timing', 'command lead')['x']) == 6
+    assert f'{len(repeats)} commands that repeat the one before' in ' '.join(report.words)
+
+
+def test_what_replaces_later_levels_is_no_repeat():
+    first = [Level(10, 1.0, 0), Level(20, 2.0, 0)]
+    same, other = Level(15, 1.0, 5), Level(12, 1.0, 6)
+    assert without_repeats([*first, same]) == ((*first, same), 0)
+    assert [x.stamp for x in in_force((x,) for x in without_repeats([*first, same])[0])] == [
+        10, 15]
+    assert without_repeats([first[0], other, first[1]]) == (tuple(first), 1)
+    assert without_repeats([]) == ((), 0)
+
+
+@pytest.mark.parametrize('late', [0, 3_000_000])
+def test_lateness_is_told_by_what_took_effect(tmp_path, late):
+    messages = simulated()
+    part = one(
+        tmp_path / 'bag', messages + applied(messages, late),
+        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    assert part.timing.lateness == pytest.approx([late / NANOSECONDS] * 6)
+    assert part.timing.late == (6 if late else 0)
+    assert part.timing.unapplied == 0
+    report = Page(page([part]))
+    row, = (x for x in report.table('timing-table')
+            if x['quantity'][1] == 'lateness of the command')
+    assert float(row['largest [ms]'][0]) == pytest.approx(late / 1e6)
+    assert report.trace('timing', 'lateness of the command')['y'] == [late / 1e6] * 6
+    assert f'6 ({6 if late else 0} late)' in ' '.join(report.words)
+
+
+def test_a_change_that_never_took_effect_is_told(tmp_path):
+    messages = simulated()
+    told = applied(messages)
+    del told[3]
+    part = one(tmp_path / 'bag', messages + told, **parameters(plant=ACTUATOR))
+    assert part.timing.unapplied == 1
+    assert np.isnan(part.timing.lateness).tolist() == [False] * 2 + [True] + [False] * 3
+    assert '1 changes of level did not take effect' in ' '.join(Page(page([part])).words)
+
+
+def test_the_field_of_a_driver_that_measures_none_is_what_it_applied(tmp_path):
+    messages = simulated()
+    part = one(tmp_path / 'bag', [
+        (time, topic, kind, joint_state(time, message.position, message.velocity, [])
+         if topic == '/joint_states' else message)
+        for time, topic, kind, message in messages + applied(messages, 2_000_000)])
+    curve = Page(page([part])).trace('response', 'field in force')
+    assert len(curve['y']) == 8
+    assert curve['x'][1] == pytest.approx(2.0)
+
+
+def of_several_joints(names, plants):
+    """Return a run of several joints, one topic a joint and one message of all their states."""
+    runs = [simulated(plant=x) for x in plants]
+    messages = []
+    for name, run in zip(names, runs, strict=True):
+        messages += [(time, f'/{name}/{COMMAND}', kind, message)
+                     for time, topic, kind, message in run if topic.endswith(COMMAND)]
+    for rows in zip(*([x for x in run if x[1] == '/joint_states'] for run in runs), strict=True):
+        messages.append((*rows[0][:3], joint_state(rows[0][0], *(
+            [getattr(x[3], field)[0] for x in rows]
+            for field in ('position', 'velocity', 'effort')), names)))
+    for time, topic, kind, message in without(runs[0], 'command', 'joint_states'):
+        if topic.endswith(('plan', 'trajectory')):
+            message.joint_names = list(names)
+            for point in message.points:
+                for field in ('positions', 'velocities', 'effort'):
+                    setattr(point, field, np.repeat(getattr(point, field), len(names)))
+        messages.append((time, topic, kind, message))
+    return messages
+
+
+def test_each_joint_of_a_planner_of_several_is_a_run(tmp_path, bag):
+    other = replace(ACTUATOR, density=2100.0)
+    folder = write(
+        tmp_path / 'bag', of_several_joints(('left', 'right'), (ACTUATOR, other)),
+        **parameters(planner=ACTUATOR, plant=ACTUATOR),
+        **{'plant.right.actuator.density': '2100.0'})
+    left, right = parts_of(folder)
+    assert (left.run.label, right.run.label) == ('bag left', 'bag right')
+    expected, = parts_of(bag)
+    for ours, theirs in zip(left.evaluation.results, expected.evaluation.results, strict=True):
+        assert asdict(ours) == pytest.approx(asdict(theirs), rel=1e-6, abs=1e-9)
+    assert max(x.residual for x in right.evaluation.results) > 0.01
+    assert (left.run.plant, right.run.plant) == (ACTUATOR, other)
+    assert np.nanmax(np.abs(left.run.stretch - left.evaluation.predicted[0])) < SAME
+    only, = parts_of(folder, joints=['right'])
+    assert only.evaluation.results == right.evaluation.results
+    with pytest.raises(BadInputError, match=r'no joint up: expected one of left, right'):
+        read_runs(folder, joints=['up'])
+
+
 # Bags of all kinds ---------------------------------------------------------------------------
 
 def test_a_bag_that_rosbags_wrote_will_do(tmp_path, bag):
@@ -437,7 +565,7 @@ def test_the_actuator_is_found_among_other_joints(tmp_path):
     assert run.stretch.tolist() == [
         x.position[0] for _, topic, _, x in simulated() if topic == '/joint_states']
     with pytest.raises(BadInputError, match=r"no joint 'leg': expected one of actuator, arm"):
-        read_runs(folder, joint='leg')
+        read_runs(folder, joints=['leg'])
 
 
 def test_hardware_that_measures_neither_rate_nor_field_will_do(tmp_path):

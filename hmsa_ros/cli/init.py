@@ -11,9 +11,9 @@ from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.quantities import (
     BY_KEY,
-    check_joints,
     DAMPING,
     default_of,
+    joint_names,
     NEEDED,
     QUANTITIES,
     Quantity,
@@ -60,8 +60,9 @@ def add_parser(subparsers: Any) -> None:
         DAMPING.option, type=_reader(DAMPING), metavar='X', dest=DAMPING.key,
         help=f'{DAMPING.text} [{DAMPING.unit}], in place of --zeta')
     parser.add_argument(
-        '--joint', nargs='+', metavar='NAME',
-        help=f'name of the joint (default {_JOINT}); several names for several actuators alike')
+        '--joint', default='', metavar='NAME',
+        help=f'name of the joint (default {_JOINT}), or several with commas between for '
+             'actuators alike')
     parser.add_argument(
         '--out', type=Path, default=_FILE, metavar='FILE',
         help=f'file to write (default {_FILE})')
@@ -112,8 +113,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise BadInputError('both --zeta and --damping are given: expected one of them')
     given = {key: getattr(arguments, key) for key in (*BY_KEY, DAMPING.key)
              if getattr(arguments, key) is not None}
-    joints: list[str] = arguments.joint or []
-    check_joints(joints)
+    joints = joint_names(arguments.joint)
     missing = [key for key in NEEDED
                if key not in given and not (key == 'zeta' and DAMPING.key in given)]
     if missing and not arguments.yes:
@@ -184,14 +184,11 @@ def _ask(
             answers[key] = value
             break
     while not joints:
-        text = _answer(f'name of the joint, or several with spaces between [{_JOINT}]: ')
-        names = text.split() or [_JOINT]
+        text = _answer(f'name of the joint, or several with commas between [{_JOINT}]: ')
         try:
-            check_joints(names)
+            joints = joint_names(text) or [_JOINT]
         except BadInputError as error:
             print(f'  {error}', file=sys.stderr)
-            continue
-        joints = names
     return answers, joints
 
 

@@ -232,14 +232,19 @@ def default_of(quantity: Quantity, given: Mapping[str, float]) -> float:
     return given['half_length'] if quantity.key == 'half_thickness' else -abs(given['flux_max'])
 
 
-def check_joints(names: list[str]) -> None:
+def joint_names(text: str) -> list[str]:
     """
-    Refuse names that ROS does not take.
+    Read names of joints.
 
     Parameters
     ----------
-    names : list of str
-        Names of joints.
+    text : str
+        With commas or spaces between.
+
+    Returns
+    -------
+    list of str
+        Empty for an empty text.
 
     Raises
     ------
@@ -247,6 +252,7 @@ def check_joints(names: list[str]) -> None:
         If one is no ROS name or stands there twice.
 
     """
+    names = text.replace(',', ' ').split()
     for name in names:
         if not _NAME.fullmatch(name):
             raise BadInputError(
@@ -254,3 +260,4 @@ def check_joints(names: list[str]) -> None:
                 'with a letter')
         if names.count(name) > 1:
             raise BadInputError(f'joint {name!r} is named twice: expected different names')
+    return names

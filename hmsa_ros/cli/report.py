@@ -42,7 +42,8 @@ def add_parser(subparsers: Any) -> None:
              'tells)')
     parser.add_argument(
         '--joint', default='', metavar='NAME',
-        help='the actuator in the joint states (default: what the planner calls it)')
+        help='actuator to show by its name in the joint states, or several with commas between '
+             '(default: those with commands)')
     parser.set_defaults(run=run)
 
 
@@ -79,6 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hmsa_ros.report.page import page
     from hmsa_ros.report.reading import read_actuator, read_runs
 
+    joints = [x for x in arguments.joint.split(',') if x]
     actuator = None if arguments.params is None else read_actuator(arguments.params)
     console = Console(stderr=True)
     with Progress(
@@ -89,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
         runs: list[Run] = []
         for bag in bags:
             runs += read_runs(
-                bag, actuator=actuator, joint=arguments.joint,
+                bag, actuator=actuator, joints=joints,
                 progress=lambda what, share: progress.update(
                     task, description=what, completed=share))
         parts = []

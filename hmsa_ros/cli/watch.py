@@ -43,7 +43,8 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         '--namespace', default='', metavar='NS', help='namespace of planner and plant')
     parser.add_argument(
-        '--joint', nargs='+', default=[], metavar='NAME', help='joints to show (default all)')
+        '--joint', default='', metavar='NAME',
+        help='joint to show, or several with commas between (default all)')
     parser.add_argument(
         '--span', type=float, default=10.0, metavar='S',
         help='time that the charts reach back (default 10 s)')
@@ -92,7 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     console = Console(highlight=False)
     with Listener(
-            namespace=arguments.namespace, joints=arguments.joint,
+            namespace=arguments.namespace, joints=[x for x in arguments.joint.split(',') if x],
             span=arguments.span) as listener:
         ending = Ending()
         if arguments.once:

@@ -90,8 +90,15 @@ SCRIPT = """
     const result = {
       ...layout, paper_bgcolor: 'rgba(0,0,0,0)', plot_bgcolor: 'rgba(0,0,0,0)',
       font: {color: colour('text'), size: narrow() ? 11 : 13, family: FONT},
-      margin: narrow() ? {l: 46, r: 8, t: 8, b: 40} : {l: 62, r: 14, t: 8, b: 46},
-      legend: {orientation: 'h', x: 0, y: 1.02, yanchor: 'bottom', groupclick: 'togglegroup'},
+      // Above the figure is room for the toolbar, below it for the legend.
+      margin: {...(narrow() ? {l: 46, r: 8, b: 40} : {l: 62, r: 14, b: 46}), t: coarse ? 8 : 30},
+      legend: {
+        orientation: 'h', x: 0, yref: 'container', y: 0, yanchor: 'bottom',
+        groupclick: 'togglegroup', bgcolor: 'rgba(0,0,0,0)',
+      },
+      modebar: {
+        bgcolor: 'rgba(0,0,0,0)', color: colour('soft'), activecolor: colour('accent'),
+      },
       hoverlabel: {bgcolor: colour('panel'), font: {color: colour('text')}, namelength: -1},
       // A finger on a figure scrolls the page.
       dragmode: coarse ? false : 'zoom', uirevision: 'kept',

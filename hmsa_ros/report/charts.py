@@ -326,12 +326,21 @@ def _commands(part: Part, unit: TimeUnit) -> list[dict[str, Any]]:
         place = np.searchsorted([x.stamp for x in found.levels], run.time, side='right') - 1
         expected = np.array([*(x.flux_density for x in found.levels)])[np.maximum(place, 0)]
         follows = np.abs(run.flux_density - expected)[place >= 0]
-        if np.nanmax(follows, initial=0.0) <= 1e-9 * np.max(np.abs(expected)):
+        if np.isfinite(follows).any() and (
+                np.nanmax(follows) <= 1e-9 * np.max(np.abs(expected))):
             return data
     if np.isfinite(run.flux_density).any():
         name, group = _names(part, 'field in force')
         x, y = decimate(unit.of(found.time), run.flux_density * 1e3)
         data.append(_curve(name, x, y, group, yaxis='y2', **_kind(part, 'field in force')))
+    elif run.applied:
+        name, group = _names(part, 'field in force')
+        told = sorted(run.applied, key=lambda x: x.stamp)
+        x = unit.of([*(found.seconds(x.stamp) for x in told), max(
+            found.seconds(told[-1].stamp), float(found.time[-1]))])
+        y = np.array([x.flux_density for x in (*told, told[-1])]) * 1e3
+        data.append(_curve(name, x, y, group, yaxis='y2', **_kind(
+            part, 'field in force', shape='hv')))
     return data
 
 
@@ -513,7 +522,7 @@ def arrival(parts: Sequence[Part], number: int) -> Figure:
     return Figure(
         f'arrival{number}', f'Setpoint {title}', 300, _grouped(data), {
             'xaxis': _axis(f'time after arrival [{unit.name}]', range=numbers(view)),
-            'yaxis': _axis('distance from target [% of step]', range=[-height, height]),
+            'yaxis': _axis('distance [% of step]', range=[-height, height]),
             'shapes': [{
                 'type': 'line', 'x0': 0, 'x1': 0, 'yref': 'paper', 'y0': 0, 'y1': 1,
                 'line': {'color': GREY, 'width': 1, 'dash': '2px,2px'}}]})
@@ -625,14 +634,21 @@ def timings(parts: Sequence[Part], unit: TimeUnit) -> Figure:
     """
     data = []
     for part in parts:
-        run, found, timing = part.run, part.evaluation, part.timing
+        found, timing = part.evaluation, part.timing
         time = unit.of(found.time)
+        told = np.isfinite(timing.lateness)
         if len(timing.lead):
             name, group = _names(part, 'command lead')
             data.append(_curve(
-                name, unit.of([found.seconds(x.stamp) for x in run.commands]),
+                name, unit.of([found.seconds(x.stamp) for x in timing.commands]),
                 timing.lead * 1e3, group, mode='markers', yaxis='y3',
                 marker={'size': 7, 'color': part.colour or BLUE, 'symbol': 'circle'}))
+        if told.any():
+            name, group = _names(part, 'lateness of the command')
+            data.append(_curve(
+                name, unit.of([found.seconds(x.stamp) for x in timing.commands])[told],
+                timing.lateness[told] * 1e3, group, mode='markers', yaxis='y3',
+                marker={'size': 8, 'color': part.colour or VERMILION, 'symbol': 'x-thin-open'}))
         name, group = _names(part, 'sample delay')
         colour = part.colour or VERMILION
         if len(timing.delay):
@@ -653,4 +669,5 @@ def timings(parts: Sequence[Part], unit: TimeUnit) -> Figure:
             'yaxis': _axis('sample interval [ms]', domain=[0.0, 0.28], rangemode='tozero'),
             'yaxis2': _axis('sample delay [ms]', domain=[0.36, 0.64], anchor='x'),
             'yaxis3': _axis(
-                'command lead [ms]', domain=[0.72, 1.0], anchor='x', rangemode='tozero')})
+                'command lead [ms]' if not any(len(x.timing.lateness) for x in parts)
+                else 'lead, lateness [ms]', domain=[0.72, 1.0], anchor='x', rangemode='tozero')})

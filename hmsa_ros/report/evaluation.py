@@ -4,7 +4,7 @@ What a run amounts to: its setpoints, what was left of the vibration, and what w
 Times are in s from the first command of the run; stamps stay integer nanoseconds.
 """
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 import math
@@ -33,6 +33,10 @@ from hmsa_ros.report.reading import Level, Run, Times
 _SAME = 1e-6
 # Stretch rates below this share of the natural frequency are rest, to a planner's precision.
 _AT_REST = 1e-3
+# A change of level that took effect within so many s of its stamp was in time.
+_PUNCTUAL = 1e-6
+# Stamps of what took effect may be rounded, in ns.
+_ROUNDED_STAMP = 1000
 # Clocks further apart than this are different clocks.
 _SAME_CLOCK = 60.0
 
@@ -121,7 +125,7 @@ class Evaluation:
     start : float
         Stretch at rest before the first move.
     levels : tuple of Level
-        Commands that came into force, by stamp.
+        Commands that came into force and changed the level, by stamp.
     moves : tuple of Move
         Setpoints.
     results : tuple of MoveResult
@@ -168,7 +172,7 @@ def evaluate(run: Run, moves: Sequence[Move] | None = None) -> Evaluation:
         The measures.
 
     """
-    levels = in_force((x,) for x in run.commands)
+    levels = in_force((x,) for x in without_repeats(run.commands)[0])
     plan = in_force(run.plans)
     start = _start(run, levels, plan)
     found = tuple(find_moves(run, levels, plan) if moves is None else moves)
@@ -206,6 +210,36 @@ def in_force(messages: Iterable[Sequence[Level]]) -> tuple[Level, ...]:
             del levels[bisect_left(levels, ordered[0].stamp, key=lambda x: x.stamp):]
             levels += ordered
     return tuple(levels)
+
+
+def without_repeats(commands: Sequence[Level]) -> tuple[tuple[Level, ...], int]:
+    """
+    Leave out the commands that change nothing, by which a planner shows that it is alive.
+
+    Parameters
+    ----------
+    commands : sequence of Level
+        In the order received.
+
+    Returns
+    -------
+    commands : tuple of Level
+        Those that change the level at their stamp, or replace levels after it.
+    repeats : int
+        How many were left out.
+
+    """
+    kept: list[Level] = []
+    schedule: list[Level] = []
+    for command in commands:
+        place = bisect_left(schedule, command.stamp, key=lambda x: x.stamp)
+        at = bisect_right(schedule, command.stamp, key=lambda x: x.stamp)
+        if at == len(schedule) > 0 and schedule[-1].flux_density == command.flux_density:
+            continue
+        del schedule[place:]
+        schedule.append(command)
+        kept.append(command)
+    return tuple(kept), len(commands) - len(kept)
 
 
 def find_moves(
@@ -484,9 +518,16 @@ class Timing:
 
     Attributes
     ----------
+    commands : tuple of Level
+        Those that change something, in the order received.
+    repeats : int
+        How many commands changed nothing.
     lead : ndarray, shape (m,)
         How far ahead of its stamp each command was recorded, in s; below 0 for a late one.
         Empty if the recorder kept another clock than the stamps.
+    lateness : ndarray, shape (k,)
+        How long after its stamp each change of level took effect, in s, by what the plant or the
+        driver told; NaN for one that it did not tell of. Empty if it tells of none.
     delay : ndarray, shape (n,)
         How long after its stamp each sample was recorded, in s; empty likewise.
     interval : ndarray, shape (n - 1,)
@@ -495,18 +536,26 @@ class Timing:
         Between the times at which they were recorded, in s.
     missing : int
         Samples that gaps in the stamps have room for.
+    unapplied : int
+        Changes of level that were due and did not take effect by what was told.
 
     """
 
+    commands: tuple[Level, ...]
+    repeats: int
     lead: Array
+    lateness: Array
     delay: Array
     interval: Array
     arrival_interval: Array
     missing: int
+    unapplied: int
 
     @property
     def late(self) -> int:
-        """Commands that were recorded after the time from which they apply."""
+        """Commands that took effect, or else were recorded, after the time they apply from."""
+        if len(self.lateness):
+            return int(np.count_nonzero(self.lateness > _PUNCTUAL))
         return int(np.count_nonzero(self.lead < 0.0))
 
 
@@ -525,17 +574,47 @@ def timing(run: Run) -> Timing:
         In s.
 
     """
+    commands, repeats = without_repeats(run.commands)
     delay = _seconds(run.logged - run.time)
     interval = _seconds(np.diff(run.time))
-    lead = _seconds(np.array([x.stamp - x.sent for x in run.commands], dtype=np.int64))
+    lead = _seconds(np.array([x.stamp - x.sent for x in commands], dtype=np.int64))
     if abs(float(np.median(delay))) > _SAME_CLOCK:
         delay, lead = np.empty(0), np.empty(0)
     recorded: Times = np.sort(run.logged)
     usual = float(np.median(interval)) if len(interval) else math.inf
     gaps = np.rint(interval / usual) - 1.0
+    lateness, unapplied = _lateness(commands, run.applied, int(run.time[-1]))
     return Timing(
-        lead, delay, interval, _seconds(np.diff(recorded)),
-        int(np.sum(gaps[gaps > 0.0])) if len(interval) else 0)
+        commands, repeats, lead, lateness, delay, interval, _seconds(np.diff(recorded)),
+        int(np.sum(gaps[gaps > 0.0])) if len(interval) else 0, unapplied)
+
+
+def _lateness(
+        commands: Sequence[Level], applied: Sequence[Level], last: int) -> tuple[Array, int]:
+    """Return how long after its stamp each command took effect, and how many never did."""
+    if not applied:
+        return np.empty(0), 0
+    result = np.full(len(commands), np.nan)
+    unapplied = 0
+    # What was replaced before its time never took effect.
+    standing = in_force((x,) for x in commands)
+    places = {x: i for i, x in enumerate(commands)}
+    before: Level | None = min(applied, key=lambda x: x.stamp)
+    for i, command in enumerate(standing):
+        until = next(
+            (x.stamp for x in standing[i + 1:] if _same_level(x, command)), math.inf)
+        when = [x.stamp for x in applied if _same_level(x, command)
+                and command.stamp - _ROUNDED_STAMP <= x.stamp < until - _ROUNDED_STAMP]
+        if when:
+            result[places[command]] = (min(when) - command.stamp) / NANOSECONDS
+        elif command.stamp < last and not (before and _same_level(before, command)):
+            unapplied += 1
+        before = command
+    return result, unapplied
+
+
+def _same_level(one: Level, other: Level) -> bool:
+    return math.isclose(one.flux_density, other.flux_density, rel_tol=1e-9, abs_tol=1e-12)
 
 
 def _seconds(nanoseconds: Times) -> Array:

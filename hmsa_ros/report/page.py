@@ -22,7 +22,7 @@ from hmsa_ros.report import charts
 from hmsa_ros.report.assets import SCRIPT, STYLE
 from hmsa_ros.report.charts import Figure, Part, percent, TimeUnit
 from hmsa_ros.report.evaluation import plan_points
-from hmsa_ros.report.reading import ACTUATOR_FIELDS, Run
+from hmsa_ros.report.reading import ACTUATOR_FIELDS, APPLIED, Run
 
 _POLICY = (
     "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
@@ -132,8 +132,12 @@ def page(parts: Sequence[Part]) -> str:
     sections += [
         ('timing-section', 'Timing', _text(
             'Lead: how far ahead of the time it applies a command was recorded; below 0 it came '
-            'late. Delay: how long after its stamp a sample was recorded. Times are those of '
-            "the recorder's clock.") + place(charts.timings(parts, unit)) + _timing(parts)),
+            'late. ' + (
+                'Lateness: how long after that time the change took effect, as the plant or the '
+                'driver told. ' if any(len(x.timing.lateness) for x in parts) else '')
+            + 'Delay: how long after its stamp a sample was recorded. Times are those of the '
+            "recorder's clock." + _repeats(parts))
+         + place(charts.timings(parts, unit)) + _timing(parts)),
         ('losses', 'Messages and losses', _losses(parts)),
         ('parameters', 'Parameters', _parameters(parts)),
     ]
@@ -213,7 +217,8 @@ def _tiles(parts: Sequence[Part]) -> str:
         str(len(x.evaluation.results)),
         percent(largest(y.residual for y in x.evaluation.results)),
         percent(largest(y.residual_unshaped for y in x.evaluation.results)),
-        f'{len(x.run.commands)}' + (f' ({x.timing.late} late)' if len(x.timing.lead) else ''),
+        f'{len(x.timing.commands)}' + (
+            f' ({x.timing.late} late)' if len(x.timing.lead) or len(x.timing.lateness) else ''),
         f'{1.0 / np.median(x.timing.interval):.6g}' if len(x.timing.interval) else '–',
         'not told' if x.run.summary.lost is None else str(x.run.summary.lost)] for x in parts]
     if len(parts) == 1:
@@ -246,6 +251,9 @@ def _notes_of(part: Part) -> Iterable[str]:
     if not len(part.timing.lead) and part.run.commands:
         yield ('The recorder kept another clock than the stamps: how far ahead commands were '
                'sent is not known (record with use_sim_time where time is simulated).')
+    if part.timing.unapplied:
+        yield (f'{part.timing.unapplied} changes of level did not take effect by what '
+               f'{part.run.topics[APPLIED]} tells.')
     if part.timing.missing:
         yield f'The stamps of the samples have gaps with room for {part.timing.missing} more.'
     for verdict in part.run.verdicts:
@@ -363,13 +371,20 @@ def _plan(parts: Sequence[Part], unit: TimeUnit) -> str:
         rows[:_MOST_ROWS])
 
 
+def _repeats(parts: Sequence[Part]) -> str:
+    count = sum(x.timing.repeats for x in parts)
+    return f' Left out are {count} commands that repeat the one before.' if count else ''
+
+
 def _timing(parts: Sequence[Part]) -> str:
     """Return the table of times."""
     rows: list[_Row] = []
     for part in parts:
         x = part.timing
         for name, values in (
-                ('command lead', x.lead), ('sample delay', x.delay),
+                ('command lead', x.lead),
+                ('lateness of the command', x.lateness[np.isfinite(x.lateness)]),
+                ('sample delay', x.delay),
                 ('interval of the stamps', x.interval),
                 ('interval of the recorded samples', x.arrival_interval)):
             if len(values):

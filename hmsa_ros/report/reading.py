@@ -6,11 +6,12 @@ bag may come from this package's recorder, from rosbag2, from a simulated plant 
 """
 
 from array import array
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 import json
 import math
 from pathlib import Path
+import re
 import struct
 from typing import Any
 
@@ -29,6 +30,7 @@ Times = NDArray[np.int64]
 
 JOINT_STATES = 'joint_states'
 COMMAND = 'flux_density_command'
+APPLIED = 'flux_density_applied'
 PLAN = 'planner/plan'
 TRAJECTORY = 'planner/joint_trajectory'
 SETPOINT = 'planner/setpoint'
@@ -36,6 +38,7 @@ STATUS = 'planner/status'
 TYPES = {
     JOINT_STATES: 'sensor_msgs/msg/JointState',
     COMMAND: 'sensor_msgs/msg/MagneticField',
+    APPLIED: 'sensor_msgs/msg/MagneticField',
     PLAN: 'trajectory_msgs/msg/JointTrajectory',
     TRAJECTORY: 'trajectory_msgs/msg/JointTrajectory',
     SETPOINT: 'std_msgs/msg/Float64',
@@ -46,6 +49,9 @@ ACTUATOR_FIELDS = (
     'shear_modulus', 'density', 'half_length', 'half_thickness', 'remanence', 'chain_limit',
     'damping_coefficient')
 _DEFAULT_JOINT = 'actuator'
+# Roles whose topics are one for each joint where there are several.
+_OF_A_JOINT = (COMMAND, APPLIED, SETPOINT)
+_NUMBER = re.compile(r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?')
 # Samples may overtake one another on their way; further back goes only a clock, in ns.
 _CLOCK_JUMP = 100_000_000
 # Between two calls of the progress.
@@ -135,6 +141,8 @@ class Run:
     ----------
     label : str
         Name for people.
+    joint : str
+        Name of the actuator in the joint states, as far as it is known.
     path : Path
         The bag.
     summary : BagSummary
@@ -150,6 +158,9 @@ class Run:
         T, NaN if it was not recorded.
     commands : tuple of Level
         In the order they were recorded.
+    applied : tuple of Level
+        Changes of the field that took effect, as the plant or the driver told them; empty if it
+        does not.
     plans : tuple of tuple of Level
         Plans in the order they were recorded.
     requests : tuple of Request
@@ -168,6 +179,7 @@ class Run:
     """
 
     label: str
+    joint: str
     path: Path
     summary: BagSummary
     topics: dict[str, str]
@@ -177,6 +189,7 @@ class Run:
     rate: Array
     flux_density: Array
     commands: tuple[Level, ...]
+    applied: tuple[Level, ...]
     plans: tuple[tuple[Level, ...], ...]
     requests: tuple[Request, ...]
     verdicts: tuple[Verdict, ...]
@@ -201,15 +214,18 @@ class Run:
             0 if it was not recorded.
 
         """
-        value = self.parameters.get(name)
+        node, _, parameter = name.partition('.')
+        value = self.parameters.get(
+            f'{node}.{self.joint}.{parameter}', self.parameters.get(name))
         return float(value) if isinstance(value, (int, float)) else 0.0
 
 
 def read_runs(
-        path: str | Path, *, actuator: ActuatorParameters | None = None, joint: str = '',
+        path: str | Path, *, actuator: ActuatorParameters | None = None,
+        joints: Sequence[str] = (),
         progress: Callable[[str, float], None] = lambda what, share: None) -> list[Run]:
     """
-    Read a bag: one run for each namespace with joint states and commands.
+    Read a bag: one run for each actuator with joint states and commands.
 
     Parameters
     ----------
@@ -217,15 +233,16 @@ def read_runs(
         Folder of a bag, or an ``.mcap`` file.
     actuator : ActuatorParameters, optional
         The block, where the bag does not tell.
-    joint : str
-        Name of the actuator in the joint states; default what the planner calls it.
+    joints : sequence of str
+        Names of the actuators in the joint states; default all that have commands of their own,
+        or the one that the planner names.
     progress : callable
         Called with what is going on and the share that is done.
 
     Returns
     -------
     list of Run
-        At least one, in order of namespace.
+        At least one, in order of namespace and joint.
 
     Raises
     ------
@@ -236,12 +253,13 @@ def read_runs(
     path = Path(path)
     reader = BagReader(path)
     spaces = _namespaces(reader)
-    found = {topic: (space, role) for space, topics in spaces.items()
-             for role, topic in topics.items()}
+    # A namespace's own topics, and in it those of each joint.
+    found = {topic: (space, role, joint) for space, by_joint in spaces.items()
+             for joint, topics in by_joint.items() for role, topic in topics.items()}
     collected: dict[str, _Collected] = {space: _Collected() for space in spaces}
     notes: list[str] = []
     decoders: dict[str, Callable[[bytes], Any]] = {}
-    for topic, (space, role) in found.items():
+    for topic, (space, role, _) in found.items():
         try:
             decoders[topic] = reader.decoder(topic)
         except BagError as error:
@@ -252,9 +270,9 @@ def read_runs(
     for i, message in enumerate(reader.messages(list(found))):
         if i % _PROGRESS_MESSAGES == 0:
             progress(f'reading {path.name}', (message.log_time - begin) / max(end - begin, 1))
-        space, role = found[message.topic]
+        space, role, joint = found[message.topic]
         try:
-            collected[space].take(role, message, decoders[message.topic])
+            collected[space].take(role, joint, message, decoders[message.topic])
         except BagError as error:
             if len(notes) < 20:
                 notes.append(f'{error}: left out')
@@ -262,25 +280,41 @@ def read_runs(
     notes += [*summary.problems]
     label = path.resolve().stem if path.is_file() else path.resolve().name
     runs, reasons = [], []
-    for space, topics in sorted(spaces.items()):
+    for space, by_joint in sorted(spaces.items()):
         name = label if len(spaces) == 1 else f'{label} {space or "/"}'
-        try:
-            runs.append(collected[space].finish(
-                name, path, summary, topics, notes, reader.custom_data, actuator, joint))
-        except BadInputError as error:
-            reasons.append(error)
+        for joint, topics in sorted(by_joint.items()):
+            if joint and joints and joint not in joints:
+                reasons.append(BadInputError(
+                    f'{path} has no joint {" or ".join(joints)}: expected one of '
+                    f'{", ".join(sorted(by_joint))}'))
+                continue
+            for wanted in ([joint] if joint else joints or ['']):
+                several = len(by_joint) > 1 or len(joints) > 1
+                try:
+                    runs.append(collected[space].finish(
+                        f'{name} {wanted}' if several else name, path, summary, topics, notes,
+                        reader.custom_data, actuator, joint, wanted))
+                except BadInputError as error:
+                    reasons.append(error)
     if not runs:
         raise reasons[0]
     return runs
 
 
-def _namespaces(reader: BagReader) -> dict[str, dict[str, str]]:
-    """Return the topics of each actuator, by namespace and role."""
+def _namespaces(reader: BagReader) -> dict[str, dict[str, dict[str, str]]]:
+    """Return the topics of each actuator, by namespace, joint ('' for the only one) and role."""
     names: dict[str, list[tuple[str, str]]] = {role: [] for role in TYPES}
     for topic in reader.topics.values():
         for role, kind in TYPES.items():
-            if topic.type == kind and f'/{topic.name}'.endswith(f'/{role}'):
+            node, _, last = role.rpartition('/')
+            if topic.type != kind:
+                continue
+            if f'/{topic.name}'.endswith(f'/{role}'):
                 names[role].append((topic.name[:-len(role)].rstrip('/'), topic.name))
+            elif role == SETPOINT and re.search(rf'/{node}/[^/]+/{last}$', f'/{topic.name}'):
+                # .../planner/JOINT/setpoint stands beside .../JOINT/flux_density_command.
+                space, _, joint = topic.name[:-len(last) - 1].rpartition('/')
+                names[role].append((f'{space[:-len(node)]}{joint}', topic.name))
     missing = [f'.../{role} ({TYPES[role]})' for role in (JOINT_STATES, COMMAND)
                if not names[role]]
     if missing:
@@ -288,18 +322,20 @@ def _namespaces(reader: BagReader) -> dict[str, dict[str, str]]:
         raise BadInputError(
             f'{reader.path} has no topic {" and no topic ".join(missing)}: expected a bag of a '
             f'run; its topics are {has}')
-    spaces: dict[str, dict[str, str]] = {}
+    spaces: dict[str, dict[str, dict[str, str]]] = {}
     for space, name in names[JOINT_STATES]:
-        topics = {JOINT_STATES: name}
-        for role in TYPES:
-            same = [x for where, x in names[role] if where == space]
-            if same:
-                topics[role] = same[0]
-            elif len(names[role]) == 1 and len(names[JOINT_STATES]) == 1:
-                # Planner and plant in namespaces of their own, remapped to each other.
-                topics[role] = names[role][0][1]
-        if COMMAND in topics:
-            spaces[space] = topics
+        own = _topics_in(names, space, name)
+        if COMMAND in own:
+            spaces[space] = {'': own}
+            continue
+        by_joint = {
+            where[len(space) + 1:]: where for where, _ in names[COMMAND]
+            if where.startswith(f'{space}/') and '/' not in where[len(space) + 1:]}
+        if by_joint:
+            spaces[space] = {joint: {
+                **own, **{role: topic for role in _OF_A_JOINT
+                          for at, topic in names[role] if at == where}}
+                for joint, where in by_joint.items()}
     if not spaces:
         raise BadInputError(
             f'{reader.path} has joint states and commands in different namespaces: expected '
@@ -308,81 +344,133 @@ def _namespaces(reader: BagReader) -> dict[str, dict[str, str]]:
     return spaces
 
 
+def _topics_in(
+        names: Mapping[str, Sequence[tuple[str, str]]], space: str, states: str
+) -> dict[str, str]:
+    """Return the topics of a namespace, by role."""
+    topics = {JOINT_STATES: states}
+    for role in TYPES:
+        same = [x for where, x in names[role] if where == space]
+        if same:
+            topics[role] = same[0]
+        elif len(names[role]) == 1 and len(names[JOINT_STATES]) == 1 and (
+                role not in _OF_A_JOINT or len(names[COMMAND]) == 1):
+            # Planner and plant in namespaces of their own, remapped to each other.
+            topics[role] = names[role][0][1]
+    return topics
+
+
 class _Collected:
-    """What has been read of one actuator so far."""
+    """What has been read of the actuators of one namespace so far."""
 
     samples: '_SampleReader'
 
     def __init__(self) -> None:
-        self.commands: list[Level] = []
-        self.refused = 0
-        self.plans: list[tuple[Level, ...]] = []
-        self.joint = ''
-        self.requests: list[Request] = []
-        self.verdicts: list[Verdict] = []
+        self.commands: dict[str, list[Level]] = {}
+        self.applied: dict[str, list[Level]] = {}
+        self.refused: dict[str, int] = {}
+        # Of all joints, as they were received.
+        self.plans: list[tuple[int, Any]] = []
+        self.trajectories: list[tuple[int, Any]] = []
+        self.setpoints: dict[str, list[Request]] = {}
+        self.statuses: list[tuple[int, Any]] = []
 
-    def take(self, role: str, message: Message, decode: Callable[[bytes], Any]) -> None:
+    def take(
+            self, role: str, joint: str, message: Message,
+            decode: Callable[[bytes], Any]) -> None:
         """Take in a message."""
         if role == JOINT_STATES:
             self.samples.take(message.log_time, message.data)
             return
         content, sent = decode(message.data), message.log_time
-        if role == COMMAND:
+        if role in (COMMAND, APPLIED):
             field = content.magnetic_field
+            kept = self.commands if role == COMMAND else self.applied
             if math.isfinite(field.x + field.y + field.z) and field.x == 0.0 == field.y:
-                self.commands.append(
+                kept.setdefault(joint, []).append(
                     Level(_ns(content.header.stamp) or sent, float(field.z), sent))
-            else:
-                self.refused += 1
+            elif role == COMMAND:
+                self.refused[joint] = self.refused.get(joint, 0) + 1
         elif role == PLAN:
-            start = _ns(content.header.stamp)
-            self.joint = next(iter(content.joint_names), '')
-            self.plans.append(tuple(
-                Level(start + _ns(x.time_from_start), float(x.effort[0]), sent,
-                      float(x.positions[0]), float(x.velocities[0]))
-                for x in content.points if x.positions and x.velocities and x.effort))
+            self.plans.append((sent, content))
         elif role == TRAJECTORY:
-            self.requests.append(Request(sent, _ns(content.header.stamp), tuple(
-                (float(x.positions[0]), _ns(x.time_from_start))
-                for x in content.points if len(x.positions) == 1)))
+            self.trajectories.append((sent, content))
         elif role == SETPOINT:
-            self.requests.append(Request(sent, 0, ((float(content.data), None),)))
+            self.setpoints.setdefault(joint, []).append(
+                Request(sent, 0, ((float(content.data), None),)))
         else:
-            self._take_status(content, sent)
+            self.statuses.append((sent, content))
 
-    def _take_status(self, content: Any, sent: int) -> None:
-        values = {x.key: x.value for x in content.values}
-        try:
-            stretch = float(values.get('stretch', ''))
-        except ValueError:
-            stretch = math.nan
-        level = content.level[0] if isinstance(content.level, bytes) else int(content.level)
-        self.verdicts.append(Verdict(
-            sent, _LEVELS[min(level, 2)], values.get('code', ''), content.message, stretch))
+    def _plans(self, joint: str) -> Iterable[tuple[Level, ...]]:
+        """Return the plans of a joint, or of the one that they are of."""
+        for sent, content in self.plans:
+            place = _place(content.joint_names, joint)
+            if place is not None:
+                start = _ns(content.header.stamp)
+                yield tuple(
+                    Level(start + _ns(x.time_from_start), float(x.effort[place]), sent,
+                          float(x.positions[place]), float(x.velocities[place]))
+                    for x in content.points
+                    if min(len(x.positions), len(x.velocities), len(x.effort)) > place)
+
+    def _requests(self, joint: str, key: str) -> list[Request]:
+        """Return what was asked of a joint, by time."""
+        requests = list(self.setpoints.get(key, ()))
+        for sent, content in self.trajectories:
+            place = _place(content.joint_names, joint)
+            if place is not None:
+                requests.append(Request(sent, _ns(content.header.stamp), tuple(
+                    (float(x.positions[place]), _ns(x.time_from_start))
+                    for x in content.points
+                    if len(x.positions) == max(len(content.joint_names), 1))))
+        return sorted(requests, key=lambda x: x.sent)
+
+    def _verdicts(self, joint: str, joints: Sequence[str]) -> Iterable[Verdict]:
+        """Return what the planner said, with the target of a joint."""
+        for sent, content in self.statuses:
+            values = {x.key: x.value for x in content.values}
+            targets = [float(x) for x in _NUMBER.findall(values.get('stretch', ''))]
+            place = _place(joints, joint)
+            level = content.level[0] if isinstance(content.level, bytes) else int(content.level)
+            yield Verdict(
+                sent, _LEVELS[min(level, 2)], values.get('code', ''), content.message,
+                targets[place] if place is not None and len(targets) == max(len(joints), 1)
+                else math.nan)
 
     def finish(
             self, label: str, path: Path, summary: BagSummary, topics: dict[str, str],
             notes: Iterable[str], custom_data: Mapping[str, str],
-            actuator: ActuatorParameters | None, joint: str) -> Run:
-        """Return the run."""
+            actuator: ActuatorParameters | None, key: str, joint: str) -> Run:
+        """Return the run of one joint, whose topics have its name in them or not."""
         notes = list(notes)
         parameters = _parameters(custom_data, topics[JOINT_STATES][:-len(JOINT_STATES)])
-        named = joint or self.joint or str(parameters.get('planner.joint', ''))
+        planned = [x for _, content in self.plans for x in content.joint_names]
+        named = joint or next(iter(planned), '') or str(parameters.get('planner.joint', ''))
         time, logged, stretch, rate, flux_density = self.samples.arrays(
             f'{path}: {topics[JOINT_STATES]}', named, required=bool(joint))
-        if not self.commands:
+        commands = self.commands.get(key, [])
+        if not commands:
             notes.append(
                 f'{topics[COMMAND]} holds no command: there is no setpoint to evaluate.')
-        if self.refused:
+        if self.refused.get(key):
             notes.append(
-                f'{self.refused} commands are not finite or not along z: left out, as the plant '
-                'does.')
+                f'{self.refused[key]} commands are not finite or not along z: left out, as the '
+                'plant does.')
         notes += self.samples.notes
-        plant, planner, known, more = _actuators(parameters, actuator)
+        plant, planner, known, more = _actuators(parameters, actuator, named)
         return Run(
-            label, path, summary, topics, time, logged, stretch, rate, flux_density,
-            tuple(self.commands), tuple(self.plans), tuple(self.requests),
-            tuple(self.verdicts), parameters, plant, planner, known, (*notes, *more))
+            label, named, path, summary, topics, time, logged, stretch, rate, flux_density,
+            tuple(commands), tuple(self.applied.get(key, ())), tuple(self._plans(joint)),
+            tuple(self._requests(joint, key)),
+            tuple(self._verdicts(joint, list(dict.fromkeys(planned)))), parameters, plant,
+            planner, known, (*notes, *more))
+
+
+def _place(names: Sequence[str], joint: str) -> int | None:
+    """Return a joint's place among some names: the first if it does not matter."""
+    if joint in names:
+        return list(names).index(joint)
+    return 0 if not joint or len(names) <= 1 else None
 
 
 def _parameters(custom_data: Mapping[str, str], space: str) -> dict[str, object]:
@@ -398,13 +486,16 @@ def _parameters(custom_data: Mapping[str, str], space: str) -> dict[str, object]
 
 
 def _actuators(
-        parameters: Mapping[str, object], given: ActuatorParameters | None
+        parameters: Mapping[str, object], given: ActuatorParameters | None, joint: str
 ) -> tuple[ActuatorParameters, ActuatorParameters, bool, list[str]]:
     """Return the block of the plant and of the planner, whether they are known, and notes."""
     found: dict[str, ActuatorParameters] = {}
     notes = []
     for node in ('plant', 'planner'):
-        values = {x: parameters.get(f'{node}.actuator.{x}') for x in ACTUATOR_FIELDS}
+        # What is set for one joint goes before what is set for all.
+        values = {x: parameters.get(
+            f'{node}.{joint}.actuator.{x}', parameters.get(f'{node}.actuator.{x}'))
+            for x in ACTUATOR_FIELDS}
         if all(isinstance(x, (int, float)) for x in values.values()):
             try:
                 found[node] = ActuatorParameters(**values)  # type: ignore[arg-type]
@@ -506,6 +597,7 @@ class _SampleReader:
             If there is no such joint, or none of its samples can be used.
 
         """
+        self.notes = []
         if not self._columns:
             raise BadInputError(f'{where} holds no message: expected samples of the actuator')
         joint = self._joint(where, joint, required)
