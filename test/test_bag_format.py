@@ -85,7 +85,7 @@ def test_the_summary_counts_everything(tmp_path):
         reader = make_reader(file)
         summary = reader.get_summary()
         assert [record.name for record in reader.iter_metadata()] == [
-            'rosbag2', 'hmsa_ros', 'rosbag2', 'hmsa_ros']
+            'rosbag2', 'hmsa_ros', 'rosbag2']
         assert reader.get_header().profile == 'ros2'
     statistics = summary.statistics
     assert statistics.message_count == 2000

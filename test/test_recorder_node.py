@@ -8,7 +8,9 @@ import subprocess
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import pytest
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
 from rosbags.highlevel import AnyReader
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
@@ -16,10 +18,12 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from hmsa_ros.bag import metadata
-from hmsa_ros.bag.definitions import type_hash
-from hmsa_ros.bag.info import lost_messages
+from hmsa_ros.bag.definitions import message_definition, type_hash
+from hmsa_ros.bag.info import lost_messages, summarize
+from hmsa_ros.bag.qos import Qos
 from hmsa_ros.bag.reader import BagReader, read_messages
 from hmsa_ros.bag.recover import recover
+from hmsa_ros.bag.writer import BagWriter, Topic
 
 pytestmark = pytest.mark.ros
 TALKER = Path(__file__).parent / 'talker.py'
@@ -351,38 +355,100 @@ def test_simulated_time_is_waited_for_and_stamped(record, ros):
     message.clock.sec = 50
     clock.publish(message)
     ros.spin_until((recorder.folder / 'bag_1.mcap').exists, 'a new file for the new time')
+    publisher.publish(Float64(data=3.0))
+    recorder.wait_for('received', '3')
+    recorder.wait_for('time_jumps', '1')
     reader = recorder.end()
-    first, second = reader.messages()
+    assert 'simulated time jumped back from 200.000 s to 50.000 s' in recorder.process.output
+    assert reader.custom_data['time_jumps'] == '1'
+    before, after = (list(BagReader(file).messages()) for file in reader.files)
+    first, second = before
     assert first.log_time // 10**9 == 100
     assert second.log_time == 200 * 10**9 + message.clock.nanosec
     assert second.publish_time > 10**18
+    assert [item.log_time // 10**9 for item in after] == [50]
+
+
+def test_a_bag_played_in_a_loop_is_recorded_round_by_round(record, start, ros, tmp_path):
+    bag = tmp_path / 'played'
+    encoding, text = message_definition('std_msgs/msg/Float64')
+    with BagWriter(bag) as writer:
+        number = writer.add_topic(Topic('/a', 'std_msgs/msg/Float64', text, encoding, (Qos(),)))
+        writer.write((number, 10**12 + i * 10**6, 1, i, serialize_message(Float64(data=float(i))))
+                     for i in range(200))
+    recorder = record('use_sim_time:=true')
+    player = start.hmsa(
+        'player', '--ros-args', '-p', f'storage.uri:={bag}', '-p', 'play.loop:=true', '-p',
+        'play.clock_publish_frequency:=500.0', '-p', 'play.wait_for_subscribers:=[/a]')
+    ros.spin_until(lambda: int(recorder.says('time_jumps') or 0) >= 3, 'three rounds')
+    player.stop()
+    reader = recorder.end()
+    assert len(reader.files) >= 4
+    for file in reader.files[:3]:
+        assert values(BagReader(file)) == list(range(200))
+
+
+def test_of_two_clocks_one_is_followed_and_that_is_told(record, ros, make_ros):
+    recorder = record('use_sim_time:=true')
+    publisher = ros.publisher(Float64, '/a', subscribers=0)
+    best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    first = ros.publisher(Clock, '/clock', best_effort)
+    second = make_ros().publisher(Clock, '/clock', best_effort)
+
+    def tick():
+        for clock, seconds in ((first, 100), (second, 7)):
+            message = Clock()
+            message.clock.sec = seconds
+            clock.publish(message)
+        return recorder.says('clock_ignored') not in ('', '0')
+
+    ros.spin_until(lambda: tick() or recorder.says('subscribed') == '1/1', 'the subscription')
+    ros.spin_until(tick, 'the other clock')
+    assert any('2 publishers of /clock, the first one is followed' in status.message
+               for message in recorder.diagnostics for status in message.status)
+    publisher.publish(Float64(data=1.0))
+    ros.spin_until(lambda: tick() and recorder.says('received') == '1', 'the message')
+    reader = recorder.end()
+    assert len(reader.files) == 1
+    item, = reader.messages()
+    assert item.log_time in (100 * 10**9, 7 * 10**9)
 
 
 def test_the_experiment_goes_into_the_bag(record, ros, make_ros):
     other = make_ros()
-    planner = Node('planner', context=other.context)
-    planner.declare_parameter('zeta', 0.1)
-    other.executor.add_node(planner)
+    planners = {}
+    for zeta, space in ((0.1, '/left'), (0.2, '/right'), (0.3, '/')):
+        planners[space] = Node('planner', context=other.context, namespace=space)
+        planners[space].declare_parameter('zeta', zeta)
+        other.executor.add_node(planners[space])
     recorder = record('storage.custom_data:=["actuator=A3", "operator=Kim"]')
     trajectory = JointTrajectory(joint_names=['actuator'], points=[
         JointTrajectoryPoint(positions=[1.1])])
-    sender = ros.publisher(JointTrajectory, 'planner/joint_trajectory')
-    sender.publish(trajectory)
+    ros.publisher(JointTrajectory, 'planner/joint_trajectory').publish(trajectory)
+    ros.publisher(Float64, '/left/planner/setpoint').publish(Float64(data=1.2))
 
     def noted():
         other.executor.spin_once(0.02)
         text = (recorder.folder / 'metadata.yaml').read_text()
-        return 'planner.zeta' in text and 'setpoints' in text
+        return text.count('planner.zeta') == 3 and text.count('received') == 2
 
     ros.spin_until((recorder.folder / 'metadata.yaml').exists, 'the bag')
     ros.spin_until(noted, 'parameters and setpoints in the bag')
+    planners['/left'].set_parameters([Parameter('zeta', value=0.4)])
+    ros.spin_until(lambda: "planner.zeta: '0.4'" in (
+        recorder.folder / 'metadata.yaml').read_text(), 'the change of a parameter')
     reader = recorder.end()
     assert reader.custom_data['actuator'] == 'A3'
-    assert reader.custom_data['/planner.zeta'] == '0.1'
-    assert json.loads(reader.custom_data['setpoints'])[0]['points'] == [[[1.1], 0.0]]
-    assert reader.records['hmsa_ros']['/planner.zeta'] == '0.1'
+    for stored in (reader.custom_data, reader.records['hmsa_ros']):
+        assert [stored[f'{space}planner.zeta'] for space in ('/left/', '/right/', '/')] == [
+            '0.4', '0.2', '0.3']
+    sequence, setpoint = json.loads(reader.custom_data['setpoints'])
+    assert sequence['points'] == [[[1.1], 0.0]]
+    assert (setpoint['topic'], setpoint['stretch']) == ('/left/planner/setpoint', 1.2)
     assert 'version' in reader.records['hmsa_ros']
-    planner.destroy_node()
+    assert summarize(recorder.folder).parameters['/right/planner.zeta'] == '0.2'
+    for planner in planners.values():
+        planner.destroy_node()
 
 
 def test_a_snapshot_holds_what_came_before_it(record, ros):

@@ -39,6 +39,8 @@ _RUN_BYTES = 512 * 1024
 _HEAD_BYTES = 64
 # A field that is an array of messages.
 _NESTED = re.compile(r'^\s*(?:[A-Z]\w*|\w+/[\w/]+)\s*\[', re.MULTILINE)
+# What an entry of a map takes besides its texts.
+_ENTRY_BYTES = 100
 # Later than any log time.
 _NEVER = 2**64
 
@@ -144,7 +146,8 @@ class BagReader:
     custom_data : mapping of str to str
         From ``metadata.yaml``, or else from the files.
     records : mapping of str to mapping
-        Metadata records of the files by name; of several with one name the last counts.
+        Metadata records by name, those of one name together; of several values the last
+        counts.
     problems : list of str
         What could not be read so far, one sentence each; grows while messages are read.
 
@@ -179,8 +182,10 @@ class BagReader:
         if not self._files:
             raise BadInputError(f'no file of {self.path} can be read: ' + self.problems[0])
         self.files = tuple(file.path for file in self._files)
-        self.records = {
-            name: values for file in self._files for name, values in file.metadata.items()}
+        self.records: dict[str, dict[str, str]] = {}
+        for file in self._files:
+            for name, values in file.metadata.items():
+                self.records.setdefault(name, {}).update(values)
         self.topics: dict[str, TopicInfo] = {}
         for file in self._files:
             for channel in file.channels.values():
@@ -416,10 +421,11 @@ class BagReader:
             file.channels[channel.id] = channel
         elif opcode == records.METADATA:
             name, values = records.read_metadata(content)
-            if name not in file.metadata:
-                # Of several with one name the last counts, so the others take no memory.
-                self._keep(min(len(content), limits.RECORD_SIZE))
-            file.metadata[name] = values
+            known = file.metadata.setdefault(name, {})
+            self._keep(len(name) + sum(
+                len(value) + (0 if key in known else len(key) + _ENTRY_BYTES)
+                for key, value in values.items() if known.get(key) != value))
+            known.update(values)
         elif opcode == records.HEADER:
             file.profile, file.library = records.read_header(content)
         else:

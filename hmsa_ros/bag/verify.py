@@ -131,6 +131,16 @@ def _stamp(message: Any) -> int:
     return int(stamp.sec) * _NANOSECONDS + int(stamp.nanosec)
 
 
+def _command(pair: _Pair, command: Any) -> tuple[int, float]:
+    """Return stamp and flux density of a command."""
+    try:
+        return _stamp(command), float(command.magnetic_field.z)
+    except (AttributeError, TypeError, ValueError):
+        raise BadInputError(
+            f'a message of {pair.commands} is no command: expected sensor_msgs/msg/'
+            'MagneticField') from None
+
+
 def _verify(reader: BagReader, pair: _Pair) -> Verification:
     """Compare one actuator."""
     from hmsa_ros.core.simulation import ActuatorSimulation
@@ -142,17 +152,14 @@ def _verify(reader: BagReader, pair: _Pair) -> Verification:
     largest, where, first = 0.0, 0, 0
     for message in reader.messages((states, commands)):
         if message.topic == commands:
-            command = decode_command(message.data)
-            stamp, flux_density = _stamp(command), float(command.magnetic_field.z)
+            stamp, flux_density = _command(pair, decode_command(message.data))
             applied += 1
             if simulation is None:
                 ahead.append((stamp, flux_density))
             else:
                 late += simulation.command(stamp or simulation.time, flux_density) > 0
             continue
-        sample = decode_state(message.data)
-        stamp = _stamp(sample)
-        stretch, rate, effort = _sample(pair, sample)
+        stamp, stretch, rate, effort = _sample(pair, decode_state(message.data))
         samples += 1
         if simulation is None:
             first = stamp
@@ -173,12 +180,13 @@ def _verify(reader: BagReader, pair: _Pair) -> Verification:
     return Verification(states, commands, samples, applied, late, largest, where * 1e-9)
 
 
-def _sample(pair: _Pair, sample: Any) -> tuple[float, float, float]:
-    """Return stretch, rate and flux density of the joint."""
+def _sample(pair: _Pair, sample: Any) -> tuple[int, float, float, float]:
+    """Return stamp, stretch, rate and flux density of the joint."""
     try:
         i = list(sample.name).index(pair.joint) if pair.joint else 0
-        return float(sample.position[i]), float(sample.velocity[i]), float(sample.effort[i])
-    except (IndexError, ValueError):
+        return (_stamp(sample), float(sample.position[i]), float(sample.velocity[i]),
+                float(sample.effort[i]))
+    except (AttributeError, IndexError, TypeError, ValueError):
         raise BadInputError(
             f'a message of {pair.states} has no position, velocity and effort of '
             f'{pair.joint or "a joint"}: expected the samples of a plant') from None

@@ -127,6 +127,8 @@ class _File:
     start: int = 2**64 - 1
     end: int = 0
     index_size: int = 0
+    # What the metadata records in it say of the experiment, and how long they are.
+    noted: dict[str, str] = field(default_factory=dict)
     notes_size: int = 0
 
 
@@ -368,12 +370,9 @@ class BagWriter:
         file = self._file
         if file is None:
             return
-        data = records.metadata(EXPERIMENT, {'version': __version__, **self.custom_data})
-        # Each record tells all, so that many of them would be more than the messages are.
-        if file.notes_size + len(data) <= max(_NOTES_SIZE, file.offset // 16):
-            file.metadata_indexes.append(
-                records.metadata_index(self._append(data), len(data), EXPERIMENT))
-            file.notes_size += len(data)
+        # What changes all the time would be more than the messages are.
+        if file.notes_size <= max(_NOTES_SIZE, file.offset // 16):
+            self._write_notes(file)
         metadata.write(self.folder, self._metadata())
 
     def flush(self) -> None:
@@ -579,13 +578,24 @@ class BagWriter:
 
     def _write_metadata_records(self, file: _File) -> None:
         """Write the record that rosbag2 has at both ends of a file, and the experiment."""
-        for name, values in (
-                ('rosbag2', {'serialized_metadata': metadata.to_yaml(
-                    self._metadata(only_file=file), outer_key=False)}),
-                (EXPERIMENT, {'version': __version__, **self.custom_data})):
-            data = records.metadata(name, values)
-            offset = self._append(data)
-            file.metadata_indexes.append(records.metadata_index(offset, len(data), name))
+        self._write_metadata(file, 'rosbag2', {'serialized_metadata': metadata.to_yaml(
+            self._metadata(only_file=file), outer_key=False)})
+        self._write_notes(file)
+
+    def _write_notes(self, file: _File) -> None:
+        """Write what of the experiment the file does not tell yet: viewers show each record."""
+        values = {'version': __version__, **self.custom_data}
+        new = {key: value for key, value in values.items() if file.noted.get(key) != value}
+        if new:
+            file.notes_size += self._write_metadata(file, EXPERIMENT, new)
+            file.noted.update(new)
+
+    def _write_metadata(self, file: _File, name: str, values: Mapping[str, str]) -> int:
+        """Write a metadata record and return its length."""
+        data = records.metadata(name, values)
+        offset = self._append(data)
+        file.metadata_indexes.append(records.metadata_index(offset, len(data), name))
+        return len(data)
 
     def _write_chunk(self) -> None:
         """Append the chunk in progress and its message indexes."""
