@@ -9,9 +9,20 @@ from pathlib import Path
 import select
 import shutil
 import subprocess
+import sys
 import time
 from typing import Any
 
+# The protocol is spoken on descriptors 3 and 4.
+_LAUNCH = '''
+import os
+import sys
+# Copied out of the way first: either may be 3 or 4 itself.
+ours = [os.dup2(int(x), 60 + i) for i, x in enumerate(sys.argv[1:3])]
+os.dup2(ours[0], 3)
+os.dup2(ours[1], 4)
+os.execv(sys.argv[3], sys.argv[3:])
+'''
 NAMES = ('chromium', 'chromium-browser', 'google-chrome', 'google-chrome-stable')
 # Limit of every wait: generous, since it is only reached when a test fails.
 WAIT_SECONDS = 60.0
@@ -30,9 +41,8 @@ class Browser:
         assert program is not None
         ours_in, theirs_out = os.pipe()
         theirs_in, ours_out = os.pipe()
-        # The protocol is spoken on descriptors 3 and 4.
         self.process = subprocess.Popen(
-            ['/bin/sh', '-c', f'exec "$0" "$@" 3<&{theirs_in} 4>&{theirs_out}', program,
+            [sys.executable, '-c', _LAUNCH, str(theirs_in), str(theirs_out), program,
              '--headless=new', '--no-sandbox', '--disable-gpu', '--disable-dev-shm-usage',
              '--hide-scrollbars', '--no-first-run', '--disable-extensions',
              '--disable-background-networking', '--host-resolver-rules=MAP * ~NOTFOUND',

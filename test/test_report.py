@@ -509,7 +509,7 @@ def test_each_joint_of_a_planner_of_several_is_a_run(tmp_path, bag):
     folder = write(
         tmp_path / 'bag', of_several_joints(('left', 'right'), (ACTUATOR, other)),
         **parameters(planner=ACTUATOR, plant=ACTUATOR),
-        **{'plant.right.actuator.density': '2100.0'})
+        **{'plant.right.actuator.density': '2100.0', 'plant.left.actuator.density': 'null'})
     left, right = parts_of(folder)
     assert (left.run.label, right.run.label) == ('bag left', 'bag right')
     expected, = parts_of(bag)

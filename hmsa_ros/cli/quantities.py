@@ -21,7 +21,7 @@ _UNITS: dict[str, dict[str, float]] = {
     'N s/m': {'N s/m': 1.0, 'Ns/m': 1.0},
 }
 _NUMBER = re.compile(r'\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*')
-_NAME = re.compile(r'[A-Za-z](?:_?[A-Za-z0-9])*_?')
+_NAME = re.compile(r'[A-Za-z](?:_?[A-Za-z0-9])*')
 
 _REVIEW = 'Wu et al., Multifunctional Materials 3 (2020) 042003'
 _ZHAO = 'Zhao et al., J. Mech. Phys. Solids 124 (2019) 244'

@@ -91,7 +91,7 @@ SCRIPT = """
       ...layout, paper_bgcolor: 'rgba(0,0,0,0)', plot_bgcolor: 'rgba(0,0,0,0)',
       font: {color: colour('text'), size: narrow() ? 11 : 13, family: FONT},
       // Above the figure is room for the toolbar, below it for the legend.
-      margin: {...(narrow() ? {l: 46, r: 8, b: 40} : {l: 62, r: 14, b: 46}), t: coarse ? 8 : 30},
+      margin: {...(narrow() ? {l: 46, r: 8, b: 40} : {l: 62, r: 14, b: 46}), t: coarse ? 8 : 38},
       legend: {
         orientation: 'h', x: 0, yref: 'container', y: 0, yanchor: 'bottom',
         groupclick: 'togglegroup', bgcolor: 'rgba(0,0,0,0)',

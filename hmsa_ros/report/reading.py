@@ -214,9 +214,7 @@ class Run:
             0 if it was not recorded.
 
         """
-        node, _, parameter = name.partition('.')
-        value = self.parameters.get(
-            f'{node}.{self.joint}.{parameter}', self.parameters.get(name))
+        value = _of_joint(self.parameters, self.joint, name)
         return float(value) if isinstance(value, (int, float)) else 0.0
 
 
@@ -485,6 +483,13 @@ def _parameters(custom_data: Mapping[str, str], space: str) -> dict[str, object]
     return parameters
 
 
+def _of_joint(parameters: Mapping[str, object], joint: str, name: str) -> object:
+    """Return what is set for one joint, or else for all."""
+    node, _, parameter = name.partition('.')
+    own = parameters.get(f'{node}.{joint}.{parameter}')
+    return parameters.get(name) if own is None else own
+
+
 def _actuators(
         parameters: Mapping[str, object], given: ActuatorParameters | None, joint: str
 ) -> tuple[ActuatorParameters, ActuatorParameters, bool, list[str]]:
@@ -492,10 +497,8 @@ def _actuators(
     found: dict[str, ActuatorParameters] = {}
     notes = []
     for node in ('plant', 'planner'):
-        # What is set for one joint goes before what is set for all.
-        values = {x: parameters.get(
-            f'{node}.{joint}.actuator.{x}', parameters.get(f'{node}.actuator.{x}'))
-            for x in ACTUATOR_FIELDS}
+        values = {
+            x: _of_joint(parameters, joint, f'{node}.actuator.{x}') for x in ACTUATOR_FIELDS}
         if all(isinstance(x, (int, float)) for x in values.values()):
             try:
                 found[node] = ActuatorParameters(**values)  # type: ignore[arg-type]
