@@ -61,6 +61,10 @@ EXTRAS_REQUIRE = {
     'bench': [
         'casadi>=3.6',
     ],
+    # Some 500 MB; opens bags without ROS.
+    'viewers': [
+        'rerun-sdk>=0.39',
+    ],
     'docs': [
         'furo>=2024.8',
         'myst-parser>=4.0',
