@@ -1,0 +1,169 @@
+"""
+Managed nodes: configured, activated, deactivated and cleaned up, by themselves or from outside.
+
+The states and services are those of ROS 2 (``ros2 lifecycle``, launch). With the parameter
+``autostart``, which is true by default, a node configures and activates itself when it starts.
+"""
+
+from collections.abc import Callable
+
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+
+from hmsa_ros.errors import HmsaError
+from hmsa_ros.nodes.parameters import declare, ParameterSpec
+
+AUTOSTART = ParameterSpec(
+    'autostart', True,
+    'Whether the node configures and activates itself at the start; if not, it waits for '
+    '~/change_state (ros2 lifecycle set).')
+
+
+class ManagedNode(LifecycleNode):
+    """
+    Node with the states of a managed node.
+
+    A subclass declares its parameters in ``__init__``, has `configure`, `activate`,
+    `deactivate` and `cleanup` do the work, and calls `autostart` last. Each of the four may
+    raise `HmsaError`: the transition is refused and can be tried again.
+
+    Attributes
+    ----------
+    active : bool
+        Whether the node acts.
+    finished : bool
+        Whether it was shut down from outside and the process is to end.
+
+    Parameters
+    ----------
+    name : str
+        Name of the node.
+
+    """
+
+    def __init__(self, name: str) -> None:
+        """Create the node, unconfigured."""
+        super().__init__(name)
+        self.active = False
+        self.finished = False
+        self._autostart: bool = declare(self, [AUTOSTART])[AUTOSTART.name]
+        self._refusal: Exception | None = None
+        self._kept: set[object] = set()
+        # rclpy lets an error out of its callback, and the process with it, if a transition is
+        # asked for that does not begin in the present state.
+        change = self._service_change_state.callback
+
+        def change_state(request, response):  # type: ignore[no-untyped-def]
+            try:
+                return change(request, response)
+            except rclpy_implementation.RCLError:
+                self.get_logger().error(
+                    f'transition {request.transition.label or request.transition.id} refused: '
+                    f'there is none of that name or number from {self.state}')
+                response.success = False
+                return response
+
+        self._service_change_state.callback = change_state
+
+    @property
+    def state(self) -> str:
+        """Name of the state: unconfigured, inactive, active or finalized."""
+        label: str = self._state_machine.current_state[1]
+        return label
+
+    # -- what a subclass does ------------------------------------------------------------------
+
+    def configure(self) -> None:
+        """Create what the node works with; it does not act yet."""
+
+    def activate(self) -> None:
+        """Begin to act."""
+
+    def deactivate(self) -> None:
+        """Cease to act."""
+
+    def cleanup(self) -> None:
+        """Give back what is no publisher, subscription, service, client or timer."""
+
+    def autostart(self) -> None:
+        """
+        Configure and activate, if the parameter says so.
+
+        Raises
+        ------
+        HmsaError
+            If the node refuses; it refuses the start then.
+
+        """
+        if not self._autostart:
+            return
+        for transition in (self.trigger_configure, self.trigger_activate):
+            self._refusal = None
+            transition()
+            if self._refusal is not None:
+                raise self._refusal
+
+    # -- transitions ---------------------------------------------------------------------------
+
+    def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
+        """Configure; what a refused one has created is destroyed."""
+        self._kept = self._entities()
+        result = self._attempt('configure', self.configure)
+        if result != TransitionCallbackReturn.SUCCESS:
+            self._destroy()
+        return result
+
+    def on_activate(self, _: LifecycleState) -> TransitionCallbackReturn:
+        """Activate."""
+        result = self._attempt('activate', self.activate)
+        self.active = result == TransitionCallbackReturn.SUCCESS
+        return result
+
+    def on_deactivate(self, _: LifecycleState) -> TransitionCallbackReturn:
+        """Deactivate."""
+        result = self._attempt('deactivate', self.deactivate)
+        self.active = result != TransitionCallbackReturn.SUCCESS
+        return result
+
+    def on_cleanup(self, _: LifecycleState) -> TransitionCallbackReturn:
+        """Clean up: destroy what was created since the node was configured."""
+        result = self._attempt('clean up', self.cleanup)
+        if result == TransitionCallbackReturn.SUCCESS:
+            self._destroy()
+        return result
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Deactivate and clean up as far as it is needed, then end."""
+        if self.active:
+            self.on_deactivate(state)
+        if state.label != 'unconfigured':
+            self.on_cleanup(state)
+        self.finished = True
+        return TransitionCallbackReturn.SUCCESS
+
+    def _attempt(self, name: str, act: Callable[[], None]) -> TransitionCallbackReturn:
+        """Do what belongs to a transition; an error refuses it."""
+        try:
+            act()
+        except Exception as error:  # rclpy would drop it without a word
+            self._refusal = error
+            if not isinstance(error, HmsaError) or not self._autostart:
+                self.get_logger().error(f'cannot {name}: {error}')
+            return TransitionCallbackReturn.FAILURE
+        return TransitionCallbackReturn.SUCCESS
+
+    def _entities(self) -> set[object]:
+        """Return all that this node has created."""
+        return {*self.publishers, *self.subscriptions, *self.services, *self.clients,
+                *self.timers}
+
+    def _destroy(self) -> None:
+        """Destroy what was not there before the node was configured."""
+        for found, destroy in (
+                (self.timers, self.destroy_timer),
+                (self.subscriptions, self.destroy_subscription),
+                (self.services, self.destroy_service), (self.clients, self.destroy_client),
+                (self.publishers, self.destroy_publisher)):
+            for entity in list(found):
+                if entity not in self._kept:
+                    destroy(entity)

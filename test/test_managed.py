@@ -1,0 +1,105 @@
+"""Managed nodes: their states, from inside and over the services of ROS 2."""
+
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+import pytest
+from std_msgs.msg import Float64
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.nodes.managed import ManagedNode
+from hmsa_ros.nodes.parameters import declare, ParameterSpec
+
+pytestmark = pytest.mark.ros
+
+
+class Example(ManagedNode):
+    """Notes what it is asked to do; refuses as long as it is told to."""
+
+    def __init__(self, refuse=()):
+        super().__init__('example')
+        declare(self, [ParameterSpec('gain', 1.0, 'Gain.')])
+        self.refuse = set(refuse)
+        self.done = []
+        self.autostart()
+
+    def _do(self, name):
+        self.done.append(name)
+        if name in self.refuse:
+            raise BadInputError(f'{name} is not wanted: expected another transition')
+
+    def configure(self):
+        self.out = self.create_publisher(Float64, 'out', 10)
+        self.create_timer(3600.0, lambda: None)
+        self._do('configure')
+
+    def activate(self):
+        self._do('activate')
+
+    def deactivate(self):
+        self._do('deactivate')
+
+    def cleanup(self):
+        self._do('cleanup')
+
+
+def change(ros, transition=0, label=''):
+    request = ChangeState.Request()
+    request.transition = Transition(id=transition, label=label)
+    return ros.call(ChangeState, 'example/change_state', request).success
+
+
+def state(ros):
+    return ros.call(GetState, 'example/get_state').current_state.id
+
+
+def test_a_node_starts_by_itself_and_goes_through_all_states(ros, serve):
+    served = serve(Example)
+    node = served.nodes[0]
+    assert node.done == ['configure', 'activate']
+    assert node.active
+    assert state(ros) == State.PRIMARY_STATE_ACTIVE
+    assert change(ros, Transition.TRANSITION_DEACTIVATE)
+    assert state(ros) == State.PRIMARY_STATE_INACTIVE
+    assert not node.active
+    assert change(ros, Transition.TRANSITION_CLEANUP)
+    assert state(ros) == State.PRIMARY_STATE_UNCONFIGURED
+    assert not [x for x in node.publishers if x.topic_name.endswith('/out')]
+    assert not list(node.timers)
+    assert change(ros, label='configure')
+    assert [x for x in node.publishers if x.topic_name.endswith('/out')]
+    assert change(ros, label='activate')
+    assert node.active
+    assert node.done == [
+        'configure', 'activate', 'deactivate', 'cleanup', 'configure', 'activate']
+
+
+def test_shutdown_ends_the_node(ros, serve):
+    node = serve(Example).nodes[0]
+    assert change(ros, Transition.TRANSITION_ACTIVE_SHUTDOWN)
+    assert node.finished
+    assert node.done[-2:] == ['deactivate', 'cleanup']
+    assert state(ros) == State.PRIMARY_STATE_FINALIZED
+
+
+@pytest.mark.parametrize('transition', [Transition.TRANSITION_CONFIGURE, 77])
+def test_a_transition_that_does_not_begin_here_is_refused(ros, serve, transition):
+    node = serve(Example).nodes[0]
+    assert not change(ros, transition)
+    assert state(ros) == State.PRIMARY_STATE_ACTIVE
+    assert node.active
+
+
+def test_a_refused_transition_can_be_tried_again(ros, serve):
+    node = serve(
+        lambda: Example(['configure']), '-p', 'autostart:=false').nodes[0]
+    assert state(ros) == State.PRIMARY_STATE_UNCONFIGURED
+    assert node.done == []
+    assert not change(ros, Transition.TRANSITION_CONFIGURE)
+    assert state(ros) == State.PRIMARY_STATE_UNCONFIGURED
+    assert not list(node.timers)
+    node.refuse.clear()
+    assert change(ros, Transition.TRANSITION_CONFIGURE)
+    node.refuse.add('activate')
+    assert not change(ros, Transition.TRANSITION_ACTIVATE)
+    assert state(ros) == State.PRIMARY_STATE_INACTIVE
+    assert not node.active
