@@ -1,13 +1,31 @@
 """The command line: plan, send, and how bad input is answered."""
 
+import argparse
+import fcntl
 import json
+import os
+from pathlib import Path
+import pty
 import re
+import select
+import shlex
+import shutil
+import struct
+import subprocess
+import sys
+import termios
+import time
 
 import pytest
 
-from hmsa_ros.cli import main
+from hmsa_ros.cli import build_parser, main, split_ros_args
+from hmsa_ros.cli.completion import commands_of, VALUES
+from hmsa_ros.cli.progress import progress
+from hmsa_ros.core.shapers import SHAPERS
 
 TOLERANCE = 1e-9
+ROOT = Path(__file__).resolve().parent.parent
+WAIT_SECONDS = 60.0
 
 
 def test_plan_prints_the_known_plans_in_full_precision(capsys):
@@ -98,3 +116,194 @@ def test_send_without_a_planner_says_how_to_start_one(start):
     send = start.hmsa('send', '1.1:1', '--timeout', '0.5')
     assert send.wait(30.0) == 1
     assert 'no planner in namespace /; start one with hmsa planner' in send.stderr
+
+
+# Help ----------------------------------------------------------------------------------------
+
+def parsers(parser, path='hmsa'):
+    """Return all parsers by the command's words."""
+    found = {path: parser}
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for name, each in action.choices.items():
+                found |= parsers(each, f'{path} {name}')
+    return found
+
+
+@pytest.mark.parametrize('path', parsers(build_parser()))
+def test_every_help_ends_with_an_example_that_can_be_copied_and_is_understood(path):
+    text = parsers(build_parser())[path].format_help().rstrip()
+    _, found, example = text.partition('\nexample: ')
+    assert found
+    words = shlex.split(example.replace('\\\n', ' '))
+    assert words[:len(path.split())] == path.split()
+    build_parser().parse_args(split_ros_args(words[1:]))
+    assert max(map(len, text.splitlines())) <= 100
+
+
+def test_options_of_one_name_mean_one_thing():
+    meanings = {}
+    for command in commands_of(build_parser()):
+        for option in command.options:
+            for name in option.names:
+                meanings.setdefault(name, set()).add(option.value)
+    # A file, or a folder where there are several.
+    several = {name for name, values in meanings.items() if len(values) > 1} - {'--out'}
+    assert several == set()
+
+
+# Completion ----------------------------------------------------------------------------------
+
+@pytest.fixture(scope='module')
+def scripts(tmp_path_factory):
+    """Return the folder with the scripts of all shells."""
+    folder = tmp_path_factory.mktemp('completion')
+    for shell in ('bash', 'zsh', 'fish'):
+        with (folder / shell).open('w') as file:
+            subprocess.run(
+                [sys.executable, '-m', 'hmsa_ros', 'completion', shell], cwd=ROOT, stdout=file,
+                check=True)
+    return folder
+
+
+def complete(script, folder, *words):
+    """Return what bash offers for the last word."""
+    assert shutil.which('bash')
+    done = subprocess.run(
+        ['bash', '-c', 'source "$0"; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _hmsa; '
+         'printf "%s\\n" "${COMPREPLY[@]}"', script / 'bash', 'hmsa', *words],
+        capture_output=True, text=True, check=True, cwd=folder)
+    assert done.stderr == ''
+    return done.stdout.split('\n')[:-1]
+
+
+@pytest.mark.parametrize(('words', 'offered'), [
+    (['pla'], ['plan', 'planner', 'plant', 'player']),
+    (['bag', ''], ['info', 'recover', 'verify', '-h', '--help']),
+    (['bag', 'info', '--j'], ['--json']),
+    (['bag', 'info', 'a b.m'], ['a b.mcap']),
+    (['plan', '1.1:10', '--sh'], ['--shaper']),
+    (['plan', '--shaper', 'z'], ['zv', 'zvd']),
+    (['plan', '--zeta', ''], ['']),
+    (['report', 'a'], ['a b.mcap', 'a_folder']),
+    (['demo', '--out', 'a'], ['a_folder']),
+    (['completion', ''], ['bash', 'zsh', 'fish', '-h', '--help']),
+    (['planner', '--r'], ['--ros-args']),
+    (['planner', '--ros-args', '--p'], ['--params-file']),
+    (['planner', '--ros-args', '--params-file', 'a b'], ['a b.mcap']),
+    (['nonsense'], ['']),
+])
+def test_bash_completes_commands_options_and_files(scripts, tmp_path, words, offered):
+    (tmp_path / 'a b.mcap').touch()
+    (tmp_path / 'a_folder').mkdir()
+    found = complete(scripts, tmp_path, *words)
+    assert sorted(found) == sorted(offered)
+
+
+def test_bash_offers_every_command_and_option_there_is(scripts, tmp_path):
+    for command in commands_of(build_parser()):
+        offered = complete(scripts, tmp_path, *command.path.split(), '')
+        assert {*command.words, *(y for x in command.options for y in x.names)} <= set(offered)
+    assert set(VALUES['--shaper']) == set(SHAPERS)
+
+
+def test_the_tab_key_completes_in_a_real_bash(scripts, tmp_path):
+    ours, theirs = pty.openpty()
+    with subprocess.Popen(
+            ['bash', '--norc', '--noprofile', '-i'], stdin=theirs, stdout=theirs, stderr=theirs,
+            start_new_session=True, cwd=tmp_path,
+            env={'PATH': os.environ['PATH'], 'TERM': 'dumb', 'PS1': '> '}) as process:
+        os.close(theirs)
+        os.write(ours, f'source {scripts / "bash"}\nhmsa robus\t--shap\t'.encode())
+        text, end = '', time.monotonic() + WAIT_SECONDS
+        while 'hmsa robustness --shapers ' not in text:
+            assert time.monotonic() < end, text
+            if select.select([ours], [], [], 0.1)[0]:
+                text += os.read(ours, 65536).decode()
+        process.kill()
+    os.close(ours)
+
+
+@pytest.mark.parametrize(('shell', 'check'), [
+    ('zsh', ['zsh', '-n']), ('fish', ['fish', '--no-execute'])])
+def test_scripts_of_other_shells_are_read_by_them(scripts, shell, check):
+    text = (scripts / shell).read_text()
+    for command in commands_of(build_parser()):
+        assert not command.path or command.path in text
+    if shutil.which(shell) is None:
+        pytest.skip(f'{shell} is not installed: its script was NOT tried')
+    done = subprocess.run([*check, scripts / shell], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, '')
+    if shell == 'fish':
+        done = subprocess.run(
+            ['fish', '-c', f'source {scripts / shell}; complete -C "hmsa bag re"'],
+            capture_output=True, text=True, check=False)
+        assert done.stdout.startswith('recover\t')
+
+
+# Colour and progress -------------------------------------------------------------------------
+
+COLOUR = re.compile(rb'\x1b\[(?:\d+;)*(?:3[0-7]|4[0-7]|9[0-7]|38|48)[;m]')
+
+
+def on_terminal(code, **env):
+    """Run code of Python on a terminal and return what it showed there."""
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack('HHHH', 24, 80, 0, 0))
+    shown = b''
+    with subprocess.Popen(
+            [sys.executable, '-c', code], cwd=ROOT, stdin=theirs, stdout=theirs, stderr=theirs,
+            start_new_session=True,
+            env={**os.environ, 'TERM': 'xterm-256color', **env}) as process:
+        os.close(theirs)
+        try:
+            while data := os.read(ours, 65536):
+                shown += data
+        except OSError:  # the other end is closed
+            pass
+    os.close(ours)
+    assert process.returncode == 0, shown
+    return shown
+
+
+PROGRESS = """
+from hmsa_ros.cli.progress import progress
+with progress('waiting') as update:
+    update('drawing', 0.5)
+print('done')
+"""
+TABLE = "from hmsa_ros.cli import main; main(['plan', '1.1:10'])"
+
+
+def test_progress_is_shown_on_a_terminal_and_gone_at_the_end(capsys):
+    shown = on_terminal(PROGRESS)
+    assert b'drawing' in shown
+    assert b' 50 %' in shown
+    assert COLOUR.search(shown)
+    with progress() as update:
+        update('nothing of this is seen', 0.5)
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err) == ('', '')
+
+
+@pytest.mark.parametrize('code', [PROGRESS, TABLE])
+@pytest.mark.parametrize('env', [{'NO_COLOR': '1'}, {'TERM': 'dumb'}])
+def test_no_colour_where_none_is_wanted(code, env):
+    assert not COLOUR.search(on_terminal(code, **env))
+
+
+@pytest.mark.ros
+def test_the_log_of_a_node_has_no_colour_where_none_is_wanted(ros_env):
+    code = """
+import rclpy, sys
+from hmsa_ros.nodes.runner import run
+class Node(rclpy.node.Node):
+    def __init__(self):
+        super().__init__('talker')
+        self.get_logger().warning('careful')
+        self.finished = True
+run(Node)
+"""
+    shown = on_terminal(code, NO_COLOR='1', RCUTILS_COLORIZED_OUTPUT='')
+    assert b'careful' in shown
+    assert not COLOUR.search(shown)

@@ -5,13 +5,13 @@ from dataclasses import replace
 from browser import Browser, find_browser, NAMES
 import numpy as np
 import pytest
+from test_report import ACTUATOR, applied, parameters, parts_of, simulated, write
 
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.report import charts
 from hmsa_ros.report.evaluation import evaluate, timing
 from hmsa_ros.report.page import page
 from hmsa_ros.report.reading import read_runs
-from test_report import ACTUATOR, applied, parameters, parts_of, simulated, write
 
 pytestmark = pytest.mark.skipif(
     find_browser() is None,

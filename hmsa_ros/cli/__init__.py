@@ -10,7 +10,7 @@ import argparse
 from collections.abc import Sequence
 from importlib import import_module
 import sys
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from hmsa_ros import __version__
 from hmsa_ros.cli.node import NODES
@@ -18,11 +18,26 @@ from hmsa_ros.errors import BadInputError, complain, HmsaError
 
 COMMANDS = (
     'demo', 'init', 'plan', 'send', 'watch', 'node', 'bag', 'report', 'figures', 'robustness',
-    'sweep')
+    'sweep', 'completion')
+
+
+class _Help(argparse.HelpFormatter):
+    """Leaves examples as they are written, so that they can be copied."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        before, example, rest = text.partition('example: ')
+        if not example:
+            return super()._fill_text(text, width, indent)
+        words = f'{super()._fill_text(before, width, indent)}\n' if before else ''
+        return f'{words}{example}{rest}'
 
 
 class Parser(argparse.ArgumentParser):
     """Argument parser that answers bad input with one line and exit status 2."""
+
+    def __init__(self, **settings: Any) -> None:
+        """Take argparse's settings."""
+        super().__init__(**{'formatter_class': _Help, **settings})
 
     def error(self, message: str) -> NoReturn:
         """
@@ -50,7 +65,8 @@ def build_parser() -> Parser:
     parser = Parser(
         prog='hmsa',
         description='Move hard-magnetic soft actuators to where they are told, fast and '
-                    'without residual vibration.')
+                    'without residual vibration.',
+        epilog='example: hmsa demo')
     parser.add_argument('--version', action='version', version=f'hmsa_ros {__version__}')
     subparsers = parser.add_subparsers(metavar='COMMAND', required=True)
     for name in COMMANDS:

@@ -7,6 +7,7 @@ import sys
 from typing import Any
 
 from hmsa_ros.bag.limits import CHUNK_SIZE, MEBIBYTE
+from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError, printable
 
 _LARGEST_CHUNK = 65536
@@ -24,17 +25,20 @@ def add_parser(subparsers: Any) -> None:
     """
     parser = subparsers.add_parser(
         'bag', help='look into recordings and recover them',
-        description='Look into recordings (MCAP bags as rosbag2 writes them) and recover them.')
+        description='Look into recordings (MCAP bags as rosbag2 writes them) and recover them.',
+        epilog='example: hmsa bag info hmsa_demo/run')
     actions = parser.add_subparsers(metavar='ACTION', required=True)
     info = actions.add_parser(
         'info', help='print what is in a bag',
-        description='Print topics, counts, rates, losses, duration and parameters of a bag.')
+        description='Print topics, counts, rates, losses, duration and parameters of a bag.',
+        epilog='example: hmsa bag info hmsa_demo/run --json')
     info.add_argument('bag', metavar='BAG', help='folder of a bag, or an .mcap file')
     info.add_argument('--json', action='store_true', help='print one JSON object')
     info.set_defaults(run=run, action=_info)
     recover = actions.add_parser(
         'recover', help='make a readable bag out of a cut-off one',
-        description='Write everything that can be read of a bag to a new one.')
+        description='Write everything that can be read of a bag to a new one.',
+        epilog='example: hmsa bag recover cut_off_run --out saved_run')
     recover.add_argument('bag', metavar='BAG', help='folder of a bag, or an .mcap file')
     recover.add_argument(
         '--out', metavar='DIR', required=True, help='folder of the new bag; must not exist')
@@ -42,7 +46,8 @@ def add_parser(subparsers: Any) -> None:
     verify = actions.add_parser(
         'verify', help='integrate the recorded commands and compare with the recorded stretch',
         description='Integrate the recorded commands with the recorded parameters and print '
-                    'the largest difference from the recorded stretch.')
+                    'the largest difference from the recorded stretch.',
+        epilog='example: hmsa bag verify hmsa_demo/run --tolerance 1e-6')
     verify.add_argument('bag', metavar='BAG', help='folder of a bag, or an .mcap file')
     verify.add_argument(
         '--tolerance', type=float, default=1e-9, metavar='D',
@@ -82,7 +87,8 @@ def run(arguments: argparse.Namespace) -> int:
 def _info(arguments: argparse.Namespace) -> int:
     """Print what is in a bag."""
     from hmsa_ros.bag.info import summarize, to_json, to_text
-    summary = summarize(arguments.bag, max_chunk_size=arguments.max_chunk_size)
+    with progress('reading'):
+        summary = summarize(arguments.bag, max_chunk_size=arguments.max_chunk_size)
     print(to_json(summary) if arguments.json else to_text(summary))
     return 0
 
@@ -92,7 +98,8 @@ def _verify(arguments: argparse.Namespace) -> int:
     from hmsa_ros.bag.verify import verify
     if not arguments.tolerance >= 0.0:
         raise BadInputError(f'tolerance is {arguments.tolerance:g}: expected at least 0')
-    results = verify(arguments.bag, max_chunk_size=arguments.max_chunk_size)
+    with progress('verifying'):
+        results = verify(arguments.bag, max_chunk_size=arguments.max_chunk_size)
     passed = all(result.largest_difference <= arguments.tolerance for result in results)
     if arguments.json:
         print(json.dumps({
@@ -110,7 +117,9 @@ def _verify(arguments: argparse.Namespace) -> int:
 def _recover(arguments: argparse.Namespace) -> int:
     """Write a new bag."""
     from hmsa_ros.bag.recover import recover
-    result = recover(arguments.bag, arguments.out, max_chunk_size=arguments.max_chunk_size)
+    with progress('recovering'):
+        result = recover(
+            arguments.bag, arguments.out, max_chunk_size=arguments.max_chunk_size)
     for problem in result.problems:
         print(f'hmsa: note: {problem}', file=sys.stderr)
     print(f'{result.message_count} messages recovered to {result.folder}')

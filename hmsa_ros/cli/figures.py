@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
 
 
@@ -59,22 +60,13 @@ def run(arguments: argparse.Namespace) -> int:
             f'cannot make the folder {folder}: {error.strerror}; expected a folder with write '
             'permission (--out)') from error
 
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
     from hmsa_ros.figures.paper import FIGURES, write_figure
 
     written: list[Path] = []
-    console = Console(stderr=True)
-    with Progress(
-            TextColumn('{task.description:<10}'), BarColumn(),
-            TextColumn('{task.completed} of {task.total}'), TimeElapsedColumn(),
-            console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task('', total=len(FIGURES))
-        for number, figure in FIGURES.items():
-            progress.update(task, description=f'Figure {number}')
+    with progress() as update:
+        for i, (number, figure) in enumerate(FIGURES.items()):
+            update(f'Figure {number}', i / len(FIGURES))
             written += write_figure(figure, folder)
-            progress.advance(task)
     for path in written:
         print(path)
     return 0

@@ -47,9 +47,9 @@ def add_parser(subparsers: Any) -> None:
                     'take by --params-file, and print what follows from it: times, damping, '
                     'flux densities and reach. What no option gives is asked for. Numbers are '
                     'in SI units, or have their unit behind them: 10mm, "50 kPa".',
-        epilog='example: hmsa init --half-length 5mm --half-thickness 5mm --shear-modulus 30kPa '
-               '--density 1.9g/cm3 --remanence 80mT --j-lim 20 --zeta 0.1 --flux-max 200mT '
-               '--out my_actuator.yaml')
+        epilog='example: hmsa init --half-length 5mm --half-thickness 5mm --density 1.9g/cm3 \\\n'
+               '    --shear-modulus 30kPa --j-lim 20 --zeta 0.1 --remanence 80mT \\\n'
+               '    --flux-max 200mT --out my_actuator.yaml')
     for quantity in QUANTITIES:
         unit = f' [{quantity.unit}]' if quantity.unit else ''
         default = _FOLLOWS.get(quantity.key) or f'{quantity.default:g}'

@@ -10,6 +10,12 @@ NODES = {
     'recorder': 'write topics to a bag',
     'player': 'send the messages of a bag again',
 }
+_EXAMPLES = {
+    'planner': '-r __ns:=/left',
+    'plant': '-p publish_rate:=500.0',
+    'recorder': '-p storage.uri:=my_run -p record.all_topics:=true',
+    'player': '-p storage.uri:=my_run',
+}
 
 
 def add_parser(subparsers: Any) -> None:
@@ -28,7 +34,7 @@ def add_parser(subparsers: Any) -> None:
             description=f'Run the {name} node: {summary}.',
             usage=f'hmsa {name} [-h] [--ros-args ...]',
             epilog='ROS arguments are parameters (-p NAME:=VALUE, --params-file FILE) and '
-                   f'remappings (-r FROM:=TO); example: hmsa {name} --ros-args -r __ns:=/left')
+                   f'remappings (-r FROM:=TO). example: hmsa {name} --ros-args {_EXAMPLES[name]}')
         parser.set_defaults(run=run, node=name)
 
 

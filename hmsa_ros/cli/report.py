@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
+from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -67,9 +68,6 @@ def run(arguments: argparse.Namespace) -> int:
         If a bag cannot be read or a file cannot be written.
 
     """
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
     bags: list[Path] = arguments.bags
     out = arguments.out or Path(f'{bags[0].resolve().stem}_report.html')
     targets = [x for x in (out, arguments.png, arguments.pdf) if x is not None]
@@ -82,25 +80,18 @@ def run(arguments: argparse.Namespace) -> int:
 
     joints = [x for x in arguments.joint.split(',') if x]
     actuator = None if arguments.params is None else read_actuator(arguments.params)
-    console = Console(stderr=True)
-    with Progress(
-            TextColumn('{task.description:<28}'), BarColumn(), TextColumn(
-                '{task.percentage:>3.0f} %'), TimeElapsedColumn(),
-            console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task('starting', total=1.0)
+    with progress() as update:
         runs: list[Run] = []
         for bag in bags:
             runs += read_runs(
-                bag, actuator=actuator, joints=joints,
-                progress=lambda what, share: progress.update(
-                    task, description=what, completed=share))
+                bag, actuator=actuator, joints=joints, progress=update)
         parts = []
         for i, each in enumerate(_labelled(runs)):
-            progress.update(task, description='evaluating', completed=i / len(runs))
+            update('evaluating', i / len(runs))
             parts.append(Part(
                 each, evaluate(each), timing(each),
                 RUN_COLOURS[i % len(RUN_COLOURS)] if len(runs) > 1 else ''))
-        progress.update(task, description='writing', completed=1.0)
+        update('writing', None)
         _write(out, page(parts))
         for path, kind in ((arguments.png, 'png'), (arguments.pdf, 'pdf')):
             if path is not None:

@@ -5,6 +5,7 @@ One place for what every node's ``main`` does, so that a node file holds wiring 
 """
 
 from collections.abc import Callable, Sequence
+import os
 import re
 import sys
 
@@ -100,6 +101,8 @@ def run(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
 
 def _initialise(arguments: Sequence[str]) -> None:
     """Start rclpy, and refuse arguments that it or nobody understands."""
+    if os.environ.get('NO_COLOR') and not os.environ.get('RCUTILS_COLORIZED_OUTPUT'):
+        os.environ['RCUTILS_COLORIZED_OUTPUT'] = '0'
     # What rcl says of bad arguments is in its error too, which is told below in one line.
     set_logger_level('rcl', LoggingSeverity.FATAL)
     try:

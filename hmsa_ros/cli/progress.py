@@ -1,0 +1,42 @@
+"""Progress of what takes more than a moment: on a terminal, on standard error, gone at the end."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def progress(what: str = 'starting') -> Iterator[Callable[[str, float | None], None]]:
+    """
+    Show how far something has come.
+
+    Parameters
+    ----------
+    what : str
+        What is going on at first.
+
+    Yields
+    ------
+    callable
+        To call with what is going on, and the share that is done, None if that is not known.
+
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    with Progress(
+            TextColumn('{task.description:<28}'), BarColumn(), TextColumn('{task.fields[share]}'),
+            TimeElapsedColumn(), console=console, transient=True,
+            disable=not console.is_terminal or console.is_dumb_terminal) as shown:
+        # Without a total the bar only says that something goes on.
+        task = shown.add_task(what, total=None, share='     ')
+
+        def update(what: str, share: float | None) -> None:
+            if share is None:
+                shown.update(task, description=what, total=None, share='     ')
+            else:
+                shown.update(
+                    task, description=what, total=1.0, completed=share,
+                    share=f'{100.0 * share:>3.0f} %')
+
+        yield update
