@@ -14,7 +14,7 @@ import time
 from typing import Any
 
 # The protocol is spoken on descriptors 3 and 4.
-_LAUNCH = '''
+_LAUNCH = """
 import os
 import sys
 # Copied out of the way first: either may be 3 or 4 itself.
@@ -22,7 +22,7 @@ ours = [os.dup2(int(x), 60 + i) for i, x in enumerate(sys.argv[1:3])]
 os.dup2(ours[0], 3)
 os.dup2(ours[1], 4)
 os.execv(sys.argv[3], sys.argv[3:])
-'''
+"""
 NAMES = ('chromium', 'chromium-browser', 'google-chrome', 'google-chrome-stable')
 # Limit of every wait: generous, since it is only reached when a test fails.
 WAIT_SECONDS = 60.0
