@@ -3,28 +3,29 @@ Measure speed and accuracy.
 
     python -m benchmarks [NAME ...] [--quick] [--json FILE] [--page FILE]
 
-NAME is planner, plant, preemption or recorder; without one all are run. The recorder's takes
-some minutes.
+NAME is planner, plant, preemption, recorder, player or crash; without one all are run. Those of
+recorder, player and crash take some seven minutes together.
 A page is a Markdown file with marks ``<!-- begin NAME -->`` and ``<!-- end NAME -->``, between
 which a table is put.
 """
 
 import argparse
+import importlib
 import importlib.util
 import json
 from pathlib import Path
 import sys
-import tempfile
 from typing import Any
 
 from rich.console import Console
 
 from benchmarks.measure import machine, Report
+from benchmarks.sheet import Sheet
 
 # Of a table that goes to a file.
 _WIDTH = 120
 
-NAMES = ('planner', 'plant', 'preemption', 'recorder')
+NAMES = ('planner', 'plant', 'preemption', 'recorder', 'player', 'crash')
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -39,7 +40,7 @@ def main(arguments: list[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit status: 0, or that of the recorder's benchmark.
+        Exit status: 0, or 1 if recorder or player did not do what they promise.
 
     """
     parser = argparse.ArgumentParser(
@@ -66,12 +67,12 @@ def main(arguments: list[str] | None = None) -> int:
     console.print(where)
     if host['load_average'] > 0.5:
         console.print('Other processes are running: trust the ratios, least times above all.')
-    reports: list[Report] = []
+    reports: list[Report | Sheet] = []
     remarks: list[str] = []
     record: dict[str, Any] = {'machine': host}
     status = 0
 
-    def add(report: Report) -> None:
+    def add(report: Report | Sheet) -> None:
         report.show(console)
         reports.append(report)
         record[report.key] = report.record()
@@ -93,8 +94,14 @@ def main(arguments: list[str] | None = None) -> int:
         from benchmarks import bench_preemption
 
         add(bench_preemption.compare(quick=options.quick))
-    if 'recorder' in names and _has_ros('recorder'):
-        status = _recorder(options.quick, record)
+    for name in ('recorder', 'player', 'crash'):
+        if name in names and _has_ros(name):
+            sheet = importlib.import_module(f'benchmarks.bench_{name}').compare(
+                quick=options.quick)
+            add(sheet)
+            if not sheet.passed:
+                console.print(f'{name}: not what is promised')
+                status = 1
     if options.json:
         options.json.write_text(json.dumps(record, indent=2) + '\n', encoding='utf-8')
     if options.page:
@@ -137,25 +144,6 @@ def _has_ros(name: str) -> bool:
         print(f'{name}: ROS 2 (rclpy) is not installed')
         return False
     return True
-
-
-def _recorder(quick: bool, record: dict[str, Any]) -> int:
-    """Run the recorder's benchmark, a program of its own."""
-    from benchmarks import bench_recorder
-
-    before = sys.argv
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / 'recorder.json'
-        sys.argv = [bench_recorder.__file__, '--json', str(file)]
-        if quick:
-            sys.argv += ['--seconds', '2', '--search-seconds', '1']
-        try:
-            status = bench_recorder.main()
-        finally:
-            sys.argv = before
-        if file.exists():
-            record['recorder'] = json.loads(file.read_text(encoding='utf-8'))
-    return int(status)
 
 
 if __name__ == '__main__':

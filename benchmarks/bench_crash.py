@@ -1,18 +1,16 @@
 """
 How much is lost when the recorder is killed.
 
-    python benchmarks/bench_crash.py [--kills N] [--rate HZ]
+    python -m benchmarks crash [--quick]
 
-While another process publishes, the recorder is started and killed with SIGKILL at a random
-moment, N times. Each bag is recovered, read by an independent reader, and the loss measured:
-the time from the last message in the bag to the kill. Takes some five seconds a kill.
+While another process publishes, recorders are started and each killed with SIGKILL at a random
+moment, fifty in all. Each bag is recovered, read by an independent reader, and the loss
+measured: the time from the last message in the bag to the kill.
 """
 
-import argparse
 import os
 from pathlib import Path
 import random
-import signal
 import statistics
 import subprocess
 import sys
@@ -20,6 +18,10 @@ import tempfile
 import time
 
 ROOT = Path(__file__).resolve().parent.parent
+RATE = 1000.0
+FLUSH_PERIOD = 0.5
+# Recorders that run at the same time.
+TOGETHER = 5
 
 
 def source(rate):
@@ -36,71 +38,106 @@ def source(rate):
         time.sleep(max(0.0, begin + i / rate - time.monotonic()))
 
 
-def kill_one(folder, flush_period, wait):
-    """Record, kill, recover; return the loss in seconds and the number of messages."""
-    from rosbags.rosbag2 import Reader
+class Recorder:
+    """A recorder that is going to be killed."""
 
-    from hmsa_ros.bag.reader import BagReader
-    from hmsa_ros.bag.recover import recover
-    recorder = subprocess.Popen(
-        [sys.executable, '-m', 'hmsa_ros', 'recorder', '--ros-args', '--log-level', 'warn', '-p',
-         f'storage.uri:={folder}', '-p', 'record.topics:=[/load]', '-p',
-         f'storage.flush_period:={flush_period}'])
-    end = time.monotonic() + 60.0
-    while not (folder.is_dir() and any(BagReader(folder).counts().values())):
-        if time.monotonic() > end:
-            raise SystemExit('nothing was recorded within 60 s')
-        time.sleep(0.05)
-    time.sleep(wait)
-    killed = time.time_ns()
-    recorder.kill()
-    recorder.wait()
-    recovered = folder.with_name(folder.name + '_recovered')
-    recover(folder, recovered)
-    with Reader(recovered) as reader:
-        stamps = [stamp for _, stamp, _ in reader.messages()]
-    sequences = [message.sequence for message in BagReader(recovered).messages()]
-    if sequences != list(range(sequences[0], sequences[0] + len(sequences))):
-        raise SystemExit(f'{recovered} has gaps')
-    return (killed - stamps[-1]) * 1e-9, len(stamps)
+    def __init__(self, folder):
+        self.folder = folder
+        self.process = subprocess.Popen(
+            [sys.executable, '-m', 'hmsa_ros', 'recorder', '--ros-args', '--log-level', 'warn',
+             '-p', f'storage.uri:={folder}', '-p', 'record.topics:=[/load]', '-p',
+             f'storage.flush_period:={FLUSH_PERIOD}'])
+        self.killed = 0
+
+    def wait(self):
+        """Wait until something has been recorded."""
+        from hmsa_ros.bag.reader import BagReader
+        end = time.monotonic() + 60.0
+        while not (self.folder.is_dir() and any(BagReader(self.folder).counts().values())):
+            if time.monotonic() > end:
+                raise RuntimeError('nothing was recorded within 60 s')
+            time.sleep(0.05)
+
+    def kill(self):
+        """Kill it."""
+        self.killed = time.time_ns()
+        self.process.kill()
+
+    def loss(self):
+        """Recover the bag; return the loss in seconds and the number of messages."""
+        from rosbags.rosbag2 import Reader
+
+        from hmsa_ros.bag.reader import BagReader
+        from hmsa_ros.bag.recover import recover
+        self.process.wait()
+        recovered = self.folder.with_name(self.folder.name + '_recovered')
+        recover(self.folder, recovered)
+        with Reader(recovered) as reader:
+            stamps = [stamp for _, stamp, _ in reader.messages()]
+        sequences = [message.sequence for message in BagReader(recovered).messages()]
+        if sequences != list(range(sequences[0], sequences[0] + len(sequences))):
+            raise RuntimeError(f'{recovered} has gaps')
+        return (self.killed - stamps[-1]) * 1e-9, len(stamps)
 
 
-def main():
-    """Kill, measure, print."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--kills', type=int, default=50)
-    parser.add_argument('--rate', type=float, default=1000.0)
-    parser.add_argument('--flush-period', type=float, default=0.5)
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--role', help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.role == 'source':
-        source(options.rate)
-        return 0
+def compare(*, quick):
+    """
+    Kill, measure, and return the table.
+
+    Parameters
+    ----------
+    quick : bool
+        Whether it is only to show that it runs.
+
+    Returns
+    -------
+    Sheet
+        Passed if no loss is larger than the flush period.
+
+    """
+    from benchmarks.sheet import Sheet
+    kills = 2 if quick else 50
     os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
     os.environ['PYTHONPATH'] = str(ROOT)
-    sys.path.insert(0, str(ROOT))
     sender = subprocess.Popen(
-        [sys.executable, __file__, '--role', 'source', '--rate', str(options.rate)],
-        stderr=subprocess.DEVNULL)
-    dice = random.Random(options.seed)
+        [sys.executable, str(Path(__file__).resolve())], stderr=subprocess.DEVNULL,
+        env=environment)
+    dice = random.Random(1)
     losses, count = [], 0
+    recorders = []
     try:
         with tempfile.TemporaryDirectory() as folder:
-            for i in range(options.kills):
-                loss, messages = kill_one(
-                    Path(folder) / f'bag{i}', options.flush_period, dice.uniform(0.0, 1.5))
-                losses.append(loss)
-                count += messages
+            while len(losses) < kills:
+                recorders = [
+                    Recorder(Path(folder) / f'bag{len(losses)}_{i}')
+                    for i in range(min(TOGETHER, kills - len(losses)))]
+                for recorder in recorders:
+                    recorder.wait()
+                # At moments of their own within three flush periods.
+                for recorder in recorders:
+                    time.sleep(dice.uniform(0.0, 3.0 * FLUSH_PERIOD / len(recorders)))
+                    recorder.kill()
+                for recorder in recorders:
+                    loss, messages = recorder.loss()
+                    losses.append(loss)
+                    count += messages
     finally:
-        sender.send_signal(signal.SIGKILL)
+        for recorder in recorders:
+            recorder.process.kill()
+            recorder.process.wait()
+        sender.kill()
         sender.wait()
-    print(f'{len(losses)} kills at {options.rate:g} messages/s, flush period '
-          f'{options.flush_period:g} s: {count} messages recovered, all readable; lost at the '
-          f'end: median {statistics.median(losses):.3f} s, largest {max(losses):.3f} s')
-    return 0 if max(losses) <= options.flush_period else 1
+    losses.sort()
+    return Sheet(
+        'crash', f'Loss when the recorder is killed, at {RATE:g} messages/s and a flush period '
+        f'of {FLUSH_PERIOD:g} s',
+        ['kills', 'bags recovered', 'messages recovered', 'median loss', 'largest loss'],
+        [[str(kills), str(len(losses)), f'{count:,}', f'{statistics.median(losses):.3f} s',
+          f'{losses[-1]:.3f} s']],
+        {'losses': losses, 'messages': count}, losses[-1] <= FLUSH_PERIOD)
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    source(RATE)

@@ -1,7 +1,7 @@
 """
 How exactly a bag is played.
 
-    python benchmarks/bench_player.py [--rate HZ] [--seconds S] [--speeds 1 10]
+    python -m benchmarks player [--quick]
 
 A bag of equally spaced messages is played; for each speed the error of the sending times
 against the bag's own spacing is printed, by the source stamps that the middleware puts on each
@@ -9,7 +9,6 @@ message. The first message is where time is counted from. Before and after, the 
 of a loop that only sleeps: what the machine itself allows at that moment.
 """
 
-import argparse
 import json
 import os
 from pathlib import Path
@@ -73,10 +72,10 @@ def sleep_only(rate, seconds):
     return sorted(late)
 
 
-def figures(errors):
+def cells(errors):
     """Return median, p99 and largest of sorted errors as text."""
-    return '  '.join(f'{error * 1e3:7.3f} ms' for error in (
-        errors[len(errors) // 2], errors[len(errors) * 99 // 100], errors[-1]))
+    return [f'{error * 1e3:.3f} ms' for error in (
+        errors[len(errors) // 2], errors[len(errors) * 99 // 100], errors[-1])]
 
 
 def play(folder, speed):
@@ -84,7 +83,7 @@ def play(folder, speed):
     import struct
     environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
     receiver = subprocess.Popen(
-        [sys.executable, __file__, '--receive'], stdout=subprocess.PIPE, env=environment)
+        [sys.executable, str(Path(__file__).resolve())], stdout=subprocess.PIPE, env=environment)
     subprocess.run(
         [sys.executable, '-m', 'hmsa_ros', 'player', '--ros-args', '--log-level', 'warn', '-p',
          f'storage.uri:={folder}', '-p', f'play.rate:={float(speed)}', '-p',
@@ -96,44 +95,59 @@ def play(folder, speed):
             [struct.unpack('<d', bytes.fromhex(data))[0] for _, data in received])
 
 
-def main():
-    """Write, play, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--rate', type=float, default=1000.0)
-    parser.add_argument('--seconds', type=float, default=30.0)
-    parser.add_argument('--speeds', type=float, nargs='+', default=[1.0, 10.0])
-    parser.add_argument('--receive', action='store_true', help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.receive:
-        receive()
-        return 0
+def compare(*, quick):
+    """
+    Write, play, and return the table.
+
+    Parameters
+    ----------
+    quick : bool
+        Whether it is only to show that it runs.
+
+    Returns
+    -------
+    Sheet
+        Passed if the order held and nothing was skipped, and at rate 1 the 99th percentile is
+        below a millisecond.
+
+    """
+    from benchmarks.sheet import Sheet
+    rate, seconds = 1000.0, 2.0 if quick else 30.0
     os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    sys.path.insert(0, str(ROOT))
-    head = (f'{"speed":>6} {"msg/s":>7} {"sent":>7} {"received":>8} {"in order":>8} '
-            f'{"median":>10}  {"p99":>10}  {"largest":>10}')
-    print(head)
-    print('-' * len(head))
-    sleeping = f'{"only sleeping":>14} {"":>24} '
-    print(sleeping + figures(sleep_only(options.rate, options.seconds / 3)))
-    good = True
+    count = round(rate * seconds)
+    rows, figures, passed = [], {}, True
+
+    def sleeping(name):
+        errors = sleep_only(rate, seconds / 3)
+        rows.append([name, f'{rate:,.0f}', '', '', '', *cells(errors)])
+
+    sleeping('a loop that only sleeps, before')
     with tempfile.TemporaryDirectory() as folder:
         bag = Path(folder) / 'bag'
-        write(bag, options.rate, options.seconds)
-        count = round(options.rate * options.seconds)
-        for speed in options.speeds:
+        write(bag, rate, seconds)
+        for speed in (1.0, 10.0):
             stamps, numbers = play(bag, speed)
             errors = sorted(
-                abs((stamp - stamps[0]) * 1e-9 - number / options.rate / speed)
+                abs((stamp - stamps[0]) * 1e-9 - (number - numbers[0]) / rate / speed)
                 for stamp, number in zip(stamps, numbers, strict=True))
-            order = numbers == list(range(count))
-            p99 = errors[len(errors) * 99 // 100]
-            print(f'{speed:6g} {options.rate * speed:7.0f} {count:7} {len(numbers):8} '
-                  f'{"yes" if order else "no":>8} {figures(errors)}')
-            good &= order and (speed != 1.0 or p99 < 1e-3)
-    print(sleeping + figures(sleep_only(options.rate, options.seconds / 3)))
-    return 0 if good else 1
+            skipped = len(set(range(count)) - set(numbers))
+            order = numbers == sorted(numbers)
+            rows.append([
+                f'hmsa player at rate {speed:g}', f'{rate * speed:,.0f}', f'{count:,}',
+                f'{skipped:,}', 'yes' if order else 'no', *cells(errors)])
+            figures[f'rate {speed:g}'] = {
+                'count': count, 'skipped': skipped, 'order': order,
+                'median': errors[len(errors) // 2], 'p99': errors[len(errors) * 99 // 100],
+                'largest': errors[-1]}
+            passed &= order and not skipped and (
+                speed != 1.0 or errors[len(errors) * 99 // 100] < 1e-3)
+    sleeping('a loop that only sleeps, after')
+    return Sheet(
+        'player', "Error of the sending times against the bag's own spacing",
+        ['', 'messages/s', 'sent', 'skipped', 'in order', 'median', 'p99', 'largest'], rows,
+        figures, passed)
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    receive()

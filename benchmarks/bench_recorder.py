@@ -1,20 +1,20 @@
 """
 How fast can be recorded without loss.
 
-    python benchmarks/bench_recorder.py [--seconds S] [--search-seconds S] [--json FILE]
+    python -m benchmarks recorder [--quick]
 
 First the highest rate is searched at which a bare raw subscription that does nothing, served
 by the EventsExecutor, gets every 120-byte message of another process. At 80 % of that rate the
-recorder of this package and a plain one (a raw subscription whose callback writes, served by
-the SingleThreadedExecutor) then record for the given time, and the bare subscription is run
-for as long. One table shows all of them. It takes some five minutes.
+bare subscription, the recorder of this package and a plain one (a raw subscription whose
+callback writes, served by the SingleThreadedExecutor) then run for a minute each. One table
+shows all of them.
 
 Once a reliable reader of Fast DDS has fallen behind by more than the writer keeps, repairs take
 up the capacity and it does not catch up again as long as the stream lasts: on a machine that
-does other work at the same time any receiver, the bare one too, may lose half a run.
+does other work at the same time any receiver, the bare one too, may lose half a run. So a rate
+counts as too high only after several tries.
 """
 
-import argparse
 import json
 import os
 from pathlib import Path
@@ -30,6 +30,11 @@ DEPTH = 10_000
 # Raw payload with header and length: 120 bytes.
 DATA_BYTES = 104
 SHARE = 0.8
+# The search begins here, doubles or halves, and then narrows down to this ratio.
+FIRST_RATE = 20_000.0
+RATIO = 1.1
+TRIES = 3
+SEARCH_LIMIT_SECONDS = 75.0
 
 
 def qos():
@@ -39,8 +44,8 @@ def qos():
                       reliability=ReliabilityPolicy.RELIABLE)
 
 
-def source(rate, seconds):
-    """Send at a rate, then say how many."""
+def source():
+    """For each line with a rate and seconds, send for so long and say how many."""
     import rclpy
     from rclpy.serialization import serialize_message
     from std_msgs.msg import UInt8MultiArray
@@ -51,22 +56,27 @@ def source(rate, seconds):
     while not publisher.get_subscription_count():
         time.sleep(0.01)
     time.sleep(0.5)
-    total, sent, begin = round(rate * seconds), 0, time.perf_counter()
-    while sent < total:
-        due = min(total, int((time.perf_counter() - begin) * rate) + 1)
-        if due <= sent:
-            time.sleep(0.0002)
-        for _ in range(due - sent):
-            publisher.publish(raw)
-        sent = max(sent, due)
-    elapsed = time.perf_counter() - begin
-    print(json.dumps({'bytes': len(raw), 'sent': sent, 'rate': sent / elapsed}), flush=True)
-    time.sleep(1.0)
+    for line in sys.stdin:
+        rate, seconds = map(float, line.split())
+        total, sent, begin = round(rate * seconds), 0, time.perf_counter()
+        while sent < total:
+            due = min(total, int((time.perf_counter() - begin) * rate) + 1)
+            if due <= sent:
+                time.sleep(0.0002)
+            # At most as many as the reader has room for, should this process have been held up.
+            due = min(due, sent + DEPTH // 4)
+            for _ in range(due - sent):
+                publisher.publish(raw)
+            sent = max(sent, due)
+            if time.perf_counter() - begin > 1.5 * seconds:
+                break
+        elapsed = time.perf_counter() - begin
+        print(json.dumps({'bytes': len(raw), 'sent': sent, 'rate': sent / elapsed}), flush=True)
     rclpy.try_shutdown()
 
 
 def receive(kind, folder):
-    """Receive until told to end, then say how many."""
+    """Receive until told to end, and say how many whenever asked and then."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.experimental.events_executor import EventsExecutor
@@ -98,6 +108,7 @@ def receive(kind, folder):
                 writer.flush()
                 flushed = time.monotonic()
         executor = SingleThreadedExecutor()
+    signal.signal(signal.SIGUSR1, lambda *_: tell(count))
     node.create_subscription(UInt8MultiArray, TOPIC, callback, qos(), raw=True)
     executor.add_node(node)
     never = Future()
@@ -105,22 +116,55 @@ def receive(kind, folder):
         executor.spin_until_future_complete(never, 0.1)
     if kind != 'bare':
         writer.close()
-    print(json.dumps({'received': count}), flush=True)
+    tell(count)
     rclpy.try_shutdown()
+
+
+def tell(count):
+    """Print a count."""
+    print(json.dumps({'received': count}), flush=True)
+
+
+def environment():
+    """Return the environment of the processes."""
+    return {**os.environ, 'PYTHONPATH': str(ROOT), 'PYTHONUNBUFFERED': '1'}
+
+
+def role(*words):
+    """Return the command of one side."""
+    return [sys.executable, str(Path(__file__).resolve()), *map(str, words)]
+
+
+class Source:
+    """The process that sends."""
+
+    def __init__(self):
+        self.process = subprocess.Popen(
+            role('source'), stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment(),
+            text=True)
+
+    def send(self, rate, seconds):
+        """Send; return what was sent and how fast."""
+        self.process.stdin.write(f'{rate} {seconds}\n')
+        self.process.stdin.flush()
+        return json.loads(self.process.stdout.readline())
+
+    def close(self):
+        """End it."""
+        self.process.communicate()
 
 
 def measure(command, rate, seconds, count):
     """Run a receiver under load; return its figures."""
-    environment = {**os.environ, 'PYTHONPATH': str(ROOT), 'PYTHONUNBUFFERED': '1'}
-    receiver = subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, text=True)
-    sender = subprocess.Popen(
-        [sys.executable, __file__, '--role', 'source', str(rate), str(seconds)],
-        stdout=subprocess.PIPE, env=environment, text=True)
-    figures = json.loads(sender.communicate()[0])
+    receiver = subprocess.Popen(command, stdout=subprocess.PIPE, env=environment(), text=True)
+    sender = Source()
+    figures = sender.send(rate, seconds)
+    time.sleep(1.0)
     receiver.send_signal(signal.SIGINT)
     output = receiver.stdout.read()
     _, _, usage = os.wait4(receiver.pid, 0)
     receiver.returncode = 0
+    sender.close()
     received = count(output)
     return {
         'rate': figures['rate'], 'seconds': seconds, 'sent': figures['sent'],
@@ -138,13 +182,12 @@ def reported(output):
 
 def bare(rate, seconds):
     """Measure a subscription that does nothing."""
-    return measure([sys.executable, __file__, '--role', 'bare'], rate, seconds, reported)
+    return measure(role('receive', 'bare', ''), rate, seconds, reported)
 
 
 def plain(rate, seconds, folder):
     """Measure a recorder whose callback writes."""
-    return measure([sys.executable, __file__, '--role', 'plain', str(folder)], rate, seconds,
-                   reported)
+    return measure(role('receive', 'plain', folder), rate, seconds, reported)
 
 
 def recorder(rate, seconds, folder):
@@ -156,62 +199,119 @@ def recorder(rate, seconds, folder):
         lambda output: sum(1 for _ in BagReader(folder).messages()))
 
 
-def search(seconds):
-    """Return the highest rate without loss, in steps of an eighth."""
-    best, rate = None, 8000.0
-    while rate < 500_000.0:
-        # A second try: other work on the machine is not the subscription's fault.
-        for _ in range(2):
-            result = bare(rate, seconds)
-            if not result['lost'] and result['rate'] > 0.97 * rate:
-                best = result
+class Search:
+    """
+    The search of the highest rate without loss.
+
+    Parameters
+    ----------
+    seconds : float
+        How long to send at each rate.
+
+    """
+
+    def __init__(self, seconds):
+        self._seconds = seconds
+        self._end = time.monotonic() + SEARCH_LIMIT_SECONDS
+        self._receiver = subprocess.Popen(
+            role('receive', 'bare', ''), stdout=subprocess.PIPE, env=environment(), text=True)
+        self._source = Source()
+        self._before = 0
+
+    def run(self):
+        """Return the highest rate and what was sent at it, None if there is none."""
+        try:
+            return self._search()
+        finally:
+            self._source.close()
+            self._receiver.send_signal(signal.SIGINT)
+            self._receiver.communicate()
+
+    def _search(self):
+        best, low, high, rate = None, None, None, FIRST_RATE
+        while time.monotonic() < self._end and rate > 100.0 and (
+                low is None or high is None or high / low > RATIO):
+            result = self._try(rate)
+            if result is not None:
+                best, low = result, rate
+            else:
+                high = rate
+            rate = rate * 2.0 if high is None else rate / 2.0 if low is None else (
+                low * high) ** 0.5
+        return best
+
+    def _try(self, rate):
+        """Return what was sent if a rate goes without loss, None if it does not."""
+        for _ in range(TRIES):
+            sent = self._source.send(rate, self._seconds)
+            received = self._settled()
+            lost = sent['sent'] - (received - self._before)
+            self._before = received
+            fast = sent['rate'] > 0.97 * rate
+            if not lost and fast:
+                return {**sent, 'seconds': self._seconds, 'lost': 0}
+            print(f'{rate:9.0f}/s: ' + (
+                f'{lost} of {sent["sent"]} lost' if lost else 'cannot be sent that fast'),
+                file=sys.stderr)
+        return None
+
+    def _settled(self):
+        """Return the number of messages received when no more come."""
+        count, same = -1, 0
+        for _ in range(50):
+            time.sleep(0.1)
+            self._receiver.send_signal(signal.SIGUSR1)
+            now = json.loads(self._receiver.stdout.readline())['received']
+            same = same + 1 if now == count else 0
+            count = now
+            if same >= 3:
                 break
-        else:
-            reason = 'loses messages' if result['lost'] else 'cannot be sent that fast'
-            print(f'{result["rate"]:9.0f}/s: bare subscription {reason}: '
-                  f'{result["lost"]} of {result["sent"]}', file=sys.stderr)
-            break
-        rate *= 1.125
-    return best
+        return count
 
 
-def main():
-    """Search, measure, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--seconds', type=float, default=60.0)
-    parser.add_argument('--search-seconds', type=float, default=5.0)
-    parser.add_argument('--json')
-    parser.add_argument('--role', nargs='+', help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.role:
-        if options.role[0] == 'source':
-            source(float(options.role[1]), float(options.role[2]))
-        else:
-            receive(options.role[0], options.role[-1])
-        return 0
+def compare(*, quick):
+    """
+    Search, measure, and return the table.
+
+    Parameters
+    ----------
+    quick : bool
+        Whether it is only to show that it runs.
+
+    Returns
+    -------
+    Sheet
+        Passed if the recorder lost nothing.
+
+    """
+    from benchmarks.sheet import Sheet
+    seconds = 2.0 if quick else 60.0
     os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    sys.path.insert(0, str(ROOT))
-    results = {'bare subscription, highest rate': search(options.search_seconds)}
-    if results['bare subscription, highest rate'] is None:
-        print('even 8000 messages a second are not received without loss', file=sys.stderr)
-        return 1
-    rate = SHARE * results['bare subscription, highest rate']['rate']
+    highest = Search(0.5 if quick else 3.0).run()
+    title = 'Recording 120-byte messages of another process'
+    if highest is None:
+        return Sheet('recorder', f'{title}: no rate goes without loss', [''], [], passed=False)
+    rate = SHARE * highest['rate']
     with tempfile.TemporaryDirectory() as folder:
-        results['bare subscription'] = bare(rate, options.seconds)
-        results['hmsa recorder'] = recorder(rate, options.seconds, Path(folder) / 'ours')
-        results['plain recorder, SingleThreadedExecutor'] = plain(
-            rate, options.seconds, Path(folder) / 'plain')
-    head = f'{"receiver":40} {"msg/s":>8} {"s":>4} {"sent":>9} {"lost":>9} {"cores":>6} {"MB":>5}'
-    print(head)
-    print('-' * len(head))
-    for name, result in results.items():
-        print(f'{name:40} {result["rate"]:8.0f} {result["seconds"]:4.0f} {result["sent"]:9} '
-              f'{result["lost"]:9} {result["cores"]:6.2f} {result["memory"]:5.0f}')
-    if options.json:
-        Path(options.json).write_text(json.dumps(results, indent=2))
-    return 0 if results['hmsa recorder']['lost'] == 0 else 1
+        results = {
+            'bare subscription': bare(rate, seconds),
+            'hmsa recorder': recorder(rate, seconds, Path(folder) / 'ours'),
+            'recorder on the SingleThreadedExecutor': plain(
+                rate, seconds, Path(folder) / 'plain'),
+        }
+    rows = [[name, f'{x["rate"]:,.0f}', f'{x["sent"]:,}', f'{x["lost"]:,}',
+             f'{100.0 * x["cores"]:.0f} %', f'{x["memory"]:.0f} MB']
+            for name, x in results.items()]
+    return Sheet(
+        'recorder', f'{title} for {seconds:.0f} s, at 80 % of the highest rate at which a bare '
+        f'subscription loses none ({highest["rate"]:,.0f}/s)',
+        ['receiver', 'messages/s', 'sent', 'lost', 'processor', 'peak memory'], rows,
+        {'highest': highest, **results}, results['hmsa recorder']['lost'] == 0)
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    if sys.argv[1] == 'source':
+        source()
+    else:
+        receive(*sys.argv[2:])

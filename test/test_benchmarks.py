@@ -7,12 +7,14 @@ import math
 
 import numpy as np
 import pytest
+from rich.console import Console
 from scipy.integrate import solve_ivp
 
 from benchmarks import __main__ as program
 from benchmarks import bench_planner, bench_plant, contenders
 from benchmarks.measure import Contender, loosest, race, Report, Row, text_of_time
 from benchmarks.reference import Actuator, response, two_step
+from benchmarks.sheet import Sheet
 
 ACTUATOR = Actuator(zeta=0.2, j_lim=5.0, c1=2.0)
 
@@ -103,7 +105,8 @@ def test_tables_of_a_page_are_renewed_and_nothing_else():
         'a\n<!-- begin x -->\n\nnew\n\n<!-- end x -->\nb <!-- begin y --> c\n')
 
 
-@pytest.mark.parametrize('name', ['machine', 'planner', 'plant', 'start', 'choices'])
+@pytest.mark.parametrize('name', [
+    'machine', 'planner', 'plant', 'start', 'choices', 'recorder', 'player', 'crash'])
 def test_page_about_the_method_has_marks_for_each_table(name):
     page = (contenders.HERE.parent / 'docs' / 'method.md').read_text(encoding='utf-8')
     assert page.count(f'<!-- begin {name} -->') == page.count(f'<!-- end {name} -->') == 1
@@ -153,6 +156,26 @@ def test_table_compares_to_its_first_row_and_leaves_empty_columns_out():
         '| ours | fine | 2 us | 3 us | 1 |  |',
         '| theirs | coarse | 5 ms | 6 ms | 2,500 |  |',
         '| other |  | - | - | - | not installed |']
+
+
+def test_sheet_has_its_own_headings_on_a_page_and_in_print():
+    sheet = Sheet('x', 'Title', ['', 'lost'], [['ours', '0'], ['theirs', '1,000']], {'a': 1.5})
+    assert sheet.markdown().splitlines() == [
+        '**Title**', '', '|  | lost |', '| --- | --: |', '| ours | 0 |', '| theirs | 1,000 |']
+    console = Console(record=True, width=40)
+    sheet.show(console)
+    assert '1,000' in console.export_text()
+    assert json.loads(json.dumps(sheet.record()))['figures'] == {'a': 1.5}
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+def test_quick_run_of_the_kills_recovers_every_bag(ros_env, tmp_path):
+    assert program.main(['crash', '--quick', '--json', str(tmp_path / 'figures.json')]) in (0, 1)
+    figures = json.loads((tmp_path / 'figures.json').read_text())['crash']['figures']
+    assert len(figures['losses']) == 2
+    assert all(0.0 <= loss < 60.0 for loss in figures['losses'])
+    assert figures['messages'] > 0
 
 
 @pytest.mark.parametrize(('seconds', 'text'), [

@@ -1,0 +1,81 @@
+"""A table of figures of any kind, to be printed, put on a page, or written as JSON."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """
+    A table with headings of its own.
+
+    Attributes
+    ----------
+    key : str
+        Name in the JSON file and in the marks of a page.
+    title : str
+        What is shown.
+    head : sequence of str
+        Headings; the first column holds text, the others numbers.
+    rows : sequence of sequence of str
+        Cells.
+    figures : mapping
+        The same in full precision, for the JSON file.
+    passed : bool
+        Whether what was promised was seen.
+
+    """
+
+    key: str
+    title: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    figures: Mapping[str, Any] = field(default_factory=dict)
+    passed: bool = True
+
+    def show(self, console: Console) -> None:
+        """
+        Print the table.
+
+        Parameters
+        ----------
+        console : Console
+            Where to.
+
+        """
+        table = Table(title=self.title, title_justify='left')
+        for i, name in enumerate(self.head):
+            table.add_column(name, justify='right' if i else 'left')
+        for cells in self.rows:
+            table.add_row(*cells)
+        console.print(table)
+
+    def markdown(self) -> str:
+        """
+        Return the table for a page of the documentation.
+
+        Returns
+        -------
+        str
+            Title and table.
+
+        """
+        rule = ['---', *['--:'] * (len(self.head) - 1)]
+        lines = ['| ' + ' | '.join(cells) + ' |' for cells in (self.head, rule, *self.rows)]
+        return '\n'.join([f'**{self.title}**', '', *lines, ''])
+
+    def record(self) -> dict[str, Any]:
+        """
+        Return the table for a JSON file.
+
+        Returns
+        -------
+        dict
+            Headings, cells and figures.
+
+        """
+        return asdict(self)
