@@ -11,6 +11,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 from hmsa_ros.errors import HmsaError
+from hmsa_ros.nodes.parameter_service import CarefulParameterService
 from hmsa_ros.nodes.parameters import declare, ParameterSpec
 
 AUTOSTART = ParameterSpec(
@@ -43,7 +44,8 @@ class ManagedNode(LifecycleNode):
 
     def __init__(self, name: str) -> None:
         """Create the node, unconfigured."""
-        super().__init__(name)
+        super().__init__(name, start_parameter_services=False)
+        self._parameter_service = CarefulParameterService(self)
         self.active = False
         self.finished = False
         self._autostart: bool = declare(self, [AUTOSTART])[AUTOSTART.name]

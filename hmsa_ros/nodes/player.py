@@ -36,6 +36,7 @@ from hmsa_ros.bag.limits import CHUNK_SIZE
 from hmsa_ros.bag.reader import BagReader, Message, TopicInfo
 from hmsa_ros.errors import BadInputError, BagError, HmsaError, printable
 from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.parameter_service import CarefulParameterService
 from hmsa_ros.nodes.parameters import declare, ParameterSpec
 from hmsa_ros.nodes.qos import publisher
 from hmsa_ros.nodes.recorder import message_class
@@ -307,7 +308,8 @@ class Player(Node):
     """
 
     def __init__(self) -> None:
-        super().__init__(interface.PLAYER)
+        super().__init__(interface.PLAYER, start_parameter_services=False)
+        self._parameter_service = CarefulParameterService(self)
         values = self._values = declare(self, PARAMETERS)
         if not values['storage.uri']:
             raise BadInputError(

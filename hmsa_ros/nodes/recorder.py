@@ -42,6 +42,7 @@ from hmsa_ros.bag.writer import BagWriter, parse_custom_data, PRESETS, Topic
 from hmsa_ros.errors import BadInputError, BagError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.capture import Capture, RawSubscription, SimulatedTime, Taken
+from hmsa_ros.nodes.parameter_service import CarefulParameterService
 from hmsa_ros.nodes.parameters import declare, ParameterSpec
 from hmsa_ros.nodes.qos import stored, subscription
 from hmsa_ros.nodes.runner import run
@@ -216,7 +217,8 @@ class Recorder(Node):
     """
 
     def __init__(self) -> None:
-        super().__init__(interface.RECORDER)
+        super().__init__(interface.RECORDER, start_parameter_services=False)
+        self._parameter_service = CarefulParameterService(self)
         self._parameters_in = declare(self, PARAMETERS)
         values = self._parameters_in
         self._priority: int = values['record.realtime_priority']
