@@ -2,9 +2,12 @@
 Measure speed and accuracy.
 
     python -m benchmarks [NAME ...] [--quick] [--json FILE] [--page FILE]
+    python -m benchmarks faults [--only KEY ...] [--quick] [--json FILE] [--page FILE]
+    python -m benchmarks soak [--hours H] [--minutes M] [--factor F] [--picture FILE] [--quick]
 
-NAME is planner, plant, preemption, recorder, player or crash; without one all are run. Those of
-recorder, player and crash take some seven minutes together.
+NAME is planner, plant, preemption, recorder, player or crash; without one all of these are run.
+Those of recorder, player and crash take some seven minutes together. faults injects faults into
+running nodes and fails if one is not answered as it should be; soak runs for hours.
 A page is a Markdown file with marks ``<!-- begin NAME -->`` and ``<!-- end NAME -->``, between
 which a table is put.
 """
@@ -26,6 +29,8 @@ from benchmarks.sheet import Sheet
 _WIDTH = 120
 
 NAMES = ('planner', 'plant', 'preemption', 'recorder', 'player', 'crash')
+#: Not run unless asked for: they take long and need the machine for themselves.
+LONG = ('faults', 'soak')
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -40,23 +45,35 @@ def main(arguments: list[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit status: 0, or 1 if recorder or player did not do what they promise.
+        Exit status: 0, or 1 if something did not do what it promises.
 
     """
     parser = argparse.ArgumentParser(
         prog='python -m benchmarks', description='Measure speed and accuracy.')
     parser.add_argument('names', nargs='*', metavar='NAME',
-                        help=f'{", ".join(NAMES)}; default all')
+                        help=f'{", ".join(NAMES)}; default all of these; or '
+                             f'{", ".join(LONG)}')
     parser.add_argument('--quick', action='store_true',
                         help='little of everything: shows that it runs, not how fast')
     parser.add_argument('--json', type=Path, metavar='FILE', help='write all figures to a file')
     parser.add_argument('--page', type=Path, metavar='FILE',
                         help='renew the tables of a page of the documentation')
+    parser.add_argument('--only', action='append', default=[], metavar='KEY',
+                        help='faults: beginning of the key of a fault to inject')
+    parser.add_argument('--hours', type=float, default=8.0,
+                        help='soak: simulated time (default 8)')
+    parser.add_argument('--minutes', type=float, default=float('inf'),
+                        help='soak: time on the wall for the part with processes, at most')
+    parser.add_argument('--factor', type=float, default=None,
+                        help='soak: real-time factor asked for, 0 for as fast as it can')
+    parser.add_argument('--picture', type=Path, metavar='FILE',
+                        help='soak: PNG of memory over time')
     options = parser.parse_args(arguments)
     names = options.names or NAMES
     for name in names:
-        if name not in NAMES:
-            parser.error(f'there is no benchmark {name!r}: expected {", ".join(NAMES)}')
+        if name not in NAMES + LONG:
+            parser.error(
+                f'there is no benchmark {name!r}: expected {", ".join(NAMES + LONG)}')
     console = Console()
     if not console.is_terminal:
         console = Console(width=_WIDTH)
@@ -102,10 +119,27 @@ def main(arguments: list[str] | None = None) -> int:
             if not sheet.passed:
                 console.print(f'{name}: not what is promised')
                 status = 1
+    texts: dict[str, str] = {}
+    if 'faults' in names and _has_ros('faults'):
+        from benchmarks import bench_faults
+
+        outcomes, failed = bench_faults.run(console, only=options.only, quick=options.quick)
+        status = status or failed
+        record['faults'] = bench_faults.record(outcomes)
+        texts['faults'] = bench_faults.page_text(outcomes)
+    if 'soak' in names and _has_ros('soak'):
+        from benchmarks import bench_soak
+
+        record['soak'], texts['soak'], failed = bench_soak.run(
+            console, hours=options.hours, minutes=options.minutes, quick=options.quick,
+            factor=bench_soak.FACTOR if options.factor is None else options.factor,
+            picture=options.picture)
+        status = status or failed
     if options.json:
-        options.json.write_text(json.dumps(record, indent=2) + '\n', encoding='utf-8')
+        options.json.write_text(
+            json.dumps(record, indent=2, default=str) + '\n', encoding='utf-8')
     if options.page:
-        texts = {report.key: report.markdown() for report in reports}
+        texts |= {report.key: report.markdown() for report in reports}
         texts['machine'] = '\n'.join([where + '.', '', *(f'* {x}' for x in remarks)])
         page = renewed(options.page.read_text(encoding='utf-8'), texts)
         options.page.write_text(page, encoding='utf-8')

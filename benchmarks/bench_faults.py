@@ -1,0 +1,108 @@
+"""
+Inject faults into running nodes, and hold what is seen against what was expected.
+
+Each row starts real processes in a ROS domain of its own, makes its fault, and judges from the
+samples of the plant and the changes of flux density that it reports, not from logs. What is
+expected stands beside the row's code, written before the run; a row that does not meet it makes
+the run fail.
+"""
+
+from collections.abc import Sequence
+import os
+import sys
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.faults.table import inject, markdown, Outcome
+
+
+def run(
+        console: Console, *, only: Sequence[str] = (),
+        quick: bool = False) -> tuple[list[Outcome], int]:
+    """
+    Inject the faults and print the table.
+
+    Parameters
+    ----------
+    console : Console
+        Where to.
+    only : sequence of str
+        Beginnings of the keys of the faults to inject; default all.
+    quick : bool
+        Only the selection that the tests run.
+
+    Returns
+    -------
+    outcomes : list of Outcome
+        In order.
+    status : int
+        Exit status: 1 if a row is not as expected.
+
+    """
+    from benchmarks.faults.rows import FAULTS, QUICK
+
+    faults = [
+        x for x in FAULTS if (not only or x.key.startswith(tuple(only)))
+        and (not quick or only or x.key in QUICK)]
+    first = int(os.environ.get('ROS_DOMAIN_ID', 1 + os.getpid() % 101))
+    outcomes: list[Outcome] = []
+    for number, fault in enumerate(faults):
+        print(f'{number + 1}/{len(faults)} {fault.key}', end=': ', file=sys.stderr, flush=True)
+        # The next domain, so that nobody waits for the lease of a killed process.
+        outcomes.append(inject(fault, 1 + (first - 1 + number) % 101))
+        seen = outcomes[-1].seen
+        print(f'{"met" if seen.met else "NOT MET"} ({seen.figure}): {seen.text}',
+              file=sys.stderr, flush=True)
+    table = Table(title='Faults injected into running nodes', title_justify='left')
+    for name in ('fault', 'how it is made', 'expected', 'seen', 'residual or loss', ''):
+        table.add_column(name)
+    for row in outcomes:
+        table.add_row(
+            row.fault.name, row.fault.how, row.fault.expected, row.seen.text, row.seen.figure,
+            'met' if row.seen.met else 'NOT MET', end_section=True)
+    console.print(table)
+    failed = [x.fault.key for x in outcomes if not x.seen.met]
+    console.print(f'{len(outcomes) - len(failed)} of {len(outcomes)} as expected'
+                  + (f'; not: {", ".join(failed)}' if failed else ''))
+    return outcomes, 1 if failed else 0
+
+
+def record(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
+    """
+    Return the table for a JSON file.
+
+    Parameters
+    ----------
+    outcomes : sequence of Outcome
+        In order.
+
+    Returns
+    -------
+    list of dict
+        One a row.
+
+    """
+    return [
+        {'key': x.fault.key, 'fault': x.fault.name, 'how': x.fault.how,
+         'expected': x.fault.expected, 'seen': x.seen.text, 'figure': x.seen.figure,
+         'met': x.seen.met} for x in outcomes]
+
+
+def page_text(outcomes: Sequence[Outcome]) -> str:
+    """
+    Return the table for a page of the documentation.
+
+    Parameters
+    ----------
+    outcomes : sequence of Outcome
+        In order.
+
+    Returns
+    -------
+    str
+        Markdown.
+
+    """
+    return markdown(outcomes)

@@ -1,0 +1,815 @@
+"""
+Soak: hours of operation, compressed in time, with everything that goes wrong in them.
+
+Two parts. Over DDS: plant, planner and recorder as real processes; the plant leads simulated
+time as fast as it can, at 1 kHz. Cycles of two kinds take turns, each with a bag of its own. In
+calm ones there are random setpoints, sequences, stops, garbage on the planner's inputs, and
+kills of planner or recorder; every sample and every command of them is in the bag, and
+integrating the commands anew must give the samples. In rough ones there is garbage on every topic
+and service, the plant is paused, reset and killed too; that nobody raises or ends, and that the
+recorder lost nothing, is what counts there. In process: the planner's and the plant's cores with
+messages between them, for all hours, at 1 kHz.
+
+Memory of each process is sampled all the time; it must not grow.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from itertools import cycle
+import math
+import multiprocessing
+import os
+from pathlib import Path
+import random
+import shutil
+import signal
+import struct
+import sys
+import tempfile
+from time import monotonic
+from typing import Any
+
+from rich.console import Console
+
+from benchmarks.faults.memory import Sample, Trend, trend, used
+
+_HOUR = 3600.0
+_STEP_NS = 1_000_000
+_NANOSECONDS = 1_000_000_000
+#: Of simulated time, which runs some ten times as fast as that on the wall.
+_LEAD_SECONDS = 5.0
+#: Part of a process's life, in simulated h, in which it may still grow: buffers fill.
+_SETTLE_HOURS = 0.25
+_LOOK_SECONDS = 2.0
+#: Simulated seconds per second: what two cores manage with all three processes, with some room.
+#: Faster, a recorder that does not get its turn for a tenth of a second loses samples, since the
+#: plant keeps the last thousand of them for those who have not taken them yet.
+FACTOR = 5.0
+_TOPICS = (
+    'joint_states', 'flux_density_command', 'flux_density_applied', 'planner/status',
+    'planner/plan', 'planner/setpoint', 'planner/joint_trajectory', '/diagnostics')
+_NODES = ('plant', 'planner', 'recorder')
+#: Of stretch: a bag's samples against its commands, integrated anew.
+_SAME = 1e-9
+
+
+@dataclass
+class Cycle:
+    """
+    What became of one cycle and its bag.
+
+    Attributes
+    ----------
+    kind : str
+        ``calm`` or ``rough``.
+    killed : str
+        Node that was killed in it; empty for none.
+    samples : int
+        Of the plant in the bag.
+    missing : int
+        Samples between others that are not in the bag, in calm ones.
+    odd : int
+        Distances between two samples that are no whole number of ms, in calm ones.
+    lost : int
+        As the recorder counts them; -1 if the bag does not tell, as one of a killed recorder.
+    difference : float
+        Largest difference of the stretch to the commands integrated anew; NaN if not checked.
+    late : int
+        Commands that came after their time.
+    failure : str
+        Why the bag could not be checked; empty if it could.
+
+    """
+
+    kind: str
+    killed: str
+    samples: int = 0
+    missing: int = 0
+    odd: int = 0
+    lost: int = 0
+    difference: float = math.nan
+    late: int = 0
+    failure: str = ''
+
+
+@dataclass
+class Result:
+    """
+    What the soak found.
+
+    Attributes
+    ----------
+    hours : float
+        Simulated over DDS.
+    wall : float
+        Hours that it took.
+    requests, garbage, calls : int
+        Setpoints, sequences and stops; messages of garbage; calls of services.
+    cycles : list of Cycle
+        In order.
+    memory : dict of list
+        Samples by node.
+    trends : dict of Trend
+        By node.
+    traces : list of str
+        Unhandled exceptions.
+    ended : list of str
+        Nodes that ended without being told.
+    statuses : list of int
+        Exit statuses of nodes that were told to end.
+
+    """
+
+    hours: float = 0.0
+    wall: float = 0.0
+    requests: int = 0
+    garbage: int = 0
+    calls: int = 0
+    cycles: list[Cycle] = field(default_factory=list)
+    memory: dict[str, list[Sample]] = field(
+        default_factory=lambda: {x: [] for x in _NODES})
+    trends: dict[str, Trend] = field(default_factory=dict)
+    traces: list[str] = field(default_factory=list)
+    ended: list[str] = field(default_factory=list)
+    statuses: list[int] = field(default_factory=list)
+
+    def failures(self) -> list[str]:
+        """
+        Say what is not as it has to be.
+
+        Returns
+        -------
+        list of str
+            Empty if all is well.
+
+        """
+        found = [f'unhandled exception in the {x}' for x in self.traces]
+        found += [f'{x} ended by itself' for x in self.ended]
+        found += [f'exit status {x}' for x in self.statuses if x]
+        for number, one in enumerate(self.cycles):
+            where = f'bag {number} ({one.kind}, {one.killed or "nobody"} killed)'
+            if one.failure:
+                found.append(f'{where}: {one.failure}')
+            if one.lost > 0:
+                found.append(f'{where}: {one.lost} messages lost')
+            if one.missing or one.odd or not one.samples and not one.failure:
+                found.append(f'{where}: {one.missing} of {one.samples} samples missing, '
+                             f'{one.odd} out of step')
+            if one.kind == 'calm' and not one.late and not one.difference < _SAME:
+                found.append(f'{where}: differs by {one.difference:.1e} from its commands')
+        found += [
+            f'memory of the {name} grows by {x.slope / 2**20:.2f} MiB an hour'
+            for name, x in self.trends.items() if not x.flat]
+        return found
+
+
+def check_bag(folder: Path, kind: str, killed: str) -> Cycle:
+    """
+    Look for gaps in a bag, integrate its commands anew, and remove it.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the bag.
+    kind, killed : str
+        As of `Cycle`.
+
+    Returns
+    -------
+    Cycle
+        What was found.
+
+    """
+    from hmsa_ros.bag.info import lost_messages
+    from hmsa_ros.bag.reader import BagReader
+    from hmsa_ros.bag.recover import recover
+    from hmsa_ros.bag.verify import verify
+    from hmsa_ros.errors import HmsaError
+
+    found = Cycle(kind, killed)
+    bag = folder
+    try:
+        if killed == 'recorder':
+            bag = folder.with_name(folder.name + '_recovered')
+            recover(folder, bag)
+        reader = BagReader(bag)
+        lost = lost_messages(reader.custom_data)
+        found.lost = -1 if lost is None else sum(lost.values())
+        before = 0
+        for message in reader.messages(('/joint_states',)):
+            # Behind the four bytes that say how it is encoded: the stamp of the header.
+            seconds, nanoseconds = struct.unpack_from('<iI', message.data, 4)
+            now = seconds * _NANOSECONDS + nanoseconds
+            if before and kind == 'calm':
+                found.missing += (now - before) // _STEP_NS - 1
+                found.odd += (now - before) % _STEP_NS != 0
+            before = now
+            found.samples += 1
+        if kind == 'calm':
+            verification, = verify(bag)
+            found.difference = verification.largest_difference
+            found.late = verification.late_count
+    except HmsaError as error:
+        found.failure = str(error)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        if bag != folder:
+            shutil.rmtree(bag, ignore_errors=True)
+    return found
+
+
+class Soak:
+    """
+    Real processes, worn out; a context manager that ends them.
+
+    Parameters
+    ----------
+    folder : Path
+        For logs and bags.
+    domain : int
+        ROS domain for this alone.
+    seed : int
+        Of all chance.
+    factor : float
+        Simulated seconds per second that the plant is asked for; 0 for as fast as it can.
+
+    Attributes
+    ----------
+    result : Result
+        So far.
+    seconds : float
+        Simulated so far.
+
+    """
+
+    def __init__(self, folder: Path, domain: int, seed: int, factor: float) -> None:
+        """Start plant and planner."""
+        from benchmarks.faults.inputs import input_topics
+        from benchmarks.faults.rig import Rig
+
+        self.result = Result()
+        self.seconds = 0.0
+        self._dice = random.Random(seed)
+        self._factor = factor
+        self._begin = monotonic()
+        self.rig = Rig(folder, domain, watch=False)
+        self._children: dict[str, Any] = {}
+        self._lives = dict.fromkeys(_NODES, 0)
+        self._born = dict.fromkeys(_NODES, 0.0)
+        self._plant_time = 0.0
+        self._looked = 0.0
+        self._asked: list[tuple[Any, Any]] = []
+        self._clients: dict[str, tuple[Any, type[Any]]] = {}
+        self._bags = 0
+        # A child of its own, so that looking at a bag does not hold up the next cycle.
+        self._pool = ProcessPoolExecutor(
+            1, mp_context=multiprocessing.get_context('spawn'))
+        self._checks: list[Future[Cycle]] = []
+        self._start('plant')
+        self._start('planner')
+        self.rig.ready('planner')
+        self._take_up_time()
+        self._topics = [
+            (topic, owner, self.rig.publisher(topic, owner)) for topic, owner in input_topics()]
+
+    def __enter__(self) -> 'Soak':
+        """Return the soak."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End all processes."""
+        for name in ('planner', 'plant'):
+            self.result.statuses.append(self._children[name].end())
+        self.rig.__exit__()
+        self.result.traces += self.rig.traces()
+        self.result.cycles += [x.result() for x in self._checks]
+        self._pool.shutdown()
+        self.result.hours = self.seconds / _HOUR
+        self.result.wall = (monotonic() - self._begin) / _HOUR
+        for name, samples in self.result.memory.items():
+            self.result.trends[name] = trend(
+                samples, min(_SETTLE_HOURS, 0.3 * self.result.hours))
+
+    # -- processes, time and memory ------------------------------------------------------------
+
+    def _start(self, name: str, **more: object) -> None:
+        parameters: dict[str, object] = {
+            'plant': {'publish_clock': True, 'real_time_factor': self._factor},
+            'planner': {'use_sim_time': True, 'lead_time': _LEAD_SECONDS,
+                        'short_spell': 'continue'},
+            'recorder': {'use_sim_time': True,
+                         'record.topics': '[' + ', '.join(_TOPICS) + ']'},
+        }[name] | more
+        self._children[name] = self.rig.start(name, parameters)
+        self._lives[name] += 1
+        self._born[name] = self.seconds / _HOUR
+
+    def _take_up_time(self) -> None:
+        """Wait for the time of a plant that has just been started."""
+        self.rig.diagnostics.clear()
+        self.rig.spin_until(
+            lambda: not math.isnan(self.rig.value('plant', 'time')), 'the time of the plant')
+        self._plant_time = self.rig.value('plant', 'time')
+
+    def _look(self) -> None:
+        """Serve callbacks a moment, follow time, sample memory, find who has ended."""
+        self.rig.spin(0.01)
+        time = self.rig.value('plant', 'time')
+        if time > self._plant_time:
+            self.seconds += time - self._plant_time
+            self._plant_time = time
+        self._asked = [x for x in self._asked if not x[1].done()]
+        while len(self._asked) > 20:
+            client, future = self._asked.pop(0)
+            client.remove_pending_request(future)
+        if monotonic() - self._looked < _LOOK_SECONDS:
+            return
+        self._looked = monotonic()
+        hours = self.seconds / _HOUR
+        for name, child in self._children.items():
+            if child.alive:
+                self.result.memory[name].append(Sample(
+                    hours, self._lives[name], hours - self._born[name],
+                    *used(child.popen.pid)))
+            elif name != 'recorder':
+                self.result.ended.append(f'{name} with status {child.popen.returncode}')
+                self._start(name)
+
+    def _pass(self, seconds: float, act: Callable[[], None] | None = None) -> None:
+        """Let simulated time pass, acting about a hundred times a second."""
+        end = self.seconds + seconds
+        patience = monotonic() + 60.0 + seconds
+        while self.seconds < end:
+            if monotonic() > patience:
+                raise TimeoutError(f'{seconds:g} simulated seconds did not pass')
+            if act is not None:
+                act()
+            self._look()
+
+    # -- what is done to them ------------------------------------------------------------------
+
+    def cycle(self, kind: str, seconds: float, victim: str) -> None:
+        """
+        Run one cycle with a bag of its own.
+
+        Parameters
+        ----------
+        kind : str
+            ``calm`` or ``rough``.
+        seconds : float
+            Of simulated time.
+        victim : str
+            Node to kill half way through; empty for none.
+
+        """
+        bag = self.rig.folder / f'bag{self._bags}'
+        self._bags += 1
+        self._start('recorder', **{'storage.uri': bag})
+        self.rig.spin_until(self._recording, 'the recorder to listen to all topics')
+        # What the plant was told before the bag began is over, or the bag would not hold it.
+        self._pass(2.0 * _LEAD_SECONDS)
+        act = self._act_calmly if kind == 'calm' else self._act_roughly
+        self._pass(0.5 * seconds, act)
+        if victim:
+            self._kill(victim)
+        if victim != 'recorder':
+            self._pass(0.5 * seconds, act)
+        if kind == 'rough':
+            self._put_right()
+        self._pass(2.0 * _LEAD_SECONDS)
+        if victim != 'recorder':
+            self.result.statuses.append(self._children['recorder'].end())
+        del self._children['recorder']
+        for name in [x for x in self.rig.diagnostics if x.startswith('recorder')]:
+            del self.rig.diagnostics[name]
+        self._checks.append(self._pool.submit(check_bag, bag, kind, victim))
+
+    def _recording(self) -> bool:
+        for name, status in self.rig.diagnostics.items():
+            if name.startswith('recorder') and 'subscribed' in status:
+                done, _, wanted = status['subscribed'].partition('/')
+                return done.strip() == wanted.strip()
+        return False
+
+    def _kill(self, name: str) -> None:
+        self._children[name].end(signal.SIGKILL)
+        if name == 'planner':
+            self._start(name)
+        elif name == 'plant':
+            # Every other one begins at the beginning: time jumps back.
+            ahead = self._plant_time + 100.0 if self._dice.random() < 0.5 else 1.0
+            self._start(name, start_time=ahead)
+            self._take_up_time()
+
+    def _request(self) -> None:
+        """Ask for something that makes sense, often before the last move is over."""
+        from hmsa_ros.nodes import interface
+        from hmsa_ros.nodes.conversions import to_trajectory
+
+        dice = self._dice
+        self.result.requests += 1
+        choice = dice.random()
+        if choice < 0.5:
+            for _ in range(dice.choice((1, 1, 1, 5))):
+                self.rig.publish_setpoint(dice.uniform(0.7, 1.6))
+        elif choice < 0.9:
+            end, points = 0.0, []
+            for _ in range(dice.randrange(1, 6)):
+                end += dice.uniform(0.005, 0.3)
+                points.append((dice.uniform(0.7, 1.6), round(end * _NANOSECONDS)))
+            self.rig.publish_trajectory(to_trajectory(points, 'actuator'))
+        else:
+            self._call(interface.STOP.type, '/planner/stop', interface.STOP.type.Request())
+
+    def _rubbish(self, *, calm: bool) -> None:
+        """Send garbage; in calm cycles only where it cannot reach the plant or its samples."""
+        from benchmarks.faults import garbage
+        from hmsa_ros.nodes import interface
+
+        topics = [
+            x for x in self._topics
+            if not calm or x[0] in (interface.SETPOINT, interface.JOINT_TRAJECTORY,
+                                    interface.FLUX_DENSITY_APPLIED)]
+        if not calm and self._dice.random() < 0.95:
+            # A little of it goes a long way: each message is a jump of time.
+            topics = [x for x in topics if x[0] != interface.CLOCK_TOPIC]
+        topic, _, publisher = self._dice.choice(topics)
+        made = garbage.message if self._dice.random() < 0.5 else garbage.encoding
+        # What the middleware itself does not take never arrives.
+        with suppress(Exception):
+            publisher.publish(made(topic.type, self._dice))
+        self.result.garbage += 1
+
+    def _act_calmly(self) -> None:
+        if self._dice.random() < 0.7:
+            self._request()
+        else:
+            self._rubbish(calm=True)
+
+    def _act_roughly(self) -> None:
+        from benchmarks.faults.inputs import service_class, wild_request
+        from hmsa_ros.nodes import interface
+
+        choice = self._dice.random()
+        if choice < 0.4:
+            self._request()
+        elif choice < 0.8:
+            self._rubbish(calm=False)
+        elif choice < 0.9:
+            owner = self._dice.choice(_NODES)
+            try:
+                services = self.rig.node.get_service_names_and_types_by_node(owner, '/')
+            except Exception:  # rclpy has a class of its own for a node that is not there
+                return
+            if services:
+                name, types = self._dice.choice(services)
+                kind = service_class(types[0])
+                self._call(kind, name, wild_request(kind, name, self._dice))
+        else:
+            # One of the calls above may have paused it, and nothing would go on.
+            self._call(interface.SET_PAUSED.type, '/plant/set_paused',
+                       interface.SET_PAUSED.type.Request(data=False))
+
+    def _call(self, kind: type[Any], name: str, request: Any) -> None:
+        """Call a service and do not wait for the answer."""
+        if name not in self._clients:
+            self._clients[name] = self.rig.node.create_client(kind, name), kind
+        client = self._clients[name][0]
+        if client.service_is_ready():
+            self._asked.append((client, client.call_async(request)))
+            self.result.calls += 1
+
+    def _put_right(self) -> None:
+        """Undo what garbage may have set."""
+        from hmsa_ros.nodes import interface
+
+        rig = self.rig
+        rig.call(interface.SET_PAUSED, 'plant', interface.SET_PAUSED.type.Request(data=False))
+        rig.set_parameters('plant', use_sim_time=False)
+        rig.set_parameters(
+            'planner', use_sim_time=True, flux_density_min=-0.5, flux_density_max=0.5,
+            shaper='two_step', short_spell='continue', robust_order=2)
+        rig.call(interface.RESET, 'plant')
+        self._pass(2.0 * _LEAD_SECONDS)
+        rig.publish_setpoint(1.0)
+        self._pass(2.0 * _LEAD_SECONDS)
+
+
+def run_over_dds(
+        folder: Path, domain: int, *, hours: float, minutes: float, length: float,
+        factor: float, seed: int = 1) -> Result:
+    """
+    Wear out real processes.
+
+    Parameters
+    ----------
+    folder : Path
+        For logs and bags.
+    domain : int
+        ROS domain for this alone.
+    hours : float
+        Of simulated time, at most.
+    minutes : float
+        On the wall, at most.
+    length : float
+        Of a cycle in simulated s.
+    factor : float
+        Simulated seconds per second that the plant is asked for; 0 for as fast as it can.
+    seed : int
+        Of all chance.
+
+    Returns
+    -------
+    Result
+        What was found.
+
+    """
+    kinds = cycle((
+        ('calm', ''), ('calm', 'planner'), ('rough', ''), ('calm', 'recorder'), ('rough', 'plant'),
+        ('calm', ''), ('rough', 'planner'), ('calm', ''), ('calm', '')))
+    with Soak(folder, domain, seed, factor) as soak:
+        end = monotonic() + 60.0 * minutes
+        while soak.seconds < hours * _HOUR and monotonic() < end:
+            kind, victim = next(kinds)
+            soak.cycle(kind, length, victim)
+            trends = ', '.join(
+                f'{name} {x[-1].own / 2**20:.1f}' for name, x in soak.result.memory.items() if x)
+            print(f'{soak.seconds / _HOUR:.2f} h, {kind} {victim}: MiB {trends}',
+                  file=sys.stderr, flush=True)
+    return soak.result
+
+
+@dataclass
+class Core:
+    """
+    What the soak in process found.
+
+    Attributes
+    ----------
+    hours, wall : float
+        Simulated, and that it took.
+    steps, requests, refused, commands : int
+        Of 1 ms; requests, how many of them were garbage and refused; commands sent.
+    drift : int
+        Time at the end less the steps that were made, in ns.
+    difference : float
+        Largest difference of the stretch to what the planner predicted.
+    memory : list of Sample
+        Of this process.
+    trend : Trend
+        Of them.
+
+    """
+
+    hours: float
+    wall: float
+    steps: int
+    requests: int
+    refused: int
+    commands: int
+    drift: int
+    difference: float
+    memory: list[Sample]
+    trend: Trend
+
+    def failures(self) -> list[str]:
+        """
+        Say what is not as it has to be.
+
+        Returns
+        -------
+        list of str
+            Empty if all is well.
+
+        """
+        found = []
+        if self.drift:
+            found.append(f'in process: time drifted by {self.drift} ns')
+        if not self.difference < 1e-6:
+            found.append(
+                f'in process: stretch {self.difference:.1e} from what was predicted')
+        if not self.trend.flat:
+            found.append(
+                f'in process: memory grows by {self.trend.slope / 2**20:.2f} MiB an hour')
+        return found
+
+
+def run_in_process(hours: float, seed: int = 2) -> Core:
+    """
+    Drive planner and plant without processes, for all hours, at 1 kHz.
+
+    Commands go from one to the other as serialised messages. Requests come at random, many
+    before the last move is over, some of them garbage; now and then a new planner takes the
+    place of the old one where the actuator is at rest.
+
+    Parameters
+    ----------
+    hours : float
+        Of simulated time.
+    seed : int
+        Of all chance.
+
+    Returns
+    -------
+    Core
+        What was found.
+
+    """
+    from rclpy.serialization import deserialize_message, serialize_message
+    from sensor_msgs.msg import MagneticField
+
+    from hmsa_ros.core.parameters import paper_actuator
+    from hmsa_ros.core.planner import Options, Planner
+    from hmsa_ros.core.simulation import ActuatorSimulation
+    from hmsa_ros.errors import HmsaError
+    from hmsa_ros.nodes.conversions import from_command, to_command
+
+    dice = random.Random(seed)
+    wild = (math.nan, math.inf, -1.0, 0.0, 1e300, 2.7, 0.2)
+    options = Options(
+        short_spell='continue', flux_density_min=-0.5, flux_density_max=0.5)
+    actuator = paper_actuator()
+    planner = Planner(actuator, options)
+    begin = _NANOSECONDS
+    plant = ActuatorSimulation(actuator, time=begin)
+    steps = round(hours * _HOUR * _NANOSECONDS / _STEP_NS)
+    requests = refused = commands = 0
+    difference = 0.0
+    memory = []
+    started = monotonic()
+    now, again = begin, 0
+    for step in range(steps):
+        if step >= again:
+            requests += 1
+            again = step + dice.choice((1, 2, 3, 5, 8, 20, 100, 1000))
+            choice = dice.random()
+            try:
+                if choice < 0.5:
+                    planner.setpoint(dice.uniform(0.7, 1.6), now)
+                elif choice < 0.8:
+                    end, points = 0, []
+                    for _ in range(dice.randrange(1, 6)):
+                        end += dice.randrange(5_000_000, 300_000_000)
+                        points.append((dice.uniform(0.7, 1.6), end))
+                    planner.request(points, None, now)
+                elif choice < 0.9:
+                    planner.stop(now)
+                else:
+                    planner.request([(dice.choice(wild), 10**7), (1.1, 10**6)], -5, now)
+            except HmsaError:
+                refused += 1
+        for level in planner.due(now):
+            sent = serialize_message(to_command(level.stamp, level.flux_density, 'coil'))
+            stamp, flux_density = from_command(deserialize_message(sent, MagneticField))
+            plant.command(stamp, flux_density)
+            commands += 1
+        now += _STEP_NS
+        plant.advance(now)
+        if step % 997 == 0:
+            difference = max(
+                difference, abs(planner.state(now).stretch - plant.stretch))
+        if step % 60_000 == 0:
+            passed = step * _STEP_NS / _NANOSECONDS / _HOUR
+            memory.append(Sample(passed, 1, passed, *used(os.getpid())))
+    return Core(
+        hours, (monotonic() - started) / _HOUR, steps, requests, refused, commands,
+        plant.time - begin - steps * _STEP_NS, difference, memory,
+        trend(memory, min(_SETTLE_HOURS, 0.3 * hours)))
+
+
+def draw(result: Result, core: Core, file: Path) -> None:
+    """
+    Draw memory over simulated time.
+
+    Parameters
+    ----------
+    result, core : Result, Core
+        What was found.
+    file : Path
+        A PNG.
+
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.0, 4.5), layout='constrained')
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    for number, (name, samples) in enumerate(
+            [*result.memory.items(), ('planner and plant in process', core.memory)]):
+        for life in sorted({x.life for x in samples}):
+            part = [x for x in samples if x.life == life and x.own]
+            axes.plot(
+                [x.time for x in part], [x.own / 2**20 for x in part], color=f'C{number}',
+                lw=1.0, label=name if life == 1 else None)
+    axes.set_xlabel('simulated time (h)')
+    axes.set_ylabel('anonymous memory (MiB)')
+    axes.set_ylim(bottom=0.0)
+    axes.grid(alpha=0.3)
+    axes.legend(loc='lower right', fontsize='small')
+    figure.savefig(file, dpi=120)
+
+
+def report(result: Result, core: Core) -> list[str]:
+    """
+    Say what was found.
+
+    Parameters
+    ----------
+    result, core : Result, Core
+        Of both parts.
+
+    Returns
+    -------
+    list of str
+        Sentences for the console and the page.
+
+    """
+    calm = [x for x in result.cycles if x.kind == 'calm']
+    checked = [x.difference for x in calm if not x.late and not math.isnan(x.difference)]
+    lines = [
+        f'Over DDS, three processes: {result.hours:.2f} h of simulated time at 1 kHz in '
+        f'{60.0 * result.wall:.1f} min, {result.hours / result.wall:.1f} times as fast as real '
+        f'time; {result.requests} requests, {result.garbage} messages of garbage, '
+        f'{result.calls} calls, {sum(bool(x.killed) for x in result.cycles)} kills.',
+        f'{len(result.traces)} unhandled exceptions, {len(result.ended)} nodes ended by '
+        'themselves.',
+        f'{len(result.cycles)} bags with {sum(x.samples for x in result.cycles)} samples: '
+        f'{sum(max(x.lost, 0) for x in result.cycles)} messages lost; {len(calm)} calm ones: '
+        f'{sum(x.missing for x in calm)} samples missing, {sum(x.odd for x in calm)} not exactly '
+        '1 ms after the last; largest difference to the commands integrated anew '
+        f'{max(checked, default=math.nan):.1e} in {len(checked)} of '
+        f'them ({sum(bool(x.late) for x in calm)} with late commands).']
+    lines += [
+        f'Memory of the {name}: {_trend_text(x)}.' for name, x in result.trends.items()]
+    lines += [
+        f'In process: {core.hours:g} h at 1 kHz in {60.0 * core.wall:.1f} min, '
+        f'{core.requests} requests, {core.refused} of them refused, {core.commands} commands; '
+        f'time {core.drift} ns off after {core.steps} steps, stretch at most '
+        f'{core.difference:.1e} from what the planner predicted; memory '
+        f'{_trend_text(core.trend)}.']
+    return lines
+
+
+def _trend_text(found: Trend) -> str:
+    """Return a trend in words."""
+    if not found.samples:
+        return 'no process lived long enough to tell'
+    return (f'{found.slope / 2**20:+.3f} +- {found.error / 2**20:.3f} MiB an hour over '
+            f'{found.span:.2f} h, {"flat" if found.flat else "not flat"}')
+
+
+def run(
+        console: Console, *, hours: float = 8.0, minutes: float = math.inf,
+        factor: float = FACTOR, quick: bool = False,
+        picture: Path | None = None) -> tuple[dict[str, Any], str, int]:
+    """
+    Run both parts and print what was found.
+
+    Parameters
+    ----------
+    console : Console
+        Where to.
+    hours : float
+        Of simulated time.
+    minutes : float
+        On the wall, at most, for the part over DDS.
+    factor : float
+        Simulated seconds per second that the plant is asked for; 0 for as fast as it can.
+    quick : bool
+        About a minute of everything.
+    picture : Path, optional
+        For the memory curve.
+
+    Returns
+    -------
+    record : dict
+        For a JSON file.
+    text : str
+        For a page.
+    status : int
+        Exit status: 1 if anything is not as it has to be.
+
+    """
+    domain = int(os.environ.get('ROS_DOMAIN_ID', 1 + os.getpid() % 101))
+    length = 300.0
+    if quick:
+        hours, minutes, length = 0.05, 0.4, 30.0
+    with tempfile.TemporaryDirectory(prefix='hmsa_soak_') as folder:
+        result = run_over_dds(
+            Path(folder), domain, hours=hours, minutes=minutes, length=length,
+            factor=factor)
+    core = run_in_process(hours)
+    lines = report(result, core)
+    for line in lines:
+        console.print(line)
+    if picture is not None:
+        draw(result, core, picture)
+    failures = [*result.failures(), *core.failures()]
+    for line in failures:
+        console.print(f'FAILED: {line}')
+    record = {'over_dds': asdict(result), 'in_process': asdict(core), 'failures': failures}
+    text = '\n'.join(f'* {x}' for x in lines) + '\n'
+    return record, text, 1 if failures else 0

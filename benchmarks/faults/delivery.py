@@ -1,0 +1,146 @@
+"""Faults of delivery: load, delay, loss, doubling and reordering of commands."""
+
+from benchmarks.faults.common import LEAD, LIMIT, move, moves, pair, Register, share
+from benchmarks.faults.rig import Rig, settled
+from benchmarks.faults.table import Seen
+
+FAULTS = Register()
+_SLOW = 0.05
+
+
+@FAULTS.fault(
+    'none', 'none', 'five moves in real time', f'residual below {LIMIT:g}')
+def _none(rig: Rig) -> Seen:
+    pair(rig)
+    worst = moves(rig)
+    return Seen('five moves as planned', share(worst), worst < LIMIT)
+
+
+def _loaded(rig: Rig, lead: float) -> Seen:
+    pair(rig, planner={'lead_time': lead})
+    rig.load(4)
+    worst = moves(rig, pause=0.3 + lead)
+    rig.fresh('plant', 'planner')
+    late = rig.value('plant', 'late')
+    return Seen(f'{late:g} commands late', share(worst), worst < LIMIT and late == 0)
+
+
+@FAULTS.fault(
+    'load', 'both cores loaded', 'four busy processes, five moves, lead_time 0.2 s',
+    f'none late, residual below {LIMIT:g}')
+def _load(rig: Rig) -> Seen:
+    return _loaded(rig, 0.2)
+
+
+@FAULTS.fault(
+    'load_default', 'both cores loaded', 'four busy processes, five moves, lead_time 0.05 s',
+    f'none late, residual below {LIMIT:g}')
+def _load_default(rig: Rig) -> Seen:
+    return _loaded(rig, LEAD)
+
+
+def _delayed(rig: Rig, part: float) -> Seen:
+    # In slow motion a thousandth of lead_time is a millisecond on the wall, more than what
+    # the relay and DDS add.
+    remap = rig.relay('--delay', str(part * LEAD / _SLOW))
+    pair(rig, slow=_SLOW, remap=remap, planner={'lead_time': LEAD})
+    worst = moves(rig, (1.2, 1.0), pause=0.15)
+    rig.fresh('plant')
+    late = rig.value('plant', 'late')
+    return Seen(f'{late:g} commands late', share(worst), worst < LIMIT and late == 0)
+
+
+for _part in (0.0, 0.5, 0.98):
+    FAULTS.fault(
+        f'delay_{_part:g}', f'commands delayed by {_part:g} lead_time',
+        'relay holds each command back; slow motion, 1 s on the wall is lead_time',
+        f'none late, residual below {LIMIT:g}')(
+            lambda rig, part=_part: _delayed(rig, part))
+
+
+@FAULTS.fault(
+    'delay_beyond', 'a move delayed by 1.5 lead_time',
+    'relay holds the commands of one move back, then no more',
+    'late counted by plant and planner, re-planned from the predicted state: residual after it '
+    f'below {LIMIT:g}')
+def _delay_beyond(rig: Rig) -> Seen:
+    remap = rig.relay('--delay', str(1.5 * LEAD / _SLOW), '--first', '2')
+    pair(rig, slow=_SLOW, remap=remap, planner={'lead_time': LEAD})
+    return _replanned(rig, 'late')
+
+
+@FAULTS.fault(
+    'delay_always', 'all commands delayed by 1.5 lead_time', 'relay holds each command back',
+    'late counted, WARN in diagnostics of both nodes, at rest at the target in the end; the '
+    'residual is that of a broken plan')
+def _delay_always(rig: Rig) -> Seen:
+    remap = rig.relay('--delay', str(1.5 * LEAD / _SLOW))
+    pair(rig, slow=_SLOW, remap=remap, planner={'lead_time': LEAD})
+    residual, error = move(rig, 1.2, start=1.0, pause=0.6)
+    rig.fresh('plant', 'planner')
+    late, told = rig.value('plant', 'late'), rig.value('planner', 'late')
+    warned = min(rig.level('plant'), rig.level('planner'))
+    return Seen(
+        f'{late:g} late at the plant, {told:g} known to the planner, '
+        f'{rig.value("planner", "replanned"):g} re-planned, error in the end {error:.0e}',
+        share(residual), late > 0 and told > 0 and warned >= 1 and error < 1e-3)
+
+
+def _replanned(rig: Rig, counter: str) -> Seen:
+    """Make a move that is disturbed, and judge what re-planning leaves of it."""
+    mark = rig.count()
+    rig.setpoint(1.2)
+    rig.let_pass(0.6, 60.0)
+    rig.fresh('plant', 'planner')
+    residual, error = settled(rig.samples(mark)[1], 1.2, 0.2)
+    count, told = rig.value('plant', counter), rig.value('planner', 'late')
+    replanned = rig.value('planner', 'replanned')
+    return Seen(
+        f'{count:g} {counter} at the plant, {told:g} late and {replanned:g} re-planned at the '
+        f'planner, error {error:.0e}', share(residual),
+        count > 0 and replanned > 0 and max(residual, error) < LIMIT)
+
+
+@FAULTS.fault(
+    'drop', 'a command lost', 'relay drops the second command of a move',
+    'the heartbeat brings the level, the planner learns that it came late and re-plans: '
+    f'residual after it below {LIMIT:g}')
+def _drop(rig: Rig) -> Seen:
+    remap = rig.relay('--drop', '2')
+    pair(rig, remap=remap)
+    return _learnt(rig)
+
+
+@FAULTS.fault(
+    'reorder', 'two commands in the wrong order', 'relay sends the second one first',
+    'by the contract of the stream the earlier stamp supersedes the later one: as if that one '
+    f'were lost; residual after re-planning below {LIMIT:g}')
+def _reorder(rig: Rig) -> Seen:
+    remap = rig.relay('--swap')
+    pair(rig, remap=remap)
+    return _learnt(rig)
+
+
+def _learnt(rig: Rig) -> Seen:
+    mark = rig.count()
+    rig.setpoint(1.2)
+    rig.let_pass(1.2)
+    rig.fresh('planner')
+    residual, error = settled(rig.samples(mark)[1], 1.2, 0.2)
+    replanned = rig.value('planner', 'replanned')
+    return Seen(
+        f'{replanned:g} re-planned, error {error:.0e}', share(residual),
+        replanned > 0 and max(residual, error) < LIMIT)
+
+
+@FAULTS.fault(
+    'twice', 'commands doubled', 'relay sends each command twice',
+    f'nothing changes: residual below {LIMIT:g}, one change in force a command')
+def _twice(rig: Rig) -> Seen:
+    remap = rig.relay('--twice')
+    pair(rig, remap=remap)
+    before = len(rig.applied)
+    worst = moves(rig)
+    changes = len(rig.applied) - before
+    return Seen(f'{changes} changes in force in five moves', share(worst),
+                worst < LIMIT and changes == 10)

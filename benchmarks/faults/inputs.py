@@ -1,0 +1,228 @@
+"""Faults of input: garbage on topics and services, strangers, changed parameters."""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from importlib import import_module
+import random
+from typing import Any
+
+from benchmarks.faults import garbage
+from benchmarks.faults.common import jump, LIMIT, move, moves, pair, Register, share
+from benchmarks.faults.rig import Rig
+from benchmarks.faults.table import Seen
+from hmsa_ros.nodes import interface
+
+FAULTS = Register()
+_COUNT = 300
+_CALLS = 60
+
+
+def input_topics() -> Iterator[tuple[interface.Topic, str]]:
+    """
+    Name every topic that nodes of the package take messages from.
+
+    Yields
+    ------
+    topic : interface.Topic
+        As declared.
+    owner : str
+        Node whose private name it is; empty for others.
+
+    """
+    for topic in vars(interface).values():
+        if isinstance(topic, interface.Topic) and topic.subscribers:
+            yield topic, next(
+                (x for x in topic.subscribers if x != interface.RECORDER), '')
+    # Parameters and rclpy subscribe to these.
+    yield interface.CLOCK_TOPIC, ''
+    yield interface.DIAGNOSTICS, ''
+
+
+@FAULTS.fault(
+    'garbage_topics', 'garbage on every topic that is taken',
+    f'{_COUNT} messages of wild values and broken encodings on each, to planner, plant and '
+    'recorder at work',
+    'nobody ends or raises; after a reset of the plant and a new request the residual is below '
+    f'{LIMIT:g}')
+def _topics(rig: Rig) -> Seen:
+    dice = random.Random(5)
+    recorder = rig.start('recorder', {'storage.uri': rig.folder / 'bag'})
+    pair(rig)
+    rig.ready('recorder')
+    publishers = [(topic, rig.publisher(topic, owner)) for topic, owner in input_topics()]
+    rig.spin(0.5)
+    rig.deaf = True
+    for _ in range(_COUNT):
+        for topic, publisher in publishers:
+            sent = garbage.message(topic.type, dice) if dice.random() < 0.5 \
+                else garbage.encoding(topic.type, dice)
+            # What the middleware itself does not take never arrives.
+            with suppress(Exception):
+                publisher.publish(sent)
+        rig.spin(0.005)
+    for _, publisher in publishers:
+        rig.node.destroy_publisher(publisher)
+    rig.spin(1.0)
+    rig.deaf = False
+    ended = [x.log.stem for x in rig.children if not x.alive]
+    worst = _recovered(rig)
+    status = recorder.end()
+    return Seen(
+        f'{len(publishers)} topics; ended: {", ".join(ended) or "nobody"}; recorder exit '
+        f'{status}', share(worst), not ended and status == 0 and worst < LIMIT)
+
+
+def _recovered(rig: Rig) -> float:
+    """Put plant and planner back to work and measure moves."""
+    rig.spin(1.0)
+    rig.setpoint(1.0)
+    rig.let_pass(1.0)
+    rig.setpoint(1.05)
+    rig.let_pass(1.0)
+    return moves(rig, start=1.05)
+
+
+@FAULTS.fault(
+    'garbage_services', 'garbage on every service',
+    f'{_CALLS} requests of wild values to each service of planner, plant and recorder, '
+    'parameters included',
+    'every request is answered, nobody ends or raises; with the parameters put back the residual '
+    f'is below {LIMIT:g}')
+def _services(rig: Rig) -> Seen:
+    dice = random.Random(6)
+    recorder = rig.start('recorder', {'storage.uri': rig.folder / 'bag'})
+    pair(rig)
+    rig.ready('recorder')
+    called = 0
+    for owner in ('planner', 'plant', 'recorder'):
+        for name, types in rig.node.get_service_names_and_types_by_node(owner, '/'):
+            kind = service_class(types[0])
+            for _ in range(_CALLS):
+                rig.call_by_name(kind, name, wild_request(kind, name, dice))
+            called += 1
+    rig.call(interface.SET_PAUSED, 'plant', interface.SET_PAUSED.type.Request(data=False))
+    refused = rig.set_parameters(
+        'planner', use_sim_time=False, flux_density_min=-0.5, flux_density_max=0.5,
+        shaper='two_step')
+    rig.set_parameters('plant', use_sim_time=False)
+    ended = [x.log.stem for x in rig.children if not x.alive]
+    worst = _recovered(rig)
+    status = recorder.end()
+    return Seen(
+        f'{called} services, each request answered; ended: {", ".join(ended) or "nobody"}; '
+        f'recorder exit {status}', share(worst),
+        not ended and not refused and status == 0 and worst < LIMIT)
+
+
+def service_class(name: str) -> type[Any]:
+    """
+    Return the class of a service type.
+
+    Parameters
+    ----------
+    name : str
+        For example ``'std_srvs/srv/Trigger'``.
+
+    Returns
+    -------
+    type
+        Its class.
+
+    """
+    package, kind, word = name.split('/')
+    return getattr(import_module(f'{package}.{kind}'), word)
+
+
+def wild_request(kind: type[Any], name: str, dice: random.Random) -> Any:
+    """
+    Return a request that nobody means.
+
+    Parameters
+    ----------
+    kind : type
+        Service class.
+    name : str
+        Of the service.
+    dice : random.Random
+        What the values are drawn from.
+
+    Returns
+    -------
+    object
+        Of transitions only such as do not exist: one that does would be obeyed.
+
+    """
+    request = garbage.message(kind.Request, dice)
+    if name.endswith('/change_state'):
+        request.transition.id = dice.randrange(100, 256)
+        request.transition.label = 'nonsense'
+    return request
+
+
+@FAULTS.fault(
+    'parameter_refused', 'parameters changed at run time, out of order',
+    'flux_density_max below flux_density_min, a shaper that does not exist, a read-only one; '
+    'during a move',
+    f'each refused with a reason, nothing changes: residual below {LIMIT:g}')
+def _refused(rig: Rig) -> Seen:
+    pair(rig)
+    moves(rig, (1.1,))
+    mark = rig.count()
+    reasons = rig.set_parameters(
+        'planner', flux_density_max=-0.9, shaper='nonsense', lead_time=-1.0,
+        command_mode='sampled')
+    left = jump(rig, mark)
+    worst = moves(rig, (1.3, 1.1), start=1.1)
+    return Seen(
+        f'{len(reasons)} of 4 refused, all with a reason: {all(reasons)}; field changed by '
+        f'{left:g} T', share(worst),
+        len(reasons) == 4 and 'no reason' not in reasons and left == 0.0 and worst < LIMIT)
+
+
+@FAULTS.fault(
+    'parameter_taken', 'a limit changed at run time', 'flux_density_max 0.05 T while holding 1.1',
+    'the field in force stays, the next plan obeys it: 1.4 is refused, 1.05 taken with a '
+    f'residual below {LIMIT:g}')
+def _taken(rig: Rig) -> Seen:
+    pair(rig)
+    moves(rig, (1.1,))
+    mark = rig.count()
+    refused = rig.set_parameters('planner', flux_density_max=0.05)
+    rig.let_pass(0.3)
+    left = jump(rig, mark)
+    verdict = rig.setpoint(1.4)
+    residual, error = move(rig, 1.05, start=1.1)
+    most = float(rig.samples(mark)[1][-1, 2])
+    return Seen(
+        f'1.4: {verdict.get("code")}; field in the end {most:.3f} T', share(residual),
+        not refused and left == 0.0 and verdict['level'] == '2' and most <= 0.05
+        and max(residual, error) < LIMIT)
+
+
+def atomically(rig: Rig, owner: str, **values: object) -> str:
+    """
+    Set parameters of a node all together or not at all.
+
+    Parameters
+    ----------
+    rig : Rig
+        Where.
+    owner : str
+        Node.
+    **values : object
+        By name.
+
+    Returns
+    -------
+    str
+        Reason of a refusal, empty if they were taken.
+
+    """
+    from rcl_interfaces.srv import SetParametersAtomically
+    from rclpy.parameter import Parameter
+
+    response = rig.call_by_name(
+        SetParametersAtomically, f'{owner}/set_parameters_atomically',
+        SetParametersAtomically.Request(parameters=[
+            Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]))
+    return '' if response.result.successful else response.result.reason or 'no reason'

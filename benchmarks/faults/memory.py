@@ -1,0 +1,147 @@
+"""Memory of processes over time, and whether it grows."""
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+#: Growth over a whole run, in bytes, that counts as none.
+SMALL = 2 * 2**20
+#: In the first minutes of a life, when buffers fill.
+SMALL_AT_FIRST = 16 * 2**20
+#: Length, in h of simulated time, from which on a life tells of leaks.
+LONG = 0.1
+
+
+def used(pid: int) -> tuple[int, int, int]:
+    """
+    Return the memory of a process.
+
+    Parameters
+    ----------
+    pid : int
+        Of the process.
+
+    Returns
+    -------
+    own, pss, rss : int
+        Anonymous memory, which is the process's own, proportional and resident set size, in
+        bytes; 0 for a process that has ended.
+
+    """
+    found = {}
+    try:
+        with open(f'/proc/{pid}/smaps_rollup', encoding='ascii') as file:
+            for line in file:
+                name, _, rest = line.partition(':')
+                if name in ('Anonymous', 'Pss', 'Rss'):
+                    found[name] = int(rest.split()[0]) * 1024
+    except (FileNotFoundError, ProcessLookupError):
+        return 0, 0, 0
+    return found.get('Anonymous', 0), found.get('Pss', 0), found.get('Rss', 0)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """
+    Memory of a process at a moment.
+
+    Attributes
+    ----------
+    time : float
+        In h of simulated time, all lives of the run together.
+    life : int
+        Counts the processes that have carried the name.
+    age : float
+        Since this process was started, in h of simulated time.
+    own, pss, rss : int
+        Anonymous memory, proportional and resident set size in bytes. The first is what leaks
+        show in: the others change as processes come and go that use the same libraries.
+
+    """
+
+    time: float
+    life: int
+    age: float
+    own: int
+    pss: int
+    rss: int
+
+
+@dataclass(frozen=True)
+class Trend:
+    """
+    How memory changes.
+
+    Attributes
+    ----------
+    slope : float
+        In bytes per simulated hour, from all lives, each with a level of its own.
+    error : float
+        Standard error of the slope; infinite for too few samples.
+    span : float
+        Longest life that counts, in h.
+    samples : int
+        That were used.
+
+    """
+
+    slope: float
+    error: float
+    span: float
+    samples: int
+
+    @property
+    def flat(self) -> bool:
+        """Whether growth is small or within the noise."""
+        small = SMALL if self.span >= LONG else SMALL_AT_FIRST
+        return self.slope * self.span < small or self.slope < 3.0 * self.error
+
+
+def trend(samples: list[Sample], settle: float) -> Trend:
+    """
+    Fit one slope through all lives of a process.
+
+    Parameters
+    ----------
+    samples : list of Sample
+        In order.
+    settle : float
+        First part of each life that is left out, in h: memory that is taken once.
+
+    Returns
+    -------
+    Trend
+        Of the anonymous memory.
+
+    """
+    ages, sizes = [], []
+    lives = {x.life for x in samples}
+    span = 0.0
+    used_lives = 0
+    for life in sorted(lives):
+        part = [x for x in samples if x.life == life and x.age >= settle and x.own > 0]
+        if len(part) < 3:
+            continue
+        used_lives += 1
+        age = np.array([x.age for x in part])
+        size = np.array([x.own for x in part], float)
+        span = max(span, float(np.ptp(age)))
+        ages.append(age - age.mean())
+        sizes.append(size - size.mean())
+    if not ages:
+        return Trend(0.0, math.inf, 0.0, 0)
+    x, y = np.concatenate(ages), np.concatenate(sizes)
+    square = float(x @ x)
+    if square == 0.0:
+        return Trend(0.0, math.inf, span, x.size)
+    slope = float(x @ y) / square
+    rest = y - slope * x
+    free = max(x.size - used_lives - 1, 1)
+    # Samples follow each other closely, and memory comes in steps: neighbours are no two
+    # observations. An autoregressive noise of first order widens the error by this.
+    spread = float(rest @ rest)
+    near = float(rest[1:] @ rest[:-1]) / spread if spread > 0.0 else 0.0
+    near = min(max(near, 0.0), 0.99)
+    error = math.sqrt(spread / free / square * (1.0 + near) / (1.0 - near))
+    return Trend(slope, error, span, int(x.size))

@@ -1,0 +1,293 @@
+"""Faults of processes: killed, stopped and restarted nodes, a full disk, an idle lifecycle."""
+
+from pathlib import Path
+import signal
+import subprocess
+from time import monotonic
+
+import numpy as np
+
+from benchmarks.faults.common import jump, LIMIT, move, moves, pair, Register, share
+from benchmarks.faults.rig import Rig, settled
+from benchmarks.faults.table import Seen
+from hmsa_ros.bag.reader import BagReader
+from hmsa_ros.bag.recover import recover
+from hmsa_ros.nodes import interface
+
+FAULTS = Register()
+_TIMEOUT = 0.5
+_RAMP = 0.05
+
+
+@FAULTS.fault(
+    'planner_killed', 'planner killed in mid-move, restarted',
+    'slow motion, kill -9 between the two commands of 1 -> 1.2, a new one, 1.1 asked for',
+    'the field does not change until the new one is asked; it starts from the state in force: '
+    f'residual below {LIMIT:g}')
+def _planner_killed(rig: Rig) -> Seen:
+    # 1 ms ahead, 0.1 s on the wall; the move takes 6 ms, 0.6 s on the wall.
+    follows = {'use_sim_time': True, 'lead_time': 0.001}
+    rig.start('plant', {
+        'publish_clock': True, 'real_time_factor': 0.01, 'publish_rate': 10_000.0})
+    planner = rig.start('planner', follows)
+    rig.ready('plant', 'planner')
+    rig.setpoint(1.2)
+    mark = rig.count()
+    rig.spin_until(lambda: jump(rig, mark) > 0.0, 'the first command to take effect')
+    planner.end(signal.SIGKILL)
+    killed = rig.count()
+    before = len(rig.verdicts)
+    rig.start('planner', follows)
+    rig.spin_until(lambda: len(rig.verdicts) > before, 'the new planner')
+    rig.ready('planner')
+    left = jump(rig, killed)
+    moving = abs(rig.samples()[1][-1, 1])
+    mark = rig.count()
+    rig.setpoint(1.1)
+    rig.let_pass(0.06, 60.0)
+    residual, error = settled(rig.samples(mark)[1], 1.1, 0.1)
+    return Seen(
+        f'field changed by {left:g} T on its own; at {moving:.1g}/s when asked again; error '
+        f'{error:.0e}', share(residual), left == 0.0 and max(residual, error) < LIMIT)
+
+
+@FAULTS.fault(
+    'planner_restarted', 'planner killed at rest, restarted',
+    'kill -9 at stretch 1.3, a new one that is told nothing, 1.1 asked for',
+    f'no jump, the move starts from 1.3: residual below {LIMIT:g}')
+def _planner_restarted(rig: Rig) -> Seen:
+    rig.start('plant')
+    planner = rig.start('planner')
+    rig.ready('plant', 'planner')
+    move(rig, 1.3, start=1.0)
+    planner.end(signal.SIGKILL)
+    mark = rig.count()
+    rig.start('planner')
+    rig.ready('planner')
+    left = jump(rig, mark)
+    residual, error = move(rig, 1.1, start=1.3)
+    return Seen(
+        f'field changed by {left:g} T on its own, error {error:.0e}', share(residual),
+        left == 0.0 and max(residual, error) < LIMIT)
+
+
+@FAULTS.fault(
+    'planner_stopped', 'planner stopped for 1 s in mid-sequence',
+    'SIGSTOP, SIGCONT 1 s later; a setpoint every 0.4 s, command_timeout 0.5 s',
+    'the watchdog of the plant tells of it, commands sent late are counted, the rest is '
+    f're-planned: residual of the last move below {LIMIT:g}')
+def _planner_stopped(rig: Rig) -> Seen:
+    rig.start('plant', {'command_timeout': _TIMEOUT, 'safe_flux': 'hold'})
+    planner = rig.start('planner')
+    rig.ready('plant', 'planner')
+    rig.sequence([(1.1, 0.4), (1.2, 0.4), (1.3, 0.4), (1.2, 0.4), (1.4, 0.4)])
+    rig.let_pass(0.5)
+    planner.send(signal.SIGSTOP)
+    worst = 0
+    end = monotonic() + 1.0
+
+    def stopped() -> bool:
+        nonlocal worst
+        worst = max(worst, rig.level('plant'))
+        return monotonic() > end
+
+    rig.spin_until(stopped, 'the time to pass')
+    planner.send(signal.SIGCONT)
+    rig.let_pass(1.5)
+    rig.fresh('plant', 'planner')
+    residual, error = settled(rig.samples()[1], 1.4, 0.2)
+    late = rig.value('planner', 'late')
+    return Seen(
+        f'watchdog level {worst}, {late:g} late, {rig.value("planner", "replanned"):g} '
+        f're-planned, error {error:.0e}, plant level {rig.level("plant")} afterwards',
+        share(residual), worst >= 1 and late > 0 and max(residual, error) < LIMIT)
+
+
+@FAULTS.fault(
+    'plant_restarted', 'plant killed in mid-sequence, restarted',
+    'kill -9 at 1.2, a new one at rest at stretch 1 and without field, sequence goes on',
+    'the planner notices that the field in force is not what it planned and re-plans: after '
+    f'the next request the residual is below {LIMIT:g}')
+def _plant_restarted(rig: Rig) -> Seen:
+    plant = rig.start('plant')
+    rig.start('planner')
+    rig.ready('plant', 'planner')
+    move(rig, 1.2, start=1.0)
+    plant.end(signal.SIGKILL)
+    mark = rig.count()
+    rig.start('plant')
+    rig.spin_until(lambda: rig.count() > mark, 'samples of the new plant')
+    rig.ready('plant', 'planner')
+    rig.let_pass(0.5)
+    first, _ = move(rig, 1.1, start=1.2)
+    worst = moves(rig, (1.3, 1.1), start=1.1)
+    return Seen(
+        f'first move {first:.0e}, then as planned, {rig.value("planner", "replanned"):g} '
+        're-planned', share(worst), max(first, worst) < LIMIT)
+
+
+def _watchdog(rig: Rig, safe: str) -> Seen:
+    rig.start('plant', {
+        'command_timeout': _TIMEOUT, 'safe_flux': safe, 'safe_ramp_rate': _RAMP})
+    planner = rig.start('planner')
+    rig.ready('plant', 'planner')
+    move(rig, 1.2, start=1.0)
+    rig.let_pass(1.5)
+    quiet = rig.level('plant')
+    held = float(rig.samples()[1][-1, 2])
+    planner.end(signal.SIGKILL)
+    mark, killed = rig.count(), rig.time
+    rig.let_pass(_TIMEOUT + held / _RAMP + 1.0, 60.0)
+    rig.fresh('plant')
+    told = rig.level('plant')
+    stamps, values = rig.samples(mark)
+    flux = values[:, 2]
+    ends = {'hold': held, 'zero': 0.0, 'ramp': 0.0}
+    good = bool(flux[-1] == ends[safe])
+    text = f'{held:.4f} T became {flux[-1]:.4f} T'
+    loss = '-'
+    if safe != 'hold':
+        changed = np.flatnonzero(flux != held)
+        after = (stamps[changed[0]] - killed) * 1e-9 if changed.size else float('nan')
+        # The last heartbeat may have been 0.2 s old, and is stamped lead_time ahead.
+        good = good and _TIMEOUT - 0.25 < after < _TIMEOUT + 0.25
+        loss = f'{after:.3f} s'
+    if safe == 'ramp':
+        falling = np.flatnonzero((flux < held) & (flux > 0.0))
+        rate = -float(np.polyfit((stamps[falling] - killed) * 1e-9, flux[falling], 1)[0]) \
+            if falling.size > 10 else float('nan')
+        good = good and abs(rate / _RAMP - 1.0) < 0.01
+        text += f' at {rate:.4f} T/s'
+    rig.start('planner')
+    rig.ready('planner')
+    start = float(rig.samples()[1][-1, 0])
+    residual, _ = move(rig, 1.3, start=start)
+    rig.let_pass(1.5)
+    rig.fresh('plant')
+    again = rig.level('plant')
+    return Seen(
+        f"{text}; plant level {quiet} before, {told} then, {again} after a new planner's "
+        f'move, whose residual is {residual:.1e}', f'safe after {loss}' if loss != '-' else '-',
+        good and quiet == 0 and told >= 1 and again < told and residual < LIMIT)
+
+
+for _safe, _what in (
+        ('hold', 'the field stays'), ('zero', 'the field goes to zero in one step'),
+        ('ramp', f'the field falls to zero at {_RAMP:g} T/s')):
+    FAULTS.fault(
+        f'watchdog_{_safe}', f'planner dies, safe_flux {_safe}',
+        f'kill -9, command_timeout {_TIMEOUT:g} s',
+        f'{_what} {_TIMEOUT:g} s after the last sign of life, told in diagnostics; a new '
+        f'planner takes over from there: residual below {LIMIT:g}')(
+            lambda rig, safe=_safe: _watchdog(rig, safe))
+
+
+@FAULTS.fault(
+    'recorder_killed', 'recorder killed while recording',
+    'kill -9 of a recorder of all topics, hmsa bag recover',
+    f'the others go on (residual below {LIMIT:g}); at most the flush period of 0.5 s is lost, '
+    'no gap before')
+def _recorder_killed(rig: Rig) -> Seen:
+    bag = rig.folder / 'bag'
+    recorder = rig.start('recorder', {'storage.uri': bag})
+    pair(rig)
+    rig.ready('recorder')
+    worst = moves(rig)
+    last = rig.time
+    recorder.end(signal.SIGKILL)
+    worst = max(worst, moves(rig, (1.1, 1.3), start=1.4))
+    recover(bag, rig.folder / 'recovered')
+    reader = BagReader(rig.folder / 'recovered')
+    topic = '/' + interface.JOINT_STATES.name
+    decode = reader.decoder(topic)
+    stamps = [decode(x.data).header.stamp for x in reader.messages((topic,))]
+    times = np.array([x.sec * 10**9 + x.nanosec for x in stamps])
+    gaps = int(np.sum(np.diff(times) != 10**6))
+    lost = (last - times[-1]) * 1e-9
+    return Seen(
+        f'{len(times)} samples recovered, {gaps} gaps; residual of the moves {worst:.1e}',
+        f'{max(lost, 0.0):.2f} s lost', gaps == 0 and lost < 0.75 and worst < LIMIT)
+
+
+@FAULTS.fault(
+    'disk_full', 'disk full while recording',
+    'a file system of 2 MB that fills up',
+    'told in diagnostics within seconds, the bag so far is readable without a gap, planner and '
+    f'plant go on: residual below {LIMIT:g}')
+def _disk_full(rig: Rig) -> Seen:
+    disk = rig.folder / 'disk'
+    disk.mkdir()
+    mounted = not subprocess.run(
+        ['mount', '-t', 'tmpfs', '-o', 'size=2m', 'tmpfs', str(disk)], check=False,
+        capture_output=True).returncode
+    if not mounted:
+        return Seen('no permission to mount a small file system: not injected', '-', met=False)
+    try:
+        recorder = rig.start('recorder', {'storage.uri': disk / 'bag'})
+        pair(rig)
+        rig.ready('recorder')
+        rig.spin_until(
+            lambda: rig.level('recorder') >= 2 or not recorder.alive, 'the disk to be full')
+        worst = moves(rig)
+        told = rig.level('recorder')
+        gaps, count = _gaps(disk / 'bag')
+        status = recorder.end()
+    finally:
+        subprocess.run(['umount', '--lazy', str(disk)], check=False)
+    return Seen(
+        f'recorder level {told}, {count} samples readable with {gaps} gaps, exit {status}',
+        share(worst), told == 2 and gaps == 0 and count > 1000 and worst < LIMIT)
+
+
+def _gaps(bag: Path) -> tuple[int, int]:
+    """Count missing samples in a bag."""
+    reader = BagReader(bag)
+    topic = '/' + interface.JOINT_STATES.name
+    decode = reader.decoder(topic)
+    stamps = [decode(x.data).header.stamp for x in reader.messages((topic,))]
+    times = np.array([x.sec * 10**9 + x.nanosec for x in stamps])
+    return int(np.sum(np.diff(times) != 10**6)), len(times)
+
+
+@FAULTS.fault(
+    'deactivated', 'planner deactivated in mid-move',
+    'lifecycle transition in slow motion between two commands of 1 -> 1.4, later activated',
+    'it comes to rest without vibration or holds and sends no more; refuses requests while '
+    f'inactive; after activation a move has a residual below {LIMIT:g}')
+def _deactivated(rig: Rig) -> Seen:
+    from lifecycle_msgs.msg import Transition
+
+    rig.start('plant', {
+        'publish_clock': True, 'real_time_factor': 0.02, 'publish_rate': 5000.0})
+    rig.start('planner', {'use_sim_time': True, 'lead_time': 0.002})
+    rig.ready('plant', 'planner')
+    rig.setpoint(1.4)
+    mark = rig.count()
+    rig.spin_until(lambda: jump(rig, mark) > 0.0, 'the first command to take effect')
+    gone = _transit(rig, Transition.TRANSITION_DEACTIVATE)
+    rig.let_pass(0.05, 60.0)
+    rest = float(np.ptp(rig.samples()[1][-50:, 0]))
+    sent = len(rig.commands)
+    mark = rig.count()
+    rig.publisher(interface.SETPOINT, interface.PLANNER).publish(
+        interface.SETPOINT.type(data=1.1))
+    rig.let_pass(0.05, 60.0)
+    moved = jump(rig, mark)
+    sent = len(rig.commands) - sent
+    back = _transit(rig, Transition.TRANSITION_ACTIVATE)
+    start = float(rig.samples()[1][-1, 0])
+    residual, error = move(rig, 1.2, start=start, pause=0.08)
+    return Seen(
+        f'rest {rest:.0e} at {start:.4f}, {sent} commands while inactive, error {error:.0e}',
+        share(residual), gone and back and moved == 0.0 and sent == 0 and rest < 1e-3
+        and max(residual, error) < LIMIT)
+
+
+def _transit(rig: Rig, transition: int) -> bool:
+    """Ask the planner for a transition."""
+    from lifecycle_msgs.msg import Transition
+    from lifecycle_msgs.srv import ChangeState
+
+    return bool(rig.call_by_name(
+        ChangeState, 'planner/change_state',
+        ChangeState.Request(transition=Transition(id=transition))).success)

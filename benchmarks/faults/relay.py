@@ -1,0 +1,115 @@
+"""
+Stand between planner and plant: delay, drop, duplicate or reorder commands.
+
+    python -m benchmarks.faults.relay IN OUT [--delay S] [--first N] [--drop I,...] [--twice]
+                                      [--swap]
+
+Takes commands from topic IN and sends them to topic OUT. Delays count by steady time, whatever
+the clock of the nodes does.
+"""
+
+import argparse
+from collections import deque
+import signal
+import sys
+from time import monotonic
+
+import rclpy
+from rclpy.clock import Clock, ClockType
+from rclpy.executors import ExternalShutdownException
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
+from rclpy.task import Future
+
+from hmsa_ros.nodes import interface
+
+_TICK_SECONDS = 0.0005
+
+
+class Relay(Node):
+    """
+    Passes commands on, with a fault.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        As the command line has them.
+
+    """
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        """Listen and pass on."""
+        super().__init__('relay', enable_rosout=False)
+        self._options = options
+        self._drop = {int(x) for x in options.drop.split(',') if x}
+        self._count = 0
+        self._held: object | None = None
+        self._waiting: deque[tuple[float, object]] = deque()
+        topic = interface.FLUX_DENSITY_COMMAND
+        self._publisher = self.create_publisher(topic.type, options.target, topic.qos)
+        self.create_subscription(topic.type, options.source, self._on_command, topic.qos)
+        self.create_timer(
+            _TICK_SECONDS, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def _on_command(self, message: object) -> None:
+        self._count += 1
+        if self._count in self._drop:
+            return
+        if self._options.swap and self._count <= 2:
+            if self._held is None:
+                self._held = message
+                return
+            self._publisher.publish(message)
+            message, self._held = self._held, None
+        delay = self._options.delay
+        if self._options.first and self._count > self._options.first:
+            delay = 0.0
+        for _ in range(2 if self._options.twice else 1):
+            self._waiting.append((monotonic() + delay, message))
+        self._on_tick()
+
+    def _on_tick(self) -> None:
+        # In the order in which they came, unless asked to reorder them.
+        while self._waiting and self._waiting[0][0] <= monotonic():
+            self._publisher.publish(self._waiting.popleft()[1])
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """
+    Relay until interrupted.
+
+    Parameters
+    ----------
+    arguments : list of str, optional
+        Default those of the command line.
+
+    Returns
+    -------
+    int
+        Exit status.
+
+    """
+    parser = argparse.ArgumentParser(description='Relay commands with a fault.')
+    parser.add_argument('source')
+    parser.add_argument('target')
+    parser.add_argument('--delay', type=float, default=0.0, help='seconds')
+    parser.add_argument('--first', type=int, default=0, help='delay only the first so many')
+    parser.add_argument('--drop', default='', help='numbers of the commands to drop, from 1')
+    parser.add_argument('--twice', action='store_true', help='send each command twice')
+    parser.add_argument('--swap', action='store_true', help='send the first two in turn')
+    options = parser.parse_args(arguments)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    rclpy.init(args=[])
+    node = Relay(options)
+    executor = EventsExecutor()
+    executor.add_node(node)
+    never = Future()
+    try:
+        while True:
+            executor.spin_until_future_complete(never, 0.1)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,733 @@
+"""A rig of real node processes in a ROS domain of its own, and a node that looks on."""
+
+from array import array
+from collections.abc import Callable, Mapping, Sequence
+import ctypes
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+from time import monotonic
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+import numpy as np
+import rclpy
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState, MagneticField
+
+from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.errors import HmsaError
+from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.conversions import from_time, to_trajectory
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+#: Patience with a process that starts, or with a condition, in s.
+PATIENCE = 40.0
+_SLICE = 0.02
+_PR_SET_PDEATHSIG = 1
+_TRACE = 'Traceback (most recent call last)'
+
+
+class Child:
+    """
+    A process with its output in a file.
+
+    Parameters
+    ----------
+    command : sequence of str
+        Program and arguments.
+    log : Path
+        Output is appended to it.
+    environment : mapping of str to str
+        Of the process.
+
+    Attributes
+    ----------
+    popen : subprocess.Popen
+        The process.
+    log : Path
+        As given.
+
+    """
+
+    def __init__(
+            self, command: Sequence[str], log: Path, environment: Mapping[str, str]) -> None:
+        """Start it."""
+        self.log = log
+        with open(log, 'ab') as file:
+            self.popen = subprocess.Popen(
+                command, cwd=ROOT, env=dict(environment), stdin=subprocess.DEVNULL,
+                stdout=file, stderr=file,
+                preexec_fn=_die_with_parent)  # noqa: PLW1509 - only calls the kernel
+
+    @property
+    def alive(self) -> bool:
+        """Whether it runs."""
+        return self.popen.poll() is None
+
+    @property
+    def said(self) -> str:
+        """What it has written so far."""
+        return self.log.read_text(errors='replace')
+
+    def send(self, number: int) -> None:
+        """
+        Send a signal.
+
+        Parameters
+        ----------
+        number : int
+            For example SIGSTOP.
+
+        """
+        self.popen.send_signal(number)
+
+    def end(self, number: int = signal.SIGINT, patience: float = PATIENCE) -> int:
+        """
+        Send a signal and wait for the end; kill what does not answer.
+
+        Parameters
+        ----------
+        number : int
+            Signal.
+        patience : float
+            In s.
+
+        Returns
+        -------
+        int
+            Exit status, negative for a signal.
+
+        """
+        if self.alive:
+            self.popen.send_signal(number)
+        try:
+            return self.popen.wait(patience)
+        except subprocess.TimeoutExpired:
+            self.popen.kill()
+            return self.popen.wait()
+
+
+def _die_with_parent() -> None:
+    """Have the kernel end this process with its parent, and answer SIGINT."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+class Rig:
+    """
+    Starts nodes, looks on, asks and measures; a context manager that ends them.
+
+    Parameters
+    ----------
+    folder : Path
+        Existing folder for logs and bags.
+    domain : int
+        ROS domain for this rig alone.
+    watch : bool
+        Whether to take samples, commands and what became of them, all of which are kept.
+
+    Attributes
+    ----------
+    folder : Path
+        As given.
+    node : rclpy.node.Node
+        Ours.
+    children : list of Child
+        All that were started.
+    commands, applied : list of (int, float)
+        Stamp in ns and flux density in T, as received.
+    verdicts : list of dict
+        Of ``planner/status``, with ``level`` and ``message``.
+    diagnostics : dict of dict
+        Newest of each name on ``/diagnostics``, with ``level`` and ``message``.
+    deaf : bool
+        Whether to pass over what comes, while garbage is sent to topics that are watched.
+
+    """
+
+    def __init__(self, folder: Path, domain: int, *, watch: bool = True) -> None:
+        """Join the domain."""
+        self.folder = folder
+        self.environment = {
+            **os.environ, 'ROS_DOMAIN_ID': str(domain), 'PYTHONUNBUFFERED': '1',
+            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_LOG_DIR': str(folder),
+            'RCUTILS_COLORIZED_OUTPUT': '0',
+            'PYTHONPATH': os.pathsep.join(
+                [str(ROOT), *filter(None, [os.environ.get('PYTHONPATH')])])}
+        self.children: list[Child] = []
+        self.context = rclpy.Context()
+        # Discovery's range is read from the environment of the process that starts a context.
+        os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+        rclpy.init(
+            args=[], context=self.context, domain_id=domain,
+            signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
+        self.node: Node = rclpy.create_node('rig', context=self.context, enable_rosout=False)
+        self._executor = EventsExecutor(context=self.context)
+        self._executor.add_node(self.node)
+        self._stamps = array('q')
+        self._values = array('d')
+        self.commands: list[tuple[int, float]] = []
+        self.applied: list[tuple[int, float]] = []
+        self.verdicts: list[dict[str, str]] = []
+        self.diagnostics: dict[str, dict[str, str]] = {}
+        self.deaf = False
+        self._seen: dict[str, int] = {}
+        if watch:
+            self._subscribe(interface.JOINT_STATES, '', self._on_sample)
+            self._subscribe(interface.FLUX_DENSITY_COMMAND, '', lambda x: self.commands.append(
+                (from_time(x.header.stamp), x.magnetic_field.z)))
+            self._subscribe(interface.FLUX_DENSITY_APPLIED, '', self._on_applied)
+        self._subscribe(interface.STATUS, interface.PLANNER, self._on_verdict)
+        self._subscribe(interface.DIAGNOSTICS, '', self._on_diagnostics)
+        self._setpoint = self.publisher(interface.SETPOINT, interface.PLANNER)
+        self._trajectory = self.publisher(interface.JOINT_TRAJECTORY, interface.PLANNER)
+
+    def __enter__(self) -> 'Rig':
+        """Return the rig."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End the processes and leave the domain."""
+        for child in self.children:
+            if child.alive:
+                # A stopped process answers nothing but this.
+                child.send(signal.SIGCONT)
+                child.send(signal.SIGINT)
+        for child in self.children:
+            child.end(patience=10.0)
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+    # -- processes -----------------------------------------------------------------------------
+
+    def start(
+            self, name: str, parameters: Mapping[str, object] | None = None,
+            remap: Mapping[str, str] | None = None) -> Child:
+        """
+        Start a node of the package.
+
+        Parameters
+        ----------
+        name : str
+            For example ``'planner'``.
+        parameters : mapping of str to object, optional
+            Values as ``-p`` takes them.
+        remap : mapping of str to str, optional
+            Names to replace.
+
+        Returns
+        -------
+        Child
+            The process.
+
+        """
+        words = []
+        for key, value in (parameters or {}).items():
+            text = str(value).lower() if isinstance(value, bool) else str(value)
+            words += ['-p', f'{key}:={text}']
+        for key, value in (remap or {}).items():
+            words += ['-r', f'{key}:={value}']
+        return self.run(name, '-m', 'hmsa_ros', name, '--ros-args', *words)
+
+    def run(self, name: str, *words: str) -> Child:
+        """
+        Start this Python with arguments.
+
+        Parameters
+        ----------
+        name : str
+            Of the log.
+        *words : str
+            Arguments.
+
+        Returns
+        -------
+        Child
+            The process.
+
+        """
+        child = Child(
+            [sys.executable, *words], self.folder / f'{name}.log', self.environment)
+        self.children.append(child)
+        return child
+
+    def relay(self, *options: str) -> dict[str, str]:
+        """
+        Start a relay and return the remapping with which the planner sends through it.
+
+        Parameters
+        ----------
+        *options : str
+            As `benchmarks.faults.relay` takes them.
+
+        Returns
+        -------
+        dict of str to str
+            For `start`.
+
+        """
+        name = interface.FLUX_DENSITY_COMMAND.name
+        self.run('relay', '-m', 'benchmarks.faults.relay', f'{name}_sent', name, *options)
+        self.spin_until(
+            lambda: self.node.count_subscribers(f'{name}_sent') > 0
+            and self.node.count_publishers(name) > 0, 'the relay')
+        return {name: f'{name}_sent'}
+
+    def load(self, count: int) -> list[Child]:
+        """
+        Keep processors busy.
+
+        Parameters
+        ----------
+        count : int
+            Number of processes.
+
+        Returns
+        -------
+        list of Child
+            They end with the rig, or when they are told to.
+
+        """
+        return [self.run('load', '-c', 'while True: pass') for _ in range(count)]
+
+    def ready(self, *names: str) -> None:
+        """
+        Wait until nodes are there and have found each other.
+
+        Parameters
+        ----------
+        *names : str
+            Nodes that answer on ``/diagnostics``.
+
+        """
+        if interface.PLANT in names:
+            self.spin_until(lambda: len(self._stamps) > 0, 'the first sample')
+        if interface.PLANNER in names:
+            self.spin_until(
+                lambda: self.verdicts and self._setpoint.get_subscription_count() > 0,
+                'the planner')
+        # What is sent before two nodes have found each other is lost. They found us, and a
+        # second round of diagnostics later, at least a second, each other.
+        begin = {x: self._rounds(x) for x in names}
+        self.spin_until(
+            lambda: all(self._rounds(x) >= begin[x] + 2 for x in names),
+            'diagnostics of ' + ', '.join(names))
+
+    def traces(self) -> list[str]:
+        """
+        Find unhandled exceptions in the logs of the package's nodes.
+
+        Returns
+        -------
+        list of str
+            The last line of each traceback.
+
+        """
+        found = []
+        for log in {x.log for x in self.children}:
+            if log.stem.split('_')[0] not in interface.NODES:
+                continue
+            for part in log.read_text(errors='replace').split(_TRACE)[1:]:
+                # Frames are indented; the first line that is not names the exception.
+                last = next((x for x in part.splitlines()[1:] if x[:1].strip()), '')
+                found.append(f'{log.stem}: {last.strip()}')
+        return found
+
+    # -- what is seen --------------------------------------------------------------------------
+
+    def _subscribe(
+            self, topic: interface.Topic, owner: str, callback: Callable[[Any], None]) -> None:
+        name = interface.from_outside(topic.name, owner)
+        self.node.create_subscription(
+            topic.type, name, lambda x: None if self.deaf else callback(x), topic.qos)
+
+    def publisher(self, topic: interface.Topic, owner: str = '') -> Any:
+        """
+        Return a publisher of ours.
+
+        Parameters
+        ----------
+        topic : interface.Topic
+            As the package declares it.
+        owner : str
+            Node that it belongs to, of a private name.
+
+        Returns
+        -------
+        rclpy.publisher.Publisher
+            On that topic.
+
+        """
+        return self.node.create_publisher(
+            topic.type, interface.from_outside(topic.name, owner), topic.qos)
+
+    def _on_sample(self, message: JointState) -> None:
+        self._stamps.append(from_time(message.header.stamp))
+        self._values.extend((message.position[0], message.velocity[0], message.effort[0]))
+
+    def _on_applied(self, message: MagneticField) -> None:
+        self.applied.append((from_time(message.header.stamp), message.magnetic_field.z))
+
+    def _on_verdict(self, message: DiagnosticStatus) -> None:
+        self.verdicts.append(_plain(message))
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self.diagnostics[status.name] = _plain(status)
+            node = status.name.partition(':')[0].rpartition('/')[2]
+            self._seen[node] = self._seen.get(node, 0) + 1
+
+    def _rounds(self, node: str) -> int:
+        return self._seen.get(node, 0)
+
+    def count(self) -> int:
+        """
+        Return the number of samples so far, a mark for `samples`.
+
+        Returns
+        -------
+        int
+            Of ``joint_states``.
+
+        """
+        return len(self._stamps)
+
+    def samples(self, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return samples of ``joint_states``.
+
+        Parameters
+        ----------
+        first : int
+            Mark from which on.
+
+        Returns
+        -------
+        stamps : ndarray of int, shape (n,)
+            In ns.
+        values : ndarray, shape (n, 3)
+            Stretch, rate in 1/s, flux density in T.
+
+        """
+        return (np.array(self._stamps[first:], np.int64),
+                np.array(self._values[3 * first:]).reshape(-1, 3))
+
+    @property
+    def time(self) -> int:
+        """Time of the newest sample in ns."""
+        return self._stamps[-1]
+
+    def value(self, node: str, key: str) -> float:
+        """
+        Return a number from the newest diagnostics of a node.
+
+        Parameters
+        ----------
+        node : str
+            Name of the node.
+        key : str
+            Of the value.
+
+        Returns
+        -------
+        float
+            NaN if the node says nothing of it.
+
+        """
+        for name, status in self.diagnostics.items():
+            if name.startswith(node) and key in status:
+                return float(status[key])
+        return float('nan')
+
+    def level(self, node: str) -> int:
+        """
+        Return the worst level in the newest diagnostics of a node.
+
+        Parameters
+        ----------
+        node : str
+            Name of the node.
+
+        Returns
+        -------
+        int
+            0 OK, 1 WARN, 2 ERROR, 3 STALE; -1 if it says nothing.
+
+        """
+        return max((int(x['level']) for name, x in self.diagnostics.items()
+                    if name.startswith(node)), default=-1)
+
+    def fresh(self, *nodes: str) -> None:
+        """
+        Wait for diagnostics that are newer than now.
+
+        Parameters
+        ----------
+        *nodes : str
+            Nodes to hear of.
+
+        """
+        begin = {x: self._rounds(x) for x in nodes}
+        # The first may have been on its way already.
+        self.spin_until(
+            lambda: all(self._rounds(x) >= begin[x] + 2 for x in nodes),
+            'diagnostics of ' + ', '.join(nodes))
+
+    # -- what is done --------------------------------------------------------------------------
+
+    def spin_until(
+            self, condition: Callable[[], Any], what: str, patience: float = PATIENCE) -> None:
+        """
+        Serve callbacks until a condition holds.
+
+        Parameters
+        ----------
+        condition : callable
+            Asked again and again.
+        what : str
+            What is waited for.
+        patience : float
+            In s.
+
+        Raises
+        ------
+        HmsaError
+            If it does not come true in time.
+
+        """
+        end = monotonic() + patience
+        while not condition():
+            if monotonic() > end:
+                raise HmsaError(f'waited {patience:g} s for {what}')
+            self._executor.spin_once(timeout_sec=_SLICE)
+
+    def spin(self, seconds: float) -> None:
+        """
+        Serve callbacks for a time by the clock on the wall.
+
+        Parameters
+        ----------
+        seconds : float
+            How long.
+
+        """
+        end = monotonic() + seconds
+        self.spin_until(lambda: monotonic() >= end, 'the time to pass', seconds + 1.0)
+
+    def let_pass(self, seconds: float, patience: float = PATIENCE) -> None:
+        """
+        Serve callbacks until the plant's samples are so much older.
+
+        Parameters
+        ----------
+        seconds : float
+            Of the plant's time.
+        patience : float
+            In s on the wall.
+
+        """
+        end = self.time + round(seconds * NANOSECONDS)
+        self.spin_until(lambda: self.time >= end, f'{seconds:g} s of the plant', patience)
+
+    def setpoint(self, stretch: float) -> dict[str, str]:
+        """
+        Ask for a stretch and wait for the verdict.
+
+        Parameters
+        ----------
+        stretch : float
+            Target.
+
+        Returns
+        -------
+        dict of str to str
+            The verdict.
+
+        """
+        return self.ask(lambda: self.publish_setpoint(stretch))
+
+    def publish_setpoint(self, stretch: float) -> None:
+        """
+        Ask for a stretch and do not wait.
+
+        Parameters
+        ----------
+        stretch : float
+            Target.
+
+        """
+        self._setpoint.publish(interface.SETPOINT.type(data=float(stretch)))
+
+    def publish_trajectory(self, message: Any) -> None:
+        """
+        Send a sequence and do not wait.
+
+        Parameters
+        ----------
+        message : trajectory_msgs.msg.JointTrajectory
+            As the planner takes them.
+
+        """
+        self._trajectory.publish(message)
+
+    def sequence(self, setpoints: Sequence[tuple[float, float]]) -> dict[str, str]:
+        """
+        Send a sequence that begins now and wait for the verdict.
+
+        Parameters
+        ----------
+        setpoints : sequence of (float, float)
+            Stretch and span in s.
+
+        Returns
+        -------
+        dict of str to str
+            The verdict.
+
+        """
+        ends = np.cumsum([x for _, x in setpoints])
+        message = to_trajectory(
+            [(x, round(end * NANOSECONDS))
+             for (x, _), end in zip(setpoints, ends, strict=True)], 'actuator')
+        return self.ask(lambda: self.publish_trajectory(message))
+
+    def ask(self, send: Callable[[], None]) -> dict[str, str]:
+        """
+        Send a request and wait for the planner's next verdict.
+
+        Parameters
+        ----------
+        send : callable
+            Sends it.
+
+        Returns
+        -------
+        dict of str to str
+            The verdict.
+
+        """
+        self.spin_until(self._setpoint.get_subscription_count, 'a planner that listens')
+        before = len(self.verdicts)
+        send()
+        self.spin_until(lambda: len(self.verdicts) > before, 'a verdict')
+        return self.verdicts[-1]
+
+    def call(self, service: interface.Service | type, owner: str, request: Any = None) -> Any:
+        """
+        Call a service of a node.
+
+        Parameters
+        ----------
+        service : interface.Service
+            As the package declares it.
+        owner : str
+            Node that serves it.
+        request : object, optional
+            Default an empty one.
+
+        Returns
+        -------
+        object
+            The response.
+
+        """
+        return self.call_by_name(
+            service.type, interface.from_outside(service.name, owner), request)
+
+    def call_by_name(self, kind: type[Any], name: str, request: Any = None) -> Any:
+        """
+        Call a service by its name.
+
+        Parameters
+        ----------
+        kind : type
+            Service class.
+        name : str
+            Relative or absolute.
+        request : object, optional
+            Default an empty one.
+
+        Returns
+        -------
+        object
+            The response.
+
+        """
+        client = self.node.create_client(kind, name)
+        try:
+            self.spin_until(client.service_is_ready, f'service {name}')
+            future = client.call_async(kind.Request() if request is None else request)
+            self.spin_until(future.done, f'the answer of {name}')
+            return future.result()
+        finally:
+            self.node.destroy_client(client)
+
+    def set_parameters(self, owner: str, **values: object) -> list[str]:
+        """
+        Set parameters of a node, each by itself; dots are written as two underscores.
+
+        Parameters
+        ----------
+        owner : str
+            Node.
+        **values : object
+            By name.
+
+        Returns
+        -------
+        list of str
+            Reasons of the refused ones.
+
+        """
+        from rcl_interfaces.srv import SetParameters
+
+        response = self.call_by_name(SetParameters, f'{owner}/set_parameters', (
+            SetParameters.Request(parameters=[
+                Parameter(name.replace('__', '.'), value=value).to_parameter_msg()
+                for name, value in values.items()])))
+        return [x.reason or 'no reason' for x in response.results if not x.successful]
+
+
+def _plain(status: DiagnosticStatus) -> dict[str, str]:
+    """Return a status as plain text by key."""
+    return {**{x.key: x.value for x in status.values}, 'level': str(status.level[0]),
+            'message': status.message}
+
+
+def settled(values: np.ndarray, target: float, step: float) -> tuple[float, float]:
+    """
+    Measure what is left of a move after the last change of the flux density in force.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n, 3)
+        Samples from before the move until long after it.
+    target : float
+        Stretch that was asked for.
+    step : float
+        Difference of stretch that was asked for.
+
+    Returns
+    -------
+    residual : float
+        Peak-to-peak stretch since the last change, as a share of the step.
+    error : float
+        Distance of the last sample from the target, as a share of the step.
+
+    Raises
+    ------
+    HmsaError
+        If too few samples have come since.
+
+    """
+    changes = np.flatnonzero(np.diff(values[:, 2]))
+    rest = values[changes[-1] + 1 if changes.size else 0:, 0]
+    if rest.size < 10:
+        raise HmsaError(f'{rest.size} samples since the last change: expected some more')
+    return float(np.ptp(rest)) / abs(step), abs(float(rest[-1]) - target) / abs(step)

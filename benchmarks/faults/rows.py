@@ -1,0 +1,9 @@
+"""All faults of the table, in its order."""
+
+from benchmarks.faults import delivery, inputs, model, processes, timing
+
+FAULTS = (
+    *delivery.FAULTS, *processes.FAULTS, *timing.FAULTS, *inputs.FAULTS, *model.FAULTS)
+
+#: What the tests inject: one of each kind.
+QUICK = ('none',)

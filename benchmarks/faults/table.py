@@ -1,0 +1,132 @@
+"""The table of faults: one row a fault, what was expected of it and what was seen."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+import tempfile
+
+from benchmarks.faults.rig import Rig
+from hmsa_ros.errors import HmsaError
+
+
+@dataclass(frozen=True)
+class Seen:
+    """
+    What was seen of a fault.
+
+    Attributes
+    ----------
+    text : str
+        In a few words.
+    figure : str
+        Residual as a share of the step, or loss with its unit.
+    met : bool
+        Whether it is what was expected.
+
+    """
+
+    text: str
+    figure: str
+    met: bool
+
+
+@dataclass(frozen=True)
+class Fault:
+    """
+    A fault to inject.
+
+    Attributes
+    ----------
+    key : str
+        To ask for it on the command line.
+    name : str
+        What goes wrong.
+    how : str
+        How it is made.
+    expected : str
+        What has to be seen.
+    inject : callable
+        Does it in a rig of its own.
+
+    """
+
+    key: str
+    name: str
+    how: str
+    expected: str
+    inject: Callable[[Rig], Seen]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """
+    A row of the table.
+
+    Attributes
+    ----------
+    fault : Fault
+        What was injected.
+    seen : Seen
+        What came of it.
+
+    """
+
+    fault: Fault
+    seen: Seen
+
+
+def inject(fault: Fault, domain: int) -> Outcome:
+    """
+    Inject one fault into real processes.
+
+    Parameters
+    ----------
+    fault : Fault
+        Which one.
+    domain : int
+        ROS domain that nobody else uses.
+
+    Returns
+    -------
+    Outcome
+        A fault that stops the rig from going on is not survived, and says why. An unhandled
+        exception in the output of any process is never what was expected.
+
+    """
+    with tempfile.TemporaryDirectory(prefix='hmsa_faults_') as folder:
+        rig = Rig(Path(folder), domain)
+        try:
+            with rig:
+                seen = fault.inject(rig)
+        except HmsaError as error:
+            seen = Seen(str(error), '-', met=False)
+        traces = rig.traces()
+        if traces:
+            seen = Seen(
+                f'{seen.text}; {len(traces)} unhandled exceptions, the first in the {traces[0]}',
+                seen.figure, met=False)
+    return Outcome(fault, seen)
+
+
+def markdown(outcomes: Sequence[Outcome]) -> str:
+    """
+    Return the table for a page of the documentation.
+
+    Parameters
+    ----------
+    outcomes : sequence of Outcome
+        In order.
+
+    Returns
+    -------
+    str
+        Markdown.
+
+    """
+    head = ('fault', 'how it is made', 'expected', 'seen', 'residual or loss', '')
+    lines = ['| ' + ' | '.join(head) + ' |', '|' + ' --- |' * len(head)]
+    for row in outcomes:
+        cells = (row.fault.name, row.fault.how, row.fault.expected, row.seen.text,
+                 row.seen.figure, 'met' if row.seen.met else '**not met**')
+        lines.append('| ' + ' | '.join(x.replace('|', '\\|') for x in cells) + ' |')
+    return '\n'.join(lines) + '\n'
