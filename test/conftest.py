@@ -5,6 +5,7 @@ Tests that do not ask for one of these fixtures need no ROS.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 import fcntl
 import os
@@ -76,9 +77,9 @@ def wait_until_fixture() -> Callable[..., Any]:
     return wait_until
 
 
-@pytest.fixture
-def ros_domain_id() -> Iterator[int]:
-    """Return a domain id that no other test on this machine uses at the same time."""
+@contextmanager
+def own_domain() -> Iterator[int]:
+    """Hold a domain id that no other test on this machine uses at the same time."""
     folder = Path(tempfile.gettempdir()) / f'hmsa_ros_domains_{os.getuid()}'
     folder.mkdir(exist_ok=True)
     # Start at a number of our own, so that id after id is used and late packets of an ended
@@ -94,6 +95,19 @@ def ros_domain_id() -> Iterator[int]:
             yield domain
             return
     pytest.fail('all ROS domain ids are taken')
+
+
+@pytest.fixture(name='own_domain', scope='session')
+def own_domain_fixture() -> Callable[[], AbstractContextManager[int]]:
+    """Return `own_domain`, for tests that need several at once."""
+    return own_domain
+
+
+@pytest.fixture
+def ros_domain_id() -> Iterator[int]:
+    """Return a domain id that no other test on this machine uses at the same time."""
+    with own_domain() as domain:
+        yield domain
 
 
 @pytest.fixture

@@ -221,6 +221,7 @@ class Session:
         self._read, self._write = os.pipe()
         self._shell: subprocess.Popen[str] | None = None
         self._python: subprocess.Popen[str] | None = None
+        self._stuck = False
         self._count = 0
 
     def run(self, language: str, text: str, place: str) -> str:
@@ -247,7 +248,7 @@ class Session:
     def close(self) -> None:
         """End everything; raise `Failure` if something failed or stayed behind."""
         try:
-            if self._shell is not None and self._shell.poll() is None:
+            if self._shell is not None and self._shell.poll() is None and not self._stuck:
                 self.run('bash', TRAILER, 'end of the page')
         finally:
             for process in (self._python, self._shell):
@@ -255,12 +256,12 @@ class Session:
                     continue
                 assert process.stdin is not None
                 process.stdin.close()
-                try:
-                    process.wait(PATIENCE_SECONDS)
-                finally:
-                    with suppress(ProcessLookupError):
-                        os.killpg(process.pid, signal.SIGKILL)
-                    process.wait()
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(0.0 if self._stuck else PATIENCE_SECONDS)
+                # Whatever is left of what it started.
+                with suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
             os.close(self._read)
             os.close(self._write)
 
@@ -284,6 +285,7 @@ class Session:
                 status = f'{process.returncode}\n'
             elif time.monotonic() > end:
                 status = f'none within {PATIENCE_SECONDS:g} s\n'
+                self._stuck = True
         if status != '0\n':
             raise Failure(
                 f'{place}: status {status.strip()}, expected 0; it printed\n{self._printed()}')
@@ -295,11 +297,11 @@ class Session:
             for file in sorted(self._files.glob('*.out'), key=lambda file: int(file.stem)))
 
 
-def run_page(page: Path, folder: Path, environment: Mapping[str, str]) -> int:
-    """Run the blocks of a page, compare what they print, and return how many ran."""
+def run_page(page: Path, folder: Path, environment: Mapping[str, str]) -> list[str]:
+    """Run the blocks of a page, compare what they print, and return a log with their times."""
     session = Session(folder, environment)
     printed: str | None = None
-    count = 0
+    log = []
     try:
         for block in blocks(page):
             if block.language == 'text' and block.follows and printed is not None:
@@ -307,18 +309,20 @@ def run_page(page: Path, folder: Path, environment: Mapping[str, str]) -> int:
             printed = None
             if not block.runs:
                 continue
-            count += 1
+            began = time.monotonic()
             if block.language == 'console':
                 for command, expected in console(block):
                     compare(expected, session.run('bash', command, block.place), block.place)
             else:
                 printed = session.run(block.language, block.text, block.place)
+            log.append(f'{block.place}: {block.language} ran in '
+                       f'{time.monotonic() - began:.1f} s')
     except BaseException:
         with suppress(Failure):  # what failed first is told
             session.close()
         raise
     session.close()
-    return count
+    return log
 
 
 def console(block: Block) -> list[tuple[str, str]]:

@@ -1,11 +1,13 @@
 """The pages: built with warnings as errors, and every block in them run or checked."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from importlib import import_module
+import os
 from pathlib import Path
 import subprocess
 import sys
-import time
 
 from documents import (
     alike,
@@ -25,6 +27,7 @@ from documents import (
 )
 import pytest
 
+AT_A_TIME = 2
 PAGES = pages()
 RUNNING = [page for page in PAGES if any(block.runs for block in blocks(page))]
 
@@ -50,16 +53,39 @@ def test_every_block_of_the_page_is_run_or_checked(page):
             check(block)
 
 
+@pytest.fixture(scope='module')
+def running(
+        own_domain: Callable[[], AbstractContextManager[int]],
+        tmp_path_factory: pytest.TempPathFactory,
+        request: pytest.FixtureRequest) -> Iterator[dict[Path, Future[list[str]]]]:
+    """Run the pages asked for, some at a time: most of what they do is to wait."""
+    def run(page: Path, folder: Path) -> list[str]:
+        with own_domain() as domain:
+            return run_page(page, folder, {
+                **os.environ, 'PYTHONPATH': str(ROOT), 'PYTHONUNBUFFERED': '1',
+                'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+                'ROS_LOG_DIR': str(folder / 'log'), 'RCUTILS_COLORIZED_OUTPUT': '0'})
+
+    asked = [item.callspec.params['page'] for item in request.session.items
+             if getattr(item, 'originalname', '') == 'test_page_does_what_it_says']
+    with ThreadPoolExecutor(AT_A_TIME) as pool:
+        runs = {page: pool.submit(run, page, tmp_path_factory.mktemp(page.stem))
+                for page in asked}
+        yield runs
+        for future in runs.values():
+            future.cancel()
+
+
 @pytest.mark.ros
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 @pytest.mark.parametrize('page', RUNNING, ids=name_of)
 def test_page_does_what_it_says(
-        page: Path, ros_env: Mapping[str, str], tmp_path: Path,
+        page: Path, running: dict[Path, Future[list[str]]],
         capsys: pytest.CaptureFixture[str]):
-    began = time.monotonic()
-    count = run_page(page, tmp_path, ros_env)
+    log = running[page].result()
     with capsys.disabled():
-        print(f'\n{name_of(page)}: ran {count} blocks in {time.monotonic() - began:.1f} s')
+        print('', *log, sep='\n')
 
 
 def test_pages_are_built_without_a_warning(tmp_path):
