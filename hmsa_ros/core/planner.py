@@ -3,142 +3,53 @@ The planner over time: requests in, a timeline of stamped flux densities out.
 
 Knows no ROS: times are integer nanoseconds of whatever clock the caller keeps. The node around
 it converts messages and publishes what `Planner.due` hands out.
+
+A request is worked out as a draft, which changes nothing, and then taken: several planners can
+so take all of a request or none of it (`hmsa_ros.core.group`).
 """
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
 
 from hmsa_ros.core import kernels
-from hmsa_ros.core.delivery import Delivery, pieces
+from hmsa_ros.core.history import Deviation, History
 from hmsa_ros.core.model import elastic_force, equilibrium_stretch
-from hmsa_ros.core.moves import Level, Limits, Move, State
+from hmsa_ros.core.moves import Level, Move, State
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.sequence import plan_sequence, Segment, Setpoint
-from hmsa_ros.core.shapers import get_shaper
-from hmsa_ros.core.simulation import check_stretch, longest_motion, RTOL, simulate
+from hmsa_ros.core.simulation import check_stretch, RTOL
 from hmsa_ros.core.status import Code, RefusedError
-from hmsa_ros.core.units import NANOSECONDS, Units
+from hmsa_ros.core.timeline import (
+    ALWAYS,
+    Draft,
+    Model,
+    Options,
+    Plan,
+    PlannedLevel,
+    PlannedSegment,
+)
+from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.errors import BadInputError
+
+__all__ = ['Options', 'Plan', 'PlannedLevel', 'PlannedSegment', 'Planner']
 
 # Stretch rates below this share of the natural frequency are rounding, not motion.
 _AT_REST = 1e-6
+# Those of a sample below this share are rest, where the model would have it move: the model is
+# off then, and not the actuator in motion.
+_SAMPLED_AT_REST = 1e-4
+# How far the model may be off a sample at rest to be believed nevertheless.
+_AGREES = 1e-3
 # How hard to brake where the hardest does not lead to a plan, from the nearest stop on.
 _BRAKE_SHARES = (0.5, 0.1, 0.02, 0.0)
 # How far inside the flux density limits a stop keeps where it has to, as a share.
 _INSIDE = 1e-3
-# Stamp of the level that is in force before the first request.
-_ALWAYS = -2**62
-
-
-@dataclass(frozen=True)
-class PlannedLevel:
-    """
-    A change of level.
-
-    Attributes
-    ----------
-    stamp : int
-        Time in ns from which it applies.
-    flux_density : float
-        In T.
-    stretch, rate : float
-        Predicted at the stamp; the rate in 1/s.
-    in_force : float
-        Flux density in T predicted at the stamp, from which a slew limit ramps to the level.
-
-    """
-
-    stamp: int
-    flux_density: float
-    stretch: float
-    rate: float
-    in_force: float
-
-
-@dataclass(frozen=True)
-class PlannedSegment:
-    """
-    One setpoint on the timeline.
-
-    Attributes
-    ----------
-    stretch : float
-        Target.
-    begin : int
-        Time in ns at which the move begins.
-    arrival : int or None
-        Time in ns of rest at the target; None where it is only approached.
-    code : Code
-        Which command it is.
-    reason : str
-        Why it is not the one asked for; empty if it is.
-
-    """
-
-    stretch: float
-    begin: int
-    arrival: int | None
-    code: Code
-    reason: str
-
-
-@dataclass(frozen=True)
-class Plan:
-    """
-    What is going to happen, from the level in force on.
-
-    Attributes
-    ----------
-    number : int
-        Counts accepted requests from 1; 0 before the first.
-    levels : tuple of PlannedLevel
-        By stamp; the first may lie in the past.
-    segments : tuple of PlannedSegment
-        By time.
-    kept : int
-        How many of them, the first ones, belong to earlier requests.
-
-    """
-
-    number: int
-    levels: tuple[PlannedLevel, ...]
-    segments: tuple[PlannedSegment, ...]
-    kept: int = 0
-
-
-@dataclass(frozen=True)
-class Options:
-    """
-    How requests are planned.
-
-    Attributes
-    ----------
-    shaper : str
-        Name of a shaper.
-    short_spell : {'refuse', 'continue'}
-        For a span that ends before the move.
-    flux_density_min, flux_density_max : float
-        In T.
-    lead_time : int
-        In ns: how far ahead of its stamp a command is sent.
-    period : int
-        In ns: commands are stamped with multiples of it; 0 for any time.
-    slew_limit : float
-        Largest change of the flux density in T/s; infinite for steps.
-    order : int
-        Of the robust shaper.
-
-    """
-
-    shaper: str = 'two_step'
-    short_spell: str = 'refuse'
-    flux_density_min: float = -math.inf
-    flux_density_max: float = math.inf
-    lead_time: int = 50_000_000
-    period: int = 0
-    slew_limit: float = math.inf
-    order: int = 2
+# How many natural periods later to try again where a plan cannot be made anew at once.
+_PATIENCE = (0.0, 0.15, 0.3, 0.45, 0.6)
+# Levels that are kept for news of when they took effect.
+_REMEMBERED = 32
 
 
 class Planner:
@@ -158,6 +69,8 @@ class Planner:
     ----------
     plan : Plan
         In force.
+    model : Model
+        Under which the next request is planned.
 
     Raises
     ------
@@ -170,45 +83,65 @@ class Planner:
             self, actuator: ActuatorParameters, options: Options, *,
             stretch: float = 1.0) -> None:
         """Start at rest."""
-        self._actuator = actuator
-        self._material = actuator.nondimensional
-        check_stretch(stretch, self._material.j_lim, 'initial stretch')
+        self.model = Model(actuator, options)
+        check_stretch(stretch, self.model.material.j_lim, 'initial stretch')
         self._work = kernels.work_space()
-        self._units = Units(actuator.time_unit, actuator.flux_density_unit, ' s', ' T')
-        self.set_options(options)
         self._initial = stretch
         self._rest(stretch, 0)
 
-    def set_options(self, options: Options) -> None:
+    @property
+    def options(self) -> Options:
+        """How the next request is planned."""
+        return self.model.options
+
+    def set_options(
+            self, options: Options, actuator: ActuatorParameters | None = None) -> None:
         """
-        Plan the next requests with other options.
+        Plan the next requests with other options, or for another block.
 
         Parameters
         ----------
         options : Options
             Taken from the next request on; the running plan stays.
+        actuator : ActuatorParameters, optional
+            Likewise; default the same as before.
 
         Raises
         ------
         BadInputError
-            If the limits are not in order; the old options stay.
+            If the limits are not in order, or the block cannot be where it is; the old
+            options stay.
 
         """
-        unit = self._actuator.flux_density_unit
-        limits = Limits(options.flux_density_min / unit, options.flux_density_max / unit)
-        delivery = Delivery(
-            options.period / NANOSECONDS / self._units.time,
-            options.slew_limit / unit * self._units.time,
-            1.0 / NANOSECONDS / self._units.time)
-        get_shaper(options.shaper)
-        self._limits, self._delivery, self.options = limits, delivery, options
+        self.take_model(self.checked_model(options, actuator or self.model.actuator))
+
+    def checked_model(self, options: Options, actuator: ActuatorParameters) -> Model:
+        """Return a model after checking that it can be taken; `set_options` says more."""
+        if (options, actuator) == (self.model.options, self.model.actuator):
+            return self.model
+        model = Model(actuator, options)
+        segments = self.plan.segments
+        check_stretch(
+            segments[-1].stretch if segments else self.plan.levels[-1].stretch,
+            model.material.j_lim, 'the stretch that is held')
+        return model
+
+    def take_model(self, model: Model) -> None:
+        """Plan the next requests under a model."""
+        self.model = model
 
     def _rest(self, stretch: float, number: int) -> None:
-        load = kernels.elastic_force(stretch, 1.0 / self._material.j_lim)
-        flux_density = load * self._actuator.flux_density_unit
-        level = PlannedLevel(_ALWAYS, flux_density, stretch, 0.0, flux_density)
+        flux_density = self.model.holding(stretch) * self.model.units.load
+        self._begin_with(
+            PlannedLevel(ALWAYS, flux_density, stretch, 0.0, flux_density, self.model), number)
+
+    def _begin_with(self, level: PlannedLevel, number: int) -> None:
         self.plan = Plan(number, (level,), ())
         self._unsent = 1
+        # Place of the last level that is known to have taken effect, and whether there is news
+        # of that at all.
+        self._known = 0
+        self._told = False
 
     def restart(self) -> None:
         """
@@ -218,6 +151,43 @@ class Planner:
         rest where it was before the first request.
         """
         self._rest(self._initial, self.plan.number)
+
+    def take_over(
+            self, stamp: int, stretch: float, rate: float, in_force: float,
+            flux_density: float | None = None) -> None:
+        """
+        Go on from a state that was measured; plans are dropped.
+
+        Parameters
+        ----------
+        stamp : int
+            Time in ns that it belongs to.
+        stretch, rate : float
+            The rate in 1/s.
+        in_force : float
+            Flux density in T.
+        flux_density : float, optional
+            Level in T that a slew limit is still ramping to; default the one in force.
+
+        Raises
+        ------
+        BadInputError
+            If a number is not finite, or the stretch is outside the limits.
+
+        """
+        model = self.model
+        check_stretch(stretch, model.material.j_lim, 'stretch in force')
+        level = in_force if flux_density is None else flux_density
+        if not math.isfinite(rate + in_force + level):
+            raise BadInputError(
+                f'state in force is rate {rate:g} 1/s, flux density {in_force:g} T: expected '
+                'finite numbers')
+        begin = PlannedLevel(stamp, level, stretch, rate, in_force, model)
+        held = equilibrium_stretch(level / model.units.load, model.material.j_lim)
+        at_rest = abs(rate) * model.units.time <= _SAMPLED_AT_REST * self._frequency(stretch)
+        if at_rest and level == in_force and abs(float(held) - stretch) > _AGREES:
+            begin = replace(begin, stamp=ALWAYS, rate=0.0)
+        self._begin_with(begin, self.plan.number)
 
     # -- requests ------------------------------------------------------------------------------
 
@@ -248,42 +218,7 @@ class Planner:
             If the request cannot be carried out; the running plan goes on.
 
         """
-        self._check_points(points)
-        soonest = self._soonest(now)
-        base = soonest if stamp is None else stamp
-        begin = self._on_grid(max(base, soonest))
-        ahead = [
-            (x, self._on_grid(base + t)) for x, t in points if base + t > begin]
-        if points[0][1] == 0 and len(points) > 1 and base == begin:
-            # A first point at time 0 that repeats where the actuator is asks for nothing.
-            self._check_first(points[0][0], begin)
-        if not ahead:
-            last = points[-1][1]
-            if last == 0:
-                raise RefusedError(
-                    Code.SPELL_TOO_SHORT,
-                    f'stretch {points[-1][0]:g} is due at time_from_start 0: expected time for '
-                    'the move')
-            raise RefusedError(
-                Code.IN_THE_PAST,
-                f'the sequence stamped {base / NANOSECONDS:.3f} s ends at '
-                f'{(base + last) / NANOSECONDS:.3f} s, now is {now / NANOSECONDS:.3f} s: '
-                'expected an end ahead by more than lead_time; do sender and planner use the '
-                'same clock (use_sim_time)?')
-        if len(ahead) == 1 and self._is_target(ahead[0][0], begin):
-            return self.plan
-        setpoints = []
-        left = begin
-        for stretch, end in ahead:
-            if end == left:
-                raise RefusedError(
-                    Code.SPELL_TOO_SHORT,
-                    f'stretch {stretch:g} begins and ends within one command period of '
-                    f'{self.options.period / NANOSECONDS:g} s: expected a longer span')
-            setpoints.append(Setpoint(
-                stretch, (end - left) / NANOSECONDS / self._actuator.time_unit))
-            left = end
-        return self._splice(now, begin, self._plan(begin, setpoints))
+        return self.take(self.draft_request(points, stamp, now), now)
 
     def setpoint(self, stretch: float, now: int) -> Plan:
         """
@@ -307,11 +242,7 @@ class Planner:
             If it cannot be had; the running plan goes on.
 
         """
-        self._check_stretch(stretch)
-        begin = self._soonest(now)
-        if self._is_target(stretch, begin):
-            return self.plan
-        return self._splice(now, begin, self._plan(begin, [Setpoint(stretch, math.inf)]))
+        return self.take(self.draft_setpoint(stretch, now), now)
 
     def stop(self, now: int) -> Plan:
         """
@@ -331,21 +262,183 @@ class Planner:
             The new plan.
 
         """
+        return self.take(self.draft_stop(now), now)
+
+    def draft_request(
+            self, points: Sequence[tuple[float, int]], stamp: int | None,
+            now: int) -> Draft | None:
+        """Work out what `request` takes; None where it changes nothing."""
+        self._check_points(points)
+        soonest = self._soonest(now)
+        base = soonest if stamp is None else stamp
+        begin = self._on_grid(max(base, soonest))
+        ahead = [
+            (x, self._on_grid(base + t)) for x, t in points if base + t > begin]
+        if points[0][1] == 0 and len(points) > 1 and base == begin:
+            # A first point at time 0 that repeats where the actuator is asks for nothing.
+            self._check_first(points[0][0], begin)
+        if not ahead:
+            last = points[-1][1]
+            if last == 0:
+                raise RefusedError(
+                    Code.SPELL_TOO_SHORT,
+                    f'stretch {points[-1][0]:g} is due at time_from_start 0: expected time for '
+                    'the move')
+            raise RefusedError(
+                Code.IN_THE_PAST,
+                f'the sequence stamped {base / NANOSECONDS:.3f} s ends at '
+                f'{(base + last) / NANOSECONDS:.3f} s, now is {now / NANOSECONDS:.3f} s: '
+                'expected an end ahead by more than lead_time; do sender and planner use the '
+                'same clock (use_sim_time)?')
+        if len(ahead) == 1 and self._is_target(ahead[0][0], begin):
+            return None
+        setpoints = []
+        left = begin
+        for stretch, end in ahead:
+            if end == left:
+                raise RefusedError(
+                    Code.SPELL_TOO_SHORT,
+                    f'stretch {stretch:g} begins and ends within one command period of '
+                    f'{self.options.period / NANOSECONDS:g} s: expected a longer span')
+            setpoints.append(Setpoint(
+                stretch, self.model.time(end - left)))
+            left = end
+        return self._plan(begin, setpoints)
+
+    def draft_setpoint(self, stretch: float, now: int) -> Draft | None:
+        """Work out what `setpoint` takes; None where it changes nothing."""
+        self._check_stretch(stretch)
+        begin = self._soonest(now)
+        if self._is_target(stretch, begin):
+            return None
+        return self._plan(begin, [Setpoint(stretch, math.inf)])
+
+    def draft_stop(self, now: int) -> Draft:
+        """Work out what `stop` takes."""
         begin = self._soonest(now)
         state = self.state(begin)
         brake, time, stretch = self._brake(state, 1.0)
         if (self._holdable(stretch) != stretch
-                or not self._delivery.ideal and time > 0.0):
-            return self._splice(now, begin, self._gentle_stop(begin, state))
+                or not self.model.delivery.ideal and time > 0.0):
+            return self._gentle_stop(begin, state)
         move = Move(Code.HOLD, tuple(
             [Level(0.0, brake)] * (time > 0.0)
-            + [Level(time, float(kernels.elastic_force(stretch, 1.0 / self._material.j_lim)))]),
+            + [Level(time, self.model.holding(stretch))]),
             time, 'stopped')
         end = State(stretch, 0.0, move.levels[-1].load)
-        return self._splice(now, begin, self._place(
-            begin, [Segment(Setpoint(stretch, math.inf), 0.0, state, end, move)]))
+        return self._place(
+            begin, [Segment(Setpoint(stretch, math.inf), 0.0, state, end, move)])
+
+    def draft_resumption(self, now: int) -> Draft | None:
+        """
+        Plan what is left of the running plan anew, from where the actuator really is.
+
+        Parameters
+        ----------
+        now : int
+            Current time in ns.
+
+        Returns
+        -------
+        Draft or None
+            From the first time that a command can reach, or, where there is no way from the
+            motion it meets, a part of a period later. Setpoints end when they did; one that
+            there is no time left for is left out. None if there is nothing left to do.
+
+        Raises
+        ------
+        RefusedError
+            If it cannot be carried out from there.
+
+        """
+        refusal: RefusedError | None = None
+        for share in _PATIENCE:
+            begin = self._soonest(now)
+            wait = share * 2.0 * math.pi / self._frequency(self.state(begin).stretch)
+            try:
+                return self._resumption(self._on_grid(begin + self.model.ns(wait)))
+            except RefusedError as error:
+                # From another phase of the motion it may be possible.
+                refusal = refusal or error
+        assert refusal is not None
+        raise refusal
+
+    def _resumption(self, begin: int) -> Draft | None:
+        """Plan from a time on what is left of the running plan."""
+        segments = self.plan.segments
+        ends = [x.spell for x in segments[1:]]
+        first = bisect_right(ends, begin)
+        refusal: RefusedError | None = None
+        for index in range(first, len(segments)):
+            # Left out setpoints make room for the next one, which is gone to at once.
+            start = begin if index > first else max(begin, segments[index].spell)
+            left = start
+            setpoints = []
+            for segment, end in zip(segments[index:], [*ends[index:], None], strict=True):
+                setpoints.append(Setpoint(
+                    segment.stretch, math.inf if end is None else self.model.time(end - left)))
+                left = left if end is None else end
+            try:
+                draft = self._plan(start, setpoints)
+            except RefusedError as error:
+                refusal = refusal or error
+                if error.code is not Code.SPELL_TOO_SHORT:
+                    break
+                continue
+            anew = replace(
+                draft.segments[0], spell=min(segments[index].spell, draft.segments[0].spell))
+            return replace(
+                draft, segments=(anew, *draft.segments[1:]), resumed=first,
+                missed=index - first)
+        if refusal is not None:
+            raise refusal
+        return None
 
     # -- what comes of them --------------------------------------------------------------------
+
+    def take(self, draft: Draft | None, now: int) -> Plan:
+        """
+        Replace everything from the begin of a draft on.
+
+        Parameters
+        ----------
+        draft : Draft or None
+            Made by this planner since it last took one; None changes nothing.
+        now : int
+            Current time in ns, as the draft was made with.
+
+        Returns
+        -------
+        Plan
+            The one in force now.
+
+        """
+        if draft is None:
+            return self.plan
+        old = self.plan
+        begin = draft.begin
+        stamps = [x.stamp for x in old.levels]
+        kept = bisect_left(stamps, begin)
+        # What is over and handed out is forgotten, but for the level in force, and for those
+        # that there may still be news of.
+        first = max(min(self._unsent, kept, bisect_right(stamps, now)) - 1, 0)
+        if self._told:
+            first = max(min(first, self._known), first - _REMEMBERED, 0)
+        self._known = max(min(self._known, kept - 1) - first, 0)
+        self._unsent = min(self._unsent, kept) - first
+        levels = old.levels[first:kept] + draft.levels
+        if draft.resumed is None:
+            running = [x for x in old.segments if x.spell < begin]
+            over = max(bisect_right([x.spell for x in running], now) - 1, 0)
+            segments = tuple(
+                replace(x, arrival=None) if x.arrival is not None and x.arrival > begin else x
+                for x in running[over:])
+            self.plan = Plan(old.number + 1, levels, segments + draft.segments, len(segments))
+        else:
+            before = old.segments[:draft.resumed]
+            self.plan = Plan(
+                old.number, levels, before + draft.segments, min(old.kept, len(before)))
+        return self.plan
 
     def due(self, now: int) -> tuple[PlannedLevel, ...]:
         """
@@ -364,7 +457,7 @@ class Planner:
         """
         levels = self.plan.levels
         end = self._unsent
-        while end < len(levels) and levels[end].stamp <= now + self.options.lead_time:
+        while end < len(levels) and levels[end].stamp <= now + self.model.options.lead_time:
             end += 1
         handed = levels[self._unsent:end]
         self._unsent = end
@@ -374,6 +467,76 @@ class Planner:
     def pending(self) -> bool:
         """Whether commands remain to be handed out."""
         return self._unsent < len(self.plan.levels)
+
+    @property
+    def next_due(self) -> int | None:
+        """Time in ns from which the next command is to be handed out; None if there is none."""
+        if not self.pending:
+            return None
+        return self.plan.levels[self._unsent].stamp - self.model.options.lead_time
+
+    @property
+    def last_sent(self) -> PlannedLevel:
+        """Level that was handed out last, or the one in force before the first."""
+        return self.plan.levels[self._unsent - 1]
+
+    def drop_missed(self, now: int, tolerance: int) -> int:
+        """
+        Take out of the plan what should have been in force already and was never handed out.
+
+        Parameters
+        ----------
+        now : int
+            Current time in ns.
+        tolerance : int
+            In ns: what is late by less may still be handed out.
+
+        Returns
+        -------
+        int
+            How many levels; the level before them is taken to stay in force.
+
+        """
+        levels = self.plan.levels
+        end = self._unsent
+        while end < len(levels) and levels[end].stamp < now - tolerance:
+            end += 1
+        missed = end - self._unsent
+        if missed:
+            self._remember(self._history.without(self._unsent, end))
+        return missed
+
+    def applied(self, stamp: int, flux_density: float, tolerance: int) -> Deviation | None:
+        """
+        Take into the timeline a change of level that has taken effect.
+
+        Parameters
+        ----------
+        stamp : int
+            Time in ns at which it did.
+        flux_density : float
+            Level in T from then on.
+        tolerance : int
+            In ns: planned changes this near to it are the same.
+
+        Returns
+        -------
+        Deviation or None
+            None if it is as planned, or no news.
+
+        """
+        self._told = True
+        history, deviation = self._history.with_news(stamp, flux_density, tolerance)
+        self._remember(history)
+        return deviation
+
+    @property
+    def _history(self) -> History:
+        return History(self.plan.levels, self._unsent, self._known)
+
+    def _remember(self, history: History) -> None:
+        self.plan = replace(self.plan, levels=history.levels)
+        self._unsent, self._known = history.sent, history.known
 
     def state(self, time: int) -> State:
         """
@@ -387,19 +550,11 @@ class Planner:
         Returns
         -------
         State
-            Under the plan as it stands.
+            Under the plan as it stands, in the units of the model for the next request.
 
         """
-        level = self._level(time)
-        load = level.in_force / self._units.load
-        if level.stamp == _ALWAYS:
-            return State(level.stretch, 0.0, load)
-        end = level.flux_density / self._units.load
-        duration = (time - level.stamp) / NANOSECONDS / self._units.time
-        longest = self._delivery.ramp(end - load) + longest_motion(end, self._material)
-        return self._follow(
-            State(level.stretch, level.rate * self._units.time, load), end,
-            min(duration, longest))
+        level = self.plan.level(time)
+        return self.model.taken_from(level.at(time), level.model)
 
     def segment(self, now: int) -> tuple[int, PlannedSegment] | None:
         """
@@ -416,31 +571,18 @@ class Planner:
             Its place in the plan; None before the first begins.
 
         """
-        index = bisect_right([x.begin for x in self.plan.segments], now) - 1
+        index = bisect_right([x.spell for x in self.plan.segments], now) - 1
         return None if index < 0 else (index, self.plan.segments[index])
 
     # -- parts -------------------------------------------------------------------------------
 
-    def _level(self, time: int) -> PlannedLevel:
-        levels = self.plan.levels
-        return levels[max(bisect_right([x.stamp for x in levels], time) - 1, 0)]
-
-    def _follow(self, state: State, load: float, duration: float) -> State:
-        """Predict the state after one level has been commanded for a time."""
-        switches, loads, slopes, last = pieces(
-            (Level(0.0, load),), state.load, duration, self._delivery.slew)
-        stretch, rate = simulate(
-            switches, loads, duration, self._material, stretch=state.stretch,
-            rate=state.rate, slopes=slopes)
-        return State(float(stretch[0]), float(rate[0]), last)
-
     def _soonest(self, now: int) -> int:
         """Return the first time that a command can still reach in time."""
-        return self._on_grid(now + self.options.lead_time)
+        return self._on_grid(now + self.model.options.lead_time)
 
     def _on_grid(self, time: int) -> int:
         """Return the next multiple of the command period."""
-        period = self.options.period
+        period = self.model.options.period
         return time if period == 0 else -(-time // period) * period
 
     def _check_stretch(self, stretch: float) -> None:
@@ -477,82 +619,57 @@ class Planner:
         """Whether the running plan ends at a stretch, is on the way and has nothing between."""
         segments = self.plan.segments
         return bool(segments) and segments[-1].stretch == stretch \
-            and segments[-1].begin <= begin
+            and segments[-1].spell <= begin
 
     def _plan(
-            self, begin: int, setpoints: Sequence[Setpoint], shaper: str = ''
-    ) -> tuple[tuple[PlannedLevel, ...], tuple[PlannedSegment, ...]]:
+            self, begin: int, setpoints: Sequence[Setpoint], shaper: str = '') -> Draft:
         """Plan setpoints from a time on and place the result on the timeline."""
-        options = self.options
+        model = self.model
+        options = model.options
         return self._place(begin, plan_sequence(
-            setpoints, self._material, start=self.state(begin),
-            shaper=shaper or options.shaper, limits=self._limits, delivery=self._delivery,
-            order=options.order, units=self._units, short_spell=options.short_spell))
+            setpoints, model.material, start=self.state(begin),
+            shaper=shaper or options.shaper, limits=model.limits, delivery=model.delivery,
+            order=options.order, units=model.units, short_spell=options.short_spell))
 
-    def _place(
-            self, begin: int, segments: Sequence[Segment]
-    ) -> tuple[tuple[PlannedLevel, ...], tuple[PlannedSegment, ...]]:
+    def _place(self, begin: int, segments: Sequence[Segment]) -> Draft:
         """Place planned moves on the timeline, in SI units."""
+        model = self.model
+        unit = model.units
         levels = []
         placed = []
         for segment in segments:
-            start = begin + self._ns(segment.begin)
+            start = begin + model.ns(segment.begin)
             state = segment.start
             if math.isnan(state.load):
                 raise ValueError('a segment on the timeline knows the load it starts from')
             time = 0.0
             for number, level in enumerate(segment.move.levels):
                 if number:
-                    state = self._follow(
+                    state = model.follow(
                         state, segment.move.levels[number - 1].load, level.time - time)
                 time = level.time
                 levels.append(PlannedLevel(
-                    start + self._ns(time), level.load * self._units.load, state.stretch,
-                    state.rate / self._units.time, state.load * self._units.load))
+                    start + model.ns(time), level.load * unit.load, state.stretch,
+                    state.rate / unit.time, state.load * unit.load, model))
             duration = segment.move.duration
             placed.append(PlannedSegment(
                 segment.setpoint.stretch, start,
-                None if math.isinf(duration) else start + self._ns(duration),
-                segment.move.code, segment.move.reason))
-        return tuple(levels), tuple(placed)
-
-    def _ns(self, time: float) -> int:
-        return round(time * self._units.time * NANOSECONDS)
-
-    def _splice(
-            self, now: int, begin: int,
-            future: tuple[tuple[PlannedLevel, ...], tuple[PlannedSegment, ...]]) -> Plan:
-        """Replace everything from a time on."""
-        old = self.plan
-        stamps = [x.stamp for x in old.levels]
-        kept = bisect_left(stamps, begin)
-        # What is over and handed out is forgotten, but for the level in force.
-        first = max(min(self._unsent, kept, bisect_right(stamps, now)) - 1, 0)
-        running = [x for x in old.segments if x.begin < begin]
-        over = max(bisect_right([x.begin for x in running], now) - 1, 0)
-        segments = tuple(
-            replace(x, arrival=None) if x.arrival is not None and x.arrival > begin else x
-            for x in running[over:])
-        self._unsent = min(self._unsent, kept) - first
-        self.plan = Plan(
-            old.number + 1, old.levels[first:kept] + future[0], segments + future[1],
-            len(segments))
-        return self.plan
+                None if math.isinf(duration) else start + model.ns(duration),
+                segment.move.code, segment.move.reason, start))
+        return Draft(begin, tuple(levels), tuple(placed))
 
     def _holdable(self, stretch: float) -> float:
         """Return the nearest stretch that a flux density inside the limits holds."""
-        load = float(elastic_force(stretch, self._material.j_lim))
-        least, most = self._limits.minimum, self._limits.maximum
+        load = float(elastic_force(stretch, self.model.material.j_lim))
+        least, most = self.model.limits.minimum, self.model.limits.maximum
         if least <= load <= most:
             return stretch
         nearest = least if load < least else most
         margin = _INSIDE * min(most - least, 1.0 + abs(nearest))
         return float(equilibrium_stretch(
-            nearest + math.copysign(margin, nearest - load), self._material.j_lim))
+            nearest + math.copysign(margin, nearest - load), self.model.material.j_lim))
 
-    def _gentle_stop(
-            self, begin: int, state: State
-    ) -> tuple[tuple[PlannedLevel, ...], tuple[PlannedSegment, ...]]:
+    def _gentle_stop(self, begin: int, state: State) -> Draft:
         """Plan a stop that a single brake does not make: on a grid, through ramps, at a limit."""
         for share in _BRAKE_SHARES:
             stretch = self._holdable(self._brake(state, share)[2])
@@ -565,16 +682,14 @@ class Planner:
 
     def _brake(self, state: State, share: float) -> tuple[float, float, float]:
         """Return a load that brakes with a share of the limit, for how long, and until where."""
-        material = self._material
+        material = self.model.material
         i_j = 1.0 / material.j_lim
-        holding = float(kernels.elastic_force(state.stretch, i_j))
-        frequency = math.sqrt(
-            kernels.elastic_stiffness(state.stretch, i_j)
-            / ((state.stretch ** -3 + material.c1) / 6.0))
+        holding = self.model.holding(state.stretch)
+        frequency = self._frequency(state.stretch)
         if abs(state.rate) <= _AT_REST * frequency:
             return holding, 0.0, state.stretch
         up = state.rate > 0.0
-        load = self._limits.minimum if up else self._limits.maximum
+        load = self.model.limits.minimum if up else self.model.limits.maximum
         if not math.isfinite(load):
             # Unlimited: a load that stops within a fraction of a period.
             load = holding - math.copysign(
@@ -586,5 +701,12 @@ class Planner:
             material.zeta, material.c1, i_j, RTOL)
         if status != kernels.DONE:
             return holding, 0.0, state.stretch
-        time = self._ns(time) / NANOSECONDS / self._units.time
+        time = self.model.time(self.model.ns(time))
         return float(load), time, stretch
+
+    def _frequency(self, stretch: float) -> float:
+        """Return the nondimensional natural frequency about a stretch."""
+        material = self.model.material
+        return math.sqrt(
+            kernels.elastic_stiffness(stretch, 1.0 / material.j_lim)
+            / ((stretch ** -3 + material.c1) / 6.0))

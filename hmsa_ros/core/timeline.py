@@ -1,0 +1,367 @@
+"""
+Records of a plan over time, and the prediction along them.
+
+Times are integer nanoseconds, levels flux densities in tesla: what happens on the wire. Each level
+knows the model under which it was planned, so that a plan that began under other parameters is
+still predicted under those.
+"""
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+import math
+
+from hmsa_ros.core import kernels
+from hmsa_ros.core.delivery import Delivery, pieces
+from hmsa_ros.core.moves import Level, Limits, State
+from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
+from hmsa_ros.core.sequence import SHORT_SPELL
+from hmsa_ros.core.shapers import get_shaper
+from hmsa_ros.core.simulation import longest_motion, simulate
+from hmsa_ros.core.status import Code
+from hmsa_ros.core.units import NANOSECONDS, Units
+from hmsa_ros.errors import BadInputError
+
+#: Stamp of a level that has been in force at rest for ever.
+ALWAYS = -2**62
+
+
+@dataclass(frozen=True)
+class Options:
+    """
+    How requests are planned.
+
+    Attributes
+    ----------
+    shaper : str
+        Name of a shaper.
+    short_spell : {'refuse', 'continue'}
+        For a span that ends before the move.
+    flux_density_min, flux_density_max : float
+        In T.
+    lead_time : int
+        In ns: how far ahead of its stamp a command is sent.
+    period : int
+        In ns: commands are stamped with multiples of it; 0 for any time.
+    slew_limit : float
+        Largest change of the flux density in T/s; infinite for steps.
+    order : int
+        Of the robust shaper.
+
+    """
+
+    shaper: str = 'two_step'
+    short_spell: str = 'refuse'
+    flux_density_min: float = -math.inf
+    flux_density_max: float = math.inf
+    lead_time: int = 50_000_000
+    period: int = 0
+    slew_limit: float = math.inf
+    order: int = 2
+
+
+@dataclass(frozen=True)
+class Model:
+    """
+    Everything that a prediction depends on: the block and how commands reach it.
+
+    Attributes
+    ----------
+    actuator : ActuatorParameters
+        The block.
+    options : Options
+        How to plan.
+    material : NondimensionalParameters
+        Of the block.
+    units : Units
+        Sizes of the nondimensional units of time (s) and load (T).
+    limits : Limits
+        Admissible loads.
+    delivery : Delivery
+        Nondimensional.
+
+    Raises
+    ------
+    BadInputError
+        If the options are out of range.
+
+    """
+
+    actuator: ActuatorParameters
+    options: Options
+    material: NondimensionalParameters = field(init=False)
+    units: Units = field(init=False)
+    limits: Limits = field(init=False)
+    delivery: Delivery = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Work out the nondimensional side."""
+        actuator, options = self.actuator, self.options
+        get_shaper(options.shaper)
+        if options.short_spell not in SHORT_SPELL:
+            raise BadInputError(
+                f'short_spell is {options.short_spell!r}: expected one of '
+                + ', '.join(SHORT_SPELL))
+        if options.lead_time < 0:
+            raise BadInputError(
+                f'lead_time is {options.lead_time / NANOSECONDS:g} s: expected at least 0 s')
+        time, load = actuator.time_unit, actuator.flux_density_unit
+        worked_out = {
+            'material': actuator.nondimensional,
+            'units': Units(time, load, ' s', ' T'),
+            'limits': Limits(options.flux_density_min / load, options.flux_density_max / load),
+            'delivery': Delivery(
+                options.period / NANOSECONDS / time, options.slew_limit / load * time,
+                1.0 / NANOSECONDS / time),
+        }
+        for name, value in worked_out.items():
+            object.__setattr__(self, name, value)
+
+    def ns(self, time: float) -> int:
+        """Return a nondimensional time in ns."""
+        return round(time * self.units.time * NANOSECONDS)
+
+    def time(self, ns: int) -> float:
+        """Return a time in ns without a dimension."""
+        return ns / NANOSECONDS / self.units.time
+
+    def holding(self, stretch: float) -> float:
+        """Return the load that holds a stretch."""
+        return float(kernels.elastic_force(stretch, 1.0 / self.material.j_lim))
+
+    def follow(self, state: State, load: float, duration: float) -> State:
+        """
+        Predict the state after one level has been commanded for a time.
+
+        Parameters
+        ----------
+        state : State
+            At the start; it knows the load in force.
+        load : float
+            Commanded from then on.
+        duration : float
+            Nondimensional.
+
+        Returns
+        -------
+        State
+            At the end.
+
+        """
+        switches, loads, slopes, last = pieces(
+            (Level(0.0, load),), state.load, duration, self.delivery.slew)
+        stretch, rate = simulate(
+            switches, loads, duration, self.material, stretch=state.stretch,
+            rate=state.rate, slopes=slopes)
+        return State(float(stretch[0]), float(rate[0]), last)
+
+    def taken_from(self, state: State, other: 'Model') -> State:
+        """Return a state of another model in the units of this one."""
+        if other is self:
+            return state
+        return State(
+            state.stretch, state.rate / other.units.time * self.units.time,
+            state.load * other.units.load / self.units.load)
+
+
+@dataclass(frozen=True)
+class PlannedLevel:
+    """
+    A change of level.
+
+    Attributes
+    ----------
+    stamp : int
+        Time in ns from which it applies.
+    flux_density : float
+        In T.
+    stretch, rate : float
+        Predicted at the stamp; the rate in 1/s.
+    in_force : float
+        Flux density in T predicted at the stamp, from which a slew limit ramps to the level.
+    model : Model
+        Under which the motion from the stamp on is predicted.
+
+    """
+
+    stamp: int
+    flux_density: float
+    stretch: float
+    rate: float
+    in_force: float
+    model: Model = field(repr=False)
+
+    def at(self, time: int) -> State:
+        """
+        Predict the state while the level is in force.
+
+        Parameters
+        ----------
+        time : int
+            In ns; before the stamp, the state at the stamp is returned.
+
+        Returns
+        -------
+        State
+            Nondimensional, in the units of the model.
+
+        """
+        model = self.model
+        load = self.in_force / model.units.load
+        if self.stamp == ALWAYS:
+            return State(self.stretch, 0.0, load)
+        end = self.flux_density / model.units.load
+        longest = model.delivery.ramp(end - load) + longest_motion(end, model.material)
+        return model.follow(
+            State(self.stretch, self.rate * model.units.time, load), end,
+            min(max(model.time(time - self.stamp), 0.0), longest))
+
+    def sample(self, times: Sequence[int]) -> list[tuple[float, float]]:
+        """
+        Predict stretch and rate at several times while the level is in force.
+
+        Parameters
+        ----------
+        times : sequence of int
+            In ns, not decreasing, none before the stamp.
+
+        Returns
+        -------
+        list of (float, float)
+            The rate in 1/s.
+
+        """
+        if self.stamp == ALWAYS or all(x == self.stamp for x in times):
+            return [(self.stretch, self.rate)] * len(times)
+        model = self.model
+        end = self.flux_density / model.units.load
+        load = self.in_force / model.units.load
+        longest = model.delivery.ramp(end - load) + longest_motion(end, model.material)
+        after = [min(model.time(x - self.stamp), longest) for x in times]
+        switches, loads, slopes, _ = pieces(
+            (Level(0.0, end),), load, after[-1], model.delivery.slew)
+        stretch, rate = simulate(
+            switches, loads, after, model.material, stretch=self.stretch,
+            rate=self.rate * model.units.time, slopes=slopes)
+        return list(zip(stretch.tolist(), (rate / model.units.time).tolist(), strict=True))
+
+    def after(self, level: 'PlannedLevel') -> 'PlannedLevel':
+        """Return this level with what is predicted at its stamp if another one precedes it."""
+        state = level.at(self.stamp)
+        units = level.model.units
+        return replace(
+            self, stretch=state.stretch, rate=state.rate / units.time,
+            in_force=state.load * units.load)
+
+
+@dataclass(frozen=True)
+class PlannedSegment:
+    """
+    One setpoint on the timeline.
+
+    Attributes
+    ----------
+    stretch : float
+        Target.
+    begin : int
+        Time in ns at which the move begins.
+    arrival : int or None
+        Time in ns of rest at the target; None where it is only approached.
+    code : Code
+        Which command it is.
+    reason : str
+        Why it is not the one asked for; empty if it is.
+    spell : int
+        Time in ns at which the setpoint takes over from the one before; the move may begin
+        later.
+
+    """
+
+    stretch: float
+    begin: int
+    arrival: int | None
+    code: Code
+    reason: str
+    spell: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """
+    What is going to happen, from the level in force on.
+
+    Attributes
+    ----------
+    number : int
+        Counts accepted requests from 1; 0 before the first.
+    levels : tuple of PlannedLevel
+        By stamp; the first may lie in the past.
+    segments : tuple of PlannedSegment
+        By time.
+    kept : int
+        How many of them, the first ones, belong to earlier requests.
+
+    """
+
+    number: int
+    levels: tuple[PlannedLevel, ...]
+    segments: tuple[PlannedSegment, ...]
+    kept: int = 0
+
+    def level(self, time: int) -> PlannedLevel:
+        """Return the level in force at a time, the first one before that."""
+        return self.levels[max(bisect_right([x.stamp for x in self.levels], time) - 1, 0)]
+
+
+@dataclass(frozen=True)
+class Draft:
+    """
+    A plan that has been worked out and not been taken yet.
+
+    Attributes
+    ----------
+    begin : int
+        Time in ns from which it replaces what was planned.
+    levels, segments : tuple
+        From then on.
+    resumed : int or None
+        Place of the first setpoint of the running plan that it plans anew; None for a new
+        request.
+    missed : int
+        How many setpoints are left out, since their time is over.
+
+    """
+
+    begin: int
+    levels: tuple[PlannedLevel, ...]
+    segments: tuple[PlannedSegment, ...]
+    resumed: int | None = None
+    missed: int = 0
+
+    def delayed(self, delays: Sequence[int]) -> 'Draft':
+        """
+        Return the draft with moves that begin later.
+
+        Parameters
+        ----------
+        delays : sequence of int
+            In ns, one for each segment; 0 where it does not begin at rest, or where its spell
+            has no room.
+
+        Returns
+        -------
+        Draft
+            The level before a delayed move stays in force until then.
+
+        """
+        begins = [x.begin for x in self.segments]
+        levels = tuple(
+            replace(x, stamp=x.stamp + delays[bisect_right(begins, x.stamp) - 1])
+            for x in self.levels)
+        segments = tuple(
+            x if not delay else replace(
+                x, begin=x.begin + delay,
+                arrival=None if x.arrival is None else x.arrival + delay)
+            for x, delay in zip(self.segments, delays, strict=True))
+        return replace(self, levels=levels, segments=segments)
+
