@@ -14,11 +14,11 @@ from hmsa_ros.core.model import signed_root, stretch_limits
 from hmsa_ros.figures import paper_data, style
 from hmsa_ros.figures.paper_data import Data, Run, Sweep
 
-TAU = r'nondimensional time $\tau$'
-STRETCH = r'stretch $\lambda$'
-RATE = r'stretch rate $\dot{\lambda}=\mathrm{d}\lambda/\mathrm{d}\tau$'
-FLUX = 'nondim. flux density $b$'
-TAU_P = r'intermediate time $\tau_p$'
+TAU = r'nondimensional time $\tau$ [1]'
+STRETCH = r'stretch $\lambda$ [1]'
+RATE = r'stretch rate $\dot{\lambda}=\mathrm{d}\lambda/\mathrm{d}\tau$ [1]'
+FLUX = 'nondim. flux density $b$ [1]'
+TAU_P = r'intermediate time $\tau_p$ [1]'
 #: Critical damping as the paper quotes it, for 1 -> 1.1.
 PAPER_CRITICAL = 2.14
 _ALONE: dict[str, Any] = {
@@ -295,11 +295,11 @@ def _draw_damping_sweep(figure: Figure, sweep: Sweep) -> None:
     top = math.ceil(float(np.nanmax(sweep.tau_p))) + 0.5
     left.set_xlim(0.0, 1.05 * sweep.critical)
     left.set_ylim(0.0, top)
-    style.finish(left, r'nondimensional damping $\zeta$', TAU_P, 'a')
+    style.finish(left, r'nondimensional damping $\zeta$ [1]', TAU_P, 'a')
     near = 2.0
     right.set_xlim(near, near + 1.12 * (sweep.critical - near))
     right.set_ylim(0.0, top)
-    style.finish(right, r'nondimensional damping $\zeta$ (close-up)', '', 'b')
+    style.finish(right, r'nondimensional damping $\zeta$ [1] (close-up)', '', 'b')
     _legend_below(figure, left)
 
 
@@ -330,7 +330,7 @@ def _draw_chain_limit_cases(figure: Figure, runs: tuple[Run, ...]) -> None:
 def _draw_chain_limit_sweep(figure: Figure, sweep: Sweep) -> None:
     left, right = figure.subplots(1, 2)
     marks = np.searchsorted(sweep.j_lim, paper_data.J_LIMS)
-    extension = r'chain extensibility $J_{\mathrm{lim}}$'
+    extension = r'chain extensibility $J_{\mathrm{lim}}$ [1]'
     b_p = signed_root(sweep.beta_p)
     for axes, values in ((left, sweep.tau_p), (right, b_p)):
         axes.plot(sweep.j_lim, values, label=r'$1\to1.2$', **style.SHAPED)
@@ -340,7 +340,7 @@ def _draw_chain_limit_sweep(figure: Figure, sweep: Sweep) -> None:
     for axes in (left, right):
         axes.set_xlim(0.0, float(sweep.j_lim[-1]))
     style.finish(left, extension, TAU_P, 'a')
-    style.finish(right, extension, 'intermediate flux density $b_p$', 'b')
+    style.finish(right, extension, 'intermediate flux density $b_p$ [1]', 'b')
     _legend_below(figure, right)
 
 

@@ -86,7 +86,7 @@ def draw_run(
         axes.plot(time * 1e3, plain_stretch, label='unshaped', **style.UNSHAPED)
         axes.plot(time * 1e3, stretch, label='shaped (recorded)', **style.SHAPED)
         axes.set_xlim(begin * 1e3, end * 1e3)
-        style.finish(axes, 'time $t$ [ms]', r'stretch $\lambda$', 'b')
+        style.finish(axes, 'time $t$ [ms]', r'stretch $\lambda$ [1]', 'b')
 
         axes = panels['phase']
         axes.plot(plain_stretch, plain_rate, **style.UNSHAPED)
@@ -94,7 +94,7 @@ def draw_run(
         axes.plot(
             [x[0] for x in targets], [0.0] * len(targets), label='equilibrium',
             **style.EQUILIBRIUM)
-        style.finish(axes, r'stretch $\lambda$', r'stretch rate $\dot{\lambda}$ [1/s]', 'c')
+        style.finish(axes, r'stretch $\lambda$ [1]', r'stretch rate $\dot{\lambda}$ [1/s]', 'c')
         figure.align_ylabels([panels['command'], panels['response']])
         handles = [
             x for panel in ('response', 'phase')

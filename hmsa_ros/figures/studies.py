@@ -175,7 +175,7 @@ def draw_sampled(path: str | Path, study: SampledStudy, *, period: float = 0.28)
         axes.set_xscale('log')
         axes.set_yscale('log')
         axes.set_ylim(5e-14, 300.0)
-        style.finish(axes, r'command period $T/\tau_p$', 'residual [% of the step]', 'a')
+        style.finish(axes, r'command period $T/\tau_p$ [1]', 'residual [% of the step]', 'a')
         ticks = [x for x in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0) if x >= study.periods[0]]
         axes.set_xticks(ticks, [f'{x:g}' for x in ticks])
         axes.xaxis.minorticks_off()
@@ -199,12 +199,12 @@ def draw_sampled(path: str | Path, study: SampledStudy, *, period: float = 0.28)
             axes.axvline(number * size, **style.TARGET)
         axes.set_xlim(-0.1 * study.tau_p, 1.6 * study.tau_p)
         style.finish(
-            axes, r'time $\tau$', r'load $\beta$', 'b')
+            axes, r'time $\tau$ [1]', r'load $\beta$ [1]', 'b')
         axes.set_title(rf'$T$ = {period:g} $\tau_p$, grid dotted', loc='right', fontsize=8)
         axes = panels['response']
         axes.axhline(study.target, **style.TARGET)
         axes.set_xlim(0.0, end)
-        style.finish(axes, r'time $\tau$', r'stretch $\lambda$', 'c')
+        style.finish(axes, r'time $\tau$ [1]', r'stretch $\lambda$ [1]', 'c')
         figure.align_ylabels([panels['command'], panels['response']])
         figure.legend(
             *panels['residual'].get_legend_handles_labels(), loc='outside lower center',
@@ -258,8 +258,8 @@ def draw_damped(path: str | Path, study: DampedStudy, *, zeta: float = 4.0) -> N
         axes.set_xlim(study.zetas[0], study.zetas[-1])
         axes.set_ylim(0.0, None)
         style.finish(
-            axes, r'damping coefficient $\zeta$',
-            f'time to within {100.0 * SETTLED:g} % of the step', 'a')
+            axes, r'damping coefficient $\zeta$ [1]',
+            rf'time $\tau$ to within {100.0 * SETTLED:g} % of the step [1]', 'a')
 
         moves: list[tuple[Move, dict[str, Any]]] = [
             (step(Request(State(study.start), study.target, material)), style.UNSHAPED)]
@@ -278,12 +278,12 @@ def draw_damped(path: str | Path, study: DampedStudy, *, zeta: float = 4.0) -> N
                 times, response(move, study.start, times, material, Errors()), **look)
         axes = panels['command']
         axes.set_xlim(-0.02 * end, end)
-        style.finish(axes, '', r'load $\beta/\beta_1$', 'b')
+        style.finish(axes, '', r'load $\beta/\beta_1$ [1]', 'b')
         axes.set_title(rf'$\zeta$ = {zeta:g}', loc='right', fontsize=8)
         axes = panels['response']
         axes.axhline(study.target, **style.TARGET)
         axes.set_xlim(-0.02 * end, end)
-        style.finish(axes, r'time $\tau$', r'stretch $\lambda$', 'c')
+        style.finish(axes, r'time $\tau$ [1]', r'stretch $\lambda$ [1]', 'c')
         figure.align_ylabels([panels['command'], panels['response']])
         figure.legend(
             *panels['times'].get_legend_handles_labels(), loc='outside lower center',

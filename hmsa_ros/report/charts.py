@@ -612,7 +612,7 @@ def prediction(parts: Sequence[Part], unit: TimeUnit) -> Figure:
     return Figure(
         'prediction', 'Recorded minus predicted stretch over time', 300, _grouped(data), {
             'xaxis': _axis(f'time from the first command [{unit.name}]'),
-            'yaxis': _axis('recorded − predicted stretch [1]')})
+            'yaxis': _axis('recorded − planned λ [1]')})
 
 
 def timings(parts: Sequence[Part], unit: TimeUnit) -> Figure:
