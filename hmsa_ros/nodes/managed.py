@@ -28,17 +28,17 @@ class ManagedNode(LifecycleNode):
     `deactivate` and `cleanup` do the work, and calls `autostart` last. Each of the four may
     raise `HmsaError`: the transition is refused and can be tried again.
 
+    Parameters
+    ----------
+    name : str
+        Name of the node.
+
     Attributes
     ----------
     active : bool
         Whether the node acts.
     finished : bool
         Whether it was shut down from outside and the process is to end.
-
-    Parameters
-    ----------
-    name : str
-        Name of the node.
 
     """
 
