@@ -1,0 +1,122 @@
+"""A selection of the faults that `python -m benchmarks faults` injects, and the soak in short."""
+
+import json
+import math
+import random
+
+import numpy as np
+import pytest
+
+from benchmarks import __main__ as program
+from benchmarks import bench_soak
+from benchmarks.faults import memory, rows
+from benchmarks.faults.rig import settled
+from benchmarks.faults.table import inject, markdown, Outcome, Seen
+
+MIB = 2**20
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(
+    'fault', [x for x in rows.FAULTS if x.key in rows.QUICK], ids=lambda x: x.key)
+def test_fault_is_answered_as_expected(fault, ros_domain_id):
+    seen = inject(fault, ros_domain_id).seen
+    assert seen.met, f'expected {fault.expected}; seen {seen.text} ({seen.figure})'
+
+
+def test_every_fault_has_a_name_of_its_own_and_says_what_is_expected():
+    keys = [x.key for x in rows.FAULTS]
+    assert len(set(keys)) == len(keys)
+    assert set(rows.QUICK) <= set(keys)
+    assert all(x.name and x.how and x.expected for x in rows.FAULTS)
+
+
+@pytest.mark.ros
+def test_a_row_that_is_not_met_fails_the_run(ros_domain_id, monkeypatch, tmp_path, capfd):
+    fault = rows.FAULTS[0]
+    wrong = type(fault)(
+        'wrong', 'none', 'nothing', 'something', lambda _: Seen('nothing', '-', met=False))
+    monkeypatch.setattr(rows, 'FAULTS', (wrong,))
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(ros_domain_id))
+    page, file = tmp_path / 'page.md', tmp_path / 'faults.json'
+    page.write_text('<!-- begin faults -->\n<!-- end faults -->\n')
+    assert program.main(['faults', '--page', str(page), '--json', str(file)]) == 1
+    assert '**not met**' in page.read_text()
+    assert json.loads(file.read_text())['faults'][0]['met'] is False
+    assert 'NOT MET' in capfd.readouterr().out
+
+
+def test_table_says_what_was_expected_beside_what_was_seen():
+    fault = rows.FAULTS[0]
+    text = markdown([Outcome(fault, Seen('a | b', '1e-9', met=True))])
+    head, _, row = text.splitlines()
+    assert head.count('|') == 7
+    assert f'{fault.expected} | a \\| b | 1e-9 | met |' in row
+
+
+def test_residual_counts_from_the_last_change_of_the_field():
+    time = np.arange(200)
+    flux = np.where(time < 50, 0.0, np.where(time < 56, 0.2, 0.1))
+    stretch = np.where(time < 56, 1.0 + 0.0005 * time, 1.1)
+    stretch[100] += 0.002
+    residual, error = settled(np.column_stack([stretch, 0.0 * time, flux]), 1.11, 0.1)
+    assert residual == pytest.approx(0.02)
+    assert error == pytest.approx(0.1)
+
+
+def lives(slope, *, noise=0.0, count=400, lives=3):
+    """Return samples of some lives of an hour each that grow by so many bytes an hour."""
+    dice = random.Random(1)
+    samples = []
+    for life in range(lives):
+        for i in range(count):
+            age = i / count
+            own = 50 * MIB + life * 3 * MIB + slope * age + dice.gauss(0.0, noise)
+            samples.append(memory.Sample(life + age, life, age, round(own), 0, 0))
+    return samples
+
+
+def test_a_leak_is_found_through_restarts_and_noise():
+    found = memory.trend(lives(6 * MIB, noise=0.3 * MIB), 0.1)
+    assert found.slope == pytest.approx(6 * MIB, rel=0.05)
+    assert not found.flat
+
+
+@pytest.mark.parametrize(('slope', 'noise'), [(0.0, 0.5 * MIB), (0.3 * MIB, 0.0), (-MIB, 0.0)])
+def test_memory_that_does_not_grow_is_flat(slope, noise):
+    assert memory.trend(lives(slope, noise=noise), 0.1).flat
+
+
+def test_memory_of_a_process_is_read_and_one_that_is_gone_has_none():
+    import os
+    own, pss, rss = memory.used(os.getpid())
+    assert 0 < own <= rss
+    assert 0 < pss <= rss
+    assert memory.used(2**22 + 1) == (0, 0, 0)
+
+
+def test_planner_and_plant_agree_over_minutes_without_drift():
+    core = bench_soak.run_in_process(0.02)
+    assert core.failures() == []
+    assert core.steps == 72_000
+    assert core.drift == 0
+    assert 0 < core.refused < core.requests < core.commands
+    assert core.difference < 1e-9
+
+
+def test_the_soak_fails_for_each_thing_that_must_not_be():
+    flat = memory.Trend(0.0, 1.0, 1.0, 10)
+    good = bench_soak.Cycle('calm', '', samples=10, difference=0.0)
+    assert bench_soak.Result(cycles=[good], trends={'plant': flat}).failures() == []
+    for result, text in (
+            (bench_soak.Result(traces=['planner: ValueError']), 'exception'),
+            (bench_soak.Result(ended=['plant with status 1']), 'ended'),
+            (bench_soak.Result(statuses=[0, 1]), 'exit status 1'),
+            (bench_soak.Result(cycles=[bench_soak.Cycle('rough', '', samples=1, lost=3)]), 'lost'),
+            (bench_soak.Result(cycles=[bench_soak.Cycle(
+                'calm', '', samples=10, missing=2, difference=0.0)]), 'missing'),
+            (bench_soak.Result(cycles=[bench_soak.Cycle('calm', '', samples=10)]), 'differs'),
+            (bench_soak.Result(trends={'plant': memory.Trend(9e6, 1.0, 1.0, 10)}), 'grows')):
+        found, = result.failures()
+        assert text in found
+    assert math.isnan(bench_soak.Cycle('calm', '').difference)
