@@ -2,7 +2,11 @@
 
 import itertools
 import signal
+import time
 
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from mcap.writer import Writer
 import pytest
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -197,12 +201,84 @@ def test_rate_and_position_change_while_playing(ros, play, tmp_path):
     assert len(values) < 200
 
 
-def test_a_rate_out_of_range_is_refused(ros, play, tmp_path):
+def test_a_rate_or_a_position_out_of_range_is_refused(ros, play, tmp_path):
     bag = write_bag(tmp_path / 'bag', [('/a', 1000 * i, i) for i in range(1000)])
     process = play(bag)
     result, = ros.set_parameters('player', [Parameter('play.rate', value=-1.0)])
     assert not result.successful
+    result, = ros.set_parameters('player', [Parameter('play.seek', value=1000.0)])
+    assert not result.successful
+    assert 'expected at most 999 s, where playing ends' in result.reason
     assert process.stop() == 0
+
+
+def test_it_plays_while_it_is_active(ros, play, tmp_path):
+    bag = write_bag(tmp_path / 'bag', [('/a', 10 * i, i) for i in range(10_000)])
+    got = ros.collect(Float64, '/a')
+    process = play(bag, 'autostart:=false')
+
+    def change(transition):
+        request = ChangeState.Request()
+        request.transition.id = transition
+        return ros.call(ChangeState, 'player/change_state', request).success
+
+    assert change(Transition.TRANSITION_CONFIGURE)
+    ros.spin_until(lambda: ros.node.count_publishers('/a'), 'the publisher')
+    assert not ros.call(Trigger, 'player/resume').success
+    assert not got
+    assert change(Transition.TRANSITION_ACTIVATE)
+    ros.spin_until(lambda: len(got) > 10, 'messages')
+    assert change(Transition.TRANSITION_DEACTIVATE)
+    assert ros.call(Trigger, 'player/is_paused').success
+    count = len(got)
+    assert change(Transition.TRANSITION_ACTIVATE)
+    ros.spin_until(lambda: len(got) > count + 10, 'more messages')
+    assert change(Transition.TRANSITION_DEACTIVATE)
+    assert change(Transition.TRANSITION_CLEANUP)
+    ros.spin_until(lambda: not ros.node.count_publishers('/a'), 'the end of the publisher')
+    assert [message.data for message in got] == list(range(len(got)))
+    # From the start again.
+    assert change(Transition.TRANSITION_CONFIGURE)
+    assert change(Transition.TRANSITION_ACTIVATE)
+    del got[:]
+    ros.spin_until(lambda: len(got) > 3, 'messages from the start')
+    assert got[0].data == 0.0
+    assert process.stop() == 0, process.output
+
+
+def test_a_bag_of_one_moment_is_played_in_a_loop_without_haste(ros, play, tmp_path):
+    bag = write_bag(tmp_path / 'bag', [('/a', 0, 0), ('/a', 0, 1)])
+    got = ros.collect(Float64, '/a')
+    process = play(bag, 'play.loop:=true')
+    begin = time.monotonic()
+    ros.spin_until(lambda: len(got) >= 20, 'ten rounds')
+    # Nine pauses of a tenth of a second: it cannot be faster, however fast the machine is.
+    assert time.monotonic() - begin > 0.5
+    assert process.stop() == 0, process.output
+    assert [message.data for message in got[:20]] == [0.0, 1.0] * 10
+
+
+def test_what_cannot_be_published_is_left_out_and_told(ros, play, tmp_path):
+    path = tmp_path / 'bag.mcap'
+    encoding, text = message_definition(FLOAT)
+    with path.open('wb') as file:
+        writer = Writer(file)
+        writer.start('ros2', 'test')
+        schemas = [writer.register_schema(name, encoding, text.encode())
+                   for name in (FLOAT, 'antigravity/msg/A')]
+        for schema, name in ((0, '/a'), (0, '/not a name\x1b'), (0, '//'), (1, '/other')):
+            channel = writer.register_channel(name, 'cdr', schemas[schema], {})
+            for i in range(50):
+                writer.add_message(channel, START + i * MS, serialize_message(
+                    Float64(data=float(i))), START)
+        writer.finish()
+    got = ros.collect(Float64, '/a')
+    process = play(path)
+    finish(ros, process, got, 50)
+    assert 'topic /not a name\\x1b is left out: it cannot be published' in process.output
+    assert 'topic // is left out: it cannot be published' in process.output
+    assert 'topic /other is left out: message type antigravity/msg/A is not installed' in (
+        process.output)
 
 
 def test_it_waits_for_the_subscribers_it_is_told_to(ros, play, tmp_path):

@@ -6,6 +6,8 @@ import signal
 import subprocess
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 import pytest
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -449,6 +451,39 @@ def test_the_experiment_goes_into_the_bag(record, ros, make_ros):
     assert summarize(recorder.folder).parameters['/right/planner.zeta'] == '0.2'
     for planner in planners.values():
         planner.destroy_node()
+
+
+def test_it_records_while_it_is_active(record, ros):
+    recorder = record('autostart:=false')
+
+    def change(transition):
+        request = ChangeState.Request()
+        request.transition.id = transition
+        return ros.call(ChangeState, 'recorder/change_state', request).success
+
+    assert change(Transition.TRANSITION_CONFIGURE)
+    publisher = ros.publisher(Float64, '/a')
+    recorder.wait_for('state', 'inactive')
+    publisher.publish(Float64(data=1.0))
+    assert not recorder.call('resume').success
+    assert change(Transition.TRANSITION_ACTIVATE)
+    publisher.publish(Float64(data=2.0))
+    recorder.wait_for('received', '1')
+    assert change(Transition.TRANSITION_DEACTIVATE)
+    publisher.publish(Float64(data=3.0))
+    recorder.wait_for('state', 'inactive')
+    assert change(Transition.TRANSITION_ACTIVATE)
+    publisher.publish(Float64(data=4.0))
+    recorder.wait_for('received', '2')
+    assert change(Transition.TRANSITION_DEACTIVATE)
+    assert change(Transition.TRANSITION_CLEANUP)
+    reader = BagReader(recorder.folder)
+    assert reader.complete
+    assert values(reader) == [2.0, 4.0]
+    # The folder is there now, and is not written to again.
+    assert not change(Transition.TRANSITION_CONFIGURE)
+    assert f'{recorder.folder} exists' in recorder.process.output
+    recorder.end()
 
 
 def test_a_snapshot_holds_what_came_before_it(record, ros):

@@ -6,6 +6,9 @@ place on an absolute schedule, so that no delay adds up. A second thread reads a
 
 Commands move things. Topics that carry them (see `COMMAND_TOPICS`) are left out unless they
 are asked for by name, in ``play.topics_to_filter`` or ``play.allow_commands``.
+
+As a managed node it opens the bag and offers its topics when it is configured, plays while it is
+active, and gives both up when it is cleaned up.
 """
 
 from collections import deque
@@ -27,7 +30,6 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.expand_topic_name import expand_topic_name
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Trigger
@@ -36,7 +38,7 @@ from hmsa_ros.bag.limits import CHUNK_SIZE
 from hmsa_ros.bag.reader import BagReader, Message, TopicInfo
 from hmsa_ros.errors import BadInputError, BagError, HmsaError, printable
 from hmsa_ros.nodes import interface
-from hmsa_ros.nodes.parameter_service import CarefulParameterService
+from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.parameters import declare, ParameterSpec
 from hmsa_ros.nodes.qos import publisher
 from hmsa_ros.nodes.recorder import message_class
@@ -289,7 +291,7 @@ class _ReadAhead:
         self._thread.join()
 
 
-class Player(Node):
+class Player(ManagedNode):
     """
     ROS 2 node that plays a bag.
 
@@ -308,15 +310,24 @@ class Player(Node):
     """
 
     def __init__(self) -> None:
-        super().__init__(interface.PLAYER, start_parameter_services=False)
-        self._parameter_service = CarefulParameterService(self)
-        values = self._values = declare(self, PARAMETERS)
+        super().__init__(interface.PLAYER)
+        self._values = declare(self, PARAMETERS)
+        self.failure: HmsaError | None = None
+        self._change = threading.Condition()
+        self._stopped = True
+        self._thread: threading.Thread | None = None
+        self.add_on_set_parameters_callback(self._on_set_parameters)
+        self.autostart()
+
+    # States ----------------------------------------------------------------------------------
+
+    def configure(self) -> None:
+        """Open the bag, offer its topics, and wait."""
+        values = self._values
         if not values['storage.uri']:
             raise BadInputError(
                 'parameter storage.uri is empty: expected the folder of a bag or an .mcap file, '
                 'for example -p storage.uri:=run1')
-        self.failure: HmsaError | None = None
-        self.finished = False
         self._reader = BagReader(
             values['storage.uri'], max_chunk_size=values['storage.max_chunk_size'])
         self._problems_told = 0
@@ -331,9 +342,10 @@ class Player(Node):
         length = self._span('play.playback_duration')
         self._end = (self._first if last is None else last) if length < 0 \
             else self._start + length
-        self._change = threading.Condition()
-        self._rate = values['play.rate']
-        self._paused = values['play.start_paused']
+        self._rate = self.get_parameter('play.rate').value
+        # While inactive it is paused.
+        self._paused = True
+        self._resumes = not values['play.start_paused']
         self._stopped = False
         self._seek: int | None = None
         self._next_wanted = 0
@@ -357,6 +369,20 @@ class Player(Node):
         self._offer()
         self._thread = threading.Thread(target=self._run, name='player', daemon=True)
         self._thread.start()
+
+    def activate(self) -> None:
+        """Play, unless it was paused before."""
+        self._set_paused(not self._resumes)
+
+    def deactivate(self) -> None:
+        """Pause."""
+        self._resumes = not self._paused
+        self._set_paused(True)
+
+    def cleanup(self) -> None:
+        """End playing."""
+        self.close()
+        self.finished = False
 
     def _names(self, parameter: str) -> tuple[str, ...]:
         """Return the full names of topics in a parameter, as they are in the bag."""
@@ -430,7 +456,6 @@ class Player(Node):
         self.create_timer(
             DIAGNOSTICS_SECONDS, self._on_diagnostics,
             clock=Clock(clock_type=ClockType.STEADY_TIME))
-        self.add_on_set_parameters_callback(self._on_set_parameters)
 
     # Sending, in the player's thread ---------------------------------------------------------
 
@@ -679,6 +704,14 @@ class Player(Node):
             self._paused = paused
             self._change.notify_all()
 
+    def _change_pause(self, paused: bool, response: Trigger.Response) -> Trigger.Response:
+        """Pause or go on, if the node is active."""
+        if not self.active:
+            response.message = f'the player is {self.state}: expected an active one'
+            return response
+        self._set_paused(paused)
+        return self._answer(response)
+
     def _answer(self, response: Trigger.Response) -> Trigger.Response:
         """Answer with the state."""
         response.success = True
@@ -688,20 +721,17 @@ class Player(Node):
     def _on_pause(
             self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Pause."""
-        self._set_paused(True)
-        return self._answer(response)
+        return self._change_pause(True, response)
 
     def _on_resume(
             self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Go on."""
-        self._set_paused(False)
-        return self._answer(response)
+        return self._change_pause(False, response)
 
     def _on_toggle(
             self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Pause or go on."""
-        self._set_paused(not self._paused)
-        return self._answer(response)
+        return self._change_pause(not self._paused, response)
 
     def _on_is_paused(
             self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -715,7 +745,7 @@ class Player(Node):
         """Send one message while paused."""
         answer = threading.Event()
         with self._change:
-            if not self._paused or self._stopped:
+            if not self.active or not self._paused or self._stopped:
                 response.message = 'not paused: expected a paused player; call pause first'
                 return response
             self._next_wanted += 1
@@ -751,12 +781,15 @@ class Player(Node):
                     specs[parameter.name].check(parameter.value)
                 except BadInputError as error:
                     return SetParametersResult(successful=False, reason=str(error))
-            length = (self._end - self._first) * 1e-9
-            if parameter.name == 'play.seek' and parameter.value > length:
-                return SetParametersResult(
-                    successful=False, reason=f'parameter play.seek is {parameter.value:g}: '
-                    f'expected at most {length:g} s, where playing ends')
+            if parameter.name == 'play.seek' and not self._stopped:
+                length = (self._end - self._first) * 1e-9
+                if parameter.value > length:
+                    return SetParametersResult(
+                        successful=False, reason=f'parameter play.seek is {parameter.value:g}: '
+                        f'expected at most {length:g} s, where playing ends')
         for parameter in parameters:
+            if self._stopped:
+                break  # a rate set now is that of the next time
             if parameter.name == 'play.rate':
                 self._set_rate(parameter.value)
             elif parameter.name == 'play.seek' and parameter.value >= 0.0:
@@ -777,7 +810,7 @@ class Player(Node):
 
     def _on_diagnostics(self) -> None:
         """Publish the state."""
-        state = 'paused' if self._paused else 'playing'
+        state = 'inactive' if not self.active else 'paused' if self._paused else 'playing'
         values = {
             'bag': str(self._reader.path), 'state': state, 'sent': str(self._sent),
             'position': f'{(self._position - self._first) * 1e-9:.3f}',
@@ -795,7 +828,9 @@ class Player(Node):
     def close(self) -> None:
         """End the player's thread."""
         self._stop()
-        self._thread.join()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
 
 
 def main(args: Sequence[str] | None = None) -> int:

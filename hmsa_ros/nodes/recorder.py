@@ -3,6 +3,9 @@ Recorder: writes topics to a bag, counts what is lost, and says so.
 
 The node's own executor serves discovery, services and diagnostics. Messages take another way:
 `Capture` takes them off their subscriptions in a thread, `Recording` writes them in another.
+
+As a managed node it opens the bag when it is configured, records while it is active, and closes
+the bag when it is cleaned up.
 """
 
 from bisect import bisect_left
@@ -42,7 +45,7 @@ from hmsa_ros.bag.writer import BagWriter, parse_custom_data, PRESETS, Topic
 from hmsa_ros.errors import BadInputError, BagError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.capture import Capture, RawSubscription, SimulatedTime, Taken
-from hmsa_ros.nodes.parameter_service import CarefulParameterService
+from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.parameters import declare, ParameterSpec
 from hmsa_ros.nodes.qos import stored, subscription
 from hmsa_ros.nodes.runner import run
@@ -196,7 +199,7 @@ class _Recorded:
     missed: int = 0
 
 
-class Recorder(Node):
+class Recorder(ManagedNode):
     """
     ROS 2 node that records.
 
@@ -217,9 +220,16 @@ class Recorder(Node):
     """
 
     def __init__(self) -> None:
-        super().__init__(interface.RECORDER, start_parameter_services=False)
-        self._parameter_service = CarefulParameterService(self)
+        super().__init__(interface.RECORDER)
         self._parameters_in = declare(self, PARAMETERS)
+        self.failure: BagError | None = None
+        self._closed = True
+        self.autostart()
+
+    # States ----------------------------------------------------------------------------------
+
+    def configure(self) -> None:
+        """Open the bag and start receiving."""
         values = self._parameters_in
         self._priority: int = values['record.realtime_priority']
         self._selection = Selection(
@@ -228,16 +238,15 @@ class Recorder(Node):
             values['record.exclude_regex'])
         self._topics: dict[str, _Recorded] = {}
         self._refused: dict[str, str] = {}
-        self._paused = values['record.start_paused']
+        # While inactive it is paused.
+        self._paused = True
+        self._resumes = not values['record.start_paused']
         self._sim_time = SimulatedTime() if self.get_parameter('use_sim_time').value else None
         self._experiment: dict[str, str] = {'hmsa_ros.version': __version__}
         self._setpoints: deque[str] = deque(maxlen=MAX_SETPOINTS)
         self._setpoints_noted = True
         self._setpoint_topics: set[str] = set()
         self._said_ready = False
-        self._closed = False
-        self.failure: BagError | None = None
-        self.finished = False
         limits = Limits(
             values['storage.flush_period'], values['storage.max_bagfile_size'],
             values['storage.max_bagfile_duration'] * 10**9, values['storage.max_cache_size'],
@@ -253,7 +262,21 @@ class Recorder(Node):
         self.folder: Path = writer.folder
         self._recording = Recording(writer, limits, self._report)
         self._capture = Capture(self, self._deliver)
+        self._closed = False
         self._start()
+
+    def activate(self) -> None:
+        """Record, unless it was paused before."""
+        self._paused = not self._resumes
+
+    def deactivate(self) -> None:
+        """Pause."""
+        self._resumes = not self._paused
+        self._paused = True
+
+    def cleanup(self) -> None:
+        """Close the bag."""
+        self.close()
 
     def _start(self) -> None:
         """Create what the node offers and start receiving."""
@@ -530,6 +553,9 @@ class Recorder(Node):
 
     def _set_paused(self, paused: bool, response: Trigger.Response) -> Trigger.Response:
         """Pause or go on."""
+        if not self.active:
+            response.message = f'the recorder is {self.state}: expected an active one'
+            return response
         response.success = True
         state = 'paused' if paused else 'recording'
         response.message = state if self._paused != paused else f'already {state}'
@@ -578,7 +604,8 @@ class Recorder(Node):
         self._note_setpoints()
         # In the bag at once, so that it is known after a crash too.
         self._note({'lost': self._lost_text(lost)})
-        state = ('paused' if self._paused else 'waiting for /clock'
+        state = ('inactive' if not self.active else 'paused' if self._paused
+                 else 'waiting for /clock'
                  if self._sim_time is not None and not self._sim_time.started else 'recording')
         if status.error:
             level, text = DiagnosticStatus.ERROR, status.error
