@@ -118,10 +118,17 @@ def test_toolbar_legend_and_curves_do_not_lie_over_each_other(browser, files, na
             Math.max(...all.map(x => x.right)), Math.max(...all.map(x => x.bottom))]];
         })))""")
     assert len(boxes) == len(FIGURES)
+    # Panels of arrivals of several runs have one key together.
+    without = sum(x['legend'][0] is None for x in boxes)
+    assert without == (3 if name == 'both' else 0)
     for box in boxes:
+        if box['legend'][0] is None:
+            box['legend'] = box['bar']
         for one, other in (('bar', 'legend'), ('bar', 'curves'), ('legend', 'title'),
                            ('legend', 'curves')):
             a, b = box[one], box[other]
+            if a is b:
+                continue
             apart = a[2] <= b[0] or b[2] <= a[0] or a[3] <= b[1] + 1 or b[3] <= a[1] + 1
             assert apart, (one, a, other, b)
 

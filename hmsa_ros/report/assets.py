@@ -42,6 +42,11 @@ figure { margin: 0.5rem 0; min-width: 0; }
   display: grid; gap: 0.5rem 1rem;
   grid-template-columns: repeat(auto-fit, minmax(min(20rem, 100%), 1fr));
 }
+.key { display: flex; flex-wrap: wrap; gap: 0.1rem 1.2rem; list-style: none; margin: 0.4rem 0;
+  padding: 0; font-size: 0.9rem; overflow-wrap: anywhere; }
+.key i { display: inline-block; width: 1.6rem; height: 0.2rem; margin-right: 0.4rem;
+  vertical-align: middle; background: var(--light); }
+@media (prefers-color-scheme: dark) { .key i { background: var(--dark); } }
 .scroll { overflow: auto; max-width: 100%; }
 .long { max-height: 30rem; border-bottom: 1px solid var(--line); }
 table { border-collapse: collapse; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
@@ -116,9 +121,21 @@ SCRIPT = """
     modeBarButtonsToRemove: ['select2d', 'lasso2d', 'autoScale2d'],
     toImageButtonOptions: {format: 'svg'},
   };
-  const draw = (element, figure) => {
+  // A legend of many names makes its figure taller, not the plot lower.
+  const grow = (element, figure) => {
+    const legend = element.querySelector('.legend .bg');
+    const rows = legend ? legend.getBoundingClientRect().height : 0;
+    const height = Math.round(figure.height + Math.max(rows - 30, 0));
+    if (Math.abs(parseFloat(element.style.height) - height) < 2) return undefined;
+    element.style.height = `${height}px`;
+    return Plotly.Plots.resize(element);
+  };
+  const draw = async (element, figure) => {
     const now = coloured(figure);
-    return Plotly.react(element, now.data, themed(now.layout), config);
+    await Plotly.react(element, now.data, themed(now.layout), config);
+    await grow(element, figure);
+    // The first time it may have been cut for want of room.
+    await grow(element, figure);
   };
   const figures = given.figures.map(figure => [document.getElementById(figure.key), figure]);
   const drawn = new Set();

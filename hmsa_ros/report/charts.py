@@ -212,15 +212,18 @@ def _names(part: Part, what: str) -> tuple[str, str]:
     if not part.colour:
         return what, what
     name = f'{part.run.label}: {what}'
-    return name, (name if what in _SIMULATED else part.run.label)
+    return name, (what if what in _SIMULATED else part.run.label)
 
 
 def _grouped(data: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return curves with each group once in the legend."""
+    """Return curves with each group once in the legend, by its own name."""
     seen: set[str] = set()
     for trace in data:
-        trace['showlegend'] = trace['legendgroup'] not in seen
-        seen.add(trace['legendgroup'])
+        group = trace['legendgroup']
+        trace['showlegend'] = group not in seen
+        if group not in seen and text(group) in trace['name'].split(': '):
+            trace['name'] = text(group)
+        seen.add(group)
     return data
 
 
@@ -446,7 +449,9 @@ def _results(parts: Sequence[Part], number: int) -> list[MoveResult]:
 def _panel_title(parts: Sequence[Part], number: int) -> str:
     results = _results(parts, number)
     targets = ', '.join(dict.fromkeys(f'{x.stretch:.6g}' for x in results))
-    left = ', '.join(percent(x.residual) for x in results)
+    shares = [x.residual for x in results if math.isfinite(x.residual)] or [math.nan]
+    # Which is whose stands in the table.
+    left = ' to '.join(dict.fromkeys(percent(x) for x in (min(shares), max(shares))))
     return f'{number + 1}. to {targets}: residual {left}'
 
 
@@ -521,6 +526,8 @@ def arrival(parts: Sequence[Part], number: int) -> Figure:
     title = _panel_title(parts, number)
     return Figure(
         f'arrival{number}', f'Setpoint {title}', 300, _grouped(data), {
+            # There is no room in every panel for the names of several runs.
+            'showlegend': len(parts) == 1,
             'xaxis': _axis(f'time after arrival [{unit.name}]', range=numbers(view)),
             'yaxis': _axis('distance [% of step]', range=[-height, height]),
             'shapes': [{

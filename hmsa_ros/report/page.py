@@ -117,7 +117,7 @@ def page(parts: Sequence[Part]) -> str:
                     '' if count <= len(panels) else
                     f' The {len(panels)} of {count} setpoints with the largest residual; the '
                     'table has all.'))
-             + '<div class="grid">' + ''.join(
+             + _key(parts) + '<div class="grid">' + ''.join(
                  place(charts.arrival(parts, i), title) for i, title in panels) + '</div>'),
             ('residual-section', 'Shaped against unshaped', _text(
                 'Residual of each setpoint as recorded, and as it would have been with plain '
@@ -146,7 +146,7 @@ def page(parts: Sequence[Part]) -> str:
         sections.insert(-2, ('requests', 'Requests', requests))
     names = ', '.join(x.run.label for x in parts)
     data = json.dumps(
-        {'figures': [{'key': x.key, 'data': x.data, 'layout': x.layout} for x in figures],
+        {'figures': [{'key': x.key, 'height': x.height, 'data': x.data, 'layout': x.layout} for x in figures],
          'dark': charts.DARK}, separators=(',', ':'), allow_nan=False)
     body = [
         f'<h1>{escape(names)}</h1>', ''.join(_source(x.run) for x in parts), _tiles(parts),
@@ -228,6 +228,15 @@ def _tiles(parts: Sequence[Part]) -> str:
     return _table(
         'run-table', 'The runs.', ['run', *header],
         [[x.run.label, *row] for x, row in zip(parts, rows, strict=True)])
+
+
+def _key(parts: Sequence[Part]) -> str:
+    """Return which colour is which run's."""
+    if len(parts) == 1:
+        return ''
+    return '<ul class="key">' + ''.join(
+        f'<li><i style="--light: {x.colour}; --dark: {charts.DARK[x.colour]}"></i>'
+        f'{escape(x.run.label)}</li>' for x in parts) + '</ul>'
 
 
 def _notes(parts: Sequence[Part]) -> str:
