@@ -57,6 +57,10 @@ docs: env ## build the documentation into docs/_build/html, warnings as errors
 graph: env ## draw docs/images/graph.svg anew, when a topic has changed
 	$(BIN)/python scripts/draw_graph.py
 
+.PHONY: theory
+theory: env ## draw the figures of docs/theory.md anew
+	$(BIN)/python scripts/draw_theory.py
+
 .PHONY: constraints
 constraints: ## write constraints.txt anew, with each of $(PYTHONS)
 	$(PYTHON) scripts/make_constraints.py $(PYTHONS)

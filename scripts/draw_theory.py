@@ -1,0 +1,139 @@
+"""
+Draw the figures of docs/theory.md into docs/images, from the package itself.
+
+Used by ``make theory``.
+"""
+
+from pathlib import Path
+import sys
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+from hmsa_ros.core.delivery import Delivery, pieces  # noqa: E402
+from hmsa_ros.core.model import elastic_force, stretch_limits  # noqa: E402
+from hmsa_ros.core.moves import State  # noqa: E402
+from hmsa_ros.core.parameters import NondimensionalParameters  # noqa: E402
+from hmsa_ros.core.sequence import plan_sequence, Setpoint  # noqa: E402
+from hmsa_ros.core.simulation import simulate  # noqa: E402
+from hmsa_ros.core.two_step import plan_two_step  # noqa: E402
+from hmsa_ros.figures import style  # noqa: E402
+
+FOLDER = ROOT / 'docs' / 'images'
+MATERIAL = NondimensionalParameters(zeta=0.2, j_lim=5.0)
+
+
+def force(path: Path) -> None:
+    """Draw the load that holds a stretch, and where the chains end it."""
+    with style.picture(path, 2.9, width=5.0) as figure:
+        axes = figure.add_subplot()
+        looks = ((1.0, style.VERMILION, '--'), (3.0, style.GREEN, '-.'), (5.0, style.BLUE, '-'))
+        for j_lim, colour, line in looks:
+            lower, upper = stretch_limits(j_lim)
+            stretch = np.linspace(lower, upper, 2001)[1:-1]
+            load = elastic_force(stretch, j_lim)
+            axes.plot(stretch, load, color=colour, linestyle=line,
+                      label=rf'$J_\mathrm{{lim}}$ = {j_lim:g}')
+            for limit in (lower, upper):
+                axes.axvline(limit, color=colour, linestyle=':', linewidth=0.8)
+        axes.axhline(0.0, color=style.GREY, linewidth=0.6)
+        axes.plot([1.0], [0.0], **style.EQUILIBRIUM)
+        axes.set_ylim(-8.0, 8.0)
+        axes.legend(loc=(0.22, 0.66))
+        style.finish(axes, r'stretch $\lambda$', r"load that holds it, $\beta_1 = \psi'$")
+
+
+def two_steps(path: Path) -> None:
+    """Draw the two-step move over time and in the phase plane."""
+    plan = plan_two_step(1.0, 1.4, MATERIAL)
+    time = np.linspace(0.0, 6.0, 1201)
+    shaped = simulate([0.0, plan.tau_p], [plan.beta_p, plan.beta_1], time, MATERIAL)
+    weak = simulate([0.0], [plan.beta_p], time, MATERIAL)
+    plain = simulate([0.0], [plan.beta_1], time, MATERIAL)
+    with style.picture(path, 3.1) as figure:
+        left, right = figure.subplots(1, 2, width_ratios=[1.2, 1.0])
+        grey = {'color': style.GREEN, 'linewidth': 1.2, 'linestyle': '-.', 'zorder': 2}
+        left.plot(time, plain[0], label=r'$\beta_1$ alone', **style.UNSHAPED)
+        left.plot(time, weak[0], label=r'$\beta_p$ alone', **grey)
+        left.plot(time, shaped[0], label=r'$\beta_p$, then $\beta_1$', **style.SHAPED)
+        left.axvline(plan.tau_p, **style.TARGET)
+        left.annotate(r'$\tau_p$', (plan.tau_p, 1.0), (4, 0), textcoords='offset points')
+        left.axhline(1.4, **style.TARGET)
+        left.legend(loc='lower right')
+        style.finish(left, r'time $\tau$', r'stretch $\lambda$', 'a')
+        right.plot(*plain, **style.UNSHAPED)
+        right.plot(*weak, **grey)
+        right.plot(*shaped, **style.SHAPED)
+        right.plot([1.0, 1.4], [0.0, 0.0], **style.EQUILIBRIUM)
+        right.annotate('start', (1.0, 0.0), (6, -12), textcoords='offset points')
+        right.annotate('target', (1.4, 0.0), (6, -12), textcoords='offset points')
+        style.finish(right, r'stretch $\lambda$', r'stretch rate $\dot\lambda$', 'b')
+
+
+def energy(path: Path) -> None:
+    """Draw why two paths cannot cross: stretch rate over stretch for a range of loads."""
+    plan = plan_two_step(1.0, 1.4, MATERIAL)
+    time = np.linspace(0.0, 3.0, 1201)
+    with style.picture(path, 2.9, width=5.0) as figure:
+        axes = figure.add_subplot()
+        for share in (0.7, 0.85, 1.15, 1.3):
+            stretch, rate = simulate([0.0], [plan.beta_p * share], time, MATERIAL)
+            end = int(np.argmax(rate[1:] <= 0.0)) + 2
+            axes.plot(stretch[:end], rate[:end], color=style.GREY, linewidth=0.9)
+            top = int(np.argmax(rate[:end]))
+            axes.annotate(rf'{share:g} $\beta_p$', (stretch[top], rate[top]), (0, 3), ha='center',
+                          textcoords='offset points', fontsize=7, color='#555555')
+        stretch, rate = simulate([0.0], [plan.beta_p], time, MATERIAL)
+        end = int(np.argmax(rate[1:] <= 0.0)) + 2
+        axes.plot(stretch[:end], rate[:end], **style.SHAPED)
+        axes.plot([1.0, 1.4], [0.0, 0.0], **style.EQUILIBRIUM)
+        axes.set_ylim(top=0.7)
+        style.finish(
+            axes, r'stretch $\lambda$', r'stretch rate $\dot\lambda$ until it turns')
+
+
+def deliveries(path: Path) -> None:
+    """Draw the same move as an ideal, a sampled and a ramped command."""
+    period = 0.4
+    cases = (
+        ('ideal', Delivery()), (f'on a grid of {period:g}', Delivery(period=period)),
+        ('ramped, 0.8 a unit of time', Delivery(slew=0.8)))
+    time = np.linspace(0.0, 3.0, 601)
+    holding = 0.0
+    with style.picture(path, 3.1) as figure:
+        rows = figure.subplots(2, 3, sharex=True, sharey='row', height_ratios=[1.0, 1.2])
+        for i, (title, delivery) in enumerate(cases):
+            segment, = plan_sequence(
+                [Setpoint(1.4, 20 * period)], MATERIAL, start=State(1.0, 0.0, 0.0),
+                delivery=delivery)
+            levels = segment.move.levels
+            switches, loads, slopes, _ = pieces(levels, holding, 3.0, delivery.slew)
+            stretch, _ = simulate(switches, loads, time, MATERIAL, slopes=slopes)
+            command = np.zeros_like(time)
+            for at, load, slope in zip(switches, loads, slopes, strict=True):
+                after = time >= at
+                command[after] = load + slope * (time[after] - at)
+            rows[0, i].plot(time, command, **style.SHAPED)
+            rows[1, i].plot(time, stretch, **style.SHAPED)
+            rows[1, i].axhline(1.4, **style.TARGET)
+            if delivery.period:
+                for at in np.arange(0.0, 3.0, period):
+                    rows[0, i].axvline(at, **style.TARGET)
+            style.finish(rows[0, i], '', '' if i else r'load $\beta$', 'abc'[i])
+            rows[0, i].set_title(title, fontsize=8)
+            style.finish(rows[1, i], r'time $\tau$', '' if i else r'stretch $\lambda$')
+
+
+def main() -> int:
+    """Draw all of them."""
+    force(FOLDER / 'theory_force.png')
+    two_steps(FOLDER / 'theory_two_steps.png')
+    energy(FOLDER / 'theory_paths.png')
+    deliveries(FOLDER / 'theory_deliveries.png')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
