@@ -10,10 +10,13 @@ from dataclasses import dataclass, field
 from itertools import groupby
 import math
 
+from hmsa_ros.core.history import Deviation
 from hmsa_ros.core.planner import Planner
 from hmsa_ros.core.status import RefusedError
 from hmsa_ros.core.timeline import Draft, Plan, PlannedSegment
 
+# How often running a plan is made anew, with no command in time in between.
+_ATTEMPTS = 3
 # What a joint counts as resting within, relative to its load and its natural frequency.
 _AT_REST = 1e-6
 # The first of these that some joint is in is that of all.
@@ -55,12 +58,15 @@ class Resumption:
         Setpoints that were left out.
     stopped : mapping of str to str
         Joints that come to rest instead, and why.
+    given_up : tuple of str
+        Joints whose plan stays as it is, since it was made anew in vain several times running.
 
     """
 
     resumed: int = 0
     missed: int = 0
     stopped: Mapping[str, str] = field(default_factory=dict)
+    given_up: tuple[str, ...] = ()
 
 
 class PlannerGroup:
@@ -91,6 +97,7 @@ class PlannerGroup:
         self.planners = dict(planners)
         self.simultaneous = simultaneous
         self.number = 0
+        self._attempts = dict.fromkeys(self.planners, 0)
 
     # -- requests ------------------------------------------------------------------------------
 
@@ -153,12 +160,16 @@ class PlannerGroup:
         """
         for name, draft in drafts.items():
             self.planners[name].take(draft, now)
+            self._attempts[name] = 0
         self.number += bool(drafts)
         return bool(drafts)
 
     def resume(self, names: Iterable[str], now: int) -> Resumption:
         """
         Plan what is left of the running plans anew, and stop the joints for which that fails.
+
+        Where commands come late for ever, so would those of every new plan: a joint whose plan
+        was made anew several times with no command in time since is left alone.
 
         Parameters
         ----------
@@ -175,7 +186,12 @@ class PlannerGroup:
         """
         resumed = missed = 0
         stopped = {}
+        given_up = []
         for name in names:
+            if self._attempts[name] >= _ATTEMPTS:
+                given_up.append(name)
+                continue
+            self._attempts[name] += 1
             planner = self.planners[name]
             try:
                 draft = planner.draft_resumption(now)
@@ -186,7 +202,34 @@ class PlannerGroup:
                 resumed += draft is not None
                 missed += 0 if draft is None else draft.missed
             planner.take(draft, now)
-        return Resumption(resumed, missed, stopped)
+        return Resumption(resumed, missed, stopped, tuple(given_up))
+
+    def applied(
+            self, name: str, stamp: int, flux_density: float,
+            tolerance: int) -> Deviation | None:
+        """
+        Take in a change of level of a joint that has taken effect.
+
+        Parameters
+        ----------
+        name : str
+            Joint.
+        stamp, flux_density, tolerance : int, float, int
+            As for `Planner.applied`.
+
+        Returns
+        -------
+        Deviation or None
+            What calls for a plan to be made anew; None if it is near enough as planned.
+
+        """
+        found = self.planners[name].applied(stamp, flux_density, tolerance)
+        if found is None:
+            return None
+        if found.foreign or found.lost or abs(found.late) > tolerance:
+            return found
+        self._attempts[name] = 0
+        return None
 
     def _each(
             self, names: Iterable[str],
@@ -303,7 +346,7 @@ class PlannerGroup:
         """
         stamps = sorted({
             level.stamp for planner in self.planners.values()
-            for level in planner.plan.levels if level.stamp >= 0})
+            for level in planner.plan.ahead})
         return stamps, {
             name: _samples(planner.plan, stamps) for name, planner in self.planners.items()}
 

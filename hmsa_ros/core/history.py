@@ -89,7 +89,7 @@ class History:
         history : History
             With predictions under what really happened.
         deviation : Deviation or None
-            None if it is as planned, or no news.
+            All zero if it is as planned; None if it is no news.
 
         """
         levels, known = self.levels, self.known
@@ -118,7 +118,7 @@ class History:
         changed = (*levels[:known + 1], news, *after)
         count = known + 2 + max(self.sent - rest, 0)
         if deviation == Deviation():
-            return History(changed, count, known + 1), None
+            return History(changed, count, known + 1), deviation
         return History(predicted(changed, known + 1), count, known + 1), deviation
 
     def _place(

@@ -138,10 +138,8 @@ class Planner:
     def _begin_with(self, level: PlannedLevel, number: int) -> None:
         self.plan = Plan(number, (level,), ())
         self._unsent = 1
-        # Place of the last level that is known to have taken effect, and whether there is news
-        # of that at all.
+        # Place of the last level that is known to have taken effect.
         self._known = 0
-        self._told = False
 
     def restart(self) -> None:
         """
@@ -421,23 +419,24 @@ class Planner:
         kept = bisect_left(stamps, begin)
         # What is over and handed out is forgotten, but for the level in force, and for those
         # that there may still be news of.
-        first = max(min(self._unsent, kept, bisect_right(stamps, now)) - 1, 0)
-        if self._told:
-            first = max(min(first, self._known), first - _REMEMBERED, 0)
+        over = max(min(self._unsent, kept, bisect_right(stamps, now)) - 1, 0)
+        first = max(min(over, self._known), over - _REMEMBERED)
         self._known = max(min(self._known, kept - 1) - first, 0)
         self._unsent = min(self._unsent, kept) - first
         levels = old.levels[first:kept] + draft.levels
         if draft.resumed is None:
             running = [x for x in old.segments if x.spell < begin]
-            over = max(bisect_right([x.spell for x in running], now) - 1, 0)
+            done = max(bisect_right([x.spell for x in running], now) - 1, 0)
             segments = tuple(
                 replace(x, arrival=None) if x.arrival is not None and x.arrival > begin else x
-                for x in running[over:])
-            self.plan = Plan(old.number + 1, levels, segments + draft.segments, len(segments))
+                for x in running[done:])
+            self.plan = Plan(
+                old.number + 1, levels, segments + draft.segments, len(segments), over - first)
         else:
             before = old.segments[:draft.resumed]
             self.plan = Plan(
-                old.number, levels, before + draft.segments, min(old.kept, len(before)))
+                old.number, levels, before + draft.segments, min(old.kept, len(before)),
+                over - first)
         return self.plan
 
     def due(self, now: int) -> tuple[PlannedLevel, ...]:
@@ -522,10 +521,9 @@ class Planner:
         Returns
         -------
         Deviation or None
-            None if it is as planned, or no news.
+            All zero if it is as planned; None if it is no news.
 
         """
-        self._told = True
         history, deviation = self._history.with_news(stamp, flux_density, tolerance)
         self._remember(history)
         return deviation
@@ -535,7 +533,7 @@ class Planner:
         return History(self.plan.levels, self._unsent, self._known)
 
     def _remember(self, history: History) -> None:
-        self.plan = replace(self.plan, levels=history.levels)
+        self.plan = replace(self.plan, levels=history.levels, past=0)
         self._unsent, self._known = history.sent, history.known
 
     def state(self, time: int) -> State:

@@ -295,11 +295,14 @@ class Plan:
     number : int
         Counts accepted requests from 1; 0 before the first.
     levels : tuple of PlannedLevel
-        By stamp; the first may lie in the past.
+        By stamp; the first ones may lie in the past.
     segments : tuple of PlannedSegment
         By time.
     kept : int
         How many of them, the first ones, belong to earlier requests.
+    past : int
+        How many levels, the first ones, are over and kept only until it is known when they
+        took effect.
 
     """
 
@@ -307,6 +310,12 @@ class Plan:
     levels: tuple[PlannedLevel, ...]
     segments: tuple[PlannedSegment, ...]
     kept: int = 0
+    past: int = 0
+
+    @property
+    def ahead(self) -> tuple[PlannedLevel, ...]:
+        """Levels from the one in force on, when it was made; none that is in force for ever."""
+        return tuple(x for x in self.levels[self.past:] if x.stamp >= 0)
 
     def level(self, time: int) -> PlannedLevel:
         """Return the level in force at a time, the first one before that."""

@@ -221,7 +221,7 @@ def to_plan(plan: 'Plan', joint: str) -> JointTrajectory:
         stretch, stretch rate and the flux density from then on.
 
     """
-    levels = [level for level in plan.levels if level.stamp >= 0]
+    levels = plan.ahead
     start = levels[0].stamp if levels else 0
     return JointTrajectory(
         header=Header(stamp=to_time(start)), joint_names=[joint],
