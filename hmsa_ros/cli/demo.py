@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
+from hmsa_ros.cli.progress import progress
 from hmsa_ros.ending import Ending
 
 if TYPE_CHECKING:
@@ -56,7 +57,6 @@ def run(arguments: argparse.Namespace) -> int:
 
     """
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from hmsa_ros.session.processes import local_environment
 
@@ -71,16 +71,8 @@ def run(arguments: argparse.Namespace) -> int:
     console.print(
         f'ROS_DOMAIN_ID {os.environ["ROS_DOMAIN_ID"]}, output in {folder}', highlight=False)
     try:
-        with Progress(
-                TextColumn('{task.description:<22}'), BarColumn(), TextColumn(
-                    '{task.percentage:>3.0f} %'), TimeElapsedColumn(),
-                console=console) as progress:
-            task = progress.add_task('starting', total=1.0)
-
-            def report(what: str, share: float) -> None:
-                progress.update(task, description=what, completed=share)
-
-            result = run_demo(folder, dict(os.environ), report, ending)
+        with progress() as update:
+            result = run_demo(folder, dict(os.environ), update, ending)
             ending.check()
     except KeyboardInterrupt:
         console.print(f'interrupted; the bag so far: {folder / "run"}', highlight=False)

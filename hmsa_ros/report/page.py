@@ -146,7 +146,9 @@ def page(parts: Sequence[Part]) -> str:
         sections.insert(-2, ('requests', 'Requests', requests))
     names = ', '.join(x.run.label for x in parts)
     data = json.dumps(
-        {'figures': [{'key': x.key, 'height': x.height, 'data': x.data, 'layout': x.layout} for x in figures],
+        {'figures': [
+            {'key': x.key, 'height': x.height, 'data': x.data, 'layout': x.layout}
+            for x in figures],
          'dark': charts.DARK}, separators=(',', ':'), allow_nan=False)
     body = [
         f'<h1>{escape(names)}</h1>', ''.join(_source(x.run) for x in parts), _tiles(parts),
