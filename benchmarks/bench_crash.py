@@ -30,7 +30,7 @@ def source(rate):
     from std_msgs.msg import Float64
     rclpy.init()
     node = rclpy.create_node('source', enable_rosout=False)
-    publisher = node.create_publisher(Float64, '/load', 1000)
+    publisher = node.create_publisher(Float64, '/load', 10_000)
     begin, i = time.monotonic(), 0
     while rclpy.ok():
         publisher.publish(Float64(data=float(i)))
@@ -64,7 +64,7 @@ class Recorder:
         self.process.kill()
 
     def loss(self):
-        """Recover the bag; return the loss in seconds and the number of messages."""
+        """Recover the bag; return the loss in seconds, the number of messages and of gaps."""
         from rosbags.rosbag2 import Reader
 
         from hmsa_ros.bag.reader import BagReader
@@ -75,9 +75,9 @@ class Recorder:
         with Reader(recovered) as reader:
             stamps = [stamp for _, stamp, _ in reader.messages()]
         sequences = [message.sequence for message in BagReader(recovered).messages()]
-        if sequences != list(range(sequences[0], sequences[0] + len(sequences))):
-            raise RuntimeError(f'{recovered} has gaps')
-        return (self.killed - stamps[-1]) * 1e-9, len(stamps)
+        # What the middleware lost while the processor was busy: not the kill's doing.
+        gaps = sequences[-1] - sequences[0] + 1 - len(sequences)
+        return (self.killed - stamps[-1]) * 1e-9, len(stamps), gaps
 
 
 def compare(*, quick):
@@ -92,7 +92,7 @@ def compare(*, quick):
     Returns
     -------
     Sheet
-        Passed if no loss is larger than the flush period.
+        Passed if no loss is larger than the flush period, and nothing is missing before.
 
     """
     from benchmarks.sheet import Sheet
@@ -105,7 +105,7 @@ def compare(*, quick):
         [sys.executable, str(Path(__file__).resolve())], stderr=subprocess.DEVNULL,
         env=environment)
     dice = random.Random(1)
-    losses, count = [], 0
+    losses, count, missing = [], 0, 0
     recorders = []
     try:
         with tempfile.TemporaryDirectory() as folder:
@@ -120,9 +120,10 @@ def compare(*, quick):
                     time.sleep(dice.uniform(0.0, 3.0 * FLUSH_PERIOD / len(recorders)))
                     recorder.kill()
                 for recorder in recorders:
-                    loss, messages = recorder.loss()
+                    loss, messages, gaps = recorder.loss()
                     losses.append(loss)
                     count += messages
+                    missing += gaps
     finally:
         for recorder in recorders:
             recorder.process.kill()
@@ -133,10 +134,12 @@ def compare(*, quick):
     return Sheet(
         'crash', f'Loss when the recorder is killed, at {RATE:g} messages/s and a flush period '
         f'of {FLUSH_PERIOD:g} s',
-        ['kills', 'bags recovered', 'messages recovered', 'median loss', 'largest loss'],
-        [[str(kills), str(len(losses)), f'{count:,}', f'{statistics.median(losses):.3f} s',
-          f'{losses[-1]:.3f} s']],
-        {'losses': losses, 'messages': count}, losses[-1] <= FLUSH_PERIOD)
+        ['kills', 'bags recovered', 'messages recovered', 'missing among them', 'median loss',
+         'largest loss'],
+        [[str(kills), str(len(losses)), f'{count:,}', f'{missing:,}',
+          f'{statistics.median(losses):.3f} s', f'{losses[-1]:.3f} s']],
+        {'losses': losses, 'messages': count, 'missing': missing},
+        losses[-1] <= FLUSH_PERIOD and not missing)
 
 
 if __name__ == '__main__':

@@ -300,8 +300,8 @@ class Recording:
 
     def _run(self) -> None:
         """Write until the end."""
-        # A little more often than promised: receiving and writing take time too.
-        period = 0.8 * self._limits.flush_period
+        # More often than promised: receiving and writing take time too.
+        period = 0.6 * self._limits.flush_period
         next_flush = time.monotonic() + period
         while True:
             with self._condition:

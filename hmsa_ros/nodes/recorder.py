@@ -54,6 +54,8 @@ DIAGNOSTICS_SECONDS = 1.0
 # Setpoints kept for the bag's custom data: how many, and of what length altogether.
 MAX_SETPOINTS = 1000
 _SETPOINTS_LENGTH = 2**18
+# One look in so many asks for the publishers of every topic, changed in number or not.
+_FULL_LOOK = 10
 # Nodes whose parameters are asked for.
 _MAX_NODES = 256
 
@@ -194,6 +196,7 @@ class _Recorded:
     number: int
     qos: QoSProfile
     offered: tuple[Qos, ...]
+    publishers: int = 0
     last: dict[bytes, int] = field(default_factory=dict)
     received: int = 0
     missed: int = 0
@@ -247,6 +250,7 @@ class Recorder(ManagedNode):
         self._setpoints_noted = True
         self._setpoint_topics: set[str] = set()
         self._said_ready = False
+        self._polls = 0
         limits = Limits(
             values['storage.flush_period'], values['storage.max_bagfile_size'],
             values['storage.max_bagfile_duration'] * 10**9, values['storage.max_cache_size'],
@@ -330,6 +334,7 @@ class Recorder(ManagedNode):
             self.finished = True
         if self._sim_time is not None and not self._sim_time.started:
             return
+        self._polls += 1
         self._find_nodes()
         for name, types in self.get_topic_names_and_types():
             if self._selection.wants(name):
@@ -363,8 +368,14 @@ class Recorder(ManagedNode):
     def _look_at(self, name: str, types: Sequence[str]) -> None:
         """Subscribe to a topic, or again if its publishers ask for it."""
         known = self._topics.get(name)
+        # Asking who they are takes five times as long as how many.
+        count = self.count_publishers(name)
+        if known is not None and count == known.publishers and self._polls % _FULL_LOOK:
+            return
         infos = [info for info in self.get_publishers_info_by_topic(name)
                  if known is None or info.topic_type == known.type]
+        if known is not None:
+            known.publishers = count
         if not infos:
             return
         offered = tuple(sorted((stored(info.qos_profile) for info in infos), key=repr))
