@@ -193,3 +193,37 @@ def test_a_wrong_name_in_any_other_block_is_found(language, marker, text, reason
     ('ini', '', "is in 'ini'"), ('{code-block}', '', 'is in')])
 def test_a_block_cannot_be_left_out(language, marker, reason):
     assert reason in fault(a_block(language, 'x', marker), None)
+
+
+@pytest.mark.ros
+def test_driver_of_the_tutorial_keeps_the_contract_of_a_driver(start, ros):
+    from hmsa_ros.nodes import interface
+    from hmsa_ros.nodes.conversions import from_time, to_command
+
+    applied = ros.collect(
+        interface.FLUX_DENSITY_APPLIED.type, interface.FLUX_DENSITY_APPLIED.name,
+        interface.FLUX_DENSITY_APPLIED.qos)
+    states = ros.collect(interface.JOINT_STATES.type, interface.JOINT_STATES.name)
+    driver = start.python(ROOT / 'docs' / 'tutorials' / 'coil_driver.py')
+    command = ros.publisher(
+        interface.FLUX_DENSITY_COMMAND.type, interface.FLUX_DENSITY_COMMAND.name,
+        interface.FLUX_DENSITY_COMMAND.qos)
+    ros.spin_until(lambda: applied and states, 'the level at the start')
+    assert applied[0].magnetic_field.z == 0.0
+
+    now = ros.node.get_clock().now().nanoseconds
+    stamps = [now + 400_000_000, now + 600_000_000]
+    command.publish(to_command(stamps[0], 0.01, 'coil'))
+    # Taken back by the one after it, which is stamped before it.
+    command.publish(to_command(now + 900_000_000, 0.5, 'coil'))
+    command.publish(to_command(stamps[1], 0.02, 'coil'))
+    command.publish(to_command(stamps[1] + 1, float('nan'), 'coil'))
+    # No word follows: the watchdog switches off.
+    ros.spin_until(lambda: len(applied) == 4, 'two levels, and the coil switched off')
+    assert [x.magnetic_field.z for x in applied] == [0.0, 0.01, 0.02, 0.0]
+    assert all(from_time(x.header.stamp) >= stamp
+               for x, stamp in zip(applied[1:], [*stamps, now + 10**9], strict=False))
+    assert states[-1].name == ['actuator']
+    assert driver.stop() == 0
+    assert 'nan T refused' in driver.stderr
+    assert 'the coil is switched off' in driver.stderr
