@@ -1,21 +1,28 @@
 """A recorded run: integrated again from the bag, and played to a second plant."""
 
+from dataclasses import fields, replace
 import json
 import re
 import time
 
 import pytest
 from rclpy.qos import QoSProfile
-from sensor_msgs.msg import MagneticField
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import JointState, MagneticField
+from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
+from hmsa_ros.bag.definitions import message_definition
 from hmsa_ros.bag.reader import read_messages
 from hmsa_ros.bag.verify import verify
-from hmsa_ros.bag.writer import BagWriter
+from hmsa_ros.bag.writer import BagWriter, Topic
+from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
+from hmsa_ros.core.simulation import ActuatorSimulation
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes.conversions import to_command
 
 SAME = 1e-9
+BEGIN = 1_000_000_000
 
 
 def samples(bag):
@@ -97,6 +104,73 @@ def test_a_second_plant_moves_the_same_when_the_bag_is_played(
     assert max(abs(first[stamp] - second[stamp]) for stamp in common) < SAME
     moved = [first[stamp] for stamp in common]
     assert max(moved) - min(moved) > 1e-3
+
+
+def write_joints(folder, densities, *, told=None, space=''):
+    """Write a run of several joints of one plant that differ in density."""
+    actuators = {joint: replace(paper_actuator(), density=density)
+                 for joint, density in densities.items()}
+    told = told or densities
+    custom_data = {f'{space}/plant.use_sim_time': 'false', f'{space}/plant.slew_limit': '0.0'} | {
+        f'{space}/plant.actuator.{field.name}': json.dumps(getattr(paper_actuator(), field.name))
+        for field in fields(ActuatorParameters) if field.init} | {
+        f'{space}/plant.{joint}.actuator.density': json.dumps(density)
+        for joint, density in told.items()} | {f'{space}/plant.one.slew_limit': 'null'}
+    simulations = {joint: ActuatorSimulation(actuator, time=BEGIN)
+                   for joint, actuator in actuators.items()}
+    with BagWriter(folder, custom_data=custom_data) as writer:
+        def topic(name, kind):
+            encoding, text = message_definition(kind)
+            return writer.add_topic(Topic(f'{space}/{name}', kind, text, encoding))
+
+        states = topic('joint_states', 'sensor_msgs/msg/JointState')
+        for i, (joint, simulation) in enumerate(simulations.items()):
+            stamp = BEGIN + 10_000_000 * (i + 1)
+            simulation.command(stamp, 0.01)
+            writer.write([(
+                topic(f'{joint}/flux_density_command', 'sensor_msgs/msg/MagneticField'),
+                BEGIN + 1, 0, 0, serialize_message(to_command(stamp, 0.01, 'coil')))])
+        for k in range(200):
+            time = BEGIN + k * 1_000_000
+            message = JointState(name=list(simulations))
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(time, 10**9)
+            for simulation in simulations.values():
+                simulation.advance(time)
+                message.position.append(simulation.stretch)
+                message.velocity.append(simulation.rate)
+                message.effort.append(simulation.flux_density)
+            writer.write([(states, time, 0, k, serialize_message(message))])
+    return folder
+
+
+def test_several_joints_of_several_namespaces_are_told_apart(tmp_path):
+    results = verify(write_joints(
+        tmp_path / 'a', {'one': 900.0, 'two': 2000.0}, space='/left'))
+    assert [result.commands for result in results] == [
+        '/left/one/flux_density_command', '/left/two/flux_density_command']
+    assert all(result.largest_difference < SAME for result in results)
+    assert [result.sample_count for result in results] == [200, 200]
+    # Swapped, they would not fit.
+    results = verify(write_joints(
+        tmp_path / 'b', {'one': 900.0, 'two': 2000.0}, told={'one': 2000.0, 'two': 900.0}))
+    assert all(result.largest_difference > 1e-4 for result in results)
+
+
+def test_several_rounds_in_one_bag_are_refused_with_a_way_out(tmp_path):
+    with BagWriter(tmp_path / 'bag', custom_data={'time_jumps': '1'}) as writer:
+        writer.split()
+    with pytest.raises(BadInputError, match=r'time jumped back 1 times: .* name one of its files'):
+        verify(tmp_path / 'bag')
+
+
+def test_topics_that_are_no_run_are_refused(tmp_path):
+    encoding, text = message_definition('std_msgs/msg/Float64')
+    with BagWriter(tmp_path / 'bag') as writer:
+        for name in ('/joint_states', '/flux_density_command'):
+            number = writer.add_topic(Topic(name, 'std_msgs/msg/Float64', text, encoding))
+            writer.write([(number, 1, 1, 1, serialize_message(Float64(data=1.0)))])
+    with pytest.raises(BadInputError, match='expected the samples of a plant'):
+        verify(tmp_path / 'bag')
 
 
 def test_a_bag_without_a_run_is_refused(tmp_path):

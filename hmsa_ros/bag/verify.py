@@ -192,17 +192,28 @@ def _sample(pair: _Pair, sample: Any) -> tuple[int, float, float, float]:
             f'{pair.joint or "a joint"}: expected the samples of a plant') from None
 
 
+def _only_joint(texts: Mapping[str, str]) -> str:
+    """Return the joint of a plant that has one, as far as its parameters name it."""
+    try:
+        names = json.loads(texts.get('joints', '[]'))
+        return str(names[0]) if isinstance(names, list) and names else ''
+    except ValueError:
+        return ''
+
+
 def _start(custom_data: Mapping[str, str], pair: _Pair, time: int) -> Any:
     """Return the simulation of the recorded actuator."""
     from hmsa_ros.core.parameters import ActuatorParameters
     from hmsa_ros.core.simulation import ActuatorSimulation
     texts = parameters_of(custom_data, 'plant', pair.space)
 
+    joint = pair.joint or _only_joint(texts)
+
     def number(name: str) -> float:
         # What is set for a joint goes before what is set for all.
-        text = texts.get(f'{pair.joint}.{name}', texts.get(name))
+        own = texts.get(f'{joint}.{name}', 'null')
         try:
-            return float(json.loads(text or ''))
+            return float(json.loads(texts.get(name, '') if own == 'null' else own))
         except (TypeError, ValueError):
             raise BadInputError(
                 f'the bag does not tell parameter {name} of node {pair.space}/plant: expected a '
