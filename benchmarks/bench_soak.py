@@ -26,7 +26,6 @@ import random
 import shutil
 import signal
 import struct
-import sys
 import tempfile
 from time import monotonic
 from typing import Any
@@ -43,6 +42,8 @@ _LEAD_SECONDS = 5.0
 #: Part of a process's life, in simulated h, in which it may still grow: buffers fill.
 _SETTLE_HOURS = 0.25
 _LOOK_SECONDS = 2.0
+#: Simulated s that pass at most between two diagnostics of the plant, 1 s apart on the wall.
+_LARGEST_ROUND = 90.0
 #: Simulated seconds per second: what two cores manage with all three processes, with some room.
 #: Faster, a recorder that does not get its turn for a tenth of a second loses samples, since the
 #: plant keeps the last thousand of them for those who have not taken them yet.
@@ -167,7 +168,7 @@ class Result:
 
 def check_bag(folder: Path, kind: str, killed: str) -> Cycle:
     """
-    Look for gaps in a bag, integrate its commands anew, and remove it.
+    Look for gaps in a bag, integrate its commands anew, and remove it if all is well.
 
     Parameters
     ----------
@@ -213,10 +214,10 @@ def check_bag(folder: Path, kind: str, killed: str) -> Cycle:
             found.late = verification.late_count
     except HmsaError as error:
         found.failure = str(error)
-    finally:
+    # A bag that tells of a fault is kept for as long as the folder is.
+    if not Result(cycles=[found]).failures():
         shutil.rmtree(folder, ignore_errors=True)
-        if bag != folder:
-            shutil.rmtree(bag, ignore_errors=True)
+        shutil.rmtree(bag, ignore_errors=True)
     return found
 
 
@@ -317,8 +318,11 @@ class Soak:
         """Serve callbacks a moment, follow time, sample memory, find who has ended."""
         self.rig.spin(0.01)
         time = self.rig.value('plant', 'time')
-        if time > self._plant_time:
-            self.seconds += time - self._plant_time
+        passed = time - self._plant_time
+        # What is larger or negative is another plant's time.
+        if 0.0 < passed < _LARGEST_ROUND:
+            self.seconds += passed
+        if not math.isnan(passed):
             self._plant_time = time
         self._asked = [x for x in self._asked if not x[1].done()]
         while len(self._asked) > 20:
@@ -449,6 +453,9 @@ class Soak:
             self._rubbish(calm=True)
 
     def _act_roughly(self) -> None:
+        from rcl_interfaces.srv import SetParameters
+        from rclpy.parameter import Parameter
+
         from benchmarks.faults.inputs import service_class, wild_request
         from hmsa_ros.nodes import interface
 
@@ -468,9 +475,11 @@ class Soak:
                 kind = service_class(types[0])
                 self._call(kind, name, wild_request(kind, name, self._dice))
         else:
-            # One of the calls above may have paused it, and nothing would go on.
+            # One of the calls above may have paused or slowed it, and nothing would go on.
             self._call(interface.SET_PAUSED.type, '/plant/set_paused',
                        interface.SET_PAUSED.type.Request(data=False))
+            self._call(SetParameters, '/plant/set_parameters', SetParameters.Request(parameters=[
+                Parameter('real_time_factor', value=self._factor).to_parameter_msg()]))
 
     def _call(self, kind: type[Any], name: str, request: Any) -> None:
         """Call a service and do not wait for the answer."""
@@ -486,8 +495,14 @@ class Soak:
         from hmsa_ros.nodes import interface
 
         rig = self.rig
+        # Nobody is asked who is not there.
+        self._looked = 0.0
+        self._look()
+        rig.ready(*self._children)
         rig.call(interface.SET_PAUSED, 'plant', interface.SET_PAUSED.type.Request(data=False))
-        rig.set_parameters('plant', use_sim_time=False)
+        rig.set_parameters(
+            'plant', use_sim_time=False, real_time_factor=self._factor, step_count=1,
+            reset_stretch=0.0, reset_rate=0.0)
         rig.set_parameters(
             'planner', use_sim_time=True, flux_density_min=-0.5, flux_density_max=0.5,
             shaper='two_step', short_spell='continue', robust_order=2)
@@ -527,9 +542,11 @@ def run_over_dds(
 
     """
     kinds = cycle((
-        ('calm', ''), ('calm', 'planner'), ('rough', ''), ('calm', 'recorder'), ('rough', 'plant'),
+        ('calm', 'planner'), ('rough', 'plant'), ('calm', 'recorder'), ('rough', ''),
         ('calm', ''), ('rough', 'planner'), ('calm', ''), ('calm', '')))
-    with Soak(folder, domain, seed, factor) as soak:
+    from benchmarks.faults.rig import hushed
+
+    with hushed(folder / 'hushed.log') as told, Soak(folder, domain, seed, factor) as soak:
         end = monotonic() + 60.0 * minutes
         while soak.seconds < hours * _HOUR and monotonic() < end:
             kind, victim = next(kinds)
@@ -537,7 +554,7 @@ def run_over_dds(
             trends = ', '.join(
                 f'{name} {x[-1].own / 2**20:.1f}' for name, x in soak.result.memory.items() if x)
             print(f'{soak.seconds / _HOUR:.2f} h, {kind} {victim}: MiB {trends}',
-                  file=sys.stderr, flush=True)
+                  file=told, flush=True)
     return soak.result
 
 

@@ -8,9 +8,10 @@ from typing import Any
 
 from benchmarks.faults import garbage
 from benchmarks.faults.common import jump, LIMIT, move, moves, pair, Register, share
-from benchmarks.faults.rig import Rig
+from benchmarks.faults.rig import hushed, Rig
 from benchmarks.faults.table import Seen
 from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.conversions import to_command
 
 FAULTS = Register()
 _COUNT = 300
@@ -52,17 +53,17 @@ def _topics(rig: Rig) -> Seen:
     publishers = [(topic, rig.publisher(topic, owner)) for topic, owner in input_topics()]
     rig.spin(0.5)
     rig.deaf = True
-    for _ in range(_COUNT):
-        for topic, publisher in publishers:
-            sent = garbage.message(topic.type, dice) if dice.random() < 0.5 \
-                else garbage.encoding(topic.type, dice)
-            # What the middleware itself does not take never arrives.
-            with suppress(Exception):
-                publisher.publish(sent)
-        rig.spin(0.005)
-    for _, publisher in publishers:
-        rig.node.destroy_publisher(publisher)
-    rig.spin(1.0)
+    with hushed(rig.folder / 'hushed.log'):
+        for _ in range(_COUNT):
+            for topic, publisher in publishers:
+                made = garbage.message if dice.random() < 0.5 else garbage.encoding
+                # What the middleware itself does not take never arrives.
+                with suppress(Exception):
+                    publisher.publish(made(topic.type, dice))
+            rig.spin(0.005)
+        for _, publisher in publishers:
+            rig.node.destroy_publisher(publisher)
+        rig.spin(1.0)
     rig.deaf = False
     ended = [x.log.stem for x in rig.children if not x.alive]
     worst = _recovered(rig)
@@ -226,3 +227,68 @@ def atomically(rig: Rig, owner: str, **values: object) -> str:
         SetParametersAtomically.Request(parameters=[
             Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]))
     return '' if response.result.successful else response.result.reason or 'no reason'
+
+
+def _stranger(rig: Rig, source: str) -> tuple[float, int, float, float]:
+    """Have a stranger command the plant while the planner holds 1.2."""
+    pair(rig, plant={'command_source': source})
+    moves(rig, (1.2,))
+    stranger = rig.publisher(interface.FLUX_DENSITY_COMMAND)
+    name = interface.FLUX_DENSITY_COMMAND.name
+    rig.spin_until(lambda: rig.node.count_publishers(name) == 2, 'the stranger')
+    rig.spin(0.5)
+    mark = rig.count()
+    for _ in range(20):
+        stranger.publish(to_command(rig.time + 10**7, 0.02, 'coil'))
+        rig.spin(0.05)
+    rig.fresh('plant')
+    changed = jump(rig, mark)
+    level = rig.level('plant')
+    refused = rig.value('plant', 'refused_source')
+    rig.node.destroy_publisher(stranger)
+    rig.spin_until(lambda: rig.node.count_publishers(name) == 1, 'the stranger to go')
+    rig.setpoint(1.05)
+    rig.let_pass(1.0)
+    return changed, level, refused, moves(rig, start=1.05)
+
+
+@FAULTS.fault(
+    'stranger_any', 'a second publisher of commands, command_source any',
+    '20 commands of a stranger in 1 s, while the planner holds 1.2',
+    'obeyed, as both are, and told: WARN in diagnostics; once it is gone and the planner has '
+    f'been asked, residual below {LIMIT:g}')
+def _any(rig: Rig) -> Seen:
+    changed, level, _, worst = _stranger(rig, 'any')
+    return Seen(
+        f'field changed by {changed:.3f} T, plant level {level}', share(worst),
+        changed > 0.0 and level >= 1 and worst < LIMIT)
+
+
+@FAULTS.fault(
+    'stranger_first', 'a second publisher of commands, command_source first',
+    '20 commands of a stranger in 1 s, while the planner holds 1.2',
+    f'refused, counted and told; the field does not change; residual below {LIMIT:g}')
+def _first(rig: Rig) -> Seen:
+    changed, level, refused, worst = _stranger(rig, 'first')
+    return Seen(
+        f'field changed by {changed:g} T, {refused:g} refused, plant level {level}',
+        share(worst), changed == 0.0 and refused == 20 and level >= 1 and worst < LIMIT)
+
+
+@FAULTS.fault(
+    'first_gone', 'the obeyed publisher dies, command_source first',
+    'planner killed, a new one, 1.1 asked for',
+    f'the new one is obeyed once the old one is gone: residual below {LIMIT:g}')
+def _gone(rig: Rig) -> Seen:
+    rig.start('plant', {'command_source': 'first'})
+    planner = rig.start('planner')
+    rig.ready('plant', 'planner')
+    moves(rig, (1.2,))
+    planner.end()
+    before = len(rig.verdicts)
+    rig.start('planner')
+    rig.spin_until(lambda: len(rig.verdicts) > before, 'the new planner')
+    rig.ready('planner')
+    worst = moves(rig, (1.1, 1.3), start=1.2)
+    return Seen(
+        f'{rig.value("plant", "refused_source"):g} commands refused', share(worst), worst < LIMIT)

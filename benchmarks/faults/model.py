@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.faults.common import LIMIT, Register
+from benchmarks.faults.common import LIMIT, moves, pair, Register, share
 from benchmarks.faults.rig import Rig, settled
 from benchmarks.faults.table import Seen
 from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.core.simulation import ActuatorSimulation
+from hmsa_ros.nodes import interface
 
 FAULTS = Register()
 _SHARES = (0.01, 0.05, 0.1, 0.2)
@@ -46,9 +47,9 @@ def _mismatch(rig: Rig, name: str) -> Seen:
 
 def _difference(
         truth: ActuatorParameters, stamps: np.ndarray, values: np.ndarray,
-        commands: list[tuple[int, float]]) -> float:
+        commands: list[tuple[int, float]], **coil: float) -> float:
     """Return the largest difference to the same commands, integrated here."""
-    simulation = ActuatorSimulation(truth, time=int(stamps[0]))
+    simulation = ActuatorSimulation(truth, time=int(stamps[0]), **coil)
     simulation.set_state(*map(float, values[0]))
     for stamp, flux_density in commands:
         simulation.command(stamp, flux_density)
@@ -67,3 +68,74 @@ for _name, _what in (
         'plant with ' + ', '.join(f'{100 * x:g}' for x in _SHARES) + ' % more, 1 -> 1.2',
         f'the residual of the model with these parameters, to {_SAME:g} of stretch, growing '
         'with the mismatch')(lambda rig, name=_name: _mismatch(rig, name))
+
+
+@FAULTS.fault(
+    'lag', 'a coil that lags behind', 'coil_lag 0.2 ms, which the planner does not know; 1 -> 1.2',
+    f'the residual of the model with this lag, to {_SAME:g} of stretch')
+def _lag(rig: Rig) -> Seen:
+    lag = 2e-4
+    pair(rig, plant={'coil_lag': lag})
+    mark, sent = rig.count(), len(rig.commands)
+    rig.setpoint(1.2)
+    rig.let_pass(0.3)
+    stamps, values = rig.samples(mark)
+    worst = _difference(paper_actuator(), stamps, values, rig.commands[sent:], lag=lag)
+    # From the change on that is as good as the last: the rest follows within microteslas.
+    late = np.flatnonzero(np.abs(values[:, 2] - values[-1, 2]) > 1e-6)[-1]
+    residual = float(np.ptp(values[late + 1:, 0])) / 0.2
+    return Seen(
+        f'as the model says of it, to {worst:.0e}', f'{residual:.2g}',
+        worst < _SAME and residual > LIMIT)
+
+
+@FAULTS.fault(
+    'noise', 'noise on what is measured', 'stretch_noise 0.001, rate_noise 1/s; 1 -> 1.2',
+    'the field is not touched, since nothing is fed back: scatter of 0.001 about the target, '
+    'and its mean at the target to a tenth of that')
+def _noise(rig: Rig) -> Seen:
+    pair(rig, plant={'stretch_noise': 1e-3, 'rate_noise': 1.0})
+    rig.setpoint(1.2)
+    rig.let_pass(1.0)
+    stretch = rig.samples()[1][-800:, 0]
+    scatter, mean = float(np.std(stretch)), float(np.mean(stretch))
+    return Seen(
+        f'scatter {scatter:.2e}, mean {mean:.5f}', '-',
+        abs(scatter / 1e-3 - 1.0) < 0.15 and abs(mean - 1.2) < 1e-4)
+
+
+@FAULTS.fault(
+    'transport', 'commands that take time in the driver',
+    'command_delay 0.02 s, below lead_time', f'none late, residual below {LIMIT:g}')
+def _transport(rig: Rig) -> Seen:
+    pair(rig, plant={'command_delay': 0.02})
+    worst = moves(rig)
+    rig.fresh('plant')
+    late = rig.value('plant', 'late')
+    return Seen(f'{late:g} commands late', share(worst), late == 0 and worst < LIMIT)
+
+
+@FAULTS.fault(
+    'disturbance', 'a force from outside', '0.05 N on its topic for 0.5 s, while 1.2 is held',
+    'the stretch gives way while it lasts and comes back when it has gone; moves after that are '
+    f'as planned: residual below {LIMIT:g}')
+def _disturbance(rig: Rig) -> Seen:
+    pair(rig)
+    moves(rig, (1.2,))
+    topic = interface.DISTURBANCE_FORCE
+    publisher = rig.publisher(topic)
+    rig.spin_until(publisher.get_subscription_count, 'the plant to listen to forces')
+    push = topic.type()
+    push.wrench.force.x = push.wrench.force.z = 0.05
+    mark = rig.count()
+    publisher.publish(push)
+    rig.let_pass(0.5)
+    pushed = float(rig.samples()[1][-1, 0])
+    flux = float(np.ptp(rig.samples(mark)[1][:, 2]))
+    publisher.publish(topic.type())
+    rig.let_pass(1.0)
+    back = float(rig.samples()[1][-1, 0])
+    worst = moves(rig, (1.1, 1.3), start=1.2)
+    return Seen(
+        f'stretch {pushed:.4f} under the force, {back:.6f} after it', share(worst),
+        abs(pushed - 1.2) > 1e-3 and abs(back - 1.2) < 1e-6 and flux == 0.0 and worst < LIMIT)

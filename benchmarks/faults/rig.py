@@ -1,7 +1,8 @@
 """A rig of real node processes in a ROS domain of its own, and a node that looks on."""
 
 from array import array
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 import ctypes
 import os
 from pathlib import Path
@@ -9,7 +10,7 @@ import signal
 import subprocess
 import sys
 from time import monotonic
-from typing import Any
+from typing import Any, TextIO
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import numpy as np
@@ -177,6 +178,7 @@ class Rig:
         self.diagnostics: dict[str, dict[str, str]] = {}
         self.deaf = False
         self._seen: dict[str, int] = {}
+        self._watch = watch
         if watch:
             self._subscribe(interface.JOINT_STATES, '', self._on_sample)
             self._subscribe(interface.FLUX_DENSITY_COMMAND, '', lambda x: self.commands.append(
@@ -306,7 +308,7 @@ class Rig:
             Nodes that answer on ``/diagnostics``.
 
         """
-        if interface.PLANT in names:
+        if interface.PLANT in names and self._watch:
             self.spin_until(lambda: len(self._stamps) > 0, 'the first sample')
         if interface.PLANNER in names:
             self.spin_until(
@@ -698,6 +700,35 @@ def _plain(status: DiagnosticStatus) -> dict[str, str]:
     """Return a status as plain text by key."""
     return {**{x.key: x.value for x in status.values}, 'level': str(status.level[0]),
             'message': status.message}
+
+
+@contextmanager
+def hushed(log: Path) -> Iterator[TextIO]:
+    """
+    Have what the middleware writes to standard error go to a file.
+
+    It complains there of every broken message that this process sends or receives.
+
+    Parameters
+    ----------
+    log : Path
+        Appended to.
+
+    Yields
+    ------
+    file
+        Standard error as it was.
+
+    """
+    sys.stderr.flush()
+    with open(os.dup(2), 'w', encoding='utf-8') as before, open(log, 'ab') as file:
+        os.dup2(file.fileno(), 2)
+        try:
+            yield before
+        finally:
+            sys.stderr.flush()
+            before.flush()
+            os.dup2(before.fileno(), 2)
 
 
 def settled(values: np.ndarray, target: float, step: float) -> tuple[float, float]:
