@@ -18,6 +18,7 @@ import numpy as np
 import rclpy
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState, MagneticField
 from trajectory_msgs.msg import JointTrajectory
@@ -34,6 +35,8 @@ _SAMPLE_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=_SAMPLES, reliability=ReliabilityPolicy.BEST_EFFORT)
 _REPORT_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+# Joints times samples that are read at one look: all of them up to ten joints at 1 kHz.
+_MOST_READ = 1000
 # Between two looks at the graph, and how long discovery may take before its result counts.
 _GRAPH_SECONDS = 1.0
 _DISCOVERY_SECONDS = 1.5
@@ -98,7 +101,7 @@ class Listener:
             rclpy.try_shutdown(context=self._context)
             raise BadInputError(f'namespace {namespace!r}: {error}') from error
         self._domain = int(self._context.get_domain_id())
-        self._samples = self._subscribe(interface.JOINT_STATES, _SAMPLE_QOS)
+        self._samples = self._subscribe(interface.JOINT_STATES, _SAMPLE_QOS, raw=True)
         self._status = self._subscribe(interface.STATUS)
         self._plan = self._subscribe(interface.PLAN)
         self._diagnostics = self._subscribe(interface.DIAGNOSTICS, _REPORT_QOS)
@@ -126,16 +129,20 @@ class Listener:
         self._node.destroy_node()
         rclpy.try_shutdown(context=self._context)
 
-    def _subscribe(self, topic: interface.Topic, qos: QoSProfile | None = None) -> Any:
+    def _subscribe(
+            self, topic: interface.Topic, qos: QoSProfile | None = None, *,
+            raw: bool = False) -> Any:
         return self._node.create_subscription(
             topic.type, interface.from_outside(topic.name, interface.PLANNER), lambda _: None,
-            qos or topic.qos)
+            qos or topic.qos, raw=raw)
 
     @staticmethod
-    def _drain(subscription: Any, kind: type[Any]) -> Iterator[tuple[Any, Any]]:
+    def _drain(
+            subscription: Any, kind: type[Any], *, raw: bool = False
+    ) -> Iterator[tuple[Any, Any]]:
         """Take what has arrived."""
         with subscription.handle:
-            while (taken := subscription.handle.take_message(kind, False)) is not None:
+            while (taken := subscription.handle.take_message(kind, raw)) is not None:
                 yield taken
 
     def look(self) -> Scene:
@@ -203,18 +210,20 @@ class Listener:
                 _whole(values.get('setpoints')))
 
     def _take_samples(self, now: float) -> None:
-        taken: dict[tuple[str, ...], list[JointState]] = {}
-        last = None
-        for message, info in self._drain(self._samples, JointState):
-            taken.setdefault(tuple(message.name), []).append(message)
-            last = message, info
-        if last is None:
+        arrived = list(self._drain(self._samples, JointState, raw=True))
+        if not arrived:
             if now - self._arrived > _QUIET_SECONDS:
                 self._rate, self._counted = math.nan, None
             return
+        # Of many joints not every sample can be read in passing.
+        every = max(1, math.ceil(len(arrived) * len(self._joints) / _MOST_READ))
+        taken: dict[tuple[str, ...], list[JointState]] = {}
+        for data, _ in arrived[::-1][::every][::-1]:
+            message = deserialize_message(data, JointState)
+            taken.setdefault(tuple(message.name), []).append(message)
         self._arrived = now
-        self._stamp = from_time(last[0].header.stamp)
-        number = int(last[1].get('publication_sequence_number') or 0)
+        self._stamp = from_time(message.header.stamp)
+        number = int(arrived[-1][1].get('publication_sequence_number') or 0)
         if self._counted is None or number < self._counted[1]:
             self._counted = now, number
         elif now - self._counted[0] >= _RATE_SECONDS:
