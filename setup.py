@@ -83,7 +83,9 @@ setup(
         ('share/ament_index/resource_index/packages', ['resource/' + PACKAGE]),
         ('share/' + PACKAGE, ['package.xml']),
         ('share/' + PACKAGE + '/launch', sorted(glob('launch/*.launch.py'))),
-        ('share/' + PACKAGE + '/config', sorted(glob('config/*.yaml'))),
+        *(('share/' + PACKAGE + '/' + folder,
+           sorted(path for path in glob(folder + '/*') if os.path.isfile(path)))
+          for folder in ('config', 'config/rviz', 'config/security')),
     ],
     zip_safe=True,
     python_requires='>=3.10,<3.14',

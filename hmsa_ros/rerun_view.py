@@ -1,0 +1,209 @@
+"""
+Show a bag in the Rerun viewer: ``python -m hmsa_ros.rerun_view BAG``.
+
+Needs rerun-sdk (``pip install rerun-sdk``). Rerun's own reader of MCAP files takes stretch, rate
+and flux density from the bag; the markers, which it does not know, are turned into its boxes and
+arrows here. What is shown where stands in `blueprint`.
+"""
+
+import argparse
+from collections.abc import Sequence
+import os
+from pathlib import Path
+import sys
+from typing import Any
+
+import numpy as np
+
+from hmsa_ros.bag.reader import BagReader, read_messages
+from hmsa_ros.errors import BadInputError, complain, HmsaError
+
+APPLICATION = 'hmsa_ros'
+#: Topics in the namespace of the nodes, as `hmsa_ros.nodes.interface` has them.
+JOINT_STATES = 'joint_states'
+MARKERS = ('plant/markers', 'planner/markers')
+#: Rerun's timeline of the times at which messages were received.
+TIMELINE = 'message_log_time'
+
+# As visualization_msgs has them; the messages themselves need a ROS installation.
+_ARROW, _CUBE, _TEXT = 0, 1, 9
+_ADD, _DELETE, _DELETE_ALL = 0, 2, 3
+
+
+def _rerun() -> Any:
+    """Return the module rerun with its blueprints."""
+    try:
+        import rerun
+        import rerun.blueprint
+    except ImportError as error:
+        raise BadInputError(
+            f'rerun-sdk cannot be imported ({error}): expected it installed, for example by '
+            'pip install rerun-sdk') from error
+    return rerun
+
+
+def views(namespace: str = '') -> dict[str, str]:
+    """
+    Return what the views show.
+
+    Parameters
+    ----------
+    namespace : str
+        Namespace of the nodes.
+
+    Returns
+    -------
+    dict of str to str
+        Entity path by the view's title.
+
+    """
+    root = '/' + namespace.strip('/') if namespace.strip('/') else ''
+    return {
+        'Stretch': f'{root}/{JOINT_STATES}/position',
+        'Stretch rate (1/s)': f'{root}/{JOINT_STATES}/velocity',
+        'Flux density (T)': f'{root}/{JOINT_STATES}/effort',
+        'Actuators': f'{root}/markers'}
+
+
+def blueprint(namespace: str = '') -> Any:
+    """
+    Return the layout of the viewer: the actuators on the left, their curves on the right.
+
+    Parameters
+    ----------
+    namespace : str
+        Namespace of the nodes.
+
+    Returns
+    -------
+    rerun.blueprint.Blueprint
+        For `rerun.send_blueprint`.
+
+    Raises
+    ------
+    BadInputError
+        If rerun-sdk is not installed.
+
+    """
+    rrb = _rerun().blueprint
+    *curves, (title, path) = views(namespace).items()
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Spatial3DView(origin=path, name=title),
+            rrb.Vertical(*(
+                rrb.TimeSeriesView(origin=origin, name=name) for name, origin in curves)),
+            column_shares=[2, 3]),
+        rrb.TimePanel(timeline=TIMELINE, expanded=True),
+        rrb.BlueprintPanel(expanded=False), rrb.SelectionPanel(expanded=False))
+
+
+def show(bag: str | os.PathLike[str], recording: Any, namespace: str = '') -> None:
+    """
+    Log a bag and the blueprint to a recording of Rerun.
+
+    Parameters
+    ----------
+    bag : path
+        Folder of the bag.
+    recording : rerun.RecordingStream
+        What to log to.
+    namespace : str
+        Namespace of the nodes.
+
+    Raises
+    ------
+    BagError
+        If the bag cannot be read.
+    BadInputError
+        If it has no samples of the actuators in that namespace.
+
+    """
+    root = '/' + namespace.strip('/') if namespace.strip('/') else ''
+    reader = BagReader(bag)
+    found = set(reader.topics)
+    if f'{root}/{JOINT_STATES}' not in found:
+        raise BadInputError(
+            f'{os.fspath(bag)} has no topic {root}/{JOINT_STATES}: expected the namespace of '
+            'the nodes in --namespace')
+    recording.send_blueprint(blueprint(namespace))
+    for file in reader.files:
+        recording.log_file_from_path(file)
+    topics = [topic for name in MARKERS if (topic := f'{root}/{name}') in found]
+    for message in read_messages(bag, topics) if topics else ():
+        recording.set_time(TIMELINE, timestamp=np.datetime64(message.log_time_ns, 'ns'))
+        for marker in message.message.markers:
+            _log_marker(recording, views(namespace)['Actuators'], marker)
+
+
+def _log_marker(recording: Any, root: str, marker: Any) -> None:
+    """Log a marker as what Rerun knows."""
+    rr = _rerun()
+    path = f'{root}/{marker.ns}/{marker.id}'
+    if marker.action == _DELETE_ALL:
+        recording.log(root, rr.Clear(recursive=True))
+        return
+    if marker.action == _DELETE:
+        recording.log(path, rr.Clear(recursive=False))
+        return
+    colour = [round(255 * x) for x in (
+        marker.color.r, marker.color.g, marker.color.b, marker.color.a)]
+    position = marker.pose.position
+    if marker.type == _CUBE:
+        recording.log(path, rr.Boxes3D(
+            centers=[[position.x, position.y, position.z]],
+            sizes=[[marker.scale.x, marker.scale.y, marker.scale.z]], colors=[colour],
+            fill_mode='solid'))
+    elif marker.type == _ARROW:
+        start, end = marker.points
+        recording.log(path, rr.Arrows3D(
+            origins=[[start.x, start.y, start.z]],
+            vectors=[[end.x - start.x, end.y - start.y, end.z - start.z]],
+            radii=[marker.scale.x / 2], colors=[colour]))
+    elif marker.type == _TEXT:
+        recording.log(path, rr.Points3D(
+            [[position.x, position.y, position.z]], radii=[0.0], labels=[marker.text],
+            colors=[colour]))
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """
+    Show a bag, or save it for the viewer.
+
+    Parameters
+    ----------
+    args : sequence of str, optional
+        Command-line arguments; default ``sys.argv[1:]``.
+
+    Returns
+    -------
+    int
+        Exit status: 0, 1 for a bag that cannot be read, 2 for bad arguments.
+
+    """
+    parser = argparse.ArgumentParser(
+        prog='python -m hmsa_ros.rerun_view', description='Show a bag in the Rerun viewer.',
+        epilog='Example: python -m hmsa_ros.rerun_view my_run')
+    parser.add_argument('bag', metavar='BAG', help='folder of the bag')
+    parser.add_argument(
+        '--namespace', default='', metavar='NAME', help='namespace of the nodes')
+    parser.add_argument(
+        '--save', type=Path, metavar='FILE.rrd',
+        help='write a recording of Rerun instead of starting the viewer')
+    given = parser.parse_args(args)
+    try:
+        recording = _rerun().RecordingStream(APPLICATION)
+        if given.save is not None:
+            recording.save(given.save)
+        else:
+            recording.spawn()
+        show(given.bag, recording, given.namespace)
+        recording.flush()
+    except BadInputError as error:
+        return complain(error, 2)
+    except HmsaError as error:
+        return complain(error, 1)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
