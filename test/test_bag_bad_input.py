@@ -13,6 +13,7 @@ import yaml
 
 from hmsa_ros.bag import metadata, qos, records
 from hmsa_ros.bag.definitions import message_definition, type_hash
+from hmsa_ros.bag.info import summarize, to_json, to_text
 from hmsa_ros.bag.reader import BagReader, read_messages
 from hmsa_ros.bag.recover import recover
 from hmsa_ros.bag.writer import BagWriter, Topic
@@ -140,6 +141,87 @@ def test_no_bytes_after_the_magic_make_the_reader_fail(tmp_path, content):
     path.write_bytes(records.MAGIC + content)
     reader, _ = stamps(path)
     reader.counts()
+
+
+def changed_value(draw, value):
+    """Return a value with something else in its place here and there."""
+    if draw(strategies.integers(0, 15)) == 0:
+        return draw(ODD_VALUES)
+    if isinstance(value, dict):
+        return {key: changed_value(draw, item) for key, item in value.items()
+                if draw(strategies.integers(0, 30))}
+    if isinstance(value, list):
+        return [changed_value(draw, item) for item in value] * draw(strategies.integers(0, 2))
+    return value
+
+
+ODD_VALUES = strategies.one_of(
+    strategies.none(), strategies.booleans(), strategies.integers(), strategies.floats(),
+    strategies.text(max_size=10), strategies.binary(max_size=5), strategies.just([]),
+    strategies.just({}), strategies.just(['..', '/', '']))
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
+@given(strategies.data())
+def test_no_change_of_the_metadata_hides_the_messages(tmp_path, data):
+    folder = tmp_path / 'bag'
+    if not folder.exists():
+        write_bag(folder, 10)
+        shutil.copy(folder / 'metadata.yaml', tmp_path / 'original.yaml')
+    content = yaml.safe_load((tmp_path / 'original.yaml').read_text())
+    changed = changed_value(data.draw, content)
+    (folder / 'metadata.yaml').write_text(yaml.safe_dump(changed, allow_unicode=True))
+    with contextlib.suppress(BagError):
+        stored = metadata.read(folder / 'metadata.yaml')
+        if stored.storage != 'mcap' or stored.compression_mode.upper() not in ('', 'NONE'):
+            # Only a bag that says to be of another kind is refused.
+            with pytest.raises(BadInputError, match='is stored as|is compressed by rosbag2'):
+                BagReader(folder)
+            return
+    _, got = stamps(folder)
+    assert got == list(range(10))
+    to_json(summarize(folder))
+    assert to_text(summarize(folder)).encode()
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@given(strategies.data())
+def test_no_records_in_any_order_make_the_reader_fail(tmp_path, data):
+    path = tmp_path / 'bag' / 'bag_0.mcap'
+    if not path.exists():
+        write_bag(tmp_path / 'bag', 60, preset='none')
+    pieces, offset, original = [], len(records.MAGIC), path.read_bytes()
+    while offset < len(original) - len(records.MAGIC):
+        opcode, length = records.PREFIX.unpack_from(original, offset)
+        offset += records.PREFIX.size
+        pieces.append((opcode, original[offset:offset + length]))
+        offset += length
+    chosen = data.draw(strategies.lists(
+        strategies.integers(0, len(pieces) - 1), min_size=1, max_size=len(pieces)))
+    content = records.MAGIC
+    for i in chosen:
+        opcode, piece = pieces[i]
+        if opcode == records.CHUNK and data.draw(strategies.booleans()):
+            # Compressed anew, so that what is wrong in it is found by nothing but reading.
+            head = records.read_chunk_head(piece, len(piece))
+            inner = bytearray(piece[head.data_offset:])
+            for _ in range(data.draw(strategies.integers(0, 3))):
+                inner[data.draw(strategies.integers(0, len(inner) - 1))] = data.draw(
+                    strategies.integers(0, 255))
+            packed = records.compress(bytes(inner), 'zstd', 1)
+            content += records.chunk_head(
+                data.draw(strategies.integers(0, 100)), data.draw(strategies.integers(0, 100)),
+                len(inner), 0, 'zstd', len(packed)) + packed
+        else:
+            content += records.record(opcode, piece)
+    copy = tmp_path / 'changed.mcap'
+    copy.write_bytes(content + data.draw(strategies.sampled_from((b'', records.MAGIC))))
+    reader, got = stamps(copy)
+    assert len(got) == sum(reader.counts().values()) or reader.complete
+    list(reader.stored_messages())
+    to_text(summarize(copy))
+    with contextlib.suppress(BagError):
+        list(read_messages(copy))
 
 
 @pytest.mark.parametrize('options', [
@@ -278,6 +360,19 @@ def test_a_bag_of_no_messages_is_a_bag(tmp_path, capsys):
     assert (got, reader.start_time, reader.problems) == ([], None, [])
     assert main(['bag', 'info', str(tmp_path / 'bag')]) == 0
     assert 'messages  0' in capsys.readouterr().out
+
+
+def test_messages_that_never_saw_a_clock_are_read(tmp_path):
+    path = tmp_path / 'zero.mcap'
+    with path.open('wb') as file:
+        writer = Writer(file)
+        writer.start('ros2', 'test')
+        channel = writer.register_channel('/a', 'cdr', 0, {})
+        writer.add_message(channel, 0, payload(1), 0)
+        writer.finish()
+    reader, got = stamps(path)
+    assert got == [0]
+    assert (reader.start_time, reader.end_time, reader.counts()) == (0, 0, {'/a': 1})
 
 
 def test_a_missing_schema_leaves_the_messages_raw(tmp_path):

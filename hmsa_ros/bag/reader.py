@@ -579,9 +579,16 @@ class BagReader:
         """Return the blocks with messages."""
         for file in self._files:
             for block in file.blocks:
-                # A chunk may hold channels only; its times are then 0.
-                if block.chunk is None or block.chunk.size and block.end:
+                # The times of a chunk with channels only are 0, as stamps may be that never saw
+                # a clock.
+                if block.chunk is None or block.chunk.size and (
+                        block.end or self._has_messages(block)):
                     yield block
+
+    def _has_messages(self, block: _Block) -> bool:
+        """Return whether a block has messages, by reading it."""
+        cursor = self._cursor(block, None, (0, _NEVER))
+        return cursor is not None and cursor.left
 
     def messages(
             self, topics: Collection[str] | None = None, *, start: int | None = None,
