@@ -51,7 +51,6 @@ ACTUATOR_FIELDS = (
 _DEFAULT_JOINT = 'actuator'
 # Roles whose topics are one for each joint where there are several.
 _OF_A_JOINT = (COMMAND, APPLIED, SETPOINT)
-_NUMBER = re.compile(r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?')
 # Samples may overtake one another on their way; further back goes only a clock, in ns.
 _CLOCK_JUMP = 100_000_000
 # Between two calls of the progress.
@@ -427,13 +426,13 @@ class _Collected:
         """Return what the planner said, with the target of a joint."""
         for sent, content in self.statuses:
             values = {x.key: x.value for x in content.values}
-            targets = [float(x) for x in _NUMBER.findall(values.get('stretch', ''))]
-            place = _place(joints, joint)
+            # Of several joints each has its own.
+            target = values.get(f'{joint}.stretch') if joint in joints and len(joints) > 1 \
+                else values.get('stretch')
             level = content.level[0] if isinstance(content.level, bytes) else int(content.level)
             yield Verdict(
                 sent, _LEVELS[min(level, 2)], values.get('code', ''), content.message,
-                targets[place] if place is not None and len(targets) == max(len(joints), 1)
-                else math.nan)
+                _number(target))
 
     def finish(
             self, label: str, path: Path, summary: BagSummary, topics: dict[str, str],
@@ -462,6 +461,14 @@ class _Collected:
             tuple(self._requests(joint, key)),
             tuple(self._verdicts(joint, list(dict.fromkeys(planned)))), parameters, plant,
             planner, known, (*notes, *more))
+
+
+def _number(text: str | None) -> float:
+    """Return a number from a status; NaN for what is none."""
+    try:
+        return float(text or 'nan')
+    except ValueError:
+        return math.nan
 
 
 def _place(names: Sequence[str], joint: str) -> int | None:

@@ -5,10 +5,10 @@ No executor serves the subscriptions: what has arrived is taken from the middlew
 so that a thousand samples a second wake nobody up.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 import math
-import re
 from time import monotonic
 from typing import Any
 from uuid import uuid4
@@ -45,7 +45,6 @@ _QUIET_SECONDS = 2.0
 _RATE_SECONDS = 1.0
 # Reports of nodes that have ended are dropped after a while.
 _FORGET_SECONDS = 30.0
-_NUMBER = re.compile(r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?')
 
 
 @dataclass
@@ -107,9 +106,9 @@ class Listener:
         self._diagnostics = self._subscribe(interface.DIAGNOSTICS, _REPORT_QOS)
         self._commands: dict[str, _Commands] = {}
         self._joints: dict[str, Joint] = {}
-        self._reports: dict[str, tuple[float, Report]] = {}
+        self._heard: dict[tuple[str, str, str], tuple[float, Report]] = {}
         self._request: Request | None = None
-        self._targets: tuple[float, ...] = ()
+        self._targets: dict[str, float] = {}
         self._planned_joints: tuple[str, ...] = ()
         self._plan_span: tuple[int, int] | None = None
         self._begin = self._looked = monotonic()
@@ -164,7 +163,7 @@ class Listener:
         self._take_commands()
         self._take_reports(now)
         for name, joint in self._joints.items():
-            joint.target = self._target_of(name)
+            joint.target = self._targets.get(name, math.nan)
             if math.isfinite(joint.target):
                 joint.targets.put(self._looked, now, np.array([joint.target]))
         self._looked = now
@@ -175,7 +174,7 @@ class Listener:
             age=now - self._arrived if self._stamp is not None else math.nan,
             sample_rate=self._rate, joints=shown, request=self._request,
             progress=self._progress(), waiting=self._waiting(now, len(shown)),
-            reports=[x for _, (_, x) in sorted(self._reports.items())])
+            reports=self._reports(now))
 
     # -- what is taken -------------------------------------------------------------------------
 
@@ -201,9 +200,10 @@ class Listener:
             self._plan_span = (start, start + max(times)) if times else None
         for message, _ in self._drain(self._status, DiagnosticStatus):
             values = {x.key: x.value for x in message.values}
-            self._targets = tuple(float(x) for x in _NUMBER.findall(values.get('stretch', '')))
-            if not self._planned_joints and message.hardware_id:
-                self._planned_joints = (message.hardware_id,)
+            # One joint has no name there; of several each has its own.
+            self._targets = {
+                key.rpartition('.')[0] or message.hardware_id: _number(value)
+                for key, value in values.items() if key.rpartition('.')[2] == 'stretch'}
             self._request = Request(
                 message.level[0], message.message, values.get('code', ''),
                 values.get('state', ''), _whole(values.get('setpoint')),
@@ -275,19 +275,29 @@ class Listener:
                     continue
                 counts = {x.key: int(x.value) for x in status.values
                           if '.' not in x.key and x.value.isdigit()}
-                self._reports[status.name] = now, Report(
+                self._heard[name, status.name, status.hardware_id] = now, Report(
                     name, status.level[0], status.message, counts)
-        for key, (when, report) in list(self._reports.items()):
-            report.age = now - when
-            if report.age > _FORGET_SECONDS:
-                del self._reports[key]
+        self._heard = {
+            key: (when, report) for key, (when, report) in self._heard.items()
+            if now - when <= _FORGET_SECONDS}
+
+    def _reports(self, now: float) -> list[Report]:
+        """Return what each node says: the worst of its reports, and all of its counters."""
+        by_node: dict[str, list[tuple[float, Report]]] = {}
+        for (name, _, _), said in sorted(self._heard.items(), key=lambda x: x[0]):
+            by_node.setdefault(name, []).append(said)
+        reports = []
+        for name, heard in by_node.items():
+            worst = max((x for _, x in heard), key=lambda x: x.level)
+            counts: Counter[str] = Counter()
+            for _, report in heard:
+                counts.update(report.counts)
+            reports.append(Report(
+                name, worst.level, worst.message, dict(counts),
+                now - max(when for when, _ in heard)))
+        return reports
 
     # -- what follows --------------------------------------------------------------------------
-
-    def _target_of(self, name: str) -> float:
-        if name in self._planned_joints and len(self._targets) == len(self._planned_joints):
-            return self._targets[self._planned_joints.index(name)]
-        return math.nan
 
     def _progress(self) -> float:
         if self._plan_span is None or self._stamp is None:
@@ -320,6 +330,13 @@ class Listener:
         if not self._senders['planner']:
             sentences.append(f'no planner seen {where}: {mend}')
         return sentences
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def _whole(text: str | None) -> int:
