@@ -92,7 +92,7 @@ def own_time(name: str, parameters: dict[str, str], count: int) -> Row:
             source.clock_callback(Clock(clock=to_time(10**9 + i * _SPACING_NS)))
             message = Float64(data=float(_TARGETS[i % _TARGETS.size]))
             begin = thread_time()
-            node._on_setpoint(message)
+            node._on_setpoint('actuator', message.data)
             spans.append(thread_time() - begin)
             node._on_poll()
         refused = node._refused

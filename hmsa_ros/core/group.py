@@ -188,7 +188,7 @@ class PlannerGroup:
         stopped = {}
         given_up = []
         for name in names:
-            if self._attempts[name] >= _ATTEMPTS:
+            if not self.may_resume(name):
                 given_up.append(name)
                 continue
             self._attempts[name] += 1
@@ -203,6 +203,10 @@ class PlannerGroup:
                 missed += 0 if draft is None else draft.missed
             planner.take(draft, now)
         return Resumption(resumed, missed, stopped, tuple(given_up))
+
+    def may_resume(self, name: str) -> bool:
+        """Return whether `resume` would plan for a joint anew."""
+        return self._attempts[name] < _ATTEMPTS
 
     def applied(
             self, name: str, stamp: int, flux_density: float,

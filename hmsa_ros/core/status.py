@@ -33,6 +33,7 @@ class Code(str, Enum):
     NOT_INCREASING = 'not_increasing'
     IN_THE_PAST = 'in_the_past'
     NO_TIME = 'no_time'
+    INACTIVE = 'inactive'
 
     def __str__(self) -> str:
         """Return the value."""
@@ -93,6 +94,9 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
     Code.NO_TIME: (
         'The planner follows simulated time, and no message has come on /clock yet.',
         'Start what publishes /clock, or set use_sim_time to false.'),
+    Code.INACTIVE: (
+        'The planner is a managed node and is not active.',
+        'Activate it: ros2 lifecycle set /planner activate.'),
 }
 
 

@@ -1,6 +1,6 @@
 """Conversion between messages and the records of `hmsa_ros.core`."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 import math
 from typing import TYPE_CHECKING
 
@@ -168,6 +168,72 @@ def from_trajectory(
     return points, (None if stamp == 0 else stamp)
 
 
+def from_trajectories(
+        message: JointTrajectory, joints: Sequence[str], *, partial: bool = False
+) -> tuple[dict[str, list[tuple[float, int]]], int | None]:
+    """
+    Return the setpoints of a trajectory for several joints and its stamp.
+
+    Parameters
+    ----------
+    message : trajectory_msgs.msg.JointTrajectory
+        For all joints, in any order.
+    joints : sequence of str
+        Names of the joints there are; with a single one, `from_trajectory` says more.
+    partial : bool
+        Whether it may be for some of them only.
+
+    Returns
+    -------
+    points : dict of str to list of (float, int)
+        By joint: stretch, and time from the start in ns.
+    stamp : int or None
+        In ns; None for stamp 0, which means now.
+
+    Raises
+    ------
+    RefusedError
+        If the joints are others, sizes do not fit, or a point asks for motion or effort.
+
+    """
+    if len(joints) == 1:
+        single, start = from_trajectory(message, joints[0])
+        return {joints[0]: single}, start
+    names = list(message.joint_names)
+    if twice := sorted({x for x in names if names.count(x) > 1}):
+        raise RefusedError(
+            Code.UNKNOWN_JOINT, f'joint_names has {twice[0]!r} twice: expected each joint once')
+    if unknown := [x for x in names if x not in joints]:
+        raise RefusedError(
+            Code.UNKNOWN_JOINT,
+            f'joint_names has {unknown[0]!r}: expected names among {", ".join(joints)}')
+    missing = [x for x in joints if x not in names]
+    if not names or missing and not partial:
+        raise RefusedError(
+            Code.UNKNOWN_JOINT,
+            f'joint_names lacks {missing[0]!r}: expected all of {", ".join(joints)} (the '
+            'parameter allow_partial_joints lets a message be for some of them)')
+    points: dict[str, list[tuple[float, int]]] = {name: [] for name in names}
+    for number, point in enumerate(message.points):
+        if len(point.positions) != len(names):
+            raise RefusedError(
+                Code.BAD_INPUT,
+                f'point {number} has {len(point.positions)} positions: expected {len(names)}, '
+                'one for each of joint_names')
+        for field in ('velocities', 'accelerations', 'effort'):
+            values = list(getattr(point, field))
+            if values and values != [0.0] * len(names):
+                raise RefusedError(
+                    Code.BAD_INPUT,
+                    f'point {number} has {field} {values}: expected none, the actuators come '
+                    'to rest at each setpoint')
+        time = from_time(point.time_from_start)
+        for name, position in zip(names, point.positions, strict=True):
+            points[name].append((float(position), time))
+    stamp = from_time(message.header.stamp)
+    return points, (None if stamp == 0 else stamp)
+
+
 def to_trajectory(
         setpoints: Iterable[tuple[float, int]], joint: str, *, stamp: int = 0,
         frame: str = '') -> JointTrajectory:
@@ -231,6 +297,36 @@ def to_plan(plan: 'Plan', joint: str) -> JointTrajectory:
                 effort=[level.flux_density],
                 time_from_start=_to_duration(level.stamp - start))
             for level in levels])
+
+
+def to_plans(
+        stamps: Sequence[int],
+        samples: Mapping[str, Sequence[tuple[float, float, float]]]) -> JointTrajectory:
+    """
+    Return the preview of several joints' plans: a point at each change of level of any.
+
+    Parameters
+    ----------
+    stamps : sequence of int
+        In ns, increasing.
+    samples : mapping of str to sequence of (float, float, float)
+        By joint, one for each stamp: stretch, rate in 1/s and flux density in T from then on.
+
+    Returns
+    -------
+    trajectory_msgs.msg.JointTrajectory
+        As `to_plan` makes it for one joint.
+
+    """
+    start = stamps[0] if stamps else 0
+    message = JointTrajectory(
+        header=Header(stamp=to_time(start)), joint_names=list(samples))
+    for stamp, *point in zip(stamps, *samples.values(), strict=True):
+        stretches, rates, flux_densities = zip(*point, strict=True)
+        message.points.append(JointTrajectoryPoint(
+            positions=stretches, velocities=rates, effort=flux_densities,
+            time_from_start=_to_duration(stamp - start)))
+    return message
 
 
 def to_status(

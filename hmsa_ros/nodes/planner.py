@@ -1,153 +1,188 @@
 """Planner node: setpoints in, the shaped stream of stamped flux density commands out."""
 
-from collections.abc import Callable, Sequence
-import math
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from time import monotonic_ns
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
 from rclpy.duration import Duration
-from rclpy.node import Node
 from rclpy.parameter import Parameter
-from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from hmsa_ros.core.planner import Options, Plan, Planner
-from hmsa_ros.core.sequence import SHORT_SPELL
-from hmsa_ros.core.shapers import SHAPERS
 from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.core.timeline import Draft, PlannedLevel
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.core.warmup import warm_up
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.nodes import conversions, interface
-from hmsa_ros.nodes.parameters import (
-    ACTUATOR,
-    actuator_from,
-    declare,
-    INITIAL_STRETCH,
-    JOINT,
-    ParameterSpec,
-)
+from hmsa_ros.nodes.channel import JointChannel
+from hmsa_ros.nodes.joints import declare_joints
+from hmsa_ros.nodes.managed import AUTOSTART, ManagedNode
+from hmsa_ros.nodes.planning import group_from, models_from, nanoseconds, OWN, SPECS
 from hmsa_ros.nodes.runner import run
+from hmsa_ros.nodes.takeover import TakeOver
+from hmsa_ros.nodes.timekeeping import StepWatch
 
-PARAMETERS = (
-    *ACTUATOR,
-    JOINT,
-    INITIAL_STRETCH,
-    ParameterSpec(
-        'frame_id', 'coil', 'Frame of the coil in the stamped commands.'),
-    ParameterSpec(
-        'lead_time', 0.05, 'How far ahead of the time it applies a command is sent.', 's',
-        0.0, 1e6),
-    ParameterSpec(
-        'shaper', 'two_step', 'How a move is commanded.', choices=tuple(SHAPERS),
-        read_only=False),
-    ParameterSpec(
-        'robust_order', 2, 'Number of chained two-step commands of the shaper robust.', '',
-        1, 16, read_only=False),
-    ParameterSpec(
-        'command_mode', 'continuous',
-        'Whether commands are stamped with any time, or on the grid of command_period.',
-        choices=('continuous', 'sampled')),
-    ParameterSpec(
-        'command_period', 0.001, 'Period of the grid in command_mode sampled.', 's',
-        1e-9, 1e3),
-    ParameterSpec(
-        'slew_limit', 0.0,
-        'Rate at which the amplifier ramps to a commanded level; 0 for steps.', 'T/s',
-        0.0, 1e12),
-    ParameterSpec(
-        'short_spell', 'refuse', 'What to do with a spell that ends before its move does.',
-        choices=SHORT_SPELL, read_only=False),
-    ParameterSpec(
-        'flux_density_min', -0.5, 'Least flux density that the coil may be asked for.', 'T',
-        -1e3, 1e3, read_only=False),
-    ParameterSpec(
-        'flux_density_max', 0.5, 'Largest flux density that the coil may be asked for.', 'T',
-        -1e3, 1e3, read_only=False),
-)
+PARAMETERS = SPECS
 
-# How often the outbox and the progress are looked at while a plan runs.
-_POLL_SECONDS = 0.002
+# How often the outbox and the progress are looked at while something is due soon, and how
+# seldom while nothing is; simulated time may run at any pace, and is looked at often.
+_POLL_NS = 2_000_000
+_LONGEST_POLL_NS = 100_000_000
+# Clock jumps nearer to each other than this are told of once.
+_STORM_NS = NANOSECONDS
+# So far ahead that all there is gets sent.
+_FAR = 2**62
 _WARNINGS = (Code.TOO_DAMPED, Code.INDISTINGUISHABLE, Code.SPELL_TOO_SHORT)
 
+_Request = Callable[[int], Mapping[str, Draft]]
 
-class PlannerNode(Node):
-    """Wires `hmsa_ros.core.planner.Planner` to topics, services and the clock."""
+
+class PlannerNode(ManagedNode):
+    """Wires `hmsa_ros.core.group.PlannerGroup` to topics, services and the clock."""
 
     def __init__(self) -> None:
-        """Declare, create and announce that there is no request yet."""
+        """Declare the parameters, and start if told to."""
         super().__init__(interface.PLANNER)
-        values = dict(declare(self, PARAMETERS))
-        self._values = values
-        self._joint: str = values['joint']
+        self._settings = declare_joints(
+            self, [x for x in PARAMETERS if x is not AUTOSTART], OWN)
+        self._group = group_from(self._settings)
         seconds = warm_up()
         if seconds > 1.0:
             self.get_logger().info(f'loaded the numerical kernels in {seconds:.1f} s')
-        self._planner = Planner(
-            actuator_from(values), _options(values), stretch=values['initial_stretch'])
-        self._verdict = (DiagnosticStatus.OK, 'no request yet', 'none', '')
-        self._progress: tuple[object, ...] = ()
-        self._sent = self._late = self._refused = 0
-
-        self._command = self._publisher(interface.FLUX_DENSITY_COMMAND)
-        self._plan = self._publisher(interface.PLAN)
-        self._status = self._publisher(interface.STATUS)
-        self._diagnostics = self._publisher(interface.DIAGNOSTICS)
-        self._subscribe(interface.JOINT_TRAJECTORY, self._on_trajectory)
-        self._subscribe(interface.SETPOINT, self._on_setpoint)
-        self.create_service(interface.STOP.type, interface.STOP.name, self._on_stop)
         self.add_on_set_parameters_callback(self._on_parameters)
+        self.autostart()
+
+    # -- states --------------------------------------------------------------------------------
+
+    def configure(self) -> None:
+        """Create topics, services and timers."""
+        self._group = group_from(self._settings)
+        self._verdict = (DiagnosticStatus.OK, 'no request yet', 'none', '')
+        self._progress: object = None
+        self._sent = self._beats = self._late = self._replanned = self._refused = 0
+        self._largest_lateness = self._jumps = self._last_jump = 0
+        self._several_clocks = False
+        # Requests that wait until the state in force is known, and whether it is.
+        self._take_over: TakeOver | None = None
+        self._waiting: list[tuple[_Request, str]] = []
+        self._engaged = False
+        # Joints whose plan reality has left.
+        self._astray: set[str] = set()
+        self._wake: int | None = None
+        self._steps = StepWatch()
+
+        self._channels = {
+            name: JointChannel(
+                self, name, self._settings.names, self._on_setpoint, self._on_applied)
+            for name in self._settings.names}
+        self._plan, self._status, self._diagnostics = (
+            self.create_publisher(x.type, x.name, x.qos)
+            for x in (interface.PLAN, interface.STATUS, interface.DIAGNOSTICS))
+        topic = interface.JOINT_TRAJECTORY
+        self.create_subscription(topic.type, topic.name, self._on_trajectory, topic.qos)
+        self.create_service(interface.STOP.type, interface.STOP.name, self._on_stop)
 
         # Steady time: timers on simulated time fire once a /clock message at the most, and
         # what is due is decided by the node's clock anyhow.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._poll = self.create_timer(_POLL_SECONDS, self._on_poll, clock=steady)
+        self._poll = self.create_timer(_POLL_NS / NANOSECONDS, self._on_poll, clock=steady)
         self.create_timer(1.0, self._on_diagnostics, clock=steady)
+        # A sign of life counts in the time of whoever listens.
+        self._heartbeat = self.create_timer(1.0, self._on_heartbeat)
+        self._set_heartbeat()
         self._jump = self.get_clock().create_jump_callback(
             JumpThreshold(
                 min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False),
             post_callback=self._on_jump)
         self._publish_status()
 
-    def _publisher(self, topic: interface.Topic):  # type: ignore[no-untyped-def]
-        return self.create_publisher(topic.type, topic.name, topic.qos)
+    def activate(self) -> None:
+        """Take requests; the first of them reads the state in force."""
+        self._poll.reset()
 
-    def _subscribe(self, topic: interface.Topic, callback: Callable[..., None]) -> None:
-        self.create_subscription(topic.type, topic.name, callback, topic.qos)
+    def deactivate(self) -> None:
+        """Come to rest, for which all commands are sent now, and send nothing more."""
+        self._end_take_over()
+        self._waiting.clear()
+        now = self._now()
+        if self._engaged and now:
+            self._group.take(self._group.draft_stop(now), now)
+            for name, planner in self._group.planners.items():
+                for level in planner.due(_FAR):
+                    self._send(name, level.stamp, level)
+            self._verdict = (
+                DiagnosticStatus.OK, 'deactivated: coming to rest', 'stopped', '')
+        self._engaged = False
+        self._publish_status()
+
+    def cleanup(self) -> None:
+        """Forget the plans."""
+        self._jump.unregister()
+        self._channels = {}
 
     def _now(self) -> int:
-        return int(self.get_clock().now().nanoseconds)
+        before = monotonic_ns()
+        now = int(self.get_clock().now().nanoseconds)
+        if not self.get_clock().ros_time_is_active:
+            back = self._steps.set_back(before, now, monotonic_ns())
+            if back:
+                self._drop_plans(back)
+        return now
 
     # -- requests ------------------------------------------------------------------------------
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
-        def plan(now: int) -> Plan:
-            points, stamp = conversions.from_trajectory(message, self._joint)
-            return self._planner.request(points, stamp, now)
-        self._answer(plan, message.header.frame_id)
+        def plan(now: int) -> Mapping[str, Draft]:
+            points, stamp = conversions.from_trajectories(
+                message, self._settings.names,
+                partial=self._settings['allow_partial_joints'])
+            return self._group.draft_request(points, stamp, now)
+        self._request(plan, message.header.frame_id)
 
-    def _on_setpoint(self, message: Float64) -> None:
-        self._answer(lambda now: self._planner.setpoint(message.data, now), '')
+    def _on_setpoint(self, joint: str, stretch: float) -> None:
+        self._request(lambda now: self._group.draft_setpoint(joint, stretch, now), '')
 
     def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = self._answer(self._planner.stop, '')
-        response.message = self._verdict[1]
+        response.success = self._request(self._group.draft_stop, '')
+        response.message = self._verdict[1] if not self._waiting else (
+            'accepted: to be carried out as soon as the state in force is known')
         return response
 
-    def _answer(self, plan: Callable[[int], Plan], request: str) -> bool:
+    def _request(self, plan: _Request, name: str) -> bool:
+        """Answer a request, now or once it is known where the actuators are."""
+        now = self._now()
+        if self.active and not self._engaged and now:
+            patience = nanoseconds(self._settings['takeover_timeout'])
+            if self._take_over is None and patience and TakeOver.possible(self):
+                self._take_over = TakeOver(
+                    self, self._settings.names, patience,
+                    nanoseconds(self._settings['takeover_max_age']))
+            if self._take_over is not None:
+                self._waiting.append((plan, name))
+                self._poll_soon()
+                return True
+        return self._answer(plan, name)
+
+    def _answer(self, plan: _Request, request: str) -> bool:
         """Plan a request, start sending and publish the verdict; say whether it was taken."""
         now = self._now()
-        before = self._planner.plan.number
         try:
+            if not self.active:
+                raise RefusedError(
+                    Code.INACTIVE,
+                    f'the planner is {self.state}: expected it active (ros2 lifecycle set '
+                    f'{self.get_fully_qualified_name()} activate)')
             if now == 0:
                 raise RefusedError(
                     Code.NO_TIME,
                     'simulated time has not started: expected messages on /clock (start the '
                     'simulator, or set use_sim_time to false)')
-            taken = plan(now)
+            drafts = plan(now)
+            if len(self._channels) > 1 and drafts:
+                drafts, now = self._in_time(plan, drafts, now)
         except HmsaError as error:
             code = Code.BAD_INPUT if isinstance(error, BadInputError) else Code.NOT_CONVERGED
             if isinstance(error, RefusedError):
@@ -157,125 +192,306 @@ class PlannerNode(Node):
             self.get_logger().error(f'request refused ({code}): {error}')
             self._publish_status()
             return False
+        self._engaged = True
+        self._astray -= drafts.keys()
+        changed = self._group.take(drafts, now)
         self._send_due(now)
-        warnings = [x for x in taken.segments if x.code in _WARNINGS]
+        warnings = [
+            x for draft in drafts.values() for x in draft.segments if x.code in _WARNINGS]
         if warnings:
             self._verdict = (
                 DiagnosticStatus.WARN, warnings[0].reason, str(warnings[0].code), request)
             self.get_logger().warning(warnings[0].reason)
-        elif taken.number == before:
+        elif not changed:
             self._verdict = (
                 DiagnosticStatus.OK, 'already on the way there: the plan stays', 'unchanged',
                 request)
         else:
             self._verdict = (DiagnosticStatus.OK, 'accepted', 'accepted', request)
-        if taken.number != before:
-            self._plan.publish(conversions.to_plan(taken, self._joint))
-        self._poll.reset()
+        if changed:
+            self._publish_plan()
         self._publish_status()
+        self._poll_soon()
         return True
+
+    def _in_time(
+            self, plan: _Request, drafts: Mapping[str, Draft],
+            now: int) -> tuple[Mapping[str, Draft], int]:
+        """Plan again for later, if planning for many joints took longer than the lead time."""
+        spent = self._now() - now
+        if min(x.begin for x in drafts.values()) >= now + spent:
+            return drafts, now
+        later = now + 3 * spent
+        return plan(later), later
+
+    # -- the state in force --------------------------------------------------------------------
+
+    def _end_take_over(self) -> None:
+        """Take the samples there are, and carry out what has waited for them."""
+        found, self._take_over = self._take_over, None
+        if found is None:
+            return
+        found.close()
+        for name, planner in self._group.planners.items():
+            if name not in found.samples:
+                self.get_logger().warning(
+                    f'no sample of joint {name} on joint_states: it is taken to rest at its '
+                    'initial stretch')
+                continue
+            stamp, stretch, rate, in_force = found.samples[name]
+            applied = self._channels[name].applied
+            try:
+                planner.take_over(
+                    stamp, stretch, rate, in_force,
+                    applied[1] if applied is not None and applied[0] <= stamp else None)
+            except BadInputError as error:
+                self.get_logger().warning(f'sample of joint {name} ignored: {error}')
+        self._engaged = True
+        waiting, self._waiting = self._waiting, []
+        for plan, name in waiting:
+            self._answer(plan, name)
+
+    def _on_applied(self, joint: str, stamp: int, flux_density: float) -> None:
+        """Hold what took effect against the plan."""
+        if not self._engaged:
+            return
+        found = self._group.applied(
+            joint, stamp, flux_density, nanoseconds(self._settings['lateness_tolerance']))
+        if found is None:
+            return
+        if found.late > 0:
+            self._note_late(found.late)
+        elif found.foreign:
+            self.get_logger().warning(
+                f'joint {joint}: {flux_density:g} T took effect, which was not commanded',
+                throttle_duration_sec=1.0)
+        if self._settings['replan_late']:
+            self._astray.add(joint)
+            self._poll_soon()
+
+    def _note_late(self, late: int) -> None:
+        self._late += 1
+        self._largest_lateness = max(self._largest_lateness, late)
+        self.get_logger().warning(
+            f'command {late / 1e6:.3f} ms after the time it applies: {self._advice()}',
+            throttle_duration_sec=1.0)
+
+    def _advice(self) -> str:
+        needed = self._settings['lead_time'] + self._largest_lateness / NANOSECONDS
+        return f'raise lead_time to more than {needed:.3g} s'
+
+    def _replan(self, now: int) -> None:
+        """Plan anew for the joints that are not where they were to be."""
+        found = self._group.resume(sorted(self._astray), now)
+        self._astray.clear()
+        request = self._verdict[3]
+        self._replanned += found.resumed
+        if found.stopped:
+            name, reason = next(iter(found.stopped.items()))
+            self._verdict = (
+                DiagnosticStatus.ERROR,
+                f'joint {name} comes to rest, since its sequence cannot be resumed: {reason}',
+                'stopped', request)
+        elif found.given_up:
+            self._verdict = (
+                DiagnosticStatus.WARN,
+                f'commands come late again and again, by up to '
+                f'{self._largest_lateness / 1e6:.3f} ms, and vibration is left: '
+                f'{self._advice()}', 'late', request)
+        elif found.resumed:
+            missed = f', without {found.missed} setpoints whose time is over' \
+                if found.missed else ''
+            self._verdict = (
+                DiagnosticStatus.WARN,
+                'commands took effect otherwise than planned: the rest is planned anew'
+                + missed, 'replanned', request)
+        else:
+            return
+        self.get_logger().warning(self._verdict[1], throttle_duration_sec=1.0)
+        if found.resumed or found.stopped:
+            self._publish_plan()
+        self._publish_status()
 
     # -- time ----------------------------------------------------------------------------------
 
+    def _poll_soon(self) -> None:
+        """Look at the outbox soon, as the plan has changed."""
+        self._wake = 0
+        self._poll.timer_period_ns = _POLL_NS
+        self._poll.reset()
+
     def _on_poll(self) -> None:
-        now = self._now()
-        self._send_due(now)
-        progress = self._progress_at(now)
-        if progress != self._progress:
-            self._publish_status()
-        if not self._planner.pending and progress[0] in ('idle', 'at_rest', 'settling'):
+        if self._take_over is not None:
+            if self._take_over.over:
+                self._end_take_over()
+            return
+        if self._wake is None or not self._engaged:
             self._poll.cancel()
+            return
+        now = self._now()
+        if now >= self._wake:
+            self._act(now)
+        self._rest_until_wake(now)
+
+    def _act(self, now: int) -> None:
+        """Do what is due, and note when to look again."""
+        if self._settings['replan_late']:
+            self._drop_missed(now)
+            if self._astray:
+                self._replan(now)
+        self._send_due(now)
+        if self._group.progress(now) != self._progress:
+            self._publish_status()
+        self._wake = self._group.next_event(now)
+
+    def _rest_until_wake(self, now: int) -> None:
+        """Poll more seldom while nothing is due, and not at all if nothing ever is."""
+        if self._wake is None:
+            self._poll.cancel()
+            return
+        if self.get_clock().ros_time_is_active:
+            return
+        wanted = min(max(self._wake - now, _POLL_NS), _LONGEST_POLL_NS)
+        if wanted != self._poll.timer_period_ns:
+            self._poll.timer_period_ns = wanted
+            self._poll.reset()
+
+    def _drop_missed(self, now: int) -> None:
+        """Take out of the plans what is too late to be sent, as after a jump of the clock."""
+        tolerance = nanoseconds(self._settings['lateness_tolerance'])
+        for name, planner in self._group.planners.items():
+            due = planner.next_due
+            if due is None or due + planner.options.lead_time >= now - tolerance \
+                    or not self._group.may_resume(name):
+                continue
+            late = now - due - planner.options.lead_time
+            self._note_late(late)
+            self._late += planner.drop_missed(now, tolerance) - 1
+            self._astray.add(name)
 
     def _send_due(self, now: int) -> None:
-        for level in self._planner.due(now):
-            self._command.publish(conversions.to_command(
-                level.stamp, level.flux_density, self._values['frame_id']))
-            self._sent += 1
-            if level.stamp < now:
-                self._late += 1
-                self.get_logger().warning(
-                    f'command sent {(now - level.stamp) / 1e6:.3f} ms after the time it '
-                    'applies: raise lead_time')
+        for name, planner in self._group.planners.items():
+            for level in planner.due(now):
+                self._send(name, level.stamp, level)
+                if level.stamp < now:
+                    self._note_late(now - level.stamp)
+
+    def _send(self, name: str, stamp: int, level: PlannedLevel) -> None:
+        self._channels[name].send(stamp, level, self._settings['frame_id'])
+        self._sent += 1
+
+    def _on_heartbeat(self) -> None:
+        """Send the level in force again: who listens learns that we are alive."""
+        if not self._engaged or not self.active:
+            return
+        now = self._now()
+        for name, planner in self._group.planners.items():
+            level = planner.last_sent
+            due = planner.next_due
+            stamp = max(now + planner.options.lead_time, level.stamp)
+            period = planner.options.period
+            stamp = stamp if period == 0 else -(-stamp // period) * period
+            if due is not None and stamp >= due + planner.options.lead_time:
+                # The next command is about to be sent.
+                continue
+            self._channels[name].send(stamp, level, self._settings['frame_id'])
+            self._beats += 1
+
+    def _set_heartbeat(self) -> None:
+        period = nanoseconds(self._settings['heartbeat_period'])
+        if period == 0:
+            self._heartbeat.cancel()
+            return
+        self._heartbeat.timer_period_ns = period
+        self._heartbeat.reset()
 
     def _on_jump(self, jump: TimeJump) -> None:
         if jump.delta.nanoseconds < 0:
-            self._planner.restart()
-            self._verdict = (
-                DiagnosticStatus.WARN,
-                f'the clock jumped back by {-jump.delta.nanoseconds / NANOSECONDS:.3f} s: the '
-                'plan is dropped and the actuator taken to be at its initial stretch',
-                'clock_jumped', '')
-            self.get_logger().warning(self._verdict[1])
-            self._publish_status()
+            self._drop_plans(-jump.delta.nanoseconds)
+
+    def _drop_plans(self, back: int) -> None:
+        """Begin anew where the clock was set back; where the actuators are is read again."""
+        self._jumps += 1
+        self._group.restart()
+        self._engaged = False
+        self._astray.clear()
+        for channel in self._channels.values():
+            channel.applied = None
+        last, self._last_jump = self._last_jump, monotonic_ns()
+        if self._jumps > 1 and self._last_jump - last < _STORM_NS:
+            return
+        self._verdict = (
+            DiagnosticStatus.WARN,
+            f'the clock jumped back by {back / NANOSECONDS:.3f} s: the plan is dropped, and the '
+            'actuator taken to be at its initial stretch unless joint_states tells otherwise',
+            'clock_jumped', '')
+        self.get_logger().warning(self._verdict[1])
+        self._publish_status()
 
     # -- reports -------------------------------------------------------------------------------
 
-    def _progress_at(self, now: int) -> tuple[object, ...]:
-        """Return state, place in the sequence and target; what a change of is published."""
-        found = self._planner.segment(now)
-        plan = self._planner.plan
-        count = len(plan.segments) - plan.kept
-        if found is None or found[0] < plan.kept:
-            return ('waiting' if count else 'idle', 0, count, '')
-        index, segment = found[0] - plan.kept, found[1]
-        last = index == count - 1
-        if segment.arrival is None:
-            state = 'settling' if last else 'moving'
-        elif now < segment.arrival:
-            state = 'moving'
+    def _publish_plan(self) -> None:
+        planners = self._group.planners
+        if len(planners) == 1:
+            (name, planner), = planners.items()
+            self._plan.publish(conversions.to_plan(planner.plan, name))
         else:
-            state = 'at_rest' if last else 'holding'
-        return (state, index + 1, count, f'{segment.stretch:.12g}')
+            self._plan.publish(conversions.to_plans(*self._group.preview()))
 
     def _publish_status(self) -> None:
-        self._progress = self._progress_at(self._now())
+        self._progress = progress, each = self._group.progress(self._now())
         level, message, code, request = self._verdict
-        state, done, count, target = self._progress
+        values: dict[str, object] = {
+            'code': code, 'request': request, 'plan': self._group.number,
+            'state': progress.state, 'setpoint': progress.setpoint,
+            'setpoints': progress.setpoints, 'stretch': progress.stretch,
+            'late': self._late, 'replanned': self._replanned}
+        if len(each) > 1:
+            for name, of_joint in each.items():
+                values |= {
+                    f'{name}.state': of_joint.state, f'{name}.setpoint': of_joint.setpoint,
+                    f'{name}.setpoints': of_joint.setpoints,
+                    f'{name}.stretch': of_joint.stretch}
         self._status.publish(conversions.to_status(
-            'planner: request', self._joint, level, message,
-            {'code': code, 'request': request, 'plan': self._planner.plan.number,
-             'state': state, 'setpoint': done, 'setpoints': count, 'stretch': target}))
+            'planner: request', ', '.join(each), level, message, values))
 
     def _on_diagnostics(self) -> None:
         level = DiagnosticStatus.WARN if self._late else DiagnosticStatus.OK
-        message = f'{self._late} commands sent late' if self._late else 'commands sent in time'
+        message = f'{self._late} commands late: {self._advice()}' if self._late \
+            else 'commands sent in time'
+        clocks = self.count_publishers('/clock') if self.get_clock().ros_time_is_active else 1
+        if clocks > 1:
+            level = DiagnosticStatus.WARN
+            message = f'{clocks} publishers on /clock, and time may go back and forth: ' \
+                'expected one'
+            if not self._several_clocks:
+                self.get_logger().warning(message)
+        self._several_clocks = clocks > 1
         self._diagnostics.publish(conversions.to_diagnostics(
             self._now(), conversions.to_status(
-                f'{self.get_name()}: commands', self._joint, level, message,
-                {'sent': self._sent, 'late': self._late, 'refused': self._refused})))
+                f'{self.get_name()}: commands', ', '.join(self._channels), level, message,
+                {'sent': self._sent, 'late': self._late, 'refused': self._refused,
+                 'replanned': self._replanned, 'heartbeats': self._beats,
+                 'largest_lateness_ms': f'{self._largest_lateness / 1e6:.3f}',
+                 'clock_jumps': self._jumps})))
 
     # -- parameters ----------------------------------------------------------------------------
 
     def _on_parameters(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         """Take changed parameters from the next request on, or refuse them together."""
-        specs = {spec.name: spec for spec in PARAMETERS}
-        values = self._values | {x.name: x.value for x in parameters if x.name in specs}
         try:
-            for parameter in parameters:
-                if parameter.name in specs:
-                    specs[parameter.name].check(parameter.value)
-            self._planner.set_options(_options(values))
+            changed = self._settings.changed(parameters)
+            models = models_from(changed, self._group)
         except BadInputError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        self._values = values
+        beat = changed['heartbeat_period'] != self._settings['heartbeat_period']
+        self._settings = changed
+        for name, model in models.items():
+            self._group.planners[name].take_model(model)
+        self._group.simultaneous = changed['simultaneous_arrival']
+        if beat and self.state != 'unconfigured':
+            self._set_heartbeat()
         return SetParametersResult(successful=True)
-
-
-def _options(values: dict[str, Any]) -> Options:
-    """Return the planning options that declared parameters describe."""
-    least, largest = float(values['flux_density_min']), float(values['flux_density_max'])
-    if not least < largest:
-        raise BadInputError(
-            f'parameter flux_density_min is {least:g} T: expected less than flux_density_max, '
-            f'which is {largest:g} T')
-    return Options(
-        shaper=str(values['shaper']), short_spell=str(values['short_spell']),
-        flux_density_min=least, flux_density_max=largest,
-        lead_time=round(float(values['lead_time']) * NANOSECONDS),
-        period=0 if values['command_mode'] == 'continuous'
-        else round(float(values['command_period']) * NANOSECONDS),
-        slew_limit=float(values['slew_limit']) or math.inf,
-        order=int(values['robust_order']))
 
 
 def main(args: Sequence[str] | None = None) -> int:
