@@ -14,8 +14,8 @@ ROOT = Path(__file__).resolve().parent.parent
 FILE = ROOT / 'docs' / 'images' / 'graph.svg'
 WIDTH = 640
 LINE = 19
-BOX_LEFT, BOX_RIGHT = 170, 390
-DOWN, UP = 210, 350
+BOX_LEFT, BOX_RIGHT = 186, 406
+DOWN, UP = 226, 366
 # Readable on a light and on a dark page, whatever shows it: it brings its own ground.
 STYLE = """
     .ground { fill: #ffffff; stroke: #d0d7de; }
@@ -87,8 +87,11 @@ def draw() -> str:
         return ', '.join(x.name.removeprefix('~/') for x in vars(interface).values()
                          if isinstance(x, interface.Service) and node in x.meaning)
 
-    requests = [interface.from_outside(x.name, PLANNER) for x in own
-                if PLANNER in x.subscribers and not x.publishers]
+    def from_you(taker: str) -> list[str]:
+        return [interface.from_outside(x.name, taker) for x in own
+                if taker in x.subscribers and not x.publishers]
+
+    requests = from_you(PLANNER)
     down, up = between(PLANNER, PLANT), between(PLANT, PLANNER)
 
     drawing = Drawing()
@@ -104,6 +107,11 @@ def draw() -> str:
             drawing.arrow(BOX_RIGHT, top + height / 2, BOX_RIGHT + 34, top + height / 2)
             drawing.names(
                 BOX_RIGHT + 42, top + height / 2 - LINE * len(sent) / 2 + 1, sent)
+        taken = from_you(name) if name == PLANT else []
+        if taken:
+            drawing.arrow(BOX_LEFT - 24, top + height / 2, BOX_LEFT - 4, top + height / 2)
+            drawing.names(
+                BOX_LEFT - 28, top + height / 2 - LINE * len(taken) / 2 + 1, taken, 'end')
         return top + height
 
     y = 14.0

@@ -11,7 +11,8 @@ A block says by its info string what becomes of it:
     It needs a full ROS 2 installation (the ros2 command, colcon, a desktop): its syntax and
     every name of this package in it are checked.
 ``bash repository``
-    It sets the clone up or runs its gate: its targets, extras and files are checked.
+    It sets the clone up, runs its gate or measures for minutes: its targets, extras, modules and
+    files are checked.
 ``yaml``, ``json``
     It must be well formed; parameters in it must exist.
 """
@@ -614,8 +615,12 @@ def _check_repository(words: list[str]) -> None:
                 _require(extra in extras, f'setup.py has no extra {extra!r}')
     elif '/' in program:
         _require((ROOT / program).is_file(), f'no file {program}')
+    elif program in ('python', 'python3') and words[1] == '-m':
+        place = ROOT / words[2].replace('.', '/')
+        _require(place.with_suffix('.py').is_file() or (place / '__main__.py').is_file(),
+                 f'no module {words[2]}')
     elif program in ('python', 'python3'):
-        _require((ROOT / words[1]).is_file() or words[1] == '-m', f'no file {words[1]}')
+        _require((ROOT / words[1]).is_file(), f'no file {words[1]}')
     else:
         _require(program in ('.', 'source', 'cd', 'git', 'export'),
                  f'{program!r} does not set a clone up')

@@ -27,7 +27,7 @@ from documents import (
 )
 import pytest
 
-AT_A_TIME = 2
+AT_A_TIME = 3
 PAGES = pages()
 RUNNING = [page for page in PAGES if any(block.runs for block in blocks(page))]
 
@@ -70,7 +70,7 @@ def running(
              if getattr(item, 'originalname', '') == 'test_page_does_what_it_says']
     with ThreadPoolExecutor(AT_A_TIME) as pool:
         runs = {page: pool.submit(run, page, tmp_path_factory.mktemp(page.stem))
-                for page in asked}
+                for page in reversed(asked)}  # the long ones are at the end
         yield runs
         for future in runs.values():
             future.cancel()
@@ -179,6 +179,7 @@ def test_a_wrong_name_in_a_block_for_an_installation_is_found(text, reason):
     ('bash', REPOSITORY, 'make tset', "no target 'tset'"),
     ('bash', REPOSITORY, "pip install '.[rso]'", "no extra 'rso'"),
     ('bash', REPOSITORY, '.ci/rn', 'no file'),
+    ('bash', REPOSITORY, 'python -m benchmark faults', 'no module'),
     ('yaml', '', '/**:\n  ros__parameters:\n    lead_tme: 1.0\n', "'lead_tme' is not declared"),
     ('yaml', '', 'a: [', 'expected'),
     ('json', '', '{', 'Expecting'),
