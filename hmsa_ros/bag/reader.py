@@ -213,8 +213,9 @@ class BagReader:
                         f'{path} describes a bag: expected its folder, {path.parent}')
                 return [path]
             if not path.is_dir():
+                what = 'is neither' if path.exists() else 'does not exist'
                 raise BadInputError(
-                    f'{path} does not exist: expected the folder of a bag or an .mcap file')
+                    f'{path} {what}: expected the folder of a bag or an .mcap file')
             present = sorted(
                 (entry for entry in path.iterdir()
                  if entry.name.endswith('.mcap') and self._is_own_file(entry)),
