@@ -9,6 +9,7 @@ that ``hmsa --help`` answers at once.
 import argparse
 from collections.abc import Sequence
 from importlib import import_module
+import signal
 import sys
 from typing import Any, NoReturn
 
@@ -92,6 +93,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     arguments = build_parser().parse_args(split_ros_args(words))
     arguments.ros_args = words[len(split_ros_args(words)):]
+    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+        # Set while everything was imported (see __main__); from here on it is handled.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         status: int = arguments.run(arguments)
         return status
