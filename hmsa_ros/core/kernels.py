@@ -96,6 +96,19 @@ def _derivative(l, v, s, r, beta, p, zeta, c1, i_j):  # noqa: E741
     return v, a, r, a_l * s + a_v * r + 6.0 * l3 * i_inertia * p
 
 
+@njit(cache=True, error_model='numpy', fastmath=_FAST, inline='always')
+def _error(h, new_l, new_v, e5_l, e5_v, e3_l, e3_v, rtol):
+    """Return the error of a step in units of the tolerance, from both error estimates."""
+    scale_l = 1.0 / (rtol * (1.0 + abs(new_l)))
+    scale_v = 1.0 / (rtol * (1.0 + abs(new_v)))
+    e5 = (e5_l * scale_l) ** 2 + (e5_v * scale_v) ** 2
+    e3 = (e3_l * scale_l) ** 2 + (e3_v * scale_v) ** 2
+    error = 0.0
+    if e5 != 0.0:
+        error = abs(h) * e5 / math.sqrt(2.0 * (e5 + 0.01 * e3))
+    return error
+
+
 @_compiled
 def _step(k, l, v, s, r, beta, slope, p, q, h, zeta, c1, i_j, rtol):  # noqa: E741
     """
@@ -129,13 +142,7 @@ def _step(k, l, v, s, r, beta, slope, p, q, h, zeta, c1, i_j, rtol):  # noqa: E7
         e3_v += ERROR_3[j] * k[j, 1]
     new_l = l + h * d0
     new_v = v + h * d1
-    scale_l = 1.0 / (rtol * (1.0 + abs(new_l)))
-    scale_v = 1.0 / (rtol * (1.0 + abs(new_v)))
-    e5 = (e5_l * scale_l) ** 2 + (e5_v * scale_v) ** 2
-    e3 = (e3_l * scale_l) ** 2 + (e3_v * scale_v) ** 2
-    error = 0.0
-    if e5 != 0.0:
-        error = abs(h) * e5 / math.sqrt(2.0 * (e5 + 0.01 * e3))
+    error = _error(h, new_l, new_v, e5_l, e5_v, e3_l, e3_v, rtol)
     return new_l, new_v, s + h * d2, r + h * d3, error
 
 
@@ -644,3 +651,117 @@ def respond(
         jacobian[0, j] = s
         jacobian[1, j] = r
     return DONE, end_l, end_v
+
+
+# -- the plant ----------------------------------------------------------------------------------
+
+
+@njit(cache=True, error_model='numpy', fastmath=_FAST, inline='always')
+def _acceleration(l, v, beta, zeta, c1, i_j):  # noqa: E741
+    """Right-hand side of Eq. 11 alone; NaN outside the admissible stretches."""
+    l2 = l * l
+    l3 = l2 * l
+    lg = l - (l - 1.0) * (l - 1.0) * (l + 2.0) * i_j
+    if not (l > 0.0 and lg > 0.0):
+        return math.nan
+    elastic = l2 * (l3 - 1.0) / lg
+    return (6.0 * (beta * l3 - elastic) - 3.0 * zeta * c1 * l3 * v + 1.5 * v * v / l) / (
+        1.0 + c1 * l3)
+
+
+@_compiled
+def _plain_step(k, l, v, beta, slope, excess, decay, h, zeta, c1, i_j, rtol):  # noqa: E741
+    """
+    One DOP853 step without sensitivities; ``k`` (12, 4) is working space, half of it used.
+
+    The load is ``beta + slope t + excess exp(-decay t)`` from the start of the step. Returns
+    the new state and the error in units of the tolerance.
+    """
+    for i in range(STAGES):
+        d0 = d1 = 0.0
+        for j in range(i):
+            w = MATRIX[i, j]
+            d0 += w * k[j, 0]
+            d1 += w * k[j, 1]
+        t = h * NODES[i]
+        load = beta + slope * t
+        if excess != 0.0:
+            load += excess * math.exp(-decay * t)
+        new_v = v + h * d1
+        k[i, 0] = new_v
+        k[i, 1] = _acceleration(l + h * d0, new_v, load, zeta, c1, i_j)
+    d0 = d1 = 0.0
+    e5_l = e5_v = e3_l = e3_v = 0.0
+    for j in range(STAGES):
+        d0 += WEIGHTS[j] * k[j, 0]
+        d1 += WEIGHTS[j] * k[j, 1]
+        e5_l += ERROR_5[j] * k[j, 0]
+        e5_v += ERROR_5[j] * k[j, 1]
+        e3_l += ERROR_3[j] * k[j, 0]
+        e3_v += ERROR_3[j] * k[j, 1]
+    new_l = l + h * d0
+    new_v = v + h * d1
+    return new_l, new_v, _error(h, new_l, new_v, e5_l, e5_v, e3_l, e3_v, rtol)
+
+
+@_compiled
+def _follow(k, l, v, h, beta, slope, excess, decay, duration, zeta, c1, i_j, rtol):  # noqa: E741
+    """Integrate one actuator as `advance` does; returns status, state and step length."""
+    if h <= 0.0:
+        h = _first_step(l, v, beta + excess, zeta, c1, i_j, rtol)
+    done = 0.0
+    for _ in range(_MAX_STEPS):
+        left = duration - done
+        if not left > 0.0:
+            return DONE, l, v, h
+        step = min(h, left)
+        rate = math.sqrt(elastic_stiffness(l, i_j) / ((l ** -3 + c1) / 6.0))
+        if _attainable(0.0, l, v, rate) > _RESOLVED and v * (l - 1.0) > 0.0:
+            v = -v
+        rest = excess
+        if excess != 0.0:
+            rest *= math.exp(-decay * done)
+        new_l, new_v, error = _plain_step(
+            k, l, v, beta + slope * done, slope, rest, decay, step, zeta, c1, i_j,
+            _attainable(rtol, l, v, rate))
+        if error <= 1.0:
+            l, v = new_l, new_v  # noqa: E741
+            done = duration if step == left else done + step
+            if step == h or error > 0.5:
+                h = _resize(step, error)
+        else:
+            h = _resize(step, error)
+    return STUCK, l, v, h
+
+
+@_compiled
+def follow(k, first, last, wanted, state, drive, material, durations, rtol, status):
+    """
+    Integrate the actuators ``first`` to ``last`` of which ``wanted`` is true.
+
+    Rows: ``state`` stretch, rate, step length (0 for none known); ``drive`` the load as
+    ``_plain_step`` takes it, which is brought forward to the end; ``material`` zeta, c1, i_j.
+    One that does not get through keeps its state. Returns how many these are; ``status`` tells
+    which.
+    """
+    failed = 0
+    for i in range(first, last):
+        if not wanted[i]:
+            continue
+        beta, slope, excess, decay = drive[i, 0], drive[i, 1], drive[i, 2], drive[i, 3]
+        duration = durations[i]
+        status[i], l, v, h = _follow(  # noqa: E741
+            k, state[i, 0], state[i, 1], state[i, 2], beta, slope, excess, decay, duration,
+            material[i, 0], material[i, 1], material[i, 2], rtol)
+        if status[i] != DONE:
+            failed += 1
+            continue
+        state[i, 0] = l
+        state[i, 1] = v
+        state[i, 2] = h
+        drive[i, 0] = beta + slope * duration
+        if excess != 0.0:
+            excess *= math.exp(-decay * duration)
+            # Nothing that a sum of loads could still show.
+            drive[i, 2] = excess if abs(excess) > 1e-17 * (1e-3 + abs(beta)) else 0.0
+    return failed

@@ -16,6 +16,8 @@ class Pacer:
 
     Attributes
     ----------
+    factor : float
+        As given.
     paused : bool
         Whether time stands still.
 
@@ -23,7 +25,7 @@ class Pacer:
 
     def __init__(self, start: int, factor: float, *, paused: bool = False) -> None:
         """Begin at a time; it runs from the first call of `target` on."""
-        self._factor = factor
+        self.factor = factor
         self._anchor = start
         self._steady: int | None = None
         self.paused = paused
@@ -31,7 +33,7 @@ class Pacer:
     @property
     def unlimited(self) -> bool:
         """Whether the simulation runs as fast as it can."""
-        return self._factor == 0.0
+        return self.factor == 0.0
 
     def target(self, steady: int) -> int:
         """
@@ -51,7 +53,7 @@ class Pacer:
         if self.paused or self._steady is None:
             self._steady = steady
             return self._anchor
-        return self._anchor + round((steady - self._steady) * self._factor)
+        return self._anchor + round((steady - self._steady) * self.factor)
 
     def set_paused(self, paused: bool, time: int) -> None:
         """
@@ -68,3 +70,18 @@ class Pacer:
         self._anchor = time
         self._steady = None
         self.paused = paused
+
+    def set_factor(self, factor: float, time: int) -> None:
+        """
+        Go on at another speed.
+
+        Parameters
+        ----------
+        factor : float
+            Simulated seconds per second; 0 for as fast as possible.
+        time : int
+            Simulated time in ns that has been reached; goes on from here.
+
+        """
+        self.factor = factor
+        self.set_paused(self.paused, time)

@@ -4,7 +4,7 @@ The stream of stamped commands, as the planner sends it and the plant obeys it.
 A command applies from its stamp on and supersedes all earlier ones stamped at or after it.
 """
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections import deque
 
 
@@ -29,9 +29,11 @@ class CommandSchedule:
         """Return the number of commands ahead."""
         return len(self._stamps)
 
-    def insert(self, stamp: int, value: float) -> None:
+    def insert(self, stamp: int, value: float) -> bool:
         """
         Take a command; those stamped at or after it are dropped.
+
+        One that repeats the level of its time, as a heartbeat does, adds nothing.
 
         Parameters
         ----------
@@ -40,12 +42,41 @@ class CommandSchedule:
         value : float
             Level in T.
 
+        Returns
+        -------
+        bool
+            Whether anything is different from before.
+
         """
-        for _ in range(len(self._stamps) - bisect_left(self._stamps, stamp)):
+        dropped = len(self._stamps) - bisect_left(self._stamps, stamp)
+        if dropped == 1 and self._stamps[-1] == stamp and self._values[-1] == value:
+            return False
+        for _ in range(dropped):
             self._stamps.pop()
             self._values.pop()
+        if value == (self._values[-1] if self._values else self.current):
+            return dropped > 0
         self._stamps.append(stamp)
         self._values.append(value)
+        return True
+
+    def at(self, stamp: int) -> float:
+        """
+        Return the level in force at a time, as far as is known.
+
+        Parameters
+        ----------
+        stamp : int
+            Time in ns, not past.
+
+        Returns
+        -------
+        float
+            In T.
+
+        """
+        known = bisect_right(self._stamps, stamp)
+        return self._values[known - 1] if known else self.current
 
     @property
     def next_stamp(self) -> int | None:

@@ -12,21 +12,22 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hmsa_ros.core import kernels
+from hmsa_ros.core.actuators import Actuators, check_stretch, RTOL, Setup
 from hmsa_ros.core.model import (
     Array,
     damping,
     equilibrium_stretch,
     mass,
     natural_frequency,
-    stretch_limits,
 )
 from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.core.schedule import CommandSchedule
-from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError, HmsaError
 
-#: Relative tolerance of the plant's integration.
-RTOL = 1e-13
+__all__ = [
+    'ActuatorSimulation', 'check_stretch', 'longest_motion', 'RTOL', 'simulate', 'too_large',
+    'unshaped']
+
 # Time constants after which nothing is left of a motion, and periods after which nobody knows
 # its phase.
 _SETTLED = 40.0
@@ -127,35 +128,9 @@ def longest_motion(load: float, material: NondimensionalParameters) -> float:
     return _SETTLED * 2.0 * decay / frequency ** 2
 
 
-def check_stretch(stretch: float, j_lim: float, name: str = 'stretch') -> None:
-    """
-    Refuse a stretch outside the limits.
-
-    Parameters
-    ----------
-    stretch : float
-        Value to check.
-    j_lim : float
-        Chain limit.
-    name : str
-        What the value is, for the message.
-
-    Raises
-    ------
-    BadInputError
-        If it is not finite or not between the limiting stretches.
-
-    """
-    lower, upper = stretch_limits(j_lim)
-    if not lower < stretch < upper:
-        raise BadInputError(
-            f'{name} is {stretch:g}: expected a stretch between the limits {lower:.4f} and '
-            f'{upper:.4f} of J_lim {j_lim:g}')
-
-
 class ActuatorSimulation:
     """
-    The actuator over time in SI units: takes stamped commands, advances to a time.
+    One actuator over time in SI units: takes stamped commands, advances to a time.
 
     Time is integer nanoseconds, so that it does not drift.
 
@@ -169,17 +144,8 @@ class ActuatorSimulation:
         Stretch at the start, at rest and held by its flux density.
     slew_limit : float
         Largest change of the flux density in T/s that the amplifier makes; infinite for steps.
-
-    Attributes
-    ----------
-    time : int
-        Time in ns that the state belongs to.
-    stretch, rate : float
-        State; the rate in 1/s.
-    flux_density : float
-        In force, in T.
-    schedule : CommandSchedule
-        Commands in force and ahead, in T.
+    coil_time_constant : float
+        With which the flux density follows the amplifier, in s; 0 for at once.
 
     Raises
     ------
@@ -190,31 +156,49 @@ class ActuatorSimulation:
 
     def __init__(
             self, actuator: ActuatorParameters, *, time: int = 0, stretch: float = 1.0,
-            slew_limit: float = math.inf) -> None:
+            slew_limit: float = math.inf, coil_time_constant: float = 0.0) -> None:
         """Start at rest."""
         self.actuator = actuator
-        self._material = actuator.nondimensional
-        check_stretch(stretch, self._material.j_lim, 'initial stretch')
-        if not slew_limit > 0.0:
-            raise BadInputError(f'slew limit is {slew_limit:g} T/s: expected a number above 0')
-        self._slew = slew_limit / actuator.flux_density_unit * actuator.time_unit
-        self._work = kernels.work_space()
-        self._initial = (
-            stretch,
-            float(kernels.elastic_force(stretch, 1.0 / self._material.j_lim))
-            * actuator.flux_density_unit)
-        self.time = time
-        self.reset()
+        self._all = Actuators(
+            [Setup(actuator, stretch, slew_limit, coil_time_constant)], time=time)
+
+    @property
+    def time(self) -> int:
+        """Time in ns that the state belongs to; setting it skips what lies between."""
+        return self._all.time
+
+    @time.setter
+    def time(self, time: int) -> None:
+        self._all.time = time
+
+    @property
+    def stretch(self) -> float:
+        """Stretch."""
+        return float(self._all.stretch[0])
+
+    @property
+    def rate(self) -> float:
+        """Stretch rate in 1/s."""
+        return float(self._all.rate[0])
+
+    @property
+    def flux_density(self) -> float:
+        """Flux density in force, in T."""
+        return float(self._all.flux_density[0])
+
+    @property
+    def schedule(self) -> CommandSchedule:
+        """Commands in force and ahead, in T."""
+        return self._all.schedules[0]
 
     def reset(self) -> None:
         """Return to the initial state, at rest, with no command ahead; time goes on."""
-        self.stretch, flux_density = self._initial
-        self._rate = 0.0
-        self._step = 0.0
-        self.flux_density = flux_density
-        self.schedule = CommandSchedule(flux_density)
+        self._all.reset(0)
+        self._all.changes.clear()
 
-    def set_state(self, stretch: float, rate: float, flux_density: float) -> None:
+    def set_state(
+            self, stretch: float, rate: float, flux_density: float,
+            level: float | None = None) -> None:
         """
         Go on from another state, with no command ahead.
 
@@ -224,6 +208,8 @@ class ActuatorSimulation:
             State; the rate in 1/s.
         flux_density : float
             In force, in T.
+        level : float, optional
+            That the amplifier is on its way to, in T; default the flux density.
 
         Raises
         ------
@@ -231,17 +217,8 @@ class ActuatorSimulation:
             If the stretch is outside the limits.
 
         """
-        check_stretch(stretch, self._material.j_lim)
-        self.stretch = stretch
-        self._rate = rate * self.actuator.time_unit
-        self._step = 0.0
-        self.flux_density = flux_density
-        self.schedule = CommandSchedule(flux_density)
-
-    @property
-    def rate(self) -> float:
-        """Stretch rate in 1/s."""
-        return self._rate / self.actuator.time_unit
+        self._all.set_state(0, stretch, rate, flux_density, level)
+        self._all.changes.clear()
 
     def command(self, stamp: int, flux_density: float) -> int:
         """
@@ -258,7 +235,8 @@ class ActuatorSimulation:
         Returns
         -------
         int
-            How late the command is in ns, 0 if it is not; a late one applies at once.
+            How late the change is in ns, 0 if it is not or if nothing changes; a late one
+            applies at once.
 
         Raises
         ------
@@ -266,16 +244,26 @@ class ActuatorSimulation:
             If the value is not finite or nobody could follow it.
 
         """
-        load = flux_density / self.actuator.flux_density_unit
-        # equilibrium_stretch keeps every finite load inside the limits; far beyond this bound
-        # it is no longer distinguishable from the limit itself.
-        if not abs(load) < 1e9:
-            raise BadInputError(
-                f'flux density is {flux_density:g} T: expected a finite value below '
-                f'{1e9 * self.actuator.flux_density_unit:g} T')
-        late = max(self.time - stamp, 0)
-        self.schedule.insert(max(stamp, self.time), flux_density)
-        return late
+        return self._all.command(0, stamp, flux_density)
+
+    def force(self, stamp: int, force: float) -> None:
+        """
+        Take a disturbing force that acts from its stamp on.
+
+        Parameters
+        ----------
+        stamp : int
+            Time in ns; a force supersedes those stamped at or after it.
+        force : float
+            Along the field in N, pulling where positive.
+
+        Raises
+        ------
+        BadInputError
+            If the value is not finite or nobody could follow it.
+
+        """
+        self._all.force(0, stamp, force)
 
     def advance(self, time: int) -> None:
         """
@@ -292,47 +280,11 @@ class ActuatorSimulation:
             If the integration does not get through.
 
         """
-        while True:
-            change = self.schedule.next_stamp
-            end = time if change is None else min(change, time)
-            if end > self.time:
-                self._integrate(end - self.time)
-                self.time = end
-            if change is None or change > time:
-                return
-            self.schedule.apply_next()
-            if math.isinf(self._slew):
-                self.flux_density = self.schedule.current
-            self._step = 0.0
-
-    def _integrate(self, duration: int) -> None:
-        unit = self.actuator.flux_density_unit
-        left = duration / NANOSECONDS / self.actuator.time_unit
-        change = (self.schedule.current - self.flux_density) / unit
-        if change != 0.0 and not math.isinf(self._slew):
-            ramp = abs(change) / self._slew
-            span = min(left, ramp)
-            slope = math.copysign(self._slew, change)
-            self._follow(span, slope)
-            if span < ramp:
-                self.flux_density += slope * span * unit
-                return
-            left -= span
-        self.flux_density = self.schedule.current
-        if left > 0.0:
-            self._follow(left, 0.0)
-
-    def _follow(self, duration: float, slope: float) -> None:
-        material = self._material
-        status, stretch, rate, _, _, step = kernels.advance(
-            self._work, self.stretch, self._rate, 0.0, 0.0,
-            self.flux_density / self.actuator.flux_density_unit, slope, 0.0, 0.0, duration,
-            material.zeta, material.c1, 1.0 / material.j_lim, RTOL, self._step)
-        if status != kernels.DONE:
-            raise HmsaError(
-                f'the integration stopped at {self.time} ns under {self.flux_density:g} T: the '
-                'load is too large to follow')
-        self.stretch, self._rate, self._step = stretch, rate, step
+        failed = self._all.advance(time)
+        self._all.changes.clear()
+        for _, reached in failed:
+            self._all.time = reached
+            raise HmsaError(too_large(reached, self.flux_density))
 
     def equilibrium(self) -> float:
         """
@@ -344,8 +296,13 @@ class ActuatorSimulation:
             Stretch.
 
         """
-        return float(equilibrium_stretch(
-            self.flux_density / self.actuator.flux_density_unit, self._material.j_lim))
+        return self._all.equilibrium(0)
+
+
+def too_large(time: int, flux_density: float) -> str:
+    """Return the sentence for a load that cannot be followed, at a time in ns and in T."""
+    return (f'the integration stopped at {time} ns under {flux_density:g} T: the load is too '
+            'large to follow')
 
 
 def unshaped(

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import WrenchStamped
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, MagneticField
@@ -120,6 +121,11 @@ FLUX_DENSITY_APPLIED = Topic(
     'What became of the commands: one message at each change of level that takes effect, stamped '
     'with the time at which it really did; z is the level from then on in tesla.',
     publishers=(PLANT,), subscribers=(PLANNER,))
+DISTURBANCE_FORCE = Topic(
+    'disturbance_force', WrenchStamped, RELIABLE,
+    'A force on the simulated actuator that nobody has planned for. From its stamp on (0: at '
+    'once) force.z pulls along the field in newton, until the next message; all else is 0.',
+    subscribers=(PLANT,))
 JOINT_STATES = Topic(
     'joint_states', JointState, SAMPLES,
     'Samples of the actuator: position is stretch, velocity stretch rate in 1/s, effort the flux '
@@ -140,8 +146,10 @@ STOP = Service('~/stop', Trigger, {
     PLANNER: 'Drops the rest of the sequence and comes to rest without vibration.',
     PLAYER: 'Ends playing.'})
 RESET = Service('~/reset', Trigger, {
-    PLANT: 'Puts the actuator back to its initial state; time goes on.'})
-STEP = Service('~/step', Trigger, {PLANT: 'Advances a paused plant by one sample.'})
+    PLANT: 'Puts the actuators back to their initial states, or to reset_stretch and '
+           'reset_rate; time goes on.'})
+STEP = Service('~/step', Trigger, {
+    PLANT: 'Advances a paused plant by step_count samples, one unless set.'})
 SET_PAUSED = Service('~/set_paused', SetBool, {PLANT: 'Stops simulated time, or lets it run.'})
 PAUSE = Service('~/pause', Trigger, {
     RECORDER: 'Stops writing; what arrives meanwhile is left out.', PLAYER: 'Holds playing.'})

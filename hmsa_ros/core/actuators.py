@@ -1,0 +1,479 @@
+"""
+Several actuators over time in SI units, advanced together by one compiled call.
+
+Time is integer nanoseconds, so that it does not drift. Each actuator is integrated in pieces of
+its own, from change to change of what drives it: what happens to one leaves no trace in the
+numbers of another, and one alone moves bit for bit as it does among others.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from hmsa_ros.core import kernels
+from hmsa_ros.core.model import Array, stretch_limits
+from hmsa_ros.core.parameters import ActuatorParameters
+from hmsa_ros.core.schedule import CommandSchedule
+from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.errors import BadInputError
+
+#: Relative tolerance of the integration.
+RTOL = 1e-13
+_NEVER = np.iinfo(np.int64).max
+# A larger load is no longer distinguishable from the limit itself.
+_LARGEST_LOAD = 1e9
+
+
+def check_stretch(stretch: float, j_lim: float, name: str = 'stretch') -> None:
+    """
+    Refuse a stretch outside the limits.
+
+    Parameters
+    ----------
+    stretch : float
+        Value to check.
+    j_lim : float
+        Chain limit.
+    name : str
+        What the value is, for the message.
+
+    Raises
+    ------
+    BadInputError
+        If it is not finite or not between the limiting stretches.
+
+    """
+    lower, upper = stretch_limits(j_lim)
+    if not lower < stretch < upper:
+        raise BadInputError(
+            f'{name} is {stretch:g}: expected a stretch between the limits {lower:.4f} and '
+            f'{upper:.4f} of J_lim {j_lim:g}')
+
+
+@dataclass(frozen=True)
+class Setup:
+    """
+    One actuator with the amplifier and the coil that drive it.
+
+    An amplifier with a slew limit ramps to a commanded level; a coil with a time constant
+    follows the amplifier as a first order lag. Both together are a ramp that is followed late.
+
+    Attributes
+    ----------
+    actuator : ActuatorParameters
+        The block.
+    stretch : float
+        Stretch at the start, at rest and held by its flux density.
+    slew_limit : float
+        Largest change of the amplifier's level in T/s, greater than 0; infinite for steps.
+    coil_time_constant : float
+        Of the lag in s, at least 0; 0 for none.
+    command_delay : int
+        Time in ns that a command takes to get through, at least 0.
+
+    Raises
+    ------
+    BadInputError
+        If a value is out of range.
+
+    """
+
+    actuator: ActuatorParameters
+    stretch: float = 1.0
+    slew_limit: float = math.inf
+    coil_time_constant: float = 0.0
+    command_delay: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        check_stretch(self.stretch, self.actuator.nondimensional.j_lim, 'initial stretch')
+        if not self.slew_limit > 0.0:
+            raise BadInputError(
+                f'slew limit is {self.slew_limit:g} T/s: expected a number above 0')
+        if not 0.0 <= self.coil_time_constant < math.inf:
+            raise BadInputError(
+                f'time constant of the coil is {self.coil_time_constant:g} s: expected a '
+                'finite number of at least 0')
+        if self.command_delay < 0:
+            raise BadInputError(
+                f'command delay is {self.command_delay} ns: expected at least 0')
+
+    def holding(self, stretch: float) -> float:
+        """Return the flux density in T that holds a stretch."""
+        return float(
+            kernels.elastic_force(stretch, 1.0 / self.actuator.nondimensional.j_lim)
+            * self.actuator.flux_density_unit)
+
+
+class Actuators:
+    """
+    Actuators that take stamped commands and forces, and advance together to a time.
+
+    Parameters
+    ----------
+    setups : sequence of Setup
+        At least one.
+    time : int
+        Time at the start in ns.
+
+    Attributes
+    ----------
+    setups : tuple of Setup
+        As given.
+    time : int
+        Time in ns that the state belongs to.
+    schedules, forces : list of CommandSchedule
+        Flux density in T and disturbing force in N, in force and ahead, for each actuator.
+    changes : list of (int, int, float)
+        Actuator, time in ns and level in T of each change of level that has taken effect.
+        Whoever reads it clears it.
+
+    """
+
+    def __init__(self, setups: Sequence[Setup], *, time: int = 0) -> None:
+        """Start at rest."""
+        self.setups = tuple(setups)
+        self.time = time
+        blocks = [x.actuator for x in self.setups]
+        count = len(blocks)
+        self._time_units = np.array([x.time_unit for x in blocks])
+        self._units = np.array([x.flux_density_unit for x in blocks])
+        # From a force to a load: F/(4 L^2 G), work over both faces against G times the volume.
+        self._per_newton = [
+            1.0 / (4.0 * x.half_length ** 2 * x.shear_modulus) for x in blocks]
+        self._lags = np.array([
+            x.coil_time_constant / x.actuator.time_unit for x in self.setups])
+        self._slews = [0.0] * count
+        for i in range(count):
+            self.limit_slew(i, math.inf)
+        self._material = np.array([
+            (x.nondimensional.zeta, x.nondimensional.c1, 1.0 / x.nondimensional.j_lim)
+            for x in blocks])
+        self._state = np.zeros((count, 3))
+        self._drive = np.zeros((count, 4))
+        self._levels = np.zeros(count)  # of the amplifiers, in T
+        self._events = np.full(count, _NEVER)
+        self._durations = np.zeros(count)
+        self._status = np.zeros(count, np.int64)
+        self._all = np.ones(count, bool)
+        self._work = kernels.work_space()
+        self.schedules = [CommandSchedule(0.0) for _ in blocks]
+        self.forces = [CommandSchedule(0.0) for _ in blocks]
+        self.changes: list[tuple[int, int, float]] = []
+        for i in range(count):
+            self.reset(i)
+        self.changes.clear()
+
+    def __len__(self) -> int:
+        """Return the number of actuators."""
+        return len(self.setups)
+
+    # -- state ---------------------------------------------------------------------------------
+
+    @property
+    def stretch(self) -> Array:
+        """Stretch of each, a view."""
+        return self._state[:, 0]
+
+    @property
+    def rate(self) -> Array:
+        """Stretch rate of each in 1/s."""
+        rates: Array = self._state[:, 1] / self._time_units
+        return rates
+
+    @property
+    def flux_density(self) -> Array:
+        """Flux density in force on each in T."""
+        drive = self._drive
+        field: Array = self._levels + (drive[:, 2] - drive[:, 1] * self._lags) * self._units
+        return field
+
+    def reset(self, i: int, stretch: float | None = None, rate: float = 0.0) -> None:
+        """
+        Put one back to its initial or another state; nothing is ahead; time goes on.
+
+        Parameters
+        ----------
+        i : int
+            Which.
+        stretch : float, optional
+            Default the initial one. It is held by its flux density.
+        rate : float
+            In 1/s.
+
+        Raises
+        ------
+        BadInputError
+            If the stretch is outside the limits.
+
+        """
+        setup = self.setups[i]
+        stretch = setup.stretch if stretch is None else stretch
+        self.set_state(i, stretch, rate, setup.holding(stretch))
+
+    def set_state(
+            self, i: int, stretch: float, rate: float, flux_density: float,
+            level: float | None = None) -> None:
+        """
+        Have one go on from another state, with nothing ahead and no force.
+
+        Parameters
+        ----------
+        i : int
+            Which.
+        stretch, rate : float
+            State; the rate in 1/s.
+        flux_density : float
+            In force, in T.
+        level : float, optional
+            That the amplifier is on its way to; default the flux density.
+
+        Raises
+        ------
+        BadInputError
+            If the stretch is outside the limits or the rate is not finite.
+
+        """
+        check_stretch(stretch, self.setups[i].actuator.nondimensional.j_lim)
+        if not math.isfinite(rate):
+            raise BadInputError(f'stretch rate is {rate:g} 1/s: expected a finite number')
+        level = flux_density if level is None else level
+        self._state[i] = stretch, rate * self._time_units[i], 0.0
+        # A coil that lags is behind an amplifier that has arrived, another is not.
+        behind = self._lags[i] > 0.0
+        self._levels[i] = level if behind and math.isinf(self._slews[i]) else flux_density
+        self._drive[i] = 0.0
+        if behind:
+            self._drive[i, 2] = (flux_density - self._levels[i]) / self._units[i]
+        self.schedules[i] = CommandSchedule(level)
+        self.forces[i] = CommandSchedule(0.0)
+        self._set_drive(i, 0.0)
+        self._plan(i)
+        self.changes.append((i, self.time, level))
+
+    def equilibrium(self, i: int) -> float:
+        """Return the stretch at which the flux density in force would hold one."""
+        return float(kernels.equilibrium_stretch(
+            self.flux_density[i] / self._units[i], self._material[i, 2]))
+
+    # -- what drives them ----------------------------------------------------------------------
+
+    def command(self, i: int, stamp: int, flux_density: float) -> int:
+        """
+        Take a command that applies from its stamp on.
+
+        A command that asks for the level which holds then anyway changes nothing.
+
+        Parameters
+        ----------
+        i : int
+            For which.
+        stamp : int
+            Time in ns from which the value applies; it supersedes all commands stamped at or
+            after it.
+        flux_density : float
+            Signed flux density in T.
+
+        Returns
+        -------
+        int
+            How late the change is in ns, 0 if it is not or if nothing changes; a late one
+            applies at once.
+
+        Raises
+        ------
+        BadInputError
+            If the value is not finite or nobody could follow it.
+
+        """
+        self.check_level(i, flux_density)
+        soonest = self.time + self.setups[i].command_delay
+        changed = self.schedules[i].insert(max(stamp, soonest), flux_density)
+        self._plan(i)
+        return max(soonest - stamp, 0) if changed else 0
+
+    def check_level(self, i: int, flux_density: float) -> None:
+        """
+        Refuse a level that nobody could follow.
+
+        Parameters
+        ----------
+        i : int
+            For which.
+        flux_density : float
+            In T.
+
+        Raises
+        ------
+        BadInputError
+            If the value is not finite or too large.
+
+        """
+        unit = self._units[i]
+        if not abs(flux_density / unit) < _LARGEST_LOAD:
+            raise BadInputError(
+                f'flux density is {flux_density:g} T: expected a finite value below '
+                f'{_LARGEST_LOAD * unit:g} T')
+
+    def force(self, i: int, stamp: int, force: float) -> None:
+        """
+        Take a disturbing force that acts from its stamp on.
+
+        Parameters
+        ----------
+        i : int
+            On which.
+        stamp : int
+            Time in ns; a force supersedes those stamped at or after it.
+        force : float
+            Along the field in N, pulling where positive.
+
+        Raises
+        ------
+        BadInputError
+            If the value is not finite or nobody could follow it.
+
+        """
+        if not abs(force * self._per_newton[i]) < _LARGEST_LOAD:
+            raise BadInputError(
+                f'disturbing force is {force:g} N: expected a finite value below '
+                f'{_LARGEST_LOAD / self._per_newton[i]:g} N')
+        self.forces[i].insert(max(stamp, self.time), force)
+        self._plan(i)
+
+    def limit_slew(self, i: int, slew: float) -> None:
+        """
+        Have one's amplifier ramp no faster than a rate from now on.
+
+        Parameters
+        ----------
+        i : int
+            Whose.
+        slew : float
+            In T/s, greater than 0; its own limit holds beside it.
+
+        """
+        setup = self.setups[i]
+        self._slews[i] = min(slew, setup.slew_limit) \
+            / setup.actuator.flux_density_unit * setup.actuator.time_unit
+
+    def _plan(self, i: int) -> None:
+        """Note when the next thing happens to one, at once while its amplifier ramps."""
+        ahead = [x for x in (self.schedules[i].next_stamp, self.forces[i].next_stamp)
+                 if x is not None]
+        ramping = self._levels[i] != self.schedules[i].current
+        self._events[i] = -1 if ramping else min(ahead, default=_NEVER)
+
+    def _set_drive(self, i: int, slope: float) -> None:
+        """Bring the load into line with amplifier, coil and force."""
+        load = self._levels[i] / self._units[i]
+        force = self.forces[i].current * self._per_newton[i]
+        lag = self._lags[i]
+        if lag > 0.0:
+            flux = self.flux_density[i] / self._units[i]
+            # u0 + s t, followed with a lag: u0 + s (t - T) + (flux - u0 + s T) exp(-t/T).
+            follower = load - slope * lag
+            self._drive[i] = follower + force, slope, flux - follower, 1.0 / lag
+        else:
+            self._drive[i] = load + force, slope, 0.0, 0.0
+
+    # -- time ----------------------------------------------------------------------------------
+
+    def advance(self, time: int) -> list[tuple[int, int]]:
+        """
+        Integrate to a time, each change applied exactly at its stamp.
+
+        Parameters
+        ----------
+        time : int
+            Time in ns; one that is not ahead changes nothing but applies what is due.
+
+        Returns
+        -------
+        list of (int, int)
+            Actuators whose load is too large to follow, and the time in ns where they stay.
+
+        """
+        due = self._events <= time
+        failed = []
+        if due.any():
+            for i in np.flatnonzero(due):
+                reached = self._advance_one(int(i), time)
+                if reached < time:
+                    failed.append((int(i), reached))
+        if time > self.time:
+            np.divide((time - self.time) / NANOSECONDS, self._time_units, self._durations)
+            if kernels.follow(
+                    self._work, 0, len(self.setups), ~due, self._state, self._drive,
+                    self._material, self._durations, RTOL, self._status):
+                failed += [(int(i), self.time) for i in np.flatnonzero(
+                    ~due & (self._status != kernels.DONE))]
+            self.time = time
+        return failed
+
+    def _advance_one(self, i: int, end: int) -> int:
+        """Advance one from change to change; return the time that it has reached."""
+        now = self.time
+        end = max(end, now)
+        schedule, forces = self.schedules[i], self.forces[i]
+        while True:
+            ahead = [x for x in (schedule.next_stamp, forces.next_stamp) if x is not None]
+            until = min([*ahead, end])
+            if until > now:
+                if not self._integrate(i, until - now):
+                    self._plan(i)
+                    return now
+                now = until
+            stamp = schedule.next_stamp
+            if stamp is not None and stamp <= now:
+                before = schedule.current
+                schedule.apply_next()
+                if schedule.current != before:
+                    self.changes.append((i, now, schedule.current))
+                if math.isinf(self._slews[i]):
+                    self._levels[i] = schedule.current
+                self._begin_piece(i)
+            elif forces.next_stamp is not None and forces.next_stamp <= now:
+                forces.apply_next()
+                self._begin_piece(i)
+            else:
+                self._plan(i)
+                return now
+
+    def _begin_piece(self, i: int) -> None:
+        """Begin anew where the load has a corner."""
+        self._set_drive(i, 0.0)
+        self._state[i, 2] = 0.0
+
+    def _integrate(self, i: int, duration: int) -> bool:
+        """Integrate one while nothing new comes; its amplifier may arrive meanwhile."""
+        left = duration / NANOSECONDS / float(self._time_units[i])
+        target = self.schedules[i].current
+        change = (target - self._levels[i]) / self._units[i]
+        if change != 0.0:
+            ramp = abs(change) / self._slews[i]
+            span = min(left, ramp)
+            slope = math.copysign(self._slews[i], change)
+            if self._drive[i, 1] != slope:
+                self._set_drive(i, slope)
+            if not self._follow(i, span):
+                return False
+            if span < ramp:
+                self._levels[i] += slope * span * self._units[i]
+                return True
+            left -= span
+            flux = self._drive[i, 0] + self._drive[i, 2]
+            self._levels[i] = target
+            self._begin_piece(i)
+            if self._lags[i] > 0.0:
+                # What the coil has reached does not jump with the slope.
+                self._drive[i, 2] = flux - self._drive[i, 0]
+        return left <= 0.0 or self._follow(i, left)
+
+    def _follow(self, i: int, duration: float) -> bool:
+        self._durations[i] = duration
+        return not kernels.follow(
+            self._work, i, i + 1, self._all, self._state, self._drive, self._material,
+            self._durations, RTOL, self._status)

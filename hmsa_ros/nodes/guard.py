@@ -1,0 +1,159 @@
+"""
+Whose commands an actuator obeys: notices a second publisher, and refuses it if told to.
+
+Publishers are told apart by their identifiers (GIDs): those of the graph, and that of each
+message, which rclpy does not tell and `hmsa_ros.nodes.capture` does.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import MagneticField
+
+from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.capture import RawSubscription
+
+#: Obey every publisher, or only the one that was seen first, until it is gone.
+COMMAND_SOURCES = ('any', 'first')
+
+
+class Allegiance:
+    """
+    Decides by identifiers which publisher is obeyed.
+
+    Attributes
+    ----------
+    source : bytes or None
+        Whom it obeys; None before the first command.
+    refused : int
+        Commands of others.
+
+    """
+
+    def __init__(self) -> None:
+        """Obey nobody yet."""
+        self.source: bytes | None = None
+        self.refused = 0
+
+    def accepts(self, publisher: bytes, present: Callable[[], Sequence[bytes]]) -> bool:
+        """
+        Return whether a command is to be obeyed.
+
+        Parameters
+        ----------
+        publisher : bytes
+            Identifier of who sent it; empty if that is not known.
+        present : callable
+            Returns the identifiers of all publishers there are.
+
+        Returns
+        -------
+        bool
+            A command whose sender is not known is refused while there are several.
+
+        """
+        if publisher and publisher == self.source:
+            return True
+        others = [bytes(x) for x in present()]
+        if not publisher:
+            accepted = len(others) <= 1
+        else:
+            accepted = self.source is None or self.source not in others
+        if not accepted:
+            self.refused += 1
+        elif publisher:
+            self.source = publisher
+        return accepted
+
+
+class CommandInput:
+    """
+    Commands for one actuator.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Node that receives.
+    topic : Topic
+        Where they come from.
+    take : callable
+        Called with each message that is obeyed.
+    source : {'any', 'first'}
+        Whom to obey.
+
+    Attributes
+    ----------
+    unreadable : int
+        Messages that could not be decoded.
+
+    """
+
+    def __init__(
+            self, node: Node, topic: interface.Topic, take: Callable[[MagneticField], None],
+            source: str) -> None:
+        """Subscribe."""
+        self.unreadable = 0
+        self._node = node
+        self._topic = topic
+        self._take = take
+        self._allegiance: Allegiance | None = None
+        self._raw: RawSubscription | None = None
+        if source == 'first':
+            self._allegiance = Allegiance()
+            self._raw = RawSubscription(node, topic.type, topic.name, topic.qos)
+        else:
+            node.create_subscription(topic.type, topic.name, take, topic.qos)
+
+    @property
+    def refused(self) -> int:
+        """Number of commands of publishers that are not obeyed."""
+        return self._allegiance.refused if self._allegiance is not None else 0
+
+    def count(self) -> int:
+        """Return how many publishers the topic has."""
+        return int(self._node.count_publishers(self._topic.name))
+
+    def publishers(self) -> list[bytes]:
+        """
+        Return the identifiers of all publishers of the topic.
+
+        Returns
+        -------
+        list of bytes
+            As the graph knows them.
+
+        """
+        name = self._node.resolve_topic_name(self._topic.name)
+        return [bytes(x.endpoint_gid) for x in self._node.get_publishers_info_by_topic(name)]
+
+    def poll(self) -> None:
+        """Take what has arrived, where the node's executor does not."""
+        if self._raw is None or self._allegiance is None:
+            return
+        for taken in self._raw.take():
+            if self._allegiance.accepts(taken.publisher, self.publishers):
+                self._obey(taken.data)
+            else:
+                self._node.get_logger().warning(
+                    f'command on {self._topic.name} refused: it comes from another publisher '
+                    'than the one obeyed; end one of them, or set command_source to any',
+                    throttle_duration_sec=60.0)
+
+    def _obey(self, data: bytes) -> None:
+        try:
+            message: Any = deserialize_message(data, self._topic.type)
+        except Exception as error:  # rclpy raises errors of several unrelated classes here
+            self.unreadable += 1
+            self._node.get_logger().error(
+                f'message on {self._topic.name} cannot be read: {error}',
+                throttle_duration_sec=60.0)
+            return
+        self._take(message)
+
+    def close(self) -> None:
+        """Receive no more."""
+        if self._raw is not None:
+            self._raw.destroy()
+            self._raw = None
