@@ -196,7 +196,7 @@ def _curve(
 ) -> dict[str, Any]:
     """Return a curve; its style is the line's, but for the names of a trace's own settings."""
     own: dict[str, Any] = {k: style.pop(k) for k in (
-        'marker', 'visible', 'xaxis', 'yaxis', 'hovertemplate', 'opacity')
+        'marker', 'visible', 'xaxis', 'yaxis', 'hovertemplate', 'opacity', 'cliponaxis')
         if k in style}
     trace = {
         'type': 'scatter', 'mode': mode, 'name': text(name), 'legendgroup': group,
@@ -648,13 +648,14 @@ def timings(parts: Sequence[Part], unit: TimeUnit) -> Figure:
             name, group = _names(part, 'command lead')
             data.append(_curve(
                 name, unit.of([found.seconds(x.stamp) for x in timing.commands]),
-                timing.lead * 1e3, group, mode='markers', yaxis='y3',
+                timing.lead * 1e3, group, mode='markers', yaxis='y3', cliponaxis=False,
                 marker={'size': 7, 'color': part.colour or BLUE, 'symbol': 'circle'}))
         if told.any():
             name, group = _names(part, 'lateness of the command')
             data.append(_curve(
                 name, unit.of([found.seconds(x.stamp) for x in timing.commands])[told],
                 timing.lateness[told] * 1e3, group, mode='markers', yaxis='y3',
+                cliponaxis=False,
                 marker={'size': 8, 'color': part.colour or VERMILION, 'symbol': 'x-thin-open'}))
         name, group = _names(part, 'sample delay')
         colour = part.colour or VERMILION

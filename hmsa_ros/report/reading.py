@@ -402,13 +402,18 @@ class _Collected:
         """Return the plans of a joint, or of the one that they are of."""
         for sent, content in self.plans:
             place = _place(content.joint_names, joint)
-            if place is not None:
-                start = _ns(content.header.stamp)
-                yield tuple(
-                    Level(start + _ns(x.time_from_start), float(x.effort[place]), sent,
-                          float(x.positions[place]), float(x.velocities[place]))
-                    for x in content.points
-                    if min(len(x.positions), len(x.velocities), len(x.effort)) > place)
+            if place is None:
+                continue
+            start = _ns(content.header.stamp)
+            levels = [
+                Level(start + _ns(x.time_from_start), float(x.effort[place]), sent,
+                      float(x.positions[place]), float(x.velocities[place]))
+                for x in content.points
+                if min(len(x.positions), len(x.velocities), len(x.effort)) > place]
+            # Of several joints there is a point wherever one of them changes.
+            yield tuple(
+                x for i, x in enumerate(levels) if i == 0 or len(content.joint_names) == 1
+                or x.flux_density != levels[i - 1].flux_density)
 
     def _requests(self, joint: str, key: str) -> list[Request]:
         """Return what was asked of a joint, by time."""
