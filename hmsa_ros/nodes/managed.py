@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rosgraph_msgs.msg import Clock
 
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.nodes.parameter_service import CarefulParameterService
@@ -46,6 +47,7 @@ class ManagedNode(LifecycleNode):
         """Create the node, unconfigured."""
         super().__init__(name, start_parameter_services=False)
         self._parameter_service = CarefulParameterService(self)
+        self._guard_clock()
         self.active = False
         self.finished = False
         self._autostart: bool = declare(self, [AUTOSTART])[AUTOSTART.name]
@@ -66,6 +68,24 @@ class ManagedNode(LifecycleNode):
                 return response
 
         self._service_change_state.callback = change_state
+
+    def _guard_clock(self) -> None:
+        """Pass over time before zero, which rclpy raises on: anybody could end the node so."""
+        source = self._time_source
+        take = source.clock_callback
+
+        def take_carefully(message: Clock) -> None:
+            if message.clock.sec >= 0:
+                take(message)
+            else:
+                self.get_logger().error(
+                    f'time {message.clock.sec} s on /clock passed over: expected at least 0',
+                    throttle_duration_sec=1.0)
+
+        # For a subscription that is made later, when use_sim_time is set, and the one there is.
+        source.clock_callback = take_carefully
+        if source._clock_sub is not None:
+            source._clock_sub.callback = take_carefully
 
     @property
     def state(self) -> str:
