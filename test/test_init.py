@@ -252,8 +252,8 @@ def test_usual_numbers_are_not_warned_of():
 
 def test_numbers_are_taken_in_the_range_that_the_nodes_take():
     specs = pytest.importorskip('hmsa_ros.nodes.parameters').ACTUATOR
-    from hmsa_ros.nodes.planner import PARAMETERS
-    declared = {x.name: x for x in (*specs, *PARAMETERS)}
+    from hmsa_ros.nodes.planning import SPECS
+    declared = {x.name: x for x in (*specs, *SPECS)}
     for quantity in (*QUANTITIES, DAMPING):
         if quantity.parameter:
             spec = declared[quantity.parameter]
