@@ -9,6 +9,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.markers import (
     BLOCK,
     Block,
@@ -167,3 +168,68 @@ def test_block_that_cannot_be_drawn_is_refused(arguments, what):
 def test_scene_that_cannot_be_drawn_is_refused(options):
     with pytest.raises(BadInputError, match='expected a finite number'):
         scene('actuator', **options)
+
+
+def collected(ros, node):
+    """Return the list that a node's marker messages are appended to."""
+    return ros.collect(MarkerArray, f'/{node}/markers', interface.MARKERS.qos)
+
+
+@pytest.mark.ros
+def test_plant_shows_its_state_only_while_somebody_looks(ros, serve):
+    from hmsa_ros.nodes.plant import PlantNode
+    plant = serve(
+        PlantNode, '-p', 'marker_rate:=100.0', '-p', 'marker_scale:=10.0', '-p',
+        'frame_id:=here', '-p', 'initial_stretch:=1.2').nodes[0]
+    (publisher,) = (x for x in plant.publishers if x.topic_name.endswith('markers'))
+    sent = []
+    publish = publisher.publish
+    publisher.publish = lambda message: (sent.append(1), publish(message))
+    states = ros.collect(
+        interface.JOINT_STATES.type, 'joint_states', interface.JOINT_STATES.qos)
+    ros.spin_until(lambda: len(states) > 200, 'time to run')
+    assert not sent
+    arrays = collected(ros, 'plant')
+    ros.spin_until(lambda: len(arrays) > 3, 'markers')
+    block = of(arrays[-1], BLOCK)
+    assert block.header.frame_id == 'here'
+    assert block.scale.z == pytest.approx(10 * 0.02 * 1.2, rel=1e-6)
+    assert block.lifetime.sec == 2
+    assert length(of(arrays[-1], FIELD)) > 0.0
+
+
+@pytest.mark.ros
+def test_planner_shows_its_target_and_plant_reaches_it_each_joint_in_its_place(ros, serve):
+    from hmsa_ros.nodes.planner import PlannerNode
+    from hmsa_ros.nodes.plant import PlantNode
+    serve(PlantNode, PlannerNode, '-p', 'joints:=[left, right]', '-p',
+          'right.actuator.half_length:=0.005')
+    shown, targets = collected(ros, 'plant'), collected(ros, 'planner')
+    setpoint = ros.publisher(
+        interface.SETPOINT.type, '/planner/right/setpoint', interface.SETPOINT.qos)
+    setpoint.publish(interface.SETPOINT.type(data=1.1))
+
+    def reached():
+        if not shown or not targets or of(targets[-1], TARGET, 'right').action != Marker.ADD:
+            return False
+        target, block = of(targets[-1], TARGET, 'right'), of(shown[-1], BLOCK, 'right')
+        return block.scale.z == pytest.approx(target.scale.z, rel=1e-4)
+
+    ros.spin_until(reached, 'the block to fill its target')
+    target, block = of(targets[-1], TARGET, 'right'), of(shown[-1], BLOCK, 'right')
+    assert target.pose == block.pose
+    assert target.scale.z == pytest.approx(0.02 * 1.1)
+    assert target.scale.x == pytest.approx(0.01 / math.sqrt(1.1))
+    assert of(targets[-1], TARGET, 'left').action == Marker.DELETE
+    assert of(shown[-1], BLOCK, 'left').pose.position.x < block.pose.position.x
+
+
+@pytest.mark.ros
+def test_rate_zero_shows_nothing(ros, serve):
+    from hmsa_ros.nodes.plant import PlantNode
+    serve(PlantNode, '-p', 'marker_rate:=0.0')
+    arrays = collected(ros, 'plant')
+    states = ros.collect(
+        interface.JOINT_STATES.type, 'joint_states', interface.JOINT_STATES.qos)
+    ros.spin_until(lambda: len(states) > 300, 'time to run')
+    assert not arrays

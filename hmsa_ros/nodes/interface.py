@@ -18,6 +18,7 @@ from sensor_msgs.msg import JointState, MagneticField
 from std_msgs.msg import Float64
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
+from visualization_msgs.msg import MarkerArray
 
 RELIABLE = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.RELIABLE)
@@ -134,6 +135,11 @@ STRETCH = Topic(
     'stretch', Float64, SAMPLES, 'The stretch alone, to plot and to echo.', publishers=(PLANT,))
 STRETCH_RATE = Topic(
     'stretch_rate', Float64, SAMPLES, 'The stretch rate alone, in 1/s.', publishers=(PLANT,))
+MARKERS = Topic(
+    '~/markers', MarkerArray, LATCHED,
+    "What a 3-D view shows. The plant's: each block as it is deformed, its magnetisation and the "
+    "field as arrows, at marker_rate while somebody subscribes. The planner's: each block as it "
+    'is to become, when that changes.', publishers=(PLANT, PLANNER))
 CLOCK_TOPIC = Topic(
     '/clock', Clock, CLOCK,
     'Simulated time, from the plant or the player if a parameter makes it the authority.',

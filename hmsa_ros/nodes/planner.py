@@ -20,6 +20,7 @@ from hmsa_ros.nodes import conversions, interface
 from hmsa_ros.nodes.channel import JointChannel
 from hmsa_ros.nodes.joints import declare_joints
 from hmsa_ros.nodes.managed import AUTOSTART, ManagedNode
+from hmsa_ros.nodes.marker_publisher import TargetMarkers
 from hmsa_ros.nodes.planning import group_from, models_from, nanoseconds, OWN, SPECS
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.nodes.takeover import TakeOver
@@ -81,6 +82,7 @@ class PlannerNode(ManagedNode):
         self._plan, self._status, self._diagnostics = (
             self.create_publisher(x.type, x.name, x.qos)
             for x in (interface.PLAN, interface.STATUS, interface.DIAGNOSTICS))
+        self._targets = TargetMarkers(self, self._settings)
         topic = interface.JOINT_TRAJECTORY
         self.create_subscription(topic.type, topic.name, self._on_trajectory, topic.qos)
         self.create_service(interface.STOP.type, interface.STOP.name, self._on_stop)
@@ -454,6 +456,8 @@ class PlannerNode(ManagedNode):
                     f'{name}.stretch': of_joint.stretch}
         self._status.publish(conversions.to_status(
             'planner: request', ', '.join(each), level, message, values))
+        self._targets.show(self._now(), {
+            name: float(x.stretch) if x.stretch else None for name, x in each.items()})
 
     def _on_diagnostics(self) -> None:
         level = DiagnosticStatus.WARN if self._late else DiagnosticStatus.OK

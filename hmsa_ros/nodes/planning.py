@@ -14,6 +14,7 @@ from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes.joints import JointParameters, JOINTS
 from hmsa_ros.nodes.managed import AUTOSTART
+from hmsa_ros.nodes.marker_publisher import MARKER_SCALE
 from hmsa_ros.nodes.parameters import (
     ACTUATOR,
     actuator_from,
@@ -58,7 +59,8 @@ SPECS = (
         'all arrive at the same time; one that is still moving is not held back.',
         read_only=False),
     ParameterSpec(
-        'frame_id', 'coil', 'Frame of the coil in the stamped commands.'),
+        'frame_id', 'coil', 'Frame of the coil in the stamped commands, and of the markers.'),
+    MARKER_SCALE,
     ParameterSpec(
         'lead_time', 0.05, 'How far ahead of the time it applies a command is sent.', 's',
         0.0, 1e6, read_only=False),

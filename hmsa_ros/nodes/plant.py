@@ -22,6 +22,13 @@ from hmsa_ros.nodes import conversions, interface
 from hmsa_ros.nodes.guard import COMMAND_SOURCES
 from hmsa_ros.nodes.joints import declare_joints, JointParameters, JOINTS
 from hmsa_ros.nodes.managed import AUTOSTART, ManagedNode
+from hmsa_ros.nodes.marker_publisher import (
+    MARKER_FRAME,
+    MARKER_RATE,
+    MARKER_SCALE,
+    StateMarkers,
+)
+from hmsa_ros.nodes.markers import State
 from hmsa_ros.nodes.parameters import JOINT, ParameterSpec
 from hmsa_ros.nodes.plant_joint import OWN, PlantJoint, setup_from
 from hmsa_ros.nodes.runner import run
@@ -68,6 +75,9 @@ PARAMETERS = (
     ParameterSpec(
         'step_count', 1, 'Samples that one call of ~/step advances.', '', 1, 100_000,
         read_only=False),
+    MARKER_FRAME,
+    MARKER_RATE,
+    MARKER_SCALE,
 )
 
 _TICK_SECONDS = 0.001
@@ -128,6 +138,9 @@ class PlantNode(ManagedNode):
             PlantJoint(self, self, i, values.names, x) for i, x in enumerate(each)]
         for i, joint in enumerate(self._joints):
             joint.tell_applied(start, self.level(i))
+        StateMarkers(
+            self, values, values['real_time_factor'] if self._authority else 1.0,
+            self._states)
         self._serve(interface.RESET, self._on_reset)
         self._serve(interface.STEP, self._on_step)
         self._serve(interface.SET_PAUSED, self._on_set_paused)
@@ -283,6 +296,12 @@ class PlantNode(ManagedNode):
         for i, stamp, level in self._actuators.changes:
             self._joints[i].tell_applied(stamp, level)
         self._actuators.changes.clear()
+
+    def _states(self) -> tuple[int, list[State]]:
+        """Return the time and what the joints do, for who looks."""
+        actuators = self._actuators
+        return actuators.time, [State(*x) for x in zip(
+            actuators.stretch.tolist(), actuators.flux_density.tolist(), strict=True)]
 
     def _publish_clock(self, steady: int) -> None:
         if self._clock_publisher is not None:

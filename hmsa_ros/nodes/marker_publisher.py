@@ -1,0 +1,125 @@
+"""Markers on the wire: the plant's of what is, the planner's of where it is to go."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+
+from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.joints import JointParameters
+from hmsa_ros.nodes.markers import Block, Scene, State
+from hmsa_ros.nodes.parameters import actuator_from, ParameterSpec
+
+MARKER_SCALE = ParameterSpec(
+    'marker_scale', 1.0,
+    'Metres shown in ~/markers for a metre; 1 is true to size.', '', 1e-6, 1e9)
+MARKER_RATE = ParameterSpec(
+    'marker_rate', 30.0,
+    'How often ~/markers is published while somebody subscribes; 0 for never.', 'Hz',
+    0.0, 1e3)
+MARKER_FRAME = ParameterSpec('frame_id', 'coil', 'Frame of the markers.')
+
+# A viewer drops what was not sent for this long, or for so many periods.
+_LIFETIME_SECONDS = 2.0
+_LIFETIME_PERIODS = 10.0
+
+
+def scene_from(values: JointParameters, lifetime: float = 0.0) -> Scene:
+    """
+    Return the scene of a node's joints.
+
+    Parameters
+    ----------
+    values : JointParameters
+        Of the node, with ``frame_id`` and ``marker_scale``.
+    lifetime : float
+        In s, 0 for ever.
+
+    Returns
+    -------
+    Scene
+        One block a joint.
+
+    """
+    return Scene(
+        tuple(Block.of(name, actuator_from(values.of(name))) for name in values.names),
+        values[MARKER_FRAME.name], values[MARKER_SCALE.name], lifetime)
+
+
+class StateMarkers:
+    """
+    Publishes the joints as they are, at a rate, while somebody looks.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Node to publish from.
+    values : JointParameters
+        Of the node, with ``marker_rate`` and what `scene_from` needs.
+    pace : float
+        Seconds of the node's time in a second, 0 if it has no bound: lifetimes are counted in
+        the node's time.
+    states : callable
+        Returns the time in ns and a `State` a joint.
+
+    """
+
+    def __init__(
+            self, node: Node, values: JointParameters, pace: float,
+            states: Callable[[], tuple[int, Sequence[State]]]) -> None:
+        """Create the publisher, and the timer unless the rate is 0."""
+        topic = interface.MARKERS
+        self._publisher = node.create_publisher(topic.type, topic.name, topic.qos)
+        self._states = states
+        rate: float = values[MARKER_RATE.name]
+        lifetime = 0.0
+        if rate > 0.0:
+            lifetime = max(1.0, pace) * max(_LIFETIME_SECONDS, _LIFETIME_PERIODS / rate)
+            # The eye's time, whatever pace simulated time has.
+            node.create_timer(
+                1.0 / rate, self._show, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._scene = scene_from(values, lifetime if pace > 0.0 else 0.0)
+
+    def _show(self) -> None:
+        if self._publisher.get_subscription_count():
+            stamp, states = self._states()
+            self._publisher.publish(self._scene.states(stamp, states))
+
+
+class TargetMarkers:
+    """
+    Publishes where the joints are to go, whenever that changes.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Node to publish from.
+    values : JointParameters
+        Of the node, with what `scene_from` needs.
+
+    """
+
+    def __init__(self, node: Node, values: JointParameters) -> None:
+        """Create the publisher."""
+        topic = interface.MARKERS
+        self._publisher = node.create_publisher(topic.type, topic.name, topic.qos)
+        self._scene = scene_from(values)
+        self._shown: Any = None
+
+    def show(self, stamp: int, stretches: Mapping[str, float | None]) -> None:
+        """
+        Show targets, unless they are shown already.
+
+        Parameters
+        ----------
+        stamp : int
+            Time in ns.
+        stretches : mapping of str to float or None
+            By joint; None for none.
+
+        """
+        wanted = tuple(stretches.get(block.joint) for block in self._scene.blocks)
+        if wanted != self._shown:
+            self._shown = wanted
+            self._publisher.publish(self._scene.targets(stamp, wanted))
