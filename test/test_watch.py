@@ -239,6 +239,62 @@ def terminal(ros_env):
 
 
 @pytest.mark.ros
+def test_each_joint_has_its_own_target_command_and_history(ros, ros_env, wait_until):
+    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+    from geometry_msgs.msg import Vector3
+    from sensor_msgs.msg import JointState, MagneticField
+    from std_msgs.msg import Header
+
+    from hmsa_ros.nodes import interface
+    from hmsa_ros.nodes.conversions import to_time
+    from hmsa_ros.watch.listener import Listener
+
+    def status(name, level, joint, **values):
+        return DiagnosticStatus(
+            name=name, level=level, hardware_id=joint, message='said',
+            values=[KeyValue(key=x.replace('__', '.'), value=y) for x, y in values.items()])
+
+    publish = {
+        name: ros.node.create_publisher(kind, name, qos).publish for name, kind, qos in (
+            ('joint_states', JointState, 100), ('diagnostics', DiagnosticArray, 10),
+            ('planner/status', DiagnosticStatus, interface.LATCHED),
+            ('right/flux_density_command', MagneticField, 100))}
+    publish['planner/status'](status(
+        'planner: request', DiagnosticStatus.OK, 'left, right', state='moving', stretch='',
+        left__stretch='1.1', right__stretch='0.9', setpoint='1', setpoints='2'))
+    seen = []
+    with Listener(span=10.0) as listener:
+        def there():
+            number = len(seen)
+            stamp = Header(stamp=to_time(10**9 + number))
+            publish['joint_states'](JointState(
+                header=stamp, name=['left', 'right'],
+                position=[1.0 + 0.5 * (number % 9 == 5), 0.95], velocity=[0.5],
+                effort=[0.01, -0.04]))
+            publish['right/flux_density_command'](MagneticField(
+                header=stamp, magnetic_field=Vector3(z=-0.02)))
+            publish['diagnostics'](DiagnosticArray(status=[
+                status('planner: commands', DiagnosticStatus.OK, 'left', late='1'),
+                status('planner: time', DiagnosticStatus.WARN, '', late='2'),
+                status('battery: charge', DiagnosticStatus.ERROR, 'pack', cells='7')]))
+            seen.append(listener.look())
+            return seen[-1].request and seen[-1].reports and all(
+                np.isfinite(x.target) for x in seen[-1].joints) and np.isfinite(
+                    seen[-1].joints[1].commanded) and seen[-1].joints[0].stretch == 1.0 and (
+                    np.nanmax(seen[-1].joints[0].stretches.ranges(seen[-1].now, 50)[1]) == 1.5)
+        # A peak that is over when the view is drawn is still in the chart.
+        wait_until(there)
+        left, right = seen[-1].joints
+        assert (left.name, left.target, left.flux_density) == ('left', 1.1, 0.01)
+        assert (right.name, right.target, right.stretch) == ('right', 0.9, 0.95)
+        assert (left.rate, np.isnan(right.rate)) == (0.5, True)
+        assert (np.isnan(left.commanded), right.commanded) == (True, -0.02)
+        report, = seen[-1].reports
+        assert (report.name, report.level, report.counts) == ('planner', 1, {'late': 3})
+        assert seen[-1].request.setpoints == 2
+
+
+@pytest.mark.ros
 def test_the_view_follows_a_real_run_and_leaves_the_terminal_clean(start, terminal):
     start.hmsa('plant')
     start.hmsa('planner')
