@@ -118,6 +118,8 @@ class Result:
         Unhandled exceptions.
     ended : list of str
         Nodes that ended without being told.
+    broken : list of str
+        Cycles that could not be finished, and why.
     statuses : list of int
         Exit statuses of nodes that were told to end.
 
@@ -134,6 +136,7 @@ class Result:
     trends: dict[str, Trend] = field(default_factory=dict)
     traces: list[str] = field(default_factory=list)
     ended: list[str] = field(default_factory=list)
+    broken: list[str] = field(default_factory=list)
     statuses: list[int] = field(default_factory=list)
 
     def failures(self) -> list[str]:
@@ -148,6 +151,7 @@ class Result:
         """
         found = [f'unhandled exception in the {x}' for x in self.traces]
         found += [f'{x} ended by itself' for x in self.ended]
+        found += self.broken
         found += [f'exit status {x}' for x in self.statuses if x]
         for number, one in enumerate(self.cycles):
             where = f'bag {number} ({one.kind}, {one.killed or "nobody"} killed)'
@@ -390,6 +394,24 @@ class Soak:
             del self.rig.diagnostics[name]
         self._checks.append(self._pool.submit(check_bag, bag, kind, victim))
 
+    def start_again(self, why: str) -> None:
+        """
+        Start all nodes anew, after a cycle that could not be finished.
+
+        Parameters
+        ----------
+        why : str
+            What happened; it makes the soak fail.
+
+        """
+        self.result.broken.append(why)
+        for child in self._children.values():
+            child.end(signal.SIGKILL)
+        self._children.clear()
+        self._start('plant')
+        self._start('planner')
+        self._take_up_time()
+
     def _recording(self) -> bool:
         for name, status in self.rig.diagnostics.items():
             if name.startswith('recorder') and 'subscribed' in status:
@@ -545,12 +567,16 @@ def run_over_dds(
         ('calm', 'planner'), ('rough', 'plant'), ('calm', 'recorder'), ('rough', ''),
         ('calm', ''), ('rough', 'planner'), ('calm', ''), ('calm', '')))
     from benchmarks.faults.rig import hushed
+    from hmsa_ros.errors import HmsaError
 
     with hushed(folder / 'hushed.log') as told, Soak(folder, domain, seed, factor) as soak:
         end = monotonic() + 60.0 * minutes
         while soak.seconds < hours * _HOUR and monotonic() < end:
             kind, victim = next(kinds)
-            soak.cycle(kind, length, victim)
+            try:
+                soak.cycle(kind, length, victim)
+            except (HmsaError, TimeoutError) as error:
+                soak.start_again(f'{kind} cycle, {victim or "nobody"} killed: {error}')
             trends = ', '.join(
                 f'{name} {x[-1].own / 2**20:.1f}' for name, x in soak.result.memory.items() if x)
             print(f'{soak.seconds / _HOUR:.2f} h, {kind} {victim}: MiB {trends}',

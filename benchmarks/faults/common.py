@@ -94,8 +94,26 @@ def move(
     """
     mark = rig.count()
     rig.setpoint(target)
+    await_change(rig, mark, patience)
     rig.let_pass(pause, patience)
     return settled(rig.samples(mark)[1], target, target - start)
+
+
+def await_change(rig: Rig, mark: int, patience: float = 60.0) -> None:
+    """
+    Wait until the flux density in force changes.
+
+    Parameters
+    ----------
+    rig : Rig
+        With a plant.
+    mark : int
+        Sample from which on a change counts.
+    patience : float
+        In s on the wall.
+
+    """
+    rig.spin_until(lambda: jump(rig, mark) > 0.0, 'a command to take effect', patience)
 
 
 def moves(

@@ -1,6 +1,15 @@
 """Faults of delivery: load, delay, loss, doubling and reordering of commands."""
 
-from benchmarks.faults.common import LEAD, LIMIT, move, moves, pair, Register, share
+from benchmarks.faults.common import (
+    await_change,
+    LEAD,
+    LIMIT,
+    move,
+    moves,
+    pair,
+    Register,
+    share,
+)
 from benchmarks.faults.rig import Rig, settled
 from benchmarks.faults.table import Seen
 
@@ -90,6 +99,7 @@ def _replanned(rig: Rig, counter: str) -> Seen:
     """Make a move that is disturbed, and judge what re-planning leaves of it."""
     mark = rig.count()
     rig.setpoint(1.2)
+    await_change(rig, mark)
     rig.let_pass(0.6, 60.0)
     rig.fresh('plant', 'planner')
     residual, error = settled(rig.samples(mark)[1], 1.2, 0.2)
@@ -124,6 +134,7 @@ def _reorder(rig: Rig) -> Seen:
 def _learnt(rig: Rig) -> Seen:
     mark = rig.count()
     rig.setpoint(1.2)
+    await_change(rig, mark)
     rig.let_pass(1.2)
     rig.fresh('planner')
     residual, error = settled(rig.samples(mark)[1], 1.2, 0.2)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.faults.common import LIMIT, moves, pair, Register, share
+from benchmarks.faults.common import await_change, LIMIT, moves, pair, Register, share
 from benchmarks.faults.rig import Rig, settled
 from benchmarks.faults.table import Seen
 from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
@@ -30,6 +30,7 @@ def _mismatch(rig: Rig, name: str) -> Seen:
         rig.ready('plant', 'planner')
         mark, sent = rig.count(), len(rig.commands)
         rig.setpoint(1.2)
+        await_change(rig, mark)
         rig.let_pass(0.3)
         stamps, values = rig.samples(mark)
         worst = max(worst, _difference(truth, stamps, values, rig.commands[sent:]))
@@ -78,6 +79,7 @@ def _lag(rig: Rig) -> Seen:
     pair(rig, plant={'coil_lag': lag})
     mark, sent = rig.count(), len(rig.commands)
     rig.setpoint(1.2)
+    await_change(rig, mark)
     rig.let_pass(0.3)
     stamps, values = rig.samples(mark)
     worst = _difference(paper_actuator(), stamps, values, rig.commands[sent:], lag=lag)
