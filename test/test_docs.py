@@ -66,6 +66,9 @@ def running(
                 'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
                 'ROS_LOG_DIR': str(folder / 'log'), 'RCUTILS_COLORIZED_OUTPUT': '0'})
 
+    # Compiled once, and not by each node of each page at the same time.
+    subprocess.run([sys.executable, '-m', 'hmsa_ros.core.warmup'], cwd=ROOT, check=True,
+                   capture_output=True)
     asked = [item.callspec.params['page'] for item in request.session.items
              if getattr(item, 'originalname', '') == 'test_page_does_what_it_says']
     with ThreadPoolExecutor(AT_A_TIME) as pool:
