@@ -366,13 +366,15 @@ class Actuators:
         ramping = self._levels[i] != self.schedules[i].current
         self._events[i] = -1 if ramping else min(ahead, default=_NEVER)
 
-    def _set_drive(self, i: int, slope: float) -> None:
-        """Bring the load into line with amplifier, coil and force."""
+    def _set_drive(self, i: int, slope: float, level: float | None = None) -> None:
+        """Bring the load into line with amplifier, coil and force; the field does not jump."""
+        flux = self.flux_density[i] / self._units[i]
+        if level is not None:
+            self._levels[i] = level
         load = self._levels[i] / self._units[i]
         force = self.forces[i].current * self._per_newton[i]
         lag = self._lags[i]
         if lag > 0.0:
-            flux = self.flux_density[i] / self._units[i]
             # u0 + s t, followed with a lag: u0 + s (t - T) + (flux - u0 + s T) exp(-t/T).
             follower = load - slope * lag
             self._drive[i] = follower + force, slope, flux - follower, 1.0 / lag
@@ -432,9 +434,9 @@ class Actuators:
                 schedule.apply_next()
                 if schedule.current != before:
                     self.changes.append((i, now, schedule.current))
-                if math.isinf(self._slews[i]):
-                    self._levels[i] = schedule.current
-                self._begin_piece(i)
+                # An amplifier that ramps arrives later.
+                self._begin_piece(
+                    i, schedule.current if math.isinf(self._slews[i]) else None)
             elif forces.next_stamp is not None and forces.next_stamp <= now:
                 forces.apply_next()
                 self._begin_piece(i)
@@ -442,9 +444,9 @@ class Actuators:
                 self._plan(i)
                 return now
 
-    def _begin_piece(self, i: int) -> None:
-        """Begin anew where the load has a corner."""
-        self._set_drive(i, 0.0)
+    def _begin_piece(self, i: int, level: float | None = None) -> None:
+        """Begin anew where the load has a corner, the amplifier at another level if given."""
+        self._set_drive(i, 0.0, level)
         self._state[i, 2] = 0.0
 
     def _integrate(self, i: int, duration: int) -> bool:
@@ -464,12 +466,8 @@ class Actuators:
                 self._levels[i] += slope * span * self._units[i]
                 return True
             left -= span
-            flux = self._drive[i, 0] + self._drive[i, 2]
             self._levels[i] = target
             self._begin_piece(i)
-            if self._lags[i] > 0.0:
-                # What the coil has reached does not jump with the slope.
-                self._drive[i, 2] = flux - self._drive[i, 0]
         return left <= 0.0 or self._follow(i, left)
 
     def _follow(self, i: int, duration: float) -> bool:
