@@ -200,6 +200,44 @@ def test_a_block_cannot_be_left_out(language, marker, reason):
 
 
 @pytest.mark.ros
+def test_topics_and_services_are_those_that_the_nodes_have(start, ros, ros_env):
+    from hmsa_ros.nodes import interface
+
+    # By parameter only, or only while it is needed.
+    sometimes = {'/clock', '/planner/markers', '/plant/markers'}
+    topics = [x for x in vars(interface).values() if isinstance(x, interface.Topic)]
+    services = [x for x in vars(interface).values() if isinstance(x, interface.Service)]
+
+    def full(name: str, node: str) -> str:
+        return '/' + interface.from_outside(name, node).lstrip('/')
+
+    for name in (interface.PLANNER, interface.PLANT):
+        start.hmsa(name)
+    for name in (interface.PLANNER, interface.PLANT):
+        sent = {full(x.name, name) for x in topics if name in x.publishers}
+        taken = {full(x.name, name) for x in topics if name in x.subscribers}
+        served = {full(x.name, name) for x in services if name in x.meaning}
+        ros.spin_until(lambda name=name: name in ros.node.get_node_names(), f'the {name}')
+        ros.spin_until(
+            lambda name=name, sent=sent: sent - sometimes <= {
+                topic for topic, _ in ros.node.get_publisher_names_and_types_by_node(name, '/')},
+            f'the topics of the {name}: {sent}')
+        ros.spin_until(
+            lambda name=name, served=served: served <= {
+                service for service, _ in ros.node.get_service_names_and_types_by_node(name, '/')},
+            f'the services of the {name}: {served}')
+        ours = ('std_msgs/', 'sensor_msgs/', 'trajectory_msgs/', 'diagnostic_msgs/', 'std_srvs/',
+                'geometry_msgs/', 'visualization_msgs/')
+
+        def of_ours(found, ours=ours):
+            return {thing for thing, types in found if types[0].startswith(ours)}
+
+        assert of_ours(ros.node.get_publisher_names_and_types_by_node(name, '/')) <= sent
+        assert of_ours(ros.node.get_subscriber_names_and_types_by_node(name, '/')) <= taken
+        assert of_ours(ros.node.get_service_names_and_types_by_node(name, '/')) <= served
+
+
+@pytest.mark.ros
 def test_driver_of_the_tutorial_keeps_the_contract_of_a_driver(start, ros):
     from hmsa_ros.nodes import interface
     from hmsa_ros.nodes.conversions import from_time, to_command
