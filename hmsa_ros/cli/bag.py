@@ -74,6 +74,11 @@ def run(arguments: argparse.Namespace) -> int:
     int
         Exit status.
 
+    Raises
+    ------
+    HmsaError
+        If an option is out of range, or the bag cannot be read.
+
     """
     if not 0.0 < arguments.max_chunk <= _LARGEST_CHUNK:
         raise BadInputError(
