@@ -1,0 +1,625 @@
+"""The planner node with several joints, with late commands, and with one before and after it."""
+
+from dataclasses import replace
+import math
+import signal
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+import pytest
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from hmsa_ros.core.model import natural_frequency
+from hmsa_ros.core.parameters import paper_actuator
+from hmsa_ros.core.planner import Options, Planner
+from hmsa_ros.core.simulation import ActuatorSimulation
+from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.conversions import (
+    from_command,
+    from_time,
+    to_clock,
+    to_command,
+    to_time,
+    to_trajectory,
+)
+from hmsa_ros.nodes.planner import PlannerNode
+from hmsa_ros.nodes.timekeeping import StepWatch
+
+pytestmark = pytest.mark.ros
+
+MS = 1_000_000
+START = 1000 * MS
+LEAD = 50 * MS
+SPELL = 44 * MS
+SEQUENCE = ((1.1, SPELL), (1.2, 2 * SPELL), (1.4, 3 * SPELL))
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+RESIDUAL = 1e-6
+QUIET = ('-p', 'use_sim_time:=true', '-p', 'heartbeat_period:=0.0')
+
+
+class Driver:
+    """An actuator and its coil in the hand of the test, which tells what takes effect."""
+
+    def __init__(self, ros: Any, joint: str = '', joints: tuple[str, ...] = ('',)) -> None:
+        self.actuator = paper_actuator()
+        self.plant = ActuatorSimulation(self.actuator, time=START)
+        self.told: list[tuple[int, float]] = []
+        self.arrived: list[tuple[int, float]] = []
+        self.received = 0
+        self.hold_back = False
+        self.held: list[Any] = []
+        topic = interface.of_joint(interface.FLUX_DENSITY_COMMAND, joint, joints)
+        ros.node.create_subscription(topic.type, topic.name, self.on_command, topic.qos)
+        topic = interface.of_joint(interface.FLUX_DENSITY_APPLIED, joint, joints)
+        self.applied = ros.node.create_publisher(topic.type, topic.name, topic.qos)
+
+    def on_command(self, message: Any) -> None:
+        """Take a command, or keep it on its way."""
+        self.received += 1
+        if self.hold_back:
+            self.held.append(message)
+            return
+        command = from_command(message)
+        self.arrived.append(command)
+        self.plant.command(*command)
+
+    def release(self) -> None:
+        """Let what was on its way arrive."""
+        self.hold_back = False
+        for message in self.held:
+            self.received -= 1
+            self.on_command(message)
+        self.held.clear()
+
+    def advance(self, time: int) -> None:
+        """Let the actuator move on, and tell what takes effect."""
+        plant = self.plant
+        while (stamp := plant.schedule.next_stamp) is not None and stamp <= time:
+            before = plant.schedule.current
+            plant.advance(stamp)
+            if plant.schedule.current != before:
+                self.told.append((plant.time, plant.schedule.current))
+                self.applied.publish(to_command(*self.told[-1], 'coil'))
+        plant.advance(time)
+
+    def sample(self, name: str = 'actuator') -> JointState:
+        """Return the state in force."""
+        return JointState(
+            header=to_command(self.plant.time, 0.0, '').header, name=[name],
+            position=[self.plant.stretch], velocity=[self.plant.rate],
+            effort=[self.plant.flux_density])
+
+    def residual(self, stretch: float) -> float:
+        """Return how far it is from resting at a stretch."""
+        frequency = float(natural_frequency(stretch, self.actuator.nondimensional))
+        return math.hypot(
+            self.plant.stretch - stretch, self.plant.rate * self.actuator.time_unit / frequency)
+
+
+class Rig:
+    """A planner in a thread, simulated time in hand, and drivers of its joints."""
+
+    def __init__(
+            self, ros: Any, make_clock: Any, served: Any, joints: tuple[str, ...] = ('',)
+    ) -> None:
+        self.ros = ros
+        self.served = served
+        self.planner = served.nodes[0]
+        self.drivers = {x: Driver(ros, x, joints) for x in joints}
+        self.statuses = ros.collect(
+            interface.STATUS.type, 'planner/status', interface.STATUS.qos)
+        self.plans = ros.collect(interface.PLAN.type, 'planner/plan', interface.PLAN.qos)
+        self.trajectories = ros.publisher(
+            JointTrajectory, 'planner/joint_trajectory', interface.JOINT_TRAJECTORY.qos)
+        channels = self.planner._channels.values()
+        ros.spin_until(
+            lambda: all(x._command.get_subscription_count() for x in channels)
+            and all(x.applied.get_subscription_count() for x in self.drivers.values()),
+            'the match of commands and news')
+        self.clock = make_clock(ros, served)
+        self.now = 0
+        self.requests = 0
+        self.at(START)
+
+    @property
+    def driver(self) -> Driver:
+        """The only driver."""
+        driver, = self.drivers.values()
+        return driver
+
+    def at(self, now: int) -> None:
+        """Let time be, and have the planner look."""
+        self.clock.set(now)
+        self.now = now
+
+    def spin(self, condition: Any, what: str) -> Any:
+        """Wait for a condition."""
+        return self.ros.spin_until(condition, what)
+
+    def values(self) -> dict[str, str]:
+        """Return the newest status' values."""
+        return {x.key: x.value for x in self.statuses[-1].values} if self.statuses else {}
+
+    def verdict(self, **values: Any) -> DiagnosticStatus:
+        """Wait for a status with values and return it."""
+        expected = {x: str(y) for x, y in values.items()}
+        self.spin(lambda: expected.items() <= self.values().items(), f'a status of {expected}')
+        return self.statuses[-1]
+
+    def send(self, message: JointTrajectory, code: str = 'accepted') -> DiagnosticStatus:
+        """Send a trajectory and wait for its verdict."""
+        self.requests += 1
+        message.header.frame_id = f'request {self.requests}'
+        self.trajectories.publish(message)
+        return self.verdict(code=code, request=message.header.frame_id)
+
+    def run(self, end: int, step: int = 4 * MS) -> None:
+        """Let time run; each command that is due arrives before it goes on."""
+        while self.now < end:
+            self.at(min(self.now + step, end))
+            self.spin(
+                lambda: all(
+                    sum(x.stamp - x.model.options.lead_time <= self.now
+                        for x in planner.plan.levels[planner._unsent:]) == 0
+                    for planner in self.planner._group.planners.values()),
+                'what is due')
+            sent = self.planner._sent
+            self.spin(
+                lambda sent=sent: sum(
+                    x.received for x in self.drivers.values()) >= sent,
+                'the commands')
+            for driver in self.drivers.values():
+                driver.advance(self.now)
+
+
+@pytest.fixture
+def rig(ros: Any, serve: Any, make_clock: Any) -> Any:
+    """Return a maker of a rig with node arguments."""
+    def make(*arguments: str, joints: tuple[str, ...] = ('',)) -> Rig:
+        named = ('-p', f'joints:=[{", ".join(joints)}]') if len(joints) > 1 else ()
+        return Rig(ros, make_clock, serve(PlannerNode, *QUIET, *named, *arguments), joints)
+    return make
+
+
+# -- several joints -----------------------------------------------------------------------------
+
+JOINTS = ('left', 'right', 'top')
+OTHERS = (
+    '-p', 'right.actuator.remanence:=0.15', '-p', 'top.flux_density_max:=0.1',
+    '-p', 'top.actuator.density:=4000.0')
+
+
+def trajectory(names: tuple[str, ...], *points: tuple[float, int]) -> JointTrajectory:
+    """Return a request that differs from joint to joint by a hundredth."""
+    message = to_trajectory([(x, t) for x, t in points], '')
+    message.joint_names = list(names)
+    for point in message.points:
+        base = point.positions[0]
+        point.positions = [base + 0.01 * JOINTS.index(x) for x in names]
+    return message
+
+
+def test_joints_of_one_trajectory_get_what_each_would_alone(rig):
+    planner = rig(*OTHERS, joints=JOINTS)
+    # The names may come in any order.
+    planner.send(trajectory(('top', 'left', 'right'), (1.1, SPELL), (1.2, 2 * SPELL)))
+    planner.run(START + LEAD + 2 * SPELL)
+    blocks = {
+        'left': paper_actuator(), 'right': replace(paper_actuator(), remanence=0.15),
+        'top': replace(paper_actuator(), density=4000.0)}
+    for k, name in enumerate(JOINTS):
+        alone = Planner(blocks[name], Options(
+            flux_density_min=-0.5, flux_density_max=0.1 if name == 'top' else 0.5))
+        alone.request([(1.1 + 0.01 * k, SPELL), (1.2 + 0.01 * k, 2 * SPELL)], None, START)
+        assert planner.drivers[name].arrived == [
+            (x.stamp, x.flux_density) for x in alone.due(START + 10**9)]
+    planner.verdict(state='at_rest', setpoint=2, setpoints=2, plan=1)
+    assert planner.values()['left.stretch'] == '1.2'
+    assert planner.values()['top.stretch'] == '1.22'
+    assert planner.statuses[-1].hardware_id == 'left, right, top'
+    plan, = planner.plans
+    assert plan.joint_names == list(JOINTS)
+    stamps = {stamp for x in planner.drivers.values() for stamp, _ in x.arrived}
+    start = from_time(plan.header.stamp)
+    assert [start + from_time(x.time_from_start) for x in plan.points] == sorted(stamps)
+    assert all(
+        len(x.positions) == len(x.velocities) == len(x.effort) == 3 for x in plan.points)
+
+
+REFUSED = {
+    'one is missing': (('left', 'top'), 'unknown_joint', "lacks 'right': expected all of"),
+    'none': ((), 'unknown_joint', "lacks 'left'"),
+    'twice': (('left', 'right', 'top', 'left'), 'unknown_joint', "'left' twice"),
+    'unknown': (('left', 'right', 'knee'), 'unknown_joint', "has 'knee': expected names among"),
+}
+
+
+def test_trajectory_that_one_joint_cannot_take_none_takes(rig):
+    planner = rig(*OTHERS, joints=JOINTS)
+    planner.send(trajectory(JOINTS, *SEQUENCE[:2]))
+    plans = {x: y.plan for x, y in planner.planner._group.planners.items()}
+    for names, code, text in REFUSED.values():
+        message = JointTrajectory(
+            joint_names=names, points=[JointTrajectoryPoint(
+                positions=[1.1] * len(names))])
+        message.points[0].time_from_start.sec = 1
+        assert text in planner.send(message, code).message
+    for field, value in (('positions', [1.1]), ('velocities', [0.0, 0.0, 0.5])):
+        message = trajectory(JOINTS, (1.1, SPELL))
+        setattr(message.points[0], field, value)
+        assert f'has {field if field != "positions" else 1}' in planner.send(
+            message, 'bad_input').message
+    # Top alone has so weak a coil.
+    answer = planner.send(trajectory(JOINTS, (1.5, SPELL)), 'flux_limit')
+    assert answer.level == ERROR
+    assert 'joint top: stretch 1.52 needs a flux density of' in answer.message
+    assert {x: y.plan for x, y in planner.planner._group.planners.items()} == plans
+
+
+def test_some_joints_only_by_parameter_and_one_by_its_own_setpoint(rig):
+    planner = rig(joints=JOINTS)
+    planner.send(trajectory(('left',), (1.1, SPELL)), 'unknown_joint')
+    results = planner.ros.set_parameters('planner', [
+        Parameter('allow_partial_joints', value=True),
+        Parameter('simultaneous_arrival', value=True)])
+    assert all(x.successful for x in results)
+    planner.send(trajectory(('right', 'top'), (1.1, SPELL)))
+    groups = planner.planner._group.planners
+    assert not groups['left'].plan.segments
+    assert groups['right'].plan.segments[0].arrival == groups['top'].plan.segments[0].arrival
+    setpoints = planner.ros.publisher(
+        Float64, 'planner/left/setpoint', interface.SETPOINT.qos)
+    setpoints.publish(Float64(data=1.3))
+    planner.verdict(code='accepted', request='', plan=2)
+    assert groups['left'].plan.segments[0].stretch == 1.3
+    answer = planner.ros.call(Trigger, 'planner/stop')
+    assert answer.success
+    assert all(x.plan.number >= 1 for x in groups.values())
+
+
+# -- signs of life ------------------------------------------------------------------------------
+
+
+def test_heartbeat_repeats_the_last_level_and_changes_nothing(rig):
+    planner = rig('-p', 'heartbeat_period:=0.02')
+    arrived = planner.driver.arrived
+    planner.at(START + 500 * MS)
+    # Nothing before the first command.
+    assert arrived == []
+    planner.send(to_trajectory([(1.1, SPELL)], 'actuator'))
+    begin = planner.now
+    for k in range(40):
+        planner.clock.set(begin + k * 5 * MS)
+        planner.ros.executor.spin_once(0.005)
+    planner.now = begin + 200 * MS
+    levels = planner.planner._group.planners['actuator'].plan.ahead
+    known = len(arrived)
+    planner.at(begin + 250 * MS)
+    planner.spin(lambda: len(arrived) > known, 'a heartbeat while holding')
+    changes = [x for k, x in enumerate(arrived) if k == 0 or x[1] != arrived[k - 1][1]]
+    assert changes == [(x.stamp, x.flux_density) for x in levels]
+    assert len(arrived) > 5
+    assert all(x[0] <= y[0] for x, y in zip(arrived, arrived[1:], strict=False))
+    assert arrived[-1] == (begin + 250 * MS + LEAD, levels[-1].flux_density)
+    result, = planner.ros.set_parameters('planner', [Parameter('heartbeat_period', value=0.0)])
+    assert result.successful
+    assert planner.planner._heartbeat.is_canceled()
+
+
+# -- taking over --------------------------------------------------------------------------------
+
+
+def test_first_request_waits_for_the_state_in_force(rig, ros):
+    planner = rig()
+    samples = ros.node.create_publisher(
+        JointState, 'joint_states', interface.JOINT_STATES.qos)
+    driver = planner.driver
+    driver.plant.set_state(1.15, 3.0, 0.06)
+    planner.trajectories.publish(to_trajectory([(1.3, SPELL)], 'actuator'))
+    setpoints = ros.publisher(Float64, 'planner/setpoint', interface.SETPOINT.qos)
+    # Somebody publishes samples: the planner asks for one, and this request waits its turn.
+    ros.spin_until(samples.get_subscription_count, 'the subscription')
+    setpoints.publish(Float64(data=1.25))
+    old = driver.sample()
+    old.header.stamp = to_time(START - 600 * MS)
+    for message in (old, driver.sample('knee')):
+        samples.publish(message)
+    known = driver.sample()
+
+    def answered() -> bool:
+        samples.publish(known)
+        return planner.values().get('plan') == '2'
+
+    planner.spin(answered, 'two answers')
+    ros.spin_until(lambda: not samples.get_subscription_count(), 'the end of the subscription')
+    planner.spin(lambda: len(planner.plans) == 2, 'two plans')
+    point = planner.plans[-1].points
+    assert point[0].effort[0] == 0.06
+    assert (point[0].positions[0], point[0].velocities[0]) == (1.15, 3.0)
+    planner.run(START + 150 * MS)
+    assert driver.residual(1.25) < 0.1 * RESIDUAL
+
+
+def test_samples_of_others_only_delay_the_first_request(rig, ros):
+    planner = rig('-p', 'takeover_timeout:=0.05')
+    samples = ros.node.create_publisher(JointState, 'joint_states', 10)
+    ros.spin_until(lambda: planner.planner.count_publishers('joint_states'), 'the publisher')
+    answer = ros.call(Trigger, 'planner/stop')
+    assert answer.success
+    assert 'as soon as the state in force is known' in answer.message
+    planner.verdict(code='accepted', plan=1)
+    planner.send(to_trajectory([(1.1, SPELL)], 'actuator'))
+    assert not samples.get_subscription_count()
+    planner.run(START + 150 * MS)
+    assert planner.driver.residual(1.1) < 0.1 * RESIDUAL
+
+
+def test_planner_that_is_killed_is_followed_by_one_that_takes_over(ros, start, make_clock):
+    arguments = ('planner', '--ros-args', *QUIET)
+    clock = ros.node.create_publisher(
+        Clock, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    samples = ros.node.create_publisher(
+        JointState, 'joint_states', interface.JOINT_STATES.qos)
+    setpoints = ros.node.create_publisher(
+        Float64, 'planner/setpoint', interface.SETPOINT.qos)
+    statuses = ros.collect(interface.STATUS.type, 'planner/status', interface.STATUS.qos)
+    driver = Driver(ros)
+    now = START
+
+    def matched() -> bool:
+        clock.publish(to_clock(now))
+        return (
+            setpoints.get_subscription_count() and driver.applied.get_subscription_count()
+            and clock.get_subscription_count()
+            and ros.node.count_publishers('flux_density_command'))
+
+    def let_run(milliseconds: int) -> None:
+        nonlocal now
+        for _ in range(milliseconds):
+            now += MS
+            driver.advance(now)
+            clock.publish(to_clock(now))
+            samples.publish(driver.sample())
+            ros.executor.spin_once(0.002)
+
+    first = start.hmsa(*arguments)
+    ros.spin_until(matched, 'the first planner')
+
+    def answered() -> bool:
+        setpoints.publish(Float64(data=1.3))
+        let_run(1)
+        return bool(driver.arrived)
+
+    ros.spin_until(answered, 'its first command')
+    # Into the middle of its move, whose other half is lost with it.
+    driver.hold_back = True
+    while driver.plant.time < driver.arrived[0][0] + 3 * MS:
+        let_run(1)
+    first.popen.send_signal(signal.SIGKILL)
+    first.wait()
+    sent = len(driver.arrived)
+    assert sent == 1
+    driver.held.clear()
+    driver.hold_back = False
+    before = driver.plant.schedule.current
+    assert before == driver.arrived[0][1]
+    assert abs(driver.plant.rate) > 1.0
+    # The dead one stays in the graph for a while: the new one is known by what it says.
+    known = len(statuses)
+    second = start.hmsa(*arguments)
+    ros.spin_until(lambda: len(statuses) > known, 'the second planner')
+    # Nothing is sent before it is asked for anything.
+    let_run(5)
+    assert len(driver.arrived) == sent
+
+    def sent_on() -> bool:
+        setpoints.publish(Float64(data=1.2))
+        let_run(1)
+        return len(driver.arrived) > sent
+
+    ros.spin_until(sent_on, 'its first command')
+    assert driver.plant.schedule.current == before
+    let_run(150)
+    assert driver.residual(1.2) < 0.1 * RESIDUAL
+    assert second.stop(signal.SIGINT) == 0
+
+
+# -- late commands ------------------------------------------------------------------------------
+
+
+def test_late_command_is_noticed_and_the_rest_planned_anew(rig):
+    planner = rig()
+    planner.send(to_trajectory(SEQUENCE, 'actuator'))
+    driver = planner.driver
+    planner.run(START + 20 * MS)
+    # What is sent from here on, of the second move, arrives up to 9 ms after its time.
+    driver.hold_back = True
+    planner.run(START + LEAD + SPELL + 9 * MS)
+    driver.release()
+    driver.advance(planner.now)
+    status = planner.verdict(code='replanned', replanned=1)
+    assert status.level == WARN
+    assert 'planned anew' in status.message
+    assert int(planner.values()['late']) >= 1
+    planner.run(START + LEAD + 4 * SPELL)
+    planner.verdict(state='at_rest', setpoint=3, setpoints=3, stretch='1.4', plan=1)
+    assert driver.residual(1.4) < 0.2 * RESIDUAL
+
+
+def test_lead_time_too_short_is_told_once_and_not_planned_for_again_and_again(rig):
+    planner = rig('-p', 'lead_time:=0.002')
+    driver = planner.driver
+    planner.send(to_trajectory([(1.2, SPELL)], 'actuator'))
+    held: list[tuple[int, Any]] = []
+    for _ in range(60):
+        # Each command is 5 ms on its way.
+        driver.hold_back = True
+        planner.run(planner.now + 2 * MS)
+        held += [(planner.now + 5 * MS, x) for x in driver.held]
+        driver.held = [x for at, x in held if at <= planner.now]
+        held = [x for x in held if x[0] > planner.now]
+        driver.release()
+        driver.advance(planner.now)
+        planner.ros.executor.spin_once(0.005)
+    status = planner.verdict(code='late')
+    assert status.level == WARN
+    assert 'raise lead_time to more than 0.00' in status.message
+    assert 1 <= int(planner.values()['replanned']) <= 3
+    assert len(driver.arrived) < 20
+
+
+def test_jump_ahead_while_a_plan_runs_is_planned_anew(rig):
+    planner = rig()
+    planner.send(to_trajectory(SEQUENCE, 'actuator'))
+    planner.run(START + 30 * MS)
+    planner.at(START + LEAD + 2 * SPELL)
+    planner.driver.advance(planner.now)
+    status = planner.verdict(code='replanned', replanned=1)
+    assert status.level == WARN
+    planner.run(START + 2 * LEAD + 4 * SPELL)
+    planner.verdict(state='at_rest', stretch='1.4')
+    assert planner.driver.residual(1.4) < 0.2 * RESIDUAL
+
+
+# -- states and parameters ----------------------------------------------------------------------
+
+
+def test_deactivated_it_comes_to_rest_and_activated_again_it_takes_over(rig, ros):
+    def change(transition: int) -> None:
+        answer = ros.call(ChangeState, 'planner/change_state', ChangeState.Request(
+            transition=Transition(id=transition)))
+        assert answer.success
+
+    planner = rig('-p', 'heartbeat_period:=0.01')
+    driver = planner.driver
+    planner.send(to_trajectory(SEQUENCE, 'actuator'))
+    planner.at(START + 3 * MS)
+    change(Transition.TRANSITION_DEACTIVATE)
+    planner.verdict(code='stopped')
+    assert planner.send(to_trajectory(SEQUENCE, 'actuator'), 'inactive').level == ERROR
+    sent = planner.planner._sent + planner.planner._beats
+    planner.spin(lambda: len(driver.arrived) == sent, 'the last commands')
+    driver.advance(START + 500 * MS)
+    rest = driver.plant.stretch
+    assert 1.0 < rest < 1.1
+    assert driver.residual(rest) < 0.1 * RESIDUAL
+    planner.at(START + 500 * MS)
+    samples = ros.publisher(JointState, 'joint_states', 10, subscribers=0)
+    ros.spin_until(lambda: planner.planner.count_publishers('joint_states'), 'the publisher')
+    change(Transition.TRANSITION_ACTIVATE)
+    assert planner.planner._sent + planner.planner._beats == sent
+    planner.trajectories.publish(to_trajectory([(1.3, SPELL)], 'actuator', frame='again'))
+
+    def answered() -> bool:
+        samples.publish(driver.sample())
+        return planner.values().get('request') == 'again'
+
+    planner.spin(answered, 'the answer')
+    for k in range(30):
+        planner.at(START + 500 * MS + k * 5 * MS)
+        ros.executor.spin_once(0.005)
+        driver.advance(planner.now)
+    assert driver.residual(1.3) < 0.3 * RESIDUAL
+    change(Transition.TRANSITION_DEACTIVATE)
+    change(Transition.TRANSITION_CLEANUP)
+    ros.spin_until(
+        lambda: not ros.node.count_publishers('flux_density_command'), 'the end of the topics')
+    change(Transition.TRANSITION_CONFIGURE)
+    change(Transition.TRANSITION_ACTIVATE)
+    ros.spin_until(
+        lambda: ros.node.count_publishers('flux_density_command'), 'the topics again')
+
+
+def test_changed_block_and_lead_time_are_taken_by_the_next_plan(rig):
+    planner = rig(joints=('left', 'right'))
+    planner.send(to_trajectory(SEQUENCE, 'left'), 'unknown_joint')
+    results = planner.ros.set_parameters('planner', [
+        Parameter('left.actuator.remanence', value=0.2), Parameter('lead_time', value=0.1),
+        Parameter('actuator.damping_coefficient', value=0.3)])
+    assert [x.reason for x in results] == [''] * 3
+    message = to_trajectory([(1.2, SPELL)], 'left')
+    message.joint_names = ['left', 'right']
+    message.points[0].positions = [1.2, 1.2]
+    planner.send(message)
+    for name, remanence in (('left', 0.2), ('right', 0.1)):
+        alone = Planner(
+            replace(paper_actuator(), remanence=remanence, damping_coefficient=0.3),
+            Options(flux_density_min=-0.5, flux_density_max=0.5, lead_time=100 * MS))
+        assert [(x.stamp, x.flux_density) for x in (
+            planner.planner._group.planners[name].plan.ahead)] == [
+            (x.stamp, x.flux_density) for x in alone.setpoint(1.2, START).ahead]
+    # 1.2 is held, which a block of so short chains cannot.
+    result, = planner.ros.set_parameters('planner', [
+        Parameter('right.actuator.chain_limit', value=0.05)])
+    assert not result.successful
+    assert 'joint right: the stretch that is held is 1.2' in result.reason
+    result, = planner.ros.set_parameters('planner', [
+        Parameter('left.flux_density_min', value=0.6)])
+    assert 'joint left: parameter flux_density_min is 0.6 T' in result.reason
+
+
+# -- time ---------------------------------------------------------------------------------------
+
+
+def test_two_clocks_are_told_of_and_their_quarrel_makes_no_storm(rig, make_ros):
+    planner = rig()
+    arrays = planner.ros.collect(
+        interface.DIAGNOSTICS.type, '/diagnostics', interface.DIAGNOSTICS.qos)
+    planner.send(to_trajectory(SEQUENCE, 'actuator'))
+    other = make_ros()
+    clock = other.publisher(
+        Clock, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    before = len(planner.statuses)
+    for k in range(20):
+        jumps = planner.planner._jumps
+        planner.clock.set(START + k * MS)
+
+        def back(k: int = k, jumps: int = jumps) -> bool:
+            clock.publish(to_clock(START // 2 + k))
+            return planner.planner._jumps > jumps
+
+        planner.spin(back, 'a jump')
+    planner.spin(
+        lambda: any('2 publishers on /clock' in x.status[0].message for x in arrays),
+        'diagnostics')
+    assert planner.planner._replanned == 0
+    assert sum(
+        x.values[0].value == 'clock_jumped' for x in planner.statuses[before:]) < 10
+
+
+def test_step_back_of_the_wall_clock_is_noticed():
+    watch = StepWatch()
+    steady = 10**12
+    now = 10**18
+    assert watch.set_back(steady, now, steady) == 0
+    # Slewed, stepped ahead, interrupted between the readings: no step back.
+    for ahead, later in ((10**9, 10**9 - 10**5), (10**9, 4 * 10**9), (10**9, 10**9)):
+        steady += ahead
+        now += later
+        assert watch.set_back(steady, now, steady) == 0
+    assert watch.set_back(steady, now, steady + 10**9) == 0
+    assert watch.set_back(steady + 10**9, now - 10**9, steady + 10**9) == 2 * 10**9
+    assert watch.set_back(steady + 2 * 10**9, now, steady + 2 * 10**9) == 0
+
+
+def test_plan_is_dropped_when_the_wall_clock_is_set_back(ros, serve):
+    served = serve(PlannerNode)
+    planner = served.nodes[0]
+    statuses = ros.collect(interface.STATUS.type, 'planner/status', interface.STATUS.qos)
+    setpoints = ros.publisher(Float64, 'planner/setpoint', interface.SETPOINT.qos)
+    setpoints.publish(Float64(data=1.1))
+    ros.spin_until(lambda: planner._engaged, 'the plan')
+    # As if the last reading had been ten seconds ahead of this one.
+    planner._steps._offset += 10**10
+    ros.spin_until(
+        lambda: statuses and statuses[-1].values[0].value == 'clock_jumped', 'the verdict')
+    assert 'the clock jumped back by 10.0' in statuses[-1].message
+    assert not planner._engaged
