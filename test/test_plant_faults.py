@@ -1,0 +1,389 @@
+"""The plant when things go wrong: silence, strangers, clocks, delays, noise and disturbances."""
+
+from collections.abc import Callable
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import WrenchStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+import numpy as np
+import pytest
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
+from std_srvs.srv import SetBool, Trigger
+
+from hmsa_ros.core.parameters import paper_actuator
+from hmsa_ros.core.simulation import ActuatorSimulation
+from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.conversions import from_time, to_clock, to_command, to_time
+from hmsa_ros.nodes.guard import Allegiance
+from hmsa_ros.nodes.plant import PlantNode
+
+pytestmark = pytest.mark.ros
+
+MS = 1_000_000
+START = 1000 * MS
+LEADING = ('-p', 'publish_clock:=true', '-p', 'start_paused:=true')
+EVERY = QoSProfile(depth=200_000)
+
+
+class Stand:
+    """A plant that leads simulated time and advances by steps, and what it says."""
+
+    def __init__(self, ros: Any, *, node: str = 'plant', subscribers: int = 1) -> None:
+        self.ros = ros
+        self.node = node
+        topics = interface
+        self.samples = ros.collect(topics.JOINT_STATES.type, topics.JOINT_STATES.name, EVERY)
+        applied = topics.FLUX_DENSITY_APPLIED
+        self.applied = ros.collect(applied.type, applied.name, applied.qos)
+        self.reports = ros.collect(
+            topics.DIAGNOSTICS.type, topics.DIAGNOSTICS.name, topics.DIAGNOSTICS.qos)
+        command = topics.FLUX_DENSITY_COMMAND
+        self.publisher = ros.publisher(command.type, command.name, command.qos, subscribers)
+        ros.spin_until(lambda: self.applied, 'the level at the start')
+
+    def send(self, *commands: tuple[int, float], publisher: Any = None) -> None:
+        """Send commands and return when the plant has them."""
+        from rclpy.duration import Duration
+        publisher = publisher or self.publisher
+        for stamp, flux_density in commands:
+            publisher.publish(to_command(stamp, flux_density, ''))
+        assert publisher.wait_for_all_acked(Duration(seconds=60))
+
+    def call(self, service: interface.Service, **request: Any) -> Any:
+        """Call a service."""
+        return self.ros.call(
+            service.type, interface.from_outside(service.name, self.node),
+            service.type.Request(**request))
+
+    def step(self, count: int) -> int:
+        """Advance by samples and return the time in ns."""
+        results = self.ros.set_parameters(self.node, [Parameter('step_count', value=count)])
+        assert results[0].successful, results[0].reason
+        answer = self.call(interface.STEP)
+        assert answer.success, answer.message
+        now = round(float(answer.message.split()[1]) * 1e9)
+        self.ros.spin_until(
+            lambda: self.samples and from_time(self.samples[-1].header.stamp) >= now
+            - self.delay, answer.message)
+        return now
+
+    delay = 0
+
+    def told(self) -> list[tuple[float, float]]:
+        """Return what took effect: time after the start in ms, and level."""
+        return [((from_time(x.header.stamp) - START) / MS, x.magnetic_field.z)
+                for x in self.applied]
+
+    def report(self, kind: str, **values: Any) -> DiagnosticStatus:
+        """Wait for diagnostics with values."""
+        del self.reports[:]
+        wanted = {key: str(value) for key, value in values.items()}
+
+        def found() -> Any:
+            for array in self.reports:
+                for status in array.status:
+                    if status.name == f'plant: {kind}' and wanted.items() <= {
+                            x.key: x.value for x in status.values}.items():
+                        return status
+            return None
+
+        return self.ros.spin_until(found, f'diagnostics with {wanted}')
+
+
+@pytest.fixture
+def stand(ros: Any, serve: Any) -> Callable[..., Stand]:
+    """Return a maker of a stand with node arguments."""
+    def make(*arguments: str) -> Stand:
+        serve(PlantNode, *LEADING, *arguments)
+        return Stand(ros)
+    return make
+
+
+# -- what took effect, and silence -------------------------------------------------------------
+
+
+def test_each_change_is_told_with_the_time_at_which_it_took_effect(stand):
+    plant = stand()
+    plant.send((START + 5_500_000, 0.05), (START + 8 * MS, 0.05), (START - 5 * MS + 1, 0.02),
+               (START + 9 * MS, 0.03))
+    plant.step(20)
+    plant.send((START + 15 * MS, 0.03), (START + 18 * MS, 0.01))
+    plant.step(1)
+    plant.ros.spin_until(lambda: len(plant.applied) == 4, 'all changes')
+    # The repetition came late too, but nothing with it.
+    assert plant.told() == [(0.0, 0.0), (0.0, 0.02), (9.0, 0.03), (20.0, 0.01)]
+    plant.report('commands', received=6, late=2)
+
+
+@pytest.mark.parametrize(('safe', 'ends'), [
+    ('hold', [(5.0, 0.05)]),
+    ('zero', [(5.0, 0.05), (101.0, 0.0)]),
+    ('ramp', [(5.0, 0.05)] + [
+        (101.0 + k, pytest.approx(0.05 - 0.01 * k, abs=1e-15)) for k in range(1, 6)])])
+def test_silence_leads_to_the_safe_flux_and_a_command_back(stand, safe, ends):
+    plant = stand('-p', 'command_timeout:=0.1', '-p', f'safe_flux:={safe}', '-p',
+                  'safe_ramp_rate:=10.0')
+    # Nobody has commanded it yet: no alarm.
+    plant.step(300)
+    now = START + 300 * MS
+    plant.send((now + 5 * MS, 0.05))
+    plant.step(99)
+    assert plant.report('commands', silent=0).level == DiagnosticStatus.OK
+    plant.step(30)
+    plant.ros.spin_until(lambda: len(plant.applied) == 1 + len(ends), 'the changes')
+    assert [(x - 300, y) for x, y in plant.told()[1:]] == ends
+    status = plant.report('commands', silent=1, timeouts=1)
+    assert status.level == DiagnosticStatus.ERROR
+    assert status.message == 'no command and no heartbeat for actuator'
+    plant.send((0, 0.04))
+    plant.step(50)
+    assert plant.samples[-1].effort[0] == 0.04
+    assert plant.report('commands', silent=0, timeouts=1).level == DiagnosticStatus.OK
+
+
+def test_a_heartbeat_is_a_sign_of_life_and_changes_nothing(stand):
+    plant = stand('-p', 'command_timeout:=0.1', '-p', 'safe_flux:=zero')
+    plant.send((START + 3_456_789, 0.05))
+    for _ in range(4):
+        now = plant.step(80)
+        plant.send((now + 50 * MS, 0.05))
+    assert plant.report('commands', timeouts=0, received=5).level == DiagnosticStatus.OK
+    simulation = ActuatorSimulation(paper_actuator(), time=START)
+    simulation.command(START + 3_456_789, 0.05)
+    for sample in plant.samples:
+        simulation.advance(from_time(sample.header.stamp))
+        assert (simulation.stretch, simulation.rate) == (sample.position[0], sample.velocity[0])
+
+
+# -- strangers ---------------------------------------------------------------------------------
+
+
+def test_a_second_publisher_is_told_and_obeyed_by_default(stand):
+    plant = stand()
+    topic = interface.FLUX_DENSITY_COMMAND
+    second = plant.ros.publisher(topic.type, topic.name, topic.qos)
+    plant.send((0, 0.05))
+    plant.send((0, 0.03), publisher=second)
+    plant.step(2)
+    assert plant.samples[-1].effort[0] == 0.03
+    status = plant.report('commands', refused_source=0)
+    assert status.level == DiagnosticStatus.WARN
+    assert status.message == 'several publishers command actuator'
+    plant.ros.node.destroy_publisher(second)
+    plant.ros.spin_until(
+        lambda: plant.report('commands').level == DiagnosticStatus.OK, 'one publisher again')
+
+
+def test_only_the_first_publisher_is_obeyed_until_it_is_gone(stand):
+    plant = stand('-p', 'command_source:=first')
+    topic = interface.FLUX_DENSITY_COMMAND
+    second = plant.ros.publisher(topic.type, topic.name, topic.qos)
+    plant.send((0, 0.05))
+    plant.step(2)
+    for _ in range(3):
+        plant.send((0, 0.03), publisher=second)
+        plant.step(2)
+    assert plant.samples[-1].effort[0] == 0.05
+    plant.send((0, 0.06))
+    plant.step(2)
+    assert plant.samples[-1].effort[0] == 0.06
+    status = plant.report('commands', refused_source=3, received=2)
+    assert status.level == DiagnosticStatus.WARN
+    plant.ros.node.destroy_publisher(plant.publisher)
+
+    def takes_over() -> bool:
+        plant.send((0, 0.03), publisher=second)
+        plant.step(2)
+        return plant.samples[-1].effort[0] == 0.03
+
+    plant.ros.spin_until(takes_over, 'the second publisher to be obeyed')
+
+
+def test_who_cannot_be_told_is_refused_while_there_are_several():
+    ours = Allegiance()
+    assert ours.accepts(b'', lambda: [b'a'])
+    assert not ours.accepts(b'', lambda: [b'a', b'b'])
+    assert ours.accepts(b'a', lambda: [b'a', b'b'])
+    assert not ours.accepts(b'b', lambda: [b'a', b'b'])
+    assert ours.accepts(b'b', lambda: [b'b'])
+    assert ours.refused == 2
+
+
+# -- conveniences ------------------------------------------------------------------------------
+
+
+def test_a_reset_leads_to_the_state_of_its_parameters(stand):
+    plant = stand()
+    plant.send((0, 0.1))
+    plant.step(10)
+    results = plant.ros.set_parameters('plant', [
+        Parameter('reset_stretch', value=1.2), Parameter('reset_rate', value=2.5)])
+    assert all(x.successful for x in results)
+    answer = plant.call(interface.RESET)
+    assert (answer.success, answer.message) == (True, 'at rate 2.5/s at stretch 1.2')
+    plant.step(1)
+    simulation = ActuatorSimulation(paper_actuator(), stretch=1.2, time=START + 10 * MS)
+    simulation.set_state(1.2, 2.5, simulation.flux_density)
+    simulation.advance(START + 11 * MS)
+    assert plant.samples[-1].position[0] == simulation.stretch
+    refused = plant.ros.set_parameters('plant', [Parameter('reset_stretch', value=9.0)])[0]
+    assert not refused.successful
+    assert 'expected a stretch between the limits' in refused.reason
+
+
+def test_a_disturbing_force_acts_from_its_stamp_on(stand):
+    plant = stand()
+    topic = interface.DISTURBANCE_FORCE
+    publisher = plant.ros.publisher(topic.type, topic.name, topic.qos)
+    message = WrenchStamped()
+    message.header.stamp = to_time(START + 2_345_678)
+    message.wrench.force.z = 0.5
+    publisher.publish(message)
+    # Across the field it is refused.
+    other = WrenchStamped()
+    other.wrench.force.x = 1.0
+    publisher.publish(other)
+    simulation = ActuatorSimulation(paper_actuator(), time=START)
+    simulation.force(START + 2_345_678, 0.5)
+    plant.ros.spin_until(lambda: plant.report('commands'), 'the force to arrive')
+    plant.step(20)
+    for sample in plant.samples:
+        simulation.advance(from_time(sample.header.stamp))
+        assert sample.position[0] == simulation.stretch
+    assert simulation.stretch > 1.01
+
+
+def test_delays_hold_back_commands_and_samples_but_not_their_stamps(stand):
+    plant = stand('-p', 'command_delay:=0.004', '-p', 'measurement_delay:=0.003')
+    Stand.delay, before = 3 * MS, Stand.delay
+    try:
+        # In time for 6 ms ahead, 2 ms late for 2 ms ahead.
+        plant.send((START + 6 * MS, 0.05))
+        plant.step(10)
+        plant.send((START + 12 * MS, 0.02))
+        plant.step(10)
+    finally:
+        Stand.delay = before
+    assert plant.told() == [(0.0, 0.0), (6.0, 0.05), (14.0, 0.02)]
+    plant.report('commands', late=1, largest_lateness_ms='2.000')
+    assert from_time(plant.samples[-1].header.stamp) == START + 17 * MS
+    simulation = ActuatorSimulation(paper_actuator(), time=START)
+    simulation.command(START + 6 * MS, 0.05)
+    simulation.command(START + 14 * MS, 0.02)
+    for sample in plant.samples:
+        simulation.advance(from_time(sample.header.stamp))
+        assert sample.position[0] == pytest.approx(simulation.stretch, abs=1e-13)
+
+
+def test_a_mismatch_is_another_actuator_and_the_coil_lags(stand):
+    plant = stand('-p', 'mismatch.shear_modulus:=1.1', '-p', 'coil_time_constant:=0.002')
+    plant.send((START + 1_234_567, 0.05))
+    plant.step(30)
+    from dataclasses import replace
+    simulation = ActuatorSimulation(
+        replace(paper_actuator(), shear_modulus=1.1 * paper_actuator().shear_modulus),
+        time=START, coil_time_constant=0.002)
+    simulation.command(START + 1_234_567, 0.05)
+    for sample in plant.samples:
+        simulation.advance(from_time(sample.header.stamp))
+        assert (sample.position[0], sample.effort[0]) == (
+            simulation.stretch, simulation.flux_density)
+    assert 0.0 < plant.samples[2].effort[0] < 0.05
+
+
+# -- lock-step, as processes -------------------------------------------------------------------
+
+
+def test_the_same_seed_gives_the_same_run_bit_for_bit(start, ros):
+    arguments = (
+        '-p', 'publish_clock:=true', '-p', 'start_paused:=true', '-p', 'stretch_noise:=1e-3',
+        '-p', 'rate_noise:=0.5', '-p', 'coil_time_constant:=1e-3')
+    runs = []
+    for name, seed in (('a', 7), ('b', 7), ('c', 8)):
+        process = start.hmsa(
+            'plant', '--ros-args', *arguments, '-p', f'seed:={seed}', '-r', f'__ns:=/{name}')
+        samples = ros.collect(interface.JOINT_STATES.type, f'/{name}/joint_states', EVERY)
+        topic = interface.FLUX_DENSITY_COMMAND
+        publisher = ros.publisher(topic.type, f'/{name}/{topic.name}', topic.qos)
+        ros.set_parameters(f'/{name}/plant', [Parameter('step_count', value=100)])
+        ros.spin_until(lambda samples=samples, name=name: ros.node.count_publishers(
+            f'/{name}/joint_states'), 'the samples')
+        for k in range(3):
+            publisher.publish(to_command(START + (100 * k + 20) * MS + 123, 0.02 * k, ''))
+            from rclpy.duration import Duration
+            assert publisher.wait_for_all_acked(Duration(seconds=60))
+            assert ros.call(Trigger, f'/{name}/plant/step').success
+        ros.spin_until(lambda samples=samples: len(samples) == 301, 'all samples')
+        runs.append(np.array([(x.position[0], x.velocity[0], x.effort[0]) for x in samples]))
+        assert process.stop() == 0, process.output
+    assert runs[0].tobytes() == runs[1].tobytes()
+    assert runs[0].tobytes() != runs[2].tobytes()
+    assert np.ptp(runs[0][:, 0]) > 0.01
+
+
+# -- clocks and states -------------------------------------------------------------------------
+
+
+def test_another_clock_beside_the_authority_is_told(stand):
+    plant = stand('-p', 'real_time_factor:=2.0')
+    assert plant.report('time', clock_publishers=1).level == DiagnosticStatus.OK
+    clock = interface.CLOCK_TOPIC
+    other = plant.ros.node.create_publisher(clock.type, clock.name, clock.qos)
+    other.publish(to_clock(START))
+    status = plant.report('time', clock_publishers=2)
+    assert status.level == DiagnosticStatus.WARN
+    assert 'this plant, which is the authority' in status.message
+
+
+def test_the_achieved_real_time_factor_is_told_and_can_be_changed(stand):
+    plant = stand()
+    assert plant.ros.set_parameters(
+        'plant', [Parameter('real_time_factor', value=0.25)])[0].successful
+    assert plant.call(interface.SET_PAUSED, data=False).success
+    plant.report('time', real_time_factor='0.25')
+
+    def achieved() -> float:
+        values = {x.key: x.value for x in plant.report('time', real_time_factor='0.25').values}
+        return float(values['real_time_factor_achieved'])
+
+    # It may fall behind on a busy machine, but never run ahead for long.
+    plant.ros.spin_until(lambda: 0.0 < achieved() <= 0.26, 'a factor')
+
+
+def test_an_inactive_plant_holds_time_and_takes_no_commands(ros, serve):
+    serve(PlantNode, '-p', 'publish_clock:=true', '-p', 'autostart:=false')
+
+    def change(transition: int) -> bool:
+        request = ChangeState.Request(transition=Transition(id=transition))
+        return bool(ros.call(ChangeState, 'plant/change_state', request).success)
+
+    assert change(Transition.TRANSITION_CONFIGURE)
+    plant = Stand(ros)
+    plant.send((0, 0.05))
+    assert not plant.call(interface.STEP).success
+    plant.report('time', state='inactive')
+    assert plant.samples == []
+    assert change(Transition.TRANSITION_ACTIVATE)
+    ros.spin_until(lambda: len(plant.samples) > 10, 'samples')
+    assert {x.effort[0] for x in plant.samples} == {0.0}
+    assert change(Transition.TRANSITION_DEACTIVATE)
+    plant.report('time', state='inactive')
+    plant.report('time', state='inactive')
+    count = len(plant.samples)
+    plant.report('time', state='inactive')
+    assert len(plant.samples) == count
+    assert change(Transition.TRANSITION_ACTIVATE)
+    ros.spin_until(lambda: len(plant.samples) > count, 'more samples')
+    stamps = [from_time(x.header.stamp) for x in plant.samples]
+    assert stamps == list(range(stamps[0], stamps[-1] + 1, MS))
+    assert change(Transition.TRANSITION_DEACTIVATE)
+    assert change(Transition.TRANSITION_CLEANUP)
+    ros.spin_until(lambda: not ros.node.count_publishers('joint_states'), 'the topic to go')
+    assert change(Transition.TRANSITION_CONFIGURE)
+    assert change(Transition.TRANSITION_ACTIVATE)
+    known = len(plant.samples)
+    ros.spin_until(lambda: len(plant.samples) > known, 'samples of the new start')
+    assert ros.call(SetBool, 'plant/set_paused', SetBool.Request(data=True)).success
