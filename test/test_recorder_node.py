@@ -444,9 +444,9 @@ def test_the_experiment_goes_into_the_bag(record, ros, make_ros):
     for stored in (reader.custom_data, reader.records['hmsa_ros']):
         assert [stored[f'{space}planner.zeta'] for space in ('/left/', '/right/', '/')] == [
             '0.4', '0.2', '0.3']
-    sequence, setpoint = json.loads(reader.custom_data['setpoints'])
-    assert sequence['points'] == [[[1.1], 0.0]]
-    assert (setpoint['topic'], setpoint['stretch']) == ('/left/planner/setpoint', 1.2)
+    setpoints = {entry['topic']: entry for entry in json.loads(reader.custom_data['setpoints'])}
+    assert setpoints['/planner/joint_trajectory']['points'] == [[[1.1], 0.0]]
+    assert setpoints['/left/planner/setpoint']['stretch'] == 1.2
     assert 'version' in reader.records['hmsa_ros']
     assert summarize(recorder.folder).parameters['/right/planner.zeta'] == '0.2'
     for planner in planners.values():
