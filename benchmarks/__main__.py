@@ -5,7 +5,8 @@ Measure speed and accuracy.
     python -m benchmarks faults [--only KEY ...] [--quick] [--json FILE] [--page FILE]
     python -m benchmarks soak [--hours H] [--minutes M] [--factor F] [--picture FILE] [--quick]
 
-NAME is planner, plant, preemption, recorder, player or crash; without one all of these are run.
+NAME is planner, plant, preemption, joints, recorder, player or crash; without one all of these
+are run.
 Those of recorder, player and crash take some seven minutes together. faults injects faults into
 running nodes and fails if one is not answered as it should be; soak runs for hours.
 A page is a Markdown file with marks ``<!-- begin NAME -->`` and ``<!-- end NAME -->``, between
@@ -28,7 +29,7 @@ from benchmarks.sheet import Sheet
 # Of a table that goes to a file.
 _WIDTH = 120
 
-NAMES = ('planner', 'plant', 'preemption', 'recorder', 'player', 'crash')
+NAMES = ('planner', 'plant', 'preemption', 'joints', 'recorder', 'player', 'crash')
 #: Not run unless asked for: they take long and need the machine for themselves.
 LONG = ('faults', 'soak')
 
@@ -111,7 +112,7 @@ def main(arguments: list[str] | None = None) -> int:
         from benchmarks import bench_preemption
 
         add(bench_preemption.compare(quick=options.quick))
-    for name in ('recorder', 'player', 'crash'):
+    for name in ('joints', 'recorder', 'player', 'crash'):
         if name in names and _has_ros(name):
             sheet = importlib.import_module(f'benchmarks.bench_{name}').compare(
                 quick=options.quick)

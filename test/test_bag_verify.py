@@ -177,3 +177,33 @@ def test_a_bag_without_a_run_is_refused(tmp_path):
     BagWriter(tmp_path / 'bag').close()
     with pytest.raises(BadInputError, match='holds no pair of topics'):
         verify(tmp_path / 'bag')
+
+
+@pytest.mark.ros
+def test_late_commands_a_slow_coil_and_the_watchdog_come_out_again(start, ros, tmp_path):
+    bag = tmp_path / 'run'
+    start.hmsa(
+        'plant', '--ros-args', '-p', 'mismatch.density:=1.1', '-p', 'coil_time_constant:=0.002',
+        '-p', 'slew_limit:=20.0', '-p', 'command_timeout:=0.1', '-p', 'safe_flux:=ramp', '-p',
+        'safe_ramp_rate:=0.1')
+    recorder = start.hmsa(
+        'recorder', '--ros-args', '-p', f'storage.uri:={bag}', '-p',
+        'record.topics:=[joint_states, flux_density_command, flux_density_applied]')
+    publisher = ros.publisher(MagneticField, 'flux_density_command', QoSProfile(depth=100), 2)
+    recorder.wait_for_output('ready: subscribed to all 3 topics')
+    ros.spin_until(lambda: 'plant.mismatch.density' in (bag / 'metadata.yaml').read_text(),
+                   "the plant's parameters in the bag")
+    applied = ros.collect(MagneticField, 'flux_density_applied')
+    for flux_density in (0.01, 0.02):
+        # Nobody could send a command later than this.
+        publisher.publish(to_command(1, flux_density, ''))
+        ros.spin_until(
+            lambda flux_density=flux_density: applied
+            and applied[-1].magnetic_field.z == flux_density, 'the level')
+    ros.spin_until(lambda: applied[-1].magnetic_field.z == 0.0, 'the end of the ramp')
+    assert recorder.stop() == 0, recorder.output
+    result, = verify(bag)
+    assert (result.command_count, result.late_count, result.note) == (2, 0, '')
+    assert result.largest_difference < SAME
+    stretches = samples(bag).values()
+    assert max(stretches) - min(stretches) > 1e-3

@@ -2,7 +2,10 @@
 Checking a recorded run against the model: the recorded commands, integrated once more.
 
 Parameters are taken from the bag, the state from its first sample; from there on every sample
-of the stretch must come out again. One bag may hold plants in several namespaces, and each of
+of the stretch must come out again. Where the plant has told which levels took effect and when,
+these are integrated, so that late, refused and repeated commands and its watchdog are accounted
+for; recorded disturbing forces are applied too. Measurement noise is not: it is the difference
+that is left. One bag may hold plants in several namespaces, and each of
 them several joints.
 """
 
@@ -11,14 +14,20 @@ from dataclasses import dataclass, fields
 import json
 import math
 import os
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.bag import limits
 from hmsa_ros.bag.experiment import parameters_of
 from hmsa_ros.bag.reader import BagReader
 from hmsa_ros.errors import BadInputError
 
+if TYPE_CHECKING:
+    # Numba comes along with it, which other commands on bags have no use for.
+    from hmsa_ros.core.simulation import ActuatorSimulation
+
 COMMAND = 'flux_density_command'
+APPLIED = 'flux_density_applied'
+FORCE = 'disturbance_force'
 STATES = 'joint_states'
 _NANOSECONDS = 1_000_000_000
 
@@ -35,11 +44,14 @@ class Verification:
     sample_count, command_count : int
         Messages compared and applied.
     late_count : int
-        Commands that came after their stamp, so that the moment of their effect is not known.
+        Commands that came after their stamp, so that the moment of their effect is not known;
+        none where the plant has told it.
     largest_difference : float
         Of the stretch, dimensionless.
     where : float
         Time of it after the first sample, in seconds.
+    note : str
+        Why the motion cannot come out exactly, empty if it must.
 
     """
 
@@ -50,6 +62,7 @@ class Verification:
     late_count: int
     largest_difference: float
     where: float
+    note: str = ''
 
 
 @dataclass(frozen=True)
@@ -64,6 +77,10 @@ class _Pair:
     def space(self) -> str:
         """Return the namespace."""
         return self.states[:self.states.rindex('/')]
+
+    def beside(self, name: str) -> str:
+        """Return a topic that stands beside the commands."""
+        return self.commands[:self.commands.rindex('/') + 1] + name
 
 
 def verify(
@@ -143,32 +160,49 @@ def _command(pair: _Pair, command: Any) -> tuple[int, float]:
 
 def _verify(reader: BagReader, pair: _Pair) -> Verification:
     """Compare one actuator."""
-    from hmsa_ros.core.simulation import ActuatorSimulation
+    states, commands, force = pair.states, pair.commands, pair.beside(FORCE)
+    decoders = {
+        topic: reader.decoder(topic) for topic in (states, commands, force)
+        if topic in reader.topics}
     simulation: ActuatorSimulation | None = None
-    states, commands = pair.states, pair.commands
-    decode_state, decode_command = reader.decoder(states), reader.decoder(commands)
-    ahead: list[tuple[int, float]] = []
-    samples = applied = late = 0
+    applied = _applied(reader, pair)
+    ahead: list[tuple[int, float]] = list(applied)
+    forces: list[tuple[int, float]] = []
+    samples = count = late = 0
     largest, where, first = 0.0, 0, 0
-    for message in reader.messages((states, commands)):
+    for message in reader.messages(tuple(decoders)):
+        decoded = decoders[message.topic](message.data)
         if message.topic == commands:
-            stamp, flux_density = _command(pair, decode_command(message.data))
-            applied += 1
+            stamp, flux_density = _command(pair, decoded)
+            count += 1
+            if applied:
+                continue
             if simulation is None:
                 ahead.append((stamp, flux_density))
             else:
                 late += simulation.command(stamp or simulation.time, flux_density) > 0
             continue
-        stamp, stretch, rate, effort = _sample(pair, decode_state(message.data))
+        if message.topic == force:
+            stamp, newton = _force(force, decoded)
+            if simulation is None:
+                forces.append((stamp, newton))
+            else:
+                simulation.force(stamp or simulation.time, newton)
+            continue
+        stamp, stretch, rate, effort = _sample(pair, decoded)
         samples += 1
         if simulation is None:
             first = stamp
             simulation = _start(reader.custom_data, pair, stamp)
-            simulation.set_state(stretch, rate, effort)
-            for command_stamp, command_level in ahead:
-                # What had taken effect by the first sample is in force with it.
-                if command_stamp > stamp:
-                    simulation.command(command_stamp, command_level)
+            # What had taken effect by the first sample is in force with it; a slow coil may
+            # still be on its way there.
+            past = [level for at, level in applied if at <= stamp]
+            simulation.set_state(stretch, rate, effort, past[-1] if past else None)
+            for at, level in ahead:
+                if at > stamp:
+                    simulation.command(at, level)
+            for at, newton in forces:
+                simulation.force(at, newton)
             continue
         simulation.advance(stamp)
         difference = abs(simulation.stretch - stretch)
@@ -177,7 +211,41 @@ def _verify(reader: BagReader, pair: _Pair) -> Verification:
     if simulation is None:
         raise BadInputError(f'topic {states} of {reader.path} has no message: expected samples '
                             'of the stretch')
-    return Verification(states, commands, samples, applied, late, largest, where * 1e-9)
+    return Verification(
+        states, commands, samples, count, late, largest, where * 1e-9,
+        _note(reader.custom_data, pair))
+
+
+def _applied(reader: BagReader, pair: _Pair) -> list[tuple[int, float]]:
+    """Return what took effect, as far as the plant has told it, by stamp."""
+    topic = pair.beside(APPLIED)
+    if topic not in reader.topics:
+        return []
+    decode = reader.decoder(topic)
+    found = [_command(pair, decode(x.data)) for x in reader.messages((topic,))]
+    return sorted(found, key=lambda x: x[0])
+
+
+def _force(topic: str, message: Any) -> tuple[int, float]:
+    """Return stamp in nanoseconds and newton of a disturbing force."""
+    try:
+        return _stamp(message), float(message.wrench.force.z)
+    except (AttributeError, TypeError, ValueError):
+        raise BadInputError(
+            f'a message of {topic} is no force: expected geometry_msgs/msg/WrenchStamped'
+        ) from None
+
+
+def _note(custom_data: Mapping[str, str], pair: _Pair) -> str:
+    """Return what makes the recorded samples differ from the motion."""
+    texts = parameters_of(custom_data, 'plant', pair.space)
+    found = [
+        f'{name} {text}' for name in ('stretch_noise', 'rate_noise')
+        if (text := _value(texts, pair, name, '0')) not in ('0', '0.0')]
+    if not found:
+        return ''
+    return (f'the samples are measured with {" and ".join(found)}: expected differences of '
+            'that size, from the first sample on')
 
 
 def _sample(pair: _Pair, sample: Any) -> tuple[int, float, float, float]:
@@ -201,26 +269,30 @@ def _only_joint(texts: Mapping[str, str]) -> str:
         return ''
 
 
+def _value(texts: Mapping[str, str], pair: _Pair, name: str, default: str) -> str:
+    """Return a parameter as JSON: what is set for a joint goes before what is set for all."""
+    own = texts.get(f'{pair.joint or _only_joint(texts)}.{name}', 'null')
+    return texts.get(name, default) if own == 'null' else own
+
+
 def _start(custom_data: Mapping[str, str], pair: _Pair, time: int) -> Any:
     """Return the simulation of the recorded actuator."""
     from hmsa_ros.core.parameters import ActuatorParameters
     from hmsa_ros.core.simulation import ActuatorSimulation
     texts = parameters_of(custom_data, 'plant', pair.space)
 
-    joint = pair.joint or _only_joint(texts)
-
-    def number(name: str) -> float:
-        # What is set for a joint goes before what is set for all.
-        own = texts.get(f'{joint}.{name}', 'null')
+    def number(name: str, default: str = '') -> float:
         try:
-            return float(json.loads(texts.get(name, '') if own == 'null' else own))
+            return float(json.loads(_value(texts, pair, name, default)))
         except (TypeError, ValueError):
             raise BadInputError(
                 f'the bag does not tell parameter {name} of node {pair.space}/plant: expected a '
                 'bag recorded while the plant was running') from None
 
-    values = {field.name: number(f'actuator.{field.name}')
+    values = {field.name:
+              number(f'actuator.{field.name}') * number(f'mismatch.{field.name}', '1.0')
               for field in fields(ActuatorParameters) if field.init}
-    slew_limit = number('slew_limit') if 'slew_limit' in texts else 0.0
     return ActuatorSimulation(
-        ActuatorParameters(**values), time=time, slew_limit=slew_limit or math.inf)
+        ActuatorParameters(**values), time=time,
+        slew_limit=number('slew_limit', '0.0') or math.inf,
+        coil_time_constant=number('coil_time_constant', '0.0'))

@@ -115,7 +115,8 @@ def _verify(arguments: argparse.Namespace) -> int:
             print(printable(
                 f'{result.states}: {result.sample_count} samples, {result.command_count} '
                 f'commands of {result.commands} ({result.late_count} late), largest difference '
-                f'of the stretch {result.largest_difference:.3g} at {result.where:.6f} s'))
+                f'of the stretch {result.largest_difference:.3g} at {result.where:.6f} s'
+                + (f'; {result.note}' if result.note else '')))
     return 0 if passed else 1
 
 

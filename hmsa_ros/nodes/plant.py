@@ -134,8 +134,10 @@ class PlantNode(ManagedNode):
         self._diagnostics = self._publisher(interface.DIAGNOSTICS)
         self._clock_publisher = (
             self._publisher(interface.CLOCK_TOPIC) if self._authority else None)
+        scalars = values['publish_scalars']
+        self._scalars = scalars == 'always' or (scalars == 'auto' and len(each) == 1)
         self._joints = [
-            PlantJoint(self, self, i, values.names, x) for i, x in enumerate(each)]
+            PlantJoint(self, self, i, values.names, x, self._scalars) for i, x in enumerate(each)]
         for i, joint in enumerate(self._joints):
             joint.tell_applied(start, self.level(i))
         StateMarkers(
@@ -284,13 +286,14 @@ class PlantNode(ManagedNode):
     def _tell(self, sample: Sample) -> None:
         message = self._message
         message.header.stamp = conversions.to_time(sample.time)
-        message.position = array('d', sample.stretch)
-        message.velocity = array('d', sample.rate)
-        message.effort = array('d', sample.flux_density)
+        message.position = array('d', sample.stretch.tobytes())
+        message.velocity = array('d', sample.rate.tobytes())
+        message.effort = array('d', sample.flux_density.tobytes())
         self._joint_states.publish(message)
-        for joint, stretch, rate in zip(
-                self._joints, message.position, message.velocity, strict=True):
-            joint.tell_scalars(stretch, rate)
+        if self._scalars:
+            for joint, stretch, rate in zip(
+                    self._joints, message.position, message.velocity, strict=True):
+                joint.tell_scalars(stretch, rate)
 
     def _tell_changes(self) -> None:
         for i, stamp, level in self._actuators.changes:

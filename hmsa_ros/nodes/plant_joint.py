@@ -109,6 +109,8 @@ class PlantJoint:
         Names of all joints of the node.
     values : mapping of str to object
         Parameters that hold for this joint.
+    scalars : bool
+        Whether to publish stretch and rate by themselves.
 
     Attributes
     ----------
@@ -126,7 +128,7 @@ class PlantJoint:
 
     def __init__(
             self, node: Node, bench: Bench, number: int, names: Sequence[str],
-            values: Mapping[str, Any]) -> None:
+            values: Mapping[str, Any], scalars: bool) -> None:
         """Create its topics."""
         self.name = names[number]
         self._node = node
@@ -146,9 +148,8 @@ class PlantJoint:
             return node.create_publisher(placed.type, placed.name, placed.qos)
 
         self._applied = publisher(interface.FLUX_DENSITY_APPLIED)
-        scalars = values['publish_scalars']
         self._scalars = (publisher(interface.STRETCH), publisher(interface.STRETCH_RATE)) \
-            if scalars == 'always' or (scalars == 'auto' and len(names) == 1) else ()
+            if scalars else ()
         self.commands = CommandInput(
             node, interface.of_joint(interface.FLUX_DENSITY_COMMAND, self.name, names),
             self._on_command, values['command_source'])

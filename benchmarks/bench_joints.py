@@ -1,0 +1,144 @@
+"""How many joints one plant and planner serve at a rate, and how many pairs side by side."""
+
+from collections.abc import Sequence
+import os
+from pathlib import Path
+import tempfile
+from time import monotonic, sleep
+
+import numpy as np
+from rclpy.qos import QoSProfile
+
+from benchmarks.faults.rig import Child, Rig
+from benchmarks.sheet import Sheet
+from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.conversions import from_time, to_trajectory
+
+_DOMAIN = 77
+#: Joints of one plant and planner, by the rate of samples in Hz.
+_JOINTS = ((1, 1000.0), (16, 1000.0), (64, 1000.0), (128, 1000.0), (64, 4000.0))
+_SPACES = (1, 4, 8)
+_SECONDS = 6.0
+#: Behind the clock by no more than this, a plant keeps up, in s.
+_BEHIND = 0.02
+_TICKS = os.sysconf('SC_CLK_TCK')
+
+
+def _used(child: Child) -> float:
+    """Return the processor time of a process so far in s."""
+    text = Path(f'/proc/{child.popen.pid}/stat').read_text(encoding='ascii')
+    words = text.rpartition(')')[2].split()
+    return (int(words[11]) + int(words[12])) / _TICKS
+
+
+class _Watch:
+    """Looks at one plant's samples now and then: how many came, how far they are behind."""
+
+    def __init__(self, rig: Rig, space: str) -> None:
+        topic = interface.JOINT_STATES
+        self.behind: list[float] = []
+        self.stamps: list[int] = []
+        self._now = rig.node.get_clock().now
+        # One reader for a plant of 64 joints, as a recorder is.
+        rig.node.create_subscription(
+            topic.type, f'{space}/{topic.name}', self._take, QoSProfile(depth=5000), raw=False)
+
+    def _take(self, message) -> None:  # type: ignore[no-untyped-def]
+        stamp = from_time(message.header.stamp)
+        self.stamps.append(stamp)
+        self.behind.append((self._now().nanoseconds - stamp) / NANOSECONDS)
+
+
+def _run(
+        joints: int, rate: float, spaces: int, seconds: float, folder: Path) -> dict[str, float]:
+    """Measure one combination."""
+    names = [f'joint_{i}' for i in range(joints)]
+    listed = '[' + ', '.join(names) + ']'
+    with Rig(folder, _DOMAIN, watch=False) as rig:
+        plants, planners, watches = [], [], []
+        for k in range(spaces):
+            space = f'/pair_{k}'
+            shared = {'joints': listed, 'command_timeout': 0.0}
+            plants.append(rig.start(
+                'plant', {**shared, 'publish_rate': rate}, {'__ns': space}))
+            planners.append(rig.start('planner', {'joints': listed}, {'__ns': space}))
+            watches.append(_Watch(rig, space))
+        rig.spin_until(lambda: all(x.stamps for x in watches), 'samples of all plants')
+        trajectories = [
+            rig.node.create_publisher(
+                interface.JOINT_TRAJECTORY.type, f'/pair_{k}/planner/joint_trajectory',
+                interface.JOINT_TRAJECTORY.qos) for k in range(spaces)]
+        rig.spin_until(
+            lambda: all(x.get_subscription_count() for x in trajectories), 'the planners')
+        rig.spin(1.0)
+        for watch in watches:
+            watch.stamps.clear()
+            watch.behind.clear()
+        begin = monotonic()
+        used = [[_used(x) for x in group] for group in (plants, planners)]
+        for publisher in trajectories:
+            publisher.publish(_sequence(names, seconds))
+        rig.spin(seconds)
+        passed = monotonic() - begin
+        shares = [
+            sum(_used(x) - y for x, y in zip(group, before, strict=True)) / passed
+            for group, before in zip((plants, planners), used, strict=True)]
+        got = sum(len(x.stamps) for x in watches) / passed / spaces
+        behind = np.concatenate([x.behind for x in watches])
+    return {
+        'joints': joints, 'rate': rate, 'spaces': spaces, 'samples_per_second': got,
+        'plant_cores': shares[0], 'planner_cores': shares[1],
+        'behind_median': float(np.median(behind)),
+        'behind_99': float(np.quantile(behind, 0.99))}
+
+
+def _sequence(names: Sequence[str], seconds: float):  # type: ignore[no-untyped-def]
+    """Return a request that moves all joints every 0.2 s."""
+    message = to_trajectory(
+        [(1.1 if k % 2 else 1.2, round((k + 1) * 0.2 * NANOSECONDS))
+         for k in range(int(seconds / 0.2))], names[0])
+    message.joint_names = list(names)
+    for point in message.points:
+        point.positions = [point.positions[0]] * len(names)
+    return message
+
+
+def compare(*, quick: bool) -> Sheet:
+    """
+    Measure joints in one pair of nodes, and pairs of nodes side by side.
+
+    Parameters
+    ----------
+    quick : bool
+        Little of everything.
+
+    Returns
+    -------
+    Sheet
+        Passed if 64 joints at 1 kHz keep up with the clock; not judged where ``quick``.
+
+    """
+    cases = [(joints, rate, 1) for joints, rate in _JOINTS] + [
+        (1, 1000.0, spaces) for spaces in _SPACES[1:]]
+    if quick:
+        cases = [(8, 1000.0, 1), (1, 500.0, 2)]
+    figures = []
+    for joints, rate, spaces in cases:
+        with tempfile.TemporaryDirectory() as folder:
+            figures.append(_run(joints, rate, spaces, 1.0 if quick else _SECONDS, Path(folder)))
+        sleep(0.5)
+    rows = [[
+        f'{x["joints"]:g} joints at {x["rate"]:g} Hz'
+        + (f', {x["spaces"]:g} pairs' if x['spaces'] > 1 else ''),
+        f'{x["samples_per_second"]:.0f}', f'{100.0 * x["plant_cores"]:.0f} %',
+        f'{100.0 * x["planner_cores"]:.0f} %', f'{1e3 * x["behind_median"]:.2f} ms',
+        f'{1e3 * x["behind_99"]:.1f} ms'] for x in figures]
+    wanted = [x for x in figures if (x['joints'], x['rate'], x['spaces']) == (64, 1000.0, 1)]
+    return Sheet(
+        'joints', 'Plant and planner at work, all joints moved five times a second',
+        ('', 'samples/s each', 'plants', 'planners', 'behind, median', '99 %'), rows,
+        {'cases': figures},
+        quick or all(
+            x['samples_per_second'] > 0.99 * x['rate'] and x['behind_99'] < _BEHIND
+            for x in wanted))
