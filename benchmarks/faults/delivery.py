@@ -1,5 +1,7 @@
 """Faults of delivery: load, delay, loss, doubling and reordering of commands."""
 
+import numpy as np
+
 from benchmarks.faults.common import (
     await_change,
     LEAD,
@@ -15,6 +17,8 @@ from benchmarks.faults.table import Seen
 
 FAULTS = Register()
 _SLOW = 0.05
+# Until when what was planned anew has been carried out.
+_AFTER_NS = round((LEAD + 0.03) * 1e9)
 
 
 @FAULTS.fault(
@@ -49,8 +53,8 @@ def _load_default(rig: Rig) -> Seen:
 
 
 def _delayed(rig: Rig, part: float) -> Seen:
-    # In slow motion a thousandth of lead_time is a millisecond on the wall, more than what
-    # the relay and DDS add.
+    # In slow motion a twentieth of lead_time is 50 ms on the wall, more than what the relay and
+    # DDS add.
     remap = rig.relay('--delay', str(part * LEAD / _SLOW))
     pair(rig, slow=_SLOW, remap=remap, planner={'lead_time': LEAD})
     worst = moves(rig, (1.2, 1.0), pause=0.15)
@@ -59,7 +63,7 @@ def _delayed(rig: Rig, part: float) -> Seen:
     return Seen(f'{late:g} commands late', share(worst), worst < LIMIT and late == 0)
 
 
-for _part in (0.0, 0.5, 0.98):
+for _part in (0.0, 0.5, 0.95):
     FAULTS.fault(
         f'delay_{_part:g}', f'commands delayed by {_part:g} lead_time',
         'relay holds each command back; slow motion, 1 s on the wall is lead_time',
@@ -137,7 +141,12 @@ def _learnt(rig: Rig) -> Seen:
     await_change(rig, mark)
     rig.let_pass(1.2)
     rig.fresh('planner')
-    residual, error = settled(rig.samples(mark)[1], 1.2, 0.2)
+    stamps, values = rig.samples(mark)
+    # The second change is the level that the heartbeat brought. What is planned then takes
+    # effect lead_time later; left to itself, vibration would be a hundredth by that time.
+    second = stamps[np.flatnonzero(np.diff(values[:, 2]))[1] + 1]
+    rest = values[stamps > second + _AFTER_NS, 0]
+    residual, error = float(np.ptp(rest)) / 0.2, abs(float(rest[-1]) - 1.2) / 0.2
     replanned = rig.value('planner', 'replanned')
     return Seen(
         f'{replanned:g} re-planned, error {error:.0e}', share(residual),

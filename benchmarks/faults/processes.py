@@ -151,7 +151,7 @@ def _watchdog(rig: Rig, safe: str) -> Seen:
         changed = np.flatnonzero(flux != held)
         after = (stamps[changed[0]] - killed) * 1e-9 if changed.size else float('nan')
         # The last heartbeat may have been 0.2 s old, and is stamped lead_time ahead.
-        good = good and _TIMEOUT - 0.25 < after < _TIMEOUT + 0.25
+        good = good and _TIMEOUT - 0.3 < after < _TIMEOUT + 0.5
         loss = f'{after:.3f} s'
     if safe == 'ramp':
         falling = np.flatnonzero((flux < held) & (flux > 0.0))
