@@ -1,0 +1,290 @@
+"""
+What viewers are given: the files of config/ against the topics of the package, and Rerun.
+
+The viewers themselves are no Python packages, so that their files are held against what their
+readers ask for; Rerun's is shown a bag if rerun-sdk is installed.
+"""
+
+from collections.abc import Iterator, Mapping
+import json
+from pathlib import Path
+import re
+import subprocess
+import sys
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+import yaml
+
+from hmsa_ros import rerun_view
+from hmsa_ros.nodes import interface
+
+ROOT = Path(__file__).resolve().parent.parent
+CONFIG = ROOT / 'config'
+RVIZ = yaml.safe_load((CONFIG / 'rviz' / 'hmsa.rviz').read_text())
+FOXGLOVE = json.loads((CONFIG / 'foxglove.json').read_text())
+PLOTJUGGLER = ElementTree.parse(CONFIG / 'plotjuggler.xml').getroot()
+JOINT = 'actuator'
+
+# What plugins of rviz_common and rviz_default_plugins are called, as far as they are used.
+RVIZ_CLASSES = {
+    'rviz_common': {'Displays', 'Views', 'Time'},
+    'rviz_default_plugins': {
+        'Axes', 'FocusCamera', 'Grid', 'MarkerArray', 'Measure', 'MoveCamera', 'Orbit', 'Select',
+        'TF'}}
+# Panels of Foxglove, and the keys by which each is told what to show.
+FOXGLOVE_PANELS = {
+    '3D': {'cameraState', 'topics', 'layers', 'followTf', 'scene', 'transforms'},
+    'Plot': {'paths', 'xAxisVal', 'showLegend', 'isSynced'},
+    'RawMessages': {'topicPath'},
+    'DiagnosticSummary': {'topicToRender', 'minLevel', 'pinnedIds', 'hardwareIdFilter'},
+    'Publish': {'topicName', 'datatype', 'value', 'advancedView'},
+    'CallService': {'serviceName', 'requestPayload', 'layout'}}
+PLOT_STYLES = {'Lines', 'Dots', 'LinesAndDots', 'Sticks', 'Steps', 'StepsInv'}
+
+
+def topics() -> Mapping[str, interface.Topic]:
+    """Return the topics by full name, of one joint and no namespace."""
+    found = {}
+    for topic in vars(interface).values():
+        if isinstance(topic, interface.Topic):
+            for node in (*topic.publishers, *topic.subscribers):
+                name = interface.from_outside(topic.name, node)
+                found[name if name.startswith('/') else f'/{name}'] = topic
+    return found
+
+
+def services() -> Mapping[str, interface.Service]:
+    """Return the services by full name."""
+    return {f'/{interface.from_outside(service.name, node)}': service
+            for service in vars(interface).values()
+            if isinstance(service, interface.Service) for node in service.meaning}
+
+
+def type_name(kind: type[Any], what: str = 'msg') -> str:
+    """Return the name of a message type."""
+    return f'{kind.__module__.partition(".")[0]}/{what}/{kind.__name__}'
+
+
+def field(kind: type[Any], path: str) -> None:
+    """Follow a path of fields, as ``points[:].positions[0]``, through a message type."""
+    message: Any = kind()
+    for part in path.split('.'):
+        name, index = re.fullmatch(r'(\w+)((?:\[[\d:]*\])?)', part).groups()  # type: ignore[union-attr]
+        assert name in message.get_fields_and_field_types(), f'{path} of {kind.__name__}'
+        element = message.get_fields_and_field_types()[name]
+        message = getattr(message, name)
+        assert bool(index) == element.startswith('sequence<')
+        if index and '/' in element:
+            package, element_name = element.removeprefix('sequence<').rstrip('>').split('/')
+            module = __import__(f'{package}.msg', fromlist=[element_name])
+            message = getattr(module, element_name)()
+
+
+def classes(value: Any) -> Iterator[str]:
+    """Return every class that an RViz file names."""
+    if isinstance(value, dict):
+        if value.get('Class'):
+            yield value['Class']
+        for part in value.values():
+            yield from classes(part)
+    elif isinstance(value, list):
+        for part in value:
+            yield from classes(part)
+
+
+def test_rviz_file_has_what_rviz_reads():
+    assert set(RVIZ) == {'Panels', 'Visualization Manager', 'Window Geometry'}
+    manager = RVIZ['Visualization Manager']
+    assert {'Displays', 'Global Options', 'Tools', 'Views', 'Transformation'} <= set(manager)
+    for name in classes(RVIZ):
+        package, _, plugin = name.partition('/')
+        assert plugin in RVIZ_CLASSES[package]
+    names = [x['Name'] for x in manager['Displays']]
+    assert len(set(names)) == len(names)
+
+
+def test_rviz_shows_the_markers_of_plant_and_planner_as_they_are_offered():
+    displays = [x for x in RVIZ['Visualization Manager']['Displays']
+                if x['Class'] == 'rviz_default_plugins/MarkerArray']
+    # Relative, so that RViz in the nodes' namespace finds them.
+    assert {x['Topic']['Value'] for x in displays} == {
+        interface.from_outside(interface.MARKERS.name, node)
+        for node in interface.MARKERS.publishers}
+    for display in displays:
+        assert display['Enabled'] is True
+        assert display['Topic']['Reliability Policy'] == 'Reliable'
+        assert interface.MARKERS.qos.durability.name == 'TRANSIENT_LOCAL'
+        assert display['Topic']['Durability Policy'] == 'Transient Local'
+
+
+def test_rviz_stands_in_the_frame_of_the_coil_near_enough_to_see_a_centimetre():
+    from hmsa_ros.nodes import planner, plant
+    manager = RVIZ['Visualization Manager']
+    for node in (plant, planner):
+        frame = next(spec for spec in node.PARAMETERS if spec.name == 'frame_id')
+        assert manager['Global Options']['Fixed Frame'] == frame.default
+    view = manager['Views']['Current']
+    assert view['Near Clip Distance'] < view['Distance'] / 10 < 0.05
+
+
+def test_foxglove_layout_has_each_panel_once_in_its_place():
+    assert set(FOXGLOVE) == {
+        'configById', 'globalVariables', 'userNodes', 'playbackConfig', 'layout'}
+
+    def leaves(node: Any) -> Iterator[str]:
+        if isinstance(node, str):
+            yield node
+            return
+        assert set(node) == {'direction', 'first', 'second', 'splitPercentage'}
+        assert node['direction'] in ('row', 'column')
+        assert 0 < node['splitPercentage'] < 100
+        yield from leaves(node['first'])
+        yield from leaves(node['second'])
+
+    placed = list(leaves(FOXGLOVE['layout']))
+    assert sorted(placed) == sorted(FOXGLOVE['configById'])
+    for name, config in FOXGLOVE['configById'].items():
+        kind, mark, identifier = name.partition('!')
+        assert mark
+        assert identifier
+        assert set(config) >= FOXGLOVE_PANELS[kind]
+
+
+def test_foxglove_shows_topics_and_fields_that_there_are():
+    known = topics()
+    for name, config in FOXGLOVE['configById'].items():
+        kind = name.partition('!')[0]
+        if kind == '3D':
+            assert config['topics']
+            for topic in config['topics']:
+                assert known[topic] is interface.MARKERS
+        elif kind == 'Plot':
+            for path in config['paths']:
+                topic, _, fields = path['value'].partition('.')
+                field(known[topic].type, fields)
+                assert path['timestampMethod'] in ('headerStamp', 'receiveTime')
+                assert re.fullmatch(r'#[0-9A-F]{6}', path['color'])
+        elif kind == 'RawMessages':
+            assert config['topicPath'] in known
+        elif kind == 'DiagnosticSummary':
+            assert config['topicToRender'] == interface.DIAGNOSTICS.name
+
+
+def test_foxglove_publishes_and_calls_what_the_planner_takes():
+    publish = FOXGLOVE['configById']['Publish!setpoint']
+    assert publish['topicName'] == '/planner/setpoint'
+    topic = topics()[publish['topicName']]
+    assert publish['datatype'] == type_name(topic.type)
+    assert topic.type(**json.loads(publish['value'])).data > 0.0
+    call = FOXGLOVE['configById']['CallService!stop']
+    request = services()[call['serviceName']].type.Request
+    assert json.loads(call['requestPayload']) == {}
+    assert request.get_fields_and_field_types() == {}
+
+
+def test_plotjuggler_file_has_what_plotjuggler_reads():
+    assert PLOTJUGGLER.tag == 'root'
+    assert {x.tag for x in PLOTJUGGLER} >= {'tabbed_widget', 'Plugins'}
+    for splitter in PLOTJUGGLER.iter('DockSplitter'):
+        assert splitter.get('orientation') in ('-', '|')
+        sizes = [float(x) for x in splitter.attrib['sizes'].split(';')]
+        assert len(sizes) == len(splitter) == int(splitter.attrib['count'])
+        assert sum(sizes) == pytest.approx(1.0)
+    plots = list(PLOTJUGGLER.iter('plot'))
+    assert plots
+    for plot in plots:
+        assert plot.get('mode') in ('TimeSeries', 'XYPlot')
+        assert plot.get('style') in PLOT_STYLES
+        found = plot.find('range')
+        assert found is not None
+        edges = {key: float(value) for key, value in found.attrib.items()}
+        assert edges['left'] < edges['right']
+        assert edges['bottom'] < edges['top']
+        for curve in plot.findall('curve'):
+            assert ('curve_x' in curve.attrib) == (plot.get('mode') == 'XYPlot')
+
+
+def test_plotjuggler_shows_topics_and_fields_that_there_are():
+    known = topics()
+    names = []
+    for curve in PLOTJUGGLER.iter('curve'):
+        names += [curve.attrib['curve_x'], curve.attrib['curve_y']] \
+            if 'curve_x' in curve.attrib else [curve.attrib['name']]
+    for name in names:
+        topic = next(x for x in known if name.startswith(f'{x}/'))
+        fields = name.removeprefix(f'{topic}/')
+        if topic == '/joint_states':
+            # Of these PlotJuggler makes a curve a joint.
+            joint, _, fields = fields.partition('/')
+            assert joint == JOINT
+            assert fields in ('position', 'velocity', 'effort')
+        else:
+            field(known[topic].type, fields.replace('/', '.'))
+
+
+def test_rerun_view_names_topics_that_there_are():
+    known = topics()
+    assert f'/{rerun_view.JOINT_STATES}' in known
+    assert all(known[f'/{name}'] is interface.MARKERS for name in rerun_view.MARKERS)
+    for path in list(rerun_view.views().values())[:-1]:
+        topic, _, fields = path.rpartition('/')
+        field(known[topic].type, f'{fields}[0]')
+    assert rerun_view.views('left')['Stretch'] == '/left/joint_states/position'
+
+
+def test_without_rerun_it_is_asked_for_in_one_line(tmp_path, capfd, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'rerun', None)
+    assert rerun_view.main([str(tmp_path)]) == 2
+    assert 'expected it installed' in capfd.readouterr().err
+
+
+@pytest.fixture
+def rerun_program() -> list[str]:
+    """Return Rerun's program, which comes with rerun-sdk."""
+    pytest.importorskip('rerun', reason='rerun-sdk is not installed')
+    return [sys.executable, '-m', 'rerun']
+
+
+@pytest.mark.ros
+def test_rerun_has_data_under_every_path_that_its_views_show(
+        rerun_program, tmp_path, start, ros, capfd):
+    bag = tmp_path / 'run'
+    recorder = start.hmsa('recorder', '--ros-args', '-p', f'storage.uri:={bag}')
+    start.hmsa('plant')
+    start.hmsa('planner')
+    # The test itself and the recorder.
+    setpoint = ros.publisher(
+        interface.SETPOINT.type, '/planner/setpoint', interface.SETPOINT.qos, subscribers=2)
+    states, targets = (
+        ros.collect(interface.MARKERS.type, f'/{node}/markers', interface.MARKERS.qos)
+        for node in interface.MARKERS.publishers)
+    for text in ('/plant/markers', '/planner/markers', '/joint_states'):
+        recorder.wait_for_output(f'subscribed to {text}')
+    setpoint.publish(interface.SETPOINT.type(data=1.1))
+    # Until it has set out: its field is there.
+    ros.spin_until(
+        lambda: targets and targets[-1].markers[0].action == 0
+        and states and states[-1].markers[2].action == 0, 'the block to set out')
+    assert recorder.stop() == 0, recorder.output
+    saved = tmp_path / 'run.rrd'
+    assert rerun_view.main([str(bag), '--save', str(saved)]) == 0
+    stats = subprocess.run(
+        [*rerun_program, 'rrd', 'stats', saved], check=True, capture_output=True, text=True)
+    chunks = {path: int(count) for path, count in re.findall(
+        r'^(/\S*): (\d+)$', stats.stdout + stats.stderr, re.M)}
+    for path in rerun_view.views().values():
+        assert any(x == path or x.startswith(f'{path}/') for x in chunks), path
+    assert sum(path.startswith('/view/') and path.count('/') == 2 for path in chunks) == len(
+        rerun_view.views())
+    # The block, its magnetisation, the field, the name and the target.
+    assert {f'/markers/{JOINT}/{number}' for number in range(5)} <= set(chunks)
+    verified = subprocess.run(
+        [*rerun_program, 'rrd', 'verify', saved], check=False, capture_output=True, text=True)
+    assert verified.returncode == 0, verified.stderr
+
+
+def test_bag_without_samples_is_refused_in_one_line(rerun_program, tmp_path, capfd):
+    assert rerun_view.main([str(tmp_path), '--save', str(tmp_path / 'x.rrd')]) == 2
+    assert capfd.readouterr().err.count('\n') == 1
