@@ -327,7 +327,8 @@ def test_planner_and_plant_take_the_file_and_arrive_when_it_says(start, tmp_path
     file = str(tmp_path / 'actuator.yaml')
     arguments = ['--ros-args', '--params-file', file]
     start.hmsa('plant', *arguments)
-    start.hmsa('planner', *arguments)
+    # Far enough ahead for a busy machine.
+    start.hmsa('planner', *arguments, '-p', 'lead_time:=3.0')
     recorder = start.hmsa(
         'recorder', '--ros-args', '-p', f'storage.uri:={tmp_path / "bag"}',
         '-p', 'record.all_topics:=true')
