@@ -321,6 +321,7 @@ def test_first_request_waits_for_the_state_in_force(rig, ros):
     planner = rig()
     samples = ros.node.create_publisher(
         JointState, 'joint_states', interface.JOINT_STATES.qos)
+    ros.spin_until(lambda: planner.planner.count_publishers('joint_states'), 'the publisher')
     driver = planner.driver
     driver.plant.set_state(1.15, 3.0, 0.06)
     planner.trajectories.publish(to_trajectory([(1.3, SPELL)], 'actuator'))
@@ -340,7 +341,10 @@ def test_first_request_waits_for_the_state_in_force(rig, ros):
 
     planner.spin(answered, 'two answers')
     ros.spin_until(lambda: not samples.get_subscription_count(), 'the end of the subscription')
-    planner.spin(lambda: len(planner.plans) == 2, 'two plans')
+    planner.spin(
+        lambda: planner.plans
+        and planner.plans[-1].points[-1].positions[0] == pytest.approx(1.25, abs=1e-9),
+        'the second plan')
     point = planner.plans[-1].points
     assert point[0].effort[0] == 0.06
     assert (point[0].positions[0], point[0].velocities[0]) == (1.15, 3.0)

@@ -184,7 +184,9 @@ class PlannerClient:
             f'no planner in namespace {where}; start one with hmsa planner, with the same '
             'ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE as here', each)
 
-    def send(self, setpoints: Sequence[tuple[float, float]]) -> Verdict:
+    def send(
+            self, setpoints: Sequence[tuple[float, float]], *,
+            time_begins: bool = False) -> Verdict:
         """
         Send a sequence that begins now and wait for the verdict.
 
@@ -192,6 +194,9 @@ class PlannerClient:
         ----------
         setpoints : sequence of (float, float)
             Stretch and span in s.
+        time_begins : bool
+            Whether simulated time has just begun, so that the planner may not know yet: it is
+            asked again then.
 
         Returns
         -------
@@ -206,7 +211,6 @@ class PlannerClient:
             If it does not answer.
 
         """
-        request = uuid4().hex
         points = []
         end = 0.0
         for stretch, span in setpoints:
@@ -214,13 +218,17 @@ class PlannerClient:
             if end >= 2**31:
                 raise BadInputError(f'the sequence lasts {end:g} s: expected less than 2^31 s')
             points.append((stretch, round(end * NANOSECONDS)))
-        self._publisher.publish(to_trajectory(points, self._joint, frame=request))
-        self.spin_until(
-            lambda: self._verdict.request == request,
-            'the planner gave no verdict')
-        if self._verdict.level >= DiagnosticStatus.ERROR[0]:
-            raise BadInputError(f'the planner refused: {self._verdict.message}')
-        return self._verdict
+        deadline = monotonic() + self._timeout
+        while True:
+            request = uuid4().hex
+            self._publisher.publish(to_trajectory(points, self._joint, frame=request))
+            self.spin_until(
+                lambda request=request: self._verdict.request == request,  # type: ignore[misc]
+                'the planner gave no verdict')
+            if self._verdict.level < DiagnosticStatus.ERROR[0]:
+                return self._verdict
+            if not time_begins or self._verdict.code != 'no_time' or monotonic() > deadline:
+                raise BadInputError(f'the planner refused: {self._verdict.message}')
 
     def follow(
             self, verdict: Verdict, *, each: Callable[[Verdict], None] | None = None,

@@ -22,7 +22,7 @@ from hmsa_ros.ending import Ending
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import from_time
-from hmsa_ros.report.evaluation import evaluate, Move, MoveResult
+from hmsa_ros.report.evaluation import evaluate, Move, MoveResult, without_repeats
 from hmsa_ros.report.reading import read_runs
 from hmsa_ros.session.client import PlannerClient
 from hmsa_ros.session.processes import NodeProcess, Session
@@ -173,7 +173,8 @@ def run_demo(
                 f'the recorder is not ready: {session.last_words("recorder")}', check)
             watch.unpause(check)
             spans = [span * paper_actuator().time_unit for _, span in SEQUENCE]
-            verdict = client.send([(x, s) for (x, _), s in zip(SEQUENCE, spans, strict=True)])
+            verdict = client.send(
+                [(x, s) for (x, _), s in zip(SEQUENCE, spans, strict=True)], time_begins=True)
             begin = watch.time
             total = sum(spans) + LEAD_TIME
 
@@ -256,7 +257,7 @@ def _evaluate(bag: Path, picture: Path, exits: dict[str, int]) -> DemoResult:
     from hmsa_ros.figures.run import draw_run
 
     run, = read_runs(bag, actuator=paper_actuator())
-    levels = run.commands
+    levels = without_repeats(run.commands)[0]
     if len(levels) != 2 * len(SEQUENCE):
         raise HmsaError(
             f'the bag holds {len(levels)} commands: expected {2 * len(SEQUENCE)}')
