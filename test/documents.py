@@ -51,6 +51,7 @@ FOREIGN = {
     'apt', 'cd', 'colcon', 'export', 'foxglove-studio', 'git', 'mkdir', 'plotjuggler', 'rosdep',
     'rqt', 'rqt_graph', 'rqt_plot', 'rviz2', 'source', 'sudo', '.', 'pip', 'rerun', 'kill',
     'wait', 'unset', 'echo', 'cp', 'openssl', 'scp', 'ssh', 'systemctl', 'ulimit', 'chrt'}
+KEYWORDS = {'do', 'done', 'else', 'fi', 'if', 'then', 'until', 'while'}
 PATIENCE_SECONDS = 100.0
 NUMBER = re.compile(r'[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?')
 LARGEST_SHARE, LARGEST_DIFFERENCE = 1e-3, 1e-6
@@ -402,17 +403,20 @@ def check(block: Block) -> None:
 
 
 def commands(text: str) -> list[list[str]]:
-    """Return the words of each simple command of a script."""
+    """Return the words of each simple command of a script, those in ``$(...)`` first."""
     found: list[list[str]] = []
-    for line in re.sub(r'\\\n', ' ', text).splitlines():
+    text = re.sub(r'\\\n', ' ', text)
+    for inner in re.findall(r'\$\(([^()]*)\)', text):
+        found += commands(inner)
+    for line in re.sub(r'\$\([^()]*\)', 'SUBSTITUTED', text).splitlines():
         lexer = shlex.shlex(line, posix=True, punctuation_chars='();<>|&')
         lexer.whitespace_split = True
         words: list[str] = []
         for word in [*lexer, ';']:
             if re.fullmatch(r'[();|&]+', word):
-                while words and re.fullmatch(r'\w+=.*', words[0]):
+                while words and (words[0] in KEYWORDS or re.fullmatch(r'\w+=.*', words[0])):
                     words.pop(0)
-                if words:
+                if words and words[0] != 'for':
                     found.append(words)
                 words = []
             else:

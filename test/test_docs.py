@@ -149,6 +149,8 @@ def test_output_is_compared_word_by_word_and_number_by_number():
 def test_commands_are_found_behind_pipes_variables_and_continued_lines():
     assert commands('A=1 ros2 topic list | grep x &\nros2 run a \\\n  b # c') == [
         ['ros2', 'topic', 'list'], ['grep', 'x'], ['ros2', 'run', 'a', 'b']]
+    assert commands('x=$(ros2 pkg list)/a\nfor i in a b; do\n  ros2 run c\ndone') == [
+        ['ros2', 'pkg', 'list'], ['ros2', 'run', 'c']]
 
 
 def test_console_blocks_are_commands_with_their_output():
