@@ -121,7 +121,7 @@ def _replanned(rig: Rig, counter: str) -> Seen:
     f'residual after it below {LIMIT:g}')
 def _drop(rig: Rig) -> Seen:
     remap = rig.relay('--drop', '2')
-    pair(rig, remap=remap)
+    pair(rig, remap=remap, planner={'lead_time': LEAD})
     return _learnt(rig)
 
 
@@ -131,7 +131,7 @@ def _drop(rig: Rig) -> Seen:
     f'were lost; residual after re-planning below {LIMIT:g}')
 def _reorder(rig: Rig) -> Seen:
     remap = rig.relay('--swap')
-    pair(rig, remap=remap)
+    pair(rig, remap=remap, planner={'lead_time': LEAD})
     return _learnt(rig)
 
 

@@ -13,6 +13,7 @@ from benchmarks.faults.common import (
     move,
     moves,
     pair,
+    PATIENT_LEAD,
     Register,
     share,
 )
@@ -66,12 +67,12 @@ def _planner_killed(rig: Rig) -> Seen:
     f'no jump, the move starts from 1.3: residual below {LIMIT:g}')
 def _planner_restarted(rig: Rig) -> Seen:
     rig.start('plant')
-    planner = rig.start('planner')
+    planner = rig.start('planner', {'lead_time': PATIENT_LEAD})
     rig.ready('plant', 'planner')
     move(rig, 1.3, start=1.0)
     planner.end(signal.SIGKILL)
     mark = rig.count()
-    rig.start('planner')
+    rig.start('planner', {'lead_time': PATIENT_LEAD})
     rig.ready('planner')
     left = jump(rig, mark)
     residual, error = move(rig, 1.1, start=1.3)

@@ -6,5 +6,4 @@ FAULTS = (
     *delivery.FAULTS, *processes.FAULTS, *timing.FAULTS, *inputs.FAULTS, *model.FAULTS)
 
 #: What the tests inject: one of each kind.
-QUICK = (
-    'none', 'twice', 'planner_restarted', 'watchdog_hold', 'stranger_first', 'parameter_refused')
+QUICK = ('none', 'twice', 'planner_restarted', 'stranger_first', 'parameter_refused')
