@@ -22,6 +22,8 @@ _SPACES = (1, 4, 8)
 _SECONDS = 6.0
 #: Behind the clock by no more than this, a plant keeps up, in s.
 _BEHIND = 0.02
+#: With nodes that start on a busy machine, in s.
+_PATIENCE = 180.0
 _TICKS = os.sysconf('SC_CLK_TCK')
 
 
@@ -64,13 +66,15 @@ def _run(
                 'plant', {**shared, 'publish_rate': rate}, {'__ns': space}))
             planners.append(rig.start('planner', {'joints': listed}, {'__ns': space}))
             watches.append(_Watch(rig, space))
-        rig.spin_until(lambda: all(x.stamps for x in watches), 'samples of all plants')
+        rig.spin_until(
+            lambda: all(x.stamps for x in watches), 'samples of all plants', _PATIENCE)
         trajectories = [
             rig.node.create_publisher(
                 interface.JOINT_TRAJECTORY.type, f'/pair_{k}/planner/joint_trajectory',
                 interface.JOINT_TRAJECTORY.qos) for k in range(spaces)]
         rig.spin_until(
-            lambda: all(x.get_subscription_count() for x in trajectories), 'the planners')
+            lambda: all(x.get_subscription_count() for x in trajectories), 'the planners',
+            _PATIENCE)
         rig.spin(1.0)
         for watch in watches:
             watch.stamps.clear()
