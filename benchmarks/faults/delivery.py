@@ -144,8 +144,8 @@ def _learnt(rig: Rig) -> Seen:
     stamps, values = rig.samples(mark)
     # The second change is the level that the heartbeat brought. What is planned then takes
     # effect lead_time later; left to itself, vibration would be a hundredth by that time.
-    second = stamps[np.flatnonzero(np.diff(values[:, 2]))[1] + 1]
-    rest = values[stamps > second + _AFTER_NS, 0]
+    changes = stamps[np.flatnonzero(np.diff(values[:, 2])) + 1]
+    rest = values[stamps > max(changes[1] + _AFTER_NS, changes[-1]), 0]
     residual, error = float(np.ptp(rest)) / 0.2, abs(float(rest[-1]) - 1.2) / 0.2
     replanned = rig.value('planner', 'replanned')
     return Seen(

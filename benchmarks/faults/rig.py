@@ -29,6 +29,8 @@ ROOT = Path(__file__).resolve().parent.parent.parent
 #: Patience with a process that starts, or with a condition, in s.
 PATIENCE = 40.0
 _SLICE = 0.02
+# What a server needs to find a new client, in s.
+_ACQUAINTANCE = 0.2
 _PR_SET_PDEATHSIG = 1
 _TRACE = 'Traceback (most recent call last)'
 
@@ -177,6 +179,7 @@ class Rig:
         self.verdicts: list[dict[str, str]] = []
         self.diagnostics: dict[str, dict[str, str]] = {}
         self.deaf = False
+        self._clients: dict[str, Any] = {}
         self._seen: dict[str, int] = {}
         self._watch = watch
         if watch:
@@ -661,14 +664,16 @@ class Rig:
             The response.
 
         """
-        client = self.node.create_client(kind, name)
-        try:
+        client = self._clients.get(name)
+        if client is None:
+            client = self._clients[name] = self.node.create_client(kind, name)
             self.spin_until(client.service_is_ready, f'service {name}')
-            future = client.call_async(kind.Request() if request is None else request)
-            self.spin_until(future.done, f'the answer of {name}')
-            return future.result()
-        finally:
-            self.node.destroy_client(client)
+            # The server may answer before it knows where to: to be ready is to know of it.
+            self.spin(_ACQUAINTANCE)
+        self.spin_until(client.service_is_ready, f'service {name}')
+        future = client.call_async(kind.Request() if request is None else request)
+        self.spin_until(future.done, f'the answer of {name}')
+        return future.result()
 
     def set_parameters(self, owner: str, **values: object) -> list[str]:
         """
