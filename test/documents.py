@@ -52,7 +52,7 @@ FOREIGN = {
     'rqt', 'rqt_graph', 'rqt_plot', 'rviz2', 'source', 'sudo', '.', 'pip', 'rerun', 'kill',
     'wait', 'unset', 'echo', 'cp', 'openssl', 'scp', 'ssh', 'systemctl', 'ulimit', 'chrt'}
 KEYWORDS = {'do', 'done', 'else', 'fi', 'if', 'then', 'until', 'while'}
-PATIENCE_SECONDS = 100.0
+PATIENCE_SECONDS = 200.0
 NUMBER = re.compile(r'[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?')
 LARGEST_SHARE, LARGEST_DIFFERENCE = 1e-3, 1e-6
 
@@ -242,6 +242,10 @@ class Session:
             file.write_text('set -eo pipefail\n' + text, encoding='utf-8')
             if self._shell is None:
                 self._shell = self._start(['bash', '--noprofile', '--norc'])
+                # If this process is killed its end of the pipe closes, the shell ends, and what
+                # it started with it.
+                self._tell(self._shell, "trap 'kill $(jobs -p) 2>/dev/null || true' EXIT; "
+                           f'echo 0 >&{self._write}', place, out)
             self._tell(
                 self._shell,
                 f'source {file} </dev/null >{out} 2>&1; echo $? >&{self._write}', place, out)
