@@ -102,7 +102,15 @@ class PlantNode(ManagedNode):
         self.autostart()
 
     def configure(self) -> None:
-        """Create actuators, topics and services; time does not run yet."""
+        """
+        Create actuators, topics and services; time does not run yet.
+
+        Raises
+        ------
+        BadInputError
+            If parameters do not go together.
+
+        """
         values = self._values
         self._period = max(round(NANOSECONDS / values['publish_rate']), 1)
         self._authority: bool = values['publish_clock']
