@@ -72,17 +72,19 @@ for _name, _what in (
 
 
 @FAULTS.fault(
-    'lag', 'a coil that lags behind', 'coil_lag 0.2 ms, which the planner does not know; 1 -> 1.2',
+    'lag', 'a coil that lags behind',
+    'coil_time_constant 0.2 ms, which the planner does not know; 1 -> 1.2',
     f'the residual of the model with this lag, to {_SAME:g} of stretch')
 def _lag(rig: Rig) -> Seen:
     lag = 2e-4
-    pair(rig, plant={'coil_lag': lag})
+    pair(rig, plant={'coil_time_constant': lag})
     mark, sent = rig.count(), len(rig.commands)
     rig.setpoint(1.2)
     await_change(rig, mark)
     rig.let_pass(0.3)
     stamps, values = rig.samples(mark)
-    worst = _difference(paper_actuator(), stamps, values, rig.commands[sent:], lag=lag)
+    worst = _difference(
+        paper_actuator(), stamps, values, rig.commands[sent:], coil_time_constant=lag)
     # From the change on that is as good as the last: the rest follows within microteslas.
     late = np.flatnonzero(np.abs(values[:, 2] - values[-1, 2]) > 1e-6)[-1]
     residual = float(np.ptp(values[late + 1:, 0])) / 0.2
@@ -128,7 +130,7 @@ def _disturbance(rig: Rig) -> Seen:
     publisher = rig.publisher(topic)
     rig.spin_until(publisher.get_subscription_count, 'the plant to listen to forces')
     push = topic.type()
-    push.wrench.force.x = push.wrench.force.z = 0.05
+    push.wrench.force.z = 0.05
     mark = rig.count()
     publisher.publish(push)
     rig.let_pass(0.5)
