@@ -265,7 +265,15 @@ class Planner:
     def draft_request(
             self, points: Sequence[tuple[float, int]], stamp: int | None,
             now: int) -> Draft | None:
-        """Work out what `request` takes; None where it changes nothing."""
+        """
+        Work out what `request` takes; None where it changes nothing.
+
+        Raises
+        ------
+        RefusedError
+            If the request cannot be carried out.
+
+        """
         self._check_points(points)
         soonest = self._soonest(now)
         base = soonest if stamp is None else stamp
@@ -349,17 +357,15 @@ class Planner:
             If it cannot be carried out from there.
 
         """
-        refusal: RefusedError | None = None
+        begin = self._soonest(now)
+        period = 2.0 * math.pi / self._frequency(self.state(begin).stretch)
         for share in _PATIENCE:
-            begin = self._soonest(now)
-            wait = share * 2.0 * math.pi / self._frequency(self.state(begin).stretch)
             try:
-                return self._resumption(self._on_grid(begin + self.model.ns(wait)))
-            except RefusedError as error:
+                return self._resumption(self._on_grid(begin + self.model.ns(share * period)))
+            except RefusedError:
                 # From another phase of the motion it may be possible.
-                refusal = refusal or error
-        assert refusal is not None
-        raise refusal
+                continue
+        return self._resumption(begin)
 
     def _resumption(self, begin: int) -> Draft | None:
         """Plan from a time on what is left of the running plan."""
