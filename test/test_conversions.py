@@ -69,16 +69,6 @@ def test_command_is_read_only_if_finite_along_z_and_after_the_epoch(x, y, z, sta
             conversions.from_command(message)
 
 
-@given(STAMPS, NAMES, FINITE, FINITE, FINITE)
-def test_joint_state_has_the_sample(stamp, joint, stretch, rate, flux_density):
-    message = sent(conversions.to_joint_state(stamp, joint, stretch, rate, flux_density))
-    assert conversions.from_time(message.header.stamp) == stamp
-    assert message.name == [joint]
-    assert list(message.position) == [stretch]
-    assert list(message.velocity) == [rate]
-    assert list(message.effort) == [flux_density]
-
-
 @given(POINTS, NAMES, STAMPS, NAMES)
 def test_trajectory_survives_the_round_trip(points, joint, stamp, frame):
     message = sent(conversions.to_trajectory(points, joint, stamp=stamp, frame=frame))

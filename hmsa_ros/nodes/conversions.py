@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from builtin_interfaces.msg import Duration, Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import JointState, MagneticField
+from sensor_msgs.msg import MagneticField
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -93,32 +93,6 @@ def from_command(message: MagneticField) -> tuple[int, float]:
     if stamp < 0:
         raise BadInputError(f'flux density command stamped {stamp} ns: expected at least 0')
     return stamp, float(field.z)
-
-
-def to_joint_state(
-        stamp: int, joint: str, stretch: float, rate: float,
-        flux_density: float) -> JointState:
-    """
-    Return a sample of the actuator.
-
-    Parameters
-    ----------
-    stamp : int
-        In ns.
-    joint : str
-        Its name.
-    stretch, rate, flux_density : float
-        Dimensionless, in 1/s and in T.
-
-    Returns
-    -------
-    sensor_msgs.msg.JointState
-        Position is stretch, velocity stretch rate, effort flux density.
-
-    """
-    return JointState(
-        header=Header(stamp=to_time(stamp)), name=[joint], position=[stretch],
-        velocity=[rate], effort=[flux_density])
 
 
 def from_trajectory(

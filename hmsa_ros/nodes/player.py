@@ -322,7 +322,15 @@ class Player(ManagedNode):
     # States ----------------------------------------------------------------------------------
 
     def configure(self) -> None:
-        """Open the bag, offer its topics, and wait."""
+        """
+        Open the bag, offer its topics, and wait.
+
+        Raises
+        ------
+        BadInputError
+            If a parameter or the bag cannot be used.
+
+        """
         values = self._values
         if not values['storage.uri']:
             raise BadInputError(

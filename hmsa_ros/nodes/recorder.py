@@ -299,7 +299,7 @@ class Recorder(ManagedNode):
                 (interface.PAUSE.name, self._on_pause), (interface.RESUME.name, self._on_resume),
                 (interface.IS_PAUSED.name, self._on_is_paused),
                 (interface.SPLIT_BAGFILE.name, self._on_split),
-                ('~/snapshot', self._on_snapshot)):
+                (interface.SNAPSHOT.name, self._on_snapshot)):
             self.create_service(Trigger, name, callback)
         for topic in _SETPOINTS.values():
             # From the start, so that the first one is not missed; others when they are found.

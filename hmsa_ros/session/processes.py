@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 
+from hmsa_ros.discovery import RANGE
 from hmsa_ros.errors import HmsaError
 
 _PR_SET_PDEATHSIG = 1
@@ -195,7 +196,7 @@ def local_environment() -> dict[str, str]:
 
     """
     environment = dict(os.environ)
-    environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    environment[RANGE] = 'LOCALHOST'
     # Domains above 101 collide with the ephemeral ports of Linux.
     environment.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 101))
     return environment
