@@ -471,6 +471,7 @@ def test_lead_time_too_short_is_told_once_and_not_planned_for_again_and_again(ri
         driver.held = [x for at, x in held if at <= planner.now]
         held = [x for x in held if x[0] > planner.now]
         driver.release()
+        driver.hold_back = True
         driver.advance(planner.now)
         planner.ros.executor.spin_once(0.005)
     status = planner.verdict(code='late')

@@ -266,7 +266,21 @@ class Planner:
             self, points: Sequence[tuple[float, int]], stamp: int | None,
             now: int) -> Draft | None:
         """
-        Work out what `request` takes; None where it changes nothing.
+        Work out what `request` takes.
+
+        Parameters
+        ----------
+        points : sequence of (float, int)
+            As for `request`.
+        stamp : int or None
+            Start of the sequence in ns.
+        now : int
+            Current time in ns.
+
+        Returns
+        -------
+        Draft or None
+            For `take`; None where the request changes nothing.
 
         Raises
         ------

@@ -65,6 +65,8 @@ class PlannerNode(ManagedNode):
         self._progress: object = None
         self._sent = self._beats = self._late = self._replanned = self._refused = 0
         self._largest_lateness = self._jumps = self._last_jump = 0
+        # How much later than now to plan for, in ns, where planning is slower than lead_time.
+        self._slow = 0
         self._several_clocks = False
         # Requests that wait until the state in force is known, and whether it is.
         self._take_over: TakeOver | None = None
@@ -183,7 +185,7 @@ class PlannerNode(ManagedNode):
                     'simulated time has not started: expected messages on /clock (start the '
                     'simulator, or set use_sim_time to false)')
             drafts = plan(now)
-            if len(self._channels) > 1 and drafts:
+            if drafts:
                 drafts, now = self._in_time(plan, drafts, now)
         except HmsaError as error:
             code = Code.BAD_INPUT if isinstance(error, BadInputError) else Code.NOT_CONVERGED
@@ -219,11 +221,13 @@ class PlannerNode(ManagedNode):
     def _in_time(
             self, plan: _Request, drafts: Mapping[str, Draft],
             now: int) -> tuple[Mapping[str, Draft], int]:
-        """Plan again for later, if planning for many joints took longer than the lead time."""
+        """Plan again for later, if planning that much took longer than the lead time."""
         spent = self._now() - now
+        self._slow = 0
         if min(x.begin for x in drafts.values()) >= now + spent:
             return drafts, now
-        later = now + 3 * spent
+        self._slow = 3 * spent
+        later = now + self._slow
         return plan(later), later
 
     # -- the state in force --------------------------------------------------------------------
@@ -284,7 +288,7 @@ class PlannerNode(ManagedNode):
 
     def _replan(self, now: int) -> None:
         """Plan anew for the joints that are not where they were to be."""
-        found = self._group.resume(sorted(self._astray), now)
+        found = self._group.resume(sorted(self._astray), now + self._slow)
         self._astray.clear()
         request = self._verdict[3]
         self._replanned += found.resumed
