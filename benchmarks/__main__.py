@@ -141,7 +141,8 @@ def main(arguments: list[str] | None = None) -> int:
             json.dumps(record, indent=2, default=str) + '\n', encoding='utf-8')
     if options.page:
         texts |= {report.key: report.markdown() for report in reports}
-        texts['machine'] = '\n'.join([where + '.', '', *(f'* {x}' for x in remarks)])
+        if remarks:
+            texts['machine'] = '\n'.join([where + '.', '', *(f'* {x}' for x in remarks)])
         page = renewed(options.page.read_text(encoding='utf-8'), texts)
         options.page.write_text(page, encoding='utf-8')
     return status
