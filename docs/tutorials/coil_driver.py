@@ -1,14 +1,16 @@
 """A driver in the place of the plant: applies flux density commands at their stamps."""
 
 import math
+import signal
 import threading
 
 from builtin_interfaces.msg import Time
 from hardware import Hardware
 import rclpy
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState, MagneticField
 
 SECOND = 1_000_000_000
@@ -100,12 +102,17 @@ class CoilDriver(Node):
 
 def main() -> None:
     """Run the driver until it is told to end."""
-    rclpy.init()
+    # A signal is only noted: the coil is switched off below, whatever was under way.
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = CoilDriver()
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
     try:
-        rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        while not ended.is_set():
+            executor.spin_once(0.1)
     finally:
         node.ending = True
         node.thread.join()
