@@ -51,6 +51,8 @@ from hmsa_ros.nodes.qos import stored, subscription
 from hmsa_ros.nodes.runner import run
 
 DIAGNOSTICS_SECONDS = 1.0
+# Between being told to end and the last look at what has come.
+_LINGER_SECONDS = 0.1
 # Setpoints kept for the bag's custom data: how many, and of what length altogether.
 MAX_SETPOINTS = 1000
 _SETPOINTS_LENGTH = 2**18
@@ -665,6 +667,8 @@ class Recorder(ManagedNode):
         if self._closed:
             return
         self._closed = True
+        # What was sent before and got lost on the way comes again meanwhile.
+        time.sleep(_LINGER_SECONDS)
         self._capture.stop()
         self._note_setpoints()
         status = self._recording.close(

@@ -18,9 +18,9 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
-from hmsa_ros.discovery import keep_to_host
 from hmsa_ros.ending import Ending
 from hmsa_ros.errors import BadInputError, complain, HmsaError
+from hmsa_ros.middleware import prepare_middleware
 
 # EventsExecutor.spin() without a time limit busy-loops and delivers nothing on this rclpy
 # (7.1); waiting for a future that never completes, a slice at a time, behaves as documented.
@@ -104,7 +104,7 @@ def _initialise(arguments: Sequence[str]) -> None:
     """Start rclpy, and refuse arguments that it or nobody understands."""
     if os.environ.get('NO_COLOR') and not os.environ.get('RCUTILS_COLORIZED_OUTPUT'):
         os.environ['RCUTILS_COLORIZED_OUTPUT'] = '0'
-    keep_to_host()
+    prepare_middleware()
     # What rcl says of bad arguments is in its error too, which is told below in one line.
     set_logger_level('rcl', LoggingSeverity.FATAL)
     try:

@@ -12,8 +12,8 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.discovery import keep_to_host
 from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.middleware import prepare_middleware
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import to_trajectory
 
@@ -98,7 +98,7 @@ class PlannerClient:
         self._timeout = timeout
         self._joint = joint
         self._namespace = namespace
-        keep_to_host()
+        prepare_middleware()
         self._context = rclpy.Context()
         # Signals stay Python's: Ctrl-C raises KeyboardInterrupt here as anywhere else.
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)

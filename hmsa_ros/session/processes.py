@@ -9,8 +9,8 @@ import signal
 import subprocess
 import sys
 
-from hmsa_ros.discovery import RANGE
 from hmsa_ros.errors import HmsaError
+from hmsa_ros.middleware import RANGE
 
 _PR_SET_PDEATHSIG = 1
 # Long enough for a recorder to write what it holds on a slow disk.

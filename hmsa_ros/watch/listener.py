@@ -24,8 +24,8 @@ from sensor_msgs.msg import JointState, MagneticField
 from trajectory_msgs.msg import JointTrajectory
 
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.discovery import keep_to_host
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.middleware import prepare_middleware
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import from_time
 from hmsa_ros.watch.scene import History, Joint, Report, Request, Scene
@@ -90,7 +90,7 @@ class Listener:
         """Create a node of our own in a context of our own."""
         self._wanted = tuple(joints)
         self._span = span
-        keep_to_host()
+        prepare_middleware()
         self._context = rclpy.Context()
         # Signals stay Python's.
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)

@@ -1,0 +1,98 @@
+"""What our processes ask of the middleware."""
+
+import os
+import signal
+
+import pytest
+
+from hmsa_ros.middleware import prepare_middleware, PROFILES, RANGE
+
+OTHERS = ('ROS_STATIC_PEERS', 'ROS_DISCOVERY_SERVER', 'ROS_LOCALHOST_ONLY')
+# More than a reader's queue in shared memory holds, from a writer that keeps all of it.
+FLOOD = 2000
+
+READER = f"""
+import rclpy
+from std_msgs.msg import Empty, String
+rclpy.init()
+node = rclpy.create_node('reader')
+node.create_subscription(Empty, 'flood', lambda _: None, {FLOOD})
+node.create_subscription(String, 'rare', lambda x: print('got', x.data, flush=True), 10)
+print('reads', flush=True)
+rclpy.spin(node)
+"""
+WRITER = f"""
+import signal
+import sys
+import time
+from hmsa_ros.middleware import prepare_middleware
+import rclpy
+from std_msgs.msg import Empty, String
+name = sys.argv[1]
+if name == 'ours':
+    prepare_middleware()
+signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGUSR1])
+rclpy.init()
+node = rclpy.create_node(name)
+flood = node.create_publisher(Empty, 'flood', {FLOOD})
+rare = node.create_publisher(String, 'rare', 10)
+while not (rare.get_subscription_count() and flood.get_subscription_count()):
+    time.sleep(0.01)
+print('ready', flush=True)
+signal.sigwait([signal.SIGUSR1])
+for _ in range({FLOOD}):
+    flood.publish(Empty())
+rare.publish(String(data=name))
+print('sent', flush=True)
+rclpy.spin(node)
+"""
+
+
+@pytest.fixture(autouse=True)
+def undecided(monkeypatch):
+    for name in (RANGE, PROFILES, *OTHERS):
+        monkeypatch.setenv(name, '')
+
+
+def test_nodes_stay_on_the_host_where_nothing_else_is_said():
+    prepare_middleware()
+    assert os.environ[RANGE] == 'LOCALHOST'
+
+
+def test_who_asks_for_the_subnet_gets_it(monkeypatch):
+    monkeypatch.setenv(RANGE, 'SUBNET')
+    prepare_middleware()
+    assert os.environ[RANGE] == 'SUBNET'
+
+
+@pytest.mark.parametrize('name', OTHERS)
+def test_who_names_others_is_left_alone(monkeypatch, name):
+    monkeypatch.setenv(name, '1')
+    prepare_middleware()
+    assert not os.environ[RANGE]
+
+
+def test_who_has_profiles_of_his_own_keeps_them(monkeypatch):
+    monkeypatch.setenv(PROFILES, '/somewhere/else.xml')
+    prepare_middleware()
+    assert os.environ[PROFILES] == '/somewhere/else.xml'
+
+
+@pytest.mark.ros
+def test_what_a_busy_reader_misses_comes_again_sooner_than_by_default(start, wait_until):
+    reader = start.python('-c', READER)
+    reader.wait_for_output('reads')
+    writers = [start.python('-c', WRITER, name) for name in ('default', 'ours')]
+    for writer in writers:
+        writer.wait_for_output('ready')
+    reader.popen.send_signal(signal.SIGSTOP)
+    for writer in writers:
+        writer.popen.send_signal(signal.SIGUSR1)
+        writer.wait_for_output('sent')
+    reader.popen.send_signal(signal.SIGCONT)
+    wait_until(lambda: reader.stdout.count('got') == 2, 'both messages')
+    # Sent last, received first.
+    got = [line for line in reader.stdout.splitlines() if line.startswith('got')]
+    assert got == ['got ours', 'got default']
+    for process in (reader, *writers):
+        process.stop(signal.SIGKILL)
