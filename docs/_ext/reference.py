@@ -5,6 +5,7 @@ Each directive asks the package itself, so that a topic, parameter, code, messag
 written down once, beside what uses it, and whatever is added there appears here.
 """
 
+from abc import ABC, abstractmethod
 import argparse
 import ast
 from collections.abc import Iterable, Iterator
@@ -359,7 +360,7 @@ def qos_text(qos: Any) -> str:
     return ', '.join([*words, f'depth {qos.depth}'])
 
 
-class Generated(SphinxDirective):
+class Generated(SphinxDirective, ABC):
     """A directive whose content is Markdown that `markdown` returns."""
 
     optional_arguments = 1
@@ -381,6 +382,7 @@ class Generated(SphinxDirective):
         text = self.markdown(self.arguments[0] if self.arguments else '')
         return self.parse_text_to_nodes(text, allow_section_headings=True)
 
+    @abstractmethod
     def markdown(self, argument: str) -> str:
         """
         Return the content.
@@ -396,7 +398,6 @@ class Generated(SphinxDirective):
             Markdown.
 
         """
-        raise NotImplementedError
 
     def missing(self, what: str) -> None:
         """
