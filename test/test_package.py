@@ -45,7 +45,8 @@ print(json.dumps({
     'name': given.get_name(), 'version': given.get_version(), 'license': given.get_license(),
     'description': given.get_description(), 'email': given.get_maintainer_email(),
     'maintainer': given.get_maintainer(), 'packages': given.packages,
-    'data_files': given.data_files, 'install_requires': given.install_requires,
+    'package_data': given.package_data, 'data_files': given.data_files,
+    'install_requires': given.install_requires,
     'extras_require': given.extras_require, 'scripts': given.entry_points['console_scripts'],
     'python_requires': str(given.python_requires)}))
 """
@@ -151,6 +152,13 @@ def test_every_module_of_the_package_is_installed(setup):
     found = {'.'.join(path.parent.relative_to(ROOT).parts)
              for path in (ROOT / 'hmsa_ros').rglob('*.py')}
     assert set(setup['packages']) == found
+
+
+def test_every_other_file_of_the_package_is_installed(setup):
+    found = [str(path.relative_to(ROOT / 'hmsa_ros')) for path in (ROOT / 'hmsa_ros').rglob('*')
+             if path.is_file() and path.suffix not in ('.py', '.pyc')
+             and '__pycache__' not in path.parts]
+    assert sorted(setup['package_data']['hmsa_ros']) == sorted(found)
 
 
 def test_every_launch_and_parameter_file_is_installed_where_ros_looks(setup):
