@@ -450,14 +450,13 @@ class Soak:
             self._call(interface.STOP.type, '/planner/stop', interface.STOP.type.Request())
 
     def _rubbish(self, *, calm: bool) -> None:
-        """Send garbage; in calm cycles only where it cannot reach the plant or its samples."""
+        """Send garbage; in calm cycles only where it cannot reach the plant or what is checked."""
         from benchmarks.faults import garbage
         from hmsa_ros.nodes import interface
 
         topics = [
             x for x in self._topics
-            if not calm or x[0] in (interface.SETPOINT, interface.JOINT_TRAJECTORY,
-                                    interface.FLUX_DENSITY_APPLIED)]
+            if not calm or x[0] in (interface.SETPOINT, interface.JOINT_TRAJECTORY)]
         if not calm and self._dice.random() < 0.95:
             # A little of it goes a long way: each message is a jump of time.
             topics = [x for x in topics if x[0] != interface.CLOCK_TOPIC]
