@@ -8,7 +8,6 @@ the run fail.
 """
 
 from collections.abc import Sequence
-import os
 import sys
 from typing import Any
 
@@ -16,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.faults.table import inject, markdown, Outcome
+from benchmarks.measure import ros_domain
 
 
 def run(
@@ -46,7 +46,7 @@ def run(
     faults = [
         x for x in FAULTS if (not only or x.key.startswith(tuple(only)))
         and (not quick or only or x.key in QUICK)]
-    first = int(os.environ.get('ROS_DOMAIN_ID', 1 + os.getpid() % 101))
+    first = ros_domain()
     outcomes: list[Outcome] = []
     for number, fault in enumerate(faults):
         print(f'{number + 1}/{len(faults)} {fault.key}', end=': ', file=sys.stderr, flush=True)

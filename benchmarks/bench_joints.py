@@ -10,12 +10,12 @@ import numpy as np
 from rclpy.qos import QoSProfile
 
 from benchmarks.faults.rig import Child, Rig
+from benchmarks.measure import ros_domain
 from benchmarks.sheet import Sheet
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import from_time, to_trajectory
 
-_DOMAIN = 77
 #: Joints of one plant and planner, by the rate of samples in Hz.
 _JOINTS = ((1, 1000.0), (16, 1000.0), (64, 1000.0), (128, 1000.0), (64, 4000.0))
 _SPACES = (1, 4, 8)
@@ -53,11 +53,12 @@ class _Watch:
 
 
 def _run(
-        joints: int, rate: float, spaces: int, seconds: float, folder: Path) -> dict[str, float]:
+        joints: int, rate: float, spaces: int, seconds: float, domain: int,
+        folder: Path) -> dict[str, float]:
     """Measure one combination."""
     names = [f'joint_{i}' for i in range(joints)]
     listed = '[' + ', '.join(names) + ']'
-    with Rig(folder, _DOMAIN, watch=False) as rig:
+    with Rig(folder, domain, watch=False) as rig:
         plants, planners, watches = [], [], []
         for k in range(spaces):
             space = f'/pair_{k}'
@@ -127,10 +128,12 @@ def compare(*, quick: bool) -> Sheet:
         (1, 1000.0, spaces) for spaces in _SPACES[1:]]
     if quick:
         cases = [(8, 1000.0, 1), (1, 500.0, 2)]
+    domain = ros_domain()
     figures = []
     for joints, rate, spaces in cases:
         with tempfile.TemporaryDirectory() as folder:
-            figures.append(_run(joints, rate, spaces, 1.0 if quick else _SECONDS, Path(folder)))
+            figures.append(_run(
+                joints, rate, spaces, 1.0 if quick else _SECONDS, domain, Path(folder)))
         sleep(0.5)
     rows = [[
         f'{x["joints"]:g} joints at {x["rate"]:g} Hz'

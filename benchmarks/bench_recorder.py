@@ -303,9 +303,10 @@ def compare(*, quick):
         Passed if the recorder lost nothing.
 
     """
+    from benchmarks.measure import ros_domain
     from benchmarks.sheet import Sheet
     seconds = 2.0 if quick else 60.0
-    os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
+    os.environ['ROS_DOMAIN_ID'] = str(ros_domain())
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     found = Search(0.5 if quick else SEARCH_SECONDS).run()
     highest = sustained(found['rate'], seconds) if found is not None else None

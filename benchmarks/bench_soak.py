@@ -33,6 +33,7 @@ from typing import Any
 from rich.console import Console
 
 from benchmarks.faults.memory import Sample, Trend, trend, used
+from benchmarks.measure import ros_domain
 
 _HOUR = 3600.0
 _STEP_NS = 1_000_000
@@ -835,7 +836,7 @@ def run(
         Exit status: 1 if anything is not as it has to be.
 
     """
-    domain = int(os.environ.get('ROS_DOMAIN_ID', 1 + os.getpid() % 101))
+    domain = ros_domain()
     length = 300.0
     if quick:
         hours, minutes, length = 0.05, 0.4, 30.0

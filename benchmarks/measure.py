@@ -275,6 +275,11 @@ class Report:
         return asdict(self)
 
 
+def ros_domain() -> int:
+    """Return the ROS domain to run in: the caller's, else one by the number of this process."""
+    return int(os.environ.get('ROS_DOMAIN_ID') or 1 + os.getpid() % 101)
+
+
 def machine() -> dict[str, Any]:
     """
     Say what it was measured on.

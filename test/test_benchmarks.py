@@ -99,6 +99,17 @@ def test_quick_run_prints_and_writes_what_it_measured(tmp_path, capsys):
         assert record[report]['title'] in printed
 
 
+@pytest.mark.ros
+@pytest.mark.slow
+def test_joints_are_moved_in_one_pair_of_nodes_and_in_several(ros_env):
+    from benchmarks import bench_joints
+
+    one, several = bench_joints.compare(quick=True).figures['cases']
+    assert (one['joints'], one['spaces']) == (8, 1)
+    assert (several['joints'], several['spaces']) == (1, 2)
+    assert all(x['samples_per_second'] > 0.0 and x['plant_cores'] > 0.0 for x in (one, several))
+
+
 def test_tables_of_a_page_are_renewed_and_nothing_else():
     page = 'a\n<!-- begin x -->\nold\n<!-- end x -->\nb <!-- begin y --> c\n'
     assert program.renewed(page, {'x': 'new\n', 'y': 'lost', 'z': 'lost'}) == (
