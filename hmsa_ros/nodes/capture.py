@@ -209,11 +209,6 @@ class Capture:
             self._guard = _rclpy.GuardCondition(node.context.handle)
         self._thread = threading.Thread(target=self._run, name='capture', daemon=True)
 
-    @property
-    def name(self) -> str:
-        """Return the name of the thread."""
-        return self._thread.name
-
     def start(self) -> None:
         """Start the thread."""
         self._thread.start()

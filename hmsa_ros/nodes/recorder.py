@@ -11,7 +11,6 @@ the bag when it is cleaned up.
 from bisect import bisect_left
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
-import contextlib
 from dataclasses import dataclass, field
 import datetime
 from importlib import import_module
@@ -19,7 +18,6 @@ import json
 import os
 from pathlib import Path
 import re
-import threading
 import time
 from typing import Any
 
@@ -108,10 +106,6 @@ PARAMETERS = (
     ParameterSpec(
         'record.queue_depth', 10_000,
         'Messages of a topic that the middleware keeps until they are taken.', '', 1, 1_000_000),
-    ParameterSpec(
-        'record.realtime_priority', 1,
-        'Real-time priority of the threads that receive, where the system grants it; 0 for '
-        'ordinary threads.', '', 0, 99),
     ParameterSpec(
         'record.snapshot_mode', False,
         'Whether messages are only kept in memory until ~/snapshot is called.'),
@@ -236,7 +230,6 @@ class Recorder(ManagedNode):
     def configure(self) -> None:
         """Open the bag and start receiving."""
         values = self._parameters_in
-        self._priority: int = values['record.realtime_priority']
         self._selection = Selection(
             tuple(map(self._full_name, values['record.topics'])), values['record.all_topics'],
             values['record.regex'], tuple(map(self._full_name, values['record.exclude_topics'])),
@@ -294,7 +287,6 @@ class Recorder(ManagedNode):
                            reliability=ReliabilityPolicy.BEST_EFFORT))
             self._capture.add(self._sim_time, self._clock_subscription)
         self._capture.start()
-        self._hurry()
         self._diagnostics = self.create_publisher(
             interface.DIAGNOSTICS.type, interface.DIAGNOSTICS.name, interface.DIAGNOSTICS.qos)
         for name, callback in (
@@ -315,12 +307,6 @@ class Recorder(ManagedNode):
         self.create_timer(max(interval, 1e-3), self._on_poll, clock=steady)
         self.create_timer(DIAGNOSTICS_SECONDS, self._on_diagnostics, clock=steady)
         self.get_logger().info(f'recording to {self.folder}')
-
-    def _hurry(self) -> None:
-        """Have the threads that receive run before others."""
-        _hurry(self._priority, (
-            thread.native_id for thread in threading.enumerate()
-            if thread.native_id is not None and thread.name != self._capture.name))
 
     def _full_name(self, name: str) -> str:
         """Return the full, remapped name of a topic or node."""
@@ -749,30 +735,6 @@ class _Followed:
         """
         return {parameter_key(self._name, name): json.dumps(
             parameter_value_to_python(value), default=list) for name, value in values}
-
-
-def _hurry(priority: int, own: Iterable[int]) -> None:
-    """
-    Have the middleware's threads run before all ordinary processes, if that is granted.
-
-    Its queues hold some milliseconds of a fast stream. A receiving thread that has to wait for
-    the processor longer than that loses messages before anything here could count on them.
-
-    Parameters
-    ----------
-    priority : int
-        Real-time priority; 0 to leave things as they are.
-    own : iterable of int
-        Threads of Python that receive nothing.
-
-    """
-    if not priority:
-        return
-    ordinary = set(own)
-    for thread in map(int, os.listdir('/proc/self/task')):
-        if thread not in ordinary:
-            with contextlib.suppress(OSError):
-                os.sched_setscheduler(thread, os.SCHED_RR, os.sched_param(priority))
 
 
 def _type_name(message_type: type[Any]) -> str:
