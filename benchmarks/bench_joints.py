@@ -3,9 +3,11 @@
 from collections.abc import Sequence
 import os
 from pathlib import Path
+import struct
 import tempfile
 from time import monotonic, sleep
 
+from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.qos import QoSProfile
 
@@ -13,8 +15,10 @@ from benchmarks.faults.rig import Child, Rig
 from benchmarks.measure import ros_domain
 from benchmarks.sheet import Sheet
 from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.errors import HmsaError
 from hmsa_ros.nodes import interface
-from hmsa_ros.nodes.conversions import from_time, to_trajectory
+from hmsa_ros.nodes.capture import Capture, RawSubscription, Taken
+from hmsa_ros.nodes.conversions import to_trajectory
 
 #: Joints of one plant and planner, by the rate of samples in Hz.
 _JOINTS = ((1, 1000.0), (16, 1000.0), (64, 1000.0), (128, 1000.0), (64, 4000.0))
@@ -35,21 +39,39 @@ def _used(child: Child) -> float:
 
 
 class _Watch:
-    """Looks at one plant's samples now and then: how many came, how far they are behind."""
+    """Looks at the samples and verdicts of one pair: how many, how far behind, what was said."""
 
     def __init__(self, rig: Rig, space: str) -> None:
-        topic = interface.JOINT_STATES
         self.behind: list[float] = []
-        self.stamps: list[int] = []
-        self._now = rig.node.get_clock().now
-        # One reader for a plant of 64 joints, as a recorder is.
+        self.late = 0
+        self.refusal = ''
+        topic = interface.JOINT_STATES
+        # Stamped as they arrive and not decoded: what this process does later does not count.
+        self._capture = Capture(rig.node, self._take)
+        self._capture.add(None, RawSubscription(
+            rig.node, topic.type, f'{space}/{topic.name}', QoSProfile(depth=5000)))
+        self._capture.start()
+        topic = interface.STATUS
         rig.node.create_subscription(
-            topic.type, f'{space}/{topic.name}', self._take, QoSProfile(depth=5000), raw=False)
+            topic.type, f'{space}/{interface.from_outside(topic.name, interface.PLANNER)}',
+            self._judge, topic.qos)
 
-    def _take(self, message) -> None:  # type: ignore[no-untyped-def]
-        stamp = from_time(message.header.stamp)
-        self.stamps.append(stamp)
-        self.behind.append((self._now().nanoseconds - stamp) / NANOSECONDS)
+    def close(self) -> None:
+        """End the thread that receives."""
+        self._capture.stop()
+
+    def _take(self, taken: Sequence[tuple[None, list[Taken]]]) -> None:
+        for _, messages in taken:
+            for message in messages:
+                # Behind the four bytes that say how it is encoded: the stamp of the header.
+                seconds, nanoseconds = struct.unpack_from('<iI', message.data, 4)
+                self.behind.append(
+                    (message.received_ns - nanoseconds) / NANOSECONDS - seconds)
+
+    def _judge(self, message: DiagnosticStatus) -> None:
+        self.late = next(int(x.value) for x in message.values if x.key == 'late')
+        if message.level == DiagnosticStatus.ERROR:
+            self.refusal = message.message
 
 
 def _run(
@@ -68,7 +90,7 @@ def _run(
             planners.append(rig.start('planner', {'joints': listed}, {'__ns': space}))
             watches.append(_Watch(rig, space))
         rig.spin_until(
-            lambda: all(x.stamps for x in watches), 'samples of all plants', _PATIENCE)
+            lambda: all(x.behind for x in watches), 'samples of all plants', _PATIENCE)
         trajectories = [
             rig.node.create_publisher(
                 interface.JOINT_TRAJECTORY.type, f'/pair_{k}/planner/joint_trajectory',
@@ -78,7 +100,6 @@ def _run(
             _PATIENCE)
         rig.spin(1.0)
         for watch in watches:
-            watch.stamps.clear()
             watch.behind.clear()
         begin = monotonic()
         used = [[_used(x) for x in group] for group in (plants, planners)]
@@ -89,11 +110,15 @@ def _run(
         shares = [
             sum(_used(x) - y for x, y in zip(group, before, strict=True)) / passed
             for group, before in zip((plants, planners), used, strict=True)]
-        got = sum(len(x.stamps) for x in watches) / passed / spaces
+        for watch in watches:
+            watch.close()
+            if watch.refusal:
+                raise HmsaError(f'{joints} joints at {rate:g} Hz: {watch.refusal}')
+        got = sum(len(x.behind) for x in watches) / passed / spaces
         behind = np.concatenate([x.behind for x in watches])
     return {
         'joints': joints, 'rate': rate, 'spaces': spaces, 'samples_per_second': got,
-        'plant_cores': shares[0], 'planner_cores': shares[1],
+        'late': sum(x.late for x in watches), 'plant_cores': shares[0], 'planner_cores': shares[1],
         'behind_median': float(np.median(behind)),
         'behind_99': float(np.quantile(behind, 0.99))}
 
@@ -140,11 +165,11 @@ def compare(*, quick: bool) -> Sheet:
         + (f', {x["spaces"]:g} pairs' if x['spaces'] > 1 else ''),
         f'{x["samples_per_second"]:.0f}', f'{100.0 * x["plant_cores"]:.0f} %',
         f'{100.0 * x["planner_cores"]:.0f} %', f'{1e3 * x["behind_median"]:.2f} ms',
-        f'{1e3 * x["behind_99"]:.1f} ms'] for x in figures]
+        f'{1e3 * x["behind_99"]:.1f} ms', f'{x["late"]:g}'] for x in figures]
     wanted = [x for x in figures if (x['joints'], x['rate'], x['spaces']) == (64, 1000.0, 1)]
     return Sheet(
         'joints', 'Plant and planner at work, all joints moved five times a second',
-        ('', 'samples/s each', 'plants', 'planners', 'behind, median', '99 %'), rows,
+        ('', 'samples/s each', 'plants', 'planners', 'behind, median', '99 %', 'late commands'), rows,
         {'cases': figures},
         quick or all(
             x['samples_per_second'] > 0.99 * x['rate'] and x['behind_99'] < _BEHIND

@@ -93,6 +93,9 @@ class Delivery:
 
 IDEAL = Delivery()
 
+#: Time of a switch, load from then on, and its change per unit of time.
+Piece = tuple[float, float, float]
+
 
 def pieces(
         levels: Sequence[Level], load: float, end: float,
@@ -119,7 +122,31 @@ def pieces(
         In force at the end.
 
     """
-    rows: list[tuple[float, float, float]] = []
+    rows, load = ramps(levels, load, end, slew)
+    switches, loads, slopes = np.array(rows).T
+    return switches, loads, slopes, load
+
+
+def ramps(
+        levels: Sequence[Level], load: float, end: float,
+        slew: float) -> tuple[list[Piece], float]:
+    """
+    Return what `pieces` returns without arrays, for a few of them.
+
+    Parameters
+    ----------
+    levels, load, end, slew : sequence of Level, float, float, float
+        As for `pieces`.
+
+    Returns
+    -------
+    pieces : list of (float, float, float)
+        Switch, load and slope of each.
+    load : float
+        In force at the end.
+
+    """
+    rows: list[Piece] = []
     for number, level in enumerate(levels):
         until = levels[number + 1].time if number + 1 < len(levels) else end
         begin = level.time
@@ -133,5 +160,4 @@ def pieces(
             begin = reached
         load = level.load
         rows.append((begin, load, 0.0))
-    switches, loads, slopes = np.array(rows).T
-    return switches, loads, slopes, load
+    return rows, load

@@ -162,6 +162,18 @@ def elastic_stiffness(l, i_j):  # noqa: E741
 
 
 @_compiled
+def mass(l, c1):  # noqa: E741
+    """Return the inertia m(l) of Eq. 7."""
+    return (l ** -3 + c1) / 6.0
+
+
+@_compiled
+def natural_frequency(l, c1, i_j):  # noqa: E741
+    """Return the frequency of small undamped motion about a stretch."""
+    return math.sqrt(elastic_stiffness(l, i_j) / mass(l, c1))
+
+
+@_compiled
 def elastic_energy(l, i_j):  # noqa: E741
     """Return psi(l), zero at l = 1."""
     return -0.5 / i_j * math.log1p(-(l - 1.0) * (l - 1.0) * (l + 2.0) * i_j / l)
@@ -170,7 +182,7 @@ def elastic_energy(l, i_j):  # noqa: E741
 @_compiled
 def critical_zeta(l, c1, i_j):  # noqa: E741
     """Return the damping that is critical for small motion about a stretch."""
-    return 4.0 / c1 * math.sqrt((l ** -3 + c1) / 6.0 * elastic_stiffness(l, i_j))
+    return 4.0 / c1 * math.sqrt(mass(l, c1) * elastic_stiffness(l, i_j))
 
 
 @_compiled
@@ -219,7 +231,7 @@ def equilibrium_stretch(beta, i_j):
 @_compiled
 def _first_step(l, v, beta, zeta, c1, i_j, rtol):  # noqa: E741
     """Return a first step length: a fixed phase of the local oscillation."""
-    rate = math.sqrt(elastic_stiffness(l, i_j) / ((l ** -3 + c1) / 6.0))
+    rate = natural_frequency(l, c1, i_j)
     return 4.0 * rtol ** 0.125 / (rate + 3.0 * zeta)
 
 
@@ -260,7 +272,7 @@ def advance(k, l, v, s, r, beta, slope, p, q, duration, zeta, c1, i_j, rtol, h):
         if not left > 0.0:
             return DONE, l, v, s, r, h
         step = min(h, left)
-        rate = math.sqrt(elastic_stiffness(l, i_j) / ((l ** -3 + c1) / 6.0))
+        rate = natural_frequency(l, c1, i_j)
         if _attainable(0.0, l, v, rate) > _RESOLVED and v * (l - 1.0) > 0.0:
             v, s, r = -v, -s, -r
         new_l, new_v, new_s, new_r, error = _step(
@@ -293,7 +305,7 @@ def turning_point(k, l, v, direction, beta, move, zeta, c1, i_j, rtol):  # noqa:
     t = 0.0
     h = _first_step(l, v, beta, zeta, c1, i_j, rtol)
     armed = direction * v > 0.0
-    rate = math.sqrt(elastic_stiffness(l, i_j) / ((l ** -3 + c1) / 6.0))
+    rate = natural_frequency(l, c1, i_j)
     for _ in range(_MAX_TURN_STEPS):
         new_l, new_v, new_s, new_r, error = _step(
             k, l, v, s, r, beta, 0.0, 1.0, 0.0, h, zeta, c1, i_j,
@@ -309,7 +321,7 @@ def turning_point(k, l, v, direction, beta, move, zeta, c1, i_j, rtol):  # noqa:
         t += h
         h = _resize(h, error)
         armed = direction * v > 0.0
-        rate = math.sqrt(elastic_stiffness(l, i_j) / ((l ** -3 + c1) / 6.0))
+        rate = natural_frequency(l, c1, i_j)
         if _attainable(0.0, l, v, rate) > _RESOLVED:
             return TOO_CLOSE, t, l, s, 0.0
         fast = rate + 3.0 * zeta
@@ -371,9 +383,9 @@ def crosses(k, l, v, target, zeta, c1, i_j, rtol):  # noqa: E741
     if zeta < critical_zeta(target, c1, i_j):
         return True
     beta = elastic_force(target, i_j)
-    mass = (target ** -3 + c1) / 6.0
-    half = 0.25 * zeta * c1 / mass
-    fast = -half - math.sqrt(max(half * half - elastic_stiffness(target, i_j) / mass, 0.0))
+    half = 0.25 * zeta * c1 / mass(target, c1)
+    fast = -half - math.sqrt(
+        max(half * half - natural_frequency(target, c1, i_j) ** 2, 0.0))
     lower, upper = stretch_limits(i_j)
     small = _LINEAR * max(abs(l - target), abs(v / fast), min(target - lower, upper - target))
     side = l - target
@@ -406,12 +418,12 @@ def _guess(l, v, target, direction, beta_1, zeta, c1, i_j):  # noqa: E741
     """
     if target == l:
         return math.inf
-    start = elastic_energy(l, i_j) + 0.5 * (l ** -3 + c1) / 6.0 * v * v
+    start = elastic_energy(l, i_j) + 0.5 * mass(l, c1) * v * v
     beta = (elastic_energy(target, i_j) - start) / (target - l)
     delta = direction * (beta_1 - beta)
     half = 0.5 * (l + target)
     kinetic = start + beta * (half - l) - elastic_energy(half, i_j)
-    fastest = math.sqrt(max(2.0 * kinetic / ((half ** -3 + c1) / 6.0), 0.0))
+    fastest = math.sqrt(max(2.0 * kinetic / mass(half, c1), 0.0))
     xi = 0.25 * zeta * c1 * fastest / abs(delta)
     decay = 1e-3
     if xi < 0.9:
@@ -436,8 +448,7 @@ def shoot(
     Returns status, beta_p, tau_p, beta_1 and the number of passes.
     """
     beta_1 = elastic_force(target, i_j)
-    move = abs(target - l) + abs(v) / math.sqrt(
-        elastic_stiffness(target, i_j) / ((target ** -3 + c1) / 6.0))
+    move = abs(target - l) + abs(v) / natural_frequency(target, c1, i_j)
     lower, upper = stretch_limits(i_j)
     # Errors count against the move and the room that the limits leave.
     size = 1.0 + target
@@ -544,8 +555,7 @@ def two_step(k, l, v, target, zeta, c1, i_j, beta_min, beta_max, rtol, hold):  #
     if not (lower < target < upper and lower < l < upper):
         return OUT_OF_RANGE, math.nan, math.nan, beta_1, 0
     beta_1 = elastic_force(target, i_j)
-    mass = (target ** -3 + c1) / 6.0
-    rate = math.sqrt(elastic_stiffness(target, i_j) / mass)
+    rate = natural_frequency(target, c1, i_j)
     if abs(l - target) <= hold and abs(v) <= hold * rate:
         return HOLD, beta_1, 0.0, beta_1, 0
     up = 1.0 if target > l else -1.0
@@ -715,7 +725,7 @@ def _follow(k, l, v, h, beta, slope, excess, decay, duration, zeta, c1, i_j, rto
         if not left > 0.0:
             return DONE, l, v, h
         step = min(h, left)
-        rate = math.sqrt(elastic_stiffness(l, i_j) / ((l ** -3 + c1) / 6.0))
+        rate = natural_frequency(l, c1, i_j)
         if _attainable(0.0, l, v, rate) > _RESOLVED and v * (l - 1.0) > 0.0:
             v = -v
         rest = excess

@@ -725,6 +725,4 @@ class Planner:
     def _frequency(self, stretch: float) -> float:
         """Return the nondimensional natural frequency about a stretch."""
         material = self.model.material
-        return math.sqrt(
-            kernels.elastic_stiffness(stretch, 1.0 / material.j_lim)
-            / ((stretch ** -3 + material.c1) / 6.0))
+        return float(kernels.natural_frequency(stretch, material.c1, 1.0 / material.j_lim))

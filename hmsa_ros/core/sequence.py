@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
-from hmsa_ros.core.delivery import Delivery, IDEAL, pieces
+from hmsa_ros.core.delivery import Delivery, IDEAL, ramps
 from hmsa_ros.core.model import elastic_force
 from hmsa_ros.core.moves import Level, Limits, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.shapers import get_shaper
 from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.core.simulation import check_stretch, longest_motion, simulate
+from hmsa_ros.core.simulation import check_stretch, endpoint, longest_motion
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.units import Units
 from hmsa_ros.errors import BadInputError
@@ -179,8 +179,7 @@ def _follow(
     load = state.load
     if math.isnan(load):
         load = float(elastic_force(state.stretch, material.j_lim))
-    switches, loads, slopes, last = pieces(move.levels, load, end, slew)
-    end = min(end, max(float(switches[-1]), 0.0) + longest_motion(last, material))
-    stretch, rate = simulate(
-        switches, loads, end, material, stretch=state.stretch, rate=state.rate, slopes=slopes)
-    return State(float(stretch[0]), float(rate[0]), last)
+    parts, last = ramps(move.levels, load, end, slew)
+    end = min(end, max(parts[-1][0], 0.0) + longest_motion(last, material))
+    stretch, rate = endpoint(parts, end, material, state.stretch, state.rate)
+    return State(stretch, rate, last)

@@ -138,8 +138,7 @@ def solve(
         solution was found from this guess.
 
     """
-    stiffness = kernels.elastic_stiffness(target, 1.0 / material.j_lim)
-    frequency = math.sqrt(stiffness / ((target ** -3 + material.c1) / 6.0))
+    frequency = kernels.natural_frequency(target, material.c1, 1.0 / material.j_lim)
     move = abs(target - state.stretch) + abs(state.rate) / frequency
     found = _end(template, state, load, target, frequency, material, slew)
     if found is None:

@@ -13,25 +13,21 @@ from numpy.typing import ArrayLike
 
 from hmsa_ros.core import kernels
 from hmsa_ros.core.actuators import Actuators, check_stretch, RTOL, Setup
-from hmsa_ros.core.model import (
-    Array,
-    damping,
-    equilibrium_stretch,
-    mass,
-    natural_frequency,
-)
+from hmsa_ros.core.delivery import Piece
+from hmsa_ros.core.model import Array, damping
 from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.core.schedule import CommandSchedule
 from hmsa_ros.errors import BadInputError, HmsaError
 
 __all__ = [
-    'ActuatorSimulation', 'check_stretch', 'longest_motion', 'RTOL', 'simulate', 'too_large',
-    'unshaped']
+    'ActuatorSimulation', 'check_stretch', 'endpoint', 'longest_motion', 'RTOL', 'simulate',
+    'too_large', 'unshaped']
 
 # Time constants after which nothing is left of a motion, and periods after which nobody knows
 # its phase.
 _SETTLED = 40.0
 _MOST_PERIODS = 2000.0
+_STUCK = 'the integration ran out of steps: the load is too large to follow'
 
 
 def simulate(
@@ -90,8 +86,47 @@ def simulate(
         float(stretch), float(rate), switches, loads, ramps, times, material.zeta, material.c1,
         1.0 / material.j_lim, float(rtol), out[0], out[1])
     if status != kernels.DONE:
-        raise HmsaError('the integration ran out of steps: the load is too large to follow')
+        raise HmsaError(_STUCK)
     return out[0], out[1]
+
+
+def endpoint(
+        pieces: Sequence[Piece], end: float, material: NondimensionalParameters,
+        stretch: float, rate: float) -> tuple[float, float]:
+    """
+    Return where a piecewise linear load leads, without checks: for those who plan.
+
+    Parameters
+    ----------
+    pieces : sequence of (float, float, float)
+        Switch, load and slope of each, as `hmsa_ros.core.delivery.ramps` returns them.
+    end : float
+        Time of the state that is wanted, not before the last switch.
+    material : NondimensionalParameters
+        zeta, J_lim and c1.
+    stretch, rate : float
+        State at the first switch.
+
+    Returns
+    -------
+    stretch, rate : float
+        At the end.
+
+    Raises
+    ------
+    HmsaError
+        If the integration does not get through.
+
+    """
+    work = kernels.work_space()
+    for i, (begin, load, slope) in enumerate(pieces):
+        until = pieces[i + 1][0] if i + 1 < len(pieces) else end
+        status, stretch, rate, *_ = kernels.advance(
+            work, stretch, rate, 0.0, 0.0, load, slope, 0.0, 0.0, until - begin, material.zeta,
+            material.c1, 1.0 / material.j_lim, RTOL, 0.0)
+        if status != kernels.DONE:
+            raise HmsaError(_STUCK)
+    return stretch, rate
 
 
 def _vector(values: ArrayLike) -> Array:
@@ -116,10 +151,12 @@ def longest_motion(load: float, material: NondimensionalParameters) -> float:
         Time after which it has settled, or, with next to no damping, some thousand periods.
 
     """
-    stretch = equilibrium_stretch(load, material.j_lim)
-    frequency = float(natural_frequency(stretch, material))
+    # Scalars by the kernels: each prediction asks for this.
+    i_j = 1.0 / material.j_lim
+    stretch = kernels.equilibrium_stretch(float(load), i_j)
+    frequency = float(kernels.natural_frequency(stretch, material.c1, i_j))
     longest = _MOST_PERIODS * 2.0 * math.pi / frequency
-    decay = damping(material) / (2.0 * float(mass(stretch, material.c1)))
+    decay = damping(material) / (2.0 * float(kernels.mass(stretch, material.c1)))
     if decay == 0.0:
         return longest
     if decay < frequency:

@@ -12,12 +12,12 @@ from dataclasses import dataclass, field, replace
 import math
 
 from hmsa_ros.core import kernels
-from hmsa_ros.core.delivery import Delivery, pieces
+from hmsa_ros.core.delivery import Delivery, pieces, ramps
 from hmsa_ros.core.moves import Level, Limits, State
 from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.core.sequence import SHORT_SPELL
 from hmsa_ros.core.shapers import get_shaper
-from hmsa_ros.core.simulation import longest_motion, simulate
+from hmsa_ros.core.simulation import endpoint, longest_motion, simulate
 from hmsa_ros.core.status import Code
 from hmsa_ros.core.units import NANOSECONDS, Units
 from hmsa_ros.errors import BadInputError
@@ -148,12 +148,10 @@ class Model:
             At the end.
 
         """
-        switches, loads, slopes, last = pieces(
-            (Level(0.0, load),), state.load, duration, self.delivery.slew)
-        stretch, rate = simulate(
-            switches, loads, duration, self.material, stretch=state.stretch,
-            rate=state.rate, slopes=slopes)
-        return State(float(stretch[0]), float(rate[0]), last)
+        parts, last = ramps((Level(0.0, load),), state.load, duration, self.delivery.slew)
+        stretch, rate = endpoint(
+            parts, duration, self.material, state.stretch, state.rate)
+        return State(stretch, rate, last)
 
     def taken_from(self, state: State, other: 'Model') -> State:
         """Return a state of another model in the units of this one."""

@@ -51,7 +51,9 @@ def warm_up(*, batch: bool = False) -> float:
             for level in planner.due(now):
                 plant.command(level.stamp, level.flux_density)
             plant.advance(now + _MILLISECOND)
-        planner.stop(2 * _MILLISECOND)
+        last = planner.stop(2 * _MILLISECOND).levels[-1]
+        # As in a preview of several joints.
+        last.sample((last.stamp, last.stamp + _MILLISECOND))
     if batch:
         plan_two_step_batch(1.0, np.array([1.1, 1.2]))
     return perf_counter() - begin

@@ -9,6 +9,7 @@ from std_msgs.msg import Float64
 from hmsa_ros.core.planner import PlannedLevel
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import conversions, interface
+from hmsa_ros.nodes.timekeeping import Seldom
 
 
 class JointChannel:
@@ -46,6 +47,7 @@ class JointChannel:
         self._on_setpoint_of = on_setpoint
         self._on_applied_of = on_applied
         self.applied: tuple[int, float] | None = None
+        self._tell_ignored = Seldom()
         topic = interface.of_joint(interface.FLUX_DENSITY_COMMAND, joint, joints)
         self._command = node.create_publisher(topic.type, topic.name, topic.qos)
         topic = interface.of_joint(interface.SETPOINT, joint, joints)
@@ -76,8 +78,8 @@ class JointChannel:
         try:
             stamp, flux_density = conversions.from_command(message)
         except BadInputError as error:
-            self._node.get_logger().error(
-                f'news of joint {self._joint} ignored: {error}', throttle_duration_sec=1.0)
+            if self._tell_ignored():
+                self._node.get_logger().error(f'news of joint {self._joint} ignored: {error}')
             return
         self.applied = stamp, flux_density
         self._on_applied_of(self._joint, stamp, flux_density)

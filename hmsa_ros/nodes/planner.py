@@ -24,7 +24,7 @@ from hmsa_ros.nodes.marker_publisher import TargetMarkers
 from hmsa_ros.nodes.planning import group_from, models_from, nanoseconds, OWN, SPECS
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.nodes.takeover import TakeOver
-from hmsa_ros.nodes.timekeeping import StepWatch
+from hmsa_ros.nodes.timekeeping import Seldom, StepWatch
 
 PARAMETERS = SPECS
 
@@ -65,7 +65,8 @@ class PlannerNode(ManagedNode):
         self._progress: object = None
         self._sent = self._beats = self._late = self._replanned = self._refused = 0
         self._largest_lateness = self._jumps = self._last_jump = 0
-        # How much later than now to plan for, in ns, where planning is slower than lead_time.
+        # Where planning is slower than lead_time: how much later than now to plan for, and how
+        # much earlier to send, so that nothing becomes due while that much is worked out. In ns.
         self._slow = 0
         self._several_clocks = False
         # Requests that wait until the state in force is known, and whether it is.
@@ -75,6 +76,7 @@ class PlannerNode(ManagedNode):
         # Joints whose plan reality has left.
         self._astray: set[str] = set()
         self._wake: int | None = None
+        self._tell_late, self._tell_foreign, self._tell_replanned = Seldom(), Seldom(), Seldom()
         self._steps = StepWatch()
 
         self._channels = {
@@ -267,10 +269,9 @@ class PlannerNode(ManagedNode):
             return
         if found.late > 0:
             self._note_late(found.late)
-        elif found.foreign:
+        elif found.foreign and self._tell_foreign():
             self.get_logger().warning(
-                f'joint {joint}: {flux_density:g} T took effect, which was not commanded',
-                throttle_duration_sec=1.0)
+                f'joint {joint}: {flux_density:g} T took effect, which was not commanded')
         if self._settings['replan_late']:
             self._astray.add(joint)
             self._poll_soon()
@@ -278,9 +279,9 @@ class PlannerNode(ManagedNode):
     def _note_late(self, late: int) -> None:
         self._late += 1
         self._largest_lateness = max(self._largest_lateness, late)
-        self.get_logger().warning(
-            f'command {late / 1e6:.3f} ms after the time it applies: {self._advice()}',
-            throttle_duration_sec=1.0)
+        if self._tell_late():
+            self.get_logger().warning(
+                f'command {late / 1e6:.3f} ms after the time it applies: {self._advice()}')
 
     def _advice(self) -> str:
         needed = self._settings['lead_time'] + self._largest_lateness / NANOSECONDS
@@ -313,7 +314,10 @@ class PlannerNode(ManagedNode):
                 + missed, 'replanned', request)
         else:
             return
-        self.get_logger().warning(self._verdict[1], throttle_duration_sec=1.0)
+        if self._tell_replanned():
+            self.get_logger().warning(self._verdict[1])
+        # At once, since telling of it takes time too.
+        self._send_due(now)
         if found.resumed or found.stopped:
             self._publish_plan()
         self._publish_status()
@@ -377,7 +381,7 @@ class PlannerNode(ManagedNode):
 
     def _send_due(self, now: int) -> None:
         for name, planner in self._group.planners.items():
-            for level in planner.due(now):
+            for level in planner.due(now + self._slow):
                 self._send(name, level.stamp, level)
                 if level.stamp < now:
                     self._note_late(now - level.stamp)

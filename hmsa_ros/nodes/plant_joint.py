@@ -17,6 +17,7 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import conversions, interface
 from hmsa_ros.nodes.guard import CommandInput
 from hmsa_ros.nodes.parameters import ACTUATOR, INITIAL_STRETCH, ParameterSpec
+from hmsa_ros.nodes.timekeeping import Seldom
 
 MISMATCH = tuple(
     ParameterSpec(
@@ -140,6 +141,7 @@ class PlantJoint:
         self._ramp_rate: float = values['safe_ramp_rate']
         self._ramp: tuple[int, float] | None = None
         self._crowded = False
+        self._tell_refused, self._tell_late, self._tell_force = Seldom(), Seldom(), Seldom()
         self.watchdog = Watchdog(round(self._timeout * NANOSECONDS))
         self.received = self.refused = self.late = self.latest = self.failed = 0
 
@@ -179,9 +181,9 @@ class PlantJoint:
             self._bench.take(self._number, stamp, flux_density)
         except BadInputError as error:
             self.refused += 1
-            self._node.get_logger().error(
-                f'{self._of_me}command refused, the one in force stays: {error}',
-                throttle_duration_sec=1.0)
+            if self._tell_refused():
+                self._node.get_logger().error(
+                    f'{self._of_me}command refused, the one in force stays: {error}')
 
     def obeyed(self, late: int) -> None:
         """
@@ -199,10 +201,10 @@ class PlantJoint:
         if late:
             self.late += 1
             self.latest = max(self.latest, late)
-            self._node.get_logger().warning(
-                f'{self._of_me}command arrived {late / 1e6:.3f} ms after the time it applies '
-                'and was applied at once: raise lead_time of the planner',
-                throttle_duration_sec=1.0)
+            if self._tell_late():
+                self._node.get_logger().warning(
+                    f'{self._of_me}command arrived {late / 1e6:.3f} ms after the time it '
+                    'applies and was applied at once: raise lead_time of the planner')
 
     def _on_force(self, message: WrenchStamped) -> None:
         if not self._bench.active:
@@ -211,8 +213,8 @@ class PlantJoint:
             stamp, force = _from_wrench(message)
             self._bench.push(self._number, stamp, force)
         except BadInputError as error:
-            self._node.get_logger().error(
-                f'{self._of_me}disturbance refused: {error}', throttle_duration_sec=1.0)
+            if self._tell_force():
+                self._node.get_logger().error(f'{self._of_me}disturbance refused: {error}')
 
     # -- silence -------------------------------------------------------------------------------
 

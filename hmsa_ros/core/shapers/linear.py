@@ -103,8 +103,7 @@ def _shaped(request: Request, weights: tuple[float, ...]) -> Move:
             Code.TOO_DAMPED,
             f'zeta {material.zeta:g} is above critical damping at stretch {target:g}: there is '
             'no oscillation to shape for, the plain step is used')
-    frequency = math.sqrt(
-        kernels.elastic_stiffness(target, i_j) / ((target ** -3 + material.c1) / 6.0))
+    frequency = kernels.natural_frequency(target, material.c1, i_j)
     damped = math.sqrt(1.0 - xi * xi)
     half_period = math.pi / (frequency * damped)
     decay = math.exp(-math.pi * xi / damped)

@@ -125,16 +125,16 @@ def _on_time(
 
 
 def _frequency(request: Request) -> float:
-    i_j = 1.0 / request.material.j_lim
-    mass = (request.target ** -3 + request.material.c1) / 6.0
-    return math.sqrt(kernels.elastic_stiffness(request.target, i_j) / mass)
+    material = request.material
+    return float(
+        kernels.natural_frequency(request.target, material.c1, 1.0 / material.j_lim))
 
 
 def _bounds(request: Request, holding: float, frequency: float) -> tuple[float, float]:
     """Return the loads to push and brake with: the limits, or twice the move's own change."""
     state = request.state
     change = abs(holding - kernels.elastic_force(state.stretch, 1.0 / request.material.j_lim))
-    mass = (state.stretch ** -3 + request.material.c1) / 6.0
+    mass = kernels.mass(state.stretch, request.material.c1)
     room = 2.0 * (change + mass * abs(state.rate) * frequency)
     least = max(request.limits.minimum, holding - room)
     most = min(request.limits.maximum, holding + room)
