@@ -99,7 +99,10 @@ def _lag(rig: Rig) -> Seen:
     'and its mean at the target to a tenth of that')
 def _noise(rig: Rig) -> Seen:
     pair(rig, plant={'stretch_noise': 1e-3, 'rate_noise': 1.0})
+    mark = rig.count()
     rig.setpoint(1.2)
+    # The first request waits for the state in force.
+    await_change(rig, mark)
     rig.let_pass(1.0)
     stretch = rig.samples()[1][-800:, 0]
     scatter, mean = float(np.std(stretch)), float(np.mean(stretch))
