@@ -17,7 +17,7 @@ from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.residual import residual_vibration
 from hmsa_ros.core.simulation import simulate
 from hmsa_ros.nodes import interface
-from hmsa_ros.nodes.conversions import from_time, to_command
+from hmsa_ros.nodes.conversions import from_time, to_clock, to_command
 from hmsa_ros.nodes.plant import PlantNode
 
 pytestmark = pytest.mark.ros
@@ -454,6 +454,33 @@ def test_following_plant_skips_a_large_jump_ahead(following):
     assert len(plant.samples) == 12
     assert plant.samples[-1].position == before.position
     assert plant.samples[-1].effort == before.effort
+
+
+def test_following_plant_tells_of_two_clocks_and_of_one_again(following, make_ros):
+    plant, clock = following
+    arrays = plant.collect(interface.DIAGNOSTICS)
+
+    def told() -> str:
+        return str(arrays[-1].status[1].message) if arrays else ''
+
+    clock.set(START)
+    plant.wait(START)
+    other = make_ros()
+    second = other.publisher(
+        interface.CLOCK_TOPIC.type, interface.CLOCK_TOPIC.name, interface.CLOCK_TOPIC.qos)
+    plant.ros.spin_until(lambda: '2 publishers of /clock' in told(), 'two clocks')
+    # Far behind: the simulation starts again, and goes on with whoever comes next.
+
+    def behind() -> bool:
+        second.publish(to_clock(START // 2))
+        return plant.stamps()[-1] <= START // 2
+
+    plant.ros.spin_until(behind, 'the time of the second')
+    other.node.destroy_publisher(second)
+    plant.ros.spin_until(lambda: told().startswith('time runs'), 'one clock')
+    clock.set(START + 10 * MS)
+    plant.wait(START + 10 * MS)
+    assert plant.samples[-1].position[0] == 1.0
 
 
 def test_following_plant_can_be_paused(following):
