@@ -169,8 +169,8 @@ def compare(*, quick: bool) -> Sheet:
     wanted = [x for x in figures if (x['joints'], x['rate'], x['spaces']) == (64, 1000.0, 1)]
     return Sheet(
         'joints', 'Plant and planner at work, all joints moved five times a second',
-        ('', 'samples/s each', 'plants', 'planners', 'behind, median', '99 %', 'late commands'), rows,
-        {'cases': figures},
+        ('', 'samples/s each', 'plants', 'planners', 'behind, median', '99 %',
+         'late commands'), rows, {'cases': figures},
         quick or all(
             x['samples_per_second'] > 0.99 * x['rate'] and x['behind_99'] < _BEHIND
             for x in wanted))

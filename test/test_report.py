@@ -782,6 +782,15 @@ def test_several_bags_lie_over_each_other_in_colours_of_their_own(tmp_path, bag)
     assert float(rows[3]['residual [%]'][0]) > 1.0
 
 
+def test_block_of_the_plant_is_the_one_that_a_mismatch_leaves(tmp_path):
+    run, = read_runs(write(
+        tmp_path / 'run', simulated(plant=replace(ACTUATOR, density=2100.0)),
+        **parameters(planner=ACTUATOR, plant=ACTUATOR),
+        **{'plant.mismatch.density': json.dumps(2100.0 / ACTUATOR.density)}))
+    assert run.plant.density == pytest.approx(2100.0, rel=1e-12)
+    assert any('other parameters' in x for x in run.notes)
+
+
 def test_names_from_a_bag_cannot_become_markup(tmp_path):
     name = 'a<b onload=x>&amp;"'
     text = page(parts_of(write(tmp_path / name, simulated(), **parameters(plant=ACTUATOR))))

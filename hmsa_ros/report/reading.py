@@ -512,6 +512,11 @@ def _actuators(
         values = {
             x: _of_joint(parameters, joint, f'{node}.actuator.{x}') for x in ACTUATOR_FIELDS}
         if all(isinstance(x, (int, float)) for x in values.values()):
+            for name, value in values.items():
+                # What a simulated block has more or less of than it says.
+                factor = _of_joint(parameters, joint, f'{node}.mismatch.{name}')
+                if isinstance(factor, (int, float)):
+                    values[name] = value * factor  # type: ignore[operator]
             try:
                 found[node] = ActuatorParameters(**values)  # type: ignore[arg-type]
             except BadInputError as error:
