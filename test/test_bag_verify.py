@@ -107,7 +107,7 @@ def test_a_second_plant_moves_the_same_when_the_bag_is_played(
     assert max(moved) - min(moved) > 1e-3
 
 
-def write_joints(folder, densities, *, told=None, space=''):
+def write_joints(folder, densities, *, told=None, space='', lost=None):
     """Write a run of several joints of one plant that differ in density."""
     actuators = {joint: replace(paper_actuator(), density=density)
                  for joint, density in densities.items()}
@@ -116,7 +116,8 @@ def write_joints(folder, densities, *, told=None, space=''):
         f'{space}/plant.actuator.{field.name}': json.dumps(getattr(paper_actuator(), field.name))
         for field in fields(ActuatorParameters) if field.init} | {
         f'{space}/plant.{joint}.actuator.density': json.dumps(density)
-        for joint, density in told.items()} | {f'{space}/plant.one.slew_limit': 'null'}
+        for joint, density in told.items()} | {f'{space}/plant.one.slew_limit': 'null'} | (
+        {'lost': json.dumps(lost)} if lost else {})
     simulations = {joint: ActuatorSimulation(actuator, time=BEGIN)
                    for joint, actuator in actuators.items()}
     with BagWriter(folder, custom_data=custom_data) as writer:
@@ -155,6 +156,14 @@ def test_several_joints_of_several_namespaces_are_told_apart(tmp_path):
     results = verify(write_joints(
         tmp_path / 'b', {'one': 900.0, 'two': 2000.0}, told={'one': 2000.0, 'two': 900.0}))
     assert all(result.largest_difference > 1e-4 for result in results)
+
+
+def test_lost_commands_are_named_beside_the_difference(tmp_path):
+    one, two = verify(write_joints(tmp_path / 'a', {'one': 900.0, 'two': 2000.0}, lost={
+        '/joint_states': 7, '/one/flux_density_command': 3, '/two/flux_density_command': 0}))
+    assert one.note == ('the recorder lost messages, 3 of /one/flux_density_command: expected '
+                        'differences from there on')
+    assert two.note == ''
 
 
 def test_several_rounds_in_one_bag_are_refused_with_a_way_out(tmp_path):

@@ -18,6 +18,7 @@ from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.bag import limits
 from hmsa_ros.bag.experiment import parameters_of
+from hmsa_ros.bag.info import lost_messages
 from hmsa_ros.bag.reader import BagReader
 from hmsa_ros.errors import BadInputError
 
@@ -238,14 +239,21 @@ def _force(topic: str, message: Any) -> tuple[int, float]:
 
 def _note(custom_data: Mapping[str, str], pair: _Pair) -> str:
     """Return what makes the recorded samples differ from the motion."""
+    notes = []
+    counts = lost_messages(custom_data) or {}
+    lost = [f'{count} of {name}' for name in (pair.commands, pair.beside(APPLIED),
+                                              pair.beside(FORCE)) if (count := counts.get(name))]
+    if lost:
+        notes.append(f'the recorder lost messages, {" and ".join(lost)}: expected differences '
+                     'from there on')
     texts = parameters_of(custom_data, 'plant', pair.space)
-    found = [
+    noise = [
         f'{name} {text}' for name in ('stretch_noise', 'rate_noise')
         if (text := _value(texts, pair, name, '0')) not in ('0', '0.0')]
-    if not found:
-        return ''
-    return (f'the samples are measured with {" and ".join(found)}: expected differences of '
-            'that size, from the first sample on')
+    if noise:
+        notes.append(f'the samples are measured with {" and ".join(noise)}: expected differences '
+                     'of that size, from the first sample on')
+    return '; '.join(notes)
 
 
 def _sample(pair: _Pair, sample: Any) -> tuple[int, float, float, float]:
