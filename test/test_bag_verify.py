@@ -96,6 +96,9 @@ def test_a_second_plant_moves_the_same_when_the_bag_is_played(
     ros.call(Trigger, 'player/resume')
     assert player.wait() == 0, player.output
     assert recorder.stop() == 0, recorder.output
+    result, = verify(recorded_run)
+    # None of its own commands was late.
+    assert result.largest_difference < SAME
     first = samples(recorded_run)
     second = {
         item.message.header.stamp.sec * 10**9 + item.message.header.stamp.nanosec:
