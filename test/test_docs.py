@@ -1,7 +1,7 @@
 """The pages: built with warnings as errors, and every block in them run or checked."""
 
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from importlib import import_module
 import os
@@ -57,9 +57,14 @@ def test_every_block_of_the_page_is_run_or_checked(page):
 def running(
         own_domain: Callable[[], AbstractContextManager[int]],
         tmp_path_factory: pytest.TempPathFactory,
-        request: pytest.FixtureRequest) -> Iterator[dict[Path, Future[list[str]]]]:
-    """Run the pages asked for, some at a time: most of what they do is to wait."""
-    def run(page: Path, folder: Path) -> list[str]:
+        request: pytest.FixtureRequest) -> Iterator[Callable[[Path], list[str]]]:
+    """
+    Run the pages asked for, some at a time: most of what they do is to wait.
+
+    What is returned waits for the log of a page; asked again, it runs the page again.
+    """
+    def run(page: Path) -> list[str]:
+        folder = tmp_path_factory.mktemp(page.stem)
         with own_domain() as domain:
             return run_page(page, folder, {
                 **os.environ, 'PYTHONPATH': str(ROOT), 'PYTHONUNBUFFERED': '1',
@@ -72,9 +77,14 @@ def running(
     asked = [item.callspec.params['page'] for item in request.session.items
              if getattr(item, 'originalname', '') == 'test_page_does_what_it_says']
     with ThreadPoolExecutor(AT_A_TIME) as pool:
-        runs = {page: pool.submit(run, page, tmp_path_factory.mktemp(page.stem))
+        runs = {page: pool.submit(run, page)
                 for page in reversed(asked)}  # the long ones are at the end
-        yield runs
+
+        def log_of(page: Path) -> list[str]:
+            first = runs.pop(page, None)
+            return run(page) if first is None else first.result()
+
+        yield log_of
         for future in runs.values():
             future.cancel()
 
@@ -84,9 +94,9 @@ def running(
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize('page', RUNNING, ids=name_of)
 def test_page_does_what_it_says(
-        page: Path, running: dict[Path, Future[list[str]]],
+        page: Path, running: Callable[[Path], list[str]],
         capsys: pytest.CaptureFixture[str]):
-    log = running[page].result()
+    log = running(page)
     with capsys.disabled():
         print('', *log, sep='\n')
 
