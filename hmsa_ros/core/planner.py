@@ -15,12 +15,13 @@ import math
 
 from hmsa_ros.core import kernels
 from hmsa_ros.core.history import Deviation, History
-from hmsa_ros.core.model import elastic_force, equilibrium_stretch
+from hmsa_ros.core.model import equilibrium_stretch
 from hmsa_ros.core.moves import Level, Move, State
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.sequence import plan_sequence, Segment, Setpoint
-from hmsa_ros.core.simulation import check_stretch, RTOL
+from hmsa_ros.core.simulation import check_stretch
 from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.core.stopping import brake, holdable
 from hmsa_ros.core.timeline import (
     ALWAYS,
     Draft,
@@ -35,17 +36,13 @@ from hmsa_ros.errors import BadInputError
 
 __all__ = ['Options', 'Plan', 'PlannedLevel', 'PlannedSegment', 'Planner']
 
-# Stretch rates below this share of the natural frequency are rounding, not motion.
-_AT_REST = 1e-6
-# Those of a sample below this share are rest, where the model would have it move: the model is
-# off then, and not the actuator in motion.
+# Stretch rates of a sample below this share of the natural frequency are rest, where the model
+# would have it move: the model is off then, and not the actuator in motion.
 _SAMPLED_AT_REST = 1e-4
 # How far the model may be off a sample at rest to be believed nevertheless.
 _AGREES = 1e-3
 # How hard to brake where the hardest does not lead to a plan, from the nearest stop on.
 _BRAKE_SHARES = (0.5, 0.1, 0.02, 0.0)
-# How far inside the flux density limits a stop keeps where it has to, as a share.
-_INSIDE = 1e-3
 # How many natural periods later to try again where a plan cannot be made anew at once.
 _PATIENCE = (0.0, 0.15, 0.3, 0.45, 0.6)
 # Levels that are kept for news of when they took effect.
@@ -182,7 +179,7 @@ class Planner:
                 'finite numbers')
         begin = PlannedLevel(stamp, level, stretch, rate, in_force, model)
         held = equilibrium_stretch(level / model.units.load, model.material.j_lim)
-        at_rest = abs(rate) * model.units.time <= _SAMPLED_AT_REST * self._frequency(stretch)
+        at_rest = abs(rate) * model.units.time <= _SAMPLED_AT_REST * self.model.frequency(stretch)
         if at_rest and level == in_force and abs(float(held) - stretch) > _AGREES:
             begin = replace(begin, stamp=ALWAYS, rate=0.0)
         self._begin_with(begin, self.plan.number)
@@ -337,17 +334,17 @@ class Planner:
         """Work out what `stop` takes."""
         begin = self._soonest(now)
         state = self.state(begin)
-        brake, time, stretch = self._brake(state, 1.0)
-        if (self._holdable(stretch) != stretch
-                or not self.model.delivery.ideal and time > 0.0):
+        found = brake(self.model, self._work, state)
+        if (holdable(self.model, found.stretch) != found.stretch
+                or not self.model.delivery.ideal and found.duration > 0.0):
             return self._gentle_stop(begin, state)
         move = Move(Code.HOLD, tuple(
-            [Level(0.0, brake)] * (time > 0.0)
-            + [Level(time, self.model.holding(stretch))]),
-            time, 'stopped')
-        end = State(stretch, 0.0, move.levels[-1].load)
+            [Level(0.0, found.load)] * (found.duration > 0.0)
+            + [Level(found.duration, self.model.holding(found.stretch))]),
+            found.duration, 'stopped')
+        end = State(found.stretch, 0.0, move.levels[-1].load)
         return self._place(
-            begin, [Segment(Setpoint(stretch, math.inf), 0.0, state, end, move)])
+            begin, [Segment(Setpoint(found.stretch, math.inf), 0.0, state, end, move)])
 
     def draft_resumption(self, now: int) -> Draft | None:
         """
@@ -372,7 +369,7 @@ class Planner:
 
         """
         begin = self._soonest(now)
-        period = 2.0 * math.pi / self._frequency(self.state(begin).stretch)
+        period = 2.0 * math.pi / self.model.frequency(self.state(begin).stretch)
         for share in _PATIENCE:
             try:
                 return self._resumption(self._on_grid(begin + self.model.ns(share * period)))
@@ -676,53 +673,14 @@ class Planner:
                 segment.move.code, segment.move.reason, start))
         return Draft(begin, tuple(levels), tuple(placed))
 
-    def _holdable(self, stretch: float) -> float:
-        """Return the nearest stretch that a flux density inside the limits holds."""
-        load = float(elastic_force(stretch, self.model.material.j_lim))
-        least, most = self.model.limits.minimum, self.model.limits.maximum
-        if least <= load <= most:
-            return stretch
-        nearest = least if load < least else most
-        margin = _INSIDE * min(most - least, 1.0 + abs(nearest))
-        return float(equilibrium_stretch(
-            nearest + math.copysign(margin, nearest - load), self.model.material.j_lim))
-
     def _gentle_stop(self, begin: int, state: State) -> Draft:
         """Plan a stop that a single brake does not make: on a grid, through ramps, at a limit."""
         for share in _BRAKE_SHARES:
-            stretch = self._holdable(self._brake(state, share)[2])
+            stretch = holdable(self.model, brake(self.model, self._work, state, share).stretch)
             try:
                 return self._plan(begin, [Setpoint(stretch, math.inf)], 'two_step')
             except RefusedError:
                 continue
         # Nothing stops it at once: let it settle.
-        return self._plan(begin, [Setpoint(self._holdable(state.stretch), math.inf)], 'step')
-
-    def _brake(self, state: State, share: float) -> tuple[float, float, float]:
-        """Return a load that brakes with a share of the limit, for how long, and until where."""
-        material = self.model.material
-        i_j = 1.0 / material.j_lim
-        holding = self.model.holding(state.stretch)
-        frequency = self._frequency(state.stretch)
-        if abs(state.rate) <= _AT_REST * frequency:
-            return holding, 0.0, state.stretch
-        up = state.rate > 0.0
-        load = self.model.limits.minimum if up else self.model.limits.maximum
-        if not math.isfinite(load):
-            # Unlimited: a load that stops within a fraction of a period.
-            load = holding - math.copysign(
-                10.0 * abs(state.rate) * frequency + 10.0, state.rate)
-        if share < 1.0:
-            load = holding + share * (load - holding)
-        status, time, stretch, _, _ = kernels.turning_point(
-            self._work, state.stretch, state.rate, 1.0 if up else -1.0, load, 1.0,
-            material.zeta, material.c1, i_j, RTOL)
-        if status != kernels.DONE:
-            return holding, 0.0, state.stretch
-        time = self.model.time(self.model.ns(time))
-        return float(load), time, stretch
-
-    def _frequency(self, stretch: float) -> float:
-        """Return the nondimensional natural frequency about a stretch."""
-        material = self.model.material
-        return float(kernels.natural_frequency(stretch, material.c1, 1.0 / material.j_lim))
+        return self._plan(
+            begin, [Setpoint(holdable(self.model, state.stretch), math.inf)], 'step')

@@ -129,6 +129,11 @@ class Model:
         """Return the load that holds a stretch."""
         return float(kernels.elastic_force(stretch, 1.0 / self.material.j_lim))
 
+    def frequency(self, stretch: float) -> float:
+        """Return the nondimensional natural frequency about a stretch."""
+        material = self.material
+        return float(kernels.natural_frequency(stretch, material.c1, 1.0 / material.j_lim))
+
     def follow(self, state: State, load: float, duration: float) -> State:
         """
         Predict the state after one level has been commanded for a time.

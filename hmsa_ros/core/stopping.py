@@ -1,0 +1,106 @@
+"""Where a motion can come to rest soonest, and the load that gets it there."""
+
+from dataclasses import dataclass
+import math
+
+from hmsa_ros.core import kernels
+from hmsa_ros.core.model import Array, equilibrium_stretch
+from hmsa_ros.core.moves import State
+from hmsa_ros.core.simulation import RTOL
+from hmsa_ros.core.timeline import Model
+
+# Stretch rates below this share of the natural frequency are rounding, not motion.
+_AT_REST = 1e-6
+# How far inside the flux density limits a stop keeps where it has to, as a share.
+_INSIDE = 1e-3
+
+
+@dataclass(frozen=True)
+class Brake:
+    """
+    A load that stops a motion at its turning point.
+
+    Attributes
+    ----------
+    load : float
+        Held until then.
+    duration : float
+        Until then; 0 for what is at rest already.
+    stretch : float
+        There.
+
+    """
+
+    load: float
+    duration: float
+    stretch: float
+
+
+def brake(model: Model, work: Array, state: State, share: float = 1.0) -> Brake:
+    """
+    Return how to stop a motion.
+
+    Parameters
+    ----------
+    model : Model
+        Of the block and its limits.
+    work : ndarray
+        Of `kernels.work_space`.
+    state : State
+        Where the motion is.
+    share : float
+        Of the way from the load that holds the stretch to the limit on the other side, 0 to 1:
+        how hard to brake.
+
+    Returns
+    -------
+    Brake
+        One of no duration where the motion cannot be followed to a turning point.
+
+    """
+    material = model.material
+    holding = model.holding(state.stretch)
+    rest = Brake(holding, 0.0, state.stretch)
+    frequency = model.frequency(state.stretch)
+    if abs(state.rate) <= _AT_REST * frequency:
+        return rest
+    up = state.rate > 0.0
+    load = model.limits.minimum if up else model.limits.maximum
+    if not math.isfinite(load):
+        # Unlimited: a load that stops within a fraction of a period.
+        load = holding - math.copysign(10.0 * abs(state.rate) * frequency + 10.0, state.rate)
+    if share < 1.0:
+        load = holding + share * (load - holding)
+    status, time, stretch, _, _ = kernels.turning_point(
+        work, state.stretch, state.rate, 1.0 if up else -1.0, load, 1.0,
+        material.zeta, material.c1, 1.0 / material.j_lim, RTOL)
+    if status != kernels.DONE:
+        return rest
+    return Brake(float(load), model.time(model.ns(time)), stretch)
+
+
+def holdable(model: Model, stretch: float) -> float:
+    """
+    Return the nearest stretch that a flux density inside the limits holds.
+
+    Parameters
+    ----------
+    model : Model
+        Of the block and its limits.
+    stretch : float
+        Wanted.
+
+    Returns
+    -------
+    float
+        The same where it can be held.
+
+    """
+    load = model.holding(stretch)
+    least, most = model.limits.minimum, model.limits.maximum
+    if least <= load <= most:
+        return stretch
+    nearest = least if load < least else most
+    margin = _INSIDE * min(most - least, 1.0 + abs(nearest))
+    return float(equilibrium_stretch(
+        nearest + math.copysign(margin, nearest - load), model.material.j_lim))
