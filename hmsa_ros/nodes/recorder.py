@@ -23,11 +23,8 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import ParameterEvent
-from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.node import Node
-from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
@@ -36,7 +33,6 @@ from std_srvs.srv import Trigger
 
 from hmsa_ros import __version__
 from hmsa_ros.bag.definitions import is_interface_package, message_definition, type_hash
-from hmsa_ros.bag.experiment import parameter_key
 from hmsa_ros.bag.qos import Qos
 from hmsa_ros.bag.recording import Limits, lost_by_topic, Message, Recording, Status
 from hmsa_ros.bag.writer import BagWriter, parse_custom_data, PRESETS, Topic
@@ -46,6 +42,7 @@ from hmsa_ros.nodes.capture import Capture, RawSubscription, SimulatedTime, Take
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.parameters import declare, ParameterSpec
 from hmsa_ros.nodes.qos import stored, subscription
+from hmsa_ros.nodes.remote_parameters import RemoteParameters
 from hmsa_ros.nodes.runner import run
 
 DIAGNOSTICS_SECONDS = 1.0
@@ -299,7 +296,7 @@ class Recorder(ManagedNode):
             # From the start, so that the first one is not missed; others when they are found.
             self._follow_setpoints(topic, self._full_name(
                 interface.from_outside(topic.name, interface.PLANNER)))
-        self._followed: dict[str, _Followed] = {}
+        self._followed: dict[str, RemoteParameters] = {}
         self.create_subscription(
             ParameterEvent, '/parameter_events', self._on_parameter_event, 100)
         interval = (self._parameters_in['record.topic_polling_interval.sec']
@@ -340,11 +337,14 @@ class Recorder(ManagedNode):
         wanted = self._parameters_in['experiment.nodes']
         bare = {name for name in wanted if '/' not in name}
         full = {self._full_name(name) for name in wanted if '/' in name}
-        for name, namespace in self.get_node_names_and_namespaces():
-            node = f'{namespace.rstrip("/")}/{name}'
-            if (name in bare or node in full) and node not in self._followed \
-                    and len(self._followed) < _MAX_NODES:
-                self._followed[node] = _Followed(self, node)
+        # By their services. The names of nodes come on a topic of their own, and what is published
+        # on it by several at the same time may get lost (ros2/rmw_fastrtps#792).
+        for service, _ in self.get_service_names_and_types():
+            node, _, last = service.rpartition('/')
+            if last == 'list_parameters' and (
+                    node.rpartition('/')[2] in bare or node in full) \
+                    and node not in self._followed and len(self._followed) < _MAX_NODES:
+                self._followed[node] = RemoteParameters(self, node)
 
     def _follow_setpoints(self, topic: interface.Topic, name: str) -> None:
         """Store the setpoints that are sent on a topic."""
@@ -668,73 +668,6 @@ class Recorder(ManagedNode):
                 print(f'hmsa recorder: lost {count} of {name}', flush=True)
         if status.error and self.failure is None:
             self.failure = BagError(status.error)
-
-
-class _Followed:
-    """
-    A node whose parameters go into the bag.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Node that asks.
-    name : str
-        Full name of the node that is asked.
-
-    """
-
-    def __init__(self, node: Node, name: str) -> None:
-        self._name = name
-        self._list = node.create_client(ListParameters, f'{name}/list_parameters')
-        self._get = node.create_client(GetParameters, f'{name}/get_parameters')
-        self._future: Any = None
-        self._names: list[str] = []
-        self._done = False
-
-    def poll(self, note: Any) -> None:
-        """
-        Take the next step towards the node's parameters, if it is there.
-
-        Parameters
-        ----------
-        note : callable
-            Takes the parameters as custom data.
-
-        """
-        if self._done:
-            # Asked again when it comes back, perhaps with other parameters.
-            self._done = bool(self._list.service_is_ready())
-        elif self._future is None:
-            if self._list.service_is_ready() and self._get.service_is_ready():
-                self._future = self._list.call_async(ListParameters.Request())
-        elif self._future.done():
-            answer, self._future = self._future.result(), None
-            if hasattr(answer, 'result'):
-                self._names = list(answer.result.names)
-                self._future = self._get.call_async(GetParameters.Request(names=self._names))
-            else:
-                self._done = True
-                note(self.texts(zip(self._names, answer.values, strict=False)))
-        elif not self._list.service_is_ready():
-            self._future = None
-
-    def texts(self, values: Iterable[tuple[str, Any]]) -> dict[str, str]:
-        """
-        Return parameters as custom data.
-
-        Parameters
-        ----------
-        values : iterable of (str, rcl_interfaces.msg.ParameterValue)
-            Names and values.
-
-        Returns
-        -------
-        dict of str to str
-            Keys as `parameter_key` gives them; the value as JSON.
-
-        """
-        return {parameter_key(self._name, name): json.dumps(
-            parameter_value_to_python(value), default=list) for name, value in values}
 
 
 def _type_name(message_type: type[Any]) -> str:

@@ -1,0 +1,42 @@
+"""Parameters of other nodes: asked for until they have come."""
+
+from typing import Any
+
+import pytest
+from rcl_interfaces.msg import ParameterValue
+from rcl_interfaces.srv import GetParameters, ListParameters
+
+from hmsa_ros.bag.experiment import parameter_key
+from hmsa_ros.nodes.remote_parameters import RemoteParameters
+
+pytestmark = pytest.mark.ros
+
+
+def answer_list(_: Any, response: Any) -> Any:
+    response.result.names = ['lead_time']
+    return response
+
+
+def answer_get(request: Any, response: Any) -> Any:
+    assert list(request.names) == ['lead_time']
+    response.values = [ParameterValue(type=3, double_value=0.05)]
+    return response
+
+
+def test_what_nobody_answers_is_asked_again(ros, make_ros):
+    # Its executor never runs.
+    deaf = make_ros().node
+    deaf.create_service(ListParameters, '/planner/list_parameters', answer_list)
+    deaf.create_service(GetParameters, '/planner/get_parameters', answer_get)
+    asking = RemoteParameters(ros.node, '/planner')
+    found: list[dict[str, str]] = []
+
+    def asked() -> bool:
+        asking.poll(found.append)
+        return asking._future is not None
+
+    ros.spin_until(asked, 'the question')
+    ros.node.create_service(ListParameters, '/planner/list_parameters', answer_list)
+    ros.node.create_service(GetParameters, '/planner/get_parameters', answer_get)
+    ros.spin_until(lambda: asking.poll(found.append) or found, 'the answer')
+    assert found == [{parameter_key('/planner', 'lead_time'): '0.05'}]
