@@ -125,13 +125,9 @@ def _run(
 
 def _sequence(names: Sequence[str], seconds: float):  # type: ignore[no-untyped-def]
     """Return a request that moves all joints every 0.2 s."""
-    message = to_trajectory(
+    return to_trajectory(
         [(1.1 if k % 2 else 1.2, round((k + 1) * 0.2 * NANOSECONDS))
-         for k in range(int(seconds / 0.2))], names[0])
-    message.joint_names = list(names)
-    for point in message.points:
-        point.positions = [point.positions[0]] * len(names)
-    return message
+         for k in range(int(seconds / 0.2))], names)
 
 
 def compare(*, quick: bool) -> Sheet:

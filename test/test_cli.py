@@ -75,8 +75,12 @@ def test_too_much_damping_falls_back_to_the_plain_step_and_says_so(capsys):
     (['plan', '1.1:10', '--start', '9'], 'start stretch is 9'),
     (['plan', '1.1:10', '--shaper', 'nothing'], 'expected one of two_step'),
     (['plan', '1.1:10', '--nonsense'], 'unrecognized arguments: --nonsense'),
+    (['plan', '1.1,1.2:10'], 'expected STRETCH:SPAN'),
     (['send', 'x'], 'expected STRETCH:SPAN'),
+    (['send', '1.1,:1'], 'expected STRETCH:SPAN'),
+    (['send', '1.1,-1:1'], 'greater than 0'),
     (['send', '1.1:1', '--timeout', '0'], 'timeout is 0'),
+    (['send', '1.1:1', '--namespace', '9 bad'], "namespace '9 bad': Invalid namespace"),
     (['nonsense'], 'invalid choice'),
     ([], 'required'),
 ])
@@ -100,6 +104,30 @@ def test_send_reports_until_the_sequence_has_been_carried_out(start):
     assert 'accepted' in send.stdout
     assert 'done: at_rest' in send.stdout
     assert 'setpoint 2 of 2' in send.stderr
+
+
+@pytest.mark.ros
+def test_send_moves_several_joints_each_to_its_stretch_or_all_to_one(start, ros):
+    from hmsa_ros.nodes import interface
+
+    plans = ros.collect(interface.PLAN.type, 'planner/plan', interface.PLAN.qos)
+    start.hmsa('planner', '--ros-args', '-p', 'joints:=[left, right]')
+    send = start.hmsa(
+        'send', '1.1,0.9:0.2', '1.2:0.2', '--joint', 'right,left', '--wait')
+    assert send.wait(30.0) == 0, send.output
+    assert 'done: at_rest' in send.stdout
+    ros.spin_until(lambda: len(plans[-1].joint_names) == 2, 'the plan')
+    # At rest at the first setpoint, and at the second.
+    reached = [dict(zip(plans[-1].joint_names, point.positions, strict=True))
+               for point in plans[-1].points]
+    for joint, stretch in (('left', 0.9), ('right', 1.1)):
+        assert any(abs(x[joint] - stretch) < 1e-6 for x in reached)
+    assert all(abs(x - 1.2) < 1e-6 for x in reached[-1].values())
+    for count in ('1.1,1.2,1.3:1', '1.1,1.2:1'):
+        names = 'left,right' if count.count(',') == 2 else 'left'
+        send = start.hmsa('send', count, '--joint', names)
+        assert send.wait(30.0) == 2
+        assert 'expected one for all, or one a joint' in send.stderr
 
 
 @pytest.mark.ros

@@ -76,6 +76,18 @@ def test_trajectory_survives_the_round_trip(points, joint, stamp, frame):
     assert conversions.from_trajectory(message, joint) == (points, stamp or None)
 
 
+@given(POINTS, st.lists(NAMES, min_size=2, max_size=4, unique=True))
+def test_a_stretch_is_that_of_all_joints_unless_there_is_one_for_each(points, joints):
+    found, _ = conversions.from_trajectories(
+        sent(conversions.to_trajectory(points, joints)), joints)
+    assert found == dict.fromkeys(joints, points)
+    own = {x: [(stretch + i, time) for stretch, time in points] for i, x in enumerate(joints)}
+    each = [([own[x][k][0] for x in joints], time) for k, (_, time) in enumerate(points)]
+    found, _ = conversions.from_trajectories(
+        sent(conversions.to_trajectory(each, joints)), joints)
+    assert found == own
+
+
 @given(st.lists(NAMES, max_size=3), NAMES)
 def test_trajectory_is_read_only_for_the_one_joint(names, joint):
     message = JointTrajectory(

@@ -199,12 +199,8 @@ OTHERS = (
 
 def trajectory(names: tuple[str, ...], *points: tuple[float, int]) -> JointTrajectory:
     """Return a request that differs from joint to joint by a hundredth."""
-    message = to_trajectory([(x, t) for x, t in points], '')
-    message.joint_names = list(names)
-    for point in message.points:
-        base = point.positions[0]
-        point.positions = [base + 0.01 * JOINTS.index(x) for x in names]
-    return message
+    return to_trajectory(
+        [([x + 0.01 * JOINTS.index(name) for name in names], t) for x, t in points], names)
 
 
 def test_joints_of_one_trajectory_get_what_each_would_alone(rig):
@@ -550,10 +546,7 @@ def test_changed_block_and_lead_time_are_taken_by_the_next_plan(rig):
         Parameter('left.actuator.remanence', value=0.2), Parameter('lead_time', value=0.1),
         Parameter('actuator.damping_coefficient', value=0.3)])
     assert [x.reason for x in results] == [''] * 3
-    message = to_trajectory([(1.2, SPELL)], 'left')
-    message.joint_names = ['left', 'right']
-    message.points[0].positions = [1.2, 1.2]
-    planner.send(message)
+    planner.send(to_trajectory([(1.2, SPELL)], ('left', 'right')))
     for name, remanence in (('left', 0.2), ('right', 0.1)):
         alone = Planner(
             replace(paper_actuator(), remanence=remanence, damping_coefficient=0.3),

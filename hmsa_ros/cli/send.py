@@ -4,7 +4,7 @@ import argparse
 import sys
 from typing import Any
 
-from hmsa_ros.cli.setpoints import setpoint
+from hmsa_ros.cli.setpoints import setpoint_of_joints
 from hmsa_ros.errors import BadInputError
 
 
@@ -24,15 +24,17 @@ def add_parser(subparsers: Any) -> None:
                     'and print its verdict.',
         epilog='example: hmsa send 1.10:2 1.20:2 --wait')
     parser.add_argument(
-        'setpoints', nargs='+', type=setpoint, metavar='STRETCH:SECONDS',
+        'setpoints', nargs='+', type=setpoint_of_joints, metavar='STRETCH:SECONDS',
         help='stretch to come to rest at, and seconds from leaving the last setpoint to '
-             'leaving this one')
+             'leaving this one; with several joints one stretch for all, or one a joint, as in '
+             '1.10,1.20:2')
     parser.add_argument(
         '--wait', action='store_true', help='report until the sequence has been carried out')
     parser.add_argument(
         '--namespace', default='', metavar='NS', help='namespace of the planner')
     parser.add_argument(
-        '--joint', default='actuator', metavar='NAME', help='joint name (default actuator)')
+        '--joint', default='actuator', metavar='NAMES',
+        help='joint, or joints with commas between (default actuator)')
     parser.add_argument(
         '--timeout', type=float, default=10.0, metavar='S',
         help='patience with a silent planner, and beyond the length of the sequence with one '
@@ -66,7 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise BadInputError(
             f'timeout is {arguments.timeout:g}: expected a number of seconds above 0')
     with PlannerClient(
-            namespace=arguments.namespace, joint=arguments.joint,
+            namespace=arguments.namespace, joints=arguments.joint.split(','),
             timeout=arguments.timeout) as client:
         client.find_planner()
         verdict = client.send(arguments.setpoints)

@@ -1,6 +1,7 @@
 """Setpoints as words on the command line."""
 
 import argparse
+import math
 
 from hmsa_ros.errors import BadInputError
 
@@ -25,19 +26,48 @@ def setpoint(text: str) -> tuple[float, float]:
         If it is not two numbers in range.
 
     """
+    stretches, span = setpoint_of_joints(text)
+    if len(stretches) > 1:
+        raise argparse.ArgumentTypeError(
+            f'{text!r}: expected STRETCH:SPAN, two numbers such as 1.10:10')
+    return stretches[0], span
+
+
+def setpoint_of_joints(text: str) -> tuple[tuple[float, ...], float]:
+    """
+    Read ``STRETCH:SPAN`` or ``STRETCH,STRETCH,...:SPAN``.
+
+    Parameters
+    ----------
+    text : str
+        For example ``'1.10:10'`` or ``'1.10,1.20:10'``.
+
+    Returns
+    -------
+    stretches : tuple of float
+        One, or one a joint.
+    span : float
+        Of all.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        If it is not numbers in range.
+
+    """
     # Not imported above: Numba comes along, which ``hmsa --help`` has no use for.
     from hmsa_ros.core.sequence import Setpoint
 
-    stretch, colon, span = text.partition(':')
+    stretches, colon, span = text.partition(':')
     try:
         if not colon:
             raise ValueError(text)
-        result = Setpoint(float(stretch), float(span))
-        if result.span == float('inf'):
+        found = [Setpoint(float(stretch), float(span)) for stretch in stretches.split(',')]
+        if math.isinf(found[0].span):
             raise BadInputError('span is inf: expected a finite number')
     except BadInputError as error:
         raise argparse.ArgumentTypeError(f'{text!r}: {error}') from error
     except ValueError:
         raise argparse.ArgumentTypeError(
             f'{text!r}: expected STRETCH:SPAN, two numbers such as 1.10:10') from None
-    return result.stretch, result.span
+    return tuple(x.stretch for x in found), found[0].span

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from builtin_interfaces.msg import Duration, Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+import numpy as np
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import MagneticField
 from std_msgs.msg import Header
@@ -209,17 +210,17 @@ def from_trajectories(
 
 
 def to_trajectory(
-        setpoints: Iterable[tuple[float, int]], joint: str, *, stamp: int = 0,
-        frame: str = '') -> JointTrajectory:
+        setpoints: Iterable[tuple[float | Sequence[float], int]], joints: str | Sequence[str], *,
+        stamp: int = 0, frame: str = '') -> JointTrajectory:
     """
     Return setpoints as a trajectory message.
 
     Parameters
     ----------
-    setpoints : iterable of (float, int)
-        Stretch, and time from the start in ns until which it lasts.
-    joint : str
-        Its name.
+    setpoints : iterable of (float or sequence of float, int)
+        Stretch, of all joints or one a joint, and time from the start in ns until which it lasts.
+    joints : str or sequence of str
+        Name or names.
     stamp : int
         Start in ns; 0 for now.
     frame : str
@@ -231,10 +232,13 @@ def to_trajectory(
         One point a setpoint.
 
     """
+    names = [joints] if isinstance(joints, str) else list(joints)
     return JointTrajectory(
-        header=Header(stamp=to_time(stamp), frame_id=frame), joint_names=[joint],
+        header=Header(stamp=to_time(stamp), frame_id=frame), joint_names=names,
         points=[
-            JointTrajectoryPoint(positions=[stretch], time_from_start=_to_duration(time))
+            JointTrajectoryPoint(
+                positions=np.broadcast_to(stretch, len(names)).tolist(),
+                time_from_start=_to_duration(time))
             for stretch, time in setpoints])
 
 

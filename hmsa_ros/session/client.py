@@ -6,16 +6,14 @@ from time import monotonic
 from uuid import uuid4
 
 from diagnostic_msgs.msg import DiagnosticStatus
-import rclpy
+import numpy as np
 from rclpy.experimental.events_executor import EventsExecutor
-from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.middleware import prepare_middleware
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import to_trajectory
+from hmsa_ros.nodes.visitor import leave, visit
 
 _SLICE_SECONDS = 0.05
 
@@ -84,31 +82,22 @@ class PlannerClient:
     ----------
     namespace : str
         Namespace of the planner.
-    joint : str
-        Name of its joint.
+    joints : sequence of str
+        Names of its joints.
     timeout : float
         Patience with a silent planner in s.
 
     """
 
     def __init__(
-            self, *, namespace: str = '', joint: str = 'actuator',
+            self, *, namespace: str = '', joints: Sequence[str] = ('actuator',),
             timeout: float = 10.0) -> None:
         """Create a node of our own in a context of our own."""
         self._timeout = timeout
-        self._joint = joint
+        self._joints = tuple(joints)
         self._namespace = namespace
-        prepare_middleware()
-        self._context = rclpy.Context()
-        # Signals stay Python's: Ctrl-C raises KeyboardInterrupt here as anywhere else.
-        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        try:
-            self.node: Node = rclpy.create_node(
-                f'client_{uuid4().hex[:8]}', namespace=namespace, context=self._context)
-        except Exception as error:  # rclpy has several classes for a bad name
-            rclpy.try_shutdown(context=self._context)
-            raise BadInputError(f'namespace {namespace!r}: {error}') from error
-        self._executor = EventsExecutor(context=self._context)
+        self.node = visit('client', namespace)
+        self._executor = EventsExecutor(context=self.node.context)
         self._executor.add_node(self.node)
         self._verdict: Verdict = _SILENCE
         topic = interface.STATUS
@@ -126,8 +115,7 @@ class PlannerClient:
     def __exit__(self, *_: object) -> None:
         """Leave the graph."""
         self._executor.shutdown()
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self._context)
+        leave(self.node)
 
     def _on_status(self, message: DiagnosticStatus) -> None:
         self._verdict = Verdict.from_message(message)
@@ -187,15 +175,15 @@ class PlannerClient:
             'ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE as here', each)
 
     def send(
-            self, setpoints: Sequence[tuple[float, float]], *,
+            self, setpoints: Sequence[tuple[float | Sequence[float], float]], *,
             time_begins: bool = False) -> Verdict:
         """
         Send a sequence that begins now and wait for the verdict.
 
         Parameters
         ----------
-        setpoints : sequence of (float, float)
-            Stretch and span in s.
+        setpoints : sequence of (float or sequence of float, float)
+            Stretch, of all joints or one a joint, and span in s.
         time_begins : bool
             Whether simulated time has just begun, so that the planner may not know yet: it is
             asked again then.
@@ -208,7 +196,7 @@ class PlannerClient:
         Raises
         ------
         BadInputError
-            If the planner refuses the sequence.
+            If the stretches are not as many as the joints, or the planner refuses the sequence.
         HmsaError
             If it does not answer.
 
@@ -216,6 +204,10 @@ class PlannerClient:
         points = []
         end = 0.0
         for stretch, span in setpoints:
+            if np.size(stretch) not in (1, len(self._joints)):
+                raise BadInputError(
+                    f'{np.size(stretch)} stretches for {len(self._joints)} joints '
+                    f'({", ".join(self._joints)}): expected one for all, or one a joint')
             end += span
             if end >= 2**31:
                 raise BadInputError(f'the sequence lasts {end:g} s: expected less than 2^31 s')
@@ -223,7 +215,7 @@ class PlannerClient:
         deadline = monotonic() + self._timeout
         while True:
             request = uuid4().hex
-            self._publisher.publish(to_trajectory(points, self._joint, frame=request))
+            self._publisher.publish(to_trajectory(points, self._joints, frame=request))
             self.spin_until(
                 lambda request=request: self._verdict.request == request,  # type: ignore[misc]
                 'the planner gave no verdict')

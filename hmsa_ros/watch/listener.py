@@ -11,23 +11,18 @@ from dataclasses import dataclass, field
 import math
 from time import monotonic
 from typing import Any
-from uuid import uuid4
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import numpy as np
-import rclpy
-from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
-from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState, MagneticField
 from trajectory_msgs.msg import JointTrajectory
 
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.middleware import prepare_middleware
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import from_time
+from hmsa_ros.nodes.visitor import leave, visit
 from hmsa_ros.watch.scene import History, Joint, Report, Request, Scene
 
 # Of the samples since the last look no more than these are kept: all of them at 1 kHz.
@@ -90,18 +85,9 @@ class Listener:
         """Create a node of our own in a context of our own."""
         self._wanted = tuple(joints)
         self._span = span
-        prepare_middleware()
-        self._context = rclpy.Context()
-        # Signals stay Python's.
-        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        try:
-            self._node: Node = rclpy.create_node(
-                f'watch_{uuid4().hex[:8]}', namespace=namespace, context=self._context,
-                enable_rosout=False, start_parameter_services=False)
-        except Exception as error:  # rclpy has several classes for a bad name
-            rclpy.try_shutdown(context=self._context)
-            raise BadInputError(f'namespace {namespace!r}: {error}') from error
-        self._domain = int(self._context.get_domain_id())
+        self._node = visit(
+            'watch', namespace, enable_rosout=False, start_parameter_services=False)
+        self._domain = int(self._node.context.get_domain_id())
         self._samples = self._subscribe(interface.JOINT_STATES, _SAMPLE_QOS, raw=True)
         self._status = self._subscribe(interface.STATUS)
         self._plan = self._subscribe(interface.PLAN)
@@ -127,8 +113,7 @@ class Listener:
 
     def __exit__(self, *_: object) -> None:
         """Leave the graph."""
-        self._node.destroy_node()
-        rclpy.try_shutdown(context=self._context)
+        leave(self._node)
 
     def _subscribe(
             self, topic: interface.Topic, qos: QoSProfile | None = None, *,
