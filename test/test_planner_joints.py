@@ -171,7 +171,7 @@ class Rig:
                         for x in planner.plan.levels[planner._unsent:]) == 0
                     for planner in self.planner._group.planners.values()),
                 'what is due')
-            sent = self.planner._sent
+            sent = self.planner._sent + self.planner._beats
             self.spin(
                 lambda sent=sent: sum(
                     x.received for x in self.drivers.values()) >= sent,
@@ -452,6 +452,35 @@ def test_late_command_is_noticed_and_the_rest_planned_anew(rig):
     planner.run(START + LEAD + 4 * SPELL)
     planner.verdict(state='at_rest', setpoint=3, setpoints=3, stretch='1.4', plan=1)
     assert driver.residual(1.4) < 0.2 * RESIDUAL
+
+
+def test_commands_that_come_late_together_change_nothing_and_are_found_out(rig):
+    slender = replace(paper_actuator(), damping_coefficient=1e-3)
+    planner = rig('-p', f'actuator.damping_coefficient:={slender.damping_coefficient}')
+    driver = planner.driver
+    driver.actuator, driver.plant = slender, ActuatorSimulation(slender, time=START)
+    planner.send(to_trajectory([(1.2, SPELL)], 'actuator'))
+    planner.run(START + 3 * MS)
+    driver.hold_back = True
+    planner.run(START + LEAD + 20 * MS)
+    driver.release()
+    driver.advance(planner.now)
+    # Both commands of the new plan, which ends at the level in force.
+    driver.hold_back = True
+    planner.verdict(code='replanned', replanned=1)
+    told = len(driver.told)
+    planner.run(planner.now + LEAD + 30 * MS)
+    assert len({from_command(x)[1] for x in driver.held}) == 2
+    driver.release()
+    driver.advance(planner.now)
+    assert len(driver.told) == told
+    assert driver.residual(1.2) > 0.01
+    planner.ros.set_parameters('planner', [Parameter('heartbeat_period', value=0.02)])
+    while int(planner.values()['replanned']) < 2:
+        planner.run(planner.now + 4 * MS)
+    planner.run(planner.now + LEAD + 40 * MS)
+    assert driver.residual(1.2) < 0.2 * RESIDUAL
+    assert int(planner.values()['replanned']) == 2
 
 
 def test_lead_time_too_short_is_told_once_and_not_planned_for_again_and_again(rig):

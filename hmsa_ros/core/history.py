@@ -48,9 +48,35 @@ class History:
     sent: int = 1
     known: int = 0
 
+    def unheard(self, now: int) -> int:
+        """
+        Count levels that never took effect, although that cannot have been told.
+
+        What is told are changes. Commands that come so late that they apply all at once make
+        none if the last of them is the level in force: those before it never were.
+
+        Parameters
+        ----------
+        now : int
+            Time in ns up to which everything has been told.
+
+        Returns
+        -------
+        int
+            How many levels after the last one known, up to one that is the same.
+
+        """
+        levels, first = self.levels, self.known + 1
+        for i in reversed(range(first, self.sent)):
+            if (levels[i].stamp <= now
+                    and _same(levels[i].flux_density, levels[self.known].flux_density)
+                    and self._changes(range(first, i + 1))):
+                return i + 1 - first
+        return 0
+
     def without(self, start: int, end: int) -> 'History':
         """
-        Take levels out that will not be handed out.
+        Take levels out that never were in force, and never will be.
 
         Parameters
         ----------
@@ -64,7 +90,8 @@ class History:
 
         """
         levels = self.levels[:start] + self.levels[end:]
-        return replace(self, levels=predicted(levels, start))
+        handed = max(min(self.sent, end) - start, 0)
+        return replace(self, levels=predicted(levels, start), sent=self.sent - handed)
 
     def with_news(
             self, stamp: int, flux_density: float,

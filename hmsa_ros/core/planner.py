@@ -522,6 +522,31 @@ class Planner:
             self._remember(self._history.without(self._unsent, end))
         return missed
 
+    def unheard(self, now: int) -> int | None:
+        """
+        Look for changes of level that never took effect, although nobody told.
+
+        Parameters
+        ----------
+        now : int
+            Time in ns up to which everything that took effect has been told.
+
+        Returns
+        -------
+        int or None
+            Stamp of the last of them in ns, for `drop_unheard`.
+
+        """
+        history = self._history
+        count = history.unheard(now)
+        return history.levels[history.known + count].stamp if count else None
+
+    def drop_unheard(self, stamp: int) -> None:
+        """Take out of the plan what `unheard` has found."""
+        history = self._history
+        first = history.known + 1
+        self._remember(history.without(first, first + history.unheard(stamp)))
+
     def applied(self, stamp: int, flux_density: float, tolerance: int) -> Deviation | None:
         """
         Take into the timeline a change of level that has taken effect.

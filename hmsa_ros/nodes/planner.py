@@ -73,8 +73,10 @@ class PlannerNode(ManagedNode):
         self._take_over: TakeOver | None = None
         self._waiting: list[tuple[_Request, str]] = []
         self._engaged = False
-        # Joints whose plan reality has left.
+        # Joints whose plan reality has left, and those of which that is suspected: the stamp of
+        # what should have been told of.
         self._astray: set[str] = set()
+        self._unheard: dict[str, int] = {}
         self._wake: int | None = None
         self._tell_late, self._tell_foreign, self._tell_replanned = Seldom(), Seldom(), Seldom()
         self._steps = StepWatch()
@@ -395,6 +397,7 @@ class PlannerNode(ManagedNode):
         if not self._engaged or not self.active:
             return
         now = self._now()
+        self._look_for_unheard(now)
         for name, planner in self._group.planners.items():
             level = planner.last_sent
             due = planner.next_due
@@ -406,6 +409,26 @@ class PlannerNode(ManagedNode):
                 continue
             self._channels[name].send(stamp, level, self._settings['frame_id'])
             self._beats += 1
+
+    def _look_for_unheard(self, now: int) -> None:
+        """Find plans that reality has left without a word; news may be as late as commands."""
+        if not self._settings['replan_late']:
+            return
+        before, self._unheard = self._unheard, {}
+        for name, planner in self._group.planners.items():
+            if self._channels[name].applied is None:
+                # Nobody tells.
+                continue
+            stamp = planner.unheard(now - planner.options.lead_time)
+            if stamp is None:
+                continue
+            if before.get(name) != stamp:
+                # It may wait to be read.
+                self._unheard[name] = stamp
+                continue
+            planner.drop_unheard(stamp)
+            self._astray.add(name)
+            self._poll_soon()
 
     def _set_heartbeat(self) -> None:
         period = nanoseconds(self._settings['heartbeat_period'])
