@@ -256,7 +256,6 @@ class Soak:
 
     def __init__(self, folder: Path, domain: int, seed: int, factor: float) -> None:
         """Start plant and planner."""
-        from benchmarks.faults.inputs import input_topics
         from benchmarks.faults.rig import Rig
 
         self.result = Result()
@@ -281,8 +280,8 @@ class Soak:
         self._start('planner')
         self.rig.ready('planner')
         self._take_up_time()
-        self._topics = [
-            (topic, owner, self.rig.publisher(topic, owner)) for topic, owner in input_topics()]
+        self._topics: list[tuple[Any, Any]] = []
+        self._publish_inputs()
 
     def __enter__(self) -> 'Soak':
         """Return the soak."""
@@ -341,13 +340,18 @@ class Soak:
             return
         self._looked = monotonic()
         hours = self.seconds / _HOUR
+        gone = []
         for name, child in self._children.items():
             if child.alive:
                 self.result.memory[name].append(Sample(
                     hours, self._lives[name], hours - self._born[name],
                     *used(child.popen.pid)))
-            elif name != 'recorder':
+            else:
                 self.result.ended.append(f'{name} with status {child.popen.returncode}')
+                gone.append(name)
+        for name in gone:
+            del self._children[name]
+            if name != 'recorder':
                 self._start(name)
 
     def _pass(self, seconds: float, act: Callable[[], None] | None = None) -> None:
@@ -392,9 +396,9 @@ class Soak:
         if kind == 'rough':
             self._put_right()
         self._pass(2.0 * _LEAD_SECONDS)
-        if victim != 'recorder':
-            self.result.statuses.append(self._children['recorder'].end())
-        del self._children['recorder']
+        recorder = self._children.pop('recorder', None)
+        if recorder is not None:
+            self.result.statuses.append(recorder.end())
         for name in [x for x in self.rig.diagnostics if x.startswith('recorder')]:
             del self.rig.diagnostics[name]
         self._checks.append(self._pool.submit(check_bag, bag, kind, victim))
@@ -410,6 +414,7 @@ class Soak:
 
         """
         self.result.broken.append(why)
+        self._publish_inputs()
         for child in self._children.values():
             child.end(signal.SIGKILL)
         self._children.clear()
@@ -425,7 +430,7 @@ class Soak:
         return False
 
     def _kill(self, name: str) -> None:
-        self._children[name].end(signal.SIGKILL)
+        self._children.pop(name).end(signal.SIGKILL)
         if name == 'planner':
             self._start(name)
         elif name == 'plant':
@@ -465,7 +470,7 @@ class Soak:
         if not calm and self._dice.random() < 0.95:
             # A little of it goes a long way: each message is a jump of time.
             topics = [x for x in topics if x[0] != interface.CLOCK_TOPIC]
-        topic, _, publisher = self._dice.choice(topics)
+        topic, publisher = self._dice.choice(topics)
         made = garbage.message if self._dice.random() < 0.5 else garbage.encoding
         # What the middleware itself does not take never arrives.
         with suppress(Exception):
@@ -516,10 +521,20 @@ class Soak:
             self._asked.append((client, client.call_async(request)))
             self.result.calls += 1
 
+    def _publish_inputs(self) -> None:
+        """Create publishers for garbage; latched garbage of those before is gone with them."""
+        from benchmarks.faults.inputs import input_topics
+
+        for _, publisher in self._topics:
+            self.rig.node.destroy_publisher(publisher)
+        self._topics = [
+            (topic, self.rig.publisher(topic, owner)) for topic, owner in input_topics()]
+
     def _put_right(self) -> None:
         """Undo what garbage may have set."""
         from hmsa_ros.nodes import interface
 
+        self._publish_inputs()
         rig = self.rig
         # Nobody is asked who is not there.
         self._looked = 0.0

@@ -333,6 +333,35 @@ def test_files_are_split_by_service_and_by_size(record, ros):
         assert sum(1 for _ in other.messages()) == 1000
 
 
+def test_garbage_on_the_clock_is_left_aside(record, ros):
+    recorder = record('use_sim_time:=true')
+    clock = ros.node.create_publisher(
+        Clock, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    message = Clock()
+    message.clock.sec = 100
+
+    def ignored(garbage, count):
+        clock.publish(garbage)
+        return int(recorder.says('clock_ignored') or 0) >= count
+
+    ros.spin_until(lambda: ignored(b'\x00\x01\x00\x00\x07', 1), 'the broken message')
+    known = int(recorder.says('clock_ignored'))
+    before = Clock()
+    before.clock.sec = -5
+    ros.spin_until(lambda: ignored(before, known + 100), 'the time before the epoch')
+    publisher = ros.node.create_publisher(Float64, '/a', 10)
+
+    def ticks():
+        message.clock.nanosec += 1
+        clock.publish(message)
+        return publisher.get_subscription_count()
+
+    ros.spin_until(ticks, 'the recorder to listen')
+    publisher.publish(Float64(data=1.0))
+    recorder.wait_for('received', '1')
+    assert values(recorder.end()) == [1.0]
+
+
 def test_simulated_time_is_waited_for_and_stamped(record, ros):
     recorder = record('use_sim_time:=true')
     clock = ros.node.create_publisher(

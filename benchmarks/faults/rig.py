@@ -319,10 +319,7 @@ class Rig:
                 'the planner')
         # What is sent before two nodes have found each other is lost. They found us, and a
         # second round of diagnostics later, at least a second, each other.
-        begin = {x: self._rounds(x) for x in names}
-        self.spin_until(
-            lambda: all(self._rounds(x) >= begin[x] + 2 for x in names),
-            'diagnostics of ' + ', '.join(names))
+        self._await_diagnostics(names)
 
     def traces(self) -> list[str]:
         """
@@ -478,11 +475,15 @@ class Rig:
             Nodes to hear of.
 
         """
-        begin = {x: self._rounds(x) for x in nodes}
-        # The first may have been on its way already.
-        self.spin_until(
-            lambda: all(self._rounds(x) >= begin[x] + 2 for x in nodes),
-            'diagnostics of ' + ', '.join(nodes))
+        self._await_diagnostics(nodes)
+
+    def _await_diagnostics(self, nodes: Sequence[str]) -> None:
+        """Wait for two rounds of diagnostics: the first may have been on its way already."""
+        ends = {x: self._rounds(x) + 2 for x in nodes}
+        for node, end in ends.items():
+            self.spin_until(
+                lambda node=node, end=end: self._rounds(node) >= end,  # type: ignore[misc]
+                f'diagnostics of {node}')
 
     # -- what is done --------------------------------------------------------------------------
 

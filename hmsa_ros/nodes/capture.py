@@ -353,7 +353,7 @@ class SimulatedTime:
     jumps : int
         How often time has jumped back.
     ignored : int
-        Messages of other publishers than the one that is followed.
+        Messages of other publishers than the one that is followed, and such as tell no time.
 
     """
 

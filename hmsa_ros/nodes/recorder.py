@@ -39,6 +39,7 @@ from hmsa_ros.bag.writer import BagWriter, parse_custom_data, PRESETS, Topic
 from hmsa_ros.errors import BadInputError, BagError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.capture import Capture, RawSubscription, SimulatedTime, Taken
+from hmsa_ros.nodes.conversions import from_time
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.parameters import declare, ParameterSpec
 from hmsa_ros.nodes.qos import stored, subscription
@@ -435,8 +436,13 @@ class Recorder(ManagedNode):
         clock = self._sim_time
         if clock is not None and taken[0][0] is clock:
             for message in taken[0][1]:
-                stamp = deserialize_message(message.data, ClockMessage).clock
-                now = stamp.sec * 10**9 + stamp.nanosec
+                try:
+                    now = from_time(deserialize_message(message.data, ClockMessage).clock)
+                except Exception:  # rclpy has a class of its own for what it cannot read
+                    now = -1
+                if now < 0:
+                    clock.ignored += 1
+                    continue
                 before = clock.add(message.received_ns, now, message.publisher)
                 if before is not None:
                     # What came before the jump belongs to the file so far.
