@@ -28,8 +28,7 @@ def setpoint(text: str) -> tuple[float, float]:
     """
     stretches, span = setpoint_of_joints(text)
     if len(stretches) > 1:
-        raise argparse.ArgumentTypeError(
-            f'{text!r}: expected STRETCH:SPAN, two numbers such as 1.10:10')
+        raise _no_setpoint(text)
     return stretches[0], span
 
 
@@ -68,6 +67,10 @@ def setpoint_of_joints(text: str) -> tuple[tuple[float, ...], float]:
     except BadInputError as error:
         raise argparse.ArgumentTypeError(f'{text!r}: {error}') from error
     except ValueError:
-        raise argparse.ArgumentTypeError(
-            f'{text!r}: expected STRETCH:SPAN, two numbers such as 1.10:10') from None
+        raise _no_setpoint(text) from None
     return tuple(x.stretch for x in found), found[0].span
+
+
+def _no_setpoint(text: str) -> argparse.ArgumentTypeError:
+    return argparse.ArgumentTypeError(
+        f'{text!r}: expected STRETCH:SPAN, two numbers such as 1.10:10')
