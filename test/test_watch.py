@@ -1,10 +1,12 @@
 """The live view: what it shows of which scene, and the whole of it on a terminal."""
 
+from contextlib import suppress
 from dataclasses import replace
 import fcntl
 import json
 import os
 import pty
+import random
 import re
 import select
 import signal
@@ -292,6 +294,50 @@ def test_each_joint_has_its_own_target_command_and_history(ros, ros_env, wait_un
         report, = seen[-1].reports
         assert (report.name, report.level, report.counts) == ('planner', 1, {'late': 3})
         assert seen[-1].request.setpoints == 2
+
+
+@pytest.mark.ros
+def test_garbage_on_its_topics_neither_ends_nor_misleads_it(ros, ros_env, wait_until):
+    from benchmarks.faults import garbage
+    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+    from sensor_msgs.msg import JointState
+    from trajectory_msgs.msg import JointTrajectory
+
+    from hmsa_ros.nodes import interface
+    from hmsa_ros.nodes.conversions import to_command
+    from hmsa_ros.watch.listener import Listener
+
+    dice = random.Random(7)
+    topics = [
+        (kind, ros.node.create_publisher(kind, name, qos)) for name, kind, qos in (
+            ('joint_states', JointState, 1000), ('diagnostics', DiagnosticArray, 1000),
+            ('planner/status', DiagnosticStatus, interface.LATCHED),
+            ('planner/plan', JointTrajectory, interface.LATCHED),
+            ('flux_density_command', type(to_command(0, 0.0, '')), 1000))]
+    screen = Screen(span=10.0, unicode=True)
+    with Listener(span=10.0) as listener:
+        def aside():
+            for kind, publisher in topics:
+                for made in (garbage.message, garbage.encoding):
+                    # What the middleware itself does not take never arrives.
+                    with suppress(Exception):
+                        publisher.publish(made(kind, dice))
+            # What it is made for, with values that are wild.
+            topics[1][1].publish(DiagnosticArray(status=[DiagnosticStatus(
+                name='planner: \x1b[2J', message='\x1b]0;mine\x07', level=bytes([255]),
+                values=[KeyValue(key='late', value=dice.choice(('²', '9' * 5000, '7')))])]))
+            seen = listener.look()
+            for text in (line(seen), *(x.plain for x in screen.lines(seen, 100, 30))):
+                assert text.isprintable()
+            json.dumps(as_json(seen), allow_nan=False)
+            return {name for name in ('joint_states', 'diagnostics', 'status', 'plan', 'command')
+                    if any(f'{name} left aside' in x for x in seen.waiting)}
+
+        names = wait_until(lambda: len(found := aside()) == 5 and found)
+        assert len(names) == 5
+        good = JointState(name=['finger'], position=[1.25], velocity=[0.0], effort=[0.01])
+        topics[0][1].publish(good)
+        wait_until(lambda: {x.name: x for x in listener.look().joints}['finger'].stretch == 1.25)
 
 
 @pytest.mark.ros

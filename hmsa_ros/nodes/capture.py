@@ -17,7 +17,10 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
 from rclpy.type_support import check_is_valid_msg_type
+
+from hmsa_ros.errors import BadInputError
 
 # Taken from one subscription before the next has its turn.
 _BATCH = 2000
@@ -37,6 +40,36 @@ class Taken(NamedTuple):
     sequence: int
     publisher: bytes
     data: bytes
+
+
+def decode(data: bytes, message_type: type[Any]) -> Any:
+    """
+    Return the message that a payload holds.
+
+    Parameters
+    ----------
+    data : bytes
+        As received.
+    message_type : type
+        Message class.
+
+    Returns
+    -------
+    object
+        Of that class.
+
+    Raises
+    ------
+    BadInputError
+        If it holds none.
+
+    """
+    try:
+        return deserialize_message(data, message_type)
+    except Exception as error:  # rclpy raises errors of several unrelated classes here
+        why = str(error).partition(', at ')[0]
+        raise BadInputError(
+            f'{len(data)} bytes cannot be read as {message_type.__name__}: {why}') from error
 
 
 class _Allocator(ctypes.Structure):

@@ -6,14 +6,13 @@ message, which rclpy does not tell and `hmsa_ros.nodes.capture` does.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 from rclpy.node import Node
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import MagneticField
 
+from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import interface
-from hmsa_ros.nodes.capture import RawSubscription
+from hmsa_ros.nodes.capture import decode, RawSubscription
 
 #: Obey every publisher, or only the one that was seen first, until it is gone.
 COMMAND_SOURCES = ('any', 'first')
@@ -143,11 +142,11 @@ class CommandInput:
 
     def _obey(self, data: bytes) -> None:
         try:
-            message: Any = deserialize_message(data, self._topic.type)
-        except Exception as error:  # rclpy raises errors of several unrelated classes here
+            message = decode(data, self._topic.type)
+        except BadInputError as error:
             self.unreadable += 1
             self._node.get_logger().error(
-                f'message on {self._topic.name} cannot be read: {error}',
+                f'message on {self._topic.name} left aside: {error}',
                 throttle_duration_sec=60.0)
             return
         self._take(message)

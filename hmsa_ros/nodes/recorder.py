@@ -26,7 +26,6 @@ from rcl_interfaces.msg import ParameterEvent
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.serialization import deserialize_message
 from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Trigger
@@ -38,7 +37,7 @@ from hmsa_ros.bag.recording import Limits, lost_by_topic, Message, Recording, St
 from hmsa_ros.bag.writer import BagWriter, parse_custom_data, PRESETS, Topic
 from hmsa_ros.errors import BadInputError, BagError
 from hmsa_ros.nodes import interface
-from hmsa_ros.nodes.capture import Capture, RawSubscription, SimulatedTime, Taken
+from hmsa_ros.nodes.capture import Capture, decode, RawSubscription, SimulatedTime, Taken
 from hmsa_ros.nodes.conversions import from_time
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.parameters import declare, ParameterSpec
@@ -437,8 +436,8 @@ class Recorder(ManagedNode):
         if clock is not None and taken[0][0] is clock:
             for message in taken[0][1]:
                 try:
-                    now = from_time(deserialize_message(message.data, ClockMessage).clock)
-                except Exception:  # rclpy has a class of its own for what it cannot read
+                    now = from_time(decode(message.data, ClockMessage).clock)
+                except BadInputError:
                     now = -1
                 if now < 0:
                     clock.ignored += 1

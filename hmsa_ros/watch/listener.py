@@ -6,21 +6,21 @@ so that a thousand samples a second wake nobody up.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 import math
+import re
 from time import monotonic
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import numpy as np
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import JointState, MagneticField
-from trajectory_msgs.msg import JointTrajectory
+from sensor_msgs.msg import JointState
 
 from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.errors import BadInputError, printable
 from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.capture import decode, RawSubscription, Taken
 from hmsa_ros.nodes.conversions import from_time
 from hmsa_ros.nodes.visitor import leave, visit
 from hmsa_ros.watch.scene import History, Joint, Report, Request, Scene
@@ -39,15 +39,45 @@ _DISCOVERY_SECONDS = 1.5
 # Samples that stay away for so long are waited for, and the window of their rate.
 _QUIET_SECONDS = 2.0
 _RATE_SECONDS = 1.0
-# Reports of nodes that have ended are dropped after a while.
+# Reports of nodes that have ended, and of messages left aside, are dropped after a while.
 _FORGET_SECONDS = 30.0
+
+
+# What a counter looks like.
+_COUNT = re.compile('[0-9]{1,18}')
+
+
+@dataclass
+class _Source:
+    """A subscription, and what arrived on it that could not be read."""
+
+    topic: str
+    kind: type[Any]
+    subscription: RawSubscription
+    unreadable: int = 0
+    complaint: str = ''
+    complained: float = -math.inf
+
+    def read(self, taken: Iterable[Taken]) -> Iterator[Any]:
+        """Yield the messages that can be read."""
+        for one in taken:
+            try:
+                yield decode(one.data, self.kind)
+            except BadInputError as error:
+                self.unreadable += 1
+                self.complaint = str(error)
+                self.complained = monotonic()
+
+    def new(self) -> Iterator[Any]:
+        """Yield the messages that have arrived and can be read."""
+        return self.read(self.subscription.take())
 
 
 @dataclass
 class _Commands:
     """Commands of one joint, until they apply."""
 
-    subscription: Any
+    source: _Source
     ahead: dict[int, float] = field(default_factory=dict)
     in_force: float = math.nan
 
@@ -88,7 +118,8 @@ class Listener:
         self._node = visit(
             'watch', namespace, enable_rosout=False, start_parameter_services=False)
         self._domain = int(self._node.context.get_domain_id())
-        self._samples = self._subscribe(interface.JOINT_STATES, _SAMPLE_QOS, raw=True)
+        self._sources: list[_Source] = []
+        self._samples = self._subscribe(interface.JOINT_STATES, _SAMPLE_QOS)
         self._status = self._subscribe(interface.STATUS)
         self._plan = self._subscribe(interface.PLAN)
         self._diagnostics = self._subscribe(interface.DIAGNOSTICS, _REPORT_QOS)
@@ -113,23 +144,17 @@ class Listener:
 
     def __exit__(self, *_: object) -> None:
         """Leave the graph."""
+        for source in self._sources:
+            source.subscription.destroy()
         leave(self._node)
 
-    def _subscribe(
-            self, topic: interface.Topic, qos: QoSProfile | None = None, *,
-            raw: bool = False) -> Any:
-        return self._node.create_subscription(
-            topic.type, interface.from_outside(topic.name, interface.PLANNER), lambda _: None,
-            qos or topic.qos, raw=raw)
-
-    @staticmethod
-    def _drain(
-            subscription: Any, kind: type[Any], *, raw: bool = False
-    ) -> Iterator[tuple[Any, Any]]:
-        """Take what has arrived."""
-        with subscription.handle:
-            while (taken := subscription.handle.take_message(kind, raw)) is not None:
-                yield taken
+    def _subscribe(self, topic: interface.Topic, qos: QoSProfile | None = None) -> _Source:
+        name = interface.from_outside(topic.name, interface.PLANNER)
+        source = _Source(
+            self._node.resolve_topic_name(name), topic.type,
+            RawSubscription(self._node, topic.type, name, qos or topic.qos))
+        self._sources.append(source)
+        return source
 
     def look(self) -> Scene:
         """
@@ -168,36 +193,36 @@ class Listener:
     def _look_at_graph(self) -> None:
         node = self._node
         self._senders = {
-            'samples': node.count_publishers(self._samples.topic_name),
-            'planner': node.count_publishers(self._status.topic_name)}
+            'samples': node.count_publishers(self._samples.topic),
+            'planner': node.count_publishers(self._status.topic)}
         space = node.get_namespace().rstrip('/')
         end = f'/{interface.FLUX_DENSITY_COMMAND.name}'
         for name, _ in node.get_topic_names_and_types():
             if name.startswith(f'{space}/') and name.endswith(end):
                 joint = name[len(space):-len(end)].strip('/')
                 if '/' not in joint and joint not in self._commands:
-                    self._commands[joint] = _Commands(node.create_subscription(
-                        MagneticField, name, lambda _: None, _REPORT_QOS))
+                    self._commands[joint] = _Commands(self._subscribe(
+                        replace(interface.FLUX_DENSITY_COMMAND, name=name), _REPORT_QOS))
 
     def _take_planner(self) -> None:
-        for message, _ in self._drain(self._plan, JointTrajectory):
-            self._planned_joints = tuple(message.joint_names)
+        for message in self._plan.new():
+            self._planned_joints = tuple(printable(x) for x in message.joint_names)
             start = from_time(message.header.stamp)
             times = [from_time(x.time_from_start) for x in message.points]
             self._plan_span = (start, start + max(times)) if times else None
-        for message, _ in self._drain(self._status, DiagnosticStatus):
-            values = {x.key: x.value for x in message.values}
+        for message in self._status.new():
+            values = {printable(x.key): printable(x.value) for x in message.values}
             # One joint has no name there; of several each has its own.
             self._targets = {
-                key.rpartition('.')[0] or message.hardware_id: _number(value)
+                key.rpartition('.')[0] or printable(message.hardware_id): _number(value)
                 for key, value in values.items() if key.rpartition('.')[2] == 'stretch'}
             self._request = Request(
-                message.level[0], message.message, values.get('code', ''),
+                message.level[0], printable(message.message), values.get('code', ''),
                 values.get('state', ''), _whole(values.get('setpoint')),
                 _whole(values.get('setpoints')))
 
     def _take_samples(self, now: float) -> None:
-        arrived = list(self._drain(self._samples, JointState, raw=True))
+        arrived = self._samples.subscription.take()
         if not arrived:
             if now - self._arrived > _QUIET_SECONDS:
                 self._rate, self._counted = math.nan, None
@@ -205,12 +230,13 @@ class Listener:
         # Of many joints not every sample can be read in passing.
         every = max(1, math.ceil(len(arrived) * len(self._joints) / _MOST_READ))
         taken: dict[tuple[str, ...], list[JointState]] = {}
-        for data, _ in arrived[::-1][::every][::-1]:
-            message = deserialize_message(data, JointState)
-            taken.setdefault(tuple(message.name), []).append(message)
+        for message in self._samples.read(arrived[::-1][::every][::-1]):
+            taken.setdefault(tuple(printable(x) for x in message.name), []).append(message)
+            self._stamp = from_time(message.header.stamp)
+        if not taken:
+            return
         self._arrived = now
-        self._stamp = from_time(message.header.stamp)
-        number = int(arrived[-1][1].get('publication_sequence_number') or 0)
+        number = arrived[-1].sequence
         if self._counted is None or number < self._counted[1]:
             self._counted = now, number
         elif now - self._counted[0] >= _RATE_SECONDS:
@@ -239,7 +265,7 @@ class Listener:
 
     def _take_commands(self) -> None:
         for name, commands in self._commands.items():
-            for message, _ in self._drain(commands.subscription, MagneticField):
+            for message in commands.source.new():
                 commands.take(from_time(message.header.stamp), message.magnetic_field.z)
             value = commands.at(self._stamp)
             joint = self._joints.get(name or self._only_joint())
@@ -254,16 +280,16 @@ class Listener:
         return ''
 
     def _take_reports(self, now: float) -> None:
-        for message, _ in self._drain(self._diagnostics, DiagnosticArray):
+        for message in self._diagnostics.new():
             for status in message.status:
-                name = status.name.partition(':')[0].strip().rpartition('/')[2]
+                name = printable(status.name.partition(':')[0].strip().rpartition('/')[2])
                 # A robot's diagnostics are of many other things.
                 if name not in interface.NODES and status.hardware_id not in self._joints:
                     continue
-                counts = {x.key: int(x.value) for x in status.values
-                          if '.' not in x.key and x.value.isdigit()}
+                counts = {printable(x.key): int(x.value) for x in status.values
+                          if '.' not in x.key and _COUNT.fullmatch(x.value)}
                 self._heard[name, status.name, status.hardware_id] = now, Report(
-                    name, status.level[0], status.message, counts)
+                    name, status.level[0], printable(status.message), counts)
         self._heard = {
             key: (when, report) for key, (when, report) in self._heard.items()
             if now - when <= _FORGET_SECONDS}
@@ -309,13 +335,17 @@ class Listener:
         elif now - self._arrived > _QUIET_SECONDS:
             quiet = now - max(self._arrived, self._begin)
             sentences.append(
-                f'nothing on {self._samples.topic_name} for {quiet:.0f} s: is the plant paused?')
+                f'nothing on {self._samples.topic} for {quiet:.0f} s: is the plant paused?')
         elif not shown:
             sentences.append(
-                f'no joint {" or ".join(self._wanted)} on {self._samples.topic_name}: it has '
+                f'no joint {" or ".join(self._wanted)} on {self._samples.topic}: it has '
                 + ', '.join(list(self._joints)[:8]))
         if not self._senders['planner']:
             sentences.append(f'no planner seen {where}: {mend}')
+        sentences += [
+            f'{x.unreadable} messages on {x.topic} left aside ({x.complaint}): end the program '
+            'that publishes them, or remap its topic'
+            for x in self._sources if now - x.complained < _FORGET_SECONDS]
         return sentences
 
 
@@ -327,4 +357,4 @@ def _number(text: str) -> float:
 
 
 def _whole(text: str | None) -> int:
-    return int(text) if text and text.isdigit() else 0
+    return int(text) if text and _COUNT.fullmatch(text) else 0
