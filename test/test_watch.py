@@ -298,11 +298,11 @@ def test_each_joint_has_its_own_target_command_and_history(ros, ros_env, wait_un
 
 @pytest.mark.ros
 def test_garbage_on_its_topics_neither_ends_nor_misleads_it(ros, ros_env, wait_until):
-    from benchmarks.faults import garbage
     from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
     from sensor_msgs.msg import JointState
     from trajectory_msgs.msg import JointTrajectory
 
+    from benchmarks.faults import garbage
     from hmsa_ros.nodes import interface
     from hmsa_ros.nodes.conversions import to_command
     from hmsa_ros.watch.listener import Listener
