@@ -22,6 +22,8 @@ from typing import Any, ClassVar
 from hypothesis import HealthCheck, settings
 import pytest
 
+from hmsa_ros.middleware import PROFILES
+
 ROOT = Path(__file__).resolve().parent.parent
 # Limit of every wait: generous, since it is only reached when a test fails.
 WAIT_SECONDS = 60.0
@@ -142,6 +144,8 @@ def ros_env(
     settings = {
         'ROS_DOMAIN_ID': str(ros_domain_id),
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        # What is lost before a match is made comes again at once, from the tests' nodes too.
+        PROFILES: str(ROOT / 'hmsa_ros' / 'fastdds.xml'),
         'ROS_LOG_DIR': str(tmp_path_factory.mktemp('ros_log')),
         'PYTHONPATH': os.pathsep.join(
             [str(ROOT), *filter(None, [os.environ.get('PYTHONPATH')])]),

@@ -2,6 +2,7 @@
 
 from dataclasses import fields, replace
 import json
+import math
 import re
 import time
 
@@ -110,8 +111,12 @@ def test_a_second_plant_moves_the_same_when_the_bag_is_played(
     assert max(moved) - min(moved) > 1e-3
 
 
-def write_joints(folder, densities, *, told=None, space='', lost=None):
-    """Write a run of several joints of one plant that differ in density."""
+def write_joints(folder, densities, *, told=None, space='', lost=None, strange=()):
+    """
+    Write a run of several joints of one plant that differ in density.
+
+    ``strange`` are more messages: nanoseconds from the begin, topic, payload.
+    """
     actuators = {joint: replace(paper_actuator(), density=density)
                  for joint, density in densities.items()}
     told = told or densities
@@ -145,7 +150,19 @@ def write_joints(folder, densities, *, told=None, space='', lost=None):
                 message.velocity.append(simulation.rate)
                 message.effort.append(simulation.flux_density)
             writer.write([(states, time, 0, k, serialize_message(message))])
+        for after, name, payload in strange:
+            number = states if name == 'joint_states' else topic(
+                name, 'sensor_msgs/msg/MagneticField')
+            writer.write([(number, BEGIN + after, 0, 0, payload)])
     return folder
+
+
+def sample(stretch=1.0, *, seconds=0, joint='one', effort=0.0):
+    """Return a sample of a joint as a payload, stamped seconds from the begin."""
+    message = JointState(name=[joint], position=[stretch], velocity=[0.0], effort=[effort])
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(
+        BEGIN + seconds * 10**9, 10**9)
+    return serialize_message(message)
 
 
 def test_several_joints_of_several_namespaces_are_told_apart(tmp_path):
@@ -167,6 +184,35 @@ def test_lost_commands_are_named_beside_the_difference(tmp_path):
     assert one.note == ('the recorder lost messages, 3 of /one/flux_density_command: expected '
                         'differences from there on')
     assert two.note == ''
+
+
+def test_messages_of_something_else_are_left_out_and_counted(tmp_path):
+    not_along_z = to_command(BEGIN + 100, 0.1, 'coil')
+    not_along_z.magnetic_field.x = 1.0
+    strange = [
+        (50, 'joint_states', sample()[:-5]),
+        (51, 'joint_states', sample(joint='somebody')),
+        (52, 'joint_states', sample(seconds=2 * 10**8)),
+        (53, 'joint_states', sample(seconds=-10**9)),
+        (0, 'one/flux_density_command', serialize_message(to_command(0, math.nan, ''))),
+        (0, 'one/flux_density_command', serialize_message(to_command(BEGIN + 9, 1e300, ''))),
+        (90, 'one/flux_density_command', serialize_message(not_along_z)),
+        (91, 'one/flux_density_command', serialize_message(to_command(0, -1e300, '')))]
+    found, = verify(write_joints(tmp_path / 'a', {'one': 900.0}, strange=strange))
+    assert found.largest_difference < SAME
+    assert (found.sample_count, found.left_out) == (200, len(strange))
+    assert found.note.startswith(f'left out: {len(strange)} of the messages, for example since ')
+    # What may be a sample of the joint is held against the motion.
+    found, = verify(write_joints(
+        tmp_path / 'b', {'one': 900.0}, strange=[(50, 'joint_states', sample(1.5))]))
+    assert (found.largest_difference, found.left_out) == (pytest.approx(0.5), 0)
+
+
+def test_where_most_cannot_be_used_there_is_no_verdict(tmp_path):
+    # The rest does not follow from a first sample of another time.
+    strange = [(-1, 'joint_states', sample(seconds=10**9))]
+    with pytest.raises(BadInputError, match=r'stamped -1e\+09 s from the one before it'):
+        verify(write_joints(tmp_path / 'a', {'one': 900.0}, strange=strange))
 
 
 def test_several_rounds_in_one_bag_are_refused_with_a_way_out(tmp_path):

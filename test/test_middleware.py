@@ -82,7 +82,8 @@ def test_who_has_profiles_of_his_own_keeps_them(monkeypatch):
 def test_what_a_busy_reader_misses_comes_again_sooner_than_by_default(start, wait_until):
     reader = start.python('-c', READER)
     reader.wait_for_output('reads')
-    writers = [start.python('-c', WRITER, name) for name in ('default', 'ours')]
+    writers = [
+        start.python('-c', WRITER, name, **{PROFILES: ''}) for name in ('default', 'ours')]
     for writer in writers:
         writer.wait_for_output('ready')
     reader.popen.send_signal(signal.SIGSTOP)

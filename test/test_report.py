@@ -145,16 +145,22 @@ def simulated(
     return messages
 
 
-def write(folder, messages, *, chunk_size=2**20, **custom_data):
-    """Write a bag as this package's recorder does."""
+def payload(message, kind):
+    """Return a message as it is stored; bytes are stored as they are."""
+    return message if isinstance(message, bytes) else bytes(STORE.serialize_cdr(message, kind))
+
+
+def write(folder, messages, *, chunk_size=2**20, definitions=(), **custom_data):
+    """Write a bag as this package's recorder does, but for some types' definitions."""
     with BagWriter(folder, custom_data=custom_data, chunk_size=chunk_size) as writer:
         numbers = {}
         for _, topic, kind, _ in messages:
             if topic not in numbers:
                 encoding, text = message_definition(kind)
+                text = dict(definitions).get(kind, text)
                 numbers[topic] = writer.add_topic(Topic(topic, kind, text, encoding))
         writer.write(
-            (numbers[topic], time, time, i, bytes(STORE.serialize_cdr(message, kind)))
+            (numbers[topic], time, time, i, payload(message, kind))
             for i, (time, topic, kind, message) in enumerate(
                 sorted(messages, key=lambda x: x[0])))
     return folder
@@ -592,6 +598,63 @@ def test_broken_samples_and_commands_are_left_out_and_told(tmp_path):
     notes = ' '.join(part.run.notes)
     assert '1 samples are not finite' in notes
     assert '1 commands are not finite or not along z' in notes
+
+
+def test_garbage_among_the_messages_does_not_spoil_the_rest(tmp_path):
+    messages = simulated()
+    clean = one(tmp_path / 'clean', messages, **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    names = {topic: kind for _, topic, kind, _ in messages}
+    late = messages[-1][0] + 1
+    strange = [(late, topic, kind, payload(message, kind)[:-9]) for topic, kind, message in (
+        next((topic, kind, x[3]) for x in messages if x[1] == topic)
+        for topic, kind in names.items())]
+    strange += [(START + 10, '/joint_states', TYPES[JOINT_STATES], x) for x in (
+        joint_state(-10**9 * NANOSECONDS, 1.0, 0.0, 0.0), joint_state(START + 5, 1e300, 0.0, 0.0),
+        joint_state(START + 7, -1e9, 0.0, 0.0), joint_state(START + 9, 1.0, 1e300, 0.0))]
+    # Long before all others, it supersedes nothing; nobody can be at these stretches.
+    strange += [(START - 1, '/planner/plan', TYPES[PLAN], trajectory(START - 5, [
+        (0, -1e300, 0.0, 0.0), (1, 1e-320, 0.0, 0.0)]))]
+    part = one(tmp_path / 'bag', messages + strange,
+               **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    assert asdict(part.evaluation.results[1]) == pytest.approx(
+        asdict(clean.evaluation.results[1]), rel=1e-9, abs=1e-12)
+    assert len(part.run.time) == len(clean.run.time) + 1
+    assert np.max(np.abs(part.run.rate)) < 1e3
+    notes = ' '.join(part.run.notes)
+    for topic in names:
+        assert f'a message of topic {topic} does not decode' in notes
+    assert '1 samples are stamped more than 30 days away' in notes
+    assert '2 samples are not finite numbers, or beyond 1e+06' in notes
+    assert '1 stretch rates were not recorded' in notes
+    assert 'NaN' not in Page(page([part])).scripts[0][1]
+
+
+def test_a_plan_without_a_point_is_no_plan(tmp_path):
+    messages = [*without(simulated(), 'plan'), (
+        START, '/planner/plan', TYPES[PLAN], trajectory(START, []))]
+    part = one(tmp_path / 'bag', messages, **parameters(plant=ACTUATOR))
+    assert plan_points(part.run, part.evaluation) == []
+    assert Page(page([part])).ids
+
+
+def of_another_definition(folder, role):
+    """Write a run, one type of which is something else in it."""
+    setpoint = STORE.types[TYPES[SETPOINT]](data=1.1)
+    return write(
+        folder, [*simulated(), (START, '/planner/setpoint', TYPES[SETPOINT], setpoint)],
+        definitions={TYPES[role]: 'uint8 something\n'}, **parameters(plant=ACTUATOR))
+
+
+@pytest.mark.parametrize('role', [COMMAND, PLAN, TRAJECTORY, SETPOINT, STATUS])
+def test_a_type_of_another_definition_is_told(tmp_path, role):
+    run, = read_runs(of_another_definition(tmp_path / 'bag', role))
+    assert f'a message of topic /{role} is not as {TYPES[role]} is defined in ROS 2' in ' '.join(
+        run.notes)
+
+
+def test_samples_of_another_definition_are_no_run(tmp_path):
+    with pytest.raises(BadInputError, match='holds no message: .*; a message of topic /joint_st'):
+        read_runs(of_another_definition(tmp_path / 'bag', JOINT_STATES))
 
 
 def test_a_clock_that_jumps_back_is_told(tmp_path):

@@ -13,6 +13,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState, MagneticField
 
+from hmsa_ros.middleware import prepare_middleware
+
 SECOND = 1_000_000_000
 COMMAND_TIMEOUT = 1 * SECOND  # without a word from the planner the coil is switched off
 COIL_LIMIT = 0.5  # T
@@ -106,6 +108,7 @@ def main() -> None:
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
+    prepare_middleware()  # what gets lost is sent again at once
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = CoilDriver()
     executor = SingleThreadedExecutor()

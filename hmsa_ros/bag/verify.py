@@ -6,10 +6,10 @@ of the stretch must come out again. Where the plant has told which levels took e
 these are integrated, so that late, refused and repeated commands and its watchdog are accounted
 for; recorded disturbing forces are applied too. Measurement noise is not: it is the difference
 that is left. One bag may hold plants in several namespaces, and each of
-them several joints.
+them several joints. Messages that are not what their topic is for are left out, and counted.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 import json
 import math
@@ -20,7 +20,7 @@ from hmsa_ros.bag import limits
 from hmsa_ros.bag.experiment import parameters_of
 from hmsa_ros.bag.info import lost_messages
 from hmsa_ros.bag.reader import BagReader
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.errors import BadInputError, BagError, HmsaError
 
 if TYPE_CHECKING:
     # Numba comes along with it, which other commands on bags have no use for.
@@ -31,6 +31,8 @@ APPLIED = 'flux_density_applied'
 FORCE = 'disturbance_force'
 STATES = 'joint_states'
 _NANOSECONDS = 1_000_000_000
+# Samples further from the last one than this are of another run, or garbage; in ns.
+_LARGEST_LEAP = 3600 * _NANOSECONDS
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,8 @@ class Verification:
         Time of it after the first sample, in seconds.
     note : str
         Why the motion cannot come out exactly, empty if it must.
+    left_out : int
+        Messages that could not be used, since they are not what their topic is for.
 
     """
 
@@ -64,6 +68,7 @@ class Verification:
     largest_difference: float
     where: float
     note: str = ''
+    left_out: int = 0
 
 
 @dataclass(frozen=True)
@@ -150,81 +155,139 @@ def _stamp(message: Any) -> int:
 
 
 def _command(pair: _Pair, command: Any) -> tuple[int, float]:
-    """Return stamp and flux density of a command."""
+    """Return stamp and flux density of a command that a plant would obey."""
     try:
-        return _stamp(command), float(command.magnetic_field.z)
+        field = command.magnetic_field
+        stamp, x, y, z = _stamp(command), float(field.x), float(field.y), float(field.z)
     except (AttributeError, TypeError, ValueError):
         raise BadInputError(
             f'a message of {pair.commands} is no command: expected sensor_msgs/msg/'
             'MagneticField') from None
+    if not math.isfinite(z) or x != 0.0 or y != 0.0:
+        raise BadInputError(
+            f'a message of {pair.commands} is ({x:g}, {y:g}, {z:g}) T: expected a finite field '
+            'along z')
+    return stamp, z
+
+
+class _Replay:
+    """An actuator that is driven anew by what was recorded of it."""
+
+    def __init__(self, pair: _Pair, custom_data: Mapping[str, str]) -> None:
+        self._pair = pair
+        self._custom_data = custom_data
+        self._simulation: ActuatorSimulation | None = None
+        # What takes effect, by stamp, and what is known before the first sample.
+        self._applied: list[tuple[int, float]] = []
+        self._ahead: list[tuple[int, float]] = []
+        self._forces: list[tuple[int, float]] = []
+        self._first = 0
+        self.samples = self.commands = self.late = 0
+        self.largest, self.where = 0.0, 0
+        # Why messages were left out, by topic.
+        self.complaints: dict[str, list[str]] = {}
+
+    def leave_out(self, topic: str, error: HmsaError) -> None:
+        """Count a message that cannot be used."""
+        self.complaints.setdefault(topic, []).append(str(error))
+
+    def applied(self, message: Any) -> None:
+        """Take what took effect; all of it is known before the rest is taken."""
+        self._applied.append(_command(self._pair, message))
+        self._applied.sort(key=lambda x: x[0])
+
+    def command(self, message: Any) -> None:
+        """Take a command, which counts where nobody told what took effect."""
+        stamp, flux_density = _command(self._pair, message)
+        if self._applied:
+            self.commands += 1
+        elif self._simulation is None:
+            self._ahead.append((stamp, flux_density))
+        else:
+            self.late += self._simulation.command(
+                stamp or self._simulation.time, flux_density) > 0
+            self.commands += 1
+
+    def force(self, message: Any) -> None:
+        """Take a disturbing force."""
+        stamp, newton = _force(self._pair.beside(FORCE), message)
+        if self._simulation is None:
+            self._forces.append((stamp, newton))
+        else:
+            self._simulation.force(stamp or self._simulation.time, newton)
+
+    def sample(self, message: Any) -> None:
+        """Take a sample: begin with it, or hold it against the motion so far."""
+        stamp, stretch, rate, effort = _sample(self._pair, message)
+        if self._simulation is None:
+            self._simulation = self._begun(stamp, stretch, rate, effort)
+            self._first = stamp
+        else:
+            leap = stamp - self._simulation.time
+            if abs(leap) > _LARGEST_LEAP:
+                raise BadInputError(
+                    f'a message of {self._pair.states} is stamped {leap / _NANOSECONDS:+g} s '
+                    'from the one before it: expected one run')
+            self._simulation.advance(stamp)
+            difference = abs(self._simulation.stretch - stretch)
+            if difference > self.largest or math.isnan(difference):
+                self.largest, self.where = difference, stamp - self._first
+        self.samples += 1
+
+    def _begun(self, stamp: int, stretch: float, rate: float, effort: float) -> Any:
+        """Return the simulation as it is at the first sample."""
+        simulation = _start(self._custom_data, self._pair, stamp)
+        # What had taken effect by then is in force; a slow coil may still be on its way there.
+        past = [level for at, level in self._applied if at <= stamp]
+        simulation.set_state(stretch, rate, effort, past[-1] if past else None)
+        for at, level in self._applied or self._ahead:
+            try:
+                if at > stamp:
+                    simulation.command(at, level)
+                self.commands += not self._applied
+            except BadInputError as error:
+                self.leave_out(self._pair.commands, error)
+        for at, newton in self._forces:
+            try:
+                simulation.force(at, newton)
+            except BadInputError as error:
+                self.leave_out(self._pair.beside(FORCE), error)
+        return simulation
 
 
 def _verify(reader: BagReader, pair: _Pair) -> Verification:
     """Compare one actuator."""
-    states, commands, force = pair.states, pair.commands, pair.beside(FORCE)
-    decoders = {
-        topic: reader.decoder(topic) for topic in (states, commands, force)
-        if topic in reader.topics}
-    simulation: ActuatorSimulation | None = None
-    applied = _applied(reader, pair)
-    ahead: list[tuple[int, float]] = list(applied)
-    forces: list[tuple[int, float]] = []
-    samples = count = late = 0
-    largest, where, first = 0.0, 0, 0
-    for message in reader.messages(tuple(decoders)):
-        decoded = decoders[message.topic](message.data)
-        if message.topic == commands:
-            stamp, flux_density = _command(pair, decoded)
-            count += 1
-            if applied:
-                continue
-            if simulation is None:
-                ahead.append((stamp, flux_density))
-            else:
-                late += simulation.command(stamp or simulation.time, flux_density) > 0
-            continue
-        if message.topic == force:
-            stamp, newton = _force(force, decoded)
-            if simulation is None:
-                forces.append((stamp, newton))
-            else:
-                simulation.force(stamp or simulation.time, newton)
-            continue
-        stamp, stretch, rate, effort = _sample(pair, decoded)
-        samples += 1
-        if simulation is None:
-            first = stamp
-            simulation = _start(reader.custom_data, pair, stamp)
-            # What had taken effect by the first sample is in force with it; a slow coil may
-            # still be on its way there.
-            past = [level for at, level in applied if at <= stamp]
-            simulation.set_state(stretch, rate, effort, past[-1] if past else None)
-            for at, level in ahead:
-                if at > stamp:
-                    simulation.command(at, level)
-            for at, newton in forces:
-                simulation.force(at, newton)
-            continue
-        simulation.advance(stamp)
-        difference = abs(simulation.stretch - stretch)
-        if difference > largest or math.isnan(difference):
-            largest, where = difference, stamp - first
-    if simulation is None:
-        raise BadInputError(f'topic {states} of {reader.path} has no message: expected samples '
-                            'of the stretch')
+    replay = _Replay(pair, reader.custom_data)
+
+    def take(handlers: Mapping[str, Callable[[Any], None]]) -> None:
+        decoders = {x: reader.decoder(x) for x in handlers if x in reader.topics}
+        for message in reader.messages(tuple(decoders)):
+            try:
+                handlers[message.topic](decoders[message.topic](message.data))
+            except (BagError, BadInputError) as error:
+                replay.leave_out(message.topic, error)
+
+    take({pair.beside(APPLIED): replay.applied})
+    take({pair.states: replay.sample, pair.commands: replay.command,
+          pair.beside(FORCE): replay.force})
+    states, commands = (
+        replay.complaints.get(x, []) for x in (pair.states, pair.commands))
+    # A few that are not what they should be do not spoil the rest.
+    if len(states) > replay.samples:
+        raise BadInputError(states[0])
+    if commands and not replay.commands:
+        raise BadInputError(commands[0])
+    if not replay.samples:
+        raise BadInputError(f'topic {pair.states} of {reader.path} has no message: expected '
+                            'samples of the stretch')
+    left_out = sum(map(len, replay.complaints.values()))
+    notes = [_note(reader.custom_data, pair)]
+    if left_out:
+        notes.append(f'left out: {left_out} of the messages, for example since '
+                     f'{next(iter(replay.complaints.values()))[0]}')
     return Verification(
-        states, commands, samples, count, late, largest, where * 1e-9,
-        _note(reader.custom_data, pair))
-
-
-def _applied(reader: BagReader, pair: _Pair) -> list[tuple[int, float]]:
-    """Return what took effect, as far as the plant has told it, by stamp."""
-    topic = pair.beside(APPLIED)
-    if topic not in reader.topics:
-        return []
-    decode = reader.decoder(topic)
-    found = [_command(pair, decode(x.data)) for x in reader.messages((topic,))]
-    return sorted(found, key=lambda x: x[0])
+        pair.states, pair.commands, replay.samples, replay.commands, replay.late,
+        replay.largest, replay.where * 1e-9, '; '.join(filter(None, notes)), left_out)
 
 
 def _force(topic: str, message: Any) -> tuple[int, float]:

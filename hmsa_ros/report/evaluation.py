@@ -417,10 +417,13 @@ def _measure(
 def _predict(run: Run, plan: Sequence[Level]) -> tuple[Array, Array]:
     """Return what the plan predicts for the samples: stretch and rate, from point to point."""
     predicted = np.full((2, len(run.time)), np.nan)
-    if not plan:
-        return predicted[0], predicted[1]
     actuator: ActuatorParameters = run.planner
     material = actuator.nondimensional
+    lower, upper = stretch_limits(material.j_lim)
+    # No block can be where the others are; a message of anything may have been recorded.
+    plan = [x for x in plan if lower < x.stretch < upper]
+    if not plan:
+        return predicted[0], predicted[1]
     slew = run.number('planner.slew_limit') / actuator.flux_density_unit * actuator.time_unit
     load = float(elastic_force(plan[0].stretch, material.j_lim))
     for i, point in enumerate(plan):
@@ -496,10 +499,11 @@ def plan_points(run: Run, evaluation: Evaluation) -> list[PlanPoint]:
     """
     commanded = {x.stamp: x.flux_density for x in evaluation.levels}
     stretch, rate = evaluation.predicted
+    # Of each point the first sample, and behind the last point the end.
     firsts = [int(np.searchsorted(run.time, x.stamp)) for x in evaluation.plan]
+    firsts.append(len(run.time))
     points = []
-    for point, first, until in zip(
-            evaluation.plan, firsts, [*firsts[1:], len(run.time)], strict=True):
+    for point, first, until in zip(evaluation.plan, firsts, firsts[1:], strict=False):
         values = [math.nan] * 5
         if first < until:
             values = [float(x[first]) for x in (stretch, rate, run.stretch, run.rate)]

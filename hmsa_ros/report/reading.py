@@ -8,6 +8,7 @@ bag may come from this package's recorder, from rosbag2, from a simulated plant 
 from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 import json
 import math
 from pathlib import Path
@@ -53,6 +54,10 @@ _DEFAULT_JOINT = 'actuator'
 _OF_A_JOINT = (COMMAND, APPLIED, SETPOINT)
 # Samples may overtake one another on their way; further back goes only a clock, in ns.
 _CLOCK_JUMP = 100_000_000
+# A sample whose stamp is this far from the others' is of another sender, or garbage; in ns.
+_FAR = 30 * 86_400 * NANOSECONDS
+# What lies beyond is no motion of a block, and nothing could be drawn beside it; the rate in 1/s.
+_LARGEST_STRETCH, _LARGEST_RATE = 1e6, 1e12
 # Between two calls of the progress.
 _PROGRESS_MESSAGES = 20_000
 _LITTLE_ENDIAN = b'\x00\x01'
@@ -294,7 +299,8 @@ def read_runs(
                 except BadInputError as error:
                     reasons.append(error)
     if not runs:
-        raise reasons[0]
+        # What was left out may be the reason.
+        raise BadInputError('; '.join([str(reasons[0]), *notes[:1]]))
     return runs
 
 
@@ -357,6 +363,50 @@ def _topics_in(
     return topics
 
 
+@dataclass(frozen=True)
+class _Point:
+    """A point of a trajectory: time from its start in ns, and values by joint."""
+
+    time: int
+    positions: tuple[float, ...]
+    velocities: tuple[float, ...]
+    effort: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _Trajectory:
+    """A request or a plan as it was received, with its stamp in ns."""
+
+    sent: int
+    joints: tuple[str, ...]
+    stamp: int
+    points: tuple[_Point, ...]
+
+    @classmethod
+    def of(cls, sent: int, message: Any) -> '_Trajectory':
+        """Take it from a message."""
+        return cls(sent, tuple(message.joint_names), _ns(message.header.stamp), tuple(
+            _Point(_ns(x.time_from_start), *(
+                tuple(map(float, y)) for y in (x.positions, x.velocities, x.effort)))
+            for x in message.points))
+
+
+@dataclass(frozen=True)
+class _Status:
+    """What the planner said, as it was received."""
+
+    sent: int
+    level: int
+    message: str
+    values: dict[str, str]
+
+    @classmethod
+    def of(cls, sent: int, message: Any) -> '_Status':
+        """Take it from a message."""
+        level = message.level[0] if isinstance(message.level, bytes) else int(message.level)
+        return cls(sent, level, message.message, {x.key: x.value for x in message.values})
+
+
 class _Collected:
     """What has been read of the actuators of one namespace so far."""
 
@@ -367,15 +417,26 @@ class _Collected:
         self.applied: dict[str, list[Level]] = {}
         self.refused: dict[str, int] = {}
         # Of all joints, as they were received.
-        self.plans: list[tuple[int, Any]] = []
-        self.trajectories: list[tuple[int, Any]] = []
+        self.plans: list[_Trajectory] = []
+        self.trajectories: list[_Trajectory] = []
         self.setpoints: dict[str, list[Request]] = {}
-        self.statuses: list[tuple[int, Any]] = []
+        self.statuses: list[_Status] = []
 
     def take(
             self, role: str, joint: str, message: Message,
             decode: Callable[[bytes], Any]) -> None:
-        """Take in a message."""
+        """Take in a message; raise BagError for one that is not what its topic is for."""
+        try:
+            self._take(role, joint, message, decode)
+        except (AttributeError, TypeError, ValueError, OverflowError) as error:
+            # The bag brings the definition along, and may call anything by that name.
+            raise BagError(
+                f'a message of topic {message.topic} is not as {TYPES[role]} is defined in ROS '
+                f'2: {error}') from error
+
+    def _take(
+            self, role: str, joint: str, message: Message,
+            decode: Callable[[bytes], Any]) -> None:
         if role == JOINT_STATES:
             self.samples.take(message.log_time, message.data)
             return
@@ -389,55 +450,51 @@ class _Collected:
             elif role == COMMAND:
                 self.refused[joint] = self.refused.get(joint, 0) + 1
         elif role == PLAN:
-            self.plans.append((sent, content))
+            self.plans.append(_Trajectory.of(sent, content))
         elif role == TRAJECTORY:
-            self.trajectories.append((sent, content))
+            self.trajectories.append(_Trajectory.of(sent, content))
         elif role == SETPOINT:
             self.setpoints.setdefault(joint, []).append(
                 Request(sent, 0, ((float(content.data), None),)))
         else:
-            self.statuses.append((sent, content))
+            self.statuses.append(_Status.of(sent, content))
 
     def _plans(self, joint: str) -> Iterable[tuple[Level, ...]]:
         """Return the plans of a joint, or of the one that they are of."""
-        for sent, content in self.plans:
-            place = _place(content.joint_names, joint)
+        for plan in self.plans:
+            place = _place(plan.joints, joint)
             if place is None:
                 continue
-            start = _ns(content.header.stamp)
             levels = [
-                Level(start + _ns(x.time_from_start), float(x.effort[place]), sent,
-                      float(x.positions[place]), float(x.velocities[place]))
-                for x in content.points
+                Level(plan.stamp + x.time, x.effort[place], plan.sent, x.positions[place],
+                      x.velocities[place])
+                for x in plan.points
                 if min(len(x.positions), len(x.velocities), len(x.effort)) > place]
             # Of several joints there is a point wherever one of them changes.
             yield tuple(
-                x for i, x in enumerate(levels) if i == 0 or len(content.joint_names) == 1
+                x for i, x in enumerate(levels) if i == 0 or len(plan.joints) == 1
                 or x.flux_density != levels[i - 1].flux_density)
 
     def _requests(self, joint: str, key: str) -> list[Request]:
         """Return what was asked of a joint, by time."""
         requests = list(self.setpoints.get(key, ()))
-        for sent, content in self.trajectories:
-            place = _place(content.joint_names, joint)
+        for asked in self.trajectories:
+            place = _place(asked.joints, joint)
             if place is not None:
-                requests.append(Request(sent, _ns(content.header.stamp), tuple(
-                    (float(x.positions[place]), _ns(x.time_from_start))
-                    for x in content.points
-                    if len(x.positions) == max(len(content.joint_names), 1))))
+                requests.append(Request(asked.sent, asked.stamp, tuple(
+                    (x.positions[place], x.time) for x in asked.points
+                    if len(x.positions) == max(len(asked.joints), 1))))
         return sorted(requests, key=lambda x: x.sent)
 
     def _verdicts(self, joint: str, joints: Sequence[str]) -> Iterable[Verdict]:
         """Return what the planner said, with the target of a joint."""
-        for sent, content in self.statuses:
-            values = {x.key: x.value for x in content.values}
+        for status in self.statuses:
             # Of several joints each has its own.
-            target = values.get(f'{joint}.stretch') if joint in joints and len(joints) > 1 \
-                else values.get('stretch')
-            level = content.level[0] if isinstance(content.level, bytes) else int(content.level)
+            target = status.values.get(f'{joint}.stretch') if joint in joints and len(joints) > 1 \
+                else status.values.get('stretch')
             yield Verdict(
-                sent, _LEVELS[min(level, 2)], values.get('code', ''), content.message,
-                _number(target))
+                status.sent, _LEVELS[min(status.level, 2)], status.values.get('code', ''),
+                status.message, _number(target))
 
     def finish(
             self, label: str, path: Path, summary: BagSummary, topics: dict[str, str],
@@ -446,7 +503,7 @@ class _Collected:
         """Return the run of one joint, whose topics have its name in them or not."""
         notes = list(notes)
         parameters = _parameters(custom_data, topics[JOINT_STATES][:-len(JOINT_STATES)])
-        planned = [x for _, content in self.plans for x in content.joint_names]
+        planned = [x for plan in self.plans for x in plan.joints]
         named = joint or next(iter(planned), '') or str(parameters.get('planner.joint', ''))
         time, logged, stretch, rate, flux_density = self.samples.arrays(
             f'{path}: {topics[JOINT_STATES]}', named, required=bool(joint))
@@ -587,9 +644,10 @@ class _SampleReader:
         columns = self._columns.get(shape)
         if columns is None:
             columns = self._columns[shape] = _Columns()
-        columns.times.extend((logged, stamp))
-        for values in numbers:
-            columns.numbers.extend(values)
+        # Both are made first: what cannot be kept leaves no half of it behind.
+        times, row = array('q', (logged, stamp)), array('d', chain.from_iterable(numbers))
+        columns.times.extend(times)
+        columns.numbers.extend(row)
 
     def arrays(
             self, where: str, joint: str, *, required: bool
@@ -664,6 +722,13 @@ class _SampleReader:
             stamps = logged.copy()
             self.notes.append(
                 'The samples carry no stamps: the times at which they were recorded are taken.')
+        near = np.abs(stamps - np.sort(stamps)[len(stamps) // 2]) < _FAR
+        if not np.all(near):
+            self.notes.append(
+                f'{np.count_nonzero(~near)} samples are stamped more than 30 days away from the '
+                'others: left out.')
+            stamps, logged = stamps[near], logged[near]
+            stretch, rate, flux_density = stretch[near], rate[near], flux_density[near]
         if np.any(np.diff(stamps) < -_CLOCK_JUMP):
             self.notes.append(
                 'The stamps of the samples jump back: the samples are sorted by stamp. Was the '
@@ -671,20 +736,25 @@ class _SampleReader:
         order = np.argsort(stamps, kind='stable')
         # Of samples with one stamp the first counts, so that time increases.
         order = order[np.append(True, np.diff(stamps[order]) > 0)]
-        good = order[np.isfinite(stretch[order])]
+        good = order[np.abs(stretch[order]) < _LARGEST_STRETCH]
         if len(good) < len(order):
             self.notes.append(
-                f'{len(order) - len(good)} samples are not finite numbers: left out.')
+                f'{len(order) - len(good)} samples are not finite numbers, or beyond '
+                f'{_LARGEST_STRETCH:g}: left out.')
         if not len(good):
             raise BadInputError(
                 f'{where} holds no finite position: expected the stretch as a number')
         stamps, logged, stretch, rate, flux_density = (
             x[good] for x in (stamps, logged, stretch, rate, flux_density))
-        if not np.all(np.isfinite(rate)):
+        missing = ~(np.abs(rate) < _LARGEST_RATE)
+        if np.any(missing):
+            which = 'Stretch rates' if np.all(missing) \
+                else f'{np.count_nonzero(missing)} stretch rates'
             self.notes.append(
-                'Stretch rates were not recorded: they are differences of the stretch.')
-            rate = np.gradient(stretch, (stamps - stamps[0]) / NANOSECONDS) \
+                f'{which} were not recorded: they are differences of the stretch.')
+            slope = np.gradient(stretch, (stamps - stamps[0]) / NANOSECONDS) \
                 if len(stamps) > 1 else np.zeros_like(stretch)
+            rate = np.where(missing, slope, rate)
         return stamps, logged, stretch, rate, flux_density
 
 
