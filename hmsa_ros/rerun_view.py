@@ -153,7 +153,7 @@ def _log_marker(recording: Any, root: str, marker: Any) -> None:
             centers=[[position.x, position.y, position.z]],
             sizes=[[marker.scale.x, marker.scale.y, marker.scale.z]], colors=[colour],
             fill_mode='solid'))
-    elif marker.type == _ARROW:
+    elif marker.type == _ARROW and len(marker.points) == 2:
         start, end = marker.points
         recording.log(path, rr.Arrows3D(
             origins=[[start.x, start.y, start.z]],
