@@ -1,6 +1,6 @@
 """Parameter records refuse what they cannot mean and survive what they can."""
 
-from dataclasses import fields, FrozenInstanceError
+from dataclasses import fields, FrozenInstanceError, replace
 import math
 
 import pytest
@@ -58,6 +58,14 @@ def test_whole_numbers_become_floats_and_stay(record, good, name):
 def test_a_whole_number_beyond_floats_is_refused(record, good, name):
     with pytest.raises(BadInputError, match=f'^{name} is '):
         record(**(good | {name: 10 ** 400}))
+
+
+@pytest.mark.parametrize(('name', 'value'), [
+    ('shear_modulus', 1e-320), ('shear_modulus', 1e308), ('remanence', 1e-300),
+    ('half_length', 1e-200), ('half_thickness', 1e300), ('density', 1e-310)])
+def test_parameters_that_no_equation_can_be_scaled_by_are_refused(name, value):
+    with pytest.raises(BadInputError, match=r'expected values of a block|expected a finite'):
+        replace(paper_actuator(), **{name: value})
 
 
 def test_the_scales_are_those_of_the_paper():

@@ -9,6 +9,8 @@ from scipy.constants import mu_0
 from hmsa_ros.errors import BadInputError
 
 _ZERO_ALLOWED = ('zeta', 'damping_coefficient')
+# Units and groups beyond this and its inverse are of no block, and overflow in the equations.
+_SMALLEST = 1e-100
 
 
 def _check(record: object) -> None:
@@ -95,8 +97,17 @@ class ActuatorParameters:
     damping_coefficient: float
 
     def __post_init__(self) -> None:
-        """Check the values."""
+        """Check the values, and that the equations can be scaled by them."""
         _check(self)
+        try:
+            scales = self.time_unit, self.flux_density_unit, self.nondimensional.c1
+        except ArithmeticError:
+            scales = math.nan, math.nan, math.nan
+        if not all(_SMALLEST < x < 1.0 / _SMALLEST for x in scales):
+            raise BadInputError(
+                f'the parameters of the actuator give a unit of time of {scales[0]:g} s, of flux '
+                f'density of {scales[1]:g} T and c1 of {scales[2]:g}: expected values of a block, '
+                'in SI units')
 
     @classmethod
     def from_nondimensional(

@@ -322,7 +322,8 @@ def _group(
             arrival += round(0.5 * period[hold] * NANOSECONDS)
         elif slew:
             change = abs(levels[hold].flux_density - levels[hold - 1].flux_density)
-            arrival += round(change / slew * NANOSECONDS)
+            # A bag may tell of any slew limit.
+            arrival += round(min(change / slew, 1e6) * NANOSECONDS)
         if arrival < min(end, last):
             moves.append(Move(target, stamp, arrival, end, tuple(
                 x.flux_density for x in levels[first:hold + 1])))

@@ -215,11 +215,12 @@ class Run:
         Returns
         -------
         float
-            0 if it was not recorded.
+            0 if it was not recorded, or as what it cannot be.
 
         """
         value = _of_joint(self.parameters, self.joint, name)
-        return float(value) if isinstance(value, (int, float)) else 0.0
+        return float(value) if isinstance(value, (int, float)) and 0.0 <= value < math.inf \
+            else 0.0
 
 
 def read_runs(
