@@ -637,12 +637,13 @@ def test_a_plan_without_a_point_is_no_plan(tmp_path):
     assert Page(page([part])).ids
 
 
-@pytest.mark.parametrize('text', ['NaN', '-1.0', 'Infinity', '"fast"', '1e-320'])
-def test_a_slew_limit_that_is_none_is_not_taken_for_one(tmp_path, text):
+@pytest.mark.parametrize(('text', 'reached'), [
+    ('NaN', [1.1, 1.2, 1.4]), ('-1.0', [1.1, 1.2, 1.4]), ('Infinity', [1.1, 1.2, 1.4]),
+    ('"fast"', [1.1, 1.2, 1.4]), ('1e-320', [])])
+def test_a_slew_limit_that_is_none_is_not_taken_for_one(tmp_path, text, reached):
     part = one(tmp_path / 'bag', simulated(), **parameters(planner=ACTUATOR, plant=ACTUATOR), **{
         'plant.slew_limit': text})
-    if text != '1e-320':
-        assert [x.stretch for x in part.evaluation.results] == [1.1, 1.2, 1.4]
+    assert [x.stretch for x in part.evaluation.results] == reached
     assert Page(page([part])).ids
 
 
