@@ -30,6 +30,13 @@ def sent(message):
     return deserialize_message(serialize_message(message), type(message))
 
 
+@pytest.mark.parametrize(('text', 'number'), [
+    ('12', 12), ('0', 0), ('', 0), (None, 0), ('-1', 0), ('1.5', 0), ('one', 0), ('\u00b2', 0),
+    ('9' * 5000, 0)])
+def test_a_status_of_anybody_tells_a_whole_number_or_none(text, number):
+    assert conversions.whole(text) == number
+
+
 @given(STAMPS)
 def test_stamp_survives_the_round_trip(stamp):
     message = sent(conversions.to_time(stamp))

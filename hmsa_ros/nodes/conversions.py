@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 import math
+import re
 from typing import TYPE_CHECKING
 
 from builtin_interfaces.msg import Duration, Time
@@ -19,6 +20,9 @@ from hmsa_ros.errors import BadInputError
 if TYPE_CHECKING:
     # Numba comes along with the planner, which a recorder has no use for.
     from hmsa_ros.core.planner import Plan
+
+# Anybody may send a status; Python refuses to read numbers of thousands of digits.
+_WHOLE = re.compile('[0-9]{1,18}')
 
 
 def to_time(nanoseconds: int) -> Time:
@@ -331,6 +335,11 @@ def to_status(
     return DiagnosticStatus(
         name=name, hardware_id=joint, level=level, message=message,
         values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
+
+
+def whole(text: str | None) -> int:
+    """Return the whole number that a status tells, 0 where it tells none."""
+    return int(text) if text and _WHOLE.fullmatch(text) else 0
 
 
 def to_diagnostics(stamp: int, *statuses: DiagnosticStatus) -> DiagnosticArray:

@@ -10,9 +10,9 @@ import numpy as np
 from rclpy.experimental.events_executor import EventsExecutor
 
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.errors import BadInputError, HmsaError, printable
 from hmsa_ros.nodes import interface
-from hmsa_ros.nodes.conversions import to_trajectory
+from hmsa_ros.nodes.conversions import to_trajectory, whole
 from hmsa_ros.nodes.visitor import leave, visit
 
 _SLICE_SECONDS = 0.05
@@ -64,11 +64,11 @@ class Verdict:
             Its content.
 
         """
-        values = {x.key: x.value for x in message.values}
+        values = {x.key: printable(x.value) for x in message.values}
         return cls(
-            message.level[0], message.message, values.get('code', ''),
+            message.level[0], printable(message.message), values.get('code', ''),
             values.get('request', ''), values.get('state', ''),
-            int(values.get('setpoint', 0)), int(values.get('setpoints', 0)))
+            whole(values.get('setpoint')), whole(values.get('setpoints')))
 
 
 _SILENCE = Verdict(0, 'no word of the planner yet', '', '', '', 0, 0)

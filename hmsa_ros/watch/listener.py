@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 import math
-import re
 from time import monotonic
 from typing import Any
 
@@ -21,7 +20,7 @@ from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError, printable
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.capture import decode, RawSubscription, Taken
-from hmsa_ros.nodes.conversions import from_time
+from hmsa_ros.nodes.conversions import from_time, whole
 from hmsa_ros.nodes.visitor import leave, visit
 from hmsa_ros.watch.scene import History, Joint, Report, Request, Scene
 
@@ -41,10 +40,6 @@ _QUIET_SECONDS = 2.0
 _RATE_SECONDS = 1.0
 # Reports of nodes that have ended, and of messages left aside, are dropped after a while.
 _FORGET_SECONDS = 30.0
-
-
-# What a counter looks like.
-_COUNT = re.compile('[0-9]{1,18}')
 
 
 @dataclass
@@ -218,8 +213,8 @@ class Listener:
                 for key, value in values.items() if key.rpartition('.')[2] == 'stretch'}
             self._request = Request(
                 message.level[0], printable(message.message), values.get('code', ''),
-                values.get('state', ''), _whole(values.get('setpoint')),
-                _whole(values.get('setpoints')))
+                values.get('state', ''), whole(values.get('setpoint')),
+                whole(values.get('setpoints')))
 
     def _take_samples(self, now: float) -> None:
         arrived = self._samples.subscription.take()
@@ -286,8 +281,8 @@ class Listener:
                 # A robot's diagnostics are of many other things.
                 if name not in interface.NODES and status.hardware_id not in self._joints:
                     continue
-                counts = {printable(x.key): int(x.value) for x in status.values
-                          if '.' not in x.key and _COUNT.fullmatch(x.value)}
+                counts = {printable(x.key): whole(x.value) for x in status.values
+                          if '.' not in x.key and x.value.isdigit()}
                 self._heard[name, status.name, status.hardware_id] = now, Report(
                     name, status.level[0], printable(status.message), counts)
         self._heard = {
@@ -354,7 +349,3 @@ def _number(text: str) -> float:
         return float(text)
     except ValueError:
         return math.nan
-
-
-def _whole(text: str | None) -> int:
-    return int(text) if text and _COUNT.fullmatch(text) else 0
