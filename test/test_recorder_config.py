@@ -7,6 +7,7 @@ import yaml
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import player, recorder
+from hmsa_ros.nodes.selection import Filter, Selection
 
 CONFIG = Path(__file__).resolve().parent.parent / 'config'
 
@@ -20,26 +21,26 @@ def test_the_file_lists_every_parameter_with_its_default(name, module):
 
 
 def test_topics_are_selected_by_name_expression_and_exclusion():
-    everything = recorder.Selection()
+    everything = Selection()
     assert everything.wants('/a')
     assert not everything.wants('/_hidden')
-    some = recorder.Selection(
+    some = Selection(
         topics=('/a', '/_b'), regex='^/x', exclude_topics=('/x1',), exclude_regex='2$')
     assert [name for name in ('/a', '/_b', '/b', '/x', '/x1', '/x2', '/_x') if some.wants(name)
             ] == ['/a', '/_b', '/x']
     with pytest.raises(BadInputError, match='expected a regular expression'):
-        recorder.Selection(regex='(')
+        Selection(regex='(')
 
 
 def test_commands_pass_only_by_name():
-    free = player.Filter()
+    free = Filter()
     assert free.passes('/left/flux_density_command')
     for topic in ('/left/flux_density_command', '/planner/joint_trajectory',
                   '/planner/setpoint'):
         assert free.withholds(topic)
-        assert player.Filter(regex='.*').withholds(topic)
-        assert not player.Filter(topics=(topic,)).withholds(topic)
-        assert not player.Filter(allow_commands=(topic,)).withholds(topic)
+        assert Filter(regex='.*').withholds(topic)
+        assert not Filter(topics=(topic,)).withholds(topic)
+        assert not Filter(allow_commands=(topic,)).withholds(topic)
     assert not free.withholds('/joint_states')
     with pytest.raises(BadInputError, match='expected a regular expression'):
-        player.Filter(exclude_regex='(')
+        Filter(exclude_regex='(')

@@ -217,7 +217,20 @@ class _Replay:
             self._simulation.force(stamp or self._simulation.time, newton)
 
     def sample(self, message: Any) -> None:
-        """Take a sample: begin with it, or hold it against the motion so far."""
+        """
+        Take a sample: begin with it, or hold it against the motion so far.
+
+        Parameters
+        ----------
+        message : object
+            As decoded.
+
+        Raises
+        ------
+        BadInputError
+            If it is no sample of the joint, or of another time.
+
+        """
         stamp, stretch, rate, effort = _sample(self._pair, message)
         if self._simulation is None:
             self._simulation = self._begun(stamp, stretch, rate, effort)

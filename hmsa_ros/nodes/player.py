@@ -4,8 +4,8 @@ Player: sends the messages of a bag again, at the spacing they were recorded wit
 The node's executor serves services and parameters. A thread sends: each message at its own
 place on an absolute schedule, so that no delay adds up. A second thread reads ahead.
 
-Commands move things. Topics that carry them (see `COMMAND_TOPICS`) are left out unless they
-are asked for by name, in ``play.topics_to_filter`` or ``play.allow_commands``.
+Commands move things. Topics that carry them (see `hmsa_ros.nodes.selection`) are left out unless
+they are asked for by name, in ``play.topics_to_filter`` or ``play.allow_commands``.
 
 As a managed node it opens the bag and offers its topics when it is configured, plays while it is
 active, and gives both up when it is cleaned up.
@@ -14,11 +14,8 @@ active, and gives both up when it is cleaned up.
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 import contextlib
-from dataclasses import dataclass
 from functools import partial
-from itertools import islice
 import os
-import re
 import sys
 import threading
 import time
@@ -35,19 +32,16 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Trigger
 
 from hmsa_ros.bag.limits import CHUNK_SIZE
+from hmsa_ros.bag.read_ahead import READ_AHEAD_BYTES, ReadAhead
 from hmsa_ros.bag.reader import BagReader, Message, TopicInfo
 from hmsa_ros.errors import BadInputError, BagError, HmsaError, printable
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.managed import ManagedNode
+from hmsa_ros.nodes.message_types import message_class
 from hmsa_ros.nodes.parameters import declare, ParameterSpec
 from hmsa_ros.nodes.qos import publisher
-from hmsa_ros.nodes.recorder import message_class
 from hmsa_ros.nodes.runner import run
-
-#: Last part of the names of topics that make something move.
-COMMAND_TOPICS = frozenset(
-    topic.name.rsplit('/', 1)[-1] for topic in (
-        interface.FLUX_DENSITY_COMMAND, interface.JOINT_TRAJECTORY, interface.SETPOINT))
+from hmsa_ros.nodes.selection import Filter
 
 DIAGNOSTICS_SECONDS = 1.0
 # A wait that can be woken ends this much early; the rest is slept, which is more exact.
@@ -55,11 +49,9 @@ _FINE_SECONDS = 0.01
 _POLL_SECONDS = 0.02
 _CLOCK_WHILE_WAITING_SECONDS = 0.1
 # Reliable messages that found the receiver's queue full are sent again when a heartbeat of
-# Fast DDS asks for them, every 3 s: the wait at the end has to last for several, in slices.
+# Fast DDS asks for them, with other profiles than ours every 3 s: the wait at the end has to
+# last for several, in slices.
 _ACKNOWLEDGED_SECONDS = 0.5
-_BATCH = 100
-# Read ahead at most, whatever the number of messages: they may be large.
-_READ_AHEAD_BYTES = 64 * 2**20
 # A loop over a bag of a single moment would send without pause.
 _SHORTEST_ROUND_SECONDS = 0.1
 # What a builtin_interfaces/Time can hold.
@@ -129,166 +121,6 @@ PARAMETERS = (
     ParameterSpec(
         'play.wait_acked_timeout.nsec', 0, 'Nanoseconds on top of them.', 'ns', 0, 999_999_999),
 )
-
-
-@dataclass(frozen=True)
-class Filter:
-    """
-    Which topics to send.
-
-    Attributes
-    ----------
-    topics, exclude_topics : tuple of str
-        Full names.
-    regex, exclude_regex : str
-        Regular expressions, empty for none.
-    allow_commands : tuple of str
-        Full names of command topics that may be sent too.
-
-    """
-
-    topics: tuple[str, ...] = ()
-    regex: str = ''
-    exclude_topics: tuple[str, ...] = ()
-    exclude_regex: str = ''
-    allow_commands: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        for name, pattern in (
-                ('play.regex_to_filter', self.regex),
-                ('play.exclude_regex_to_filter', self.exclude_regex)):
-            try:
-                re.compile(pattern)
-            except re.error as error:
-                raise BadInputError(
-                    f'parameter {name} is {pattern!r}: expected a regular expression '
-                    f'({error})') from error
-
-    def passes(self, topic: str) -> bool:
-        """
-        Return whether a topic is to be sent, commands apart.
-
-        Parameters
-        ----------
-        topic : str
-            Full name.
-
-        Returns
-        -------
-        bool
-            Exclusion comes first.
-
-        """
-        if topic in self.exclude_topics or (
-                self.exclude_regex and re.search(self.exclude_regex, topic)):
-            return False
-        if topic in self.topics or topic in self.allow_commands:
-            return True
-        if self.regex:
-            return re.search(self.regex, topic) is not None
-        return not self.topics
-
-    def withholds(self, topic: str) -> bool:
-        """
-        Return whether a topic is left out for being a command not asked for by name.
-
-        Parameters
-        ----------
-        topic : str
-            Full name.
-
-        Returns
-        -------
-        bool
-            A regular expression does not name it.
-
-        """
-        return (topic.rsplit('/', 1)[-1] in COMMAND_TOPICS
-                and topic not in self.topics and topic not in self.allow_commands)
-
-
-class _ReadAhead:
-    """
-    Reads messages in a thread.
-
-    Parameters
-    ----------
-    read : callable
-        Returns the messages; gets a function that says whether nobody wants more of them.
-    size : int
-        How many messages to keep ready.
-
-    """
-
-    def __init__(
-            self, read: Callable[[Callable[[], bool]], Iterator[Message]], size: int) -> None:
-        self._messages = read(lambda: self._ended)
-        self._size = size
-        self._condition = threading.Condition()
-        self._batches: deque[tuple[list[Message], int]] = deque()
-        self._count = 0
-        self._bytes = 0
-        self._ended = False
-        self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._run, name='read ahead', daemon=True)
-        self._thread.start()
-
-    def _run(self) -> None:
-        """Read until the end or until nobody wants more."""
-        try:
-            more = True
-            while more:
-                batch, size = [], 0
-                for message in islice(self._messages, min(_BATCH, self._size)):
-                    batch.append(message)
-                    size += len(message.data)
-                    if size > _READ_AHEAD_BYTES // 8:
-                        break
-                more = bool(batch)
-                with self._condition:
-                    self._condition.wait_for(lambda: self._ended or (
-                        self._count < self._size and self._bytes < _READ_AHEAD_BYTES))
-                    if self._ended:
-                        return
-                    if batch:
-                        self._batches.append((batch, size))
-                        self._count += len(batch)
-                        self._bytes += size
-                        self._condition.notify_all()
-        except BaseException as error:  # raised again where the messages are taken
-            self._error = error
-        finally:
-            with self._condition:
-                self._ended = True
-                self._condition.notify_all()
-
-    def __iter__(self) -> Iterator[Message]:
-        while True:
-            with self._condition:
-                self._condition.wait_for(lambda: self._batches or self._ended)
-                if not self._batches:
-                    if self._error is not None:
-                        raise self._error
-                    return
-                batch, size = self._batches.popleft()
-                self._count -= len(batch)
-                self._bytes -= size
-                self._condition.notify_all()
-            yield from batch
-
-    def wait(self, cancelled: Callable[[], bool]) -> None:
-        """Wait for the first messages, or the end if there are none or nobody waits."""
-        with self._condition:
-            while not (self._batches or self._ended or cancelled()):
-                self._condition.wait(_POLL_SECONDS)
-
-    def stop(self) -> None:
-        """Read no further."""
-        with self._condition:
-            self._ended = True
-            self._batches.clear()
-            self._condition.notify_all()
-        self._thread.join()
 
 
 class Player(ManagedNode):
@@ -551,7 +383,7 @@ class Player(ManagedNode):
     def _play(self, start: int) -> bool:
         """Play from a time on; return whether the end was reached."""
         while True:
-            source = _ReadAhead(
+            source = ReadAhead(
                 partial(self._read, start), self._values['play.read_ahead_queue_size'])
             try:
                 self._send_latched(start)
@@ -666,7 +498,7 @@ class Player(ManagedNode):
             latest.append(message)
             size += len(message.data)
             while len(latest) > depths[message.topic] or (
-                    size > _READ_AHEAD_BYTES and len(latest) > 1):
+                    size > READ_AHEAD_BYTES and len(latest) > 1):
                 size -= len(latest.popleft().data)
         for message in sorted((message for messages in kept.values() for message in messages),
                               key=lambda message: message.log_time):

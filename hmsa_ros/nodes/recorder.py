@@ -13,11 +13,9 @@ from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 import datetime
-from importlib import import_module
 import json
 import os
 from pathlib import Path
-import re
 import time
 from typing import Any
 
@@ -26,12 +24,11 @@ from rcl_interfaces.msg import ParameterEvent
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Trigger
 
 from hmsa_ros import __version__
-from hmsa_ros.bag.definitions import is_interface_package, message_definition, type_hash
+from hmsa_ros.bag.definitions import message_definition, type_hash
 from hmsa_ros.bag.qos import Qos
 from hmsa_ros.bag.recording import Limits, lost_by_topic, Message, Recording, Status
 from hmsa_ros.bag.writer import BagWriter, parse_custom_data, PRESETS, Topic
@@ -40,10 +37,12 @@ from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.capture import Capture, decode, RawSubscription, SimulatedTime, Taken
 from hmsa_ros.nodes.conversions import from_time
 from hmsa_ros.nodes.managed import ManagedNode
+from hmsa_ros.nodes.message_types import message_class, type_name_of
 from hmsa_ros.nodes.parameters import declare, ParameterSpec
 from hmsa_ros.nodes.qos import stored, subscription
 from hmsa_ros.nodes.remote_parameters import RemoteParameters
 from hmsa_ros.nodes.runner import run
+from hmsa_ros.nodes.selection import Selection
 
 DIAGNOSTICS_SECONDS = 1.0
 # Between being told to end and the last look at what has come.
@@ -119,65 +118,6 @@ PARAMETERS = (
 _SETPOINTS = {
     topic.name.rsplit('/', 1)[-1]: topic
     for topic in (interface.JOINT_TRAJECTORY, interface.SETPOINT)}
-
-
-@dataclass(frozen=True)
-class Selection:
-    """
-    Which topics to record.
-
-    Attributes
-    ----------
-    topics, exclude_topics : tuple of str
-        Full names.
-    all_topics : bool
-        Whether every topic that is not hidden is wanted.
-    regex, exclude_regex : str
-        Regular expressions, empty for none.
-
-    """
-
-    topics: tuple[str, ...] = ()
-    all_topics: bool = False
-    regex: str = ''
-    exclude_topics: tuple[str, ...] = ()
-    exclude_regex: str = ''
-
-    def __post_init__(self) -> None:
-        for name, pattern in (
-                ('record.regex', self.regex), ('record.exclude_regex', self.exclude_regex)):
-            try:
-                re.compile(pattern)
-            except re.error as error:
-                raise BadInputError(
-                    f'parameter {name} is {pattern!r}: expected a regular expression '
-                    f'({error})') from error
-
-    def wants(self, topic: str) -> bool:
-        """
-        Return whether a topic is to be recorded.
-
-        Parameters
-        ----------
-        topic : str
-            Full name.
-
-        Returns
-        -------
-        bool
-            A topic named in ``topics`` is wanted unless it is excluded.
-
-        """
-        if topic in self.exclude_topics or (
-                self.exclude_regex and re.search(self.exclude_regex, topic)):
-            return False
-        if topic in self.topics:
-            return True
-        if topic_or_service_is_hidden(topic):
-            return False
-        if self.regex and re.search(self.regex, topic):
-            return True
-        return self.all_topics or not (self.topics or self.regex)
 
 
 @dataclass
@@ -325,7 +265,7 @@ class Recorder(ManagedNode):
             if self._selection.wants(name):
                 self._look_at(name, types)
             topic = _SETPOINTS.get(name.rsplit('/', 1)[-1])
-            if topic is not None and _type_name(topic.type) in types and any(
+            if topic is not None and type_name_of(topic.type) in types and any(
                     name.startswith(f'{node}/') for node in self._followed):
                 self._follow_setpoints(topic, name)
         self._say_ready()
@@ -673,46 +613,6 @@ class Recorder(ManagedNode):
                 print(f'hmsa recorder: lost {count} of {name}', flush=True)
         if status.error and self.failure is None:
             self.failure = BagError(status.error)
-
-
-def _type_name(message_type: type[Any]) -> str:
-    """Return the name of a message class's type."""
-    package, folder, *_ = message_type.__module__.split('.')
-    return f'{package}/{folder}/{message_type.__name__}'
-
-
-def message_class(type_name: str) -> type[Any]:
-    """
-    Return the class of a message type.
-
-    Parameters
-    ----------
-    type_name : str
-        For example ``'std_msgs/msg/Float64'``.
-
-    Returns
-    -------
-    type
-        The class.
-
-    Raises
-    ------
-    BagError
-        If its package is not installed.
-
-    """
-    parts = type_name.split('/')
-    try:
-        package, folder, name = parts
-        # The name may come from anybody's bag: nothing but an interface is ever imported.
-        if folder not in ('msg', 'srv', 'action') or not is_interface_package(package):
-            raise ImportError(type_name)
-        message_class: type[Any] = getattr(import_module(f'{package}.{folder}'), name)
-    except (ValueError, ImportError, AttributeError) as error:
-        raise BagError(
-            f'message type {type_name} is not installed: expected its Python package; source '
-            'its workspace') from error
-    return message_class
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -426,7 +426,24 @@ class _Collected:
     def take(
             self, role: str, joint: str, message: Message,
             decode: Callable[[bytes], Any]) -> None:
-        """Take in a message; raise BagError for one that is not what its topic is for."""
+        """
+        Take in a message.
+
+        Parameters
+        ----------
+        role, joint : str
+            Which topic it is from.
+        message : Message
+            As stored.
+        decode : callable
+            Of the topic.
+
+        Raises
+        ------
+        BagError
+            If it is not what its topic is for.
+
+        """
         try:
             self._take(role, joint, message, decode)
         except (AttributeError, TypeError, ValueError, OverflowError) as error:

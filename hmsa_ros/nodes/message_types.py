@@ -1,0 +1,47 @@
+"""Message classes by the names of their types, and the other way round."""
+
+from importlib import import_module
+from typing import Any
+
+from hmsa_ros.bag.definitions import is_interface_package
+from hmsa_ros.errors import BagError
+
+
+def type_name_of(message_type: type[Any]) -> str:
+    """Return the name of a message class's type."""
+    package, folder, *_ = message_type.__module__.split('.')
+    return f'{package}/{folder}/{message_type.__name__}'
+
+
+def message_class(type_name: str) -> type[Any]:
+    """
+    Return the class of a message type.
+
+    Parameters
+    ----------
+    type_name : str
+        For example ``'std_msgs/msg/Float64'``.
+
+    Returns
+    -------
+    type
+        The class.
+
+    Raises
+    ------
+    BagError
+        If its package is not installed.
+
+    """
+    parts = type_name.split('/')
+    try:
+        package, folder, name = parts
+        # The name may come from anybody's bag: nothing but an interface is ever imported.
+        if folder not in ('msg', 'srv', 'action') or not is_interface_package(package):
+            raise ImportError(type_name)
+        message_class: type[Any] = getattr(import_module(f'{package}.{folder}'), name)
+    except (ValueError, ImportError, AttributeError) as error:
+        raise BagError(
+            f'message type {type_name} is not installed: expected its Python package; source '
+            'its workspace') from error
+    return message_class

@@ -1,0 +1,146 @@
+"""Which topics are recorded, and which are played."""
+
+from dataclasses import dataclass
+import re
+
+from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.nodes import interface
+
+#: Last part of the names of topics that make something move.
+COMMAND_TOPICS = frozenset(
+    topic.name.rsplit('/', 1)[-1] for topic in (
+        interface.FLUX_DENSITY_COMMAND, interface.JOINT_TRAJECTORY, interface.SETPOINT))
+
+
+def _check_expression(parameter: str, expression: str) -> None:
+    """Refuse what is no regular expression."""
+    try:
+        re.compile(expression)
+    except re.error as error:
+        raise BadInputError(
+            f'parameter {parameter} is {expression!r}: expected a regular expression '
+            f'({error})') from error
+
+
+@dataclass(frozen=True)
+class Selection:
+    """
+    Which topics to record.
+
+    Attributes
+    ----------
+    topics, exclude_topics : tuple of str
+        Full names.
+    all_topics : bool
+        Whether every topic that is not hidden is wanted.
+    regex, exclude_regex : str
+        Regular expressions, empty for none.
+
+    """
+
+    topics: tuple[str, ...] = ()
+    all_topics: bool = False
+    regex: str = ''
+    exclude_topics: tuple[str, ...] = ()
+    exclude_regex: str = ''
+
+    def __post_init__(self) -> None:
+        _check_expression('record.regex', self.regex)
+        _check_expression('record.exclude_regex', self.exclude_regex)
+
+    def wants(self, topic: str) -> bool:
+        """
+        Return whether a topic is to be recorded.
+
+        Parameters
+        ----------
+        topic : str
+            Full name.
+
+        Returns
+        -------
+        bool
+            A topic named in ``topics`` is wanted unless it is excluded.
+
+        """
+        if topic in self.exclude_topics or (
+                self.exclude_regex and re.search(self.exclude_regex, topic)):
+            return False
+        if topic in self.topics:
+            return True
+        if topic_or_service_is_hidden(topic):
+            return False
+        if self.regex and re.search(self.regex, topic):
+            return True
+        return self.all_topics or not (self.topics or self.regex)
+
+
+@dataclass(frozen=True)
+class Filter:
+    """
+    Which topics to send.
+
+    Attributes
+    ----------
+    topics, exclude_topics : tuple of str
+        Full names.
+    regex, exclude_regex : str
+        Regular expressions, empty for none.
+    allow_commands : tuple of str
+        Full names of command topics that may be sent too.
+
+    """
+
+    topics: tuple[str, ...] = ()
+    regex: str = ''
+    exclude_topics: tuple[str, ...] = ()
+    exclude_regex: str = ''
+    allow_commands: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        _check_expression('play.regex_to_filter', self.regex)
+        _check_expression('play.exclude_regex_to_filter', self.exclude_regex)
+
+    def passes(self, topic: str) -> bool:
+        """
+        Return whether a topic is to be sent, commands apart.
+
+        Parameters
+        ----------
+        topic : str
+            Full name.
+
+        Returns
+        -------
+        bool
+            Exclusion comes first.
+
+        """
+        if topic in self.exclude_topics or (
+                self.exclude_regex and re.search(self.exclude_regex, topic)):
+            return False
+        if topic in self.topics or topic in self.allow_commands:
+            return True
+        if self.regex:
+            return re.search(self.regex, topic) is not None
+        return not self.topics
+
+    def withholds(self, topic: str) -> bool:
+        """
+        Return whether a topic is left out for being a command not asked for by name.
+
+        Parameters
+        ----------
+        topic : str
+            Full name.
+
+        Returns
+        -------
+        bool
+            A regular expression does not name it.
+
+        """
+        return (topic.rsplit('/', 1)[-1] in COMMAND_TOPICS
+                and topic not in self.topics and topic not in self.allow_commands)
