@@ -826,8 +826,9 @@ def _trend_text(found: Trend) -> str:
     """Return a trend in words."""
     if not found.samples:
         return 'no process lived long enough to tell'
-    return (f'{found.slope / 2**20:+.3f} +- {found.error / 2**20:.3f} MiB an hour over '
-            f'{found.span:.2f} h, {"flat" if found.flat else "not flat"}')
+    return (f'{found.slope / 2**20:+.3f} +- {found.error / 2**20:.3f} MiB an hour in the second '
+            f'halves of its lives, of up to {found.span:.2f} h: '
+            f'{"flat" if found.flat else "not flat"}')
 
 
 def run(

@@ -5,8 +5,8 @@ import math
 
 import numpy as np
 
-#: Growth over a whole run, in bytes, that counts as none.
-SMALL = 2 * 2**20
+#: Growth over the second half of a life, in bytes, that counts as none.
+SMALL = 2**20
 #: In the first minutes of a life, when buffers fill.
 SMALL_AT_FIRST = 16 * 2**20
 #: Length, in h of simulated time, from which on a life tells of leaks.
@@ -80,7 +80,7 @@ class Trend:
     error : float
         Standard error of the slope; infinite for too few samples.
     span : float
-        Longest life that counts, in h.
+        Longest part of a life that counts, in h.
     samples : int
         That were used.
 
@@ -100,14 +100,17 @@ class Trend:
 
 def trend(samples: list[Sample], settle: float) -> Trend:
     """
-    Fit one slope through all lives of a process.
+    Fit one slope through the second halves of all lives of a process.
+
+    A leak goes on for ever and shows there as well. The heap's holes fill ever more slowly: by as
+    much from the first hour to the second as from the second to the fourth.
 
     Parameters
     ----------
     samples : list of Sample
         In order.
     settle : float
-        First part of each life that is left out, in h: memory that is taken once.
+        Part of each life that is left out at least, in h: memory that is taken once.
 
     Returns
     -------
@@ -120,7 +123,9 @@ def trend(samples: list[Sample], settle: float) -> Trend:
     span = 0.0
     used_lives = 0
     for life in sorted(lives):
-        part = [x for x in samples if x.life == life and x.age >= settle and x.own > 0]
+        part = [x for x in samples if x.life == life and x.own > 0]
+        begin = max(settle, 0.5 * max((x.age for x in part), default=0.0))
+        part = [x for x in part if x.age >= begin]
         if len(part) < 3:
             continue
         used_lives += 1
