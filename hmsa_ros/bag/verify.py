@@ -9,6 +9,8 @@ that is left. One bag may hold plants in several namespaces, and each of
 them several joints. Messages that are not what their topic is for are left out, and counted.
 """
 
+from bisect import insort
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 import json
@@ -184,17 +186,18 @@ class _Replay:
         self._first = 0
         self.samples = self.commands = self.late = 0
         self.largest, self.where = 0.0, 0
-        # Why messages were left out, by topic.
-        self.complaints: dict[str, list[str]] = {}
+        # By topic, how many messages were left out, and why the first of them.
+        self.left_out: Counter[str] = Counter()
+        self.reasons: dict[str, str] = {}
 
     def leave_out(self, topic: str, error: HmsaError) -> None:
         """Count a message that cannot be used."""
-        self.complaints.setdefault(topic, []).append(str(error))
+        self.left_out[topic] += 1
+        self.reasons.setdefault(topic, str(error))
 
     def applied(self, message: Any) -> None:
         """Take what took effect; all of it is known before the rest is taken."""
-        self._applied.append(_command(self._pair, message))
-        self._applied.sort(key=lambda x: x[0])
+        insort(self._applied, _command(self._pair, message), key=lambda x: x[0])
 
     def command(self, message: Any) -> None:
         """Take a command, which counts where nobody told what took effect."""
@@ -283,21 +286,19 @@ def _verify(reader: BagReader, pair: _Pair) -> Verification:
     take({pair.beside(APPLIED): replay.applied})
     take({pair.states: replay.sample, pair.commands: replay.command,
           pair.beside(FORCE): replay.force})
-    states, commands = (
-        replay.complaints.get(x, []) for x in (pair.states, pair.commands))
     # A few that are not what they should be do not spoil the rest.
-    if len(states) > replay.samples:
-        raise BadInputError(states[0])
-    if commands and not replay.commands:
-        raise BadInputError(commands[0])
+    if replay.left_out[pair.states] > replay.samples:
+        raise BadInputError(replay.reasons[pair.states])
+    if replay.left_out[pair.commands] and not replay.commands:
+        raise BadInputError(replay.reasons[pair.commands])
     if not replay.samples:
         raise BadInputError(f'topic {pair.states} of {reader.path} has no message: expected '
                             'samples of the stretch')
-    left_out = sum(map(len, replay.complaints.values()))
+    left_out = replay.left_out.total()
     notes = [_note(reader.custom_data, pair)]
     if left_out:
         notes.append(f'left out: {left_out} of the messages, for example since '
-                     f'{next(iter(replay.complaints.values()))[0]}')
+                     f'{next(iter(replay.reasons.values()))}')
     return Verification(
         pair.states, pair.commands, replay.samples, replay.commands, replay.late,
         replay.largest, replay.where * 1e-9, '; '.join(filter(None, notes)), left_out)
