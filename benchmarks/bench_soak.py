@@ -46,6 +46,7 @@ _LEAD_SECONDS = 5.0
 _SETTLE_HOURS = 0.25
 #: Part of all hours in which plant and planner are killed; memory is watched in the rest.
 _DEADLY_SHARE = 1.0 / 3.0
+_LOADED_HOURS = 0.005
 _LOOK_SECONDS = 2.0
 #: Simulated s that pass at most between two diagnostics of the plant, 1 s apart on the wall.
 _LARGEST_ROUND = 90.0
@@ -275,9 +276,11 @@ class Soak:
         self._asked: list[tuple[Any, Any]] = []
         self._clients: dict[str, tuple[Any, type[Any]]] = {}
         self._bags = 0
-        # A child of its own, so that looking at a bag does not hold up the next cycle.
+        # A child of its own, so that looking at a bag does not hold up the next cycle; after all
+        # others, so that it takes no time from the recorder.
         self._pool = ProcessPoolExecutor(
-            1, mp_context=multiprocessing.get_context('spawn'))
+            1, mp_context=multiprocessing.get_context('spawn'), initializer=os.nice,
+            initargs=(19,))
         self._checks: list[Future[Cycle]] = []
         self._start('plant')
         self._start('planner')
@@ -748,14 +751,14 @@ def run_in_process(hours: float, seed: int = 2) -> Core:
         trend(memory, min(_SETTLE_HOURS, 0.3 * hours)))
 
 
-def draw(result: Result, core: Core, file: Path) -> None:
+def draw(result: Result, file: Path) -> None:
     """
-    Draw memory over simulated time.
+    Draw the memory of the processes over simulated time.
 
     Parameters
     ----------
-    result, core : Result, Core
-        What was found.
+    result : Result
+        Of the part over DDS.
     file : Path
         A PNG.
 
@@ -763,13 +766,13 @@ def draw(result: Result, core: Core, file: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8.0, 4.5), layout='constrained')
+    figure = Figure(figsize=(8.0, 4.0), layout='constrained')
     FigureCanvasAgg(figure)
     axes = figure.subplots()
-    for number, (name, samples) in enumerate(
-            [*result.memory.items(), ('planner and plant in process', core.memory)]):
+    for number, (name, samples) in enumerate(result.memory.items()):
         for life in sorted({x.life for x in samples}):
-            part = [x for x in samples if x.life == life and x.own]
+            # In its first seconds a process is still being loaded.
+            part = [x for x in samples if x.life == life and x.own and x.age > _LOADED_HOURS]
             axes.plot(
                 [x.time for x in part], [x.own / 2**20 for x in part], color=f'C{number}',
                 lw=1.0, label=name if life == 1 else None)
@@ -777,7 +780,7 @@ def draw(result: Result, core: Core, file: Path) -> None:
     axes.set_ylabel('anonymous memory (MiB)')
     axes.set_ylim(bottom=0.0)
     axes.grid(alpha=0.3)
-    axes.legend(loc='lower right', fontsize='small')
+    axes.legend(loc='upper right', fontsize='small', ncols=len(result.memory))
     figure.savefig(file, dpi=120)
 
 
@@ -876,7 +879,7 @@ def run(
     for line in lines:
         console.print(line)
     if picture is not None:
-        draw(result, core, picture)
+        draw(result, picture)
     failures = [*result.failures(), *core.failures()]
     for line in failures:
         console.print(f'FAILED: {line}')
