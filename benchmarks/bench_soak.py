@@ -46,6 +46,7 @@ _LEAD_SECONDS = 5.0
 _SETTLE_HOURS = 0.25
 #: Part of all hours in which plant and planner are killed; memory is watched in the rest.
 _DEADLY_SHARE = 1.0 / 3.0
+#: Part of a process's life, in simulated h, that is not drawn: it is still being loaded.
 _LOADED_HOURS = 0.005
 _LOOK_SECONDS = 2.0
 #: Simulated s that pass at most between two diagnostics of the plant, 1 s apart on the wall.
@@ -493,8 +494,9 @@ class Soak:
         from rcl_interfaces.srv import SetParameters
         from rclpy.parameter import Parameter
 
-        from benchmarks.faults.inputs import service_class, wild_request
+        from benchmarks.faults.inputs import wild_request
         from hmsa_ros.nodes import interface
+        from hmsa_ros.nodes.message_types import interface_class
 
         choice = self._dice.random()
         if choice < 0.4:
@@ -509,7 +511,7 @@ class Soak:
                 return
             if services:
                 name, types = self._dice.choice(services)
-                kind = service_class(types[0])
+                kind = interface_class(types[0])
                 self._call(kind, name, wild_request(kind, name, self._dice))
         else:
             # One of the calls above may have paused or slowed it, and nothing would go on.
@@ -771,7 +773,6 @@ def draw(result: Result, file: Path) -> None:
     axes = figure.subplots()
     for number, (name, samples) in enumerate(result.memory.items()):
         for life in sorted({x.life for x in samples}):
-            # In its first seconds a process is still being loaded.
             part = [x for x in samples if x.life == life and x.own and x.age > _LOADED_HOURS]
             axes.plot(
                 [x.time for x in part], [x.own / 2**20 for x in part], color=f'C{number}',

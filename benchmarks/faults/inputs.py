@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from contextlib import suppress
-from importlib import import_module
 import random
 from typing import Any
 
@@ -12,6 +11,7 @@ from benchmarks.faults.rig import hushed, Rig
 from benchmarks.faults.table import Seen
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import to_command
+from hmsa_ros.nodes.message_types import interface_class
 
 FAULTS = Register()
 _COUNT = 300
@@ -97,7 +97,7 @@ def _services(rig: Rig) -> Seen:
     called = 0
     for owner in ('planner', 'plant', 'recorder'):
         for name, types in rig.node.get_service_names_and_types_by_node(owner, '/'):
-            kind = service_class(types[0])
+            kind = interface_class(types[0])
             for _ in range(_CALLS):
                 rig.call_by_name(kind, name, wild_request(kind, name, dice))
             called += 1
@@ -113,25 +113,6 @@ def _services(rig: Rig) -> Seen:
         f'{called} services, each request answered; ended: {", ".join(ended) or "nobody"}; '
         f'recorder exit {status}', share(worst),
         not ended and not refused and status == 0 and worst < LIMIT)
-
-
-def service_class(name: str) -> type[Any]:
-    """
-    Return the class of a service type.
-
-    Parameters
-    ----------
-    name : str
-        For example ``'std_srvs/srv/Trigger'``.
-
-    Returns
-    -------
-    type
-        Its class.
-
-    """
-    package, kind, word = name.split('/')
-    return getattr(import_module(f'{package}.{kind}'), word)
 
 
 def wild_request(kind: type[Any], name: str, dice: random.Random) -> Any:

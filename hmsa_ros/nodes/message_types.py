@@ -1,4 +1,4 @@
-"""Message classes by the names of their types, and the other way round."""
+"""Classes of messages and services by the names of their types, and the other way round."""
 
 from importlib import import_module
 from typing import Any
@@ -13,14 +13,14 @@ def type_name_of(message_type: type[Any]) -> str:
     return f'{package}/{folder}/{message_type.__name__}'
 
 
-def message_class(type_name: str) -> type[Any]:
+def interface_class(type_name: str) -> type[Any]:
     """
-    Return the class of a message type.
+    Return the class of a message, service or action type.
 
     Parameters
     ----------
     type_name : str
-        For example ``'std_msgs/msg/Float64'``.
+        For example ``'std_msgs/msg/Float64'`` or ``'std_srvs/srv/Trigger'``.
 
     Returns
     -------
@@ -39,9 +39,9 @@ def message_class(type_name: str) -> type[Any]:
         # The name may come from anybody's bag: nothing but an interface is ever imported.
         if folder not in ('msg', 'srv', 'action') or not is_interface_package(package):
             raise ImportError(type_name)
-        message_class: type[Any] = getattr(import_module(f'{package}.{folder}'), name)
+        found: type[Any] = getattr(import_module(f'{package}.{folder}'), name)
     except (ValueError, ImportError, AttributeError) as error:
         raise BagError(
             f'message type {type_name} is not installed: expected its Python package; source '
             'its workspace') from error
-    return message_class
+    return found

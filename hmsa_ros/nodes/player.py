@@ -37,7 +37,7 @@ from hmsa_ros.bag.reader import BagReader, Message, TopicInfo
 from hmsa_ros.errors import BadInputError, BagError, HmsaError, printable
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.managed import ManagedNode
-from hmsa_ros.nodes.message_types import message_class
+from hmsa_ros.nodes.message_types import interface_class
 from hmsa_ros.nodes.parameters import declare, ParameterSpec
 from hmsa_ros.nodes.qos import publisher
 from hmsa_ros.nodes.runner import run
@@ -247,7 +247,7 @@ class Player(ManagedNode):
                 continue
             try:
                 result[name] = self.create_publisher(
-                    message_class(info.type), name, publisher(info.profiles))
+                    interface_class(info.type), name, publisher(info.profiles))
             except Exception as error:
                 # A name or a quality of service that no publisher can have.
                 self.get_logger().warning(printable(
@@ -277,7 +277,7 @@ class Player(ManagedNode):
         if info.encoding != 'cdr':
             return f'its messages are encoded as {info.encoding!r}, expected cdr'
         try:
-            message_class(info.type)
+            interface_class(info.type)
         except BagError as error:
             return str(error)
         return ''

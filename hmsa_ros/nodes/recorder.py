@@ -37,7 +37,7 @@ from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.capture import Capture, decode, RawSubscription, SimulatedTime, Taken
 from hmsa_ros.nodes.conversions import from_time
 from hmsa_ros.nodes.managed import ManagedNode
-from hmsa_ros.nodes.message_types import message_class, type_name_of
+from hmsa_ros.nodes.message_types import interface_class, type_name_of
 from hmsa_ros.nodes.parameters import declare, ParameterSpec
 from hmsa_ros.nodes.qos import stored, subscription
 from hmsa_ros.nodes.remote_parameters import RemoteParameters
@@ -314,7 +314,7 @@ class Recorder(ManagedNode):
             self._refuse(f'{name}#', f'topic {name} has the types {", ".join(types)}: '
                                      f'{type_name} is recorded')
         try:
-            message_type = message_class(type_name)
+            message_type = interface_class(type_name)
         except BagError as error:
             self._refuse(name, f'topic {name} is not recorded: {error}')
             return

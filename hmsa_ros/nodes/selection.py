@@ -24,6 +24,11 @@ def _check_expression(parameter: str, expression: str) -> None:
             f'({error})') from error
 
 
+def _excluded(topic: str, names: tuple[str, ...], expression: str) -> bool:
+    """Return whether a topic is among names, or an expression that is not empty is found in it."""
+    return topic in names or bool(expression and re.search(expression, topic))
+
+
 @dataclass(frozen=True)
 class Selection:
     """
@@ -65,8 +70,7 @@ class Selection:
             A topic named in ``topics`` is wanted unless it is excluded.
 
         """
-        if topic in self.exclude_topics or (
-                self.exclude_regex and re.search(self.exclude_regex, topic)):
+        if _excluded(topic, self.exclude_topics, self.exclude_regex):
             return False
         if topic in self.topics:
             return True
@@ -118,8 +122,7 @@ class Filter:
             Exclusion comes first.
 
         """
-        if topic in self.exclude_topics or (
-                self.exclude_regex and re.search(self.exclude_regex, topic)):
+        if _excluded(topic, self.exclude_topics, self.exclude_regex):
             return False
         if topic in self.topics or topic in self.allow_commands:
             return True
