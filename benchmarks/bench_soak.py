@@ -52,8 +52,8 @@ _LOOK_SECONDS = 2.0
 #: Simulated s that pass at most between two diagnostics of the plant, 1 s apart on the wall.
 _LARGEST_ROUND = 90.0
 #: Simulated seconds per second: what two cores manage with all three processes, with some room.
-#: Faster, a recorder that does not get its turn for a tenth of a second loses samples, since the
-#: plant keeps the last thousand of them for those who have not taken them yet.
+#: A recorder that does not get its turn for longer than a second loses samples then, since the
+#: plant keeps the last five thousand of them for those who have not taken them yet.
 FACTOR = 5.0
 _TOPICS = (
     'joint_states', 'flux_density_command', 'flux_density_applied', 'planner/status',

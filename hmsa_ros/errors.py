@@ -5,7 +5,13 @@ Every message is one sentence that says what was wrong, what was got, what was e
 where it is not obvious, how to mend it.
 """
 
+import reprlib
 import sys
+
+# Long enough for what a user may have mistyped, too short to flood a log.
+_EXCERPT = reprlib.Repr()
+_EXCERPT.maxstring = _EXCERPT.maxother = 80
+_EXCERPT.maxlist = 4
 
 
 class HmsaError(Exception):
@@ -72,3 +78,22 @@ def printable(text: str) -> str:
     return ''.join(
         character if character.isprintable()
         else character.encode('unicode_escape').decode() for character in text)
+
+
+def excerpt(value: object) -> str:
+    """
+    Return a value from elsewhere as a message may tell of it.
+
+    Parameters
+    ----------
+    value : object
+        A text, a number, or a list of such.
+
+    Returns
+    -------
+    str
+        Its ``repr``, from which the middle of long texts and the end of long lists are left out:
+        the log keeps what it is told, and shows it on every terminal.
+
+    """
+    return _EXCERPT.repr(value)

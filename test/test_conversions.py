@@ -107,6 +107,19 @@ def test_trajectory_is_read_only_for_the_one_joint(names, joint):
         assert caught.value.code is Code.UNKNOWN_JOINT
 
 
+@pytest.mark.parametrize('joints', [('actuator',), ('left', 'right')])
+@pytest.mark.parametrize('message', [
+    JointTrajectory(joint_names=['a' * 4096] * 50),
+    JointTrajectory(joint_names=['actuator'], points=[
+        JointTrajectoryPoint(positions=[1.1], velocities=[0.1] * 5000)]),
+    JointTrajectory(joint_names=['left', 'right'], points=[
+        JointTrajectoryPoint(positions=[1.1, 1.1], effort=[0.1] * 5000)])])
+def test_a_refusal_does_not_repeat_all_that_was_sent(message, joints):
+    with pytest.raises(RefusedError) as caught:
+        conversions.from_trajectories(message, joints)
+    assert len(str(caught.value)) < 500
+
+
 @given(st.lists(st.floats(), max_size=3))
 def test_point_has_one_position(positions):
     message = JointTrajectory(

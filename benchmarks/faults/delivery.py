@@ -136,20 +136,23 @@ def _reorder(rig: Rig) -> Seen:
 
 
 def _learnt(rig: Rig) -> Seen:
-    mark = rig.count()
+    mark, told = rig.count(), len(rig.applied)
     rig.setpoint(1.2)
     await_change(rig, mark)
     rig.let_pass(1.2)
     rig.fresh('planner')
     stamps, values = rig.samples(mark)
-    # The second change is the level that the heartbeat brought. What is planned then takes
-    # effect lead_time later; left to itself, vibration would be a hundredth by that time.
-    changes = stamps[np.flatnonzero(np.diff(values[:, 2])) + 1]
+    # What the plant tells of, since a level may be in force for less than a sample. The second
+    # change is the level that the heartbeat brought. What is planned then takes effect lead_time
+    # later; left to itself, vibration would be a hundredth by that time.
+    changes = [stamp for stamp, _ in rig.applied[told:]]
+    if len(changes) < 2:
+        return Seen(f'{len(changes)} changes in force: expected at least 2', '-', False)
     rest = values[stamps > max(changes[1] + _AFTER_NS, changes[-1]), 0]
     residual, error = float(np.ptp(rest)) / 0.2, abs(float(rest[-1]) - 1.2) / 0.2
-    replanned = rig.value('planner', 'replanned')
+    late, replanned = rig.value('planner', 'late'), rig.value('planner', 'replanned')
     return Seen(
-        f'{replanned:g} re-planned, error {error:.0e}', share(residual),
+        f'{late:g} late, {replanned:g} re-planned, error {error:.0e}', share(residual),
         replanned > 0 and max(residual, error) < LIMIT)
 
 

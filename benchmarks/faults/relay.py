@@ -14,12 +14,14 @@ import signal
 import sys
 from time import monotonic
 
+from builtin_interfaces.msg import Time
 import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.task import Future
+from sensor_msgs.msg import MagneticField
 
 from hmsa_ros.nodes import interface
 
@@ -43,23 +45,29 @@ class Relay(Node):
         self._options = options
         self._drop = {int(x) for x in options.drop.split(',') if x}
         self._count = 0
-        self._held: object | None = None
-        self._waiting: deque[tuple[float, object]] = deque()
+        self._held: MagneticField | None = None
+        # Stamps of commands that are lost; a heartbeat may repeat one before it applies.
+        self._lost: list[Time] = []
+        self._waiting: deque[tuple[float, MagneticField]] = deque()
         topic = interface.FLUX_DENSITY_COMMAND
         self._publisher = self.create_publisher(topic.type, options.target, topic.qos)
         self.create_subscription(topic.type, options.source, self._on_command, topic.qos)
         self.create_timer(
             _TICK_SECONDS, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
-    def _on_command(self, message: object) -> None:
+    def _on_command(self, message: MagneticField) -> None:
         self._count += 1
         if self._count in self._drop:
+            self._lost.append(message.header.stamp)
+        if message.header.stamp in self._lost:
             return
         if self._options.swap and self._count <= 2:
             if self._held is None:
                 self._held = message
                 return
             self._publisher.publish(message)
+            # The one sent after it is to supersede it for good.
+            self._lost.append(message.header.stamp)
             message, self._held = self._held, None
         delay = self._options.delay
         if self._options.first and self._count > self._options.first:

@@ -15,7 +15,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.errors import BadInputError, excerpt
 
 if TYPE_CHECKING:
     # Numba comes along with the planner, which a recorder has no use for.
@@ -128,7 +128,7 @@ def from_trajectory(
     names = list(message.joint_names)
     if names != [joint]:
         raise RefusedError(
-            Code.UNKNOWN_JOINT, f'joint_names is {names}: expected [{joint!r}]')
+            Code.UNKNOWN_JOINT, f'joint_names is {excerpt(names)}: expected [{joint!r}]')
     points = []
     for number, point in enumerate(message.points):
         if len(point.positions) != 1:
@@ -140,8 +140,8 @@ def from_trajectory(
             if values not in ([], [0.0]):
                 raise RefusedError(
                     Code.BAD_INPUT,
-                    f'point {number} has {name} {values}: expected none, the actuator comes to '
-                    'rest at each setpoint')
+                    f'point {number} has {name} {excerpt(values)}: expected none, the actuator '
+                    'comes to rest at each setpoint')
         points.append((float(point.positions[0]), from_time(point.time_from_start)))
     stamp = from_time(message.header.stamp)
     return points, (None if stamp == 0 else stamp)
@@ -181,11 +181,12 @@ def from_trajectories(
     names = list(message.joint_names)
     if twice := sorted({x for x in names if names.count(x) > 1}):
         raise RefusedError(
-            Code.UNKNOWN_JOINT, f'joint_names has {twice[0]!r} twice: expected each joint once')
+            Code.UNKNOWN_JOINT,
+            f'joint_names has {excerpt(twice[0])} twice: expected each joint once')
     if unknown := [x for x in names if x not in joints]:
         raise RefusedError(
             Code.UNKNOWN_JOINT,
-            f'joint_names has {unknown[0]!r}: expected names among {", ".join(joints)}')
+            f'joint_names has {excerpt(unknown[0])}: expected names among {", ".join(joints)}')
     missing = [x for x in joints if x not in names]
     if not names or missing and not partial:
         raise RefusedError(
@@ -204,8 +205,8 @@ def from_trajectories(
             if values and values != [0.0] * len(names):
                 raise RefusedError(
                     Code.BAD_INPUT,
-                    f'point {number} has {field} {values}: expected none, the actuators come '
-                    'to rest at each setpoint')
+                    f'point {number} has {field} {excerpt(values)}: expected none, the '
+                    'actuators come to rest at each setpoint')
         time = from_time(point.time_from_start)
         for name, position in zip(names, point.positions, strict=True):
             points[name].append((float(position), time))

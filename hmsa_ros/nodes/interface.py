@@ -25,9 +25,9 @@ RELIABLE = QoSProfile(
 # A plan may be sent as one burst of commands; none of them may be overwritten unread.
 COMMAND = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=1000, reliability=ReliabilityPolicy.RELIABLE)
-# Samples at 1 kHz and more: deep enough for a reader that pauses for some hundred samples.
+# Samples at 1 kHz and more: deep enough for a reader that pauses for some seconds.
 SAMPLES = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+    history=HistoryPolicy.KEEP_LAST, depth=5000, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL)

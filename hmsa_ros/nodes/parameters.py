@@ -15,7 +15,7 @@ from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 
 from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.errors import BadInputError, excerpt
 
 Value = bool | int | float | str | list[str]
 
@@ -102,7 +102,7 @@ class ParameterSpec:
                 f'parameter {self.name} is {value}: expected a finite number')
         if self.choices and value not in self.choices:
             raise BadInputError(
-                f'parameter {self.name} is {value!r}: expected one of '
+                f'parameter {self.name} is {excerpt(value)}: expected one of '
                 + ', '.join(self.choices))
         if isinstance(value, (int, float)) and not (
                 (self.minimum is None or value >= self.minimum)
@@ -200,7 +200,7 @@ def _as_list(name: str, value: Any) -> list[str]:
     values = list(value) if isinstance(value, Sequence) and not isinstance(value, str) \
         else [value]
     if not all(isinstance(item, str) for item in values):
-        raise BadInputError(f'parameter {name} is {value!r}: expected a list of strings')
+        raise BadInputError(f'parameter {name} is {excerpt(value)}: expected a list of strings')
     return values
 
 
