@@ -3,6 +3,8 @@
 from collections.abc import Iterator
 import re
 import signal
+import subprocess
+import sys
 from typing import Any
 
 import numpy as np
@@ -120,6 +122,24 @@ def test_signal_ends_planner_and_plant_at_work_with_status_0_and_no_word(ros, st
         assert all(
             re.match(r'\[WARN].* (lead_time|late|planned anew)|\[INFO].* kernels', x)
             for x in process.stderr.splitlines()), process.stderr
+
+
+def test_a_collection_of_garbage_does_not_look_at_all_libraries_again(ros_env):
+    code = """
+import gc
+from rclpy.node import Node
+from hmsa_ros.nodes.runner import run
+class Still(Node):
+    @property
+    def finished(self):
+        print(len(gc.get_objects()), gc.get_freeze_count())
+        return True
+run(lambda: Still('still'), [])
+"""
+    done = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, check=True, timeout=60)
+    looked_at, left_alone = map(int, done.stdout.split())
+    assert looked_at < 0.01 * left_alone
 
 
 @pytest.mark.slow

@@ -147,6 +147,9 @@ def placeholder(part: ast.expr) -> str:
 
     """
     value = part.value if isinstance(part, ast.FormattedValue) else part
+    if (isinstance(value, ast.Call) and isinstance(value.func, ast.Name)
+            and value.func.id == errors.excerpt.__name__):
+        value = value.args[0]
     if isinstance(value, ast.Name | ast.Attribute):
         name = value.id if isinstance(value, ast.Name) else value.attr
         return '{' + name.strip('_') + '}'

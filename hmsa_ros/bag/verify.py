@@ -22,6 +22,7 @@ from hmsa_ros.bag import limits
 from hmsa_ros.bag.experiment import parameters_of
 from hmsa_ros.bag.info import lost_messages
 from hmsa_ros.bag.reader import BagReader
+from hmsa_ros.core.schedule import obeyed
 from hmsa_ros.errors import BadInputError, BagError, HmsaError
 
 if TYPE_CHECKING:
@@ -165,7 +166,7 @@ def _command(pair: _Pair, command: Any) -> tuple[int, float]:
         raise BadInputError(
             f'a message of {pair.commands} is no command: expected sensor_msgs/msg/'
             'MagneticField') from None
-    if not math.isfinite(z) or x != 0.0 or y != 0.0:
+    if not obeyed(x, y, z):
         raise BadInputError(
             f'a message of {pair.commands} is ({x:g}, {y:g}, {z:g}) T: expected a finite field '
             'along z')

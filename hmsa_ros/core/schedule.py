@@ -6,6 +6,25 @@ A command applies from its stamp on and supersedes all earlier ones stamped at o
 
 from bisect import bisect_left, bisect_right
 from collections import deque
+import math
+
+
+def obeyed(x: float, y: float, z: float) -> bool:
+    """
+    Return whether a field is one that an actuator obeys.
+
+    Parameters
+    ----------
+    x, y, z : float
+        Flux density in T; the actuator moves along z.
+
+    Returns
+    -------
+    bool
+        Whether it is finite, and along z.
+
+    """
+    return math.isfinite(z) and x == 0.0 == y
 
 
 class CommandSchedule:

@@ -1,7 +1,6 @@
 """Conversion between messages and the records of `hmsa_ros.core`."""
 
 from collections.abc import Iterable, Mapping, Sequence
-import math
 import re
 from typing import TYPE_CHECKING
 
@@ -13,6 +12,7 @@ from sensor_msgs.msg import MagneticField
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from hmsa_ros.core.schedule import obeyed
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError, excerpt
@@ -86,14 +86,10 @@ def from_command(message: MagneticField) -> tuple[int, float]:
 
     """
     field = message.magnetic_field
-    if not math.isfinite(field.x + field.y + field.z):
+    if not obeyed(field.x, field.y, field.z):
         raise BadInputError(
-            f'flux density command ({field.x:g}, {field.y:g}, {field.z:g}) T: expected finite '
-            'numbers')
-    if field.x != 0.0 or field.y != 0.0:
-        raise BadInputError(
-            f'flux density command ({field.x:g}, {field.y:g}, {field.z:g}) T: expected a field '
-            'along z, with x = y = 0')
+            f'flux density command ({field.x:g}, {field.y:g}, {field.z:g}) T: expected a finite '
+            'field along z, with x = y = 0')
     stamp = from_time(message.header.stamp)
     if stamp < 0:
         raise BadInputError(f'flux density command stamped {stamp} ns: expected at least 0')

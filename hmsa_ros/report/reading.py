@@ -24,6 +24,7 @@ from hmsa_ros.bag.info import BagSummary, summarize
 from hmsa_ros.bag.reader import BagReader, Message
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
+from hmsa_ros.core.schedule import obeyed
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError, BagError
 
@@ -462,7 +463,7 @@ class _Collected:
         if role in (COMMAND, APPLIED):
             field = content.magnetic_field
             kept = self.commands if role == COMMAND else self.applied
-            if math.isfinite(field.x + field.y + field.z) and field.x == 0.0 == field.y:
+            if obeyed(field.x, field.y, field.z):
                 kept.setdefault(joint, []).append(
                     Level(_ns(content.header.stamp) or sent, float(field.z), sent))
             elif role == COMMAND:
