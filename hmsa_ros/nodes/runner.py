@@ -6,6 +6,7 @@ One place for what every node's ``main`` does, so that a node file holds wiring 
 
 from collections.abc import Callable, Sequence
 import gc
+import inspect
 import os
 import re
 import sys
@@ -83,6 +84,9 @@ def run(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
     status = 0
     try:
         node = factory()
+        # rclpy asks for the module of whoever logs something. That takes 30 ms and more the first
+        # time, when all modules are looked up, and shall not be when a command is late.
+        inspect.getmodule(inspect.currentframe())
         _settle_memory()
         spin(node, lambda: ending.asked or getattr(node, 'finished', False))
     except (BadInputError, ParameterException) as error:
