@@ -84,10 +84,7 @@ def run(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
     status = 0
     try:
         node = factory()
-        # rclpy asks for the module of whoever logs something. That takes 30 ms and more the first
-        # time, when all modules are looked up, and shall not be when a command is late.
-        inspect.getmodule(inspect.currentframe())
-        _settle_memory()
+        _avoid_pauses()
         spin(node, lambda: ending.asked or getattr(node, 'finished', False))
     except (BadInputError, ParameterException) as error:
         status = complain(error, 2)
@@ -106,10 +103,13 @@ def run(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
     return complain(failure, 1) if failure is not None and not status else status
 
 
-def _settle_memory() -> None:
-    """Keep what start-up has made out of all later collections of garbage."""
-    # The libraries bring 140,000 objects along. To look at them all takes 40 ms, in which nothing
-    # is sent, and Python does so seldom, so that garbage and spare tuples pile up until then.
+def _avoid_pauses() -> None:
+    """Do now what would keep commands waiting for tens of milliseconds later."""
+    # rclpy asks for the module of whoever logs something. The first time all modules are looked
+    # up, which takes 30 ms and more, and would be when a command is late.
+    inspect.getmodule(inspect.currentframe())
+    # The libraries bring 140,000 objects along. A full collection of garbage looks at them all for
+    # 40 ms, and Python makes it so seldom that garbage and spare tuples pile up until then.
     gc.collect()
     gc.freeze()
     # With nothing left to look at: tells Python that a full collection is cheap from now on.
