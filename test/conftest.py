@@ -46,26 +46,24 @@ def pytest_configure(config: pytest.Config) -> None:
     settings.load_profile('gate')
 
 
+def pytest_xdist_auto_num_workers() -> int:
+    """Return two workers a core: tests that run nodes mostly wait."""
+    return 2 * (os.cpu_count() or 1)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """
-    Have what runs nodes over DDS tried once more if it fails.
+    Say what each worker takes at once: a test that runs nodes, or all others of a module.
 
-    It shares the machine with whatever else runs there. What fails twice is wrong; what fails
-    once is named at the end, with its reason, and is to be looked into.
+    Long tests begin first.
     """
     for item in items:
-        if item.get_closest_marker('ros'):
-            item.add_marker(pytest.mark.flaky(reruns=1))
-
-
-def pytest_terminal_summary(terminalreporter: Any) -> None:
-    """Tell why tests were tried once more."""
-    reports = terminalreporter.getreports('rerun')
-    if reports:
-        terminalreporter.section('tried once more after')
-    for report in reports:
-        terminalreporter.section(report.nodeid, sep='_')
-        terminalreporter.line(report.longreprtext)
+        if item.get_closest_marker('ros') or item.get_closest_marker('xdist_group'):
+            continue
+        item.add_marker(pytest.mark.xdist_group(item.path.stem))
+    if 'PYTEST_XDIST_WORKER' in os.environ:
+        items.sort(key=lambda item: (
+            not item.get_closest_marker('slow'), bool(item.get_closest_marker('ros'))))
 
 
 def wait_until(

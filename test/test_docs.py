@@ -1,10 +1,6 @@
 """The pages: built with warnings as errors, and every block in them run or checked."""
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager
 from importlib import import_module
-import os
 from pathlib import Path
 import subprocess
 import sys
@@ -27,7 +23,6 @@ from documents import (
 )
 import pytest
 
-AT_A_TIME = 3
 PAGES = pages()
 RUNNING = [page for page in PAGES if any(block.runs for block in blocks(page))]
 
@@ -53,54 +48,17 @@ def test_every_block_of_the_page_is_run_or_checked(page):
             check(block)
 
 
-@pytest.fixture(scope='module')
-def running(
-        own_domain: Callable[[], AbstractContextManager[int]],
-        tmp_path_factory: pytest.TempPathFactory,
-        request: pytest.FixtureRequest) -> Iterator[Callable[[Path], list[str]]]:
-    """
-    Run the pages asked for, some at a time: most of what they do is to wait.
-
-    What is returned waits for the log of a page; asked again, it runs the page again.
-    """
-    def run(page: Path) -> list[str]:
-        folder = tmp_path_factory.mktemp(page.stem)
-        with own_domain() as domain:
-            return run_page(page, folder, {
-                **os.environ, 'PYTHONPATH': str(ROOT), 'PYTHONUNBUFFERED': '1',
-                'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-                'ROS_LOG_DIR': str(folder / 'log'), 'RCUTILS_COLORIZED_OUTPUT': '0'})
-
-    # Compiled once, and not by each node of each page at the same time.
-    subprocess.run([sys.executable, '-m', 'hmsa_ros.core.warmup'], cwd=ROOT, check=True,
-                   capture_output=True)
-    asked = [item.callspec.params['page'] for item in request.session.items
-             if getattr(item, 'originalname', '') == 'test_page_does_what_it_says']
-    with ThreadPoolExecutor(AT_A_TIME) as pool:
-        runs = {page: pool.submit(run, page)
-                for page in reversed(asked)}  # the long ones are at the end
-
-        def log_of(page: Path) -> list[str]:
-            first = runs.pop(page, None)
-            return run(page) if first is None else first.result()
-
-        yield log_of
-        for future in runs.values():
-            future.cancel()
-
-
 @pytest.mark.ros
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize('page', RUNNING, ids=name_of)
-def test_page_does_what_it_says(
-        page: Path, running: Callable[[Path], list[str]],
-        capsys: pytest.CaptureFixture[str]):
-    log = running(page)
-    with capsys.disabled():
-        print('', *log, sep='\n')
+def test_page_does_what_it_says(page, ros_env, tmp_path):
+    # How long each block took: shown if it fails, or by pytest -rP.
+    print(*run_page(page, tmp_path, ros_env), sep='\n')
 
 
+@pytest.mark.slow
+@pytest.mark.xdist_group('sphinx')
 def test_pages_are_built_without_a_warning(tmp_path):
     built = subprocess.run(
         [sys.executable, '-m', 'sphinx', '-W', '--keep-going', '-q', '-b', 'html',

@@ -11,6 +11,8 @@ of Polymers 2022, 14, 3037. Written in energy form, Eq. 11 is
 with constant d, of which `mass`, `damping` and `elastic_force` are the parts.
 """
 
+from typing import Any
+
 from numba import vectorize
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +22,8 @@ from hmsa_ros.core import kernels
 from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
 
 Array = NDArray[np.float64]
+#: What functions accept: older NumPy types do not know what ``linspace`` returns.
+Floats = NDArray[np.floating[Any]]
 
 
 def _array(value: ArrayLike) -> Array:
@@ -348,4 +352,5 @@ def signed_root(load: ArrayLike) -> Array:
 
     """
     load = _array(load)
-    return np.sign(load) * np.sqrt(np.abs(load))
+    root: Array = np.sign(load) * np.sqrt(np.abs(load))
+    return root

@@ -15,6 +15,7 @@ from hmsa_ros.core.model import (
     critical_zeta,
     elastic_energy,
     elastic_force,
+    Floats,
     signed_root,
     stretch_limits,
 )
@@ -270,7 +271,7 @@ def _shaped(targets: Sequence[float], material: NondimensionalParameters) -> Run
     return run
 
 
-def _resample(run: Run, time: Array) -> Array:
+def _resample(run: Run, time: Floats) -> Array:
     stretch, _ = simulate(run.switches, run.loads, time, run.material)
     return stretch
 

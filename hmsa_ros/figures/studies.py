@@ -115,8 +115,8 @@ def _bars(
         height=0.62, zorder=2)
     for place, length, value in zip(places, lengths, worst, strict=True):
         axes.annotate(
-            percent(value), (length, place), xytext=(3, 0), textcoords='offset points',
-            va='center', fontsize=8)
+            percent(value), (float(length), float(place)), xytext=(3, 0),
+            textcoords='offset points', va='center', fontsize=8)
     axes.set_xscale('log')
     axes.set_xlim(100.0 * _FLOOR, 1000.0)
     axes.set_yticks(places, [x.candidate.name for x in results])

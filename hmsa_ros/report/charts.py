@@ -160,7 +160,8 @@ def _extremes(y: Array, buckets: int) -> Any:
     whole = len(y) // size * size
     begins = np.arange(0, whole, size)
     rows = y[:whole].reshape(-1, size)
-    keep = [begins + rows.argmin(axis=1), begins + rows.argmax(axis=1), [0, len(y) - 1]]
+    keep: list[Any] = [
+        begins + rows.argmin(axis=1), begins + rows.argmax(axis=1), [0, len(y) - 1]]
     if whole < len(y):
         rest = y[whole:]
         keep.append([whole + int(rest.argmin()), whole + int(rest.argmax())])

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from hmsa_ros.core.model import Array, critical_zeta, elastic_force, natural_frequency
+from hmsa_ros.core.model import Array, critical_zeta, elastic_force, Floats, natural_frequency
 from hmsa_ros.core.moves import Limits, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.shapers.minimum_time import minimum_time
@@ -124,7 +124,7 @@ def settling_time(
     return float(times[last] + share * (times[last + 1] - times[last]))
 
 
-def damped_study(start: float, target: float, zetas: Array) -> DampedStudy:
+def damped_study(start: float, target: float, zetas: Floats) -> DampedStudy:
     """
     Compare the plain step with the minimum-time command over zeta.
 

@@ -10,6 +10,7 @@ from hmsa_ros.core.model import (
     critical_zeta,
     elastic_force,
     equilibrium_stretch,
+    Floats,
     natural_frequency,
 )
 from hmsa_ros.core.moves import Move
@@ -113,7 +114,7 @@ def arrival_of(
 
 
 def response(
-        move: Move, start: float, times: Array, material: NondimensionalParameters,
+        move: Move, start: float, times: Floats, material: NondimensionalParameters,
         errors: Errors) -> Array:
     """
     Sample the stretch of an actuator that carries out a move planned for another.

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from hmsa_ros.core.delivery import Delivery
-from hmsa_ros.core.model import Array
+from hmsa_ros.core.model import Array, Floats
 from hmsa_ros.core.moves import Level, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.shapers.request import Request
@@ -53,7 +53,7 @@ class SampledStudy:
     target: float
     material: NondimensionalParameters
     tau_p: float
-    periods: Array
+    periods: Floats
     solved: Array
     rounded: Array
     bound: Array
@@ -159,7 +159,7 @@ def solved_move(
 
 def sampled_study(
         start: float, target: float, material: NondimensionalParameters,
-        periods: Array) -> SampledStudy:
+        periods: Floats) -> SampledStudy:
     """
     Compute residuals over the command period.
 

@@ -1,0 +1,17 @@
+"""The package's types, by mypy: here, so that it runs beside the other tests."""
+
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_types_of_the_package_are_right():
+    checked = subprocess.run(
+        [sys.executable, '-m', 'mypy'], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert checked.returncode == 0, checked.stdout + checked.stderr
