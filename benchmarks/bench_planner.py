@@ -23,7 +23,7 @@ import numpy as np
 from benchmarks import contenders
 from benchmarks.measure import Contender, loosest, race, Report, Row, stopwatch
 from benchmarks.reference import Actuator, two_step
-from hmsa_ros.core import kernels
+from hmsa_ros.core import kernels, two_step_kernel
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.two_step import HOLD_TOLERANCE, plan_two_step, plan_two_step_batch
 
@@ -36,7 +36,7 @@ LIMIT = 1e-10
 #: The cheapest that keeps it.
 POLYNOMIALS = contenders.Collocation(elements=2, degree=7)
 #: Tolerance of the first pass, as in the kernel.
-COARSE = kernels._COARSE
+COARSE = two_step_kernel._COARSE
 NOT_INSTALLED = 'not installed'
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -92,8 +92,8 @@ def _ours(reference: Reference) -> list[Contender]:
         work = kernels.work_space()
 
         def solve(start: float, target: float) -> tuple[float, float]:
-            return kernels.two_step(
-                work, start, 0.0, target, 0.2, 2.0, 0.2, -np.inf, np.inf, rtol,
+            return two_step_kernel.two_step(
+                work, start, 0.0, target, MATERIAL.packed, -np.inf, np.inf, rtol,
                 HOLD_TOLERANCE)[1:3]
         return solve
 

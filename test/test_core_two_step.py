@@ -20,7 +20,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from hmsa_ros.core import kernels
+from hmsa_ros.core import kernels, two_step_kernel
 from hmsa_ros.core.model import (
     critical_zeta,
     elastic_force,
@@ -163,8 +163,8 @@ def test_the_integrator_is_of_order_eight(zeta):
     for count in (5, 10, 20):
         state = (1.0, 0.3, 0.0, 0.0)
         for _ in range(count):
-            state = kernels._step(
-                work, *state, load, 0.0, 1.0, 0.0, duration / count, zeta, 2.0, 0.2,
+            state = kernels.step(
+                work, *state, load, 0.0, 1.0, 0.0, duration / count, group(zeta).packed,
                 1e-12)[:4]
         errors.append(math.hypot(state[0] - exact[0], state[1] - exact[1]))
     assert errors[-1] > 1e-13
@@ -180,8 +180,8 @@ def test_sensitivities_are_derivatives_by_the_load():
             for sign in (1.0, -1.0)]
         expected = (ends[0] - ends[1]) / (2.0 * step)
         _, _, _, s, r, _ = kernels.advance(
-            kernels.work_space(), *state, 0.0, 0.0, load, 0.0, 1.0, 0.0, duration, 0.2, 2.0,
-            0.2, 1e-12, 0.0)
+            kernels.work_space(), *state, 0.0, 0.0, load, 0.0, 1.0, 0.0, duration,
+            PAPER.packed, 1e-12, 0.0)
         assert (s, r) == pytest.approx(expected, rel=1e-7)
 
 
@@ -191,7 +191,7 @@ def test_turning_points_are_those_of_the_independent_integration():
             ((1.2, 1.0), 0.1, -1.0), ((0.4, -3.0), 2.0, 1.0)):
         expected = turning_point(state, load, direction, 0.2, 5.0, 2.0)
         status, time, stretch, _, _ = kernels.turning_point(
-            kernels.work_space(), *state, direction, load, 0.1, 0.2, 2.0, 0.2, 1e-13)
+            kernels.work_space(), *state, direction, load, 0.1, PAPER.packed, 1e-13)
         assert status == kernels.DONE
         assert (time, stretch) == pytest.approx(expected, rel=1e-11)
 
@@ -203,7 +203,7 @@ def test_turning_points_are_those_of_the_independent_integration():
 def test_the_intermediate_load_grows_with_the_target(zeta):
     targets = np.concatenate([np.linspace(0.26, 0.999, 300), np.linspace(1.001, 2.69, 300)])
     batch = plan_two_step_batch(1.0, targets, zeta=zeta)
-    assert np.all(batch.status == kernels.TWO_STEP)
+    assert np.all(batch.status == two_step_kernel.TWO_STEP)
     assert np.all(np.diff(batch.beta_p) > 0.0)
     assert np.all(np.diff(batch.beta_1) > 0.0)
     assert np.all(batch.tau_p > 0.0)
@@ -467,7 +467,7 @@ def test_huge_rates_end_in_a_plan_or_a_code_within_bounded_work(rate):
     for zeta in (0.0, 0.2, 50.0):
         for target in (0.9, 1.2, 2.6):
             plan = plan_two_step(1.2, target, group(zeta), rate=rate)
-            assert plan.passes <= 2 * kernels._MAX_ITERATIONS
+            assert plan.passes <= 2 * two_step_kernel._MAX_ITERATIONS
             if plan.code is Code.TWO_STEP:
                 end = after_plan(1.2, rate, plan, group(zeta))
                 assert distance(end, target, group(zeta)) < 1e-6

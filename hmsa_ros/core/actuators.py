@@ -12,8 +12,8 @@ import math
 
 import numpy as np
 
-from hmsa_ros.core import kernels
-from hmsa_ros.core.model import Array, stretch_limits
+from hmsa_ros.core import kernels, law
+from hmsa_ros.core.model import Array, Material, stretch_limits
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.schedule import CommandSchedule
 from hmsa_ros.core.units import NANOSECONDS
@@ -26,7 +26,7 @@ _NEVER = np.iinfo(np.int64).max
 _LARGEST_LOAD = 1e9
 
 
-def check_stretch(stretch: float, j_lim: float, name: str = 'stretch') -> None:
+def check_stretch(stretch: float, material: Material, name: str = 'stretch') -> None:
     """
     Refuse a stretch outside the limits.
 
@@ -34,8 +34,8 @@ def check_stretch(stretch: float, j_lim: float, name: str = 'stretch') -> None:
     ----------
     stretch : float
         Value to check.
-    j_lim : float
-        Chain limit.
+    material : NondimensionalParameters or float
+        The group, or the chain limit of a Gent block.
     name : str
         What the value is, for the message.
 
@@ -45,11 +45,11 @@ def check_stretch(stretch: float, j_lim: float, name: str = 'stretch') -> None:
         If it is not finite or not between the limiting stretches.
 
     """
-    lower, upper = stretch_limits(j_lim)
+    lower, upper = stretch_limits(material)
     if not lower < stretch < upper:
         raise BadInputError(
             f'{name} is {stretch:g}: expected a stretch between the limits {lower:.4f} and '
-            f'{upper:.4f} of J_lim {j_lim:g}')
+            f'{upper:.4f} of J_lim {getattr(material, "j_lim", material):g}')
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Setup:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        check_stretch(self.stretch, self.actuator.nondimensional.j_lim, 'initial stretch')
+        check_stretch(self.stretch, self.actuator.nondimensional, 'initial stretch')
         if not self.slew_limit > 0.0:
             raise BadInputError(
                 f'slew limit is {self.slew_limit:g} T/s: expected a number above 0')
@@ -103,7 +103,7 @@ class Setup:
     def holding(self, stretch: float) -> float:
         """Return the flux density in T that holds a stretch."""
         return float(
-            kernels.elastic_force(stretch, 1.0 / self.actuator.nondimensional.j_lim)
+            law.elastic_force(stretch, self.actuator.nondimensional.packed)
             * self.actuator.flux_density_unit)
 
 
@@ -148,9 +148,7 @@ class Actuators:
         self._slews = [0.0] * count
         for i in range(count):
             self.limit_slew(i, math.inf)
-        self._material = np.array([
-            (x.nondimensional.zeta, x.nondimensional.c1, 1.0 / x.nondimensional.j_lim)
-            for x in blocks])
+        self._material = np.array([x.nondimensional.packed for x in blocks])
         self._state = np.zeros((count, 3))
         self._drive = np.zeros((count, 4))
         self._levels = np.zeros(count)  # of the amplifiers, in T
@@ -236,7 +234,7 @@ class Actuators:
             If the stretch is outside the limits or the rate is not finite.
 
         """
-        check_stretch(stretch, self.setups[i].actuator.nondimensional.j_lim)
+        check_stretch(stretch, self.setups[i].actuator.nondimensional)
         if not math.isfinite(rate):
             raise BadInputError(f'stretch rate is {rate:g} 1/s: expected a finite number')
         level = flux_density if level is None else level
@@ -255,8 +253,8 @@ class Actuators:
 
     def equilibrium(self, i: int) -> float:
         """Return the stretch at which the flux density in force would hold one."""
-        return float(kernels.equilibrium_stretch(
-            self.flux_density[i] / self._units[i], self._material[i, 2]))
+        return float(law.equilibrium_stretch(
+            self.flux_density[i] / self._units[i], self._material[i]))
 
     # -- what drives them ----------------------------------------------------------------------
 

@@ -1,67 +1,55 @@
 """
-The actuator's equations: energies, forces, equilibrium, limits and linearised motion.
+The actuator's equations for arrays: energies, forces, equilibrium, limits, linearised motion.
 
 Every function takes arrays or scalars, broadcast against each other, and returns float64.
-Stretch comes first, then rate and load; material constants follow. The load is the signed
+Stretch comes first, then rate and load, then the material. The load is the signed
 ``beta = Br B/(mu0 G)``; the paper's b is ``sign(beta) sqrt|beta|``. Equation numbers are those
-of Polymers 2022, 14, 3037. Written in energy form, Eq. 11 is
-
-    m(l) l'' + m'(l) l'^2 / 2 + d l' + psi'(l) = beta
-
-with constant d, of which `mass`, `damping` and `elastic_force` are the parts.
+of Polymers 2022, 14, 3037. The equations themselves are in `hmsa_ros.core.law`.
 """
 
 from typing import Any
 
-from numba import vectorize
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.constants import mu_0
 
-from hmsa_ros.core import kernels
+from hmsa_ros.core import law
 from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
 
 Array = NDArray[np.float64]
 #: What functions accept: older NumPy types do not know what ``linspace`` returns.
 Floats = NDArray[np.floating[Any]]
+# A number is the chain limit of a Gent block.
+Material = NondimensionalParameters | float
 
 
 def _array(value: ArrayLike) -> Array:
     return np.asarray(value, dtype=np.float64)
 
 
-def extensibility(stretch: ArrayLike, j_lim: float) -> Array:
+def packed(material: Material) -> Array:
+    """Return what the kernels take for a material."""
+    if isinstance(material, NondimensionalParameters):
+        return material.packed
+    return law.pack(0.0, material, 1.0)
+
+
+def _evaluate(what: int, values: ArrayLike, material: Material) -> Array:
+    flat = np.array(values, dtype=np.float64, order='C')
+    out = np.empty(flat.size)
+    law.evaluate(what, flat.ravel(), packed(material), out)
+    return out.reshape(flat.shape)
+
+
+def elastic_energy(stretch: ArrayLike, material: Material) -> Array:
     """
-    Return how much of the chains' extension is left, g of Eq. 4.
-
-    Parameters
-    ----------
-    stretch : array_like
-        Principal stretch, greater than 0.
-    j_lim : float
-        Chain limit.
-
-    Returns
-    -------
-    ndarray
-        1 at rest, 0 at either limiting stretch, negative beyond.
-
-    """
-    stretch = _array(stretch)
-    # 2/l + l^2 - 3 = (l - 1)^2 (l + 2)/l loses no digits near l = 1.
-    return 1.0 - (stretch - 1.0) ** 2 * (stretch + 2.0) / (stretch * j_lim)
-
-
-def elastic_energy(stretch: ArrayLike, j_lim: float) -> Array:
-    """
-    Return the elastic energy per volume in units of G, Eq. 4.
+    Return the elastic energy per volume in units of G, Eq. 4 for Gent.
 
     Parameters
     ----------
     stretch : array_like
         Principal stretch inside the limits.
-    j_lim : float
-        Chain limit.
+    material : NondimensionalParameters or float
+        The group, or the chain limit of a Gent block.
 
     Returns
     -------
@@ -69,13 +57,10 @@ def elastic_energy(stretch: ArrayLike, j_lim: float) -> Array:
         psi, 0 at stretch 1; NaN outside the limits.
 
     """
-    stretch = _array(stretch)
-    with np.errstate(invalid='ignore', divide='ignore'):
-        return np.asarray(-0.5 * j_lim * np.log1p(
-            -(stretch - 1.0) ** 2 * (stretch + 2.0) / (stretch * j_lim)))
+    return _evaluate(law.ENERGY, stretch, material)
 
 
-def elastic_force(stretch: ArrayLike, j_lim: float) -> Array:
+def elastic_force(stretch: ArrayLike, material: Material) -> Array:
     """
     Return the load that holds a stretch at rest, psi' = beta_1.
 
@@ -83,20 +68,19 @@ def elastic_force(stretch: ArrayLike, j_lim: float) -> Array:
     ----------
     stretch : array_like
         Principal stretch inside the limits.
-    j_lim : float
-        Chain limit.
+    material : NondimensionalParameters or float
+        The group, or the chain limit of a Gent block.
 
     Returns
     -------
     ndarray
-        Signed load beta.
+        Signed load beta; NaN outside the limits.
 
     """
-    stretch = _array(stretch)
-    return (stretch - stretch ** -2) / extensibility(stretch, j_lim)
+    return _evaluate(law.FORCE, stretch, material)
 
 
-def elastic_stiffness(stretch: ArrayLike, j_lim: float) -> Array:
+def elastic_stiffness(stretch: ArrayLike, material: Material) -> Array:
     """
     Return psi'', the stiffness about a stretch.
 
@@ -104,31 +88,28 @@ def elastic_stiffness(stretch: ArrayLike, j_lim: float) -> Array:
     ----------
     stretch : array_like
         Principal stretch inside the limits.
-    j_lim : float
-        Chain limit.
+    material : NondimensionalParameters or float
+        The group, or the chain limit of a Gent block.
 
     Returns
     -------
     ndarray
-        Positive.
+        Positive; NaN outside the limits.
 
     """
-    stretch = _array(stretch)
-    left = extensibility(stretch, j_lim)
-    force = stretch - stretch ** -2
-    return (1.0 + 2.0 * stretch ** -3) / left + 2.0 * force ** 2 / (j_lim * left ** 2)
+    return _evaluate(law.STIFFNESS, stretch, material)
 
 
-def mass(stretch: ArrayLike, c1: float) -> Array:
+def mass(stretch: ArrayLike, material: NondimensionalParameters) -> Array:
     """
-    Return the inertia m(l) = (l^-3 + c1)/6, from Eq. 7.
+    Return the inertia m(l) = (l^-3 + c1)/6 of a block, from Eq. 7.
 
     Parameters
     ----------
     stretch : array_like
-        Principal stretch, greater than 0.
-    c1 : float
-        Shape 2 H^2/L^2.
+        Principal stretch inside the limits.
+    material : NondimensionalParameters
+        The group.
 
     Returns
     -------
@@ -136,7 +117,7 @@ def mass(stretch: ArrayLike, c1: float) -> Array:
         Positive.
 
     """
-    return (_array(stretch) ** -3 + c1) / 6.0
+    return _evaluate(law.MASS, stretch, material)
 
 
 def damping(material: NondimensionalParameters) -> float:
@@ -154,7 +135,7 @@ def damping(material: NondimensionalParameters) -> float:
         At least 0.
 
     """
-    return material.zeta * material.c1 / 2.0
+    return float(material.packed[law.DAMPING])
 
 
 def acceleration(
@@ -168,21 +149,18 @@ def acceleration(
     stretch, rate, load : array_like
         Nondimensional state and signed load.
     material : NondimensionalParameters
-        zeta, J_lim and c1.
+        The group.
 
     Returns
     -------
     ndarray
-        In nondimensional time.
+        In nondimensional time; NaN outside the limits.
 
     """
-    stretch, rate, load = _array(stretch), _array(rate), _array(load)
-    cube = stretch ** 3
-    inertia = 1.0 + material.c1 * cube
-    elastic = (stretch ** 4 - stretch) / extensibility(stretch, material.j_lim)
-    return (1.5 * rate ** 2 / (stretch * inertia)
-            - 3.0 * material.zeta * material.c1 * cube * rate / inertia
-            - 6.0 / inertia * (elastic - load * cube))
+    columns = np.broadcast_arrays(_array(stretch), _array(rate), _array(load))
+    out = np.empty(columns[0].size)
+    law.accelerations(*(np.array(x).ravel() for x in columns), material.packed, out)
+    return out.reshape(columns[0].shape)
 
 
 def acceleration_si(
@@ -194,7 +172,7 @@ def acceleration_si(
     Parameters
     ----------
     stretch : array_like
-        Principal stretch.
+        Principal stretch inside the limits.
     rate : array_like
         Stretch rate in 1/s.
     flux_density : array_like
@@ -205,22 +183,13 @@ def acceleration_si(
     Returns
     -------
     ndarray
-        In 1/s^2.
+        In 1/s^2; NaN outside the limits.
 
     """
-    stretch, rate = _array(stretch), _array(rate)
-    flux_density = _array(flux_density)
-    shape = 2.0 * (actuator.half_thickness / actuator.half_length) ** 2
-    cube = stretch ** 3
-    inertia = 1.0 + shape * cube
-    elastic = (stretch ** 4 - stretch) / extensibility(stretch, actuator.chain_limit)
-    magnetic = (actuator.remanence * flux_density * cube
-                / (actuator.shear_modulus * float(mu_0)))
-    return (1.5 * rate ** 2 / (stretch * inertia)
-            - 6.0 * actuator.damping_coefficient * rate * actuator.half_thickness * cube
-            / (8.0 * actuator.density * actuator.half_length ** 4 * inertia)
-            - 6.0 * actuator.shear_modulus
-            / (actuator.density * actuator.half_length ** 2 * inertia) * (elastic - magnetic))
+    unit = actuator.time_unit
+    return acceleration(
+        stretch, _array(rate) * unit, _array(flux_density) / actuator.flux_density_unit,
+        actuator.nondimensional) / unit ** 2
 
 
 def energy(
@@ -234,7 +203,7 @@ def energy(
     stretch, rate, load : array_like
         Nondimensional state and signed load.
     material : NondimensionalParameters
-        zeta, J_lim and c1.
+        The group.
 
     Returns
     -------
@@ -242,18 +211,11 @@ def energy(
         In units of the shear modulus.
 
     """
-    stretch, rate, load = _array(stretch), _array(rate), _array(load)
-    return (0.5 * mass(stretch, material.c1) * rate ** 2
-            + elastic_energy(stretch, material.j_lim) - load * stretch)
+    return (0.5 * mass(stretch, material) * _array(rate) ** 2
+            + elastic_energy(stretch, material) - _array(load) * _array(stretch))
 
 
-@vectorize(['float64(float64, float64)'], cache=True)
-def _equilibrium(load: float, i_j: float) -> float:
-    value: float = kernels.equilibrium_stretch(load, i_j)
-    return value
-
-
-def equilibrium_stretch(load: ArrayLike, j_lim: float) -> Array:
+def equilibrium_stretch(load: ArrayLike, material: Material) -> Array:
     """
     Return the stretch at which a constant load is in balance, the inverse of `elastic_force`.
 
@@ -261,8 +223,8 @@ def equilibrium_stretch(load: ArrayLike, j_lim: float) -> Array:
     ----------
     load : array_like
         Signed load beta, finite.
-    j_lim : float
-        Chain limit.
+    material : NondimensionalParameters or float
+        The group, or the chain limit of a Gent block.
 
     Returns
     -------
@@ -270,29 +232,27 @@ def equilibrium_stretch(load: ArrayLike, j_lim: float) -> Array:
         Inside the limits; unique, since the force is monotone.
 
     """
-    return np.asarray(_equilibrium(_array(load), 1.0 / j_lim))
+    return _evaluate(law.EQUILIBRIUM, load, material)
 
 
-def stretch_limits(j_lim: float) -> tuple[float, float]:
+def stretch_limits(material: Material) -> tuple[float, float]:
     """
     Return the limiting stretches, at which the chains are fully extended.
 
-    Both are roots of 2/l + l^2 - 3 = J_lim: the upper one is the paper's, the lower one bounds
-    contraction.
-
     Parameters
     ----------
-    j_lim : float
-        Chain limit.
+    material : NondimensionalParameters or float
+        The group, or the chain limit of a Gent block.
 
     Returns
     -------
     tuple of float
-        Lower limit below 1 and upper limit above 1; both excluded.
+        Lower limit below 1 and upper limit above 1, both excluded; 0 and infinity where the
+        law has none.
 
     """
-    lower, upper = kernels.stretch_limits(1.0 / j_lim)
-    return lower, upper
+    made = packed(material)
+    return float(made[law.LOWER]), float(made[law.UPPER])
 
 
 def natural_frequency(stretch: ArrayLike, material: NondimensionalParameters) -> Array:
@@ -302,9 +262,9 @@ def natural_frequency(stretch: ArrayLike, material: NondimensionalParameters) ->
     Parameters
     ----------
     stretch : array_like
-        Equilibrium stretch inside the limits.
+        Principal stretch inside the limits.
     material : NondimensionalParameters
-        zeta, J_lim and c1.
+        The group.
 
     Returns
     -------
@@ -312,7 +272,7 @@ def natural_frequency(stretch: ArrayLike, material: NondimensionalParameters) ->
         sqrt(psi''/m), per unit of nondimensional time.
 
     """
-    return np.sqrt(elastic_stiffness(stretch, material.j_lim) / mass(stretch, material.c1))
+    return _evaluate(law.FREQUENCY, stretch, material)
 
 
 def critical_zeta(stretch: ArrayLike, material: NondimensionalParameters) -> Array:
@@ -322,9 +282,9 @@ def critical_zeta(stretch: ArrayLike, material: NondimensionalParameters) -> Arr
     Parameters
     ----------
     stretch : array_like
-        Equilibrium stretch inside the limits.
+        Principal stretch inside the limits.
     material : NondimensionalParameters
-        J_lim and c1; its own zeta plays no part.
+        The group; its own zeta plays no part.
 
     Returns
     -------
@@ -332,8 +292,7 @@ def critical_zeta(stretch: ArrayLike, material: NondimensionalParameters) -> Arr
         (4/c1) sqrt(m psi'').
 
     """
-    return 4.0 / material.c1 * np.sqrt(
-        mass(stretch, material.c1) * elastic_stiffness(stretch, material.j_lim))
+    return _evaluate(law.CRITICAL_ZETA, stretch, material)
 
 
 def signed_root(load: ArrayLike) -> Array:

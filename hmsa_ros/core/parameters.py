@@ -1,28 +1,36 @@
 """Parameters of an actuator, in SI units and as the nondimensional group of Eq. 11."""
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 import math
 import sys
 
+import numpy as np
+from numpy.typing import NDArray
 from scipy.constants import mu_0
 
 from hmsa_ros.errors import BadInputError
 
 _ZERO_ALLOWED = ('zeta', 'damping_coefficient')
+# Infinite for neo-Hookean.
+_INFINITE_ALLOWED = ('j_lim', 'chain_limit')
 # Units and groups beyond this and its inverse are of no block, and overflow in the equations.
 _SMALLEST = 1e-100
 
 
 def _check(record: object) -> None:
-    """Refuse a record with a field that is not a finite positive number."""
+    """Refuse a record with a field that is out of range."""
     for field in fields(record):  # type: ignore[arg-type]
         value = getattr(record, field.name)
         if not isinstance(value, (int, float)) or isinstance(value, bool):
             raise BadInputError(f'{field.name} is {value!r}: expected a number')
         zero_allowed = field.name in _ZERO_ALLOWED
+        endless = field.name in _INFINITE_ALLOWED
         # Compared, since a whole number may be too large to convert.
-        if not 0.0 <= value <= sys.float_info.max or (value == 0.0 and not zero_allowed):
+        if not (0.0 <= value <= sys.float_info.max or (endless and value == math.inf)) or (
+                value == 0.0 and not zero_allowed):
             least = 'of at least 0' if zero_allowed else 'greater than 0'
+            least += ', or inf' if endless else ''
             raise BadInputError(f'{field.name} is {value!r}: expected a finite number {least}')
         object.__setattr__(record, field.name, float(value))
 
@@ -38,7 +46,8 @@ class NondimensionalParameters:
         Damping coefficient c/8 sqrt(1/(L^2 H^2 rho G)), at least 0. It is not a damping
         ratio: about a stretch of 1.1 the motion is critically damped near 2.16 for J_lim 5.
     j_lim : float
-        Limit of the chains' extension J_lim of the Gent model (Eq. 4), greater than 0.
+        Limit of the chains' extension J_lim of the Gent model (Eq. 4), greater than 0;
+        infinite for the neo-Hookean one.
     c1 : float
         Shape 2 H^2/L^2, greater than 0. The paper does not state it; the damping that it calls
         critical implies 2 (H = L).
@@ -57,6 +66,13 @@ class NondimensionalParameters:
     def __post_init__(self) -> None:
         """Check the values."""
         _check(self)
+
+    @cached_property
+    def packed(self) -> NDArray[np.float64]:
+        """The one argument of the compiled law, see `hmsa_ros.core.law`."""
+        from hmsa_ros.core import law  # imports Numba, which not all who have parameters need
+
+        return law.pack(self.zeta, self.j_lim, self.c1)
 
 
 @dataclass(frozen=True)
@@ -77,7 +93,7 @@ class ActuatorParameters:
     remanence : float
         Residual flux density Br in T, greater than 0.
     chain_limit : float
-        J_lim, dimensionless, greater than 0.
+        J_lim, dimensionless, greater than 0; infinite for neo-Hookean.
     damping_coefficient : float
         c of Eq. 9 in N s/m, at least 0.
 
@@ -153,7 +169,7 @@ class ActuatorParameters:
         """Flux density in T of the load beta = 1, mu0 G/Br."""
         return float(mu_0) * self.shear_modulus / self.remanence
 
-    @property
+    @cached_property
     def nondimensional(self) -> NondimensionalParameters:
         """The group that Eq. 11 depends on."""
         area = self.half_length * self.half_thickness

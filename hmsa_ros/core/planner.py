@@ -81,7 +81,7 @@ class Planner:
             stretch: float = 1.0) -> None:
         """Start at rest."""
         self.model = Model(actuator, options)
-        check_stretch(stretch, self.model.material.j_lim, 'initial stretch')
+        check_stretch(stretch, self.model.material, 'initial stretch')
         self._work = kernels.work_space()
         self._initial = stretch
         self._rest(stretch, 0)
@@ -120,7 +120,7 @@ class Planner:
         segments = self.plan.segments
         check_stretch(
             segments[-1].stretch if segments else self.plan.levels[-1].stretch,
-            model.material.j_lim, 'the stretch that is held')
+            model.material, 'the stretch that is held')
         return model
 
     def take_model(self, model: Model) -> None:
@@ -171,14 +171,14 @@ class Planner:
 
         """
         model = self.model
-        check_stretch(stretch, model.material.j_lim, 'stretch in force')
+        check_stretch(stretch, model.material, 'stretch in force')
         level = in_force if flux_density is None else flux_density
         if not math.isfinite(rate + in_force + level):
             raise BadInputError(
                 f'state in force is rate {rate:g} 1/s, flux density {in_force:g} T: expected '
                 'finite numbers')
         begin = PlannedLevel(stamp, level, stretch, rate, in_force, model)
-        held = equilibrium_stretch(level / model.units.load, model.material.j_lim)
+        held = equilibrium_stretch(level / model.units.load, model.material)
         at_rest = abs(rate) * model.units.time <= _SAMPLED_AT_REST * self.model.frequency(stretch)
         if at_rest and level == in_force and abs(float(held) - stretch) > _AGREES:
             begin = replace(begin, stamp=ALWAYS, rate=0.0)

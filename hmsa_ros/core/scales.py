@@ -128,8 +128,8 @@ def scales(actuator: ActuatorParameters, coil: Coil) -> Scales:
     material = actuator.nondimensional
     unit = actuator.flux_density_unit
     loads = coil.flux_density_min / unit, coil.flux_density_max / unit
-    lower, upper = stretch_limits(material.j_lim)
-    held = tuple(float(equilibrium_stretch(x, material.j_lim)) for x in loads)
+    lower, upper = stretch_limits(material)
+    held = tuple(float(equilibrium_stretch(x, material)) for x in loads)
 
     def duration(target: float) -> float:
         plan = plan_two_step(1.0, target, material, load_limits=loads)
@@ -169,7 +169,7 @@ def scales(actuator: ActuatorParameters, coil: Coil) -> Scales:
         zeta=material.zeta, critical_zeta=critical, damping=actuator.damping_coefficient,
         critical_damping=critical * per_zeta, flux_density_unit=unit,
         flux_densities=tuple(
-            (x, float(elastic_force(x, material.j_lim)) * unit)
+            (x, float(elastic_force(x, material)) * unit)
             for x in STRETCHES if lower < x < upper),
         stretch_limits=(lower, upper), held=(held[0], held[1]),
         reached=(reached[0], reached[1]), target=target,

@@ -130,7 +130,7 @@ def plan_sequence(
     limits = limits or Limits()
     units = units or Units()
     state = start or State(1.0)
-    check_stretch(state.stretch, material.j_lim, 'start stretch')
+    check_stretch(state.stretch, material, 'start stretch')
     begin = 0.0
     segments = []
     for number, setpoint in enumerate(setpoints, 1):
@@ -178,7 +178,7 @@ def _follow(
         end = max(end, span)
     load = state.load
     if math.isnan(load):
-        load = float(elastic_force(state.stretch, material.j_lim))
+        load = float(elastic_force(state.stretch, material))
     parts, last = ramps(move.levels, load, end, slew)
     end = min(end, max(parts[-1][0], 0.0) + longest_motion(last, material))
     stretch, rate = endpoint(parts, end, material, state.stretch, state.rate)

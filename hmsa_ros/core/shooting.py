@@ -1,7 +1,7 @@
 """
 Commands with two free numbers, solved for rest at the target.
 
-The two-step command on ideal hardware has a solver of its own (`hmsa_ros.core.kernels.shoot`).
+The two-step command on ideal hardware has a solver of its own, `two_step_kernel.shoot`.
 Everything else, a command on a grid, through ramps, or with two intermediate levels of given
 height, has two unknowns as well, and they meet the same two conditions: stretch at the target,
 rate zero, at the instant at which the last level is in force. Newton solves them with the
@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from hmsa_ros.core import kernels
+from hmsa_ros.core import kernels, law
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.moves import Level, State
 from hmsa_ros.core.parameters import NondimensionalParameters
@@ -138,7 +138,7 @@ def solve(
         solution was found from this guess.
 
     """
-    frequency = kernels.natural_frequency(target, material.c1, 1.0 / material.j_lim)
+    frequency = law.natural_frequency(target, material.packed)
     move = abs(target - state.stretch) + abs(state.rate) / frequency
     found = _end(template, state, load, target, frequency, material, slew)
     if found is None:
@@ -184,7 +184,7 @@ def _end(
     jacobian = np.empty((2, 2))
     status, stretch, rate = kernels.respond(
         state.stretch, state.rate, durations, loads, slopes, d_durations, d_loads,
-        material.zeta, material.c1, 1.0 / material.j_lim, _RTOL, jacobian)
+        material.packed, _RTOL, jacobian)
     if status != kernels.DONE or not np.all(np.isfinite(jacobian)):
         return None
     jacobian[1] /= frequency

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hmsa_ros.core import kernels
+from hmsa_ros.core import kernels, law
 from hmsa_ros.core.actuators import Actuators, check_stretch, RTOL, Setup
 from hmsa_ros.core.delivery import Piece
 from hmsa_ros.core.model import Array, damping
@@ -80,11 +80,11 @@ def simulate(
             times.size and times[0] < switches[0]):
         raise BadInputError(
             'switches and times must not decrease, and no time may lie before the first switch')
-    check_stretch(stretch, material.j_lim)
+    check_stretch(stretch, material)
     out = np.empty((2, times.size))
     status = kernels.trajectory(
-        float(stretch), float(rate), switches, loads, ramps, times, material.zeta, material.c1,
-        1.0 / material.j_lim, float(rtol), out[0], out[1])
+        float(stretch), float(rate), switches, loads, ramps, times, material.packed,
+        float(rtol), out[0], out[1])
     if status != kernels.DONE:
         raise HmsaError(_STUCK)
     return out[0], out[1]
@@ -122,8 +122,8 @@ def endpoint(
     for i, (begin, load, slope) in enumerate(pieces):
         until = pieces[i + 1][0] if i + 1 < len(pieces) else end
         status, stretch, rate, *_ = kernels.advance(
-            work, stretch, rate, 0.0, 0.0, load, slope, 0.0, 0.0, until - begin, material.zeta,
-            material.c1, 1.0 / material.j_lim, RTOL, 0.0)
+            work, stretch, rate, 0.0, 0.0, load, slope, 0.0, 0.0, until - begin,
+            material.packed, RTOL, 0.0)
         if status != kernels.DONE:
             raise HmsaError(_STUCK)
     return stretch, rate
@@ -152,11 +152,10 @@ def longest_motion(load: float, material: NondimensionalParameters) -> float:
 
     """
     # Scalars by the kernels: each prediction asks for this.
-    i_j = 1.0 / material.j_lim
-    stretch = kernels.equilibrium_stretch(float(load), i_j)
-    frequency = float(kernels.natural_frequency(stretch, material.c1, i_j))
+    stretch = law.equilibrium_stretch(float(load), material.packed)
+    frequency = float(law.natural_frequency(stretch, material.packed))
     longest = _MOST_PERIODS * 2.0 * math.pi / frequency
-    decay = damping(material) / (2.0 * float(kernels.mass(stretch, material.c1)))
+    decay = damping(material) / (2.0 * float(law.mass(stretch, material.packed)))
     if decay == 0.0:
         return longest
     if decay < frequency:
@@ -373,6 +372,6 @@ def unshaped(
 
     """
     for target in targets:
-        check_stretch(target, material.j_lim, 'target')
-    loads = [kernels.elastic_force(float(x), 1.0 / material.j_lim) for x in targets]
+        check_stretch(target, material, 'target')
+    loads = [law.elastic_force(float(x), material.packed) for x in targets]
     return simulate(begins, loads, times, material, stretch=start)

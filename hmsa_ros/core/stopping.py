@@ -58,7 +58,6 @@ def brake(model: Model, work: Array, state: State, share: float = 1.0) -> Brake:
         One of no duration where the motion cannot be followed to a turning point.
 
     """
-    material = model.material
     holding = model.holding(state.stretch)
     rest = Brake(holding, 0.0, state.stretch)
     frequency = model.frequency(state.stretch)
@@ -73,7 +72,7 @@ def brake(model: Model, work: Array, state: State, share: float = 1.0) -> Brake:
         load = holding + share * (load - holding)
     status, time, stretch, _, _ = kernels.turning_point(
         work, state.stretch, state.rate, 1.0 if up else -1.0, load, 1.0,
-        material.zeta, material.c1, 1.0 / material.j_lim, RTOL)
+        model.material.packed, RTOL)
     if status != kernels.DONE:
         return rest
     return Brake(float(load), model.time(model.ns(time)), stretch)
@@ -103,4 +102,4 @@ def holdable(model: Model, stretch: float) -> float:
     nearest = least if load < least else most
     margin = _INSIDE * min(most - least, 1.0 + abs(nearest))
     return float(equilibrium_stretch(
-        nearest + math.copysign(margin, nearest - load), model.material.j_lim))
+        nearest + math.copysign(margin, nearest - load), model.material))

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 import math
 
-from hmsa_ros.core import kernels
+from hmsa_ros.core import law
 from hmsa_ros.core.delivery import Delivery, pieces, ramps
 from hmsa_ros.core.moves import Level, Limits, State
 from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
@@ -127,12 +127,11 @@ class Model:
 
     def holding(self, stretch: float) -> float:
         """Return the load that holds a stretch."""
-        return float(kernels.elastic_force(stretch, 1.0 / self.material.j_lim))
+        return float(law.elastic_force(stretch, self.material.packed))
 
     def frequency(self, stretch: float) -> float:
         """Return the nondimensional natural frequency about a stretch."""
-        material = self.material
-        return float(kernels.natural_frequency(stretch, material.c1, 1.0 / material.j_lim))
+        return float(law.natural_frequency(stretch, self.material.packed))
 
     def follow(self, state: State, load: float, duration: float) -> State:
         """

@@ -11,7 +11,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hmsa_ros.core import kernels
+from hmsa_ros.core import kernels, law
+from hmsa_ros.core import two_step_kernel as kernel
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.status import Code
 from hmsa_ros.errors import BadInputError
@@ -22,14 +23,14 @@ RTOL = 1e-12
 HOLD_TOLERANCE = 1e-9
 
 CODES = {
-    kernels.TWO_STEP: Code.TWO_STEP,
-    kernels.HOLD: Code.HOLD,
-    kernels.TOO_DAMPED: Code.TOO_DAMPED,
-    kernels.INDISTINGUISHABLE: Code.INDISTINGUISHABLE,
-    kernels.NO_TWO_STEP: Code.NO_TWO_STEP,
-    kernels.NOT_CONVERGED: Code.NOT_CONVERGED,
-    kernels.OUT_OF_RANGE: Code.OUT_OF_RANGE,
-    kernels.BAD_INPUT: Code.BAD_INPUT,
+    kernel.TWO_STEP: Code.TWO_STEP,
+    kernel.HOLD: Code.HOLD,
+    kernel.TOO_DAMPED: Code.TOO_DAMPED,
+    kernel.INDISTINGUISHABLE: Code.INDISTINGUISHABLE,
+    kernel.NO_TWO_STEP: Code.NO_TWO_STEP,
+    kernel.NOT_CONVERGED: Code.NOT_CONVERGED,
+    kernel.OUT_OF_RANGE: Code.OUT_OF_RANGE,
+    kernel.BAD_INPUT: Code.BAD_INPUT,
 }
 
 _WORK = kernels.work_space()
@@ -105,10 +106,9 @@ def plan_two_step(
             f'start {start!r}, target {target!r}, rate {rate!r}: expected finite numbers')
     if not 1e-14 <= rtol <= 1e-4:
         raise BadInputError(f'rtol is {rtol!r}: expected 1e-14 to 1e-4')
-    status, beta_p, tau_p, beta_1, passes = kernels.two_step(
-        _WORK, float(start), float(rate), float(target), material.zeta, material.c1,
-        1.0 / material.j_lim, float(load_limits[0]), float(load_limits[1]), float(rtol),
-        HOLD_TOLERANCE)
+    status, beta_p, tau_p, beta_1, passes = kernel.two_step(
+        _WORK, float(start), float(rate), float(target), material.packed,
+        float(load_limits[0]), float(load_limits[1]), float(rtol), HOLD_TOLERANCE)
     return TwoStep(CODES[status], beta_p, tau_p, beta_1, passes)
 
 
@@ -164,15 +164,16 @@ def plan_two_step_batch(
         raise BadInputError(f'rtol is {rtol!r}: expected 1e-14 to 1e-4')
     try:
         arrays = np.broadcast_arrays(*(
-            np.asarray(a, dtype=np.float64) for a in (start, rate, target, zeta, c1, j_lim)))
+            np.asarray(a, dtype=np.float64) for a in (start, rate, target, zeta, j_lim, c1)))
     except ValueError as error:
         raise BadInputError(f'the arrays do not broadcast against each other: {error}') from error
     shape = arrays[0].shape
     # Copies: NumPy warns of a broadcast array that Numba asks whether it may write to.
     columns = [np.array(a).ravel() for a in arrays]
+    materials = law.pack(*columns[3:])
     status = np.empty(columns[0].size, dtype=np.int64)
     results = [np.empty(status.size) for _ in range(3)]
-    kernels.two_step_batch(
-        *columns, float(load_limits[0]), float(load_limits[1]), float(rtol), HOLD_TOLERANCE,
-        status, *results)
+    kernel.two_step_batch(
+        *columns[:3], materials, float(load_limits[0]), float(load_limits[1]), float(rtol),
+        HOLD_TOLERANCE, status, *results)
     return TwoStepBatch(status.reshape(shape), *(a.reshape(shape) for a in results))

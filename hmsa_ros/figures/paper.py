@@ -308,7 +308,7 @@ def _draw_chain_limit_cases(figure: Figure, runs: tuple[Run, ...]) -> None:
     grid = figure.subplots(len(pairs), 2, sharex='col', width_ratios=[1.6, 1.0])
     begin = 2 * paper_data.SPAN
     for (left, right), pair, letter in zip(grid, pairs, 'abc', strict=True):
-        limit = stretch_limits(pair[0].material.j_lim)[1]
+        limit = stretch_limits(pair[0].material)[1]
         for axes in (left, right):
             axes.axhline(
                 limit, color=style.BLACK, linewidth=0.9, linestyle=(0, (6, 2)),

@@ -238,7 +238,7 @@ def draw_damped(path: str | Path, study: DampedStudy, *, zeta: float = 4.0) -> N
 
     """
     material = NondimensionalParameters(zeta)
-    holding = float(elastic_force(study.target, material.j_lim))
+    holding = float(elastic_force(study.target, material))
     colours = (style.BLUE, style.GREEN)
     names = [
         rf'minimum time, ${least:g}\,\beta_1$ to ${most:g}\,\beta_1$' for least, most in LIMITS]

@@ -97,7 +97,7 @@ class ParameterSpec:
             If it is not finite, outside the range or not one of the choices.
 
         """
-        if isinstance(value, float) and not math.isfinite(value):
+        if isinstance(value, float) and not (math.isfinite(value) or value == self.maximum):
             raise BadInputError(
                 f'parameter {self.name} is {value}: expected a finite number')
         if self.choices and value not in self.choices:
@@ -223,7 +223,8 @@ ACTUATOR = (
         'actuator.remanence', _DEFAULT.remanence, 'Residual flux density Br.', 'T', 1e-9, 1e3),
     ParameterSpec(
         'actuator.chain_limit', _DEFAULT.chain_limit,
-        "Limit of the chains' extension J_lim of the Gent model.", '', 1e-3, 1e9),
+        "Limit of the chains' extension J_lim of the Gent model; .inf for neo-Hookean.", '',
+        1e-3, math.inf),
     ParameterSpec(
         'actuator.damping_coefficient', _DEFAULT.damping_coefficient,
         'Damping coefficient c; zeta = c/(8 L H sqrt(rho G)).', 'N s/m', 0.0, 1e12),

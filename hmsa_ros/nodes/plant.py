@@ -536,7 +536,7 @@ def _check_reset(values: JointParameters) -> None:
         own = values.of(name)
         if own['reset_stretch']:
             check_stretch(
-                own['reset_stretch'], setup_from(own).actuator.nondimensional.j_lim,
+                own['reset_stretch'], setup_from(own).actuator.nondimensional,
                 f'reset_stretch of {name}')
 
 

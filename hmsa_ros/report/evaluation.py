@@ -269,7 +269,7 @@ def find_moves(
     asked = _asked(run)
     unit = run.planner.flux_density_unit
     material = run.planner.nondimensional
-    balance = equilibrium_stretch([x.flux_density / unit for x in levels], material.j_lim)
+    balance = equilibrium_stretch([x.flux_density / unit for x in levels], material)
     period = 2.0 * math.pi / natural_frequency(balance, material) * run.planner.time_unit
     predicted = {x.stamp: x for x in plan}
 
@@ -381,7 +381,7 @@ def _unshaped(
     unit = run.plant.time_unit
     begins = [(x.begin - zero) / NANOSECONDS for x in moves]
     running = time >= begins[0]
-    lower, upper = stretch_limits(run.plant.chain_limit)
+    lower, upper = stretch_limits(run.plant.nondimensional)
     margin = 1e-6 * (upper - lower)
     try:
         stretch[running], nondimensional_rate = simulate(
@@ -420,13 +420,13 @@ def _predict(run: Run, plan: Sequence[Level]) -> tuple[Array, Array]:
     predicted = np.full((2, len(run.time)), np.nan)
     actuator: ActuatorParameters = run.planner
     material = actuator.nondimensional
-    lower, upper = stretch_limits(material.j_lim)
+    lower, upper = stretch_limits(material)
     # No block can be where the others are; a message of anything may have been recorded.
     plan = [x for x in plan if lower < x.stretch < upper]
     if not plan:
         return predicted[0], predicted[1]
     slew = run.number('planner.slew_limit') / actuator.flux_density_unit * actuator.time_unit
-    load = float(elastic_force(plan[0].stretch, material.j_lim))
+    load = float(elastic_force(plan[0].stretch, material))
     for i, point in enumerate(plan):
         until = plan[i + 1].stamp if i + 1 < len(plan) else max(int(run.time[-1]), point.stamp)
         duration = (until - point.stamp) / NANOSECONDS / actuator.time_unit

@@ -449,7 +449,7 @@ def _parameters(parts: Sequence[Part]) -> str:
         [name.replace('_', ' '), _UNITS[name], *(_cell(getattr(x, name)) for x in columns)]
         for name in ACTUATOR_FIELDS]
     groups = [x.nondimensional for x in columns]
-    limits = [stretch_limits(x.chain_limit) for x in columns]
+    limits = [stretch_limits(x.nondimensional) for x in columns]
     rows += [
         ['zeta', '1', *(_cell(x.zeta) for x in groups)],
         ['critical zeta about stretch 1', '1', *(

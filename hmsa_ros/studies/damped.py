@@ -75,7 +75,7 @@ def limits_of(target: float, material: NondimensionalParameters, number: int) ->
         As loads.
 
     """
-    holding = float(elastic_force(target, material.j_lim))
+    holding = float(elastic_force(target, material))
     least, most = LIMITS[number]
     return Limits(least * holding, most * holding)
 

@@ -150,7 +150,7 @@ def response(
     stiffer = 1.0 + errors.shear_modulus
     faster = math.sqrt(stiffer)
     actual = errors.actual(material)
-    begin = equilibrium_stretch(elastic_force(start, material.j_lim) / stiffer, actual.j_lim)
+    begin = equilibrium_stretch(elastic_force(start, material) / stiffer, actual)
     stretch, _ = simulate(
         np.array([x.time for x in move.levels]) * faster,
         np.array([x.load for x in move.levels]) / stiffer, times * faster, actual,
@@ -178,7 +178,7 @@ def rest(move: Move, material: NondimensionalParameters, errors: Errors) -> floa
 
     """
     load = move.levels[-1].load / (1.0 + errors.shear_modulus)
-    return float(equilibrium_stretch(load, errors.actual(material).j_lim))
+    return float(equilibrium_stretch(load, errors.actual(material)))
 
 
 def residual(

@@ -125,8 +125,8 @@ class Case:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        check_stretch(self.start, self.material.j_lim, 'start stretch')
-        check_stretch(self.target, self.material.j_lim, 'target stretch')
+        check_stretch(self.start, self.material, 'start stretch')
+        check_stretch(self.target, self.material, 'target stretch')
         if abs(self.target - self.start) < 1e-6:
             raise BadInputError(
                 f'the move from stretch {self.start:g} to {self.target:g} is none: expected '

@@ -11,7 +11,7 @@ larger the move.
 
 import math
 
-from hmsa_ros.core import kernels
+from hmsa_ros.core import law
 from hmsa_ros.core.moves import Level, Move
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.status import Code
@@ -96,14 +96,13 @@ def _shaped(request: Request, weights: tuple[float, ...]) -> Move:
     """Shape the step with impulses half a damped period apart, decaying as the motion does."""
     holding = request.holding_load()
     material, target = request.material, request.target
-    i_j = 1.0 / material.j_lim
-    xi = material.zeta / kernels.critical_zeta(target, material.c1, i_j)
+    xi = material.zeta / law.critical_zeta(target, material.packed)
     if xi >= 1.0:
         return request.plain(
             Code.TOO_DAMPED,
             f'zeta {material.zeta:g} is above critical damping at stretch {target:g}: there is '
             'no oscillation to shape for, the plain step is used')
-    frequency = kernels.natural_frequency(target, material.c1, i_j)
+    frequency = law.natural_frequency(target, material.packed)
     damped = math.sqrt(1.0 - xi * xi)
     half_period = math.pi / (frequency * damped)
     decay = math.exp(-math.pi * xi / damped)

@@ -4,7 +4,7 @@ import math
 
 from scipy.optimize import brentq
 
-from hmsa_ros.core import kernels
+from hmsa_ros.core import kernels, law
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.moves import Level, Move, State
 from hmsa_ros.core.shapers.request import Request
@@ -125,16 +125,14 @@ def _on_time(
 
 
 def _frequency(request: Request) -> float:
-    material = request.material
-    return float(
-        kernels.natural_frequency(request.target, material.c1, 1.0 / material.j_lim))
+    return float(law.natural_frequency(request.target, request.material.packed))
 
 
 def _bounds(request: Request, holding: float, frequency: float) -> tuple[float, float]:
     """Return the loads to push and brake with: the limits, or twice the move's own change."""
     state = request.state
-    change = abs(holding - kernels.elastic_force(state.stretch, 1.0 / request.material.j_lim))
-    mass = kernels.mass(state.stretch, request.material.c1)
+    change = abs(holding - law.elastic_force(state.stretch, request.material.packed))
+    mass = law.mass(state.stretch, request.material.packed)
     room = 2.0 * (change + mass * abs(state.rate) * frequency)
     least = max(request.limits.minimum, holding - room)
     most = min(request.limits.maximum, holding + room)
@@ -153,13 +151,13 @@ def _bounds(request: Request, holding: float, frequency: float) -> tuple[float, 
 def _direction(
         work: Array, request: Request, least: float, most: float) -> float:
     """Return where to push: +1 if full braking would stop short of the target, seen upwards."""
-    state, material = request.state, request.material
+    state = request.state
     stop = state.stretch
     if state.rate != 0.0:
         up = state.rate > 0.0
         status, _, stop, _, _ = kernels.turning_point(
             work, state.stretch, state.rate, 1.0 if up else -1.0, least if up else most, 1.0,
-            material.zeta, material.c1, 1.0 / material.j_lim, _RTOL)
+            request.material.packed, _RTOL)
         if status != kernels.DONE:
             stop = state.stretch
     return 1.0 if request.target > stop else -1.0
@@ -170,13 +168,11 @@ def _durations(
         brake: float) -> tuple[float, float]:
     """Find how long to push so that braking turns at the target, and how long that brakes."""
     state, material, target = request.state, request.material, request.target
-    i_j = 1.0 / material.j_lim
-    constants = (material.zeta, material.c1, i_j)
-    limits = kernels.stretch_limits(i_j)
+    packed = material.packed
 
     def follow(start: State, time: float) -> State:
         _, stretch, rate, _, _, _ = kernels.advance(
-            work, start.stretch, start.rate, 0.0, 0.0, push, 0.0, 0.0, 0.0, time, *constants,
+            work, start.stretch, start.rate, 0.0, 0.0, push, 0.0, 0.0, 0.0, time, packed,
             _RTOL, 0.0)
         return State(stretch, rate)
 
@@ -184,10 +180,10 @@ def _durations(
         if direction * start.rate <= 0.0:
             return 0.0, start.stretch
         status, time, stretch, _, _ = kernels.turning_point(
-            work, start.stretch, start.rate, direction, brake, 1.0, *constants, _RTOL)
+            work, start.stretch, start.rate, direction, brake, 1.0, packed, _RTOL)
         if status != kernels.DONE:
             # Too hard against a limiting stretch to be followed: far beyond the target.
-            return 0.0, limits[1] if direction > 0.0 else limits[0]
+            return 0.0, float(packed[law.UPPER if direction > 0.0 else law.LOWER])
         return time, stretch
 
     begin = 0.0
@@ -195,7 +191,7 @@ def _durations(
     if direction * state.rate < 0.0:
         # Moving away: the push first has to bring it to a stop.
         status, begin, stretch, _, _ = kernels.turning_point(
-            work, state.stretch, state.rate, -direction, push, 1.0, *constants, _RTOL)
+            work, state.stretch, state.rate, -direction, push, 1.0, packed, _RTOL)
         if status == kernels.DONE:
             here = State(stretch, 0.0)
     stride = 0.02 / (_frequency(request) + material.zeta)

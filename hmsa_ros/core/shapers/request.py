@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 import math
 
-from hmsa_ros.core import kernels
+from hmsa_ros.core import law
 from hmsa_ros.core.delivery import Delivery, IDEAL
 from hmsa_ros.core.moves import Level, Limits, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
@@ -51,7 +51,7 @@ class Request:
         """Load in force before the move."""
         if math.isfinite(self.state.load):
             return self.state.load
-        return float(kernels.elastic_force(self.state.stretch, 1.0 / self.material.j_lim))
+        return float(law.elastic_force(self.state.stretch, self.material.packed))
 
     def to(self, target: float) -> 'Request':
         """
@@ -86,10 +86,10 @@ class Request:
 
         """
         try:
-            check_stretch(self.target, self.material.j_lim, 'target stretch')
+            check_stretch(self.target, self.material, 'target stretch')
         except BadInputError as error:
             raise RefusedError(Code.OUT_OF_RANGE, str(error)) from error
-        load = float(kernels.elastic_force(self.target, 1.0 / self.material.j_lim))
+        load = float(law.elastic_force(self.target, self.material.packed))
         self.limits.check(load, self.target, self.units)
         return load
 

@@ -10,7 +10,7 @@ oscillator gives the levels of n convolved ZV shapers.
 
 from dataclasses import replace
 
-from hmsa_ros.core import kernels
+from hmsa_ros.core import law
 from hmsa_ros.core.delivery import IDEAL
 from hmsa_ros.core.moves import Level, Move, State
 from hmsa_ros.core.shapers.request import Request
@@ -52,7 +52,7 @@ def robust(request: Request) -> Move:
     chain = two_step(ideal)
     for _ in range(request.order - 1):
         waypoints = [
-            float(kernels.equilibrium_stretch(x.load, 1.0 / request.material.j_lim))
+            float(law.equilibrium_stretch(x.load, request.material.packed))
             for x in chain.levels[:-1]]
         chain = _chain(ideal, [*waypoints, request.target])
         if chain.code is not Code.ROBUST:

@@ -1,0 +1,177 @@
+"""
+The one decorator of what Numba compiles, with a cache that follows all of its sources.
+
+Numba renews a cached function when its own file changes, not when a function that it calls
+does. Here an entry belongs to a hash of all modules with kernels and of the versions that
+compiled it. An entry that cannot be read is compiled anew, and where no folder can be written
+the kernels are compiled in memory.
+"""
+
+from collections.abc import Callable
+import contextlib
+from functools import cache
+import hashlib
+import logging
+import os
+from pathlib import Path
+import pickle
+import sys
+from typing import Any
+import zlib
+
+import numba
+from numba import njit
+from numba.core import caching, serialize
+import numpy as np
+
+# Fused multiply-add, but nothing that would treat NaN as impossible: it ends bad steps.
+_OPTIONS = {'error_model': 'numpy', 'fastmath': {'contract', 'nsz'}}
+_SOURCES = ('compiling', 'dop853', 'kernels', 'law', 'two_step_kernel')
+_HERE = Path(__file__).resolve().parent
+
+
+def compiled(*, inline: bool = False, parallel: bool = False) -> Callable[..., Any]:
+    """
+    Return a decorator that has Numba compile a function and caches it.
+
+    Parameters
+    ----------
+    inline : bool
+        Copy the function into its callers before types are known.
+    parallel : bool
+        Run the loops over ``prange`` on all cores.
+
+    Returns
+    -------
+    callable
+        The decorator.
+
+    """
+    options = {**_OPTIONS, 'parallel': parallel, 'inline': 'always' if inline else 'never'}
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        dispatcher = njit(**options)(function)
+        if _folder() is not None:
+            # As `Dispatcher.enable_caching` does, with a cache of our own.
+            dispatcher._cache = _Cache(function)
+        return dispatcher
+
+    return decorate
+
+
+@cache
+def stamp() -> str:
+    """Return the hash of the sources of all kernels and of what compiles them."""
+    made = hashlib.sha256()
+    for name in _SOURCES:
+        made.update((_HERE / f'{name}.py').read_bytes())
+    for version in (sys.version, numba.__version__, np.__version__):
+        made.update(version.encode())
+    return made.hexdigest()
+
+
+@cache
+def _folder() -> str | None:
+    """Return where compiled kernels are kept, or None where nothing can be written."""
+    owner = hashlib.sha256(str(_HERE).encode()).hexdigest()[:16]
+    home = os.environ.get('XDG_CACHE_HOME') or os.path.expanduser('~/.cache')
+    wanted = [_HERE / '__pycache__', Path(home) / 'hmsa_ros' / owner]
+    if numba.config.CACHE_DIR:
+        wanted.insert(0, Path(numba.config.CACHE_DIR) / f'hmsa_ros-{owner}')
+    for folder in wanted:
+        probe = folder / f'.writable-{os.getpid()}'
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            probe.touch()
+            probe.unlink()
+        except (OSError, RuntimeError):
+            continue
+        return str(folder)
+    logging.getLogger('hmsa_ros').warning(
+        'cannot write to %s: the numerical kernels are compiled at each start, for some '
+        'seconds; expected a folder that can be written, which NUMBA_CACHE_DIR may name',
+        ' or '.join(str(x) for x in wanted))
+    return None
+
+
+class _Locator(caching._CacheLocator):
+    """Where the cache of a function is, and what it belongs to."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._py_file = function.__code__.co_filename
+
+    def get_cache_path(self) -> str:
+        """Return the folder."""
+        return str(_folder())
+
+    def get_source_stamp(self) -> str:
+        """Return what an entry must have been made from."""
+        return stamp()
+
+    def get_disambiguator(self) -> str:
+        """Return nothing: names are unique in the modules of kernels."""
+        return ''
+
+    @classmethod
+    def from_function(cls, function: Callable[..., Any], _: str) -> '_Locator':
+        """Return the locator of a function."""
+        return cls(function)
+
+
+class _Implementation(caching.CompileResultCacheImpl):
+    _locator_classes = (_Locator,)
+
+
+class _Entries:
+    """The compiled versions of a function, a file each: a checksum, then what it holds."""
+
+    def __init__(self, folder: str, name: str) -> None:
+        self._start = Path(folder) / name
+
+    def _path(self, key: Any) -> Path:
+        # Without the hash of the code, so that a new version takes the place of the old one.
+        name = hashlib.sha256(repr(key[:2]).encode()).hexdigest()[:16]
+        return self._start.with_name(f'{self._start.name}-{name}.hmsa')
+
+    def load(self, key: Any) -> Any:
+        """Return the compiled function, None where there is none, or an old or damaged one."""
+        try:
+            data = self._path(key).read_bytes()
+        except FileNotFoundError:
+            return None
+        # Damaged machine code would crash the process.
+        if zlib.crc32(data[4:]).to_bytes(4, 'little') != data[:4]:
+            return None
+        made, kept, compiled_function = pickle.loads(data[4:])
+        return compiled_function if (made, kept) == (stamp(), repr(key)) else None
+
+    def save(self, key: Any, compiled_function: Any) -> None:
+        """Keep a compiled function."""
+        data = serialize.dumps((stamp(), repr(key), compiled_function))
+        path = self._path(key)
+        beside = path.with_suffix(f'.{os.getpid()}')
+        try:
+            beside.write_bytes(zlib.crc32(data).to_bytes(4, 'little') + data)
+            beside.replace(path)
+        finally:
+            beside.unlink(missing_ok=True)
+
+
+class _Cache(caching.FunctionCache):
+    """A cache that never keeps a kernel from running."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        self._cache_file = _Entries(self._cache_path, self._impl.filename_base)
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return the cached function, or None where it must be compiled."""
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:  # a damaged pickle may raise anything
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep a compiled function where the disk takes it."""
+        with contextlib.suppress(OSError):
+            super().save_overload(sig, data)

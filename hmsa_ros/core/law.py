@@ -1,0 +1,260 @@
+"""
+The law of the actuator: what it weighs, how it pushes back, what drives it.
+
+In nondimensional energy form every actuator of this package obeys
+
+    m(l) l'' + m'(l) l'^2 / 2 + d l' + psi'(l) = beta
+
+with stretch ``l``, time in units of ``L sqrt(rho/G)`` and the signed load
+``beta = Br B/(mu0 G)``. This module has the parts: everything else takes them from here, and a
+further law is one more branch in `_elastic`, `elastic_energy` and `pack`.
+
+The compiled functions take one array ``material``, as `pack` makes it: a header (`KIND` to
+`UPPER`), then the constants of the law from `CONSTANTS` on, as many as it has, tables included.
+Nothing here checks its arguments; outside the limits the results are NaN.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmsa_ros.core.compiling import compiled
+
+# Places in the packed material.
+KIND = 0  # which law
+ZETA = 1  # damping of the group
+C1 = 2  # shape of the block, 2 H^2/L^2
+DAMPING = 3  # d
+LOWER = 4  # limiting stretches; 0 and infinity where there are none
+UPPER = 5
+CONSTANTS = 6
+
+# Laws, with their constants.
+GENT = 0.0  # 1/J_lim
+NEO_HOOKEAN = 1.0  # none
+
+#: Columns of `acceleration_slopes` before the constants of the law.
+BY_LOAD, BY_MODULUS, BY_ZETA, BY_C1, BY_CONSTANT = 0, 1, 2, 3, 4
+
+# What `evaluate` computes.
+FORCE, STIFFNESS, ENERGY, MASS, FREQUENCY, CRITICAL_ZETA, EQUILIBRIUM = range(7)
+
+Array = NDArray[np.float64]
+
+
+def gent_limits(i_j: Any) -> tuple[Any, Any]:
+    """
+    Return the stretches at which chains of limit 1/i_j are fully extended, for arrays too.
+
+    They are the positive roots of l^3 - (1/i_j + 3) l + 2; 0 and infinity for i_j = 0.
+    """
+    with np.errstate(divide='ignore', invalid='ignore'):
+        p = 1.0 / np.asarray(i_j, dtype=np.float64) + 3.0
+        angle = np.arccos(-((3.0 / p) ** 1.5))
+        lower = 2.0 * np.sqrt(p / 3.0) * np.cos((angle - 2.0 * math.pi) / 3.0)
+        upper = 2.0 * np.sqrt(p / 3.0) * np.cos(angle / 3.0)
+        for _ in range(2):
+            # Newton steps recover the digits lost where the roots lie close together.
+            lower = lower - (lower ** 3 - p * lower + 2.0) / (3.0 * lower * lower - p)
+            upper = upper - (upper ** 3 - p * upper + 2.0) / (3.0 * upper * upper - p)
+    endless = np.isinf(p)
+    return np.where(endless, 0.0, lower), np.where(endless, math.inf, upper)
+
+
+def pack(zeta: Any, j_lim: Any, c1: Any) -> Array:
+    """
+    Return the packed material of a Gent block; neo-Hookean where J_lim is infinite.
+
+    Arrays (n,) give n rows.
+    """
+    zeta, j_lim, c1 = (np.asarray(x, dtype=np.float64) for x in (zeta, j_lim, c1))
+    with np.errstate(divide='ignore', over='ignore'):
+        i_j = 1.0 / j_lim
+    kind = np.where(i_j == 0.0, NEO_HOOKEAN, GENT)
+    return np.stack(
+        [kind, zeta, c1, 0.5 * zeta * c1, *gent_limits(i_j), i_j], axis=-1)
+
+
+@compiled(inline=True)
+def _elastic(l, material):  # noqa: E741
+    """Return psi' and psi'' by the law; NaN outside its limits."""
+    force = stiffness = math.nan
+    if material[KIND] == GENT:
+        # psi = -(J/2) ln g, A. N. Gent, Rubber Chem. Technol. 69, 59 (1996), and Eq. 4.
+        # lg = l g, free of cancellation near l = 1.
+        i_j = material[CONSTANTS]
+        lg = l - (l - 1.0) * (l - 1.0) * (l + 2.0) * i_j
+        if l > 0.0 and lg > 0.0:
+            i_l = 1.0 / l
+            i_lg = 1.0 / lg
+            force = (l - 1.0) * (l * l + l + 1.0) * i_l * i_lg
+            stiffness = (
+                3.0 * l - force * (lg * i_l + 1.0 - 3.0 * (l * l - 1.0) * i_j)) * i_lg
+    elif l > 0.0:
+        # psi = (I1 - 3)/2, the limit of Gent for an endless chain.
+        i_l = 1.0 / l
+        force = (l - 1.0) * (l * l + l + 1.0) * i_l * i_l
+        stiffness = 1.0 + 2.0 * i_l * i_l * i_l
+    return force, stiffness
+
+
+@compiled(inline=True)
+def motion(l, v, beta, material):  # noqa: E741
+    """
+    Return the acceleration and its derivatives by stretch, rate and load, Eq. 11.
+
+    Outside the limits they are NaN, which makes a step control reject its step.
+    """
+    force, stiffness = _elastic(l, material)
+    i_l = 1.0 / l
+    l3 = l * l * l
+    # 1/m, with -m'/2 = l^-4/4 and -m''/2 = -l^-5.
+    i_mass = 6.0 * l3 / (1.0 + material[C1] * l3)
+    half = 0.25 * (i_l * i_l) * (i_l * i_l)
+    a = (beta - force - (material[DAMPING] - half * v) * v) * i_mass
+    a_l = (half * (2.0 * a - 4.0 * v * v * i_l) - stiffness) * i_mass
+    a_v = (2.0 * half * v - material[DAMPING]) * i_mass
+    return a, a_l, a_v, i_mass
+
+
+@compiled(inline=True)
+def acceleration(l, v, beta, material):  # noqa: E741
+    """Return the acceleration alone; NaN outside the limits."""
+    return motion(l, v, beta, material)[0]
+
+
+@compiled()
+def elastic_force(l, material):  # noqa: E741
+    """Return the load that balances the stretch at rest, psi'(l)."""
+    return _elastic(l, material)[0]
+
+
+@compiled()
+def elastic_stiffness(l, material):  # noqa: E741
+    """Return psi''(l)."""
+    return _elastic(l, material)[1]
+
+
+@compiled()
+def elastic_energy(l, material):  # noqa: E741
+    """Return psi(l), zero at l = 1."""
+    if not material[LOWER] < l < material[UPPER]:
+        return math.nan
+    # (I1 - 3), free of cancellation near l = 1.
+    strain = (l - 1.0) * (l - 1.0) * (l + 2.0) / l
+    if material[KIND] == GENT:
+        i_j = material[CONSTANTS]
+        return -0.5 / i_j * math.log1p(-strain * i_j)
+    return 0.5 * strain
+
+
+@compiled()
+def mass(l, material):  # noqa: E741
+    """Return the inertia m(l) = (l^-3 + c1)/6 of a block, from Eq. 7."""
+    return (1.0 / (l * l * l) + material[C1]) / 6.0
+
+
+@compiled()
+def natural_frequency(l, material):  # noqa: E741
+    """Return the frequency of small undamped motion about a stretch."""
+    return math.sqrt(elastic_stiffness(l, material) / mass(l, material))
+
+
+@compiled()
+def critical_zeta(l, material):  # noqa: E741
+    """Return the damping that is critical for small motion about a stretch."""
+    return 4.0 / material[C1] * math.sqrt(mass(l, material) * elastic_stiffness(l, material))
+
+
+@compiled()
+def equilibrium_stretch(beta, material):
+    """Return the stretch at which a constant load is in balance; psi' is monotone."""
+    lower, upper = material[LOWER], material[UPPER]
+    if beta > 0.0:
+        lower = 1.0
+        if upper == math.inf:
+            upper = 2.0
+            while elastic_force(upper, material) < beta:
+                upper *= 2.0
+    elif beta < 0.0:
+        upper = 1.0
+    else:
+        return 1.0
+    l = 0.5 * (lower + upper)  # noqa: E741
+    for _ in range(200):
+        force, stiffness = _elastic(l, material)
+        value = force - beta
+        if math.isnan(value):
+            # Rounded onto a limit.
+            value = beta * math.inf
+        if value > 0.0:
+            upper = l
+        elif value < 0.0:
+            lower = l
+        else:
+            return l
+        # Newton on log(force/beta), on which a pole at a limit acts about linearly; on the
+        # force itself where it is of the other sign or small.
+        ratio = force / beta
+        step = value / stiffness
+        if ratio > 1.0:
+            step = math.log(ratio) * force / stiffness
+        new = l - step
+        if not lower < new < upper:
+            new = 0.5 * (lower + upper)
+        if abs(new - l) <= 2e-16 * l:
+            return new
+        l = new  # noqa: E741
+    return l
+
+
+@compiled()
+def acceleration_slopes(l, v, beta, material, slopes):  # noqa: E741
+    """
+    Differentiate the acceleration by what an identification may not know.
+
+    ``slopes`` takes the derivatives by the load, by a factor of the elastic force (the shear
+    modulus at a fixed unit of time, load in units of the nominal one), by zeta, by c1 and by
+    each constant of the law, 1/J_lim for Gent, in the order of the packed material. With them
+    and with `motion`, s'' = a_l s + a_v s' + slope gives the sensitivity of a trajectory.
+    """
+    force, _ = _elastic(l, material)
+    a, _, _, i_mass = motion(l, v, beta, material)
+    slopes[BY_LOAD] = i_mass
+    slopes[BY_MODULUS] = -force * i_mass
+    slopes[BY_ZETA] = -0.5 * material[C1] * v * i_mass
+    slopes[BY_C1] = -(0.5 * material[ZETA] * v + a / 6.0) * i_mass
+    if material[KIND] == GENT:
+        extension = (l - 1.0) * (l - 1.0) * (l + 2.0)
+        slopes[BY_CONSTANT] = -force * extension * i_mass / (
+            l - extension * material[CONSTANTS])
+
+
+@compiled()
+def evaluate(what, values, material, out):
+    """Compute one quantity, such as `FORCE`, for an array of stretches, or of loads."""
+    for i in range(values.size):
+        x = values[i]
+        if what == FORCE:
+            out[i] = elastic_force(x, material)
+        elif what == STIFFNESS:
+            out[i] = elastic_stiffness(x, material)
+        elif what == ENERGY:
+            out[i] = elastic_energy(x, material)
+        elif what == MASS:
+            out[i] = mass(x, material)
+        elif what == FREQUENCY:
+            out[i] = natural_frequency(x, material)
+        elif what == CRITICAL_ZETA:
+            out[i] = critical_zeta(x, material)
+        else:
+            out[i] = equilibrium_stretch(x, material)
+
+
+@compiled()
+def accelerations(stretch, rate, load, material, out):
+    """Compute the acceleration for arrays of states and loads."""
+    for i in range(stretch.size):
+        out[i] = acceleration(stretch[i], rate[i], load[i], material)
