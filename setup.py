@@ -95,8 +95,8 @@ setup(
     extras_require=EXTRAS_REQUIRE,
     entry_points={
         'console_scripts': [
-            'hmsa = hmsa_ros.cli:main',
-            *(f'{node} = hmsa_ros.nodes.{node}:main' for node in NODES),
+            'hmsa = hmsa_ros.entry:main',
+            *(f'{node} = hmsa_ros.entry:{node}' for node in NODES),
         ],
     },
     author='hmsa_ros maintainers',

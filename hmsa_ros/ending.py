@@ -1,33 +1,57 @@
 """
-Ending on SIGINT and SIGTERM at a place that is safe to end at.
+How a process ends when a signal asks it to.
 
-An exception raised by a signal handler can strike anywhere: in a callback that then fails
-where it publishes, or between the start of a process and the note that it runs. Here the
-handlers only remember, and the program looks.
+Python answers SIGINT with an exception wherever it happens to be: a traceback while modules are
+imported, and nothing at all in a destructor or the callback of a weak reference, which drop it
+(each import runs one). It answers SIGTERM and SIGHUP, and every signal while it shuts down, by
+dying. So an entry point takes all three over before it imports anything slow, and a process that
+has something to put in order only notes them, and looks where it is safe to end.
 """
 
+from collections.abc import Callable
+import os
 import signal
+
+_NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Ending:
     """
-    Whether a signal has asked the process to end.
+    Whether a signal has asked this process to end.
 
     Attributes
     ----------
     asked : bool
-        Set by SIGINT and SIGTERM from construction on.
+        Whether one has.
+    status : int
+        Exit status that shells expect then.
 
     """
 
     def __init__(self) -> None:
-        """Take the two signals over."""
+        """Leave signals as they are."""
         self.asked = False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._on_signal)
+        self.status = 128 + signal.SIGINT
+        self._respond: Callable[[], object] | None = None
 
-    def _on_signal(self, *_: object) -> None:
-        self.asked = True
+    def leave(self, status: int | None = None) -> None:
+        """End the process at once from now on: nothing has been done yet."""
+        self._take_over(lambda: os._exit(self.status if status is None else status))
+
+    def interrupt(self) -> None:
+        """Raise KeyboardInterrupt from now on, if the signals have been taken over."""
+        if self._taken:
+            self._take_over(_raise)
+
+    def note(self) -> None:
+        """Only note signals from now on; the process calls `check`, or looks at `asked`."""
+        self._take_over(None)
+
+    def ignore(self) -> None:
+        """Pass over signals from now on: the process is about to end anyway."""
+        if self._taken:
+            for number in _NUMBERS:
+                signal.signal(number, signal.SIG_IGN)
 
     def check(self) -> None:
         """
@@ -40,4 +64,31 @@ class Ending:
 
         """
         if self.asked:
-            raise KeyboardInterrupt
+            _raise()
+
+    @property
+    def _taken(self) -> bool:
+        return signal.getsignal(signal.SIGTERM) == self._on_signal
+
+    def _take_over(self, respond: Callable[[], object] | None) -> None:
+        self._respond = respond
+        for number in _NUMBERS:
+            # A shell has its background jobs ignore SIGINT, nohup SIGHUP. A process that notes
+            # signals is one to be ended by them, and SIGINT is the usual one.
+            if signal.getsignal(number) is not signal.SIG_IGN or (
+                    respond is None and number == signal.SIGINT):
+                signal.signal(number, self._on_signal)
+
+    def _on_signal(self, number: int, _: object) -> None:
+        self.asked = True
+        self.status = 128 + number
+        if self._respond is not None:
+            self._respond()
+
+
+def _raise() -> None:
+    raise KeyboardInterrupt
+
+
+#: Of this process.
+ENDING = Ending()

@@ -67,7 +67,7 @@ BAD_OF_A_NODE = {
 @pytest.fixture
 def handlers() -> Iterator[None]:
     """Give back the signal handlers that a node takes over."""
-    kept = {x: signal.getsignal(x) for x in (signal.SIGINT, signal.SIGTERM)}
+    kept = {x: signal.getsignal(x) for x in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     yield
     for number, handler in kept.items():
         signal.signal(number, handler)

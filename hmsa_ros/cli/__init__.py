@@ -9,12 +9,12 @@ that ``hmsa --help`` answers at once.
 import argparse
 from collections.abc import Sequence
 from importlib import import_module
-import signal
 import sys
 from typing import Any, NoReturn
 
 from hmsa_ros import __version__
 from hmsa_ros.cli.node import NODES
+from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, complain, HmsaError
 
 COMMANDS = (
@@ -87,15 +87,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit status: 0 done, 1 the run failed, 2 bad input, 130 interrupted.
+        Exit status: 0 done, 1 the run failed, 2 bad input, 130 interrupted
+        (SIGINT; 143 by SIGTERM, 129 by SIGHUP).
 
     """
     words = list(sys.argv[1:] if argv is None else argv)
     arguments = build_parser().parse_args(split_ros_args(words))
     arguments.ros_args = words[len(split_ros_args(words)):]
-    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
-        # Set while everything was imported (see __main__); from here on it is handled.
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+    ENDING.interrupt()
     try:
         status: int = arguments.run(arguments)
         return status
@@ -104,7 +103,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except HmsaError as error:
         return complain(error, 1)
     except KeyboardInterrupt:
-        return 130
+        return ENDING.status
     except BrokenPipeError:
         # The reader of our output (head, less) has gone: there is nobody left to tell.
         sys.stderr.close()

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.progress import progress
-from hmsa_ros.ending import Ending
+from hmsa_ros.ending import ENDING
 
 if TYPE_CHECKING:
     from hmsa_ros.session.demo import DemoResult
@@ -66,17 +66,17 @@ def run(arguments: argparse.Namespace) -> int:
     from hmsa_ros.session.demo import prepare, run_demo
 
     prepare(folder)
-    ending = Ending()
+    ENDING.note()
     console = Console(stderr=True)
     console.print(
         f'ROS_DOMAIN_ID {os.environ["ROS_DOMAIN_ID"]}, output in {folder}', highlight=False)
     try:
         with progress() as update:
-            result = run_demo(folder, dict(os.environ), update, ending)
-            ending.check()
+            result = run_demo(folder, dict(os.environ), update)
+            ENDING.check()
     except KeyboardInterrupt:
         console.print(f'interrupted; the bag so far: {folder / "run"}', highlight=False)
-        return 130
+        return ENDING.status
     if arguments.json:
         print(json.dumps(result.as_json(), indent=2))
     else:

@@ -2,8 +2,9 @@
 
 import argparse
 from importlib import import_module
-import signal
 from typing import Any
+
+from hmsa_ros.ending import ENDING
 
 NODES = {
     'planner': 'turn setpoint sequences into the shaped command stream',
@@ -54,11 +55,8 @@ def run(arguments: argparse.Namespace) -> int:
         Exit status.
 
     """
-    # An interrupt while ROS is imported would be told as a traceback, or be swallowed there and
-    # leave a node that nobody ends. So it ends the process, which has done nothing yet; the
-    # node takes the signal over.
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    # Asked to end while ROS is imported, it has nothing to put in order.
+    ENDING.leave(0)
     module = import_module(f'hmsa_ros.nodes.{arguments.node}')
     status: int = module.main(arguments.ros_args)
     return status

@@ -5,6 +5,7 @@ import sys
 from typing import Any
 
 from hmsa_ros.cli.setpoints import setpoint_of_joints
+from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError
 
 
@@ -67,6 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.timeout > 0.0:
         raise BadInputError(
             f'timeout is {arguments.timeout:g}: expected a number of seconds above 0')
+    ENDING.note()
     with PlannerClient(
             namespace=arguments.namespace, joints=arguments.joint.split(','),
             timeout=arguments.timeout) as client:

@@ -10,7 +10,7 @@ import sys
 from time import monotonic
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.ending import Ending
+from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -95,23 +95,22 @@ def run(arguments: argparse.Namespace) -> int:
     with Listener(
             namespace=arguments.namespace, joints=[x for x in arguments.joint.split(',') if x],
             span=arguments.span) as listener:
-        ending = Ending()
+        ENDING.note()
         if arguments.once:
-            return _once(listener, console, arguments, ending)
+            return _once(listener, console, arguments)
         if arguments.json or not console.is_terminal or console.is_dumb_terminal:
-            return _lines(listener, arguments.json, ending)
-        return _live(listener, console, arguments, ending)
+            return _lines(listener, arguments.json)
+        return _live(listener, console, arguments)
 
 
 def _once(
-        listener: 'Listener', console: 'Console', arguments: argparse.Namespace,
-        ending: Ending) -> int:
+        listener: 'Listener', console: 'Console', arguments: argparse.Namespace) -> int:
     """Print one view as soon as everything is there, or when patience ends."""
     end = monotonic() + arguments.timeout
     scene = listener.look()
     # Two looks, so that the samples' rate can be told.
     while not (scene.joints and scene.request and scene.sample_rate > 0.0):
-        if monotonic() >= end or ending.asked:
+        if monotonic() >= end or ENDING.asked:
             break
         _wait(_LOOK_SECONDS)
         scene = listener.look()
@@ -125,12 +124,12 @@ def _once(
     return 0 if scene.joints or scene.request else 1
 
 
-def _lines(listener: 'Listener', as_objects: bool, ending: Ending) -> int:
+def _lines(listener: 'Listener', as_objects: bool) -> int:
     """Print a line each second."""
     from hmsa_ros.watch.screen import as_json, line
 
     due = monotonic() + _LINE_SECONDS
-    while not ending.asked:
+    while not ENDING.asked:
         _wait(min(_LOOK_SECONDS, max(due - monotonic(), 0.0)))
         scene = listener.look()
         if monotonic() >= due:
@@ -150,8 +149,7 @@ def _screen(console: 'Console', span: float) -> Any:
 
 
 def _live(
-        listener: 'Listener', console: 'Console', arguments: argparse.Namespace,
-        ending: Ending) -> int:
+        listener: 'Listener', console: 'Console', arguments: argparse.Namespace) -> int:
     """Show the view until a key or a signal ends it."""
     from rich.console import Console, ConsoleOptions
     from rich.live import Live
@@ -173,7 +171,7 @@ def _live(
     with _keys() as key_pressed, Live(
             View(), console=console, screen=True, auto_refresh=False) as live:
         due = monotonic()
-        while not ending.asked:
+        while not ENDING.asked:
             due = max(due + 1.0 / arguments.rate, monotonic())
             while monotonic() < due:
                 if key_pressed(min(_LOOK_SECONDS, max(due - monotonic(), 0.0))) in ('q', 'Q'):

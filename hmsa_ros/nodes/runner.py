@@ -20,7 +20,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
-from hmsa_ros.ending import Ending
+from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, complain, HmsaError
 from hmsa_ros.middleware import prepare_middleware
 
@@ -73,7 +73,7 @@ def run(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
         Exit status: 0 for a clean end, 2 for bad arguments or parameters, 1 for a failure.
 
     """
-    ending = Ending()
+    ENDING.note()
     arguments = list(sys.argv[1:] if args is None else args)
     try:
         _initialise(arguments)
@@ -85,7 +85,7 @@ def run(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
     try:
         node = factory()
         _avoid_pauses()
-        spin(node, lambda: ending.asked or getattr(node, 'finished', False))
+        spin(node, lambda: ENDING.asked or getattr(node, 'finished', False))
     except (BadInputError, ParameterException) as error:
         status = complain(error, 2)
     except HmsaError as error:

@@ -10,6 +10,7 @@ import numpy as np
 from rclpy.experimental.events_executor import EventsExecutor
 
 from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, HmsaError, printable
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import to_trajectory, whole
@@ -141,6 +142,8 @@ class PlannerClient:
         ------
         HmsaError
             If the condition does not come true in time.
+        KeyboardInterrupt
+            If a signal that was noted asks for the end.
 
         """
         patience = self._timeout if timeout is None else timeout
@@ -148,6 +151,7 @@ class PlannerClient:
         while not condition():
             if monotonic() > deadline:
                 raise HmsaError(f'waited {patience:g} s: {failure}')
+            ENDING.check()
             self._executor.spin_once(timeout_sec=_SLICE_SECONDS)
             if each is not None:
                 each()

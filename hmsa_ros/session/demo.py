@@ -18,7 +18,7 @@ from std_srvs.srv import SetBool
 
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.ending import Ending
+from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import from_time
@@ -129,7 +129,7 @@ def prepare(folder: Path) -> None:
 
 def run_demo(
         folder: Path, environment: dict[str, str],
-        progress: Callable[[str, float], None], ending: Ending) -> DemoResult:
+        progress: Callable[[str, float], None]) -> DemoResult:
     """
     Run the paper's sequence and evaluate the bag.
 
@@ -141,8 +141,6 @@ def run_demo(
         Environment of the processes; this process must live in the same ROS domain.
     progress : callable
         Called with what is going on and the share of the sequence that is done.
-    ending : Ending
-        Asked between two callbacks; the processes are ended whatever happens.
 
     Returns
     -------
@@ -154,24 +152,20 @@ def run_demo(
     HmsaError
         If a process fails or the bag does not hold the run.
     KeyboardInterrupt
-        If the end was asked for.
+        If the end was asked for; the processes are ended whatever happens.
 
     """
-    def check() -> None:
-        ending.check()
-        session.check()
-
     bag = folder / 'run'
     with Session(folder, environment) as session:
-        _start(session, bag, ending)
+        _start(session, bag)
         with PlannerClient(timeout=_START_SECONDS) as client:
             watch = _Watch(client)
             progress('starting the nodes', 0.0)
-            client.find_planner(check)
+            client.find_planner(session.check)
             client.spin_until(
                 lambda: watch.recorder_ready,
-                f'the recorder is not ready: {session.last_words("recorder")}', check)
-            watch.unpause(check)
+                f'the recorder is not ready: {session.last_words("recorder")}', session.check)
+            watch.unpause(session.check)
             spans = [span * paper_actuator().time_unit for _, span in SEQUENCE]
             verdict = client.send(
                 [(x, s) for (x, _), s in zip(SEQUENCE, spans, strict=True)], time_begins=True)
@@ -179,7 +173,7 @@ def run_demo(
             total = sum(spans) + LEAD_TIME
 
             def report() -> None:
-                check()
+                session.check()
                 progress('running the sequence', min((watch.time - begin) / total, 1.0))
 
             # Not only carried out: the last setpoint is watched for its whole span.
@@ -198,7 +192,7 @@ def run_demo(
     return _evaluate(bag, folder / 'run.png', exits)
 
 
-def _start(session: Session, bag: Path, ending: Ending) -> None:
+def _start(session: Session, bag: Path) -> None:
     """Start the three nodes; time stands still until all are ready."""
     for node in (
             NodeProcess('plant', {
@@ -209,7 +203,7 @@ def _start(session: Session, bag: Path, ending: Ending) -> None:
             NodeProcess('recorder', {
                 'use_sim_time': 'true', 'storage.uri': str(bag),
                 'record.topics': '[' + ', '.join(_TOPICS) + ']'})):
-        ending.check()
+        ENDING.check()
         session.start(node)
 
 

@@ -1,0 +1,50 @@
+"""Entry points of all processes: signals are taken over before anything slow is imported."""
+
+from collections.abc import Sequence
+import sys
+
+from hmsa_ros.ending import ENDING
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Run the ``hmsa`` command.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Arguments without the program's name; default ``sys.argv[1:]``.
+
+    Returns
+    -------
+    int
+        Exit status.
+
+    """
+    ENDING.leave()
+    from hmsa_ros.cli import main as command
+    try:
+        return command(argv)
+    finally:
+        # Python's own end takes a while, in which it would answer signals by dying.
+        ENDING.ignore()
+
+
+def planner() -> int:
+    """Run ``hmsa planner``."""
+    return main(['planner', *sys.argv[1:]])
+
+
+def plant() -> int:
+    """Run ``hmsa plant``."""
+    return main(['plant', *sys.argv[1:]])
+
+
+def recorder() -> int:
+    """Run ``hmsa recorder``."""
+    return main(['recorder', *sys.argv[1:]])
+
+
+def player() -> int:
+    """Run ``hmsa player``."""
+    return main(['player', *sys.argv[1:]])

@@ -1,0 +1,91 @@
+"""How processes end when they are told to: at the start, at work, and twice."""
+
+import signal
+import subprocess
+import sys
+
+from conftest import Starter, wait_until
+import pytest
+
+pytestmark = pytest.mark.ros
+
+NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+NODES = ('planner', 'plant', 'recorder', 'player')
+# Runs an entry point, with a signal as soon as a module is asked for.
+AT_IMPORT = """
+import os, sys
+class Sender:
+    def find_spec(self, name, path=None, target=None):
+        if name == {module!r}:
+            os.kill(os.getpid(), {number})
+        return None
+sys.meta_path.insert(0, Sender())
+from hmsa_ros import entry
+sys.argv[1:] = []
+sys.exit(entry.{entry}())
+"""
+# Begins `hmsa send`, with an interrupt where Python drops an exception.
+IN_A_DESTRUCTOR = """
+import os, signal, sys
+from hmsa_ros.entry import main
+from hmsa_ros.session.client import PlannerClient
+class Trap:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+find = PlannerClient.find_planner
+def find_planner(self, each=None):
+    Trap()
+    find(self, each)
+PlannerClient.find_planner = find_planner
+sys.exit(main(['send', '1.1:1', '--timeout', '1000']))
+"""
+
+
+@pytest.mark.parametrize(('node', 'module', 'number'), [
+    (node, module, NUMBERS[i % 3]) for i, (node, module) in enumerate([
+        *((x, 'rclpy') for x in NODES), ('planner', 'numba'), ('plant', 'scipy')])])
+def test_a_node_that_is_told_to_end_while_it_is_imported_ends_without_a_word(
+        ros_env, node, module, number):
+    done = subprocess.run(
+        [sys.executable, '-c', AT_IMPORT.format(
+            module=module, number=int(number), entry=node)],
+        capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
+
+
+def test_an_interrupt_that_python_drops_still_ends_a_command(ros_env):
+    done = subprocess.run(
+        [sys.executable, '-c', IN_A_DESTRUCTOR], capture_output=True, text=True, check=False,
+        timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
+
+
+@pytest.mark.parametrize(('number', 'status'), [
+    (signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_a_computation_is_given_up_in_order(number, status):
+    code = AT_IMPORT.replace('entry.{entry}()', "entry.main(['plan', '1.1:10'])")
+    done = subprocess.run(
+        [sys.executable, '-c', code.format(module='numba', number=int(number))],
+        capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (status, '', '')
+
+
+@pytest.mark.parametrize('number', NUMBERS, ids=lambda x: x.name)
+def test_a_recorder_told_to_end_again_and_again_closes_its_bag(
+        tmp_path, start: Starter, number):
+    process = start.hmsa(
+        'recorder', '--ros-args', '-p', f'storage.uri:={tmp_path / "bag"}', '-p',
+        'record.all_topics:=true')
+    process.wait_for_output('/rosout')
+
+    def ended() -> bool:
+        if not process.alive():
+            return True
+        for each in (number, *NUMBERS):
+            process.popen.send_signal(each)
+        return False
+
+    wait_until(ended, 'the end')
+    assert process.popen.returncode == 0
+    assert 'Traceback' not in process.stderr
+    assert (tmp_path / 'bag' / 'metadata.yaml').exists()
