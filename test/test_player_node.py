@@ -109,6 +109,18 @@ def test_commands_are_only_sent_if_asked_for_by_name(ros, play, tmp_path):
     finish(ros, process, commands, 40)
 
 
+def test_a_topic_remapped_to_a_command_is_a_command(ros, start, tmp_path):
+    bag = write_bag(tmp_path / 'bag', [
+        entry for i in range(20) for entry in (('/a', i, i), ('/b', i, i))])
+    commands = ros.collect(Float64, '/planner/setpoint')
+    got = ros.collect(Float64, '/b')
+    process = start.hmsa('player', '--ros-args', '-p', f'storage.uri:={bag}',
+                         '-r', '/a:=/planner/setpoint')
+    finish(ros, process, got, 20)
+    assert not commands
+    assert 'topic /a is left out: it carries commands' in process.output
+
+
 def test_the_clock_runs_before_and_with_the_messages(ros, play, tmp_path):
     bag = write_bag(tmp_path / 'bag', [('/a', i, i) for i in range(100)])
     events = []
@@ -267,16 +279,21 @@ def test_what_cannot_be_published_is_left_out_and_told(ros, play, tmp_path):
         writer = Writer(file)
         writer.start('ros2', 'test')
         schemas = [writer.register_schema(name, encoding, text.encode())
-                   for name in (FLOAT, 'antigravity/msg/A')]
-        for schema, name in ((0, '/a'), (0, '/not a name\x1b'), (0, '//'), (1, '/other')):
+                   for name in (FLOAT, 'antigravity/msg/A', FIELD)]
+        for schema, name in ((0, '/a'), (0, '/not a name\x1b'), (0, '//'), (1, '/other'),
+                             (2, '/flux_density_command\0'), (2, '/coil/b')):
             channel = writer.register_channel(name, 'cdr', schemas[schema], {})
             for i in range(50):
                 writer.add_message(channel, START + i * MS, serialize_message(
                     Float64(data=float(i))), START)
         writer.finish()
     got = ros.collect(Float64, '/a')
+    driven = [ros.collect(MagneticField, x) for x in ('/flux_density_command', '/coil/b')]
     process = play(path)
     finish(ros, process, got, 50)
+    assert driven == [[], []]
+    assert 'topic /flux_density_command\\x00 is left out: it cannot be' in process.output
+    assert 'topic /coil/b is left out: it carries commands' in process.output
     assert 'topic /not a name\\x1b is left out: it cannot be published' in process.output
     assert 'topic // is left out: it cannot be published' in process.output
     assert 'topic /other is left out: message type antigravity/msg/A is not installed' in (
@@ -298,6 +315,38 @@ def test_a_subscriber_that_does_not_come_fails_the_run(play, tmp_path):
     assert process.wait() == 1
     assert process.stderr.strip().splitlines()[-1].startswith(
         'hmsa: error: no subscriber of /a within 0.3 s')
+
+
+def test_it_waits_for_the_node_that_obeys_and_not_for_a_listener(ros, start, play, tmp_path):
+    bag = write_bag(tmp_path / 'bag', [
+        ('/flux_density_command', i, 0.1) for i in range(50)])
+    got = ros.collect(MagneticField, '/flux_density_command')
+    process = play(
+        bag, 'play.wait_for_nodes:=[plant]', 'play.wait_for_subscribers:=[flux_density_command]',
+        'play.allow_commands:=[flux_density_command]')
+    ros.spin_until(lambda: ros.node.count_publishers('/flux_density_command'), 'the publisher')
+    applied = ros.collect(MagneticField, '/flux_density_applied')
+    start.hmsa('plant')
+    finish(ros, process, got, 50)
+    ros.spin_until(lambda: applied, 'the level in force')
+
+
+def test_topics_without_end_are_refused_and_those_named_are_played(ros, play, tmp_path):
+    path = tmp_path / 'bag.mcap'
+    encoding, text = message_definition(FLOAT)
+    with path.open('wb') as file:
+        writer = Writer(file)
+        writer.start('ros2', 'test')
+        schema = writer.register_schema(FLOAT, encoding, text.encode())
+        for i in range(65_000):
+            channel = writer.register_channel(f'/t{i}', 'cdr', schema, {})
+            writer.add_message(channel, START + i, serialize_message(Float64(data=1.0)), START)
+        writer.finish()
+    process = play(path)
+    assert process.wait() == 2
+    assert 'has 65000 topics to send: expected at most 1000; name those wanted' in process.stderr
+    got = ros.collect(Float64, '/t7')
+    finish(ros, play(path, 'play.topics_to_filter:=[/t7]'), got, 1)
 
 
 def test_a_bag_of_rosbags_is_played(ros, play, tmp_path):

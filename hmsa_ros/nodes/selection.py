@@ -7,11 +7,43 @@ from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.message_types import type_name_of
+
+
+def _last(name: str) -> str:
+    """Return the last part of a name."""
+    return name.rsplit('/', 1)[-1]
+
 
 #: Last part of the names of topics that make something move.
-COMMAND_TOPICS = frozenset(
-    topic.name.rsplit('/', 1)[-1] for topic in (
-        interface.FLUX_DENSITY_COMMAND, interface.JOINT_TRAJECTORY, interface.SETPOINT))
+COMMAND_TOPICS = frozenset(_last(topic.name) for topic in (
+    interface.FLUX_DENSITY_COMMAND, interface.JOINT_TRAJECTORY, interface.SETPOINT))
+# Types that drive a coil or a planner, whatever the topic is called, but for reports.
+_COMMAND_TYPES = frozenset(type_name_of(topic.type) for topic in (
+    interface.FLUX_DENSITY_COMMAND, interface.JOINT_TRAJECTORY))
+_REPORTS = frozenset(_last(topic.name) for topic in (
+    interface.FLUX_DENSITY_APPLIED, interface.PLAN))
+# A full name, as rcl validates it; the middleware adds three characters to the length.
+_FULL_NAME = re.compile(r'(?:/[A-Za-z_][A-Za-z0-9_]*)+')
+_LONGEST_NAME = 247
+
+
+def is_full_name(name: str) -> bool:
+    """
+    Return whether ROS takes a name from a file for the very same topic.
+
+    Parameters
+    ----------
+    name : str
+        Anything; rclpy would cut a name at a NUL character, and so publish elsewhere.
+
+    Returns
+    -------
+    bool
+        True for a fully qualified name.
+
+    """
+    return len(name) <= _LONGEST_NAME and _FULL_NAME.fullmatch(name) is not None
 
 
 def _check_expression(parameter: str, expression: str) -> None:
@@ -130,14 +162,18 @@ class Filter:
             return re.search(self.regex, topic) is not None
         return not self.topics
 
-    def withholds(self, topic: str) -> bool:
+    def withholds(self, topic: str, resolved: str, type_name: str) -> bool:
         """
         Return whether a topic is left out for being a command not asked for by name.
 
         Parameters
         ----------
         topic : str
-            Full name.
+            Full name in the bag.
+        resolved : str
+            Full name under which it would be sent.
+        type_name : str
+            Name of its type.
 
         Returns
         -------
@@ -145,5 +181,7 @@ class Filter:
             A regular expression does not name it.
 
         """
-        return (topic.rsplit('/', 1)[-1] in COMMAND_TOPICS
-                and topic not in self.topics and topic not in self.allow_commands)
+        if topic in self.topics or topic in self.allow_commands:
+            return False
+        return (_last(topic) in COMMAND_TOPICS or _last(resolved) in COMMAND_TOPICS
+                or (type_name in _COMMAND_TYPES and _last(resolved) not in _REPORTS))

@@ -1,0 +1,195 @@
+"""Sending the messages of a bag, each at its own place on an absolute schedule."""
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+import time
+
+from hmsa_ros.bag.read_ahead import READ_AHEAD_BYTES, ReadAhead
+from hmsa_ros.bag.reader import BagReader, Message
+from hmsa_ros.bag.transport import Transport
+
+#: How often the clock is repeated while time stands still, in s.
+CLOCK_WHILE_WAITING_SECONDS = 0.1
+# A loop over a bag of a single moment would send without pause.
+_SHORTEST_ROUND_SECONDS = 0.1
+
+
+@dataclass(frozen=True)
+class Excerpt:
+    """
+    What of a bag is played.
+
+    Attributes
+    ----------
+    first, start, end : int
+        First time of the bag, and the first and last that are played, in ns.
+    loop : bool
+        Whether to begin again at the end.
+    read_ahead : int
+        Messages read ahead.
+
+    """
+
+    first: int
+    start: int
+    end: int
+    loop: bool = False
+    read_ahead: int = 1000
+
+
+@dataclass(frozen=True)
+class ClockOut:
+    """
+    The clock that goes with the messages.
+
+    Attributes
+    ----------
+    send : callable
+        Takes a time of the bag in ns.
+    frequency : float
+        In Hz of real time, 0 for not.
+    on_publish : bool
+        Whether it precedes each message.
+
+    """
+
+    send: Callable[[int], None]
+    frequency: float = 0.0
+    on_publish: bool = False
+
+
+class Sender:
+    """
+    Sends a bag once, or in a loop.
+
+    Parameters
+    ----------
+    reader : BagReader
+        The bag.
+    out : mapping of str to callable
+        Takes the bytes of a message, by topic.
+    latched : mapping of str to int
+        Of the latched topics, how many messages a late subscriber gets.
+    transport : Transport
+        Says what is due when.
+    excerpt : Excerpt
+        What is played.
+    clock : ClockOut, optional
+        Default none.
+
+    Attributes
+    ----------
+    count : int
+        Messages sent so far.
+
+    """
+
+    def __init__(
+            self, reader: BagReader, out: Mapping[str, Callable[[bytes], object]],
+            latched: Mapping[str, int], transport: Transport, excerpt: Excerpt,
+            clock: ClockOut | None = None) -> None:
+        self._reader = reader
+        self._out = out
+        self._latched = latched
+        self._transport = transport
+        self._excerpt = excerpt
+        self._clock = clock
+        self.count = 0
+
+    def run(self) -> None:
+        """Send until the end of the excerpt, or of the last round, or until it is stopped."""
+        while True:
+            begin, count = time.monotonic(), self.count
+            if not self._play(self._excerpt.start) or self.count == count:
+                return
+            if not self._excerpt.loop or self._transport.rest(
+                    begin + _SHORTEST_ROUND_SECONDS - time.monotonic()):
+                return
+
+    def _play(self, start: int) -> bool:
+        """Play from a time on; return whether the end was reached."""
+        while True:
+            source = ReadAhead(partial(self._read, start), self._excerpt.read_ahead)
+            try:
+                self._send_latched(start)
+                # Time runs from when there is something to send.
+                source.wait(self._transport.interrupted)
+                self._transport.begin(start)
+                outcome = self._send_all(source, start)
+            finally:
+                source.stop()
+            if outcome != 'seek':
+                return not outcome
+            start = self._transport.take_seek(self._excerpt.first)
+
+    def _read(self, start: int, cancelled: Callable[[], bool]) -> Iterator[Message]:
+        """Return the messages to send from a time on."""
+        return self._reader.messages(
+            self._out.keys(), start=start, end=self._excerpt.end + 1, cancelled=cancelled)
+
+    def _send_all(self, messages: Iterable[Message], start: int) -> str:
+        """Send messages, each at its time; return why it ended early, or an empty string."""
+        tick, clock = start, self._clock
+        ticking = clock is not None and clock.frequency > 0.0
+        if clock is not None and ticking:
+            # Before the first message: in a loop, time jumps back with this.
+            clock.send(start)
+        for message in messages:
+            outcome, tick = self._tick_until(message.log_time, tick, last=False)
+            if outcome:
+                return outcome
+            if clock is not None and clock.on_publish:
+                clock.send(message.log_time)
+            self._out[message.topic](message.data)
+            self.count += 1
+            self._transport.sent(message.log_time)
+        outcome, _ = self._tick_until(self._excerpt.end, tick, last=True)
+        if clock is not None and ticking and not outcome:
+            clock.send(self._excerpt.end)
+        return outcome
+
+    def _tick_until(self, when: int, tick: int, *, last: bool) -> tuple[str, int]:
+        """Wait until a time of the bag, with the clock's ticks before it."""
+        clock = self._clock
+        if clock is not None and clock.frequency > 0.0:
+            while tick <= when:
+                outcome = self._wait(tick, message=False)
+                if outcome:
+                    return outcome, tick
+                if self._transport.stepping and not last:
+                    break
+                clock.send(tick)
+                tick += max(1, round(1e9 * self._transport.rate / clock.frequency))
+        return self._wait(when, message=not last), tick
+
+    def _wait(self, when: int, *, message: bool) -> str:
+        """Wait until a time of the bag; return why it did not come, or an empty string."""
+        while True:
+            outcome = self._transport.wait(
+                when, message=message, patience=CLOCK_WHILE_WAITING_SECONDS)
+            if outcome != 'paused':
+                return outcome
+            if self._clock is not None:
+                # Time stands still, but who comes now is to know it.
+                self._clock.send(self._transport.standing_at)
+
+    def _send_latched(self, start: int) -> None:
+        """Send what a subscriber of the latched topics would have got at a time."""
+        if not self._latched or start <= self._excerpt.first:
+            return
+        kept = {name: deque[Message]() for name in self._latched}
+        size = 0
+        for message in self._reader.messages(
+                self._latched.keys(), end=start, cancelled=self._transport.interrupted):
+            latest = kept[message.topic]
+            latest.append(message)
+            size += len(message.data)
+            while len(latest) > self._latched[message.topic] or (
+                    size > READ_AHEAD_BYTES and len(latest) > 1):
+                size -= len(latest.popleft().data)
+        for message in sorted((message for messages in kept.values() for message in messages),
+                              key=lambda message: message.log_time):
+            self._out[message.topic](message.data)
+            self.count += 1

@@ -1,0 +1,181 @@
+"""Position and speed of playing, which other threads change: pause, seek, step and stop."""
+
+from collections import deque
+import threading
+import time
+
+# A wait that can be woken ends this much early; the rest is slept, which is more exact.
+_FINE_SECONDS = 0.01
+
+
+class Transport:
+    """
+    The schedule of one run: which time of the bag is due when.
+
+    Parameters
+    ----------
+    start : int
+        Time of the bag at which to begin, in ns.
+    rate : float
+        Speed as a multiple of the recorded one, above 0.
+
+    Attributes
+    ----------
+    change : threading.Condition
+        Notified of every change.
+    paused, stopped : bool
+        It begins paused.
+    rate : float
+        As above.
+    position : int
+        Time of the bag reached, in ns.
+    late : float
+        Largest delay of a message so far, in s.
+
+    """
+
+    def __init__(self, start: int, rate: float) -> None:
+        self.change = threading.Condition()
+        self.paused = True
+        self.stopped = False
+        self.rate = rate
+        self.position = start
+        self.late = 0.0
+        self._seek: int | None = None
+        self._steps = 0
+        self._answers: deque[threading.Event] = deque()
+        self._anchor = (start, time.monotonic())
+
+    # Called by other threads -------------------------------------------------------------------
+
+    def set_paused(self, paused: bool) -> None:
+        """Pause or go on, without a jump in the schedule."""
+        with self.change:
+            if paused != self.paused:
+                self._rebase()
+                self.paused = paused
+                self.change.notify_all()
+
+    def set_rate(self, rate: float) -> None:
+        """Change the speed, without a jump in the schedule."""
+        with self.change:
+            self._rebase()
+            self.rate = rate
+            self.change.notify_all()
+
+    def seek(self, when: int) -> None:
+        """Go on from a time of the bag in ns."""
+        with self.change:
+            self._seek = when
+            self.change.notify_all()
+
+    def step(self, timeout: float) -> bool:
+        """Send one message while paused; return whether there was one within ``timeout`` s."""
+        answer = threading.Event()
+        with self.change:
+            self._steps += 1
+            self._answers.append(answer)
+            self.change.notify_all()
+        answer.wait(timeout)
+        return answer.is_set() and not self.stopped
+
+    def stop(self) -> None:
+        """End playing, and what waits for it."""
+        with self.change:
+            self.stopped = True
+            for answer in self._answers:
+                answer.set()
+            self.change.notify_all()
+
+    def _rebase(self) -> None:
+        """Count from now on."""
+        since, began = self._anchor
+        now = time.monotonic()
+        if not self.paused:
+            since += round((now - began) * 1e9 * self.rate)
+        self._anchor = (since, now)
+
+    # Called by the thread that sends -----------------------------------------------------------
+
+    def begin(self, start: int) -> None:
+        """Have a time of the bag be due now."""
+        with self.change:
+            self.position = start
+            self._anchor = (start, time.monotonic())
+
+    def interrupted(self) -> bool:
+        """Return whether what is going on has been given up."""
+        return self.stopped or self._seek is not None
+
+    def take_seek(self, otherwise: int) -> int:
+        """Return the time of the bag to go on from."""
+        with self.change:
+            start, self._seek = self._seek, None
+            return otherwise if start is None else start
+
+    @property
+    def stepping(self) -> bool:
+        """Whether the next message is wanted at once."""
+        return self._steps > 0
+
+    def sent(self, when: int) -> None:
+        """Note that a message has left, and tell who asked for it."""
+        self.position = when
+        if self._answers:
+            with self.change:
+                self._answers.popleft().set()
+
+    def rest(self, seconds: float) -> bool:
+        """Wait; return whether playing was stopped meanwhile."""
+        with self.change:
+            return self.change.wait_for(lambda: self.stopped, max(0.0, seconds))
+
+    def wait(self, when: int, *, message: bool, patience: float) -> str:
+        """
+        Wait until a time of the bag is due.
+
+        Parameters
+        ----------
+        when : int
+            Time of the bag in ns.
+        message : bool
+            Whether a message is due then, which a step may ask for.
+        patience : float
+            How long to wait at most while paused, in s.
+
+        Returns
+        -------
+        str
+            Empty if it is due, otherwise ``'stop'``, ``'seek'`` or ``'paused'``.
+
+        """
+        while True:
+            with self.change:
+                if self.stopped:
+                    return 'stop'
+                if self._seek is not None:
+                    return 'seek'
+                if self.paused:
+                    if self._steps:
+                        if message:
+                            self._steps -= 1
+                            self._anchor = (when, time.monotonic())
+                        return ''
+                    if not self.change.wait(patience):
+                        return 'paused'
+                    continue
+                since, began = self._anchor
+                delay = began + (when - since) * 1e-9 / self.rate - time.monotonic()
+                if delay > 2 * _FINE_SECONDS:
+                    self.change.wait(delay - _FINE_SECONDS)
+                    continue
+            if delay > 0.0:
+                time.sleep(delay)
+            else:
+                self.late = max(self.late, -delay)
+            return ''
+
+    @property
+    def standing_at(self) -> int:
+        """Time of the bag at which it is paused, in ns."""
+        return self._anchor[0]

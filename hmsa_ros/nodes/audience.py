@@ -1,0 +1,101 @@
+"""Who is to receive what is sent, and whether they are all there."""
+
+from collections.abc import Mapping, Sequence
+from time import monotonic
+from typing import Any
+
+from lifecycle_msgs.msg import State
+from lifecycle_msgs.srv import GetState
+from rclpy.node import Node
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.nodes.senders import listed
+
+# An answer that has not come by then does not come: it was sent before the way back was known.
+_PATIENCE_SECONDS = 1.0
+
+
+class Audience:
+    """
+    Subscribers of what a node sends.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Node that sends; it must be served while `missing` is asked.
+    senders : mapping of str to rclpy.publisher.Publisher
+        By topic.
+    topics : sequence of str
+        Those that need a subscriber.
+    nodes : sequence of str
+        Full names of managed nodes that must be active; if there are any, one of them must be
+        the subscriber.
+
+    Raises
+    ------
+    BadInputError
+        If one of the topics is not sent.
+
+    """
+
+    def __init__(
+            self, node: Node, senders: Mapping[str, Any], topics: Sequence[str],
+            nodes: Sequence[str]) -> None:
+        unsent = [name for name in topics if name not in senders]
+        if unsent:
+            raise BadInputError(
+                f'parameter play.wait_for_subscribers names {", ".join(unsent)}: expected topics '
+                f'that are sent, {listed(senders) or "of which there is none"}')
+        self._node = node
+        self._senders = senders
+        self._topics = topics
+        self._states = {
+            name: _Asked(node.create_client(GetState, f'{name}/get_state')) for name in nodes}
+
+    def missing(self) -> list[str]:
+        """Return in words who is not there yet, of those that must be."""
+        return [
+            *(f'active node {name}' for name, x in self._states.items() if not x.active()),
+            *(f'subscriber of {name}' for name in self._topics if not self._subscribed(name))]
+
+    def _subscribed(self, topic: str) -> bool:
+        """Return whether somebody who counts subscribes to a topic."""
+        sender = self._senders[topic]
+        if not self._states:
+            return bool(sender.get_subscription_count() > 0)
+        return any(
+            f'{x.node_namespace.rstrip("/")}/{x.node_name}' in self._states
+            for x in self._node.get_subscriptions_info_by_topic(sender.topic_name))
+
+    def found(self, also: Any) -> bool:
+        """Return whether all known subscribers hear us; ``also`` is one more publisher or None."""
+        senders = [*self._senders.values(), *([] if also is None else [also])]
+        if any(x.get_subscription_count() < self._node.count_subscribers(x.topic_name)
+               for x in senders):
+            return False
+        return bool(self._topics or self._states) or all(
+            x.get_subscription_count() for x in self._senders.values())
+
+
+class _Asked:
+    """The state of a managed node, asked for again until it is active."""
+
+    def __init__(self, client: Any) -> None:
+        self._client = client
+        self._future: Any = None
+        self._since = 0.0
+
+    def active(self) -> bool:
+        """Return whether the node has said that it is active."""
+        if self._future is not None and self._future.done():
+            answer = self._future.result()
+            if answer is not None and answer.current_state.id == State.PRIMARY_STATE_ACTIVE:
+                return True
+            self._future = None
+        late = monotonic() - self._since > _PATIENCE_SECONDS
+        if (self._future is None or late) and self._client.service_is_ready():
+            if self._future is not None:
+                self._client.remove_pending_request(self._future)
+            self._future = self._client.call_async(GetState.Request())
+            self._since = monotonic()
+        return False
