@@ -104,7 +104,7 @@ def _turn(l0: Decimal, beta: Decimal, actuator: Actuator) -> tuple[Decimal, Deci
     stretch, rate = l0, Decimal(0)
     time = Decimal(0)
     direction = 0
-    for _ in range(1000):
+    for _ in range(200):
         series = _expand(stretch, rate, beta, actuator)
         step = _reach(*series)
         stretch, end = _value(series[0], step), _value(series[1], step)

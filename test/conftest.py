@@ -46,11 +46,13 @@ def pytest_configure(config: pytest.Config) -> None:
     settings.load_profile('gate')
 
 
+@pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
     """Return two workers a core: tests that run nodes mostly wait."""
     return 2 * (os.cpu_count() or 1)
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """
     Say what each worker takes at once: a test that runs nodes, or all others of a module.
@@ -58,6 +60,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     Long tests begin first.
     """
     for item in items:
+        if 'ros_domain_id' in getattr(item, 'fixturenames', ()):
+            item.add_marker(pytest.mark.ros)
         if item.get_closest_marker('ros') or item.get_closest_marker('xdist_group'):
             continue
         item.add_marker(pytest.mark.xdist_group(item.path.stem))
