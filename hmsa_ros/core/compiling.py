@@ -160,6 +160,8 @@ class _Entries:
 class _Cache(caching.FunctionCache):
     """A cache that never keeps a kernel from running."""
 
+    _impl_class = _Implementation
+
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
         self._cache_file = _Entries(self._cache_path, self._impl.filename_base)

@@ -382,7 +382,7 @@ def _unshaped(
     begins = [(x.begin - zero) / NANOSECONDS for x in moves]
     running = time >= begins[0]
     lower, upper = stretch_limits(run.plant.nondimensional)
-    margin = 1e-6 * (upper - lower)
+    margin = 1e-6 * (min(upper, 2.0) - lower)
     try:
         stretch[running], nondimensional_rate = simulate(
             [x / unit for x in begins],
