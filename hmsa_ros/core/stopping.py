@@ -11,6 +11,9 @@ from hmsa_ros.core.timeline import Model
 
 # Stretch rates below this share of the natural frequency are rounding, not motion.
 _AT_REST = 1e-6
+# Newton passes on the load of a brake, and the share of its duration that they may miss.
+_PASSES = 8
+_ON_TIME = 1e-14
 # How far inside the flux density limits a stop keeps where it has to, as a share.
 _INSIDE = 1e-3
 
@@ -70,12 +73,28 @@ def brake(model: Model, work: Array, state: State, share: float = 1.0) -> Brake:
         load = holding - math.copysign(10.0 * abs(state.rate) * frequency + 10.0, state.rate)
     if share < 1.0:
         load = holding + share * (load - holding)
-    status, time, stretch, _, _ = kernels.turning_point(
-        work, state.stretch, state.rate, 1.0 if up else -1.0, load, 1.0,
-        model.material.packed, RTOL)
-    if status != kernels.DONE:
+    direction = 1.0 if up else -1.0
+
+    def turn(load: float) -> tuple[float, float, float] | None:
+        status, time, stretch, _, slope = kernels.turning_point(
+            work, state.stretch, state.rate, direction, load, 1.0, model.material.packed, RTOL)
+        return (time, stretch, slope) if status == kernels.DONE else None
+
+    found = turn(load)
+    if found is None:
         return rest
-    return Brake(float(load), model.time(model.ns(time)), stretch)
+    # A command carries whole nanoseconds. The load is solved for the next one, at which the
+    # motion then is at rest to rounding: at full load half of one leaves more than a move does.
+    aim = math.ceil(found[0] / model.delivery.resolution) * model.delivery.resolution
+    for _ in range(_PASSES):
+        time, stretch, slope = found
+        if slope == 0.0 or abs(aim - time) <= _ON_TIME * aim:
+            break
+        found = turn(load + (aim - time) / slope)
+        if found is None:
+            break
+        load += (aim - time) / slope
+    return Brake(float(load), aim, stretch)
 
 
 def holdable(model: Model, stretch: float) -> float:
