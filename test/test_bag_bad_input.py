@@ -1,20 +1,28 @@
 """Damaged, foreign and old bags: a clear sentence, no traceback, and what can be read is read."""
 
 import contextlib
+import json
+import os
+from pathlib import Path
 import random
 import shutil
 import struct
 
 from hypothesis import given, HealthCheck, settings, strategies
+from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
+from mcap_bytes import BEGIN, channel, chunk, END, pieces, record, schema
 import pytest
 from rosbags.rosbag2 import Reader as RosbagsReader
 import yaml
+import zstandard
 
-from hmsa_ros.bag import metadata, qos, records
+from benchmarks import flips
+from hmsa_ros.bag import limits, metadata, qos
 from hmsa_ros.bag.definitions import message_definition, type_hash
 from hmsa_ros.bag.info import summarize, to_json, to_text
 from hmsa_ros.bag.reader import BagReader, read_messages
+from hmsa_ros.bag.records import MAGIC, read_chunk_head
 from hmsa_ros.bag.recover import recover
 from hmsa_ros.bag.writer import BagWriter, Topic
 from hmsa_ros.cli import main
@@ -66,7 +74,7 @@ def test_a_file_cut_anywhere_is_read_up_to_the_cut(tmp_path, preset):
                       *range(len(data) - 10, len(data))})
     for length in lengths:
         cut.write_bytes(data[:length])
-        if length < len(records.MAGIC):
+        if length < len(MAGIC):
             with pytest.raises(BadInputError, match='is empty|was cut off'):
                 BagReader(cut)
             continue
@@ -97,10 +105,7 @@ def test_a_flipped_byte_in_a_chunk_costs_that_chunk(tmp_path, preset):
     path = write_bag(tmp_path / 'bag', preset=preset)
     data = bytearray(path.read_bytes())
     _, intact = stamps(path)
-    # Somewhere in the data of the second chunk.
-    chunks = [i for i in range(len(data) - 9) if data[i] == records.CHUNK
-              and struct.unpack_from('<Q', data, i + 1)[0] < 2000
-              and data[i + 9:i + 17] == struct.pack('<Q', data[i + 9])]
+    chunks = [offset for opcode, offset, _ in pieces(bytes(data)) if opcode == Opcode.CHUNK]
     data[chunks[1] + 100] ^= 0x10
     path.write_bytes(data)
     reader, got = stamps(path)
@@ -138,7 +143,7 @@ def test_no_change_of_bytes_makes_the_reader_fail(tmp_path, data):
 @given(content=strategies.binary(max_size=300))
 def test_no_bytes_after_the_magic_make_the_reader_fail(tmp_path, content):
     path = tmp_path / 'any.mcap'
-    path.write_bytes(records.MAGIC + content)
+    path.write_bytes(MAGIC + content)
     reader, _ = stamps(path)
     reader.counts()
 
@@ -190,32 +195,26 @@ def test_no_records_in_any_order_make_the_reader_fail(tmp_path, data):
     path = tmp_path / 'bag' / 'bag_0.mcap'
     if not path.exists():
         write_bag(tmp_path / 'bag', 60, preset='none')
-    pieces, offset, original = [], len(records.MAGIC), path.read_bytes()
-    while offset < len(original) - len(records.MAGIC):
-        opcode, length = records.PREFIX.unpack_from(original, offset)
-        offset += records.PREFIX.size
-        pieces.append((opcode, original[offset:offset + length]))
-        offset += length
+    original = [(opcode, content) for opcode, _, content in pieces(path.read_bytes())]
     chosen = data.draw(strategies.lists(
-        strategies.integers(0, len(pieces) - 1), min_size=1, max_size=len(pieces)))
-    content = records.MAGIC
+        strategies.integers(0, len(original) - 1), min_size=1, max_size=len(original)))
+    content = MAGIC
     for i in chosen:
-        opcode, piece = pieces[i]
-        if opcode == records.CHUNK and data.draw(strategies.booleans()):
+        opcode, piece = original[i]
+        if opcode == Opcode.CHUNK and data.draw(strategies.booleans()):
             # Compressed anew, so that what is wrong in it is found by nothing but reading.
-            head = records.read_chunk_head(piece, len(piece))
+            head = read_chunk_head(piece, len(piece))
             inner = bytearray(piece[head.data_offset:])
             for _ in range(data.draw(strategies.integers(0, 3))):
                 inner[data.draw(strategies.integers(0, len(inner) - 1))] = data.draw(
                     strategies.integers(0, 255))
-            packed = records.compress(bytes(inner), 'zstd', 1)
-            content += records.chunk_head(
-                data.draw(strategies.integers(0, 100)), data.draw(strategies.integers(0, 100)),
-                len(inner), 0, 'zstd', len(packed)) + packed
+            content += chunk(
+                zstandard.ZstdCompressor().compress(bytes(inner)), len(inner), 'zstd',
+                data.draw(strategies.integers(0, 100)), data.draw(strategies.integers(0, 100)))
         else:
-            content += records.record(opcode, piece)
+            content += record(opcode, piece)
     copy = tmp_path / 'changed.mcap'
-    copy.write_bytes(content + data.draw(strategies.sampled_from((b'', records.MAGIC))))
+    copy.write_bytes(content + data.draw(strategies.sampled_from((b'', MAGIC))))
     reader, got = stamps(copy)
     assert len(got) == sum(reader.counts().values()) or reader.complete
     list(reader.stored_messages())
@@ -244,26 +243,23 @@ def test_what_other_writers_make_is_read(tmp_path, options):
 def test_damage_outside_the_chunks_is_got_around_by_the_index(tmp_path):
     path = write_bag(tmp_path / 'bag')
     data = bytearray(path.read_bytes())
-    offset, indexes = len(records.MAGIC), []
-    while len(indexes) < 3:
-        opcode, length = records.PREFIX.unpack_from(data, offset)
-        if opcode == records.MESSAGE_INDEX:
-            indexes.append(offset)
-        offset += records.PREFIX.size + length
+    indexes = [offset for opcode, offset, _ in pieces(bytes(data))
+               if opcode == Opcode.MESSAGE_INDEX]
     # Nothing after a record whose length is wrong can be found record by record.
-    struct.pack_into('<Q', data, indexes[-1] + 1, 2**40)
+    struct.pack_into('<Q', data, indexes[2] + 1, 2**40)
     path.write_bytes(data)
     reader, got = stamps(path)
     assert got == list(range(400))
-    problem, = reader.problems
-    assert 'the chunks after it are found by the index' in problem
+    # It costs nothing, since the index names the chunks; the CRC of the data tells of it.
+    assert reader.counts() == {'/a': 400}
+    assert any('the CRC of its data differs' in problem for problem in reader.problems)
 
 
 def test_a_file_that_is_no_mcap_is_named(tmp_path, capsys):
     for content, expected in (
             (b'', 'is empty: expected an MCAP file'),
             (b'#ROSBAG V2.0\n', 'is not an MCAP file'),
-            (records.MAGIC[:4], 'was cut off after 4 bytes')):
+            (MAGIC[:4], 'was cut off after 4 bytes')):
         path = tmp_path / 'file.mcap'
         path.write_bytes(content)
         assert main(['bag', 'info', str(path)]) == 2
@@ -443,3 +439,79 @@ def test_profiles_out_of_range_are_refused():
 def test_metadata_that_cannot_be_opened_are_named(tmp_path):
     with pytest.raises(BagError, match='is no file'):
         metadata.read(tmp_path)
+
+
+@pytest.mark.parametrize('killed', [False, True])
+def test_a_wrong_bit_in_the_header_of_a_record_is_said_or_harmless(tmp_path, killed):
+    path = flips.make_bag(tmp_path / 'bag', killed=killed)
+    (tmp_path / 'changed').mkdir()
+    bits = flips.header_bits(path.read_bytes(), killed=killed)
+    count = flips.flip(path, random.Random(8).sample(bits, 60), tmp_path / 'changed')
+    assert not count.wrong
+    assert count.said
+
+
+def test_a_message_lost_from_a_chunk_is_said_by_recover(tmp_path, capsys):
+    path = write_bag(tmp_path / 'bag')
+    data = bytearray(path.read_bytes())
+    chunks = [offset for opcode, offset, _ in pieces(bytes(data)) if opcode == Opcode.CHUNK]
+    data[chunks[1] + 100] ^= 0x10
+    path.write_bytes(data)
+    assert main(['bag', 'recover', str(tmp_path / 'bag'), '--out', str(tmp_path / 'new')]) == 0
+    assert 'of 400 messages cannot be read' in capsys.readouterr().err
+    assert main(['bag', 'info', str(tmp_path / 'bag')]) == 0
+    assert 'the CRC of its data differs' in capsys.readouterr().out
+
+
+def test_a_recovery_that_is_cancelled_leaves_no_bag_that_says_it_is_whole(tmp_path, monkeypatch):
+    write_bag(tmp_path / 'bag')
+    monkeypatch.setattr(BagReader, 'stored_messages', interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        recover(tmp_path / 'bag', tmp_path / 'new')
+    reader = BagReader(tmp_path / 'new')
+    assert not reader.complete
+    assert 'was not closed by its recorder' in ' '.join(reader.problems)
+
+
+def interrupted(self):
+    yield next(self.messages())
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize('lost', [
+    '{"/a": 1e999}', '{"/a": NaN}', '{"/a": ' + '9' * 4300 + '}', '[' * 200_000, '{"/a": -1}',
+    '[1]', '{"/a": "1"}'])
+def test_counts_of_losses_that_make_no_sense_are_left_aside(tmp_path, lost):
+    with BagWriter(tmp_path / 'bag', custom_data={'lost': lost}) as writer:
+        writer.add_topic(Topic('/a', FLOAT))
+    summary = summarize(tmp_path / 'bag')
+    assert summary.lost is None
+    json.loads(to_json(summary), parse_constant=pytest.fail)
+
+
+def test_a_folder_whose_name_is_no_text_is_written_and_read(tmp_path):
+    folder = Path(os.fsdecode(os.fsencode(tmp_path / 'bag') + b'\xff'))
+    write_bag(tmp_path / 'bag')
+    assert main(['bag', 'recover', str(tmp_path / 'bag'), '--out', str(folder)]) == 0
+    assert BagReader(folder).counts() == {'/a': 400}
+    assert main(['bag', 'info', str(folder)]) == 0
+
+
+def test_metadata_that_are_a_link_out_of_the_folder_are_not_followed(tmp_path):
+    write_bag(tmp_path / 'bag')
+    path = tmp_path / 'bag' / 'metadata.yaml'
+    path.rename(tmp_path / 'elsewhere.yaml')
+    path.symlink_to(tmp_path / 'elsewhere.yaml')
+    reader = BagReader(tmp_path / 'bag')
+    assert reader.metadata is None
+    assert any('is a link' in problem for problem in reader.problems)
+    assert reader.counts() == {'/a': 400}
+
+
+def test_more_topics_than_anybody_has_are_said_and_cost_no_time(tmp_path):
+    path = tmp_path / 'many.mcap'
+    path.write_bytes(BEGIN + schema(1, FLOAT, b'float64 data\n') + b''.join(
+        channel(i, 1, f'/{i}') for i in range(1, 65_000)) + END)
+    reader = BagReader(path)
+    assert len(reader.topics) == limits.TOPICS
+    assert any('the rest is passed over' in problem for problem in reader.problems)

@@ -182,9 +182,12 @@ def test_notes_survive_without_a_clean_end(tmp_path):
     writer.note({'planner.zeta': '0.1'})
     reader = BagReader(tmp_path / 'bag' / 'bag_0.mcap')
     assert reader.custom_data == {'planner.zeta': '0.1'}
-    assert metadata.read(tmp_path / 'bag' / 'metadata.yaml').custom_data == {
-        'planner.zeta': '0.1'}
+    bag = BagReader(tmp_path / 'bag')
+    assert bag.metadata.custom_data['planner.zeta'] == '0.1'
+    assert bag.custom_data == {'planner.zeta': '0.1'}
+    assert 'was not closed by its recorder' in bag.problems[-1]
     writer.close()
+    assert not BagReader(tmp_path / 'bag').problems
 
 
 def test_what_is_flushed_can_be_read_while_writing_goes_on(tmp_path):

@@ -8,11 +8,14 @@ import subprocess
 import sys
 
 import lz4.frame
+from mcap.opcode import Opcode
+from mcap_bytes import BEGIN, channel, chunk, END, record, schema
+from mcap_bytes import metadata as metadata_record
 import pytest
 import yaml
 import zstandard
 
-from hmsa_ros.bag import limits, metadata, records
+from hmsa_ros.bag import limits, metadata
 from hmsa_ros.bag.definitions import message_definition
 from hmsa_ros.bag.reader import BagReader, read_messages
 from hmsa_ros.bag.recover import recover
@@ -24,10 +27,7 @@ ROOT = Path(__file__).resolve().parent.parent
 FLOAT = 'std_msgs/msg/Float64'
 PAYLOAD = bytes((0, 1, 0, 0)) + bytes(8)
 MEGA = 2**20
-BEGIN = records.MAGIC + records.header('ros2', 'a stranger')
-END = records.data_end() + records.footer(0, 0, b'') + records.MAGIC
-DECLARED = records.schema(records.Schema(1, FLOAT, 'ros2msg', b'float64 data\n')) + (
-    records.channel(records.Channel(1, 1, '/a', 'cdr', {})))
+DECLARED = schema(1, FLOAT, b'float64 data\n') + channel(1, 1, '/a')
 
 # Reads a bag in every way there is, with no more memory than it is given.
 READER = """
@@ -67,12 +67,7 @@ def read_apart(path, *, chunk=4, memory=300):
 
 
 def message(data=PAYLOAD, time=1):
-    return records.MESSAGE_HEAD.pack(
-        records.MESSAGE, records.MESSAGE_FIXED + len(data), 1, 0, time, time) + data
-
-
-def chunk(packed, size, compression='zstd', start=1, end=1):
-    return records.chunk_head(start, end, size, 0, compression, len(packed)) + packed
+    return record(Opcode.MESSAGE, struct.pack('<HIQQ', 1, 0, time, time) + data)
 
 
 def zstd_of_zeros(size):
@@ -89,7 +84,7 @@ def hostile_files():
     zeros = zstd_of_zeros(512 * MEGA)
     small = many_small_messages(4 * MEGA)
     overlapping = chunk(zstandard.ZstdCompressor().compress(small), len(small), end=10**9)
-    large_schema = records.schema(records.Schema(2, 'x/msg/Y', 'ros2msg', b'#' * 3 * MEGA))
+    large_schema = schema(2, 'x/msg/Y', b'#' * 3 * MEGA)
     packed_schema = zstandard.ZstdCompressor().compress(large_schema)
     nested = b'A[] a\n' + b'=' * 80 + b'\nMSG: x/A\n'
     many = struct.pack('<I', 10 * MEGA) + bytes(10 * MEGA)
@@ -102,24 +97,22 @@ def hostile_files():
         zstandard.ZstdCompressor(write_content_size=False).compress(bytes(64 * MEGA)),
         3 * MEGA), 'does not decompress'
     yield 'many chunks at once', overlapping * 20, 'overlap in time'
-    yield 'large record', records.PREFIX.pack(records.METADATA, 2**40), 'is not complete'
+    yield 'large record', struct.pack('<BQ', Opcode.METADATA, 2**40), 'is not complete'
     yield 'large definition', large_schema, 'bytes, more than'
     yield 'large definitions in chunks', chunk(
         packed_schema, len(large_schema)), 'bytes, more than'
-    yield 'metadata of many entries', records.metadata(
+    yield 'metadata of many entries', metadata_record(
         'hmsa_ros', {str(i): '' for i in range(150_000)}), 'more than 100000 entries'
-    yield 'statistics that lie', records.record(records.STATISTICS, struct.pack(
+    yield 'statistics that lie', record(Opcode.STATISTICS, struct.pack(
         '<QHIIIIQQI', 2**63, 1, 1, 0, 0, 1, 0, 0, 2**32 - 1)), 'statistics record ends early'
     yield 'many channels', b''.join(
-        records.channel(records.Channel(i, 9, f'/{i}', 'cdr', {})) for i in range(2, 2000)
+        channel(i, 9, f'/{i}') for i in range(2, 2000)
         ), 'more problems, which are not told'
-    yield 'message of many messages', records.schema(records.Schema(
-        1, 'x/msg/Y', 'ros2msg', nested)) + records.channel(
-        records.Channel(1, 1, '/a', 'cdr', {})) + message(PAYLOAD[:4] + many), (
+    yield 'message of many messages', schema(
+        1, 'x/msg/Y', nested) + channel(1, 1, '/a') + message(PAYLOAD[:4] + many), (
         'expected at most 8388608')
-    yield 'definition within itself', records.schema(records.Schema(
-        1, 'x/msg/Y', 'ros2msg', b'Y y\n')) + records.channel(
-        records.Channel(1, 1, '/a', 'cdr', {})) + message(), 'does not decode'
+    yield 'definition within itself', schema(
+        1, 'x/msg/Y', b'Y y\n') + channel(1, 1, '/a') + message(), 'does not decode'
 
 
 def test_sizes_that_lie_take_no_memory(tmp_path):
@@ -135,9 +128,9 @@ def test_sizes_that_lie_take_no_memory(tmp_path):
 
 def test_a_file_with_holes_takes_no_memory(tmp_path):
     path = tmp_path / 'holes.mcap'
-    for opcode in (records.MESSAGE, records.CHUNK, records.SCHEMA, records.METADATA):
+    for opcode in (Opcode.MESSAGE, Opcode.CHUNK, Opcode.SCHEMA, Opcode.METADATA):
         with path.open('wb') as file:
-            file.write(BEGIN + DECLARED + message() + records.PREFIX.pack(opcode, 2**36))
+            file.write(BEGIN + DECLARED + message() + struct.pack('<BQ', opcode, 2**36))
             file.truncate(2**36 + 2**20)
         output = read_apart(path)
         assert int(output.split('\n', 1)[0]) == 1
@@ -249,9 +242,8 @@ def test_profiles_made_to_do_harm_are_left_aside(tmp_path):
     path = tmp_path / 'bag.mcap'
     for bomb in YAML_BOMBS.values():
         text = bomb.decode('latin-1') if isinstance(bomb, bytes) else bomb
-        path.write_bytes(BEGIN + records.schema(
-            records.Schema(1, FLOAT, 'ros2msg', b'float64 data\n')) + records.channel(
-            records.Channel(1, 1, '/a', 'cdr', {'offered_qos_profiles': text[:2 * MEGA]}))
+        path.write_bytes(BEGIN + schema(1, FLOAT, b'float64 data\n') + channel(
+            1, 1, '/a', {'offered_qos_profiles': text[:2 * MEGA]})
             + message() + END)
         output = read_apart(path)
         assert output.startswith('1\n')
@@ -259,10 +251,9 @@ def test_profiles_made_to_do_harm_are_left_aside(tmp_path):
 
 def test_what_would_take_over_a_terminal_is_shown_as_codes(tmp_path, capsys):
     path = tmp_path / 'bag.mcap'
-    topic = records.Channel(1, 1, '/a\x1b[2Jb', 'cdr', {})
-    data = records.channel(topic).replace(b'[2Jb', b'[2J\xff')
-    path.write_bytes(BEGIN + DECLARED[:DECLARED.index(records.channel(
-        records.Channel(1, 1, '/a', 'cdr', {})))] + data + message() + records.metadata(
+    data = channel(1, 1, '/a\x1b[2Jb').replace(b'[2Jb', b'[2J\xff')
+    path.write_bytes(BEGIN + schema(
+        1, FLOAT, b'float64 data\n') + data + message() + metadata_record(
         'hmsa_ros', {'note\x07': 'two\nlines \x9b31m'}) + END)
     assert main(['bag', 'info', str(path)]) == 0
     shown = capsys.readouterr().out

@@ -6,10 +6,10 @@ import datetime
 import json
 import os
 
-from hmsa_ros.bag import limits
+from hmsa_ros.bag import limits, qos
 from hmsa_ros.bag.experiment import node_parameters, parameter_key
 from hmsa_ros.bag.reader import BagReader
-from hmsa_ros.errors import printable
+from hmsa_ros.errors import BagError, printable
 
 
 @dataclass(frozen=True)
@@ -121,6 +121,7 @@ def summarize(
 
     """
     reader = BagReader(path, max_chunk_size=max_chunk_size)
+    # First of all: it finds out what is damaged.
     counts = reader.counts()
     start, end = reader.start_time, reader.end_time
     seconds = 0.0 if start is None or end is None else (end - start) * 1e-9
@@ -140,7 +141,7 @@ def summarize(
         str(path), tuple((file.name, file.stat().st_size) for file in reader.files), start, end,
         topics, parameters,
         {key: value for key, value in reader.custom_data.items()
-         if key not in parameters and key != 'lost'},
+         if key not in parameters and key != 'lost' and not key.startswith(qos.LATER)},
         reader.complete, tuple(reader.problems))
 
 
@@ -160,10 +161,12 @@ def lost_messages(custom_data: Mapping[str, str]) -> dict[str, int] | None:
 
     """
     try:
-        counts = json.loads(custom_data['lost'])
-        return {str(name): int(count) for name, count in counts.items()}
-    except (KeyError, ValueError, TypeError, AttributeError):
+        counts = limits.load_json(custom_data['lost'])
+    except (KeyError, BagError):
         return None
+    good = isinstance(counts, dict) and all(
+        isinstance(count, int) and 0 <= count < 2**63 for count in counts.values())
+    return counts if good else None
 
 
 def to_json(summary: BagSummary) -> str:
@@ -197,7 +200,7 @@ def to_json(summary: BagSummary) -> str:
         'custom_data': dict(summary.custom_data),
         'complete': summary.complete,
         'problems': list(summary.problems),
-    }, indent=2)
+    }, indent=2, allow_nan=False)
 
 
 def to_text(summary: BagSummary) -> str:

@@ -5,6 +5,9 @@ A bag may come from anybody. Its lengths and counts are held against these limit
 is taken for them, and its YAML is counted before it is built.
 """
 
+import json
+import math
+import reprlib
 from typing import Any
 
 import yaml
@@ -18,6 +21,14 @@ CHUNK_SIZE = 128 * MEBIBYTE
 CHUNKS_AT_ONCE = 4
 #: Chunks of a file; with rosbag2's usual chunks that is more than a terabyte.
 CHUNKS = 2_000_000
+#: Channels of a file, and schemas; each topic costs a player a publisher.
+CHANNELS = 8192
+#: Topics of a bag.
+TOPICS = 4096
+#: Summary of a file, that of half a terabyte in usual chunks.
+SUMMARY_SIZE = 128 * MEBIBYTE
+#: Data held against their CRC as a whole when a bag is summarized: seconds.
+CHECKED_SIZE = 1024 * MEBIBYTE
 #: Record of a schema, a channel, statistics or metadata.
 RECORD_SIZE = 16 * MEBIBYTE
 #: All schemas, channels and metadata that are kept of a bag.
@@ -39,6 +50,39 @@ YAML_DEPTH = 30
 PROBLEMS = 200
 # The C parser is some ten times faster; not every installation of PyYAML has it.
 _Loader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+
+
+def load_json(text: str) -> Any:
+    """
+    Build what a JSON text from a bag says.
+
+    Parameters
+    ----------
+    text : str
+        From a bag.
+
+    Returns
+    -------
+    object
+        Plain lists, maps and scalars; numbers are finite.
+
+    Raises
+    ------
+    BagError
+        If it is no JSON, is nested too deep, or has a number that is not finite or too long.
+
+    """
+    def number(digits: str) -> float:
+        value = float(digits)
+        if not math.isfinite(value):
+            raise ValueError(digits)
+        return value
+
+    try:
+        return json.loads(text, parse_float=number, parse_constant=number)
+    except (ValueError, RecursionError) as error:
+        raise BagError(
+            f'{reprlib.repr(text)} cannot be read: expected JSON with finite numbers') from error
 
 
 def load_yaml(text: str) -> Any:

@@ -15,6 +15,8 @@ FILE_NAME = 'metadata.yaml'
 VERSION = 9
 # What rosbag2 writes as the start of a bag without a message.
 NO_TIME = 9223372036854775807
+#: Key of custom data while a bag is written: who finds it reads what a killed writer left.
+NOT_ENDED = 'hmsa_ros.not_ended'
 _Dumper: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 
 

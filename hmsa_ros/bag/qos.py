@@ -20,6 +20,8 @@ LIVELINESSES = (
     'system_default', 'automatic', 'manual_by_node', 'manual_by_topic', 'unknown',
     'best_available')
 INFINITE_NS = 9223372036854775807
+#: Key of custom data, before a topic's name: profiles of publishers that came later.
+LATER = 'offered_qos_profiles.'
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ def _time_to_map(nanoseconds: int) -> dict[str, int]:
 
 
 def _time_from_map(value: Any) -> int:
-    """Read a duration; zero is how rmw spells infinity in requests, and means none here too."""
+    """Read a duration; at most what means none."""
     total = int(value['sec']) * 10**9 + int(value['nsec'])
     return min(total, INFINITE_NS)
 

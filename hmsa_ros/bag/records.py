@@ -1,63 +1,56 @@
 """
-MCAP records as bytes: the subset that rosbag2 writes.
+MCAP records as bytes: what the mcap package does not check or cannot bound.
 
 https://mcap.dev/spec. Little endian; a record is its opcode (1 byte), the length of its content
-(8 bytes) and the content. Decoding takes any bytes and raises `BagError` for what is no record,
-never another exception.
+(8 bytes) and the content. The package's own classes read the records; here they are given no
+more than the record has, and chunks are unfolded into no more memory than they say.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
+import io
+import os
 import struct
+from typing import Any, TypeVar
 import zlib
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import (
+    Channel,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
+from mcap.writer import MCAP0_MAGIC
 
 from hmsa_ros.bag import limits
 from hmsa_ros.errors import BagError
 
-MAGIC = b'\x89MCAP0\r\n'
-HEADER = 0x01
-FOOTER = 0x02
-SCHEMA = 0x03
-CHANNEL = 0x04
-MESSAGE = 0x05
-CHUNK = 0x06
-MESSAGE_INDEX = 0x07
-CHUNK_INDEX = 0x08
-ATTACHMENT = 0x09
-STATISTICS = 0x0B
-METADATA = 0x0C
-METADATA_INDEX = 0x0D
-SUMMARY_OFFSET = 0x0E
-DATA_END = 0x0F
-OPCODES = frozenset(range(0x01, 0x10))
-
+#: How a file begins and ends.
+MAGIC = MCAP0_MAGIC
 PREFIX = struct.Struct('<BQ')
 # Opcode, length, channel, sequence, log time, publish time; the payload follows.
 MESSAGE_HEAD = struct.Struct('<BQHIQQ')
+#: A plain number: this is asked of every message.
+MESSAGE = int(Opcode.MESSAGE)
 MESSAGE_FIXED = MESSAGE_HEAD.size - PREFIX.size
-FOOTER_SIZE = PREFIX.size + 20
-_CHUNK_HEAD = struct.Struct('<QQQI')
+#: Of the content of a chunk before its data, at most: compression has a short name.
+CHUNK_HEAD_SIZE = 64
+_CHUNK_HEAD = struct.Struct('<QQQII')
+_Record = TypeVar('_Record', bound=McapRecord)
 
-
-@dataclass(frozen=True)
-class Schema:
-    """A message type: name, encoding of its definition, and the definition."""
-
-    id: int
-    name: str
-    encoding: str
-    data: bytes
-
-
-@dataclass(frozen=True)
-class Channel:
-    """A topic: name, encoding of its messages, schema and metadata."""
-
-    id: int
-    schema_id: int
-    topic: str
-    encoding: str
-    metadata: Mapping[str, str]
+_CLASSES: dict[int, type[Any]] = {
+    Opcode.HEADER: Header, Opcode.FOOTER: Footer, Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel, Opcode.CHUNK_INDEX: ChunkIndex, Opcode.STATISTICS: Statistics,
+    Opcode.METADATA: Metadata, Opcode.METADATA_INDEX: MetadataIndex, Opcode.DATA_END: DataEnd}
 
 
 @dataclass(frozen=True)
@@ -87,211 +80,65 @@ class ChunkHead:
     data_length: int
 
 
-def record(opcode: int, content: bytes) -> bytes:
-    """
-    Return a record.
+class _Content(ReadDataStream):
+    """The content of a record: ends where the record does, and has a limit of fields."""
 
-    Parameters
-    ----------
-    opcode : int
-        Kind of record.
-    content : bytes
-        Its content.
-
-    Returns
-    -------
-    bytes
-        The record.
-
-    """
-    return PREFIX.pack(opcode, len(content)) + content
-
-
-def text(value: str) -> bytes:
-    """
-    Return a string with its length before it.
-
-    Parameters
-    ----------
-    value : str
-        Any text.
-
-    Returns
-    -------
-    bytes
-        Encoded.
-
-    """
-    data = value.encode('utf-8', 'backslashreplace')
-    return struct.pack('<I', len(data)) + data
-
-
-def text_map(values: Mapping[str, str]) -> bytes:
-    """
-    Return a map of strings with its length before it.
-
-    Parameters
-    ----------
-    values : mapping of str to str
-        Any texts.
-
-    Returns
-    -------
-    bytes
-        Encoded.
-
-    """
-    data = b''.join(text(key) + text(value) for key, value in values.items())
-    return struct.pack('<I', len(data)) + data
-
-
-def header(profile: str, library: str) -> bytes:
-    """Return the record that opens a file."""
-    return record(HEADER, text(profile) + text(library))
-
-
-def schema(value: Schema) -> bytes:
-    """Return a schema record."""
-    return record(SCHEMA, struct.pack('<H', value.id) + text(value.name) + text(value.encoding)
-                  + struct.pack('<I', len(value.data)) + value.data)
-
-
-def channel(value: Channel) -> bytes:
-    """Return a channel record."""
-    return record(CHANNEL, struct.pack('<HH', value.id, value.schema_id) + text(value.topic)
-                  + text(value.encoding) + text_map(value.metadata))
-
-
-def metadata(name: str, values: Mapping[str, str]) -> bytes:
-    """Return a metadata record."""
-    return record(METADATA, text(name) + text_map(values))
-
-
-def metadata_index(offset: int, length: int, name: str) -> bytes:
-    """Return the summary's entry of a metadata record."""
-    return record(METADATA_INDEX, struct.pack('<QQ', offset, length) + text(name))
-
-
-def summary_offset(opcode: int, start: int, length: int) -> bytes:
-    """Return the entry that tells where the summary's records of one kind lie."""
-    return record(SUMMARY_OFFSET, struct.pack('<BQQ', opcode, start, length))
-
-
-def data_end() -> bytes:
-    """Return the record that ends the data section, without a CRC over all of it."""
-    return record(DATA_END, struct.pack('<I', 0))
-
-
-def footer(summary_start: int, offsets_start: int, summary: bytes) -> bytes:
-    """Return the record that closes a file, with the CRC of the summary before it."""
-    head = PREFIX.pack(FOOTER, 20) + struct.pack('<QQ', summary_start, offsets_start)
-    return head + struct.pack('<I', zlib.crc32(head, zlib.crc32(summary)))
-
-
-class Fields:
-    """
-    Reads the fields of a record one after the other.
-
-    Parameters
-    ----------
-    data : bytes
-        Content of one record.
-    what : str
-        Kind of record, for messages.
-
-    """
-
-    def __init__(self, data: bytes | memoryview, what: str) -> None:
-        self._data = memoryview(data)
+    def __init__(self, data: bytes, what: str) -> None:
+        super().__init__(io.BytesIO(data))
+        self._size = len(data)
         self._what = what
-        self.offset = 0
+        self._fields = 0
 
-    def take(self, length: int) -> bytes:
-        """
-        Return the next bytes.
-
-        Parameters
-        ----------
-        length : int
-            How many.
-
-        Returns
-        -------
-        bytes
-            A copy of them.
-
-        Raises
-        ------
-        BagError
-            If the record ends before.
-
-        """
-        end = self.offset + length
-        if length < 0 or end > len(self._data):
+    def read(self, length: int) -> bytes:
+        self._fields += 1
+        if self._fields > 4 * limits.MAP_ENTRIES:
+            raise BagError(
+                f'a {self._what} record has more than {limits.MAP_ENTRIES} entries')
+        if self.count + length > self._size:
             raise BagError(f'a {self._what} record ends early')
-        value = bytes(self._data[self.offset:end])
-        self.offset = end
-        return value
+        return super().read(length)
 
-    def number(self, size: int) -> int:
-        """Return the next unsigned number of some bytes."""
-        return int.from_bytes(self.take(size), 'little')
-
-    def text(self) -> str:
-        """Return the next string; bytes that are not UTF-8 are told by their codes."""
-        return self.take(self.number(4)).decode('utf-8', 'backslashreplace')
-
-    def text_map(self) -> dict[str, str]:
-        """
-        Return the next map of strings.
-
-        Returns
-        -------
-        dict of str to str
-            In the order of the record.
-
-        Raises
-        ------
-        BagError
-            If the record ends before, or has too many of them.
-
-        """
-        end = self.number(4) + self.offset
-        if end > len(self._data):
-            raise BagError(f'a {self._what} record ends early')
-        values: dict[str, str] = {}
-        while self.offset < end:
-            if len(values) >= limits.MAP_ENTRIES:
-                raise BagError(
-                    f'a {self._what} record has more than {limits.MAP_ENTRIES} entries')
-            key = self.text()
-            values[key] = self.text()
-        return values
+    def read_prefixed_string(self) -> str:
+        return self.read(self.read4()).decode('utf-8', 'backslashreplace')
 
 
-def read_header(data: bytes) -> tuple[str, str]:
-    """Return profile and library of a header record's content."""
-    fields = Fields(data, 'header')
-    return fields.text(), fields.text()
+def parse(kind: type[_Record], content: bytes) -> _Record:
+    """
+    Read a record by the mcap package's class.
+
+    Parameters
+    ----------
+    kind : type
+        Class of the record.
+    content : bytes
+        All of its content.
+
+    Returns
+    -------
+    mcap.records.McapRecord
+        Bytes that are not UTF-8 are written as their codes.
+
+    Raises
+    ------
+    BagError
+        If the content is not that of such a record.
+
+    """
+    what = kind.__name__.lower()
+    stream = _Content(content, what)
+    try:
+        record: _Record = kind.read(stream)  # type: ignore[attr-defined]
+    except (McapError, struct.error) as error:
+        raise BagError(f'a {what} record ends early') from error
+    if stream.count != len(content):
+        raise BagError(f'a {what} record is longer than what it holds')
+    return record
 
 
-def read_schema(data: bytes) -> Schema:
-    """Return the schema of a record's content."""
-    fields = Fields(data, 'schema')
-    return Schema(fields.number(2), fields.text(), fields.text(), fields.take(fields.number(4)))
-
-
-def read_channel(data: bytes) -> Channel:
-    """Return the channel of a record's content."""
-    fields = Fields(data, 'channel')
-    return Channel(
-        fields.number(2), fields.number(2), fields.text(), fields.text(), fields.text_map())
-
-
-def read_metadata(data: bytes) -> tuple[str, dict[str, str]]:
-    """Return name and values of a metadata record's content."""
-    fields = Fields(data, 'metadata')
-    return fields.text(), fields.text_map()
+def parse_any(opcode: int, content: bytes) -> McapRecord | None:
+    """Return the record of a known kind, None of another; see `parse`."""
+    kind = _CLASSES.get(opcode)
+    return None if kind is None else parse(kind, content)
 
 
 def read_chunk_head(data: bytes, length: int) -> ChunkHead:
@@ -301,7 +148,7 @@ def read_chunk_head(data: bytes, length: int) -> ChunkHead:
     Parameters
     ----------
     data : bytes
-        Beginning of the record's content, 64 bytes or all of it.
+        Beginning of the record's content, `CHUNK_HEAD_SIZE` bytes or all of it.
     length : int
         Length of the whole content.
 
@@ -316,21 +163,16 @@ def read_chunk_head(data: bytes, length: int) -> ChunkHead:
         If it is no chunk.
 
     """
-    fields = Fields(data, 'chunk')
-    start, end, size, crc = _CHUNK_HEAD.unpack(fields.take(_CHUNK_HEAD.size))
-    compression = fields.text()
-    data_length = fields.number(8)
-    if fields.offset + data_length > length:
-        raise BagError('a chunk record ends early')
-    return ChunkHead(start, end, size, crc, compression, fields.offset, data_length)
-
-
-def chunk_head(
-        start: int, end: int, size: int, crc: int, compression: str, length: int) -> bytes:
-    """Return a chunk record without its data, which has ``length`` bytes."""
-    head = (_CHUNK_HEAD.pack(start, end, size, crc) + text(compression)
-            + struct.pack('<Q', length))
-    return PREFIX.pack(CHUNK, len(head) + length) + head
+    try:
+        start, end, size, crc, name = _CHUNK_HEAD.unpack_from(data)
+        offset = _CHUNK_HEAD.size + name + 8
+        compression = data[_CHUNK_HEAD.size:offset - 8].decode()
+        data_length, = struct.unpack_from('<Q', data, offset - 8)
+    except (struct.error, UnicodeDecodeError) as error:
+        raise BagError('a chunk record ends early') from error
+    if offset + data_length != length:
+        raise BagError(f'a chunk record has {length} bytes: it says {offset + data_length}')
+    return ChunkHead(start, end, size, crc, compression, offset, data_length)
 
 
 def decompress(data: bytes, compression: str, size: int) -> bytes:
@@ -382,38 +224,68 @@ def decompress(data: bytes, compression: str, size: int) -> bytes:
     return content
 
 
-def compress(data: bytes, compression: str, level: int) -> bytes:
+def checked(content: bytes, crc: int) -> bytes:
     """
-    Return the content of a chunk as it is stored.
-
-    Parameters
-    ----------
-    data : bytes
-        Content.
-    compression : str
-        ``''``, ``'lz4'`` or ``'zstd'``.
-    level : int
-        Of the compression.
-
-    Returns
-    -------
-    bytes
-        Compressed.
+    Return the content of a chunk.
 
     Raises
     ------
     BagError
-        If the compression is unknown.
+        If its CRC, unless that is 0, is another.
 
     """
-    if not compression:
-        return data
-    if compression == 'zstd':
-        import zstandard
-        packed: bytes = zstandard.ZstdCompressor(level=level).compress(data)
-        return packed
-    if compression == 'lz4':
-        import lz4.frame
-        framed: bytes = lz4.frame.compress(data, compression_level=level)
-        return framed
-    raise BagError(f'compression is {compression!r}: expected none, lz4 or zstd')
+    if crc and zlib.crc32(content) != crc:
+        raise BagError('a chunk is damaged (its CRC differs)')
+    return content
+
+
+def split(content: bytes) -> Iterator[tuple[int, int, int]]:
+    """
+    Go through records that follow each other.
+
+    Parameters
+    ----------
+    content : bytes
+        Of a chunk or a summary.
+
+    Yields
+    ------
+    tuple of int
+        Opcode, and start and end of the content of each record.
+
+    Raises
+    ------
+    BagError
+        At a record that is not whole.
+
+    """
+    offset, size = 0, len(content)
+    prefix_size, unpack = PREFIX.size, PREFIX.unpack_from
+    while offset < size:
+        if offset + prefix_size > size:
+            raise BagError('a record in a chunk ends early')
+        opcode, length = unpack(content, offset)
+        start = offset + prefix_size
+        offset = start + length
+        if offset > size or (opcode == MESSAGE and length < MESSAGE_FIXED):
+            raise BagError('a record in a chunk ends early')
+        yield opcode, start, offset
+
+
+def read_exactly(descriptor: int, length: int, offset: int) -> bytes:
+    """
+    Read from a file.
+
+    Raises
+    ------
+    BagError
+        If it has become shorter.
+
+    """
+    data = os.pread(descriptor, length, offset)
+    while len(data) < length:
+        more = os.pread(descriptor, length - len(data), offset + len(data))
+        if not more:
+            raise BagError('the file has become shorter')
+        data += more
+    return data

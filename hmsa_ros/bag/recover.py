@@ -84,6 +84,8 @@ def recover(
     if check.problems or found != expected:
         raise BagError(f'{out} does not read back as written: '
                        + ('; '.join(check.problems) or f'{found}, expected {expected}'))
+    # Counted last, when all damage is known.
+    reader.counts()
     return Recovered(str(out), sum(found.values()), tuple(reader.problems))
 
 

@@ -128,5 +128,5 @@ def _recover(arguments: argparse.Namespace) -> int:
             arguments.bag, arguments.out, max_chunk_size=arguments.max_chunk_size)
     for problem in result.problems:
         print(f'hmsa: note: {problem}', file=sys.stderr)
-    print(f'{result.message_count} messages recovered to {result.folder}')
+    print(printable(f'{result.message_count} messages recovered to {result.folder}'))
     return 0

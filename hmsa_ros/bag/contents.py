@@ -1,0 +1,158 @@
+"""What a bag being written holds: its topics, counts, files and custom data."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from hmsa_ros.bag import metadata, qos
+from hmsa_ros.bag.output import OutputFile
+from hmsa_ros.errors import BadInputError, BagError
+
+MAX_CHANNELS = 2**16 - 1
+
+
+@dataclass(frozen=True)
+class Topic:
+    """
+    A topic to be written.
+
+    Attributes
+    ----------
+    name, type : str
+        For example ``'/joint_states'`` and ``'sensor_msgs/msg/JointState'``.
+    definition : str
+        Message definition with its dependencies; empty if not known.
+    definition_encoding : str
+        ``'ros2msg'`` or ``'ros2idl'``; empty if not known.
+    profiles : tuple of hmsa_ros.bag.qos.Qos
+        What the publishers offer.
+    type_hash : str
+        RIHS01 hash, empty if not known.
+
+    """
+
+    name: str
+    type: str
+    definition: str = ''
+    definition_encoding: str = 'ros2msg'
+    profiles: tuple[qos.Qos, ...] = ()
+    type_hash: str = ''
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise BadInputError('a topic has an empty name: expected a name such as /stretch')
+        if not self.type:
+            raise BadInputError(f'topic {self.name} has an empty type: expected a message type')
+
+
+class Contents:
+    """
+    What a bag being written holds.
+
+    Parameters
+    ----------
+    custom_data : mapping of str to str
+        What the user notes.
+    ros_distro : str
+        Name of the distribution.
+
+    Attributes
+    ----------
+    topics : list of Topic
+        By number.
+    files : list of hmsa_ros.bag.metadata.FileMetadata
+        Those closed.
+    custom_data : dict of str to str
+        Of the bag.
+    dropped : dict of str to int
+        By topic, messages that are not in the bag after all.
+    ended : bool
+        Whether the recording has ended.
+
+    """
+
+    def __init__(self, custom_data: Mapping[str, str], ros_distro: str) -> None:
+        self.topics: list[Topic] = []
+        self.files: list[metadata.FileMetadata] = []
+        self.custom_data: dict[str, str] = {}
+        self.dropped: dict[str, int] = {}
+        self.ended = False
+        self._ros_distro = ros_distro
+        self._counts: dict[int, int] = {}
+        self.note(custom_data)
+
+    def note(self, values: Mapping[str, str]) -> None:
+        """Add to the custom data; what UTF-8 cannot hold is written as its codes."""
+        for key, value in values.items():
+            self.custom_data[_storable(key)] = _storable(value)
+
+    def number_of(self, topic: Topic) -> int | None:
+        """Return the number of a topic that is known, None of a new one."""
+        return next((
+            number for number, known in enumerate(self.topics)
+            if (known.name, known.type) == (topic.name, topic.type)), None)
+
+    def check_room(self) -> None:
+        """
+        Refuse one topic more than MCAP can number.
+
+        Raises
+        ------
+        BagError
+            If there are as many as that.
+
+        """
+        if len(self.topics) >= MAX_CHANNELS:
+            raise BagError(f'a bag cannot have more than {MAX_CHANNELS} topics')
+
+    def counts(self) -> dict[str, int]:
+        """Return the number of messages written, by topic."""
+        return {topic.name: self._counts.get(number, 0)
+                for number, topic in enumerate(self.topics)}
+
+    def count(self, numbers: Iterable[int]) -> None:
+        """Count messages written, each by its topic's number."""
+        for number in numbers:
+            self._counts[number] = self._counts.get(number, 0) + 1
+
+    def lose(self, numbers: Iterable[int]) -> None:
+        """Count messages that could not be written."""
+        for number in numbers:
+            name = self.topics[number].name
+            self.dropped[name] = self.dropped.get(name, 0) + 1
+
+    def lose_file(self, file: OutputFile) -> None:
+        """Count the messages of a file that is gone."""
+        for number, count in file.counts.items():
+            name = self.topics[number].name
+            self.dropped[name] = self.dropped.get(name, 0) + count
+            self._counts[number] -= count
+
+    def describe(self, file: OutputFile | None) -> metadata.BagMetadata:
+        """Return the metadata of the bag, with the file being written if there is one."""
+        files = [*self.files, *([file.summary()] if file else [])]
+        ended = {} if self.ended else {metadata.NOT_ENDED: 'true'}
+        return self._metadata(files, self._counts, {**self.custom_data, **ended})
+
+    def serialized(self, file: OutputFile) -> str:
+        """Return the metadata as rosbag2 has them in a file, about that file alone."""
+        return metadata.to_yaml(
+            self._metadata([file.summary()], file.counts, self.custom_data), outer_key=False)
+
+    def _metadata(
+            self, files: list[metadata.FileMetadata], counts: Mapping[int, int],
+            custom_data: Mapping[str, str]) -> metadata.BagMetadata:
+        """Return metadata."""
+        filled = [file for file in files if file.message_count]
+        start = min((file.start_ns for file in filled), default=metadata.NO_TIME)
+        end = max((file.start_ns + file.duration_ns for file in filled), default=start)
+        return metadata.BagMetadata(
+            start, end - start, sum(file.message_count for file in files),
+            tuple(metadata.TopicMetadata(
+                topic.name, topic.type, 'cdr', topic.profiles, topic.type_hash,
+                counts.get(number, 0)) for number, topic in enumerate(self.topics)),
+            tuple(files), custom_data, self._ros_distro)
+
+
+def _storable(text: str) -> str:
+    """Return a text with what UTF-8 cannot hold written as its codes."""
+    return text.encode('utf-8', 'backslashreplace').decode()

@@ -1,0 +1,191 @@
+"""What the scan of a file takes in, within limits, and the problems that it finds."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+from mcap.records import Channel, McapRecord, Metadata, Schema
+
+from hmsa_ros.bag import limits, records
+from hmsa_ros.errors import BagError, printable
+
+_Declared = TypeVar('_Declared', Schema, Channel)
+# What an entry of a map takes besides its texts.
+_ENTRY_BYTES = 100
+
+
+class Problems:
+    """Sentences about what cannot be read, each once and not without end."""
+
+    def __init__(self) -> None:
+        self.sentences: list[str] = []
+        self._known: set[str] = set()
+
+    def add(self, sentence: str) -> None:
+        """Note one."""
+        if sentence in self._known or len(self._known) > limits.PROBLEMS:
+            return
+        self._known.add(sentence)
+        self.sentences.append(
+            printable(sentence) if len(self._known) <= limits.PROBLEMS
+            else 'there are more problems, which are not told')
+
+
+@dataclass(frozen=True)
+class Block:
+    """
+    A chunk, or a run of messages outside chunks.
+
+    Attributes
+    ----------
+    file : int
+        Number of the file.
+    offset, length : int
+        Of the stored bytes.
+    size, crc : int
+        Length and CRC-32 of the content; 0 for no CRC.
+    compression : str
+        As for `records.decompress`.
+    start, end : int
+        Lowest and highest log time.
+
+    """
+
+    file: int
+    offset: int
+    length: int
+    size: int
+    start: int
+    end: int
+    compression: str = ''
+    crc: int = 0
+
+    def content(self, descriptor: int) -> bytes:
+        """Return the content, or raise `BagError` if it is damaged."""
+        stored = records.read_exactly(descriptor, self.length, self.offset)
+        return records.checked(
+            records.decompress(stored, self.compression, self.size), self.crc)
+
+
+@dataclass
+class ScannedFile:
+    """
+    What a file holds.
+
+    Attributes
+    ----------
+    complete : bool
+        Whether it was closed by its writer.
+    damaged : bool
+        Whether something in it does not agree with the rest.
+    counted : bool
+        Whether `counts` were counted, and not only read.
+    counts : dict of int to int
+        Messages by channel.
+    data_end, data_crc : int
+        Where the data end, and their CRC-32; 0 if there is none.
+
+    """
+
+    path: Path
+    number: int
+    size: int
+    complete: bool = False
+    damaged: bool = False
+    counted: bool = False
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    blocks: list[Block] = field(default_factory=list)
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    counts: dict[int, int] = field(default_factory=dict)
+    data_end: int = 0
+    data_crc: int = 0
+
+
+class Intake:
+    """
+    Takes in what a file holds, within the limits for a bag.
+
+    Parameters
+    ----------
+    max_chunk_size : int
+        Largest content of a chunk, and largest message, in bytes.
+    problems : Problems
+        Gets what cannot be read or does not agree.
+
+    """
+
+    def __init__(self, max_chunk_size: int, problems: Problems) -> None:
+        self._max_chunk_size = max_chunk_size
+        self._problems = problems
+        self._kept = 0
+
+    def problem(self, file: ScannedFile, sentence: str) -> None:
+        """Note that something in a file is damaged."""
+        file.damaged = True
+        self._problems.add(f'{file.path.name}{sentence}')
+
+    def add_block(self, file: ScannedFile, block: Block, offset: int) -> None:
+        """Take in a chunk that is not too large."""
+        try:
+            self.check_size(max(block.size, block.length), 'chunk')
+        except BagError as error:
+            self.problem(file, f': {error}, at byte {offset}: passed over')
+        else:
+            file.blocks.append(block)
+
+    def check_size(self, size: int, what: str) -> None:
+        """Refuse what is larger than the memory it may take."""
+        if size > self._max_chunk_size:
+            raise BagError(f'a {what} of {size} bytes is larger than the {self._max_chunk_size} '
+                           'bytes allowed')
+
+    def take(self, file: ScannedFile, record: McapRecord) -> None:
+        """Take in a schema, a channel or metadata."""
+        if isinstance(record, Schema):
+            if self._is_new(file, file.schemas, record):
+                self._keep(len(record.data))
+                if len(record.data) > limits.DEFINITION_SIZE:
+                    raise BagError(
+                        f'the definition of {record.name} has {len(record.data)} bytes, more '
+                        f'than {limits.DEFINITION_SIZE}')
+                file.schemas[record.id] = record
+        elif isinstance(record, Channel):
+            if self._is_new(file, file.channels, record):
+                self._keep(sum(map(len, record.metadata.values())) + len(record.topic))
+                file.channels[record.id] = record
+        elif isinstance(record, Metadata):
+            values = file.metadata.setdefault(record.name, {})
+            self._keep(len(record.name) + sum(
+                len(value) + (0 if key in values else len(key) + _ENTRY_BYTES)
+                for key, value in record.metadata.items() if values.get(key) != value))
+            values.update(record.metadata)
+
+    def _is_new(self, file: ScannedFile, known: Mapping[int, _Declared],
+                record: _Declared) -> bool:
+        """Return whether a declaration is to be taken in."""
+        what = type(record).__name__.lower()
+        if record.id in known:
+            if known[record.id] != record:
+                self.problem(file, f': {what} {record.id} is declared in two ways')
+            return False
+        if len(known) >= limits.CHANNELS:
+            self.problem(file, f' declares more than {limits.CHANNELS} of {what}: the rest is '
+                               'passed over')
+            return False
+        return True
+
+    def _keep(self, size: int) -> None:
+        """Count what is kept of the small records, and refuse too much of it."""
+        if self._kept + size > limits.KEPT_SIZE:
+            raise BagError(f'schemas, channels and metadata are larger than '
+                           f'{limits.KEPT_SIZE} bytes')
+        self._kept += size
+
+
+def block_at(number: int, offset: int, head: records.ChunkHead) -> Block:
+    """Return the chunk whose record begins at a place."""
+    return Block(
+        number, offset + records.PREFIX.size + head.data_offset, head.data_length, head.size,
+        head.start, head.end, head.compression, head.crc)

@@ -1,0 +1,136 @@
+"""Messages of several chunks in order of time."""
+
+from array import array
+from collections import Counter
+from collections.abc import Callable, Iterator
+import heapq
+from itertools import islice
+from typing import NamedTuple
+
+from hmsa_ros.bag import records
+from hmsa_ros.errors import BagError
+
+
+class Message(NamedTuple):
+    """A message as stored: topic, stamps in nanoseconds, sequence and payload."""
+
+    topic: str
+    log_time: int
+    publish_time: int
+    sequence: int
+    data: bytes
+
+
+class Cursor:
+    """
+    A place among the messages of a chunk or run, at first in the order stored.
+
+    It keeps places, not messages: a chunk of many small messages would take ten times its size.
+
+    Parameters
+    ----------
+    key : tuple of int
+        Where it was written; of equal stamps the smaller comes first.
+    content : bytes
+        Of the chunk.
+    topic_of : callable
+        Returns the topic of a channel, None if its messages are not wanted.
+    start, end : int
+        Only log times of at least ``start`` and less than ``end``.
+
+    Attributes
+    ----------
+    problem : str
+        What is damaged; empty if nothing is.
+
+    """
+
+    def __init__(
+            self, key: tuple[int, int], content: bytes,
+            topic_of: Callable[[int], str | None], start: int, end: int) -> None:
+        self.key = key
+        self.content = content
+        self.problem = ''
+        self._names: dict[int, str | None] = {}
+        self._times, self._places = array('Q'), array('Q')
+        self._next = 0
+        names, times, places = self._names, self._times, self._places
+        unpack, prefix_size = records.MESSAGE_HEAD.unpack_from, records.PREFIX.size
+        try:
+            for opcode, begin, _ in records.split(content):
+                if opcode == records.MESSAGE:
+                    _, _, channel, _, time, _ = unpack(content, begin - prefix_size)
+                    if channel not in names:
+                        names[channel] = topic_of(channel)
+                    if names[channel] is not None and start <= time < end:
+                        times.append(time)
+                        places.append(begin - prefix_size)
+        except BagError as error:
+            self.problem = str(error)
+
+    def sort(self) -> None:
+        """Put the messages in order of time; equal ones stay as they are."""
+        times = self._times
+        # Nearly always they are in order already.
+        if any(later < earlier for earlier, later in zip(times, islice(times, 1, None),
+                                                         strict=False)):
+            order = sorted(range(len(times)), key=times.__getitem__)
+            self._times = array('Q', (times[i] for i in order))
+            self._places = array('Q', (self._places[i] for i in order))
+
+    @property
+    def left(self) -> bool:
+        """Return whether there is a next message."""
+        return self._next < len(self._times)
+
+    @property
+    def time(self) -> int:
+        """Return the log time of the next message."""
+        return self._times[self._next]
+
+    def take(self, limit: int) -> Iterator[Message]:
+        """Return the next messages, up to a log time; that is for messages in order."""
+        unpack, head_size = records.MESSAGE_HEAD.unpack_from, records.MESSAGE_HEAD.size
+        prefix_size = records.PREFIX.size
+        content, names = self.content, self._names
+        while self._next < len(self._times) and self._times[self._next] < limit:
+            place = self._places[self._next]
+            self._next += 1
+            _, length, channel, sequence, log_time, publish_time = unpack(content, place)
+            yield Message(
+                names[channel] or '', log_time, publish_time, sequence,
+                content[place + head_size:place + prefix_size + length])
+
+    def counts(self) -> Counter[int]:
+        """Return the number of messages by channel."""
+        unpack = records.MESSAGE_HEAD.unpack_from
+        return Counter(unpack(self.content, place)[2] for place in self._places)
+
+
+def merge(cursors: list[Cursor], limit: int) -> Iterator[Message]:
+    """
+    Return the messages of several chunks up to a log time, in order.
+
+    Parameters
+    ----------
+    cursors : list of Cursor
+        Sorted ones.
+    limit : int
+        Only earlier log times.
+
+    Yields
+    ------
+    Message
+        Of equal stamps the one written first comes first.
+
+    """
+    heap = [(cursor.time, cursor.key, cursor) for cursor in cursors
+            if cursor.left and cursor.time < limit]
+    heapq.heapify(heap)
+    while heap:
+        _, key, cursor = heapq.heappop(heap)
+        # Up to the next message of another chunk; where they are equal, key decides.
+        until = limit if not heap else min(limit, heap[0][0] + (key < heap[0][1]))
+        yield from cursor.take(until)
+        if cursor.left and cursor.time < limit:
+            heapq.heappush(heap, (cursor.time, key, cursor))

@@ -1,0 +1,262 @@
+"""
+One MCAP file being written: the mcap package's writer over a stream of ours.
+
+The stream adds what the package lacks: a chunk is in the file whole or not at all, and room for
+the chunk and for the summary is taken on the disk before the writer is given a message, so that
+a full disk leaves a file that can still be closed.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+import errno
+import os
+from pathlib import Path
+import sys
+from typing import cast, IO
+
+from mcap.writer import CompressionType, Writer
+
+from hmsa_ros import __version__
+from hmsa_ros.bag import metadata, qos
+
+LIBRARY = f'hmsa_ros {__version__}'
+#: Name of the metadata record with the experiment.
+EXPERIMENT = 'hmsa_ros'
+#: Room is taken in steps of so many bytes.
+RESERVE_STEP = 256 * 1024
+# Head, index entry and message index entry of a message; of a channel in the indexes of a chunk.
+MESSAGE_HEAD = 31
+_MESSAGE_BYTES = MESSAGE_HEAD + 16
+_CHANNEL_BYTES = 25
+_CHUNK_BYTES = 256
+
+
+@dataclass(frozen=True)
+class Preset:
+    """How chunks are stored: compression, and whether with checksums."""
+
+    compression: CompressionType
+    crc: bool = True
+
+
+# Names as rosbag2 has them, and lz4. With fastwrite rosbag2 leaves out chunks too; here they
+# stay, since the recovery of a cut file goes by them. The mcap package has one level of zstd.
+PRESETS: Mapping[str, Preset] = {
+    'none': Preset(CompressionType.NONE),
+    'fastwrite': Preset(CompressionType.NONE, crc=False),
+    'lz4': Preset(CompressionType.LZ4),
+    'zstd_fast': Preset(CompressionType.ZSTD),
+    'zstd_small': Preset(CompressionType.ZSTD),
+}
+
+
+class _Stream:
+    """Keeps what is written until `flush`, which stores all of it or nothing."""
+
+    def __init__(self, descriptor: int) -> None:
+        self.descriptor = descriptor
+        self.stored = 0
+        self.broken = False
+        self._position = 0
+        self._pending: list[bytes] = []
+
+    def write(self, data: bytes) -> int:
+        self._pending.append(data)
+        self._position += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        return self._position
+
+    def flush(self) -> None:
+        view = memoryview(b''.join(self._pending))
+        try:
+            while view:
+                view = view[os.write(self.descriptor, view):]
+        except OSError:
+            # The writer counts this chunk already: nothing more can be added to the file.
+            self.broken = True
+            os.ftruncate(self.descriptor, self.stored)
+            raise
+        self._pending.clear()
+        self.stored = self._position
+
+
+class OutputFile:
+    """
+    One file.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        Must not exist.
+    number : int
+        Of the file in its bag.
+    preset : Preset
+        How chunks are stored.
+
+    Attributes
+    ----------
+    counts : dict of int to int
+        Messages stored, by topic.
+    start, end : int
+        Lowest and highest log time stored.
+    overhead : int
+        Bytes of what is no message: declarations and metadata records.
+    noted : dict of str to str
+        What the metadata records say of the experiment.
+    notes_size : int
+        Length of these records.
+
+    Raises
+    ------
+    OSError
+        Also by the methods, if the disk does not take it.
+
+    """
+
+    def __init__(self, path: Path, number: int, preset: Preset) -> None:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+        self.path = path
+        self.number = number
+        self.counts: dict[int, int] = {}
+        self.start, self.end = 2**64 - 1, 0
+        self.overhead = self.notes_size = 0
+        self.noted: dict[str, str] = {}
+        self._stream = _Stream(descriptor)
+        self._schemas: dict[str, int] = {}
+        self._ending = False
+        self._end_size = self._notes_room = self._room = 0
+        # Chunks end with `write` alone.
+        self._writer = Writer(
+            cast('IO[bytes]', self._stream), chunk_size=sys.maxsize,
+            compression=preset.compression, enable_crcs=preset.crc, enable_data_crcs=preset.crc)
+        self._writer.start('ros2', LIBRARY)
+
+    @property
+    def size(self) -> int:
+        """Return how many bytes are stored."""
+        return self._stream.stored
+
+    def reserve(self, size: int) -> None:
+        """Take room for some bytes more and for the end of the file."""
+        needed = self.size + size + self._end_size + self._notes_room + RESERVE_STEP // 2
+        if needed > self._room:
+            room = -(-needed // RESERVE_STEP) * RESERVE_STEP
+            os.posix_fallocate(self._stream.descriptor, 0, room)
+            self._room = room
+
+    def declare(
+            self, name: str, kind: str, encoding: str, definition: str,
+            profiles: Sequence[qos.Qos], type_hash: str) -> None:
+        """Announce the next topic; it is stored with the next chunk and in the summary."""
+        data = definition.encode()
+        values = {
+            'offered_qos_profiles': qos.to_yaml(profiles), 'topic_type_hash': type_hash}
+        size = len(name) * 4 + sum(map(len, values.values())) + 100
+        if kind not in self._schemas:
+            size += len(data) + len(kind) * 4
+        # In a chunk, in the summary, and in the metadata.
+        self._end_size += 4 * size
+        self.reserve(0)
+        self.overhead += size
+        if kind not in self._schemas:
+            self._schemas[kind] = self._writer.register_schema(kind, encoding, data)
+        self._writer.register_channel(name, 'cdr', self._schemas[kind], values)
+
+    def write(self, entries: Sequence[tuple[int, int, int, int, bytes]], size: int) -> None:
+        """Store messages with ``size`` bytes of payload as one chunk."""
+        index = _CHUNK_BYTES + _CHANNEL_BYTES * len({entry[0] for entry in entries})
+        content = size + _MESSAGE_BYTES * len(entries) + self.overhead
+        # What cannot be compressed becomes a little longer.
+        self.reserve(content + content // 128 + 2 * index)
+        self._end_size += index
+        add = self._writer.add_message
+        for topic, log_time, publish_time, sequence, data in entries:
+            add(topic + 1, log_time, data, publish_time, sequence & 0xFFFFFFFF)
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        for topic, log_time, *_ in entries:
+            self.counts[topic] = self.counts.get(topic, 0) + 1
+            self.start = min(self.start, log_time)
+            self.end = max(self.end, log_time)
+
+    def describe(self, serialized_metadata: str, notes: Mapping[str, str]) -> None:
+        """Store the record that rosbag2 has at both ends of a file, and the experiment."""
+        self._add_metadata('rosbag2', {'serialized_metadata': serialized_metadata})
+        self.note(notes)
+
+    def note(self, values: Mapping[str, str]) -> None:
+        """Store what of the experiment the file does not say yet: viewers show each record."""
+        new = {key: value for key, value in values.items() if self.noted.get(key) != value}
+        if new:
+            # All of it comes once more at the end, and twice in the metadata file.
+            self._notes_room = 4 * sum(len(key) + len(value) for key, value in values.items())
+            self.notes_size += self._add_metadata(EXPERIMENT, new)
+            self.noted.update(new)
+
+    def _add_metadata(self, name: str, values: Mapping[str, str]) -> int:
+        """Store a metadata record and return its length."""
+        if not self._ending:
+            self.reserve(100 + sum(
+                4 * (len(key) + len(value)) + 8 for key, value in values.items()))
+        self._end_size += len(name) + 50
+        before = self.size
+        self._writer.add_metadata(name, dict(values))
+        self._stream.flush()
+        self.overhead += self.size - before
+        return self.size - before
+
+    def finish(
+            self, serialized_metadata: str, notes: Mapping[str, str], *, fsync: bool) -> None:
+        """
+        Store the last metadata and the summary in the room taken, and close the file.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written, or a chunk could not be.
+
+        """
+        if self._stream.broken:
+            raise OSError(errno.EIO, f'{self.path.name} has been left in the middle of a chunk')
+        self._ending = True
+        self.describe(serialized_metadata, notes)
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._stream.flush()
+        os.ftruncate(self._stream.descriptor, self.size)
+        if fsync:
+            self.sync()
+        self.close()
+
+    def sync(self) -> None:
+        """Wait until what is stored is on the disk."""
+        os.fsync(self._stream.descriptor)
+
+    def close(self) -> None:
+        """Close the file as it is."""
+        os.close(self._stream.descriptor)
+
+    def check_still_there(self) -> None:
+        """
+        Refuse to go on in a file that was removed: what is written there is lost.
+
+        Raises
+        ------
+        FileNotFoundError
+            If it is not in its place.
+
+        """
+        try:
+            there = os.stat(self.path)
+        except OSError as error:
+            raise FileNotFoundError(
+                error.errno, f'{self.path} is gone', str(self.path)) from error
+        if not os.path.samestat(there, os.fstat(self._stream.descriptor)):
+            raise FileNotFoundError(2, f'{self.path} has been replaced', str(self.path))
+
+    def summary(self) -> metadata.FileMetadata:
+        """Return what the bag's metadata say of the file."""
+        if not self.counts:
+            return metadata.FileMetadata(self.path.name)
+        return metadata.FileMetadata(
+            self.path.name, self.start, self.end - self.start, sum(self.counts.values()))

@@ -1,0 +1,83 @@
+"""The topics of a bag, from the channels of its files and from what its metadata say."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+
+from mcap.records import Channel, Schema
+
+from hmsa_ros.bag import limits, qos
+from hmsa_ros.bag.decode import TopicInfo
+from hmsa_ros.bag.intake import Problems, ScannedFile
+from hmsa_ros.bag.metadata import TopicMetadata
+from hmsa_ros.errors import BagError
+
+
+class Topics:
+    """
+    Gathers topics.
+
+    Parameters
+    ----------
+    described : iterable of TopicMetadata
+        From ``metadata.yaml``.
+    custom_data : mapping of str to str
+        Of the bag.
+    problems : Problems
+        Gets what cannot be read or does not agree.
+
+    Attributes
+    ----------
+    by_name : dict of str to TopicInfo
+        In order of appearance.
+
+    """
+
+    def __init__(
+            self, described: Iterable[TopicMetadata], custom_data: Mapping[str, str],
+            problems: Problems) -> None:
+        self._described = {topic.name: topic for topic in described}
+        self._custom_data = custom_data
+        self._problems = problems
+        self.by_name: dict[str, TopicInfo] = {}
+
+    def add(self, file: ScannedFile, channel: Channel) -> None:
+        """Take in a channel as a topic."""
+        known = self.by_name.get(channel.topic)
+        if known is None and len(self.by_name) >= limits.TOPICS:
+            self._problems.add(f'the bag has more than {limits.TOPICS} topics: the rest is '
+                               'passed over')
+            return
+        schema = file.schemas.get(channel.schema_id)
+        described = self._described.get(channel.topic)
+        if schema is None:
+            self._problems.add(
+                f'{file.path.name}: topic {channel.topic} has no message definition: its '
+                'messages can be sent again but not decoded')
+            schema = Schema(
+                id=0, name=described.type if described is not None else '', encoding='', data=b'')
+        if known is not None and known.type != schema.name:
+            self._problems.add(
+                f'topic {channel.topic} has the types {known.type} and {schema.name}: '
+                f'the messages of type {schema.name} are passed over')
+            return
+        profiles = self._profiles(
+            file, channel.topic, channel.metadata.get('offered_qos_profiles', ''))
+        for more in () if described is None else described.profiles, self._profiles(
+                file, channel.topic, self._custom_data.get(qos.LATER + channel.topic, '')):
+            profiles += tuple(profile for profile in more if profile not in profiles)
+        if known is None:
+            self.by_name[channel.topic] = TopicInfo(
+                channel.topic, schema.name, channel.message_encoding, schema.encoding,
+                schema.data.decode('utf-8', 'replace'), profiles,
+                channel.metadata.get('topic_type_hash', ''))
+        elif len(profiles) > len(known.profiles):
+            # A later split may know more publishers.
+            self.by_name[channel.topic] = replace(known, profiles=profiles)
+
+    def _profiles(self, file: ScannedFile, topic: str, text: str) -> tuple[qos.Qos, ...]:
+        """Return stored profiles, none if they cannot be read."""
+        try:
+            return qos.from_stored(text)
+        except BagError as error:
+            self._problems.add(f'{file.path.name}: topic {topic}: {error}')
+            return ()
