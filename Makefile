@@ -9,6 +9,7 @@ ARGS ?=
 PYTHONS ?= python3.10 python3.11 python3.12 python3.13
 
 BIN := $(VENV)/bin
+PYTEST := $(BIN)/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet -c constraints.txt
 
 # The environment brings its own ROS: one that the calling shell has sourced is set aside, and
@@ -35,9 +36,14 @@ demo: env ## run the demonstration
 	$(BIN)/hmsa demo $(ARGS)
 
 .PHONY: test
-test: env ## run the whole gate: ruff, mypy, pytest with warnings as errors
+test: tools ## run the whole gate: ruff, then mypy and all tests in parallel
 	$(BIN)/python -m ruff check .
-	$(BIN)/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder $(ARGS)
+	$(PYTEST) $(ARGS)
+
+.PHONY: check
+check: tools ## run what needs no nodes of the gate: ruff, mypy, tests of the rest
+	$(BIN)/python -m ruff check .
+	$(PYTEST) -m 'not ros' $(ARGS)
 
 .PHONY: bench
 bench: $(VENV)/.bench env ## measure speed and accuracy
@@ -48,16 +54,16 @@ figures: env ## draw Figures 2 to 10 of the paper into figures/
 	$(BIN)/hmsa figures --out figures $(ARGS)
 
 .PHONY: docs
-docs: env ## build the documentation into docs/_build/html, warnings as errors
+docs: tools ## build the documentation into docs/_build/html, warnings as errors
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html $(ARGS)
 	@echo "docs/_build/html/index.html"
 
 .PHONY: graph
-graph: env ## draw docs/images/graph.svg anew, when a topic has changed
+graph: tools ## draw docs/images/graph.svg anew, when a topic has changed
 	$(BIN)/python scripts/draw_graph.py
 
 .PHONY: theory
-theory: env ## draw the figures of docs/theory.md anew
+theory: tools ## draw the figures of docs/theory.md anew
 	$(BIN)/python scripts/draw_theory.py
 
 .PHONY: constraints
@@ -73,6 +79,9 @@ clean: ## remove the environment, builds and caches
 .PHONY: env
 env: $(VENV)/.kernels ## make the environment
 
+.PHONY: tools
+tools: $(VENV)/.tools env ## make the environment, with what tests and documentation need
+
 # The stamps come last in their recipes: an environment left half made has none and is made anew.
 $(VENV)/.installed: setup.py setup.cfg pyproject.toml package.xml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(0 if (3, 10) <= sys.version_info[:2] <= (3, 13) else 1)' \
@@ -83,7 +92,11 @@ $(VENV)/.installed: setup.py setup.cfg pyproject.toml package.xml constraints.tx
 	"ensurepip; install them (on Debian and Ubuntu: python3-venv)" >&2; exit 1; }
 	@echo "Making the environment $(VENV), which takes some minutes the first time"
 	$(PYTHON) -m venv --clear $(VENV)
-	$(INSTALL) -e '.[ros,test,studies,docs]'
+	$(INSTALL) -e '.[ros]'
+	@touch $@
+
+$(VENV)/.tools: $(VENV)/.installed
+	$(INSTALL) -e '.[test,studies,docs]'
 	@touch $@
 
 $(VENV)/.bench: $(VENV)/.installed

@@ -18,6 +18,7 @@ MIB = 2**20
 
 
 @pytest.mark.ros
+@pytest.mark.xdist_group('loops')
 @pytest.mark.parametrize(
     'fault', [x for x in rows.FAULTS if x.key in rows.QUICK], ids=lambda x: x.key)
 def test_fault_is_answered_as_expected(fault, ros_domain_id):

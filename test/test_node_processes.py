@@ -143,6 +143,7 @@ run(lambda: Still('still'), [])
 
 
 @pytest.mark.slow
+@pytest.mark.xdist_group('loops')
 def test_loop_leaves_no_residual_vibration_beside_a_process_that_takes_a_core(
         ros, start):
     start.python('-c', 'while True: pass')
