@@ -1,4 +1,4 @@
-"""Actuators advanced together: as each alone, and the coil, the force, sensor and watchdog."""
+"""Actuators advanced together: as each alone, and the coil and the force."""
 
 from dataclasses import replace
 import math
@@ -9,9 +9,7 @@ from scipy.integrate import solve_ivp
 
 from hmsa_ros.core.actuators import Actuators, Setup
 from hmsa_ros.core.parameters import paper_actuator
-from hmsa_ros.core.sensor import Sample, Sensor
 from hmsa_ros.core.simulation import ActuatorSimulation
-from hmsa_ros.core.watchdog import Watchdog
 from hmsa_ros.errors import BadInputError
 
 ACTUATOR = paper_actuator()
@@ -179,58 +177,3 @@ def test_a_reset_leads_to_the_state_asked_for():
         Setup(ACTUATOR, coil_time_constant=-1.0)
 
 
-# -- sensor and watchdog ------------------------------------------------------------------------
-
-
-def measured(sensor, count):
-    told = []
-    for k in range(count):
-        ones = np.ones(2)
-        told += sensor.measure(Sample(k * MS, ones, 2.0 * ones, 3.0 * ones))
-    return told
-
-
-def test_noise_has_its_deviation_and_its_seed():
-    runs = [measured(Sensor([0.01, 0.0], [0.0, 5.0], seed=x), 4000) for x in (1, 1, 2)]
-    stretch = np.array([x.stretch for x in runs[0]])
-    rate = np.array([x.rate for x in runs[0]])
-    assert stretch[:, 0].std() == pytest.approx(0.01, rel=0.05)
-    assert stretch[:, 0].mean() == pytest.approx(1.0, abs=1e-3)
-    assert rate[:, 1].std() == pytest.approx(5.0, rel=0.05)
-    assert set(stretch[:, 1]) == {1.0}
-    assert set(rate[:, 0]) == {2.0}
-    assert all(np.array_equal(a.stretch, b.stretch) for a, b in zip(*runs[:2], strict=True))
-    assert not np.array_equal(runs[0][0].stretch, runs[2][0].stretch)
-    assert all(set(x.flux_density) == {3.0} for x in runs[0])
-
-
-def test_a_delayed_measurement_keeps_its_stamp():
-    sensor = Sensor([0.0], [0.0], 3 * MS)
-    told = []
-    for k in range(6):
-        for x in sensor.measure(Sample(k * MS, np.ones(1), np.zeros(1), np.zeros(1))):
-            told.append((k, x.time // MS))
-    assert told == [(3, 0), (4, 1), (5, 2)]
-    with pytest.raises(BadInputError, match='none below 0'):
-        Sensor([-1.0], [0.0])
-
-
-def test_the_watchdog_waits_for_a_first_command_and_leaves_pauses_out():
-    dog = Watchdog(10)
-    assert not dog.check(1000)
-    assert not dog.feed(1000)
-    assert not dog.check(1010)
-    assert dog.check(1011)
-    assert not dog.check(1012)
-    assert dog.feed(1020)
-    dog.pass_over(50)
-    assert not dog.check(1080)
-    assert dog.check(1081)
-    assert dog.trips == 2
-    dog.disarm()
-    assert not dog.check(5000)
-    quiet = Watchdog(0)
-    quiet.feed(0)
-    assert not quiet.check(10**18)
-    with pytest.raises(BadInputError, match='timeout is -1'):
-        Watchdog(-1)

@@ -237,5 +237,5 @@ def test_driver_of_the_tutorial_keeps_the_contract_of_a_driver(start, ros):
                for x, stamp in zip(applied[1:], [*stamps, now + 10**9], strict=False))
     assert states[-1].name == ['actuator']
     assert driver.stop() == 0
-    assert 'nan T refused' in driver.stderr
-    assert 'the coil is switched off' in driver.stderr
+    assert 'command refused: flux density command (0, 0, nan) T' in driver.stderr
+    assert 'no command and no heartbeat for 1 s: the field goes to zero' in driver.stderr

@@ -17,7 +17,7 @@ import yaml
 from hmsa_ros.cli import main
 from hmsa_ros.cli.quantities import BY_KEY, DAMPING, NEEDED, QUANTITIES
 from hmsa_ros.core.model import elastic_force, natural_frequency
-from hmsa_ros.core.parameters import NondimensionalParameters, paper_actuator
+from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters, paper_actuator
 from hmsa_ros.core.scales import Coil, scales
 from hmsa_ros.core.simulation import simulate
 from hmsa_ros.core.two_step import plan_two_step
@@ -133,6 +133,20 @@ def test_the_file_has_what_was_given_in_si_units(run, tmp_path):
     assert 'hmsa planner --ros-args --params-file own.yaml' in out
     for line in out.splitlines()[:10]:
         assert f'#   {line}' in (tmp_path / 'own.yaml').read_text()
+
+
+def test_a_small_actuator_is_sampled_often_enough(run, tmp_path):
+    small = [x.replace('5mm', '0.3mm').replace('4 mm', '0.3 mm') for x in OWN]
+    assert run(*small)[0] == 0
+    document = yaml.safe_load((tmp_path / 'actuator.yaml').read_text())
+    rate = document['/**/plant']['ros__parameters']['publish_rate']
+    values = document['/**']['ros__parameters']
+    actuator = ActuatorParameters(**{
+        x.partition('.')[2]: y for x, y in values.items() if x.startswith('actuator.')})
+    period = 1.0 / scales(actuator, COIL).frequency
+    assert 10.0 <= rate * period < 11.0
+    assert run('--yes', '--out', 'large.yaml')[0] == 0
+    assert list(yaml.safe_load((tmp_path / 'large.yaml').read_text())) == ['/**']
 
 
 def test_defaults_are_the_papers_block(run, tmp_path):

@@ -326,8 +326,10 @@ def _note(custom_data: Mapping[str, str], pair: _Pair) -> str:
                      'from there on')
     texts = parameters_of(custom_data, 'plant', pair.space)
     noise = [
-        f'{name} {text}' for name in ('stretch_noise', 'rate_noise')
-        if (text := _value(texts, pair, name, '0')) not in ('0', '0.0')]
+        f'{name} {text}' for name, none in (
+            ('stretch_noise', '0'), ('rate_noise', '0'), ('stretch_bias', '0'),
+            ('stretch_gain', '1'))
+        if (text := _value(texts, pair, name, none)) not in (none, f'{none}.0')]
     if noise:
         notes.append(f'the samples are measured with {" and ".join(noise)}: expected differences '
                      'of that size, from the first sample on')

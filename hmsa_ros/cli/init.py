@@ -333,7 +333,22 @@ def file_text(
             '    # Names of the joints; all are alike but for what is set for one, such as',
             f'    # {joints[0]}.actuator.remanence: {_number(actuator.remanence)}',
             f'    joints: [{names}]']
-    return '\n'.join(lines) + '\n'
+    return '\n'.join(lines + _sampling(actuator)) + '\n'
+
+
+def _sampling(actuator: 'ActuatorParameters') -> list[str]:
+    """Return lines with the plant's sample rate, if its default misses the actuator's peaks."""
+    from hmsa_ros.device.health import enough_samples, LARGEST_SAMPLE_RATE, SAMPLE_RATE
+
+    enough = enough_samples(actuator)
+    if enough <= SAMPLE_RATE:
+        return []
+    digits = 10 ** (math.floor(math.log10(enough)) - 1)
+    rate = min(math.ceil(enough / digits) * digits, LARGEST_SAMPLE_RATE)
+    return [
+        '/**/plant:', '  ros__parameters:',
+        '    # Samples per second: at least ten in a period of the actuator [Hz].',
+        f'    publish_rate: {_number(rate)}']
 
 
 def _parameters(actuator: 'ActuatorParameters', coil: 'Coil') -> dict[str, float]:

@@ -70,8 +70,6 @@ class Setup:
         Largest change of the amplifier's level in T/s, greater than 0; infinite for steps.
     coil_time_constant : float
         Of the lag in s, at least 0; 0 for none.
-    command_delay : int
-        Time in ns that a command takes to get through, at least 0.
 
     Raises
     ------
@@ -84,7 +82,6 @@ class Setup:
     stretch: float = 1.0
     slew_limit: float = math.inf
     coil_time_constant: float = 0.0
-    command_delay: int = 0
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -96,9 +93,6 @@ class Setup:
             raise BadInputError(
                 f'time constant of the coil is {self.coil_time_constant:g} s: expected a '
                 'finite number of at least 0')
-        if self.command_delay < 0:
-            raise BadInputError(
-                f'command delay is {self.command_delay} ns: expected at least 0')
 
     def holding(self, stretch: float) -> float:
         """Return the flux density in T that holds a stretch."""
@@ -287,10 +281,9 @@ class Actuators:
 
         """
         self.check_level(i, flux_density)
-        soonest = self.time + self.setups[i].command_delay
-        changed = self.schedules[i].insert(max(stamp, soonest), flux_density)
+        changed = self.schedules[i].insert(max(stamp, self.time), flux_density)
         self._plan(i)
-        return max(soonest - stamp, 0) if changed else 0
+        return max(self.time - stamp, 0) if changed else 0
 
     def check_level(self, i: int, flux_density: float) -> None:
         """

@@ -6,7 +6,11 @@ A command applies from its stamp on and supersedes all earlier ones stamped at o
 
 from bisect import bisect_left, bisect_right
 from collections import deque
+from collections.abc import Iterator
 import math
+from typing import Generic, TypeVar
+
+T = TypeVar('T')
 
 
 def obeyed(x: float, y: float, z: float) -> bool:
@@ -27,26 +31,52 @@ def obeyed(x: float, y: float, z: float) -> bool:
     return math.isfinite(z) and x == 0.0 == y
 
 
-class CommandSchedule:
+class Superseding(Generic[T]):
+    """Things with stamps in ns, of which a later one drops all stamped at or after it."""
+
+    def __init__(self) -> None:
+        """Begin with none."""
+        self._stamps: deque[int] = deque()
+        self._things: deque[T] = deque()
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self._stamps)
+
+    def __iter__(self) -> Iterator[T]:
+        """Yield them by stamp."""
+        return iter(self._things)
+
+    def put(self, stamp: int, thing: T) -> None:
+        """Add one, and drop what it supersedes."""
+        self._drop(stamp)
+        self._stamps.append(stamp)
+        self._things.append(thing)
+
+    def _drop(self, stamp: int) -> int:
+        """Drop what is stamped at or after a time; return how many there were."""
+        dropped = len(self._stamps) - bisect_left(self._stamps, stamp)
+        for _ in range(dropped):
+            self._stamps.pop()
+            self._things.pop()
+        return dropped
+
+
+class CommandSchedule(Superseding[float]):
     """
     The level in force and the commands ahead.
 
     Parameters
     ----------
     current : float
-        Level in force before the first command, in T.
+        Level in force before the first command, in T; NaN for none.
 
     """
 
     def __init__(self, current: float) -> None:
         """Start with one level and nothing ahead."""
+        super().__init__()
         self.current = current
-        self._stamps: deque[int] = deque()
-        self._values: deque[float] = deque()
-
-    def __len__(self) -> int:
-        """Return the number of commands ahead."""
-        return len(self._stamps)
 
     def insert(self, stamp: int, value: float) -> bool:
         """
@@ -67,35 +97,18 @@ class CommandSchedule:
             Whether anything is different from before.
 
         """
-        dropped = len(self._stamps) - bisect_left(self._stamps, stamp)
-        if dropped == 1 and self._stamps[-1] == stamp and self._values[-1] == value:
+        if self._stamps and self._stamps[-1] == stamp and self._things[-1] == value:
             return False
-        for _ in range(dropped):
-            self._stamps.pop()
-            self._values.pop()
-        if value == (self._values[-1] if self._values else self.current):
+        dropped = self._drop(stamp)
+        if value == (self._things[-1] if self._things else self.current):
             return dropped > 0
-        self._stamps.append(stamp)
-        self._values.append(value)
+        self.put(stamp, value)
         return True
 
     def at(self, stamp: int) -> float:
-        """
-        Return the level in force at a time, as far as is known.
-
-        Parameters
-        ----------
-        stamp : int
-            Time in ns, not past.
-
-        Returns
-        -------
-        float
-            In T.
-
-        """
+        """Return the level in T that is in force at a time in ns, not past, as far as known."""
         known = bisect_right(self._stamps, stamp)
-        return self._values[known - 1] if known else self.current
+        return self._things[known - 1] if known else self.current
 
     @property
     def next_stamp(self) -> int | None:
@@ -105,4 +118,10 @@ class CommandSchedule:
     def apply_next(self) -> None:
         """Put the next command ahead in force; there must be one."""
         self._stamps.popleft()
-        self.current = self._values.popleft()
+        self.current = self._things.popleft()
+
+    def apply_until(self, time: float) -> float:
+        """Put what is due by a time in ns in force; return the level in T."""
+        while self._stamps and self._stamps[0] <= time:
+            self.apply_next()
+        return self.current

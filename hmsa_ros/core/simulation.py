@@ -166,9 +166,7 @@ def longest_motion(load: float, material: NondimensionalParameters) -> float:
 
 class ActuatorSimulation:
     """
-    One actuator over time in SI units: takes stamped commands, advances to a time.
-
-    Time is integer nanoseconds, so that it does not drift.
+    `Actuators` with one actuator, seen as numbers; the parameters are those of `Setup`.
 
     Parameters
     ----------
@@ -176,17 +174,8 @@ class ActuatorSimulation:
         The block.
     time : int
         Time at the start in ns.
-    stretch : float
-        Stretch at the start, at rest and held by its flux density.
-    slew_limit : float
-        Largest change of the flux density in T/s that the amplifier makes; infinite for steps.
-    coil_time_constant : float
-        With which the flux density follows the amplifier, in s; 0 for at once.
-
-    Raises
-    ------
-    BadInputError
-        If the stretch is outside the limits.
+    stretch, slew_limit, coil_time_constant : float
+        Stretch at the start; of the amplifier in T/s; of the coil in s.
 
     """
 
@@ -230,109 +219,40 @@ class ActuatorSimulation:
     def reset(self) -> None:
         """Return to the initial state, at rest, with no command ahead; time goes on."""
         self._all.reset(0)
-        self._all.changes.clear()
 
     def set_state(
             self, stretch: float, rate: float, flux_density: float,
             level: float | None = None) -> None:
-        """
-        Go on from another state, with no command ahead.
-
-        Parameters
-        ----------
-        stretch, rate : float
-            State; the rate in 1/s.
-        flux_density : float
-            In force, in T.
-        level : float, optional
-            That the amplifier is on its way to, in T; default the flux density.
-
-        Raises
-        ------
-        BadInputError
-            If the stretch is outside the limits.
-
-        """
+        """Go on from another state, as `Actuators.set_state`."""
         self._all.set_state(0, stretch, rate, flux_density, level)
-        self._all.changes.clear()
 
     def command(self, stamp: int, flux_density: float) -> int:
-        """
-        Take a command that applies from its stamp on.
-
-        Parameters
-        ----------
-        stamp : int
-            Time in ns from which the value applies; it supersedes all commands stamped at or
-            after it.
-        flux_density : float
-            Signed flux density in T.
-
-        Returns
-        -------
-        int
-            How late the change is in ns, 0 if it is not or if nothing changes; a late one
-            applies at once.
-
-        Raises
-        ------
-        BadInputError
-            If the value is not finite or nobody could follow it.
-
-        """
+        """Take a command in T, as `Actuators.command`; return how late it is in ns."""
         return self._all.command(0, stamp, flux_density)
 
     def force(self, stamp: int, force: float) -> None:
-        """
-        Take a disturbing force that acts from its stamp on.
-
-        Parameters
-        ----------
-        stamp : int
-            Time in ns; a force supersedes those stamped at or after it.
-        force : float
-            Along the field in N, pulling where positive.
-
-        Raises
-        ------
-        BadInputError
-            If the value is not finite or nobody could follow it.
-
-        """
+        """Take a disturbing force in N, as `Actuators.force`."""
         self._all.force(0, stamp, force)
+
+    def equilibrium(self) -> float:
+        """Return the stretch that the flux density in force would hold."""
+        return self._all.equilibrium(0)
 
     def advance(self, time: int) -> None:
         """
-        Integrate to a time, each command applied exactly at its stamp.
-
-        Parameters
-        ----------
-        time : int
-            Time in ns; one that is not ahead changes nothing but applies what is due.
+        Integrate to a time in ns, as `Actuators.advance`.
 
         Raises
         ------
         HmsaError
-            If the integration does not get through.
+            If the load is too large to follow.
 
         """
         failed = self._all.advance(time)
         self._all.changes.clear()
-        for _, reached in failed:
-            self._all.time = reached
-            raise HmsaError(too_large(reached, self.flux_density))
-
-    def equilibrium(self) -> float:
-        """
-        Return the stretch at which the flux density in force would hold the actuator.
-
-        Returns
-        -------
-        float
-            Stretch.
-
-        """
-        return self._all.equilibrium(0)
+        if failed:
+            self._all.time = failed[0][1]
+            raise HmsaError(too_large(self.time, self.flux_density))
 
 
 def too_large(time: int, flux_density: float) -> str:

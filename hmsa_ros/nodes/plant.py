@@ -1,7 +1,6 @@
 """Plant node: simulated actuators, driven by stamped flux density commands."""
 
 from array import array
-from collections import deque
 from collections.abc import Callable, Sequence
 from time import monotonic_ns
 
@@ -11,12 +10,17 @@ from rclpy.clock import Clock, ClockType
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
-from hmsa_ros.core.actuators import Actuators, check_stretch
 from hmsa_ros.core.pacer import Pacer
-from hmsa_ros.core.sensor import Sample, Sensor
-from hmsa_ros.core.simulation import too_large
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.core.warmup import warm_up
+from hmsa_ros.device.health import (
+    CommandHealth,
+    LARGEST_SAMPLE_RATE,
+    SAMPLE_RATE,
+    too_few_samples,
+)
+from hmsa_ros.device.protocol import Sample
+from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import conversions, interface
 from hmsa_ros.nodes.guard import COMMAND_SOURCES
@@ -30,7 +34,7 @@ from hmsa_ros.nodes.marker_publisher import (
 )
 from hmsa_ros.nodes.markers import State
 from hmsa_ros.nodes.parameters import JOINT, ParameterSpec
-from hmsa_ros.nodes.plant_joint import OWN, PlantJoint, setup_from
+from hmsa_ros.nodes.plant_joint import joint_from, OWN, PlantJoint
 from hmsa_ros.nodes.runner import run
 
 PARAMETERS = (
@@ -52,8 +56,8 @@ PARAMETERS = (
     ParameterSpec(
         'seed', 0, 'Of the noise: the same seed gives the same run.', '', 0, 2**31 - 1),
     ParameterSpec(
-        'publish_rate', 1000.0, "Samples per second of the plant's own time.", 'Hz',
-        1e-3, 1e6),
+        'publish_rate', SAMPLE_RATE, "Samples per second of the plant's own time.", 'Hz',
+        1e-3, LARGEST_SAMPLE_RATE),
     ParameterSpec(
         'publish_scalars', 'auto',
         'Whether stretch and stretch_rate are published beside joint_states; auto for a single '
@@ -83,13 +87,11 @@ PARAMETERS = (
 _TICK_SECONDS = 0.001
 # Of each tick, the share that samples may take; commands and services get the rest.
 _BUDGET_NS = 800_000
-# A gap of the clock that is not simulated through but skipped.
-_LARGEST_GAP_NS = 5 * NANOSECONDS
 _PAUSED_CLOCK_NS = 100_000_000
 
 
 class PlantNode(ManagedNode):
-    """Advances `Actuators` along a clock and publishes their samples."""
+    """Advances a `SimulatedDevice` along a clock and publishes what comes of it."""
 
     def __init__(self) -> None:
         """Declare the parameters, and start if told to."""
@@ -112,27 +114,16 @@ class PlantNode(ManagedNode):
 
         """
         values = self._values
-        self._period = max(round(NANOSECONDS / values['publish_rate']), 1)
         self._authority: bool = values['publish_clock']
         if self._authority and self.get_parameter('use_sim_time').value:
             raise BadInputError(
                 'publish_clock and use_sim_time are both true: expected a plant that either '
                 'leads simulated time or follows it')
-        each = [values.of(name) for name in values.names]
-        _check_reset(values)
         start = round(values['start_time'] * NANOSECONDS) if self._authority else 0
-        self._actuators = Actuators([setup_from(x) for x in each], time=start)
-        self._sensor = Sensor(
-            [x['stretch_noise'] for x in each], [x['rate_noise'] for x in each],
-            round(values['measurement_delay'] * NANOSECONDS), values['seed'])
-        self._command_delay = round(values['command_delay'] * NANOSECONDS)
-        # Commands on their way: when they are known, for which joint, stamp and level.
-        self._transit: deque[tuple[int, int, int, float]] = deque()
+        factor = values['real_time_factor'] if self._authority else 1.0
+        self._device = self._make_device(start)
         warm_up()
-        self._next_sample = start
-        self._pacer = Pacer(
-            start, values['real_time_factor'] if self._authority else 1.0,
-            paused=values['start_paused'])
+        self._pacer = Pacer(start, factor, paused=values['start_paused'])
         self._clock_published = 0
         self._measured = (start, monotonic_ns())
         self._clocks_warned = False
@@ -143,14 +134,13 @@ class PlantNode(ManagedNode):
         self._clock_publisher = (
             self._publisher(interface.CLOCK_TOPIC) if self._authority else None)
         scalars = values['publish_scalars']
-        self._scalars = scalars == 'always' or (scalars == 'auto' and len(each) == 1)
+        self._scalars = scalars == 'always' or (
+            scalars == 'auto' and len(values.names) == 1)
         self._joints = [
-            PlantJoint(self, self, i, values.names, x, self._scalars) for i, x in enumerate(each)]
-        for i, joint in enumerate(self._joints):
-            joint.tell_applied(start, self.level(i))
-        StateMarkers(
-            self, values, values['real_time_factor'] if self._authority else 1.0,
-            self._states)
+            PlantJoint(self, self._device, i, values.names, values.of(x), self._scalars)
+            for i, x in enumerate(values.names)]
+        self._publish_news()
+        StateMarkers(self, values, factor, self._states)
         self._serve(interface.RESET, self._on_reset)
         self._serve(interface.STEP, self._on_step)
         self._serve(interface.SET_PAUSED, self._on_set_paused)
@@ -161,13 +151,25 @@ class PlantNode(ManagedNode):
         self.create_timer(_TICK_SECONDS, self._on_tick, clock=steady)
         self.create_timer(1.0, self._on_diagnostics, clock=steady)
 
+    def _make_device(self, start: int) -> SimulatedDevice:
+        values = self._values
+        joints = joints_from(values)
+        for name, joint in zip(values.names, joints, strict=True):
+            if few := too_few_samples(joint.setup.actuator, values['publish_rate']):
+                self.get_logger().warning(f'joint {name}: {few}')
+        return SimulatedDevice(
+            joints, period=max(round(NANOSECONDS / values['publish_rate']), 1), time=start,
+            command_delay=round(values['command_delay'] * NANOSECONDS),
+            measurement_delay=round(values['measurement_delay'] * NANOSECONDS),
+            seed=values['seed'])
+
     def activate(self) -> None:
-        """Let time run, from where it stood."""
-        self._pacer.set_paused(self._pacer.paused, self.time)
+        """Let time run, from where it is."""
+        self._pacer.set_paused(self._pacer.paused, self._device.time)
 
     def deactivate(self) -> None:
         """Hold time; commands on their way are lost."""
-        self._transit.clear()
+        self._device.drop_commands()
 
     def cleanup(self) -> None:
         """Close the inputs that no executor serves."""
@@ -188,13 +190,8 @@ class PlantNode(ManagedNode):
     # -- time ----------------------------------------------------------------------------------
 
     @property
-    def time(self) -> int:
-        """Time in ns of the simulation."""
-        return self._actuators.time
-
-    @property
     def _standing(self) -> bool:
-        """Whether time stands still."""
+        """Whether time does not run."""
         return self._pacer.paused or not self.active
 
     def _on_tick(self) -> None:
@@ -213,7 +210,7 @@ class PlantNode(ManagedNode):
                 self._publish_clock(steady)
             return
         target = self._pacer.target(steady)
-        while (self._pacer.unlimited or self._next_sample <= target) \
+        while (self._pacer.unlimited or self._device.next_sample <= target) \
                 and monotonic_ns() - steady < _BUDGET_NS:
             self._sample()
 
@@ -222,76 +219,38 @@ class PlantNode(ManagedNode):
         now = int(self.get_clock().now().nanoseconds)
         if now == 0:
             return
-        if self.time == 0:
-            self._go_on_from(now)
-        if now < self.time - self._period:
+        jump = self._device.follow(now, standing=self._standing)
+        if jump:
             self.get_logger().warning(
-                f'the clock jumped back by {(self.time - now) / 1e9:.3f} s: the '
-                'simulation starts again from its initial state',
-                throttle_duration_sec=1.0)
-            self._go_on_from(now)
-            for i in range(len(self._joints)):
-                self._start_again(i)
-            self._transit.clear()
-        elif self._standing:
-            self._go_on_from(now)
-            return
-        elif now - self.time > _LARGEST_GAP_NS:
-            self.get_logger().warning(
-                f'the clock jumped ahead by {(now - self.time) / 1e9:.3f} s: the '
-                'simulation goes on from there in its present state')
-            self._go_on_from(now)
+                f'the clock jumped {"ahead" if jump > 0 else "back"} by {abs(jump) / 1e9:.3f} s: '
+                'the simulation ' + (
+                    'goes on from there in its present state' if jump > 0
+                    else 'starts again from its initial state'), throttle_duration_sec=1.0)
+            self._publish_news()
         begin = monotonic_ns()
-        while (self._next_sample <= now and not self._standing
+        while (self._device.next_sample <= now and not self._standing
                 and monotonic_ns() - begin < _BUDGET_NS):
             self._sample()
 
-    def _go_on_from(self, now: int) -> None:
-        """Set the time without simulating up to it; samples lie on a grid from time zero."""
-        for joint in self._joints:
-            # Time that was not simulated is no silence.
-            joint.watchdog.pass_over(now - self.time)
-        self._actuators.time = now
-        self._next_sample = -(-now // self._period) * self._period
-
     def _sample(self) -> None:
         """Advance to the next sample and publish it."""
-        time = self._next_sample
-        while self._transit and self._transit[0][0] <= time:
-            known, i, stamp, level = self._transit.popleft()
-            self._advance(known)
-            self._obey(i, stamp, level)
-        for joint in self._joints:
-            joint.watch(time)
-        self._advance(time)
-        self._next_sample += self._period
+        self._device.advance(self._device.next_sample)
         self._publish_clock(monotonic_ns())
-        self._tell_changes()
-        actuators = self._actuators
-        for sample in self._sensor.measure(Sample(
-                time, actuators.stretch.copy(), actuators.rate, actuators.flux_density)):
-            self._tell(sample)
+        self._publish_news()
 
-    def _advance(self, time: int) -> None:
-        """Advance all joints; those whose load is too large start again."""
-        for i, reached in self._actuators.advance(time):
-            joint = self._joints[i]
-            joint.failed += 1
-            self.get_logger().error(
-                f'{too_large(reached, self.level(i))}; joint {joint.name} starts again from '
-                'its initial state')
-            self._start_again(i)
-
-    def _start_again(self, i: int) -> None:
-        self._actuators.reset(i)
-        self._joints[i].start_again()
-        self._sensor.forget()
-        self._tell_changes()
-
-    # -- what is told --------------------------------------------------------------------------
+    # -- what is published ---------------------------------------------------------------------
     # Every view of the state, markers among them, is published from here.
 
-    def _tell(self, sample: Sample) -> None:
+    def _publish_news(self) -> None:
+        """Publish what has come of the device since the last time."""
+        for notice in self._device.notices():
+            self._joints[notice.joint].log(notice)
+        for change in self._device.changes():
+            self._joints[change.joint].publish_applied(change)
+        for sample in self._device.samples():
+            self._publish_sample(sample)
+
+    def _publish_sample(self, sample: Sample) -> None:
         message = self._message
         message.header.stamp = conversions.to_time(sample.time)
         message.position = array('d', sample.stretch.tobytes())
@@ -301,108 +260,18 @@ class PlantNode(ManagedNode):
         if self._scalars:
             for joint, stretch, rate in zip(
                     self._joints, message.position, message.velocity, strict=True):
-                joint.tell_scalars(stretch, rate)
-
-    def _tell_changes(self) -> None:
-        for i, stamp, level in self._actuators.changes:
-            self._joints[i].tell_applied(stamp, level)
-        self._actuators.changes.clear()
+                joint.publish_scalars(stretch, rate)
 
     def _states(self) -> tuple[int, list[State]]:
         """Return the time and what the joints do, for who looks."""
-        actuators = self._actuators
-        return actuators.time, [State(*x) for x in zip(
-            actuators.stretch.tolist(), actuators.flux_density.tolist(), strict=True)]
+        device = self._device
+        return device.time, [State(*x) for x in zip(
+            device.stretch.tolist(), device.flux_density.tolist(), strict=True)]
 
     def _publish_clock(self, steady: int) -> None:
         if self._clock_publisher is not None:
-            self._clock_publisher.publish(conversions.to_clock(self.time))
+            self._clock_publisher.publish(conversions.to_clock(self._device.time))
         self._clock_published = steady
-
-    # -- what drives the joints ----------------------------------------------------------------
-
-    def level(self, joint: int) -> float:
-        """
-        Return the level in force on a joint.
-
-        Parameters
-        ----------
-        joint : int
-            Its place.
-
-        Returns
-        -------
-        float
-            In T, that of the amplifier's last command.
-
-        """
-        return self._actuators.schedules[joint].current
-
-    def take(self, joint: int, stamp: int, flux_density: float) -> None:
-        """
-        Have a command take effect once it has passed the transport delay.
-
-        Parameters
-        ----------
-        joint : int
-            Its place.
-        stamp : int
-            Time in ns from which it applies, 0 for at once.
-        flux_density : float
-            In T.
-
-        Raises
-        ------
-        BadInputError
-            If nobody could follow it.
-
-        """
-        if self._command_delay:
-            self._actuators.check_level(joint, flux_density)
-            self._transit.append((self.time + self._command_delay, joint, stamp, flux_density))
-        else:
-            self._obey(joint, stamp, flux_density)
-
-    def _obey(self, joint: int, stamp: int, flux_density: float) -> None:
-        late = self._actuators.command(joint, stamp or self.time, flux_density)
-        self._joints[joint].obeyed(late)
-
-    def go_safe(self, joint: int, stamp: int, flux_density: float) -> None:
-        """
-        Have the watchdog's level take effect.
-
-        Parameters
-        ----------
-        joint : int
-            Its place.
-        stamp : int
-            Time in ns.
-        flux_density : float
-            In T.
-
-        """
-        self._actuators.command(joint, stamp, flux_density)
-
-    def push(self, joint: int, stamp: int, force: float) -> None:
-        """
-        Have a force act on a joint.
-
-        Parameters
-        ----------
-        joint : int
-            Its place.
-        stamp : int
-            Time in ns from which it acts, 0 for at once.
-        force : float
-            Along the field in N.
-
-        Raises
-        ------
-        BadInputError
-            If nobody could follow it.
-
-        """
-        self._actuators.force(joint, stamp or self.time, force)
 
     # -- services and parameters ---------------------------------------------------------------
 
@@ -411,13 +280,11 @@ class PlantNode(ManagedNode):
         for i, joint in enumerate(self._joints):
             values = self._values.of(joint.name)
             rate = values['reset_rate']
-            self._actuators.reset(i, values['reset_stretch'] or None, rate)
-            joint.start_again()
+            self._device.restart(i, values['reset_stretch'] or None, rate)
             how = f'at rate {rate:g}/s' if rate else 'at rest'
-            where.append(f'{how} at stretch {self._actuators.stretch[i]:g}')
-        self._transit.clear()
-        self._sensor.forget()
-        self._tell_changes()
+            where.append(f'{how} at stretch {self._device.stretch[i]:g}')
+        self._device.drop_commands()
+        self._publish_news()
         response.success = True
         response.message = where[0] if len(where) == 1 else ', '.join(
             f'{joint.name} {text}' for joint, text in zip(self._joints, where, strict=True))
@@ -434,18 +301,18 @@ class PlantNode(ManagedNode):
             for joint in self._joints:
                 joint.commands.poll()
             for _ in range(self._values['step_count']):
-                before = self.time
-                while self.time == before:
+                before = self._device.time
+                while self._device.time == before:
                     # The first sample is the start itself.
                     self._sample()
-            self._pacer.set_paused(True, self.time)
+            self._pacer.set_paused(True, self._device.time)
             response.success = True
-            response.message = f'at {self.time / 1e9:.9f} s'
+            response.message = f'at {self._device.time / 1e9:.9f} s'
         return response
 
     def _on_set_paused(
             self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        self._pacer.set_paused(request.data, self.time)
+        self._pacer.set_paused(request.data, self._device.time)
         response.success = True
         response.message = 'paused' if request.data else 'running'
         return response
@@ -454,13 +321,13 @@ class PlantNode(ManagedNode):
         """Take changed parameters, or refuse them together."""
         try:
             changed = self._values.changed(parameters)
-            _check_reset(changed)
+            joints_from(changed)
         except BadInputError as error:
             return SetParametersResult(successful=False, reason=str(error))
         self._values = changed
         factor = changed['real_time_factor']
         if self._joints and self._authority and factor != self._pacer.factor:
-            self._pacer.set_factor(factor, self.time)
+            self._pacer.set_factor(factor, self._device.time)
         return SetParametersResult(successful=True)
 
     # -- reports -------------------------------------------------------------------------------
@@ -472,41 +339,31 @@ class PlantNode(ManagedNode):
 
     def _status_of_commands(self) -> DiagnosticStatus:
         joints = self._joints
-        late, refused = sum(x.late for x in joints), sum(x.refused for x in joints)
-        unreadable = sum(x.commands.unreadable for x in joints)
-        strangers = sum(x.commands.refused for x in joints)
-        failed = sum(x.failed for x in joints)
-        silent = [x.name for x in joints if x.watchdog.tripped]
-        crowded = [x.name for x in joints if x.crowded()]
-        level, notes = DiagnosticStatus.OK, []
-        if late or refused or strangers or unreadable:
-            level = DiagnosticStatus.WARN
-            notes.append(f'{late} commands late, {refused + strangers + unreadable} refused')
-        if crowded:
-            level = DiagnosticStatus.WARN
-            notes.append(f'several publishers command {_listed(crowded)}')
-        if failed:
-            level = DiagnosticStatus.ERROR
-            notes.append(f'{failed} times started again after a load too large to follow')
-        if silent:
-            level = DiagnosticStatus.ERROR
-            notes.append(f'no command and no heartbeat for {_listed(silent)}')
+        health = CommandHealth(
+            late=sum(x.late for x in joints),
+            refused=sum(x.refused + x.commands.unreadable for x in joints),
+            refused_source=sum(x.commands.refused for x in joints),
+            failed=sum(x.failed for x in joints),
+            silent=[joints[i].name for i in self._device.silent],
+            crowded=[x.name for x in joints if x.crowded()])
+        level, message = health.verdict()
         return conversions.to_status(
-            f'{self.get_name()}: commands', ', '.join(x.name for x in joints), level,
-            '; '.join(notes) or 'commands in time',
-            {'received': sum(x.received for x in joints), 'late': late,
-             'refused': refused + unreadable, 'refused_source': strangers, 'failed': failed,
+            f'{self.get_name()}: commands', ', '.join(x.name for x in joints),
+            bytes([level]), message,
+            {'received': sum(x.received for x in joints), 'late': health.late,
+             'refused': health.refused, 'refused_source': health.refused_source,
+             'failed': health.failed,
              'largest_lateness_ms': f'{max(x.latest for x in joints) / 1e6:.3f}',
-             'timeouts': sum(x.watchdog.trips for x in joints), 'silent': len(silent),
-             'time': f'{self.time / 1e9:.9f}', 'paused': self._pacer.paused})
+             'timeouts': self._device.trips, 'silent': len(health.silent),
+             'time': f'{self._device.time / 1e9:.9f}', 'paused': self._pacer.paused})
 
     def _status_of_time(self) -> DiagnosticStatus:
         then, since = self._measured
         steady = monotonic_ns()
-        self._measured = (self.time, steady)
-        achieved = (self.time - then) / max(steady - since, 1) if then else 0.0
+        self._measured = (self._device.time, steady)
+        achieved = (self._device.time - then) / max(steady - since, 1) if then else 0.0
         level = DiagnosticStatus.OK
-        message = f'time stands, {self.state}' if self._standing else 'time runs'
+        message = f'time is held, {self.state}' if self._standing else 'time runs'
         clocks = self.count_publishers(interface.CLOCK_TOPIC.name)
         if clocks > 1 and (self._authority or self.get_parameter('use_sim_time').value):
             level = DiagnosticStatus.WARN
@@ -525,19 +382,35 @@ class PlantNode(ManagedNode):
              'real_time_factor_achieved': f'{achieved:.3f}', 'clock_publishers': clocks})
 
 
-def _listed(names: Sequence[str]) -> str:
-    """Return names for a sentence, the first few of many."""
-    return ', '.join(names[:4]) + (f' and {len(names) - 4} more' if len(names) > 4 else '')
+def joints_from(values: JointParameters) -> list[SimulatedJoint]:
+    """
+    Return the simulated joints that parameters describe.
 
+    Parameters
+    ----------
+    values : JointParameters
+        Of the node.
 
-def _check_reset(values: JointParameters) -> None:
-    """Refuse a state to reset to that does not exist."""
+    Returns
+    -------
+    list of SimulatedJoint
+        In the order of the names.
+
+    Raises
+    ------
+    BadInputError
+        If a value is out of range; it names the joint where there are several.
+
+    """
+    found = []
     for name in values.names:
-        own = values.of(name)
-        if own['reset_stretch']:
-            check_stretch(
-                own['reset_stretch'], setup_from(own).actuator.nondimensional,
-                f'reset_stretch of {name}')
+        try:
+            found.append(joint_from(values.of(name)))
+        except BadInputError as error:
+            if len(values.names) == 1:
+                raise
+            raise BadInputError(f'joint {name}: {error}') from error
+    return found
 
 
 def main(args: Sequence[str] | None = None) -> int:

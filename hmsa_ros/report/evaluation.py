@@ -4,7 +4,7 @@ What a run amounts to: its setpoints, what was left of the vibration, and what w
 Times are in s from the first command of the run; stamps stay integer nanoseconds.
 """
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect_left
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 import math
@@ -23,6 +23,7 @@ from hmsa_ros.core.model import (
 from hmsa_ros.core.moves import Level as PlannedLoad
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.residual import residual_vibration
+from hmsa_ros.core.schedule import CommandSchedule, Superseding
 from hmsa_ros.core.simulation import simulate
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError, HmsaError
@@ -203,12 +204,10 @@ def in_force(messages: Iterable[Sequence[Level]]) -> tuple[Level, ...]:
         By stamp.
 
     """
-    levels: list[Level] = []
+    levels: Superseding[Level] = Superseding()
     for message in messages:
-        ordered = sorted(message, key=lambda x: x.stamp)
-        if ordered:
-            del levels[bisect_left(levels, ordered[0].stamp, key=lambda x: x.stamp):]
-            levels += ordered
+        for level in sorted(message, key=lambda x: x.stamp):
+            levels.put(level.stamp, level)
     return tuple(levels)
 
 
@@ -229,17 +228,9 @@ def without_repeats(commands: Sequence[Level]) -> tuple[tuple[Level, ...], int]:
         How many were left out.
 
     """
-    kept: list[Level] = []
-    schedule: list[Level] = []
-    for command in commands:
-        place = bisect_left(schedule, command.stamp, key=lambda x: x.stamp)
-        at = bisect_right(schedule, command.stamp, key=lambda x: x.stamp)
-        if at == len(schedule) > 0 and schedule[-1].flux_density == command.flux_density:
-            continue
-        del schedule[place:]
-        schedule.append(command)
-        kept.append(command)
-    return tuple(kept), len(commands) - len(kept)
+    schedule = CommandSchedule(math.nan)
+    kept = tuple(x for x in commands if schedule.insert(x.stamp, x.flux_density))
+    return kept, len(commands) - len(kept)
 
 
 def find_moves(

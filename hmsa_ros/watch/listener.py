@@ -7,7 +7,7 @@ so that a thousand samples a second wake nobody up.
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 import math
 from time import monotonic
 from typing import Any
@@ -16,6 +16,7 @@ import numpy as np
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 
+from hmsa_ros.core.schedule import CommandSchedule
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError, printable
 from hmsa_ros.nodes import interface
@@ -68,27 +69,6 @@ class _Source:
         return self.read(self.subscription.take())
 
 
-@dataclass
-class _Commands:
-    """Commands of one joint, until they apply."""
-
-    source: _Source
-    ahead: dict[int, float] = field(default_factory=dict)
-    in_force: float = math.nan
-
-    def take(self, stamp: int, value: float) -> None:
-        """Take in a command, which supersedes those stamped at or after it."""
-        self.ahead = {x: y for x, y in self.ahead.items() if x < stamp}
-        self.ahead[stamp] = value
-
-    def at(self, stamp: int | None) -> float:
-        """Return what has been commanded for a time; without one the newest."""
-        for each in sorted(self.ahead):
-            if stamp is None or each <= stamp:
-                self.in_force = self.ahead.pop(each)
-        return self.in_force
-
-
 class Listener:
     """
     Looks at planner, plant and the rest of one namespace; a context manager.
@@ -118,7 +98,7 @@ class Listener:
         self._status = self._subscribe(interface.STATUS)
         self._plan = self._subscribe(interface.PLAN)
         self._diagnostics = self._subscribe(interface.DIAGNOSTICS, _REPORT_QOS)
-        self._commands: dict[str, _Commands] = {}
+        self._commands: dict[str, tuple[_Source, CommandSchedule]] = {}
         self._joints: dict[str, Joint] = {}
         self._heard: dict[tuple[str, str, str], tuple[float, Report]] = {}
         self._request: Request | None = None
@@ -196,8 +176,9 @@ class Listener:
             if name.startswith(f'{space}/') and name.endswith(end):
                 joint = name[len(space):-len(end)].strip('/')
                 if '/' not in joint and joint not in self._commands:
-                    self._commands[joint] = _Commands(self._subscribe(
-                        replace(interface.FLUX_DENSITY_COMMAND, name=name), _REPORT_QOS))
+                    self._commands[joint] = self._subscribe(
+                        replace(interface.FLUX_DENSITY_COMMAND, name=name),
+                        _REPORT_QOS), CommandSchedule(math.nan)
 
     def _take_planner(self) -> None:
         for message in self._plan.new():
@@ -259,10 +240,11 @@ class Listener:
                 joint.stretches.put(self._looked, now, finite)
 
     def _take_commands(self) -> None:
-        for name, commands in self._commands.items():
-            for message in commands.source.new():
-                commands.take(from_time(message.header.stamp), message.magnetic_field.z)
-            value = commands.at(self._stamp)
+        for name, (source, schedule) in self._commands.items():
+            for message in source.new():
+                schedule.insert(from_time(message.header.stamp), message.magnetic_field.z)
+            # Where no sample tells the time, the newest counts.
+            value = schedule.apply_until(math.inf if self._stamp is None else self._stamp)
             joint = self._joints.get(name or self._only_joint())
             if joint is not None:
                 joint.commanded = value

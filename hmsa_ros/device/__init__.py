@@ -1,0 +1,6 @@
+"""
+What moves actuators: the simulated plant, and drivers of real hardware.
+
+A `Device` takes stamped levels and is advanced to a time by whoever drives it. It knows no ROS,
+and has no threads and no clock.
+"""

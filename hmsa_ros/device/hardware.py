@@ -1,0 +1,164 @@
+"""Real hardware as a device: levels written at their stamps, a watchdog, and samples."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+import math
+from typing import Protocol
+
+import numpy as np
+
+from hmsa_ros.core.schedule import CommandSchedule
+from hmsa_ros.device.protocol import Change, Kind, Notice, Outbox, Sample
+from hmsa_ros.device.watchdog import Fallback, Watchdog
+from hmsa_ros.errors import BadInputError
+
+
+class Hardware(Protocol):
+    """A coil's amplifier, and the sensor of its actuator; both calls must be quick."""
+
+    def write(self, level: float, now: int) -> int:
+        """Set the coil to a level in T at a time in ns; return when that took effect."""
+
+    def read(self, now: int) -> tuple[float, float]:
+        """Return stretch and stretch rate in 1/s; NaN for what is not measured."""
+
+
+@dataclass(frozen=True)
+class HardwareJoint:
+    """
+    A real actuator.
+
+    Attributes
+    ----------
+    hardware : Hardware
+        What writes and reads.
+    limit : float
+        Largest level in T, above 0; what exceeds it is refused.
+    fallback : Fallback
+        What to do after a silence.
+
+    Raises
+    ------
+    BadInputError
+        If the limit is out of range.
+
+    """
+
+    hardware: Hardware
+    limit: float
+    fallback: Fallback = field(default_factory=lambda: Fallback(safe_flux='zero'))
+
+    def __post_init__(self) -> None:
+        """Check the limit."""
+        if not 0.0 < self.limit < math.inf:
+            raise BadInputError(f'limit is {self.limit:g} T: expected a number above 0')
+
+
+class HardwareDevice(Outbox):
+    """
+    Real actuators; a `Device`.
+
+    Parameters
+    ----------
+    joints : sequence of HardwareJoint
+        At least one; their coils are switched off at the start.
+    time : int
+        Time at the start in ns.
+    period : int
+        Between samples, in ns; 0 for none.
+
+    """
+
+    def __init__(
+            self, joints: Sequence[HardwareJoint], *, time: int, period: int = 0) -> None:
+        """Switch the coils off."""
+        super().__init__()
+        self._joints = tuple(joints)
+        self._time = time
+        self._period = period
+        self._next_sample = time
+        self._schedules = [CommandSchedule(0.0) for _ in joints]
+        self._watchdogs = [Watchdog(x.fallback) for x in joints]
+        self._heard = [False for _ in joints]
+        self._levels = [math.nan for _ in joints]
+        self.switch_off(time)
+
+    @property
+    def time(self) -> int:
+        """Time in ns that it has been advanced to."""
+        return self._time
+
+    @property
+    def due(self) -> int | None:
+        """When to advance it next, in ns; None for not before a command comes."""
+        times = [x.next_stamp for x in self._schedules]
+        times += [x.due(self._time) for x in self._watchdogs]
+        if self._period:
+            times.append(self._next_sample)
+        return min((x for x in times if x is not None), default=None)
+
+    def receive(self, joint: int, stamp: int, level: float) -> None:
+        """
+        Take a level that applies from a stamp on.
+
+        Parameters
+        ----------
+        joint : int
+            Its place.
+        stamp : int
+            Time in ns; a past one, or 0, for at once.
+        level : float
+            In T.
+
+        Raises
+        ------
+        BadInputError
+            If the level is beyond the limit.
+
+        """
+        limit = self._joints[joint].limit
+        if not abs(level) <= limit:  # not a number is refused, too
+            raise BadInputError(f'flux density is {level:g} T: expected at most {limit:g} T')
+        self._schedules[joint].insert(stamp, level)
+        self._heard[joint] = True
+
+    def advance(self, time: int) -> None:
+        """Write what is due at a time in ns, which is now, and read if that is due."""
+        if time < self._time:
+            # The clock was set back.
+            self._next_sample = min(self._next_sample, time)
+        self._time = time
+        for i, schedule in enumerate(self._schedules):
+            self._watch(i)
+            self._write(i, schedule.apply_until(self._time))
+        if self._period and self._time >= self._next_sample:
+            self._next_sample = (self._time // self._period + 1) * self._period
+            read = np.array([x.hardware.read(self._time) for x in self._joints])
+            self._samples.append(
+                Sample(self._time, read[:, 0], read[:, 1], np.array(self._levels)))
+
+    def _watch(self, i: int) -> None:
+        """Obey the watchdog of a joint."""
+        watchdog, schedule = self._watchdogs[i], self._schedules[i]
+        if self._heard[i]:
+            self._heard[i] = False
+            if watchdog.feed(self._time):
+                self._notices.append(Notice(Kind.HEARD, i, 'commands have come back'))
+        trips = watchdog.trips
+        for stamp, level in watchdog.watch(self._time, self._time, schedule.current):
+            schedule.insert(stamp, level)
+        if watchdog.trips > trips:
+            self._notices.append(Notice(Kind.SILENT, i, watchdog.alarm))
+
+    def _write(self, i: int, level: float) -> None:
+        if level != self._levels[i]:
+            self._levels[i] = level
+            stamp = self._joints[i].hardware.write(level, self._time)
+            self._changes.append(Change(i, stamp, level))
+
+    def switch_off(self, time: int) -> None:
+        """Switch all coils off at a time in ns, which is now; nothing is ahead."""
+        self._time = time
+        self._schedules = [CommandSchedule(0.0) for _ in self._joints]
+        for i in range(len(self._joints)):
+            self._write(i, 0.0)

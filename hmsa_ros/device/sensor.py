@@ -1,0 +1,110 @@
+"""What is measured of the state of several actuators: bias, gain, noise and transport delay."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from hmsa_ros.device.protocol import Sample
+from hmsa_ros.device.transport import Transport
+from hmsa_ros.errors import BadInputError
+
+
+@dataclass(frozen=True)
+class SensorErrors:
+    """
+    How what is measured of one actuator differs from the truth.
+
+    The measured stretch is the bias plus the gain times the true one; the measured rate, which
+    is its derivative, has the gain alone.
+
+    Attributes
+    ----------
+    stretch_noise, rate_noise : float
+        Standard deviations, the latter in 1/s; at least 0.
+    stretch_bias, stretch_gain : float
+        Finite, the gain above 0.
+
+    Raises
+    ------
+    BadInputError
+        If a value is out of range.
+
+    """
+
+    stretch_noise: float = 0.0
+    rate_noise: float = 0.0
+    stretch_bias: float = 0.0
+    stretch_gain: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for name in ('stretch_noise', 'rate_noise'):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise BadInputError(f'{name} is {getattr(self, name):g}: expected at least 0')
+        if not math.isfinite(self.stretch_bias):
+            raise BadInputError(
+                f'stretch_bias is {self.stretch_bias:g}: expected a finite number')
+        if not 0.0 < self.stretch_gain < math.inf:
+            raise BadInputError(
+                f'stretch_gain is {self.stretch_gain:g}: expected a number above 0')
+
+
+class Sensor:
+    """
+    Measures with errors, and answers later.
+
+    Parameters
+    ----------
+    errors : sequence of SensorErrors
+        Of each actuator.
+    delay : int
+        Time in ns between taking a sample and having it.
+    seed : int
+        Of the noise: the same seed gives the same errors.
+
+    """
+
+    def __init__(
+            self, errors: Sequence[SensorErrors], delay: int = 0, seed: int = 0) -> None:
+        """Begin the noise."""
+        self._deviations = np.array(
+            [[x.stretch_noise for x in errors], [x.rate_noise for x in errors]])
+        self._bias = np.array([x.stretch_bias for x in errors])
+        self._gain = np.array([x.stretch_gain for x in errors])
+        self._exact = all(x == SensorErrors() for x in errors)
+        self._noisy = bool(np.any(self._deviations))
+        self._random = np.random.default_rng(seed)
+        self._transport: Transport[Sample] = Transport(delay)
+
+    def forget(self) -> None:
+        """Drop what is on its way."""
+        self._transport.clear()
+
+    def measure(self, sample: Sample) -> Iterator[Sample]:
+        """
+        Take a sample of the true state.
+
+        Parameters
+        ----------
+        sample : Sample
+            Later than the one before; its arrays are kept.
+
+        Yields
+        ------
+        Sample
+            Measurements that have arrived by now: each once, its delay later.
+
+        """
+        if not self._exact:
+            stretch = self._bias + self._gain * sample.stretch
+            rate = self._gain * sample.rate
+            if self._noisy:
+                errors = self._deviations * self._random.standard_normal(
+                    self._deviations.shape)
+                stretch, rate = stretch + errors[0], rate + errors[1]
+            sample = sample._replace(stretch=stretch, rate=rate)
+        self._transport.send(sample.time, sample)
+        for _, measured in self._transport.arrived(sample.time):
+            yield measured

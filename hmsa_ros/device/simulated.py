@@ -1,0 +1,272 @@
+"""The simulated plant as a device: what it does, and when."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from hmsa_ros.core.actuators import Actuators, Setup
+from hmsa_ros.core.model import Array
+from hmsa_ros.core.simulation import too_large
+from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.device.protocol import Change, Kind, Notice, Outbox, Sample
+from hmsa_ros.device.sensor import Sensor, SensorErrors
+from hmsa_ros.device.transport import Transport
+from hmsa_ros.device.watchdog import Fallback, Watchdog
+
+# A gap of the clock that is not simulated through but skipped.
+_LARGEST_GAP_NS = 5 * NANOSECONDS
+
+
+@dataclass(frozen=True)
+class SimulatedJoint:
+    """A simulated actuator, what its watchdog does, and how it is measured."""
+
+    setup: Setup
+    fallback: Fallback = field(default_factory=Fallback)
+    errors: SensorErrors = field(default_factory=SensorErrors)
+
+
+class SimulatedDevice(Outbox):
+    """
+    Simulated actuators; a `Device`.
+
+    Commands take effect exactly at their stamps, inside the integration.
+
+    Parameters
+    ----------
+    joints : sequence of SimulatedJoint
+        At least one.
+    period : int
+        Between samples, in ns, at least 1; they lie on a grid from time zero.
+    time : int
+        Time at the start in ns; its state is the first sample.
+    command_delay, measurement_delay : int
+        Transport delays of commands and samples in ns, at least 0.
+    seed : int
+        Of the sensor's noise.
+
+    Attributes
+    ----------
+    period : int
+        As given.
+    next_sample : int
+        Time in ns of the next sample.
+
+    """
+
+    def __init__(
+            self, joints: Sequence[SimulatedJoint], *, period: int, time: int = 0,
+            command_delay: int = 0, measurement_delay: int = 0, seed: int = 0) -> None:
+        """Start at rest."""
+        super().__init__()
+        self.period = period
+        self.next_sample = time
+        self._actuators = Actuators([x.setup for x in joints], time=time)
+        self._watchdogs = [Watchdog(x.fallback) for x in joints]
+        self._sensor = Sensor([x.errors for x in joints], measurement_delay, seed)
+        self._transit: Transport[tuple[int, int, float]] = Transport(command_delay)
+        self._changes += [Change(i, time, self.level(i)) for i in range(len(joints))]
+
+    # -- what there is to see ------------------------------------------------------------------
+
+    @property
+    def time(self) -> int:
+        """Time in ns that the state belongs to."""
+        return self._actuators.time
+
+    @property
+    def stretch(self) -> Array:
+        """True stretch of each joint."""
+        return self._actuators.stretch
+
+    @property
+    def flux_density(self) -> Array:
+        """Flux density on each joint in T."""
+        return self._actuators.flux_density
+
+    @property
+    def silent(self) -> list[int]:
+        """Joints that nobody commands any more."""
+        return [i for i, x in enumerate(self._watchdogs) if x.tripped]
+
+    @property
+    def trips(self) -> int:
+        """How often a joint fell silent."""
+        return sum(x.trips for x in self._watchdogs)
+
+    def level(self, joint: int) -> float:
+        """Return the last level in T that took effect on a joint."""
+        return self._actuators.schedules[joint].current
+
+    def changes(self) -> list[Change]:
+        """Return which levels took effect since the last call."""
+        self._changes += [Change(*x) for x in self._actuators.changes]
+        self._actuators.changes.clear()
+        return super().changes()
+
+    # -- what drives it ------------------------------------------------------------------------
+
+    def receive(self, joint: int, stamp: int, level: float) -> None:
+        """
+        Have a command take effect once it has passed the transport delay.
+
+        Parameters
+        ----------
+        joint : int
+            Its place.
+        stamp : int
+            Time in ns from which it applies, 0 for at once.
+        level : float
+            In T.
+
+        Raises
+        ------
+        BadInputError
+            If nobody could follow it.
+
+        """
+        if self._transit.delay:
+            self._actuators.check_level(joint, level)
+            self._transit.send(self.time, (joint, stamp, level))
+        else:
+            self._obey(joint, stamp, level)
+
+    def push(self, joint: int, stamp: int, force: float) -> None:
+        """
+        Have a force act on a joint.
+
+        Parameters
+        ----------
+        joint : int
+            Its place.
+        stamp : int
+            Time in ns from which it acts, 0 for at once.
+        force : float
+            Along the field in N.
+
+        Raises
+        ------
+        BadInputError
+            If nobody could follow it.
+
+        """
+        self._actuators.force(joint, stamp or self.time, force)
+
+    def _obey(self, joint: int, stamp: int, level: float) -> None:
+        late = self._actuators.command(joint, stamp or self.time, level)
+        if self._watchdogs[joint].feed(self.time):
+            self._notices.append(Notice(Kind.HEARD, joint, 'commands have come back'))
+        if late:
+            self._notices.append(Notice(
+                Kind.LATE, joint,
+                f'command arrived {late / 1e6:.3f} ms after the time it applies and was '
+                'applied at once: raise lead_time of the planner', late))
+
+    # -- time ----------------------------------------------------------------------------------
+
+    def advance(self, time: int) -> None:
+        """Simulate up to a time in ns and take the samples on the way."""
+        while self.next_sample <= time:
+            self._run(self.next_sample)
+            self.next_sample += self.period
+            actuators = self._actuators
+            self._samples += self._sensor.measure(Sample(
+                actuators.time, actuators.stretch.copy(), actuators.rate,
+                actuators.flux_density))
+        if self.time < time:
+            self._run(time)
+
+    def _run(self, time: int) -> None:
+        """Simulate, with what is known of commands and of silence by then."""
+        for known, command in self._transit.arrived(time):
+            self._integrate(known)
+            self._obey(*command)
+        for i, watchdog in enumerate(self._watchdogs):
+            trips = watchdog.trips
+            for stamp, level in watchdog.watch(self.time, time, self.level(i)):
+                self._actuators.command(i, stamp, level)
+            if watchdog.trips > trips:
+                self._notices.append(Notice(Kind.SILENT, i, watchdog.alarm))
+        self._integrate(time)
+
+    def _integrate(self, time: int) -> None:
+        """Advance all joints; those whose load is too large start again."""
+        for i, reached in self._actuators.advance(time):
+            self._notices.append(Notice(
+                Kind.FAILED, i, f'{too_large(reached, self.level(i))}; the joint starts again '
+                'from its initial state'))
+            self.restart(i)
+
+    def follow(self, now: int, *, standing: bool = False) -> int:
+        """
+        Bring the time into line with a clock, as far as it is not to be simulated.
+
+        A device that has not begun, one that stands still, and one whose clock jumps goes on
+        from the clock's time; where the clock has jumped back it starts again. Samples stay on
+        the grid from time zero.
+
+        Parameters
+        ----------
+        now : int
+            Of the clock, in ns.
+        standing : bool
+            Whether time is not to run.
+
+        Returns
+        -------
+        int
+            By how many ns the clock jumped, 0 if it did not.
+
+        """
+        gap = now - self.time
+        if self.time == 0:
+            self._go_on_from(now)
+            return 0
+        if gap < -self.period:
+            self._go_on_from(now)
+            self._transit.clear()
+            for i in range(len(self._watchdogs)):
+                self.restart(i)
+            return gap
+        if standing:
+            self._go_on_from(now)
+        elif gap > _LARGEST_GAP_NS:
+            self._go_on_from(now)
+            return gap
+        return 0
+
+    def _go_on_from(self, now: int) -> None:
+        for watchdog in self._watchdogs:
+            # Time that was not simulated is no silence.
+            watchdog.pass_over(now - self.time)
+        self._actuators.time = now
+        self.next_sample = -(-now // self.period) * self.period
+
+    # -- beginning anew ------------------------------------------------------------------------
+
+    def restart(self, joint: int, stretch: float | None = None, rate: float = 0.0) -> None:
+        """
+        Put a joint back to its initial or another state; nothing is ahead; time goes on.
+
+        Parameters
+        ----------
+        joint : int
+            Its place.
+        stretch : float, optional
+            Default the initial one. It is held by its flux density.
+        rate : float
+            In 1/s.
+
+        Raises
+        ------
+        BadInputError
+            If the stretch is outside the limits.
+
+        """
+        self._actuators.reset(joint, stretch, rate)
+        # A first command arms it again.
+        self._watchdogs[joint].disarm()
+        self._sensor.forget()
+
+    def drop_commands(self) -> None:
+        """Lose the commands on their way."""
+        self._transit.clear()

@@ -1,0 +1,154 @@
+"""Watchdog: what a coil does when nobody commands it any more."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import math
+
+from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.errors import BadInputError
+
+#: What to do: keep the last level, go to zero at once, or ramp to zero.
+SAFE_FLUX = ('hold', 'zero', 'ramp')
+_REASONS = {
+    'hold': 'what is commanded stays (safe_flux hold)', 'zero': 'the field goes to zero',
+    'ramp': 'the field ramps to zero'}
+_RAMP_STEP_NS = 1_000_000
+
+
+@dataclass(frozen=True)
+class Fallback:
+    """
+    What to do after a silence.
+
+    Attributes
+    ----------
+    timeout : float
+        Longest silence in s; 0 for any.
+    safe_flux : str
+        One of `SAFE_FLUX`.
+    ramp_rate : float
+        Of a ramp to zero, in T/s, above 0.
+
+    Raises
+    ------
+    BadInputError
+        If a value is out of range.
+
+    """
+
+    timeout: float = 1.0
+    safe_flux: str = 'hold'
+    ramp_rate: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if not 0.0 <= self.timeout < math.inf:
+            raise BadInputError(f'timeout is {self.timeout:g} s: expected at least 0')
+        if self.safe_flux not in SAFE_FLUX:
+            raise BadInputError(
+                f'safe flux is {self.safe_flux!r}: expected one of {", ".join(SAFE_FLUX)}')
+        if not 0.0 < self.ramp_rate < math.inf:
+            raise BadInputError(f'ramp rate is {self.ramp_rate:g} T/s: expected above 0')
+
+
+class Watchdog:
+    """
+    Notices that commands and heartbeats have ceased, and commands the safe flux then.
+
+    Armed by the first command, so that an actuator nobody has moved yet raises no alarm.
+
+    Attributes
+    ----------
+    tripped : bool
+        Whether the silence has lasted too long.
+    trips : int
+        How often it has.
+
+    """
+
+    def __init__(self, fallback: Fallback) -> None:
+        """Start unarmed."""
+        self._fallback = fallback
+        self._timeout = round(fallback.timeout * NANOSECONDS)
+        self._last: int | None = None
+        self._ramp: tuple[int, float] | None = None
+        self.tripped = False
+        self.trips = 0
+
+    @property
+    def alarm(self) -> str:
+        """What to log when it trips."""
+        return (f'no command and no heartbeat for {self._fallback.timeout:g} s: '
+                f'{_REASONS[self._fallback.safe_flux]}; is the planner running?')
+
+    def feed(self, now: int) -> bool:
+        """Take a sign of life at a time in ns; return whether it ends an alarm."""
+        recovered = self.tripped
+        self.tripped = False
+        self._ramp = None
+        self._last = now
+        return recovered
+
+    def watch(self, now: int, until: int, level: float) -> Iterator[tuple[int, float]]:
+        """
+        Look at the time, and command the safe flux if need be.
+
+        Parameters
+        ----------
+        now : int
+            Time in ns; one that has jumped back begins the silence anew.
+        until : int
+            Time in ns up to which levels are wanted.
+        level : float
+            In force, in T.
+
+        Yields
+        ------
+        (int, float)
+            Stamp in ns and level in T, a ramp in steps of a millisecond.
+
+        """
+        if self._trips(now):
+            if self._fallback.safe_flux == 'zero':
+                yield now, 0.0
+            elif self._fallback.safe_flux == 'ramp':
+                self._ramp = now, level
+        if self._ramp is None:
+            return
+        begin, level = self._ramp
+        for step in range(-(-(now - begin) // _RAMP_STEP_NS),
+                          (until - begin) // _RAMP_STEP_NS + 1):
+            passed = step * _RAMP_STEP_NS
+            left = abs(level) - self._fallback.ramp_rate * passed / NANOSECONDS
+            yield begin + passed, math.copysign(max(left, 0.0), level)
+            if left <= 0.0:
+                self._ramp = None
+                return
+
+    def _trips(self, now: int) -> bool:
+        if self._last is None or self.tripped or self._timeout == 0:
+            return False
+        self._last = min(self._last, now)
+        if now - self._last <= self._timeout:
+            return False
+        self.tripped = True
+        self.trips += 1
+        return True
+
+    def due(self, now: int) -> int | None:
+        """Return when to `watch` next, in ns; None if there is nothing to watch."""
+        if self._ramp is not None:
+            return now + _RAMP_STEP_NS
+        if self._last is None or self.tripped or self._timeout == 0:
+            return None
+        return self._last + self._timeout + 1
+
+    def pass_over(self, span: int) -> None:
+        """Leave out a span of time in ns, which was no silence."""
+        if self._last is not None:
+            self._last += span
+
+    def disarm(self) -> None:
+        """Wait for a first command again."""
+        self._last = self._ramp = None
+        self.tripped = False
