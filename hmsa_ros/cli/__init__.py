@@ -18,8 +18,8 @@ from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, complain, HmsaError
 
 COMMANDS = (
-    'demo', 'init', 'plan', 'send', 'watch', 'node', 'bag', 'report', 'figures', 'robustness',
-    'sweep', 'completion')
+    'demo', 'init', 'plan', 'send', 'identify', 'watch', 'node', 'bag', 'report', 'figures',
+    'robustness', 'sweep', 'completion')
 
 
 class _Help(argparse.HelpFormatter):

@@ -56,7 +56,7 @@ class Cell:
     value: float | None = None
 
 
-_Row = list[Cell | str]
+Row = list[Cell | str]
 
 
 def page(parts: Sequence[Part]) -> str:
@@ -84,17 +84,14 @@ def page(parts: Sequence[Part]) -> str:
 
     def place(figure: Figure, heading: str = '') -> str:
         figures.append(figure)
-        title = f'<h3>{escape(heading)}</h3>' if heading else ''
-        return (
-            f'<figure>{title}<div class="plot" id="{figure.key}" role="img" '
-            f'aria-label="{escape(figure.alt)}" style="height:{figure.height}px"></div></figure>')
+        return placed(figure, heading)
 
     phase, shown = charts.phase(parts)
     panels = charts.panels(parts)
     count = max(len(x.evaluation.results) for x in parts)
     planned = any(x.evaluation.plan for x in parts)
     sections = [
-        ('response-section', 'Command and response', _text(
+        ('response-section', 'Command and response', text(
             'Above, the flux density commanded: a dot where the level switches. Below, the '
             'stretch: recorded, predicted by the plan, and simulated for plain steps to the '
             'levels that hold the targets. Drag to zoom, double-click to go back, click in the '
@@ -102,7 +99,7 @@ def page(parts: Sequence[Part]) -> str:
                 '' if len(parts) == 1 else ' What is simulated is hidden until its name is '
                 'clicked.')) + place(charts.response(parts, unit))),
         ('setpoints', 'Setpoints', _setpoints(parts)),
-        ('phase-section', 'Phase plane', _text(
+        ('phase-section', 'Phase plane', text(
             'Stretch rate over stretch. Filled dots are the equilibria of the setpoints, the '
             'open one is where the run starts.' + (
                 '' if shown == 1.0 else f' Only the first {shown:.0%} of the longest curve is '
@@ -110,7 +107,7 @@ def page(parts: Sequence[Part]) -> str:
     ]
     if panels:
         sections += [
-            ('arrivals', 'Arrivals', _text(
+            ('arrivals', 'Arrivals', text(
                 'Distance from the target in percent of the step, over the time since planned '
                 'arrival. The residual is what is left of the vibration: peak to peak from '
                 'arrival to the next move.' + (
@@ -119,18 +116,18 @@ def page(parts: Sequence[Part]) -> str:
                     'table has all.'))
              + _key(parts) + '<div class="grid">' + ''.join(
                  place(charts.arrival(parts, i), title) for i, title in panels) + '</div>'),
-            ('residual-section', 'Shaped against unshaped', _text(
+            ('residual-section', 'Shaped against unshaped', text(
                 'Residual of each setpoint as recorded, and as it would have been with plain '
                 'steps (simulated). The axis is logarithmic.')
              + place(charts.residuals(parts))),
         ]
     if planned:
-        sections.append(('plan-section', 'Plan against run', _text(
+        sections.append(('plan-section', 'Plan against run', text(
             'The plan predicts stretch and rate from each change of level to the next; here is '
             'how far the recording is from it.') + place(charts.prediction(parts, unit))
             + _plan(parts, unit)))
     sections += [
-        ('timing-section', 'Timing', _text(
+        ('timing-section', 'Timing', text(
             'Lead: how far ahead of the time it applies a command was recorded; below 0 it came '
             'late. ' + (
                 'Lateness: how long after that time the change took effect, as the plant or the '
@@ -145,11 +142,6 @@ def page(parts: Sequence[Part]) -> str:
     if requests:
         sections.insert(-2, ('requests', 'Requests', requests))
     names = ', '.join(x.run.label for x in parts)
-    data = json.dumps(
-        {'figures': [
-            {'key': x.key, 'height': x.height, 'data': x.data, 'layout': x.layout}
-            for x in figures],
-         'dark': charts.DARK}, separators=(',', ':'), allow_nan=False)
     body = [
         f'<h1>{escape(names)}</h1>', ''.join(_source(x.run) for x in parts), _tiles(parts),
         _notes(parts),
@@ -160,17 +152,52 @@ def page(parts: Sequence[Part]) -> str:
         f'<footer class="soft"><p>Written by hmsa_ros {__version__}. Each curve shows the least '
         f'and the largest value in each of {charts.BUCKETS} intervals, so that no peak is '
         'lost.</p></footer>']
+    return document(f'{names} – run report', body, figures)
+
+
+def document(title: str, body: Sequence[str], figures: Sequence[Figure]) -> str:
+    """
+    Return a page that needs nothing else.
+
+    Parameters
+    ----------
+    title : str
+        Plain text.
+    body : sequence of str
+        HTML with a place for each figure.
+    figures : sequence of Figure
+        To be drawn in their places.
+
+    Returns
+    -------
+    str
+        HTML.
+
+    """
+    data = json.dumps(
+        {'figures': [
+            {'key': x.key, 'height': x.height, 'data': x.data, 'layout': x.layout}
+            for x in figures],
+         'dark': charts.DARK}, separators=(',', ':'), allow_nan=False)
     return '\n'.join([
         '<!DOCTYPE html>', '<html lang="en">', '<head>', '<meta charset="utf-8">',
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
         '<link rel="icon" href="data:,">',
-        f'<title>{escape(names)} – run report</title>', f'<style>{STYLE}</style>', '</head>',
+        f'<title>{escape(title)}</title>', f'<style>{STYLE}</style>', '</head>',
         '<body>', *body,
         # Inside a script only "</" could end it.
         '<script type="application/json" id="report-data">' + data.replace('</', '<\\/')
         + '</script>',
         f'<script>{_plotly()}</script>', f'<script>{SCRIPT}</script>', '</body>', '</html>', ''])
+
+
+def placed(figure: Figure, heading: str = '') -> str:
+    """Return the place of a figure."""
+    title = f'<h3>{escape(heading)}</h3>' if heading else ''
+    return (
+        f'<figure>{title}<div class="plot" id="{figure.key}" role="img" '
+        f'aria-label="{escape(figure.alt)}" style="height:{figure.height}px"></div></figure>')
 
 
 def _plotly() -> str:
@@ -187,7 +214,8 @@ def _plotly() -> str:
     return script.replace('</script', '<\\/script')
 
 
-def _text(words: str) -> str:
+def text(words: str) -> str:
+    """Return a paragraph."""
     return f'<p class="soft">{escape(words)}</p>'
 
 
@@ -227,7 +255,7 @@ def _tiles(parts: Sequence[Part]) -> str:
         return '<div class="tiles">' + ''.join(
             f'<div><b>{escape(value)}</b><span>{escape(name)}</span></div>'
             for name, value in zip(header, rows[0], strict=True)) + '</div>'
-    return _table(
+    return table(
         'run-table', 'The runs.', ['run', *header],
         [[x.run.label, *row] for x, row in zip(parts, rows, strict=True)])
 
@@ -274,9 +302,9 @@ def _notes_of(part: Part) -> Iterable[str]:
 
 # Tables --------------------------------------------------------------------------------------
 
-def _table(
+def table(
         key: str, caption: str, header: Sequence[str],
-        rows: Sequence[_Row]) -> str:
+        rows: Sequence[Row]) -> str:
     """Return a table with a button that copies it."""
     if header[0] in ('run', 'bag') and len({row[0] for row in rows}) <= 1:
         # A run on its own needs no name in every row.
@@ -306,7 +334,7 @@ def _table(
         f'<button type="button" data-table="{key}">Copy table</button>'])
 
 
-def _cell(value: float, form: str = '.6g') -> Cell:
+def cell(value: float, form: str = '.6g') -> Cell:
     """Return a number as a cell."""
     value = float(value)
     return Cell(f'{value:{form}}', value) if math.isfinite(value) else Cell('–', math.nan)
@@ -314,29 +342,29 @@ def _cell(value: float, form: str = '.6g') -> Cell:
 
 def _percent(share: float) -> Cell:
     """Return a share as a cell in percent."""
-    return _cell(100.0 * share, '.3g')
+    return cell(100.0 * share, '.3g')
 
 
 def _setpoints(parts: Sequence[Part]) -> str:
     """Return the table of what became of the setpoints."""
-    rows: list[_Row] = []
+    rows: list[Row] = []
     for part in parts:
         for i, (move, x) in enumerate(zip(
                 part.evaluation.moves, part.evaluation.results, strict=True), 1):
             levels = len(move.flux_densities)
             rows.append([
-                part.run.label, Cell(str(i), i), _cell(x.stretch), _cell(x.b_p, '.5f'),
-                _cell(x.tau_p, '.5f'), _cell(x.b_1, '.5f'), _cell(x.begin * 1e3, '.3f'),
-                _cell(x.arrival * 1e3, '.3f'), _cell(x.end * 1e3, '.3f'), _percent(x.error),
+                part.run.label, Cell(str(i), i), cell(x.stretch), cell(x.b_p, '.5f'),
+                cell(x.tau_p, '.5f'), cell(x.b_1, '.5f'), cell(x.begin * 1e3, '.3f'),
+                cell(x.arrival * 1e3, '.3f'), cell(x.end * 1e3, '.3f'), _percent(x.error),
                 _percent(x.residual), _percent(x.residual_unshaped),
                 'plain step' if levels == 1 else f'{levels} levels'])
     if not rows:
-        return _text('No setpoint was carried out while the samples were recorded.')
+        return text('No setpoint was carried out while the samples were recorded.')
     header = [
         'run', 'setpoint', 'target λ [1]', 'b_p [1]', 'tau_p [1]', 'b_1 [1]', 'begin [ms]',
         'arrival [ms]', 'until [ms]', 'largest error [%]', 'residual [%]', 'plain steps [%]',
         'command']
-    return _table(
+    return table(
         'setpoint-table', 'b and tau nondimensional as in the paper: of the first level, the '
         'time until arrival, and of the level that holds the target. Error and residual in '
         'percent of the step, from arrival on; times from the first command.',
@@ -345,7 +373,7 @@ def _setpoints(parts: Sequence[Part]) -> str:
 
 def _requests(parts: Sequence[Part], unit: TimeUnit) -> str:
     """Return the table of verdicts."""
-    rows: list[_Row] = []
+    rows: list[Row] = []
     for part in parts:
         before = None
         for x in part.run.verdicts:
@@ -353,27 +381,27 @@ def _requests(parts: Sequence[Part], unit: TimeUnit) -> str:
                 before = x.code, x.message
                 rows.append([
                     part.run.label,
-                    _cell(unit.of(part.evaluation.seconds(x.sent)).item(), '.3f'), x.level,
+                    cell(unit.of(part.evaluation.seconds(x.sent)).item(), '.3f'), x.level,
                     x.code, x.message])
     if not rows:
         return ''
-    return _table(
+    return table(
         'request-table', 'What the planner said of the requests.',
         ['run', f'time [{unit.name}]', 'level', 'code', 'message'], rows[:_MOST_ROWS])
 
 
 def _plan(parts: Sequence[Part], unit: TimeUnit) -> str:
     """Return the table of planned changes of level."""
-    rows: list[_Row] = []
+    rows: list[Row] = []
     for part in parts:
         for x in plan_points(part.run, part.evaluation):
             rows.append([
-                part.run.label, _cell(unit.of(x.time).item(), '.4f'),
-                _cell(x.planned * 1e3, '.4f'), _cell(x.commanded * 1e3, '.4f'),
-                _cell(x.stretch, '.7f'), _cell(x.recorded_stretch, '.7f'),
-                _cell(x.rate, '.4g'), _cell(x.recorded_rate, '.4g'),
-                _cell(x.deviation, '.2e')])
-    return _table(
+                part.run.label, cell(unit.of(x.time).item(), '.4f'),
+                cell(x.planned * 1e3, '.4f'), cell(x.commanded * 1e3, '.4f'),
+                cell(x.stretch, '.7f'), cell(x.recorded_stretch, '.7f'),
+                cell(x.rate, '.4g'), cell(x.recorded_rate, '.4g'),
+                cell(x.deviation, '.2e')])
+    return table(
         'plan-table', 'Each change of level: flux density planned and commanded; stretch and '
         'rate of the first sample from then on; and the largest distance of the recorded from '
         'the predicted stretch until the next change.',
@@ -389,7 +417,7 @@ def _repeats(parts: Sequence[Part]) -> str:
 
 def _timing(parts: Sequence[Part]) -> str:
     """Return the table of times."""
-    rows: list[_Row] = []
+    rows: list[Row] = []
     for part in parts:
         x = part.timing
         for name, values in (
@@ -402,9 +430,9 @@ def _timing(parts: Sequence[Part]) -> str:
                 low, middle, high, top = np.quantile(values, [0.0, 0.5, 0.99, 1.0]) * 1e3
                 rows.append([
                     part.run.label, name, Cell(str(len(values)), len(values)),
-                    *(_cell(y, '.4f') for y in (low, middle, high, top)),
-                    _cell(float(np.std(values)) * 1e3, '.4f')])
-    return _table(
+                    *(cell(y, '.4f') for y in (low, middle, high, top)),
+                    cell(float(np.std(values)) * 1e3, '.4f')])
+    return table(
         'timing-table', 'Jitter is the standard deviation.',
         ['run', 'quantity', 'count', 'least [ms]', 'median [ms]', '99 % [ms]', 'largest [ms]',
          'jitter [ms]'], rows)
@@ -412,7 +440,7 @@ def _timing(parts: Sequence[Part]) -> str:
 
 def _losses(parts: Sequence[Part]) -> str:
     """Return the table of topics."""
-    rows: list[_Row] = []
+    rows: list[Row] = []
     told = True
     for part in dict.fromkeys(x.run.path for x in parts):
         run = next(x.run for x in parts if x.run.path == part)
@@ -420,13 +448,13 @@ def _losses(parts: Sequence[Part]) -> str:
         for topic in run.summary.topics:
             rows.append([
                 run.label, topic.name, topic.type, Cell(str(topic.count), topic.count),
-                _cell(math.nan if topic.rate is None else topic.rate, '.1f'),
+                cell(math.nan if topic.rate is None else topic.rate, '.1f'),
                 Cell('not told' if topic.lost is None else str(topic.lost),
                      math.nan if topic.lost is None else topic.lost)])
-    words = '' if told else _text(
+    words = '' if told else text(
         'A recorder that counts what it misses stores that in the bag (hmsa recorder does); '
         'where it is not told, gaps in the stamps of the samples are all there is to go by.')
-    return words + _table(
+    return words + table(
         'loss-table', 'What is in the bags.',
         ['bag', 'topic', 'type', 'messages', 'a second', 'lost'], rows)
 
@@ -445,31 +473,31 @@ def _parameters(parts: Sequence[Part]) -> str:
         else:
             header += [f'{prefix}plant', f'{prefix}as planned']
             columns += [run.plant, run.planner]
-    rows: list[_Row] = [
-        [name.replace('_', ' '), _UNITS[name], *(_cell(getattr(x, name)) for x in columns)]
+    rows: list[Row] = [
+        [name.replace('_', ' '), _UNITS[name], *(cell(getattr(x, name)) for x in columns)]
         for name in ACTUATOR_FIELDS]
     groups = [x.nondimensional for x in columns]
     limits = [stretch_limits(x.nondimensional) for x in columns]
     rows += [
-        ['zeta', '1', *(_cell(x.zeta) for x in groups)],
+        ['zeta', '1', *(cell(x.zeta) for x in groups)],
         ['critical zeta about stretch 1', '1', *(
-            _cell(float(critical_zeta(1.0, x))) for x in groups)],
-        ['J_lim', '1', *(_cell(x.j_lim) for x in groups)],
-        ['c1', '1', *(_cell(x.c1) for x in groups)],
-        ['time unit', 'ms', *(_cell(x.time_unit * 1e3) for x in columns)],
-        ['flux density of load 1', 'mT', *(_cell(x.flux_density_unit * 1e3) for x in columns)],
-        ['least stretch', '1', *(_cell(x) for x, _ in limits)],
-        ['largest stretch', '1', *(_cell(x) for _, x in limits)],
+            cell(float(critical_zeta(1.0, x))) for x in groups)],
+        ['J_lim', '1', *(cell(x.j_lim) for x in groups)],
+        ['c1', '1', *(cell(x.c1) for x in groups)],
+        ['time unit', 'ms', *(cell(x.time_unit * 1e3) for x in columns)],
+        ['flux density of load 1', 'mT', *(cell(x.flux_density_unit * 1e3) for x in columns)],
+        ['least stretch', '1', *(cell(x) for x, _ in limits)],
+        ['largest stretch', '1', *(cell(x) for _, x in limits)],
     ]
-    words = '' if all(x.run.parameters_known for x in parts) else _text(
+    words = '' if all(x.run.parameters_known for x in parts) else text(
         'Unknown: the bag does not tell the parameters, and the example block of the paper '
         'stands in.')
-    recorded: list[_Row] = [
+    recorded: list[Row] = [
         [part.run.label, key, json.dumps(value)] for part in parts
         for key, value in part.run.parameters.items()]
     more = '' if not recorded else (
-        '<details><summary>All parameters that were recorded</summary>' + _table(
+        '<details><summary>All parameters that were recorded</summary>' + table(
             'recorded-table', 'As the nodes had them.', ['run', 'parameter', 'value'], recorded)
         + '</details>')
-    return words + _table(
+    return words + table(
         'parameter-table', 'The block, and what follows from it.', header, rows) + more

@@ -1,0 +1,200 @@
+"""``hmsa identify``: the parameters of an actuator out of a recording."""
+
+import argparse
+import json
+from pathlib import Path
+import sys
+from typing import Any, TYPE_CHECKING
+
+from hmsa_ros.errors import BadInputError
+
+if TYPE_CHECKING:
+    from hmsa_ros.identification import Identification, Recording
+    from hmsa_ros.identification.files import Belief
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    Add the command.
+
+    Parameters
+    ----------
+    subparsers : argparse action
+        Where to add it.
+
+    """
+    parser = subparsers.add_parser(
+        'identify', help="find the actuator's parameters in a recording",
+        description="Find the actuator's parameters in a recording of its motion, with their "
+                    '95 % intervals, or say what the recording does not hold. RUN is a bag, or a '
+                    'CSV with a header and the columns time (s), stretch and, without '
+                    '--commands, flux_density (T). No start values are needed.',
+        epilog='example: hmsa identify camera.csv --commands levels.csv --out actuator.yaml')
+    parser.add_argument(
+        'recording', type=Path, metavar='RUN', help='a bag, or a CSV of samples')
+    parser.add_argument(
+        '--commands', type=Path, metavar='CSV',
+        help='CSV of time, flux_density: the level in force from that time on')
+    parser.add_argument(
+        '--params-file', type=Path, metavar='YAML', dest='params_file',
+        help='parameter file with what is known, such as geometry and density')
+    parser.add_argument(
+        '--free', default='', metavar='NAME,...',
+        help='parameters to find (default shear_modulus, damping_coefficient, chain_limit, '
+             'remanence, stretch_bias); others: density, time_unit, stretch_gain, '
+             'sensor_latency, coil_time_constant, constant_force, initial_stretch, '
+             'initial_rate, viscoelastic_ratio, viscoelastic_time')
+    parser.add_argument(
+        '--joint', default='', metavar='NAME', help='actuator, where a bag has several')
+    parser.add_argument(
+        '--profile', default='', metavar='NAME',
+        help='print the profile likelihood of this parameter as well')
+    parser.add_argument(
+        '--out', type=Path, metavar='YAML',
+        help='parameter file to write for planner and plant, if they are identified; one of that '
+             'name is replaced')
+    parser.add_argument(
+        '--report', type=Path, metavar='HTML',
+        help='page to write: data, fit, residuals, intervals; one of that name is replaced')
+    parser.add_argument('--json', action='store_true', help='print one JSON object')
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """
+    Read, identify and print.
+
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+        As parsed.
+
+    Returns
+    -------
+    int
+        Exit status: 0 only if the parameters are identified.
+
+    Raises
+    ------
+    BadInputError
+        If the recording or a file cannot be used.
+
+    """
+    _check_targets(arguments)
+
+    from hmsa_ros.identification.files import file_text, read_belief
+    from hmsa_ros.identification.identify import identify, profile
+    from hmsa_ros.identification.quantities import DEFAULT_FREE
+
+    belief = read_belief(arguments.params_file)
+    recording, belief = _read(arguments, belief)
+    free = [x for x in arguments.free.split(',') if x] or DEFAULT_FREE
+    found = identify(recording, free=free, actuator=belief.actuator, known=belief.others)
+    curve = profile(found, arguments.profile) if arguments.profile else []
+    good = found.verdict == 'identified'
+    written = []
+    if arguments.out is not None and good:
+        from datetime import datetime
+
+        now = datetime.now().astimezone()
+        _write(arguments.out, file_text(found, belief, str(arguments.recording), now))
+        written.append(arguments.out)
+    if arguments.report is not None:
+        from hmsa_ros.identification.page import page
+
+        _write(arguments.report, page(found))
+        written.append(arguments.report)
+    if arguments.json:
+        record = found.record()
+        if curve:
+            record['profile'] = {'name': arguments.profile, 'points': curve}
+        print(json.dumps(record, indent=2, allow_nan=False))
+    else:
+        for line in table(found):
+            print(line)
+        for value, deviance in curve:
+            print(f'profile {arguments.profile} {value:.8g} deviance {deviance:.4g}')
+        for path in written:
+            print(f'{path} written')
+    if not good:
+        refused = f'; {arguments.out} was not written' if arguments.out is not None else ''
+        print(f'hmsa: {found.verdict}: {found.reason}{refused}', file=sys.stderr)
+    return 0 if good else 1
+
+
+def _check_targets(arguments: argparse.Namespace) -> None:
+    """Refuse what cannot be written before anything is read."""
+    targets = [x for x in (arguments.out, arguments.report) if x is not None]
+    sources = [x.resolve() for x in (
+        arguments.recording, arguments.commands) if x is not None]
+    for target in targets:
+        if target.is_dir() or target.resolve() in sources or not (
+                target.resolve().parent.is_dir()):
+            raise BadInputError(
+                f'cannot write {target}: expected a file of its own in a folder that exists')
+
+
+def _read(
+        arguments: argparse.Namespace, belief: 'Belief') -> 'tuple[Recording, Belief]':
+    """Return the recording, and what is known with what the bag says of it."""
+    from dataclasses import replace
+    import math
+
+    path: Path = arguments.recording
+    if path.is_dir() or path.suffix == '.mcap':
+        from hmsa_ros.identification.runs import read_bag
+
+        if arguments.commands is not None:
+            raise BadInputError(
+                f'--commands {arguments.commands} is given for the bag {path}: a bag has its '
+                'own commands; expected a CSV of samples with it')
+        given = belief.actuator if arguments.params_file is not None else None
+        recording, actuator, known = read_bag(path, joint=arguments.joint, actuator=given)
+        return recording, replace(
+            belief, actuator=actuator, others={**known, **belief.others})
+    from hmsa_ros.identification.tables import read_csv
+
+    slew = belief.number('slew_limit', 0.0) or math.inf
+    return read_csv(path, arguments.commands, slew_limit=slew), belief
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding='utf-8')
+    except OSError as error:
+        raise BadInputError(
+            f'cannot write {path}: {error.strerror or error}; expected a folder with write '
+            'permission') from error
+
+
+def table(found: 'Identification') -> list[str]:
+    """
+    Return the result, a line each.
+
+    Parameters
+    ----------
+    found : Identification
+        What was found.
+
+    Returns
+    -------
+    list of str
+        Aligned.
+
+    """
+    lines = [f'{"parameter":<22}{"value":>14}{"std":>11}{"95 % interval":>28}  unit']
+    for name in found.names:
+        x = found.parameters[name]
+        if x.value != x.value:
+            lines.append(f'{name:<22}{"not identifiable":>53}  {x.unit}')
+            continue
+        interval = f'{x.low:.6g} to {x.high:.6g}'
+        lines.append(f'{name:<22}{x.value:>14.7g}{x.std:>11.2g}{interval:>28}  {x.unit}')
+    lines.append(
+        f'noise {found.noise_std:.3g}, residual rms {found.residual_rms:.3g}, '
+        f'{found.samples} samples')
+    if found.verdict == 'identified':
+        lines += [f'{one} and {other} are confounded: correlation {x:.3f}'
+                  for one, other, x in found.confounded()]
+        lines.append(f'identified: {found.reason}')
+    return [*lines, *(f'note: {x}' for x in found.warnings)]

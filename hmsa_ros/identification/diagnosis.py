@@ -1,0 +1,368 @@
+"""Whether data hold the parameters, and whether the model holds the data."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from hmsa_ros.core.model import Array
+from hmsa_ros.identification.fit import Fit
+from hmsa_ros.identification.noise import autocorrelation, inflation, Whiteness, whiteness
+from hmsa_ros.identification.quantities import QUANTITIES
+from hmsa_ros.identification.recording import Recording
+from hmsa_ros.identification.response import respond
+from hmsa_ros.identification.result import Signature
+
+# Deviation, in the coordinates, from which on a number is none: of positive values a quarter.
+_RELATIVE = 0.25
+# Components of a direction below this share of the largest are left out.
+_NAMED = 0.2
+# A signature counts from this share of the residuals and this many deviations on.
+_SHARE, _DEVIATIONS = 0.02, 4.5
+# Residuals in motion this much above those at rest are of the model, not of the sensor.
+_IN_MOTION = 2.0
+_FEWEST_PARTS = 8
+_NUMERICAL = 1e-6  # residuals below this are those of the integration
+_DISTANT = 0.1  # residual over motion from which on nothing was fitted
+
+
+def allowed(fit: Fit) -> Array:
+    """Return the deviation of each free parameter's coordinate that still leaves a number."""
+    values = fit.values
+    unit = values['time_unit']
+    load = 4.0 * values['half_length'] ** 2 * values['shear_modulus']
+    per_zeta = 8.0 * values['half_length'] * values['half_thickness'] * math.sqrt(
+        values['density'] * values['shear_modulus'])
+    limits = {
+        'chain_limit': _RELATIVE / min(values['chain_limit'], 1e3),
+        'damping_coefficient': _RELATIVE * max(values['damping_coefficient'], 0.05 * per_zeta),
+        'stretch_bias': 0.05, 'stretch_gain': 0.1, 'sensor_latency': 0.5 * unit,
+        'coil_time_constant': max(_RELATIVE * values['coil_time_constant'], 0.1 * unit),
+        'constant_force': 0.1 * load, 'initial_stretch': 0.05, 'initial_rate': 0.5 / unit,
+        'viscoelastic_ratio': 0.05, 'viscoelastic_time': 0.5}
+    return np.array([limits.get(x, _RELATIVE) for x in fit.free])
+
+
+@dataclass(frozen=True)
+class Weakness:
+    """
+    Parameters, or a combination of them, that the data do not hold.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Parameters without a number.
+    words : str
+        What is not held, and what to record instead.
+
+    """
+
+    names: tuple[str, ...]
+    words: str
+
+
+def weakness(fit: Fit, deviation: float, factors: Array) -> Weakness | None:
+    """
+    Return what the data do not hold.
+
+    Parameters
+    ----------
+    fit : Fit
+        The optimum.
+    deviation : float
+        Standard deviation of a sample.
+    factors : ndarray, shape (p,)
+        By which correlation widens the deviations.
+
+    Returns
+    -------
+    Weakness or None
+        None if every number can be given.
+
+    """
+    limits = allowed(fit)
+    scaled = limits / np.maximum(factors, 1.0) / deviation
+    matrix = fit.information * np.outer(scaled, scaled)
+    size, directions = np.linalg.eigh(matrix)
+    size = np.maximum(size, 1e-13 * max(float(size[-1]), 1e-300))
+    variances = (directions ** 2) @ (1.0 / size)
+    names = tuple(x for x, y in zip(fit.free, variances, strict=True) if y > 1.0)
+    if not names:
+        return None
+    sentences = []
+    for i in np.flatnonzero(size < 1.0 * len(limits)):
+        parts = directions[:, i] * limits
+        relative = np.abs(directions[:, i])
+        chosen = [j for j in np.argsort(-relative) if relative[j] >= _NAMED * np.max(relative)]
+        if not set(names).intersection(fit.free[j] for j in chosen):
+            continue
+        if len(chosen) == 1:
+            sentences.append(f'{fit.free[chosen[0]]} hardly changes the recorded stretch')
+        else:
+            share = 0.1 / _RELATIVE / max(relative[chosen[0]], 1e-12)
+            words = ', '.join(
+                _change(fit, j, parts[j] * share, parts[chosen[0]]) for j in chosen)
+            sentences.append(
+                f'{_listed([fit.free[j] for j in chosen])} are held only together: {words} '
+                'at the same time leaves the recorded stretch as it is within the noise')
+    advice = list(dict.fromkeys(
+        QUANTITIES[x].advice for x in names if QUANTITIES[x].advice))
+    if {'shear_modulus', 'density', 'remanence'} <= set(fit.free) or (
+            {'shear_modulus', 'time_unit', 'remanence'} <= set(fit.free)):
+        advice = [QUANTITIES['density'].advice]
+    listed = '; '.join(sentences) or 'the recorded stretch hardly depends on them'
+    return Weakness(names, (
+        f'{_listed(list(names))} cannot be told from this recording: {listed}. Instead, '
+        f'{"; or ".join(advice[:3])}; or leave out of --free what is known'))
+
+
+def _change(fit: Fit, place: int, change: float, first: float) -> str:
+    """Word a change of one parameter along a direction in which the first one grows."""
+    name = fit.free[place]
+    change = math.copysign(1.0, first) * change
+    kind = QUANTITIES[name].scale
+    if kind == 'linear':
+        value = fit.values[name]
+        if name == 'damping_coefficient' and value > 0.0:
+            return f'{name} {100.0 * change / value:+.3g} %'
+        unit = QUANTITIES[name].unit
+        return f'{name} {change:+.3g}{" " + unit if unit else ""}'
+    if kind == 'inverse':
+        change = -change * fit.values[name]
+    return f'{name} {100.0 * change:+.3g} %'
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f'{", ".join(names[:-1])} and {names[-1]}'
+
+
+@dataclass(frozen=True, eq=False)
+class _Columns:
+    """Directions of the residuals that stand for something the model leaves out."""
+
+    recording: Recording
+    fit: Fit
+    at_rest: bool
+
+    def all(self) -> list[tuple[str, Array]]:
+        """Return names and columns."""
+        fit, time = self.fit, self.recording.time
+        unit = fit.values['time_unit']
+        found: list[tuple[str, Array]] = []
+        names = [x for x in ('coil_time_constant', 'sensor_latency') if x not in fit.free]
+        if names:
+            found += [(_WORDS[x], y) for x, y in zip(
+                names, self._by(names, fit.values).T, strict=True)]
+        if 'viscoelastic_ratio' not in fit.free:
+            span = float(time[-1] - time[0])
+            for tau in (2.0 * unit, 0.03 * span, 0.3 * span):
+                column = self._by(
+                    ['viscoelastic_ratio'], {**fit.values, 'viscoelastic_time': tau})
+                found.append((f'creep with a time of {tau:.2g} s', column[:, 0]))
+        middle = 0.5 * (time[0] + time[-1])
+        found.append(('drift of the sensor or the temperature', time - middle))
+        levels = self.recording.levels
+        signs = np.sign(np.diff(levels, prepend=levels[0]))
+        for i in range(1, len(signs)):
+            signs[i] = signs[i] or signs[i - 1]
+        place = np.searchsorted(self.recording.level_times, time, side='right').clip(1) - 1
+        if len(set(signs[place].tolist()) - {0.0}) > 1:
+            found.append((
+                'hysteresis: rest depends on whether the level was raised or lowered',
+                signs[place]))
+        return found
+
+    def _by(self, names: Sequence[str], values: dict[str, float]) -> Array:
+        response = respond(
+            self.recording, values, (*self.fit.free, *names), at_rest=self.at_rest)
+        if response is None:
+            return np.zeros((len(self.recording.time), len(names)))
+        return response.jacobian[:, len(self.fit.free):]
+
+
+_WORDS = {
+    'coil_time_constant': 'lag of the coil', 'sensor_latency': 'latency of the sensor'}
+
+
+def signatures(
+        recording: Recording, fit: Fit, found: Whiteness, *, at_rest: bool
+) -> tuple[Signature, ...]:
+    """
+    Look in the residuals for what the model leaves out.
+
+    Each candidate is a direction; what the free parameters could do of it is taken off first.
+    Its size is held against the noise that would be left without it.
+
+    Parameters
+    ----------
+    recording : Recording
+        What was measured.
+    fit : Fit
+        The optimum.
+    found : Whiteness
+        Of the residuals.
+    at_rest : bool
+        Whether the motion began at rest.
+
+    Returns
+    -------
+    tuple of Signature
+        The largest first.
+
+    """
+    root = np.sqrt(fit.weights)
+    known = np.hstack([fit.response.jacobian, fit.response.by_switch])
+    base, _ = np.linalg.qr(root[:, None] * known / np.maximum(
+        np.linalg.norm(known, axis=0), 1e-300))
+    residual = root * fit.residual
+    total = float(residual @ residual)
+    quantum = recording.quantum
+    results = []
+    for name, column in _Columns(recording, fit, at_rest).all():
+        direction = root * column
+        norm = float(np.linalg.norm(direction))
+        direction = direction - base @ (base.T @ direction)
+        if norm == 0.0 or float(np.linalg.norm(direction)) < 1e-6 * norm or total == 0.0:
+            continue
+        direction /= np.linalg.norm(direction)
+        size = float(direction @ residual)
+        rest = residual - size * direction
+        spread = float(np.linalg.norm(rest)) / math.sqrt(max(len(rest) - len(fit.free) - 1, 1))
+        factor = 1.0 if found.white else inflation(direction, whiteness(rest, len(fit.free)))
+        deviations = abs(size) / max(spread * factor, 1e-300)
+        share = size * size / total
+        results.append(Signature(name, share, deviations, bool(
+            share > _SHARE and deviations > _DEVIATIONS
+            and abs(size) / math.sqrt(len(residual)) > 0.5 * quantum)))
+    if recording.earlier:
+        # Switches at unknown times look like lag and latency, and stand for both.
+        results = [x for x in results if 'coil' not in x.name and 'latency' not in x.name]
+    results += _jitter(recording, fit)
+    if not found.white:
+        results += _second_mode(recording, fit)
+    return tuple(sorted(results, key=lambda x: (-x.found, -x.share)))
+
+
+def _jitter(recording: Recording, fit: Fit) -> list[Signature]:
+    """Look for residuals that grow with the rate: stamps that are not those of the exposure."""
+    if fit.scale < _NUMERICAL:
+        return []
+    keep = fit.weights > 0.0
+    squares, speed = fit.residual[keep] ** 2, fit.response.rate[keep] ** 2
+    centred = speed - np.mean(speed)
+    variance = float(centred @ centred)
+    if variance == 0.0 or not np.any(squares):
+        return []
+    slope = float(centred @ squares) / variance
+    rest = squares - np.mean(squares) - slope * centred
+    deviations = slope / math.sqrt(
+        max(float(np.sum((centred * rest) ** 2)), 1e-300)) * variance
+    share = max(slope * float(np.mean(speed)) / float(np.mean(squares)), 0.0)
+    near = whiteness(fit.residual[keep], len(fit.free)).autocorrelation[1]
+    error = math.sqrt(max(slope, 0.0))
+    return [Signature(
+        f'jitter of the stamps of {error:.2g} s rms', min(share, 1.0), max(deviations, 0.0),
+        bool(share > 0.5 and deviations > _DEVIATIONS and abs(near) < 0.5))]
+
+
+def _second_mode(recording: Recording, fit: Fit) -> list[Signature]:
+    """Look for one sharp frequency in the residuals, of evenly spaced samples."""
+    gaps = np.diff(recording.time)
+    if np.max(gaps) > 1.5 * np.min(gaps):
+        return []
+    power = np.abs(np.fft.rfft(fit.residual * fit.weights)) ** 2
+    power = power[3:]
+    if len(power) < 32 or not np.any(power):
+        return []
+    place = int(np.argmax(power))
+    near = power[max(place - 2, 0):place + 3]
+    share = float(np.sum(near) / np.sum(power))
+    # Fisher's g: the chance of the largest of m exponential shares.
+    chance = len(power) * math.exp(-len(power) * float(power[place]) / float(np.sum(power)))
+    frequency = (place + 3) / (gaps.mean() * len(recording.time))
+    own = math.sqrt(fit.values['shear_modulus'] / fit.values['density'] * 6.0 / (
+        1.0 + 2.0 * (fit.values['half_thickness'] / fit.values['half_length']) ** 2)
+        * 3.0) / fit.values['half_length'] / (2.0 * math.pi)
+    apart = not 0.5 < frequency / own < 2.0
+    return [Signature(
+        f'a second mode at {frequency:.4g} Hz', share,
+        math.sqrt(max(-2.0 * math.log(max(chance, 1e-300)), 0.0)),
+        bool(share > 0.3 and chance < 1e-6 and apart and frequency > own))]
+
+
+def in_motion(recording: Recording, fit: Fit) -> float:
+    """Return how much larger residuals are in motion than at rest; 1 where nobody can tell."""
+    speed = np.abs(fit.response.rate)
+    order = np.argsort(speed)
+    part = len(order) // 4
+    if part < _FEWEST_PARTS:
+        return 1.0
+    slow, fast = (np.sqrt(np.mean((fit.weights * fit.residual ** 2)[x]))
+                  for x in (order[:part], order[-part:]))
+    return float(fast / slow) if slow > 0.0 else 1.0
+
+
+def distant(recording: Recording, fit: Fit, found: Whiteness) -> bool:
+    """Whether nothing of the motion was fitted."""
+    return not found.white and fit.scale > _DISTANT * float(np.std(recording.stretch)) and abs(
+        float(found.autocorrelation[1])) > 0.2
+
+
+def misfit(
+        recording: Recording, fit: Fit, found: Whiteness, marks: Sequence[Signature]
+) -> str:
+    """
+    Return why the model is rejected, empty if it is not.
+
+    Parameters
+    ----------
+    recording : Recording
+        What was measured.
+    fit : Fit
+        The optimum.
+    found : Whiteness
+        Of the residuals.
+    marks : sequence of Signature
+        What was looked for.
+
+    Returns
+    -------
+    str
+        A sentence with the figures.
+
+    """
+    motion = float(np.std(recording.stretch))
+    figures = (
+        f'residuals of {fit.scale:.3g} with an autocorrelation of '
+        f'{float(autocorrelation(fit.residual * np.sqrt(fit.weights))[1]):.2f} from one sample '
+        f'to the next (white with a probability of {found.p_value:.2g})')
+    if distant(recording, fit, found):
+        return (
+            f'no motion of the model is like the recorded one: {figures}, against a motion of '
+            f'{motion:.3g} rms; are levels and samples of one clock, of one run and in tesla, '
+            'and is the block described by --params-file?')
+    if fit.scale < _NUMERICAL:
+        return ''
+    seen = [x for x in marks if x.found]
+    if seen:
+        words = '; '.join(
+            f'{x.name} ({x.share:.0%} of them, {x.deviations:.0f} deviations)' for x in seen[:3])
+        return f'the model leaves {figures}, which look like {words}{_remedy(seen)}'
+    ratio = in_motion(recording, fit)
+    if not found.white and ratio > _IN_MOTION and recording.quantum == 0.0 and (
+            abs(float(found.autocorrelation[1])) > 0.3):
+        return (
+            f'the model leaves {figures}, {ratio:.1f} times as large in fast motion as in '
+            'slow: something moves that the model does not know; compare --report')
+    return ''
+
+
+def _remedy(seen: Sequence[Signature]) -> str:
+    """Word which parameters to free for what explains nearly as much as the first."""
+    names = [
+        name for word, name in (
+            ('creep', 'viscoelastic_ratio,viscoelastic_time'),
+            ('coil', 'coil_time_constant'), ('latency', 'sensor_latency'))
+        if any(word in x.name and x.share > 0.8 * seen[0].share for x in seen)]
+    return f'; add {" or ".join(names)} to --free' if names else ''

@@ -1,0 +1,224 @@
+"""
+The parameter file that an identification leaves, and what is read back out of one.
+
+It is the YAML that planner and plant take. The covariance travels in it as ROS parameters that
+no node declares, and that nodes leave alone: ``identification.names``, and
+``identification.covariance`` row after row.
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from datetime import datetime
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from hmsa_ros.core.model import Array
+from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification.quantities import actuator_of, check_free, QUANTITIES
+from hmsa_ros.identification.result import Identification
+
+_BLOCK = tuple(ActuatorParameters.__dataclass_fields__)
+# What coil and sensor have, by the name in parameter files.
+_OTHERS = {
+    'coil_time_constant': 'coil_time_constant', 'stretch_bias': 'stretch_bias',
+    'stretch_gain': 'stretch_gain', 'initial_stretch': 'initial_stretch'}
+_LISTS = {
+    'viscoelastic_ratio': 'viscoelastic.ratio', 'viscoelastic_time': 'viscoelastic.time'}
+_PREFIX = 'identification.'
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """
+    What a parameter file says of an actuator and of how well it is known.
+
+    Attributes
+    ----------
+    actuator : ActuatorParameters
+        The block.
+    others : dict of str to float
+        Of coil and sensor.
+    settings : dict of str to object
+        All parameters in the file, by dotted name.
+    names : tuple of str
+        Identified parameters, in the order of the covariance; empty if the file has none.
+    covariance : ndarray, shape (p, p)
+        Of their values in SI.
+
+    """
+
+    actuator: ActuatorParameters
+    others: dict[str, float]
+    settings: dict[str, Any]
+    names: tuple[str, ...]
+    covariance: Array
+
+    def number(self, name: str, default: float) -> float:
+        """Return a setting that is a number."""
+        value = self.settings.get(name)
+        return float(value) if isinstance(value, (int, float)) else default
+
+
+def read_belief(path: Path | None) -> Belief:
+    """
+    Read a parameter file.
+
+    Parameters
+    ----------
+    path : Path, optional
+        YAML as ROS 2 has it; without one everything has its default.
+
+    Returns
+    -------
+    Belief
+        With the defaults of the nodes for what the file leaves out.
+
+    Raises
+    ------
+    BadInputError
+        If the file cannot be read or a value is none.
+
+    """
+    settings: dict[str, Any] = {}
+    if path is not None:
+        try:
+            document = yaml.safe_load(path.read_text(encoding='utf-8'))
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            reason = getattr(error, 'strerror', None) or ' '.join(str(error).split())
+            raise BadInputError(
+                f'{path} cannot be read ({reason}): expected a parameter file (YAML)') from error
+        _collect(document, '', settings)
+        if not settings:
+            raise BadInputError(
+                f'{path} has no ros__parameters: expected a parameter file as hmsa init writes it')
+    default = asdict(paper_actuator())
+    numbers = {x: _number(path, f'actuator.{x}', settings.get(f'actuator.{x}', default[x]))
+               for x in _BLOCK}
+    others = {name: _number(path, key, settings[key])
+              for name, key in _OTHERS.items() if key in settings}
+    for name, key in _LISTS.items():
+        value = settings.get(key)
+        if isinstance(value, list) and len(value) == 1:
+            others[name] = _number(path, key, value[0])
+        elif isinstance(value, list) and len(value) > 1:
+            raise BadInputError(
+                f'{path} gives {len(value)} values of {key}: expected one, since one branch of '
+                'creep is identified')
+    if others.get('viscoelastic_ratio') == 0.0:
+        others.pop('viscoelastic_time', None)
+    names, covariance = _covariance(path, settings)
+    return Belief(ActuatorParameters(**numbers), others, settings, names, covariance)
+
+
+def _collect(value: object, name: str, found: dict[str, Any]) -> None:
+    """Collect what is below ``ros__parameters``, by dotted name."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            whole = '' if key == 'ros__parameters' else f'{name}.{key}' if name else str(key)
+            _collect(inner, whole, found)
+    elif name and not name.startswith('/'):
+        found[name] = value
+
+
+def _number(path: Path | None, name: str, value: object) -> float:
+    if not isinstance(value, (int, float)) or isinstance(value, bool):
+        raise BadInputError(f'{path} gives {name} as {value!r}: expected a number')
+    return float(value)
+
+
+def _covariance(path: Path | None, settings: Mapping[str, Any]) -> tuple[tuple[str, ...], Array]:
+    names = settings.get(f'{_PREFIX}names') or []
+    flat = settings.get(f'{_PREFIX}covariance') or []
+    if not names:
+        return (), np.zeros((0, 0))
+    free = check_free(names)
+    matrix = np.array(flat, dtype=np.float64)
+    if matrix.size != len(free) ** 2 or not np.all(np.isfinite(matrix)):
+        raise BadInputError(
+            f'{path} has {matrix.size} numbers in {_PREFIX}covariance for {len(free)} names: '
+            f'expected {len(free) ** 2} finite ones')
+    return free, matrix.reshape(len(free), len(free))
+
+
+def file_text(found: Identification, belief: Belief, run: str, now: datetime) -> str:
+    """
+    Return the parameter file of an identification.
+
+    Parameters
+    ----------
+    found : Identification
+        What was found.
+    belief : Belief
+        What was known before: settings of it that were not identified are kept.
+    run : str
+        What was recorded, for the comments.
+    now : datetime
+        Date of the identification.
+
+    Returns
+    -------
+    str
+        YAML as ROS 2 has it.
+
+    """
+    lines = [
+        f'# Parameters of an actuator, identified from {run}',
+        f'# on {now.isoformat(" ", "seconds")} by hmsa identify.',
+        f'# Verdict: {found.verdict}: {found.reason}.',
+        f'# Noise {found.noise_std:.3g} of stretch a sample, {found.samples} samples.',
+        *(f'# Note: {x}.' for x in found.warnings),
+        '/**:', '  ros__parameters:']
+    written: dict[str, Any] = {}
+    for name, value in asdict(actuator_of(found.values)).items():
+        source = 'time_unit' if name == 'density' and 'time_unit' in found.names else name
+        lines.append(_line(f'actuator.{name}', value, found, source))
+        written[f'actuator.{name}'] = value
+    for name, key in {**_OTHERS, **_LISTS}.items():
+        if name in found.names:
+            value = found.values[name]
+            lines.append(_line(key, [value] if name in _LISTS else value, found, name))
+            written[key] = value
+    for key, value in belief.settings.items():
+        if key not in written and not key.startswith(_PREFIX):
+            lines.append(f'    {key}: {_yaml(value)}')
+    lines += [
+        '    # The covariance of the values named, row after row, in SI units.',
+        f'    {_PREFIX}verdict: {found.verdict}',
+        f'    {_PREFIX}noise_std: {_yaml(found.noise_std)}',
+        f'    {_PREFIX}names: {_yaml(list(found.names))}',
+        f'    {_PREFIX}covariance: {_yaml(found.covariance.ravel().tolist())}']
+    return '\n'.join(lines) + '\n'
+
+
+def _line(key: str, value: Any, found: Identification, name: str) -> str:
+    """Return the line of a value with its deviation and interval."""
+    estimate = found.parameters[name]
+    if not estimate.free:
+        return f'    {key}: {_yaml(value)}  # not identified'
+    unit = f' {QUANTITIES[name].unit}' if QUANTITIES[name].unit else ''
+    of = '' if key.endswith(name) or '.' in key and name in _LISTS else f'{name} '
+    return (
+        f'    {key}: {_yaml(value)}  # {of}standard deviation {estimate.std:.3g}{unit}, 95 % '
+        f'interval {estimate.low:.6g} to {estimate.high:.6g}')
+
+
+def _yaml(value: Any) -> str:
+    """Return a value as every reader of YAML takes it, numbers with a point."""
+    if isinstance(value, bool):
+        return 'true' if value else 'false'
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            return '.nan' if math.isnan(value) else '.inf' if value > 0.0 else '-.inf'
+        text = repr(value)
+        mantissa, letter, exponent = text.partition('e')
+        return f'{mantissa}.0e{exponent}' if letter and '.' not in mantissa else text
+    if isinstance(value, list):
+        return f'[{", ".join(_yaml(x) for x in value)}]'
+    if isinstance(value, str):
+        return "'" + value.replace("'", "''") + "'"
+    return str(value)

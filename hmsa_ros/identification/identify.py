@@ -1,0 +1,326 @@
+"""Identification from start to verdict."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hmsa_ros.core.model import Array
+from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification import diagnosis
+from hmsa_ros.identification.fit import Fit, fit, loss, robust_scale
+from hmsa_ros.identification.noise import whiteness, widening
+from hmsa_ros.identification.quantities import (
+    check_free,
+    DEFAULT_FREE,
+    derivative,
+    from_coordinate,
+    GEOMETRY,
+    QUANTITIES,
+    to_coordinate,
+    values_of,
+)
+from hmsa_ros.identification.recording import as_recording, Recording
+from hmsa_ros.identification.response import complete
+from hmsa_ros.identification.result import Estimate, Identification, Verdict
+from hmsa_ros.identification.start import scan, segments, starts
+
+_95 = 1.959963984540054
+# Residuals this near to the scatter of their differences are white enough for a first look.
+_NEAR_WHITE = 1.5
+# Neighbours that are both outliers, as a share of all, from which on they may be motion.
+_ADJACENT = 0.002
+# Simulations for each of the starts; the best one goes on.
+_FIRST_PASSES = 25
+# Fits within this share of the deviations, or of the scale, are one optimum.
+_SAME = 0.02
+# A run whose fastest motion after a change of level is this much slower than a step's is shaped.
+_SHAPED = 0.15
+
+
+def identify(
+        time: ArrayLike | Recording, stretch: ArrayLike | None = None,
+        level_times: ArrayLike | None = None, levels: ArrayLike | None = None, *,
+        free: Sequence[str] = DEFAULT_FREE, actuator: ActuatorParameters | None = None,
+        known: Mapping[str, float] | None = None, slew_limit: float = math.inf
+) -> Identification:
+    """
+    Find the parameters of an actuator in a recording of its motion.
+
+    Parameters
+    ----------
+    time : array_like, shape (n,), or Recording
+        Times of the samples in s, increasing; or all of the measured in one record.
+    stretch : array_like, shape (n,)
+        Measured stretch.
+    level_times, levels : array_like, shape (m,)
+        Flux density in T in force from each time in s on.
+    free : sequence of str
+        What is sought, names of `hmsa_ros.identification.quantities.QUANTITIES`.
+    actuator : ActuatorParameters, optional
+        The block as far as it is known; default the paper's.
+    known : mapping of str to float, optional
+        Of coil and sensor, where they are not the defaults.
+    slew_limit : float
+        Rate in T/s at which the amplifier ramps; infinite for steps.
+
+    Returns
+    -------
+    Identification
+        Values, covariance, residuals and verdict.
+
+    Raises
+    ------
+    BadInputError
+        If the data or the names cannot be used.
+
+    """
+    if isinstance(time, Recording):
+        recording = time
+    else:
+        if stretch is None or level_times is None or levels is None:
+            raise BadInputError(
+                'stretch, level_times or levels is missing: expected all three beside time')
+        recording = as_recording(time, stretch, level_times, levels, slew_limit)
+    free = check_free(free)
+    values = complete(values_of(actuator or paper_actuator(), known), ())
+    at_rest = _begins_at_rest(recording) and not {'initial_stretch', 'initial_rate'} & set(free)
+    if not at_rest:
+        values['initial_stretch'] = float(np.median(recording.stretch[:3]))
+        free = tuple(dict.fromkeys((*free, 'initial_stretch', 'initial_rate')))
+    if len(recording.time) < 2 * len(free):
+        raise BadInputError(
+            f'{recording.label} has {len(recording.time)} samples for {len(free)} free '
+            f'parameters: expected {2 * len(free)} or more')
+    best, tried, agreed = _search(recording, values, free, at_rest)
+    return _conclude(recording, best, tried, agreed, at_rest)
+
+
+def _begins_at_rest(recording: Recording) -> bool:
+    """Whether the samples before the first change of level show no motion."""
+    spans = segments(recording, 4)
+    changes = recording.level_times[1:][np.diff(recording.levels) != 0.0]
+    first = float(changes[0]) if len(changes) else math.inf
+    before = recording.stretch[recording.time <= first]
+    if len(before) < 4:
+        return True
+    # Of white noise second differences have a deviation of sqrt(6).
+    tails = [recording.stretch[begin + (end - begin) * 2 // 3:end]
+             for begin, end, _, _ in spans if end - begin >= 15]
+    quiet = min((float(min(np.std(x), np.std(np.diff(x, 2)) / math.sqrt(6.0)))
+                 for x in tails), default=0.0)
+    quiet = max(quiet, 0.5 * recording.quantum, 1e-6)
+    return float(np.std(before)) < 4.0 * quiet
+
+
+def _good(recording: Recording, found: Fit) -> bool:
+    """Whether a fit leaves little but white noise, and outliers here and there."""
+    differences = np.diff(found.residual)
+    out = found.weights < 0.5
+    return bool(
+        found.converged
+        and found.scale < _NEAR_WHITE * robust_scale(differences) / math.sqrt(2.0)
+        and np.count_nonzero(out[1:] & out[:-1]) <= _ADJACENT * len(out))
+
+
+def _search(
+        recording: Recording, values: Mapping[str, float], free: Sequence[str], at_rest: bool
+) -> tuple[Fit, int, int]:
+    """Return the best of the fits, how many there are, and how many ended there."""
+    found: list[Fit] = []
+
+    def tried(candidates: Sequence[Mapping[str, float]]) -> bool:
+        for candidate in candidates:
+            one = fit(recording, candidate, free, at_rest=at_rest, most=_FIRST_PASSES)
+            if one is not None:
+                found.append(one)
+                if _good(recording, one):
+                    return True
+        return False
+
+    given = starts(recording, values, free)
+    # The likeliest first; then all time units, and what else was seen in the data.
+    if not tried(given[:1]) and not tried(
+            scan(recording, values, free, at_rest=at_rest)):
+        tried(given[1:])
+    if not found:
+        raise BadInputError(
+            f'no start value leads to a motion that {recording.label} could be compared with: '
+            'expected levels in T and a block as --params-file describes it; a level may be more '
+            'than the block can hold')
+    scale = min(x.scale for x in found)
+    losses = [loss(x.residual, scale) for x in found]
+    best = found[int(np.argmin(losses))]
+    agreed = sum(x < (1.0 + _SAME) * min(losses) for x in losses)
+    if not best.converged:
+        best = fit(recording, best.values, free, at_rest=at_rest) or best
+    return best, len(found), agreed
+
+
+def _conclude(
+        recording: Recording, best: Fit, tried: int, agreed: int, at_rest: bool
+) -> Identification:
+    """Return the result of a fit."""
+    root = np.sqrt(best.weights)
+    weighted = root * best.residual
+    counted = float(np.sum(best.weights))
+    deviation = math.sqrt(
+        float(weighted @ weighted) / max(counted - len(best.free), 1.0)) or 1e-15
+    found = whiteness(weighted, len(best.free))
+    inverse = _inverse(best.information)
+    factors = widening(root[:, None] * best.jacobian, weighted, inverse, found)
+    covariance = inverse * deviation ** 2 * np.outer(factors, factors)
+    weak = diagnosis.weakness(best, deviation, factors)
+    marks = diagnosis.signatures(recording, best, found, at_rest=at_rest)
+    reason = diagnosis.misfit(recording, best, found, marks)
+    verdict: Verdict = 'model_rejected'
+    distant = diagnosis.distant(recording, best, found)
+    if weak is not None and not distant:
+        verdict, reason = 'not_identifiable', weak.words
+    elif not reason and not best.converged:
+        reason = (
+            f'the search did not come to an end from {tried} starts: the best leaves residuals '
+            f'of {best.scale:.3g}; give a --params-file that is nearer, or free less')
+    elif not reason:
+        verdict = 'identified'
+        reason = (
+            f'{len(best.free)} parameters from {len(recording.time)} samples with a noise of '
+            f'{deviation:.3g}')
+    lost = set(best.free) if verdict == 'model_rejected' and distant else set(
+        weak.names if weak else ())
+    parameters, matrix = _estimates(best, covariance, lost)
+    outliers = int(np.count_nonzero(best.weights == 0.0))
+    warnings = (*recording.notes, *_warnings(recording, best, factors, outliers, found.white))
+    return Identification(
+        verdict, reason, warnings, parameters, best.free, matrix, deviation,
+        float(np.sqrt(np.mean(best.residual ** 2))), len(recording.time), outliers, recording,
+        best.response.stretch, best.residual, best.weights, found, marks,
+        float(np.max(factors)), complete(best.values, best.free), at_rest, tried, agreed)
+
+
+def _inverse(information: Array) -> Array:
+    """Return the inverse of an information matrix, large where it is singular."""
+    size = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    values, vectors = np.linalg.eigh(information / np.outer(size, size))
+    values = np.maximum(values, 1e-13 * values[-1])
+    found: Array = (vectors / values) @ vectors.T / np.outer(size, size)
+    return found
+
+
+def _estimates(
+        best: Fit, covariance: Array, lost: set[str]) -> tuple[dict[str, Estimate], Array]:
+    """Return all parameters with intervals, and the covariance of the free values in SI."""
+    values = complete(best.values, best.free)
+    scales = np.array([derivative(x, values[x]) for x in best.free])
+    matrix = covariance * np.outer(scales, scales)
+    estimates: dict[str, Estimate] = {}
+    for name, quantity in QUANTITIES.items():
+        value = values[name]
+        if name in lost:
+            estimates[name] = Estimate(
+                math.nan, math.nan, math.nan, math.nan, quantity.unit, True)
+        elif name in best.free:
+            place = best.free.index(name)
+            half = _95 * math.sqrt(covariance[place, place])
+            x = to_coordinate(name, value)
+            ends = sorted(from_coordinate(name, y) for y in (x - half, x + half))
+            if quantity.scale == 'inverse' and x - half <= 1e-9:
+                ends[1] = math.inf
+            estimates[name] = Estimate(
+                value, math.sqrt(matrix[place, place]), ends[0], ends[1], quantity.unit, True)
+        else:
+            estimates[name] = Estimate(value, 0.0, value, value, quantity.unit, False)
+    for name in GEOMETRY:
+        value = values[name]
+        estimates[name] = Estimate(value, 0.0, value, value, 'm', False)
+    for place, name in enumerate(best.free):
+        if name in lost:
+            matrix[place, :] = matrix[:, place] = math.nan
+    return estimates, matrix
+
+
+def _warnings(
+        recording: Recording, best: Fit, factors: Array, outliers: int, white: bool
+) -> list[str]:
+    """Return what a reader should know besides the verdict, a sentence each."""
+    found = []
+    if outliers:
+        found.append(
+            f'{outliers} of {len(recording.time)} samples are more than six deviations off and '
+            'did not count')
+    if not white:
+        found.append(
+            'the residuals are not white: correlation widened the intervals by up to '
+            f'{float(np.max(factors)):.3g} times')
+    if recording.quantum:
+        found.append(f'the stretch comes in steps of {recording.quantum:.3g}')
+    if _shaped(recording, best):
+        found.append(
+            'all moves are shaped so that nothing rings: they carry about a sixth of the '
+            'information of plain steps; record what hmsa excite proposes')
+    return found
+
+
+def _shaped(recording: Recording, best: Fit) -> bool:
+    """Whether hardly any motion goes past the stretch that it comes to rest at."""
+    fitted, before = best.response.stretch, None
+    past = []
+    for begin, end, _, _ in segments(recording, 6):
+        rest = float(fitted[end - 1])
+        before = float(fitted[begin]) if before is None else before
+        if abs(rest - before) > 0.01:
+            part = (fitted[begin:end] - rest) / (rest - before)
+            past.append(float(np.max(part)))
+        before = rest
+    return bool(past) and max(past) < _SHAPED
+
+
+def profile(
+        found: Identification, name: str, points: int = 11
+) -> list[tuple[float, float]]:
+    """
+    Return the profile likelihood of a parameter: the best of all others at each of its values.
+
+    Parameters
+    ----------
+    found : Identification
+        The optimum.
+    name : str
+        Of a free parameter.
+    points : int
+        Values over its interval of four deviations on either side.
+
+    Returns
+    -------
+    list of (float, float)
+        Value, and how much the deviance, twice the negative logarithm of the likelihood, lies
+        above that of the optimum: 3.84 at the ends of a 95 % interval.
+
+    Raises
+    ------
+    BadInputError
+        If the parameter was not free.
+
+    """
+    if name not in found.names:
+        raise BadInputError(
+            f'{name} was not free: expected one of {", ".join(found.names)}')
+    others = tuple(x for x in found.names if x != name)
+    place = found.names.index(name)
+    centre = to_coordinate(name, found.values[name])
+    std = math.sqrt(float(found.covariance[place, place])) / abs(
+        derivative(name, found.values[name])) if math.isfinite(
+            found.covariance[place, place]) else 0.2 * max(abs(centre), 0.1)
+    base = float(np.sum(found.weights * found.residual ** 2))
+    kept = replace(found.recording, notes=())
+    rows = []
+    for x in centre + 4.0 * std * np.linspace(-1.0, 1.0, points):
+        values = {**found.values, name: from_coordinate(name, float(x))}
+        one = fit(kept, values, others, at_rest=found.at_rest) if others else None
+        if one is not None:
+            loss = float(np.sum(found.weights * one.residual ** 2))
+            rows.append((values[name], max(loss - base, 0.0) / found.noise_std ** 2))
+    return rows

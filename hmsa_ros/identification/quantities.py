@@ -1,0 +1,191 @@
+"""What can be estimated: names, units, ranges, and the coordinate in which each is sought."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+import math
+
+from hmsa_ros.core.parameters import ActuatorParameters
+from hmsa_ros.errors import BadInputError
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """
+    One parameter of actuator, coil or sensor.
+
+    Attributes
+    ----------
+    unit : str
+        In plain text; empty for a dimensionless value.
+    default : float
+        Where neither a file nor a caller gives one; NaN for what the actuator always has.
+    scale : {'log', 'inverse', 'linear'}
+        Coordinate of the search: positive values by their logarithm, the chain limit by its
+        inverse, which is 0 for chains without a limit.
+    least, most : float
+        Admissible values.
+    advice : str
+        What to record, or to measure, where the data do not hold it.
+
+    """
+
+    unit: str
+    default: float = math.nan
+    scale: str = 'log'
+    least: float = 0.0
+    most: float = math.inf
+    advice: str = ''
+
+
+_STEP = 'record plain steps that ring, at a rate above twice the frequency of the ringing'
+_SCALE = ('only ratios of shear_modulus, density and remanence act on the motion: measure one of '
+          'them (weigh the block for the density) and leave it out of --free')
+_CREEP = 'record rest at a large stretch for several times the time of the creep'
+#: By name; those of the actuator are named as its parameters are.
+QUANTITIES: dict[str, Quantity] = {
+    'shear_modulus': Quantity('Pa', advice=_STEP),
+    'density': Quantity('kg/m^3', advice=_SCALE),
+    'remanence': Quantity('T', advice='record rest at two or more levels that differ widely'),
+    'chain_limit': Quantity(
+        '', scale='inverse', advice='record larger stretches, and rest at three or more levels'),
+    'damping_coefficient': Quantity('N s/m', scale='linear', advice=_STEP),
+    'time_unit': Quantity('s', advice=_STEP),
+    'stretch_bias': Quantity(
+        '', 0.0, 'linear', -math.inf, advice='record rest without field, or calibrate the '
+        'sensor there'),
+    'stretch_gain': Quantity(
+        '', 1.0, advice='calibrate the sensor with a known length and leave stretch_gain out of '
+        '--free: its gain looks like remanence and chain_limit'),
+    'sensor_latency': Quantity(
+        's', 0.0, 'linear', -math.inf, advice='record plain steps with stamps of one clock'),
+    'coil_time_constant': Quantity(
+        's', 0.0, 'linear', advice='record steps at more than two samples per time constant'),
+    'constant_force': Quantity(
+        'N', 0.0, 'linear', -math.inf, advice='record rest at three or more levels of both '
+        'signs'),
+    'initial_stretch': Quantity('', 1.0, advice='begin to record before the first step'),
+    'initial_rate': Quantity(
+        '1/s', 0.0, 'linear', -math.inf, advice='begin to record at rest'),
+    'viscoelastic_ratio': Quantity('', 0.0, 'linear', advice=_CREEP),
+    'viscoelastic_time': Quantity('s', 0.01, advice=_CREEP),
+}
+#: Free unless others are named.
+DEFAULT_FREE = (
+    'shear_modulus', 'damping_coefficient', 'chain_limit', 'remanence', 'stretch_bias')
+#: Fields of `ActuatorParameters` that are measured with a ruler, and are never sought.
+GEOMETRY = ('half_length', 'half_thickness')
+
+
+def check_free(names: Iterable[str]) -> tuple[str, ...]:
+    """
+    Return the names of free parameters, checked.
+
+    Parameters
+    ----------
+    names : iterable of str
+        As asked for; ``actuator.`` before a name is dropped.
+
+    Returns
+    -------
+    tuple of str
+        Each once.
+
+    Raises
+    ------
+    BadInputError
+        If a name is unknown, none is given, or two exclude each other.
+
+    """
+    free = tuple(dict.fromkeys(x.strip().removeprefix('actuator.') for x in names))
+    unknown = [x for x in free if x not in QUANTITIES]
+    if unknown or not free:
+        raise BadInputError(
+            f'free parameter {", ".join(map(repr, unknown)) or "missing"}: expected some of '
+            f'{", ".join(QUANTITIES)}')
+    if 'time_unit' in free and 'density' in free:
+        raise BadInputError(
+            'both time_unit and density are free: expected one of them, since one follows from '
+            'the other')
+    return free
+
+
+def values_of(
+        actuator: ActuatorParameters, others: Mapping[str, float] | None = None
+) -> dict[str, float]:
+    """
+    Return values of all quantities.
+
+    Parameters
+    ----------
+    actuator : ActuatorParameters
+        The block.
+    others : mapping of str to float, optional
+        Of coil and sensor, where they are not the defaults.
+
+    Returns
+    -------
+    dict of str to float
+        By name, geometry included.
+
+    Raises
+    ------
+    BadInputError
+        If a name is unknown or a value out of range.
+
+    """
+    values = {name: x.default for name, x in QUANTITIES.items()}
+    values |= asdict(actuator) | {'time_unit': actuator.time_unit}
+    for name, value in (others or {}).items():
+        quantity = QUANTITIES.get(name)
+        if quantity is None:
+            raise BadInputError(
+                f'unknown parameter {name!r}: expected some of {", ".join(QUANTITIES)}')
+        if not (quantity.least <= value <= quantity.most and math.isfinite(value)):
+            raise BadInputError(
+                f'{name} is {value:g}: expected a finite number of at least {quantity.least:g}')
+        values[name] = float(value)
+    return values
+
+
+def actuator_of(values: Mapping[str, float]) -> ActuatorParameters:
+    """
+    Return the block of some values.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        As `values_of` returns them.
+
+    Returns
+    -------
+    ActuatorParameters
+        In SI units.
+
+    """
+    return ActuatorParameters(
+        shear_modulus=values['shear_modulus'], density=values['density'],
+        half_length=values['half_length'], half_thickness=values['half_thickness'],
+        remanence=values['remanence'], chain_limit=min(values['chain_limit'], 1e9),
+        damping_coefficient=values['damping_coefficient'])
+
+
+def to_coordinate(name: str, value: float) -> float:
+    """Return the coordinate of a value in the search."""
+    scale = QUANTITIES[name].scale
+    return math.log(value) if scale == 'log' else 1.0 / value if scale == 'inverse' else value
+
+
+def from_coordinate(name: str, x: float) -> float:
+    """Return the value of a coordinate; a chain limit beyond all data is infinite."""
+    scale = QUANTITIES[name].scale
+    if scale == 'log':
+        return math.exp(min(max(x, -230.0), 230.0))
+    if scale == 'inverse':
+        return 1.0 / x if x > 1e-9 else 1e9
+    return x
+
+
+def derivative(name: str, value: float) -> float:
+    """Return the derivative of a value by its coordinate."""
+    scale = QUANTITIES[name].scale
+    return value if scale == 'log' else -value * value if scale == 'inverse' else 1.0

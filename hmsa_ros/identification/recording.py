@@ -1,0 +1,234 @@
+"""What was measured: samples of the stretch and the levels of the field, as arrays."""
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hmsa_ros.core.model import Array
+from hmsa_ros.errors import BadInputError
+
+#: Fewer samples than this hold no motion and five parameters.
+FEWEST = 12
+# Motion below this share of the stretch, or of the scatter from sample to sample, is none.
+_LEAST_MOTION = 1e-7
+_TIMES_SCATTER = 4.0
+# A crest is cut off where the value stays exactly at an extreme between samples that differ by
+# this share of the whole range.
+_CLIPPED_SLOPE = 0.01
+_CLIPPED_SAMPLES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """
+    A measured motion.
+
+    Attributes
+    ----------
+    time : ndarray, shape (n,)
+        Times of the samples in s, increasing; n of at least 12.
+    stretch : ndarray, shape (n,)
+        Measured stretch.
+    level_times, levels : ndarray, shape (m,)
+        Flux density in T in force from each time on, increasing in time; m of at least 1.
+    slew_limit : float
+        Rate in T/s at which the amplifier ramps; infinite for steps.
+    earlier : float
+        By how much in s the levels may have switched before their times, as where they were
+        sampled; 0 where the times are true.
+    label : str
+        Name for people.
+    notes : tuple of str
+        What a reader should know, one sentence each.
+
+    Raises
+    ------
+    BadInputError
+        If shapes differ, a value is not finite, times do not increase, the actuator never moved
+        or the sensor was saturated.
+
+    """
+
+    time: Array
+    stretch: Array
+    level_times: Array
+    levels: Array
+    slew_limit: float = math.inf
+    earlier: float = 0.0
+    label: str = 'recording'
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check the arrays."""
+        for name in ('time', 'stretch', 'level_times', 'levels'):
+            values = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
+            if values.ndim != 1 or not np.all(np.isfinite(values)):
+                raise BadInputError(
+                    f'{name} of {self.label} is not one row of finite numbers: got shape '
+                    f'{values.shape} with {np.count_nonzero(~np.isfinite(values))} that are not '
+                    'finite')
+            values.setflags(write=False)
+            object.__setattr__(self, name, values)
+        for one, other in (('time', 'stretch'), ('level_times', 'levels')):
+            times, values = getattr(self, one), getattr(self, other)
+            if len(times) != len(values):
+                raise BadInputError(
+                    f'{self.label} has {len(times)} {one} and {len(values)} {other}: expected '
+                    'as many of both')
+            if np.any(np.diff(times) <= 0.0):
+                place = int(np.argmax(np.diff(times) <= 0.0)) + 1
+                raise BadInputError(
+                    f'{one} of {self.label} goes from {times[place - 1]:.9g} to '
+                    f'{times[place]:.9g} s: expected increasing times')
+        if not self.slew_limit > 0.0:
+            raise BadInputError(
+                f'slew limit is {self.slew_limit:g} T/s: expected a number above 0')
+        if not 0.0 <= self.earlier < math.inf:
+            raise BadInputError(
+                f'levels may have switched {self.earlier:g} s earlier: expected a finite time of '
+                'at least 0')
+        self._check_motion()
+
+    def _check_motion(self) -> None:
+        count = len(self.time)
+        if count < FEWEST:
+            raise BadInputError(
+                f'{self.label} has {count} samples: expected {FEWEST} or more, and some ten for '
+                'each parameter')
+        if not len(self.levels):
+            raise BadInputError(f'{self.label} has no level: expected the flux density in T')
+        if np.min(self.stretch) <= 0.0 or np.max(self.stretch) > 20.0:
+            raise BadInputError(
+                f'{self.label} has stretches from {np.min(self.stretch):.6g} to '
+                f'{np.max(self.stretch):.6g}: expected the length over the length at rest, '
+                'around 1; is it a length in mm?')
+        if np.max(np.abs(self.levels)) > 20.0:
+            raise BadInputError(
+                f'{self.label} has flux densities up to {np.max(np.abs(self.levels)):.6g} T: '
+                'expected tesla; is it in mT?')
+        spread = float(np.quantile(self.stretch, 0.99) - np.quantile(self.stretch, 0.01))
+        # White noise alone spreads by 4.65 of its deviation; a motion is slow from one to next.
+        scatter = float(np.median(np.abs(np.diff(self.stretch)))) / 0.954
+        jitter = scatter / 1.414
+        during = self.levels[np.searchsorted(
+            self.level_times, [self.time[0], self.time[-1]], side='right').clip(1) - 1]
+        inside = (self.level_times > self.time[0]) & (self.level_times < self.time[-1])
+        driven = np.ptp(np.append(during, self.levels[inside])) > 0.0
+        still = spread < _LEAST_MOTION or (not driven and spread < _TIMES_SCATTER * 1.5 * jitter)
+        if driven and not still:
+            still = self._unmoved(jitter)
+        if still:
+            raise BadInputError(
+                f'the stretch of {self.label} stays within {spread:.3g}, scatter {jitter:.2g}: '
+                'expected a motion; was the coil on, and is it the column of the stretch?')
+        clipped = self._clipped()
+        if clipped:
+            raise BadInputError(
+                f'the stretch of {self.label} is cut off {clipped} times at '
+                f'{np.min(self.stretch):.6g} or {np.max(self.stretch):.6g}: expected a sensor '
+                'within its range; the crests are lost, and a fit would be wrong without a sign')
+
+    def _unmoved(self, jitter: float) -> bool:
+        """Whether nothing differs between the levels, nor from sample to sample but noise."""
+        edges = np.searchsorted(self.time, self.level_times)
+        parts = [x for x in np.split(self.stretch, np.unique(edges)) if len(x) >= 4]
+        if len(parts) < 2:
+            return False
+        means = np.array([np.mean(x) for x in parts])
+        errors = np.array([jitter / math.sqrt(len(x)) for x in parts])
+        same = bool(np.all(np.abs(means - np.mean(self.stretch)) < 5.0 * errors + 1e-12))
+        quiet = float(np.std(self.stretch)) < 1.3 * jitter + 1e-12
+        return same and quiet
+
+    def _clipped(self) -> int:
+        """Return how many crests are cut off by the end of the sensor's range."""
+        y = self.stretch
+        steep = _CLIPPED_SLOPE * float(np.ptp(y))
+        count = 0
+        for extreme in (np.min(y), np.max(y)):
+            flat = np.concatenate([[0], (y == extreme).astype(np.int8), [0]])
+            begins, ends = np.flatnonzero(np.diff(flat) == 1), np.flatnonzero(
+                np.diff(flat) == -1)
+            for begin, end in zip(begins, ends, strict=True):
+                if (end - begin >= _CLIPPED_SAMPLES and begin > 0 and end < len(y)
+                        and abs(y[begin - 1] - extreme) > steep
+                        and abs(y[end] - extreme) > steep):
+                    count += 1
+        return count if count > 1 else 0
+
+    @property
+    def uncertain(self) -> NDArray[np.int64]:
+        """Places of the levels that switch at an uncertain time while samples are taken."""
+        if self.earlier == 0.0:
+            return np.zeros(0, np.int64)
+        inside = (self.level_times > self.time[0]) & (self.level_times <= self.time[-1])
+        return np.flatnonzero(inside)
+
+    @property
+    def quantum(self) -> float:
+        """Step in which the values come; 0 where they are not quantised."""
+        values = np.unique(self.stretch)
+        if len(values) > 0.5 * len(self.stretch) or len(values) < 2:
+            return 0.0
+        steps = np.diff(values)
+        least = float(np.min(steps))
+        whole = steps / least
+        return least if float(np.max(np.abs(whole - np.round(whole)))) < 0.01 else 0.0
+
+
+def pieces(
+        times: Array, levels: Array, slew: float, begin: float
+) -> tuple[Array, Array, Array]:
+    """
+    Return the amplifier's level as pieces of lines.
+
+    Parameters
+    ----------
+    times, levels : ndarray, shape (m,)
+        Commanded levels in T from each time on.
+    slew : float
+        Rate of the ramps in T/s; infinite for steps.
+    begin : float
+        Time in s of the begin: the level in force then has been reached.
+
+    Returns
+    -------
+    begins, values, slopes : ndarray, shape (k,)
+        The level is ``values + slopes (t - begins)`` from each of ``begins`` on.
+
+    """
+    first = max(int(np.searchsorted(times, begin, side='right')) - 1, 0)
+    level = float(levels[first])
+    ahead = range(first + 1, len(times))
+    if math.isinf(slew):
+        places = list(ahead)
+        return (np.append(begin, times[places]), np.append(level, levels[places]),
+                np.zeros(1 + len(places)))
+    rows = [(begin, level, 0.0)]
+    for i in ahead:
+        start, target = float(times[i]), float(levels[i])
+        until = float(times[i + 1]) if i + 1 < len(times) else math.inf
+        sign = math.copysign(slew, target - level)
+        duration = abs(target - level) / slew
+        if start + duration <= until:
+            rows += [(start, level, sign if duration else 0.0), (start + duration, target, 0.0)]
+            level = target
+        else:
+            rows.append((start, level, sign))
+            level += sign * (until - start)
+    table = np.array(rows)
+    # Of pieces that begin at once the last one counts.
+    keep = np.append(np.diff(table[:, 0]) > 0.0, True)
+    return table[keep, 0].copy(), table[keep, 1].copy(), table[keep, 2].copy()
+
+
+def as_recording(
+        time: ArrayLike, stretch: ArrayLike, level_times: ArrayLike, levels: ArrayLike,
+        slew_limit: float = math.inf) -> Recording:
+    """Return a recording of arrays or lists."""
+    return Recording(
+        np.asarray(time, dtype=np.float64), np.asarray(stretch, dtype=np.float64),
+        np.atleast_1d(np.asarray(level_times, dtype=np.float64)),
+        np.atleast_1d(np.asarray(levels, dtype=np.float64)), slew_limit)

@@ -1,0 +1,211 @@
+"""The simulated measurement of a recording, with its derivatives by the free parameters."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.constants import mu_0
+
+from hmsa_ros.core.model import Array, equilibrium_stretch
+from hmsa_ros.identification import kernels
+from hmsa_ros.identification.quantities import derivative, QUANTITIES
+from hmsa_ros.identification.recording import pieces, Recording
+
+#: Relative tolerance of the integration: far below the noise of any sensor.
+RTOL = 1e-8
+_SENSOR = ('stretch_bias', 'stretch_gain', 'sensor_latency')
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """
+    What the sensor would have shown.
+
+    Attributes
+    ----------
+    stretch, rate : ndarray, shape (n,)
+        Measured stretch, and rate of the block in 1/s.
+    jacobian : ndarray, shape (n, p)
+        Derivatives of the measured stretch by the coordinates of the free parameters.
+    by_switch : ndarray, shape (n, u)
+        Derivatives by the uncertain times of switches.
+
+    """
+
+    stretch: Array
+    rate: Array
+    jacobian: Array
+    by_switch: Array
+
+
+def _chain(
+        values: Mapping[str, float], branches: int) -> tuple[Array, dict[str, dict[int, float]]]:
+    """Return theta of the kernel and, by name, its derivatives by the parameters."""
+    length, thickness = values['half_length'], values['half_thickness']
+    inertia = values['density'] * length ** 2
+    a = values['shear_modulus'] / inertia
+    per_damping = thickness / (8.0 * length ** 2) / inertia
+    d = per_damping * values['damping_coefficient']
+    k = values['remanence'] / (mu_0 * inertia)
+    per_force = 1.0 / (4.0 * length ** 2 * inertia)
+    f = per_force * values['constant_force']
+    theta = np.zeros(kernels.FIRST_BRANCH + 2 * branches)
+    theta[:kernels.FIRST_BRANCH] = (
+        a, d, k, f, values['coil_time_constant'], 1.0 / values['chain_limit'],
+        values['initial_stretch'], values['initial_rate'])
+    density = values['density']
+    by_density = {
+        kernels.STIFFNESS: -a / density, kernels.DAMPING: -d / density,
+        kernels.DRIVE: -k / density, kernels.FORCE: -f / density}
+    by_modulus = {kernels.STIFFNESS: a / values['shear_modulus']}
+    chain = {
+        'density': by_density, 'shear_modulus': by_modulus,
+        'remanence': {kernels.DRIVE: k / values['remanence']},
+        'damping_coefficient': {kernels.DAMPING: per_damping},
+        'constant_force': {kernels.FORCE: per_force},
+        'chain_limit': {kernels.CHAIN: -1.0 / values['chain_limit'] ** 2},
+        'coil_time_constant': {kernels.LAG: 1.0},
+        'initial_stretch': {kernels.STRETCH: 1.0}, 'initial_rate': {kernels.RATE: 1.0}}
+    if branches:
+        theta[kernels.FIRST_BRANCH:] = values['viscoelastic_ratio'], values['viscoelastic_time']
+        chain['viscoelastic_ratio'] = {kernels.FIRST_BRANCH: 1.0}
+        chain['viscoelastic_time'] = {kernels.FIRST_BRANCH + 1: 1.0}
+    # The density that goes with a time unit, L sqrt(rho/G).
+    chain['time_unit'] = {i: x * 2.0 * density / values['time_unit']
+                          for i, x in by_density.items()}
+    return theta, chain
+
+
+def complete(values: Mapping[str, float], free: Sequence[str]) -> dict[str, float]:
+    """
+    Return values in which the density and the time unit agree.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Of all quantities.
+    free : sequence of str
+        Where the time unit is free the density follows from it, else the other way round.
+
+    Returns
+    -------
+    dict of str to float
+        Of all quantities.
+
+    """
+    done = dict(values)
+    if 'time_unit' in free:
+        done['density'] = (
+            done['shear_modulus'] * (done['time_unit'] / done['half_length']) ** 2)
+    else:
+        done['time_unit'] = done['half_length'] * math.sqrt(
+            done['density'] / done['shear_modulus'])
+    return done
+
+
+def respond(
+        recording: Recording, values: Mapping[str, float], free: Sequence[str], *,
+        at_rest: bool = True, rtol: float = RTOL, shifts: Array | None = None
+) -> Response | None:
+    """
+    Simulate what the sensor would have shown.
+
+    Parameters
+    ----------
+    recording : Recording
+        Its levels and the times of its samples.
+    values : mapping of str to float
+        Of all quantities.
+    free : sequence of str
+        By which to differentiate.
+    at_rest : bool
+        Whether the motion begins at rest at its first level; else with ``initial_stretch`` and
+        ``initial_rate`` at the first sample.
+    rtol : float
+        Relative tolerance.
+    shifts : ndarray, shape (u,), optional
+        By how much in s the uncertain switches are later than recorded; default half of what
+        they may be earlier.
+
+    Returns
+    -------
+    Response or None
+        None if the motion meets the limits of the chains, where it cannot be followed.
+
+    """
+    values = complete(values, free)
+    branches = int(values['viscoelastic_ratio'] > 0.0 or 'viscoelastic_ratio' in free)
+    theta, chain = _chain(values, branches)
+    if 'time_unit' in free and 'shear_modulus' in free:
+        extra = values['density'] / values['shear_modulus']
+        modulus = dict(chain['shear_modulus'])
+        for i, x in chain['density'].items():
+            modulus[i] = modulus.get(i, 0.0) + x * extra
+        chain['shear_modulus'] = modulus
+    inner = [x for x in free if x not in _SENSOR]
+    wanted = np.array(sorted({i for x in inner for i in chain[x]}), dtype=np.int64)
+    times = recording.time - values['sensor_latency']
+    begin = float(recording.time[0])
+    if at_rest:
+        begin = min(begin, float(recording.level_times[0]), float(times[0]))
+    level_times, uncertain = recording.level_times, recording.uncertain
+    if len(uncertain):
+        level_times = level_times.copy()
+        level_times[uncertain] += -0.5 * recording.earlier if shifts is None else shifts
+    begins, levels, slopes = pieces(level_times, recording.levels, recording.slew_limit, begin)
+    inner_count = len(wanted)
+    if len(uncertain) and free:
+        # Steps: a piece begins with each level.
+        place = np.searchsorted(begins, level_times[uncertain])
+        wanted = np.append(wanted, kernels.SWITCH + place)
+    start = np.zeros(len(wanted))
+    if at_rest and not _set_rest(theta, float(levels[0]), wanted, start):
+        return None
+    if not at_rest:
+        start[wanted == kernels.STRETCH] = 1.0
+    n = len(times)
+    stretch, rate, raw = np.empty(n), np.empty(n), np.empty((n, len(wanted)))
+    c1 = 2.0 * (values['half_thickness'] / values['half_length']) ** 2
+    if not kernels.respond(
+            theta, c1, branches, wanted, start, begins, levels, slopes, float(levels[0]), times,
+            rtol, stretch, rate, raw):
+        return None
+    gain = values['stretch_gain']
+    mixing = np.zeros((inner_count, len(free)))
+    jacobian = np.zeros((n, len(free)))
+    for j, name in enumerate(free):
+        scale = derivative(name, values[name])
+        if name in _SENSOR:
+            jacobian[:, j] = scale * (
+                1.0 if name == 'stretch_bias' else stretch if name == 'stretch_gain'
+                else -gain * rate)
+            continue
+        for i, x in chain[name].items():
+            mixing[np.searchsorted(wanted[:inner_count], i), j] = gain * scale * x
+    jacobian += raw[:, :inner_count] @ mixing
+    return Response(
+        gain * stretch + values['stretch_bias'], rate, jacobian, gain * raw[:, inner_count:])
+
+
+def _set_rest(theta: Array, level: float, wanted: NDArray[np.int64], start: Array) -> bool:
+    """Begin at the rest of a level; return whether there is one."""
+    a, k, f, chain = theta[[
+        kernels.STIFFNESS, kernels.DRIVE, kernels.FORCE, kernels.CHAIN]]
+    rest = float(equilibrium_stretch((k * level + f) / a, 1.0 / max(chain, 1e-9)))
+    p1, p2, p_c = kernels.elastic(rest, chain)
+    if not math.isfinite(p2):
+        return False
+    theta[kernels.STRETCH], theta[kernels.RATE] = rest, 0.0
+    slopes = {kernels.STIFFNESS: -p1, kernels.DRIVE: level, kernels.FORCE: 1.0,
+              kernels.CHAIN: -a * p_c}
+    for j, i in enumerate(wanted.tolist()):
+        start[j] = slopes.get(i, 0.0) / (a * p2)
+    return True
+
+
+def clip(name: str, value: float) -> float:
+    """Return a value within its range."""
+    quantity = QUANTITIES[name]
+    return min(max(value, quantity.least), quantity.most)

@@ -1,0 +1,180 @@
+"""What an identification has found, as one frozen record."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+import math
+from typing import Any, Literal
+
+from hmsa_ros.core.model import Array
+from hmsa_ros.core.parameters import ActuatorParameters
+from hmsa_ros.identification.noise import Whiteness
+from hmsa_ros.identification.quantities import actuator_of
+from hmsa_ros.identification.recording import Recording
+
+Verdict = Literal['identified', 'not_identifiable', 'model_rejected']
+#: Correlation from which two parameters count as confounded.
+CONFOUNDED = 0.95
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """
+    One parameter.
+
+    Attributes
+    ----------
+    value, std : float
+        Value and standard deviation in SI; NaN where the data do not hold it; ``std`` is 0 for
+        one that was not free.
+    low, high : float
+        Ends of the 95 % interval.
+    unit : str
+        In plain text.
+    free : bool
+        Whether it was sought.
+
+    """
+
+    value: float
+    std: float
+    low: float
+    high: float
+    unit: str
+    free: bool
+
+
+@dataclass(frozen=True)
+class Signature:
+    """
+    Something that the model leaves out, looked for in the residuals.
+
+    Attributes
+    ----------
+    name : str
+        What it is.
+    share : float
+        Share of the residuals' sum of squares that it explains, 0 to 1.
+    deviations : float
+        Its size in standard deviations.
+    found : bool
+        Whether it is there.
+
+    """
+
+    name: str
+    share: float
+    deviations: float
+    found: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """
+    Parameters out of a recording, and how far they can be trusted.
+
+    Attributes
+    ----------
+    verdict : str
+        ``identified``, ``not_identifiable`` or ``model_rejected``.
+    reason : str
+        Why, in sentences.
+    warnings : tuple of str
+        What else a reader should know.
+    parameters : dict of str to Estimate
+        By name; numbers that the data do not hold are NaN.
+    names : tuple of str
+        Free parameters, in the order of the covariance.
+    covariance : ndarray, shape (p, p)
+        Of their values in SI; NaN where the data do not hold them.
+    noise_std : float
+        Standard deviation of a sample.
+    residual_rms : float
+        Of all residuals, outliers included.
+    samples, outliers : int
+        How many samples there are, and how many of them did not count.
+    recording : Recording
+        What was measured.
+    fitted, residual, weights : ndarray, shape (n,)
+        Simulated stretch, measured less simulated, and how far each sample counted.
+    whiteness : Whiteness
+        Of the residuals.
+    signatures : tuple of Signature
+        What was looked for in the residuals.
+    widened : float
+        Largest factor by which correlation widened a deviation.
+    values : dict of str to float
+        Of all quantities at the optimum, whatever the verdict.
+    at_rest : bool
+        Whether the motion began at rest.
+    starts, agreed : int
+        Start values that were tried, and how many of them ended at this optimum.
+
+    """
+
+    verdict: Verdict
+    reason: str
+    warnings: tuple[str, ...]
+    parameters: dict[str, Estimate]
+    names: tuple[str, ...]
+    covariance: Array
+    noise_std: float
+    residual_rms: float
+    samples: int
+    outliers: int
+    recording: Recording
+    fitted: Array
+    residual: Array
+    weights: Array
+    whiteness: Whiteness
+    signatures: tuple[Signature, ...]
+    widened: float
+    values: Mapping[str, float]
+    at_rest: bool
+    starts: int
+    agreed: int
+
+    @property
+    def actuator(self) -> ActuatorParameters:
+        """The block at the optimum; trust it only if the verdict is ``identified``."""
+        return actuator_of(self.values)
+
+    @property
+    def correlation(self) -> Array:
+        """Correlation of the free parameters, shape (p, p)."""
+        size = self.covariance.diagonal() ** 0.5
+        found: Array = self.covariance / size[:, None] / size[None, :]
+        return found
+
+    def confounded(self) -> list[tuple[str, str, float]]:
+        """Return pairs of parameters that the data hardly tell apart, with their correlation."""
+        matrix = self.correlation
+        return [
+            (self.names[i], self.names[j], float(matrix[i, j]))
+            for i in range(len(self.names)) for j in range(i)
+            if abs(matrix[i, j]) >= CONFOUNDED]
+
+    def record(self) -> dict[str, Any]:
+        """Return it as ``hmsa identify --json`` prints it; what is no number is None."""
+        return {
+            'verdict': self.verdict, 'reason': self.reason, 'warnings': list(self.warnings),
+            'parameters': {
+                name: {
+                    'value': _number(x.value), 'std': _number(x.std), 'low': _number(x.low),
+                    'high': _number(x.high), 'unit': x.unit, 'free': x.free}
+                for name, x in self.parameters.items()},
+            'names': list(self.names),
+            'covariance': [[_number(x) for x in row] for row in self.covariance.tolist()],
+            'noise_std': _number(self.noise_std), 'samples': self.samples,
+            'residual_rms': _number(self.residual_rms), 'outliers': self.outliers,
+            'whiteness': {
+                'lag_one': _number(float(self.whiteness.autocorrelation[1])),
+                'p_value': _number(self.whiteness.p_value)},
+            'signatures': [
+                {'name': x.name, 'share': _number(x.share),
+                 'deviations': _number(x.deviations), 'found': x.found}
+                for x in self.signatures],
+            'starts': self.starts, 'agreed': self.agreed}
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

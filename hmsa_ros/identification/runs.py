@@ -1,0 +1,81 @@
+"""Recordings out of bags."""
+
+from collections.abc import Sequence
+import math
+from pathlib import Path
+
+import numpy as np
+
+from hmsa_ros.core.parameters import ActuatorParameters
+from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification.recording import Recording
+from hmsa_ros.report.evaluation import in_force, without_repeats
+from hmsa_ros.report.reading import read_runs
+
+
+def read_bag(
+        path: Path, *, joint: str = '', actuator: ActuatorParameters | None = None
+) -> tuple[Recording, ActuatorParameters, dict[str, float]]:
+    """
+    Read the recording of one actuator from a bag.
+
+    Parameters
+    ----------
+    path : Path
+        Folder of a bag, or an ``.mcap`` file.
+    joint : str
+        Name of the actuator; not needed where there is one.
+    actuator : ActuatorParameters, optional
+        The block, where the bag does not tell.
+
+    Returns
+    -------
+    recording : Recording
+        Times count from the first sample.
+    actuator : ActuatorParameters
+        As given, or as the planner took it to be.
+    known : dict of str to float
+        What the planner knew of the coil.
+
+    Raises
+    ------
+    BadInputError
+        If there is no bag, or several actuators and none is named.
+
+    """
+    runs = read_runs(path, actuator=actuator, joints=[joint] if joint else [])
+    if len(runs) > 1:
+        raise BadInputError(
+            f'{path} has the actuators {", ".join(x.joint or x.label for x in runs)}: name one '
+            'with --joint')
+    run = runs[0]
+    levels = run.applied or in_force((x,) for x in without_repeats(run.commands)[0])
+    if not levels:
+        raise BadInputError(
+            f'{path} has no command that took effect: expected the levels of the field')
+    zero = int(run.time[0])
+    stamps = np.array([(x.stamp - zero) / NANOSECONDS for x in levels])
+    fields = np.array([x.flux_density for x in levels])
+    if stamps[0] > 0.0:
+        # Before the first command the field is that of the first sample, as far as it is known.
+        field = float(run.flux_density[0])
+        stamps = np.append(0.0, stamps)
+        fields = np.append(field if math.isfinite(field) else 0.0, fields)
+    slew = run.number('planner.slew_limit') or run.number('plant.slew_limit')
+    keep = _last_at_each(stamps)
+    return (
+        Recording(
+            (run.time - zero) / NANOSECONDS, run.stretch, stamps[keep], fields[keep],
+            slew or math.inf, 0.0, run.label, () if actuator is not None else _notes(run.notes)),
+        actuator or run.planner,
+        {'coil_time_constant': run.number('planner.coil_time_constant')})
+
+
+def _last_at_each(stamps: 'np.ndarray[tuple[int], np.dtype[np.float64]]') -> list[int]:
+    """Return the places of the last of those at one time."""
+    return [i for i in range(len(stamps)) if i + 1 == len(stamps) or stamps[i + 1] > stamps[i]]
+
+
+def _notes(notes: Sequence[str]) -> tuple[str, ...]:
+    return tuple(x.rstrip('.') for x in notes if 'plain steps' not in x)

@@ -1,0 +1,268 @@
+"""
+Start values out of the data alone: levels at rest, and the spectrum of the ringing.
+
+The mean stretch at the end of each level gives the drive and the chain limit; a decaying
+oscillation fitted after each change of level gives frequency and decay, and with the inertia
+the modulus and the damping. Frequencies above half the rate of the samples appear folded, so
+that several are handed out.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+from scipy.constants import mu_0
+
+from hmsa_ros.core import model
+from hmsa_ros.core.model import Array
+from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.identification.recording import Recording
+from hmsa_ros.identification.response import respond
+
+_FEWEST = 6  # samples on a level that may ring
+_MOST_SAMPLES = 150  # of a level that are looked at
+_MOST_LEVELS = 3
+_CHAIN_LIMITS = (1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 15.0, 40.0, 1000.0)
+_FREQUENCIES = 160
+_DECAYS = (0.02, 0.1, 0.3)
+# Of the scan over the time unit: from one on over the other, and samples that count.
+_SCAN_RANGE, _SCAN_POINTS, _SCAN_DECAYS, _SCAN_SAMPLES = 12.0, 64, (0.05, 0.4), 300
+_BEST = 3  # of the scan
+_SHORTEST = 0.02  # time unit in intervals of the samples
+
+
+@dataclass(frozen=True)
+class Static:
+    """
+    What the levels at rest say.
+
+    Attributes
+    ----------
+    per_tesla : float
+        Load psi' that a flux density of 1 T holds, Br/(mu0 G); NaN if nothing came to rest.
+    chain_limit : float
+        The best of a few.
+    rests : tuple of (float, float, float)
+        Begin of the level in s, flux density in T, mean stretch at its end.
+
+    """
+
+    per_tesla: float
+    chain_limit: float
+    rests: tuple[tuple[float, float, float], ...]
+
+
+def segments(
+        recording: Recording, fewest: int = _FEWEST) -> list[tuple[int, int, float, float]]:
+    """Return first and last place, begin in s and flux density of each level with samples."""
+    times, levels = recording.level_times, recording.levels
+    changed = np.flatnonzero(np.append(True, np.diff(levels) != 0.0))
+    edges = np.searchsorted(recording.time, np.append(times[changed], math.inf))
+    found = []
+    for i, place in enumerate(changed):
+        begin = 0 if i == 0 else int(edges[i])
+        end = int(edges[i + 1])
+        if end - begin >= fewest:
+            found.append((begin, end, float(times[place]), float(levels[place])))
+    return found
+
+
+def static(recording: Recording, chain_limit: float | None = None) -> Static:
+    """Return what the levels at rest say; a chain limit that is known is kept."""
+    rests = []
+    for begin, end, when, level in segments(recording, 1):
+        tail = recording.stretch[begin + (end - begin) * 2 // 3:end]
+        rests.append((when, level, float(np.median(tail))))
+    # Each level once: short ones have not come to rest, but ring about it.
+    fields = np.unique([x[1] for x in rests])
+    if len(fields) < 2:
+        return Static(math.nan, chain_limit or 5.0, tuple(rests))
+    stretch = np.array([np.median([x[2] for x in rests if x[1] == y]) for y in fields])
+    low, high = float(np.min(recording.stretch)), float(np.max(recording.stretch))
+    best = (math.inf, math.nan, chain_limit or 5.0)
+    for limit in (chain_limit,) if chain_limit else _CHAIN_LIMITS:
+        lower, upper = model.stretch_limits(limit)
+        if not lower * 1.002 < low <= high < upper * 0.998:
+            continue
+        force = np.asarray(model.elastic_force(stretch, limit))
+        slope = float(fields @ force) / float(fields @ fields)
+        if slope > 0.0:
+            held = np.asarray(model.equilibrium_stretch(slope * fields, limit))
+            miss = float(np.sum((held - stretch) ** 2))
+            if miss < 0.98 * best[0]:
+                best = miss, slope, limit
+    return Static(best[1], best[2], tuple(rests))
+
+
+def ringing(recording: Recording, rests: Sequence[tuple[float, float, float]]) -> list[
+        tuple[float, float, float]]:
+    """
+    Return candidates of frequency (rad/s), decay (1/s) and the stretch that it rings about.
+
+    For each frequency and decay of a grid the amplitude follows by least squares; how much of
+    the motion they explain is added up over the levels, in units of the frequency at rest.
+    """
+    spans = [x for x in segments(recording) if any(y[0] == x[2] for y in rests)]
+    spans.sort(key=lambda x: -float(np.std(recording.stretch[x[0]:x[1]])))
+    found: list[tuple[float, float, float, float]] = []
+    for begin, end, when, _ in spans[:_MOST_LEVELS]:
+        mean = next(x[2] for x in rests if x[0] == when)
+        part = slice(begin, min(end, begin + _MOST_SAMPLES))
+        t = recording.time[part] - recording.time[begin]
+        y = recording.stretch[part] - mean
+        found += [(*x, mean) for x in _oscillations(t, y)]
+    found.sort(key=lambda x: -x[0])
+    return [(w, d, mean) for _, w, d, mean in found]
+
+
+def _oscillations(t: Array, y: Array) -> list[tuple[float, float, float]]:
+    """Return explained sum of squares, frequency and decay of the best peaks."""
+    span, gap = float(t[-1]), float(np.median(np.diff(t)))
+    lowest, highest = math.pi / span, 2.0 * math.pi / gap
+    if not 0.0 < lowest < highest:
+        return []
+    frequencies = np.geomspace(lowest, highest, _FREQUENCIES)
+    phase = np.exp(1j * np.outer(frequencies, t))
+    power = np.zeros((len(_DECAYS), _FREQUENCIES))
+    for i, ratio in enumerate(_DECAYS):
+        wave = phase * np.exp(-ratio * np.outer(frequencies, t))
+        c, s = wave.real, wave.imag
+        cc, ss, cs = (np.sum(a * b, axis=1) for a, b in ((c, c), (s, s), (c, s)))
+        yc, ys = c @ y, s @ y
+        determinant = cc * ss - cs * cs
+        good = determinant > 1e-9 * cc * ss
+        power[i] = np.where(good, (
+            ss * yc ** 2 - 2.0 * cs * yc * ys + cc * ys ** 2) / np.where(
+                good, determinant, 1.0), 0.0)
+    best = np.max(power, axis=0)
+    inner = np.flatnonzero((best[1:-1] >= best[:-2]) & (best[1:-1] >= best[2:])) + 1
+    peaks = sorted(inner.tolist(), key=lambda j: -best[j])[:3]
+    return [(float(best[j]), float(frequencies[j]),
+             _DECAYS[int(np.argmax(power[:, j]))] * float(frequencies[j])) for j in peaks
+            if best[j] > 0.2 * best[peaks[0]]]
+
+
+def starts(
+        recording: Recording, values: Mapping[str, float], free: Sequence[str]
+) -> list[dict[str, float]]:
+    """
+    Return start values, the likeliest first; the values given come last.
+
+    Parameters
+    ----------
+    recording : Recording
+        What was measured.
+    values : mapping of str to float
+        What is known, of all quantities.
+    free : sequence of str
+        What is sought.
+
+    Returns
+    -------
+    list of dict
+        At least one.
+
+    """
+    given = dict(values)
+    if 'stretch_gain' in free:
+        given['stretch_gain'] = 1.0
+    known = None if 'chain_limit' in free else given['chain_limit']
+    found = static(recording, known)
+    c1 = 2.0 * (given['half_thickness'] / given['half_length']) ** 2
+    candidates: list[dict[str, float]] = []
+    for frequency, decay, mean in ringing(recording, found.rests):
+        lower, upper = model.stretch_limits(found.chain_limit)
+        if not lower < mean < upper:
+            continue
+        material = NondimensionalParameters(0.2, found.chain_limit, c1)
+        natural = math.hypot(frequency, decay)
+        unit = float(model.natural_frequency(mean, material)) / natural
+        candidate = _candidate(given, free, unit, found)
+        inertia = candidate['density'] * given['half_length'] ** 2
+        if 'damping_coefficient' in free:
+            candidate['damping_coefficient'] = (
+                2.0 * float(model.mass(mean, material)) * decay * inertia * 8.0
+                * given['half_length'] ** 2 / given['half_thickness'])
+        if all(abs(math.log(x['time_unit'] / candidate['time_unit'])) > 0.02
+               for x in candidates):
+            candidates.append(candidate)
+    return [*candidates[:4], given]
+
+
+def scan(
+        recording: Recording, values: Mapping[str, float], free: Sequence[str], *,
+        at_rest: bool) -> list[dict[str, float]]:
+    """
+    Return start values by trying time units and dampings on the first of the data.
+
+    That finds them where nothing rings, or where the samples are too few to see it.
+
+    Parameters
+    ----------
+    recording : Recording
+        What was measured.
+    values : mapping of str to float
+        What is known, of all quantities.
+    free : sequence of str
+        What is sought.
+    at_rest : bool
+        Whether the motion begins at rest.
+
+    Returns
+    -------
+    list of dict
+        The best few.
+
+    """
+    found = static(recording, None if 'chain_limit' in free else values['chain_limit'])
+    first = _SCAN_SAMPLES
+    changes = np.searchsorted(recording.time, recording.level_times)
+    begin = int(np.min(changes[changes > 0], initial=len(recording.time)))
+    if begin < len(recording.time):
+        first = max(first, min(begin + _SCAN_SAMPLES, len(recording.time)))
+    part = replace(recording, time=recording.time[:first], stretch=recording.stretch[:first]) \
+        if first < len(recording.time) else recording
+    shortest = _SHORTEST * float(np.median(np.diff(recording.time)))
+    tried: list[tuple[float, int, dict[str, float]]] = []
+    timed = {'shear_modulus', 'density', 'time_unit'}.intersection(free)
+    factors = np.geomspace(1.0 / _SCAN_RANGE, _SCAN_RANGE, _SCAN_POINTS) if timed else (1.0,)
+    c1 = 2.0 * (values['half_thickness'] / values['half_length']) ** 2
+    for factor in factors:
+        unit = max(float(factor) * values['time_unit'], shortest)
+        candidate = _candidate(values, free, unit, found)
+        per_zeta = 8.0 * values['half_length'] * values['half_thickness'] * math.sqrt(
+            candidate['density'] * candidate['shear_modulus'])
+        for decay in _SCAN_DECAYS if 'damping_coefficient' in free else (0.0,):
+            if decay:
+                # The share of critical damping about rest, zeta_c = 4/c1 sqrt(m psi'').
+                candidate = candidate | {'damping_coefficient': per_zeta * decay * 4.0 / c1
+                                         * math.sqrt((1.0 + c1) / 2.0)}
+            response = respond(part, candidate, (), at_rest=at_rest, rtol=1e-5)
+            if response is not None:
+                miss = float(np.mean(np.abs(part.stretch - response.stretch)))
+                tried.append((miss, len(tried), candidate))
+    tried.sort()
+    return [x[2] for x in tried[:_BEST]]
+
+
+def _candidate(
+        given: Mapping[str, float], free: Sequence[str], unit: float, found: Static
+) -> dict[str, float]:
+    """Return values with a time unit and what the levels at rest say."""
+    values = dict(given)
+    if 'chain_limit' in free:
+        values['chain_limit'] = found.chain_limit
+    length = given['half_length']
+    if 'shear_modulus' in free and 'time_unit' not in free:
+        values['shear_modulus'] = values['density'] * (length / unit) ** 2
+    elif 'time_unit' in free or 'density' in free:
+        values['density'] = values['shear_modulus'] * (unit / length) ** 2
+    values['time_unit'] = unit
+    if math.isfinite(found.per_tesla):
+        if 'remanence' in free:
+            values['remanence'] = found.per_tesla * mu_0 * values['shear_modulus']
+        elif 'shear_modulus' in free and 'time_unit' in free:
+            values['shear_modulus'] = values['remanence'] / (mu_0 * found.per_tesla)
+            values['density'] = values['shear_modulus'] * (unit / length) ** 2
+    return values

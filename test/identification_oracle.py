@@ -1,0 +1,94 @@
+"""Measurements of an actuator, simulated by SciPy alone, for what identifies it."""
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from scipy.constants import mu_0
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
+
+BLOCK = paper_actuator()
+
+
+@dataclass(frozen=True)
+class Extras:
+    """What the actuator has besides the block, SI."""
+
+    coil: float = 0.0
+    ratio: float = 0.0
+    time: float = 0.01
+    force: float = 0.0
+    bias: float = 0.0
+    gain: float = 1.0
+
+
+def force_of(stretch, limit):
+    """Return psi' of the Gent law."""
+    return (stretch - stretch ** -2) / (1.0 - (2.0 / stretch + stretch ** 2 - 3.0) / limit)
+
+
+def level_of(stretch, block: ActuatorParameters = BLOCK) -> float:
+    """Return the flux density that holds a stretch."""
+    return force_of(stretch, block.chain_limit) * mu_0 * block.shear_modulus / block.remanence
+
+
+def steps(targets, span, repeats=1, begin=0.02):
+    """Return times and levels of plain steps, after a while without field."""
+    levels = [level_of(x) for _ in range(repeats) for x in targets]
+    return (np.append(begin - 0.02, begin + span * np.arange(len(levels))),
+            np.append(0.0, levels))
+
+
+def simulate(times, level_times, levels, block: ActuatorParameters = BLOCK,
+             extras: Extras | None = None):
+    """Return the measured stretch, without noise."""
+    x = extras or Extras()
+    inertia = block.density * block.half_length ** 2
+    c1 = 2.0 * (block.half_thickness / block.half_length) ** 2
+    modulus = block.shear_modulus
+    damping = block.damping_coefficient * block.half_thickness / (8.0 * block.half_length ** 2)
+    load = x.force / (4.0 * block.half_length ** 2)
+
+    def slope(_, state, level):
+        stretch, rate, relaxed, field = state
+        elastic = force_of(stretch, block.chain_limit)
+        acting = level if x.coil == 0.0 else field
+        total = (
+            block.remanence * acting / mu_0 + load - modulus * elastic
+            - x.ratio * modulus * (elastic - relaxed) - damping * rate
+            + 0.25 * inertia * rate ** 2 / stretch ** 4)
+        return [rate, total / (inertia * (stretch ** -3 + c1) / 6.0),
+                (elastic - relaxed) / x.time,
+                (level - field) / x.coil if x.coil else 0.0]
+
+    first = block.remanence * levels[0] / mu_0 + load
+    rest = brentq(
+        lambda l: modulus * force_of(l, block.chain_limit) - first,  # noqa: E741
+        0.5, 0.999 * _upper(block.chain_limit), xtol=1e-15)
+    state = np.array([rest, 0.0, force_of(rest, block.chain_limit), levels[0]])
+    stretch = np.empty(len(times))
+    ends = np.append(level_times[1:], max(times[-1], level_times[-1]) + 1e-9)
+    for begin, end, level in zip(level_times, ends, levels, strict=True):
+        inside = (times >= begin) & (times < end)
+        solved = solve_ivp(
+            slope, (begin, end), state, method='DOP853', rtol=1e-11, atol=1e-12, args=(level,),
+            dense_output=True)
+        stretch[inside] = solved.sol(times[inside])[0]
+        state = solved.y[:, -1]
+    return x.gain * stretch + x.bias
+
+
+def _upper(limit):
+    roots = np.roots([1.0, 0.0, -(limit + 3.0), 2.0])
+    return float(max(roots.real))
+
+
+def relative(found, block: ActuatorParameters = BLOCK):
+    """Return how far identified parameters of the block are off, in standard deviations."""
+    return {
+        name: (found.parameters[name].value - getattr(block, name)) / found.parameters[name].std
+        for name in found.names if hasattr(block, name)
+        and math.isfinite(found.parameters[name].value)}

@@ -1,0 +1,150 @@
+"""``hmsa identify``: files in, numbers, files and exit codes out."""
+
+import json
+import re
+
+from identification_oracle import BLOCK, simulate, steps
+import numpy as np
+import pytest
+import yaml
+
+from hmsa_ros.cli import main
+from hmsa_ros.identification.files import read_belief
+
+TIMES = np.arange(500) * 1e-3
+LEVELS = steps((1.1, 1.4, 1.0), 0.0444, 3)
+STRETCH = simulate(TIMES, *LEVELS) + 1e-3 * np.random.default_rng(0).standard_normal(500)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Return a folder with a recording, made the current one."""
+    monkeypatch.chdir(tmp_path)
+    write('camera.csv', 'time,stretch', zip(TIMES, STRETCH, strict=True))
+    write('levels.csv', 'time,flux_density', zip(*LEVELS, strict=True))
+    return tmp_path
+
+
+def write(name, header, rows, separator=','):
+    """Write a CSV file."""
+    lines = [separator.join(f'{x:.12g}' for x in row) for row in rows]
+    with open(name, 'w', encoding='utf-8') as file:
+        file.write('\n'.join([header, *lines]) + '\n')
+
+
+def identify(capsys, *arguments):
+    """Run the command; return status, standard output and standard error."""
+    status = main(['identify', *arguments])
+    return (status, *capsys.readouterr())
+
+
+def test_json_has_what_the_interface_promises(folder, capsys):
+    status, out, err = identify(capsys, 'camera.csv', '--commands', 'levels.csv', '--json')
+    assert (status, err) == (0, '')
+    found = json.loads(out)
+    assert {'verdict', 'reason', 'parameters', 'names', 'covariance', 'noise_std', 'samples',
+            'residual_rms'} <= set(found)
+    assert found['verdict'] == 'identified'
+    assert found['samples'] == 500
+    matrix = np.array(found['covariance'])
+    assert matrix.shape == (len(found['names']),) * 2
+    for name, variance in zip(found['names'], np.diag(matrix), strict=True):
+        x = found['parameters'][name]
+        assert set(x) == {'value', 'std', 'low', 'high', 'unit', 'free'}
+        assert x['low'] < x['value'] < x['high']
+        assert x['std'] ** 2 == pytest.approx(variance, rel=1e-9)
+    assert found['parameters']['shear_modulus']['unit'] == 'Pa'
+    assert not found['parameters']['density']['free']
+
+
+def test_file_written_is_that_of_the_nodes_and_keeps_the_covariance(folder, capsys):
+    with open('known.yaml', 'w', encoding='utf-8') as file:
+        file.write('/**:\n  ros__parameters:\n    actuator.density: 1900.0\n'
+                   '    flux_density_max: 0.2\n    joint: tip\n')
+    status, _, _ = identify(
+        capsys, 'camera.csv', '--commands', 'levels.csv', '--params-file', 'known.yaml',
+        '--out', 'found.yaml', '--report', 'page.html')
+    assert status == 0
+    text = (folder / 'found.yaml').read_text(encoding='utf-8')
+    assert 'standard deviation' in text
+    assert 'Verdict: identified' in text
+    settings = yaml.safe_load(text)['/**']['ros__parameters']
+    assert settings['flux_density_max'] == 0.2
+    assert settings['joint'] == 'tip'
+    assert settings['actuator.shear_modulus'] == pytest.approx(BLOCK.shear_modulus, rel=2e-3)
+    belief = read_belief(folder / 'found.yaml')
+    assert belief.names[0] == 'shear_modulus'
+    assert np.all(np.linalg.eigvalsh(belief.covariance / np.sqrt(np.outer(
+        np.diag(belief.covariance), np.diag(belief.covariance)))) > 0.0)
+    page = (folder / 'page.html').read_text(encoding='utf-8')
+    for words in ('identified', 'shear_modulus', 'Autocorrelation', 'confounded'):
+        assert words in page
+    assert 'src="http' not in page
+
+
+def test_what_is_not_identified_is_not_written_and_ends_with_1(folder, capsys):
+    status, out, err = identify(
+        capsys, 'camera.csv', '--commands', 'levels.csv', '--out', 'found.yaml', '--json',
+        '--free', 'shear_modulus,density,damping_coefficient,chain_limit,remanence')
+    assert status == 1
+    assert json.loads(out)['parameters']['density']['value'] is None
+    assert err.startswith('hmsa: not_identifiable: ')
+    assert 'found.yaml was not written' in err
+    assert not (folder / 'found.yaml').exists()
+
+
+def test_levels_sampled_beside_the_stretch_serve_with_semicolons_and_units(folder, capsys):
+    place = np.searchsorted(LEVELS[0], TIMES, side='right') - 1
+    rows = zip(1e3 * TIMES, STRETCH, 1e3 * LEVELS[1][place], strict=True)
+    write('all.csv', 'time [ms];stretch;flux_density [mT]', rows, ';')
+    text = (folder / 'all.csv').read_text(encoding='utf-8')
+    (folder / 'all.csv').write_text(text.replace('.', ','), encoding='utf-8')
+    status, out, _ = identify(capsys, 'all.csv', '--json')
+    assert status == 0
+    found = json.loads(out)
+    x = found['parameters']['shear_modulus']
+    assert abs(x['value'] - BLOCK.shear_modulus) < 4.0 * x['std']
+    for word in ('from ms', 'from mt', 'is estimated too'):
+        assert any(word in note for note in found['warnings'])
+
+
+@pytest.mark.parametrize(('text', 'message'), [
+    ('', 'camera.csv is empty: expected a header'),
+    ('time,stretch\n', 'has a header and no row'),
+    ('0.0,1.0\n0.1,1.1\n', 'begins with numbers .*expected a header'),
+    ('time,length\n0,1\n', 'has no column stretch'),
+    ('time,stretch [mm]\n0,1\n', 'gives stretch in mm: expected no unit: divide'),
+    ('time,stretch\n0,1\n0.1,abc\n', "line 3 has 'abc' in column stretch"),
+    ('time,stretch\n0,1\n0.1,1\n0.05,1\n', 'line 4 jumps back in time from 0.1 to 0.05 s'),
+    ('time,stretch\n0,1\n0,1\n0,1\n0.1,1\n', '2 of 4 rows .* stamp of its own'),
+    ('time,stretch\n0,1\n0.1,1\n0.2,1\n0.3,1\n0.4,1\n', 'has 5 samples: expected 12 or more')])
+def test_bad_samples_end_with_2_and_a_sentence(folder, capsys, text, message):
+    (folder / 'camera.csv').write_text(text, encoding='utf-8')
+    status, out, err = identify(capsys, 'camera.csv', '--commands', 'levels.csv')
+    assert (status, out, err.count('\n')) == (2, '', 1)
+    assert re.search(message, err)
+
+
+@pytest.mark.parametrize(('arguments', 'message'), [
+    (['nowhere.csv'], 'nowhere.csv cannot be read'),
+    (['camera.csv'], 'no column flux_density'),
+    (['camera.csv', '--commands', 'levels.csv', '--free', 'mass'], "free parameter 'mass'"),
+    (['camera.csv', '--commands', 'levels.csv', '--out', 'camera.csv'], 'cannot write'),
+    (['camera.csv', '--commands', 'levels.csv', '--params-file', 'camera.csv'],
+     'has no ros__parameters'),
+    (['camera.csv', '--commands', 'camera.csv'], 'no column flux_density')])
+def test_bad_arguments_end_with_2_and_a_sentence(folder, capsys, arguments, message):
+    status, out, err = identify(capsys, *arguments)
+    assert (status, out, err.count('\n')) == (2, '', 1)
+    assert message in err
+
+
+def test_rows_without_numbers_and_gaps_are_said(folder, capsys):
+    keep = (TIMES < 0.2) | (TIMES > 0.25)
+    stretch = np.where(np.arange(500) % 100 == 7, np.nan, STRETCH)
+    write('camera.csv', 'time,stretch', zip(TIMES[keep], stretch[keep], strict=True))
+    status, out, _ = identify(capsys, 'camera.csv', '--commands', 'levels.csv', '--json')
+    assert status == 0
+    notes = json.loads(out)['warnings']
+    assert any('5 rows without a number' in x for x in notes)
+    assert any('gap of 0.051 s' in x for x in notes)

@@ -1,0 +1,329 @@
+"""Identification: derivatives, bounds, accuracy, verdicts, against simulations by SciPy."""
+
+from dataclasses import replace
+
+from identification_oracle import BLOCK, Extras, level_of, relative, simulate, steps
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from hmsa_ros.core.two_step import plan_two_step
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification import identify, profile, Recording
+from hmsa_ros.identification.quantities import (
+    DEFAULT_FREE,
+    from_coordinate,
+    to_coordinate,
+    values_of,
+)
+from hmsa_ros.identification.response import respond
+
+T = BLOCK.time_unit
+SPAN = 10.0 * T
+SEQUENCE = (1.1, 1.4, 1.0)
+REPEATS = 15
+NINE = (*DEFAULT_FREE, 'coil_time_constant', 'constant_force', 'viscoelastic_ratio',
+        'viscoelastic_time')
+EXTRAS = Extras(coil=5e-4, ratio=0.1, time=2.0 * T, force=0.3, bias=0.01)
+#: Ten times off in modulus and damping, and off in all else.
+FAR = replace(
+    BLOCK, shear_modulus=10.0 * BLOCK.shear_modulus,
+    damping_coefficient=0.1 * BLOCK.damping_coefficient, chain_limit=9.0, remanence=0.06)
+NEAR_FAR = (FAR, replace(
+    BLOCK, shear_modulus=0.1 * BLOCK.shear_modulus,
+    damping_coefficient=10.0 * BLOCK.damping_coefficient))
+TIMES = np.arange(1200) * 1e-3
+
+
+def values_with(extras: Extras):
+    """Return values of all quantities."""
+    return values_of(BLOCK, {
+        'coil_time_constant': extras.coil, 'viscoelastic_ratio': extras.ratio,
+        'viscoelastic_time': extras.time, 'constant_force': extras.force,
+        'stretch_bias': extras.bias, 'stretch_gain': extras.gain})
+
+
+def recorded(targets=SEQUENCE, *, noise=1e-3, seed=0, times=TIMES, extras=None, repeats=9,
+             span=SPAN) -> Recording:
+    """Return a noisy recording of plain steps."""
+    level_times, levels = steps(targets, span, repeats)
+    stretch = simulate(times, level_times, levels, extras=extras)
+    noisy = stretch + noise * np.random.default_rng(seed).standard_normal(len(times))
+    return Recording(times, noisy, level_times, levels)
+
+
+def shaped(repeats: int, noise: float = 1e-3) -> Recording:
+    """Return a recording of two-step moves."""
+    now, start, level_times, levels = 0.02, 1.0, [0.0], [0.0]
+    for target in SEQUENCE * repeats:
+        plan = plan_two_step(start, target, BLOCK.nondimensional)
+        level_times += [now, now + plan.tau_p * T]
+        levels += [plan.beta_p * BLOCK.flux_density_unit, level_of(target)]
+        start, now = target, now + SPAN
+    level_times, levels = np.array(level_times), np.array(levels)
+    stretch = simulate(TIMES, level_times, levels)
+    noisy = stretch + noise * np.random.default_rng(1).standard_normal(len(TIMES))
+    return Recording(TIMES, noisy, level_times, levels)
+
+
+@pytest.mark.parametrize('slew', [np.inf, 20.0])
+def test_derivatives_are_those_of_finite_differences_for_every_parameter(slew):
+    free = (*NINE, 'density', 'stretch_gain', 'sensor_latency')
+    times = np.sort(np.random.default_rng(0).uniform(0.0, 0.25, 300))
+    recording = Recording(
+        times, 1.0 + 0.1 * np.sin(70.0 * times), *steps(SEQUENCE, SPAN), slew_limit=slew)
+    values = values_with(EXTRAS) | {'sensor_latency': 3e-4}
+    for at_rest in (True, False):
+        names = free if at_rest else (*free, 'initial_stretch', 'initial_rate')
+        values |= {'initial_stretch': 1.05, 'initial_rate': 3.0}
+        exact = respond(recording, values, names, at_rest=at_rest, rtol=1e-12).jacobian
+        for column, name in enumerate(names):
+            x = to_coordinate(name, values[name])
+            h = 1e-5 * max(abs(x), 1e-4)
+            ends = [respond(
+                recording, values | {name: from_coordinate(name, x + y)}, (), at_rest=at_rest,
+                rtol=1e-12).stretch for y in (h, -h)]
+            difference = (ends[0] - ends[1]) / (2.0 * h)
+            assert exact[:, column] == pytest.approx(
+                difference, abs=2e-5 * np.max(np.abs(difference))), name
+
+
+def test_derivative_by_a_lag_of_nothing_is_the_limit_of_lags():
+    times = np.arange(300) * 1e-3
+    recording = Recording(times, 1.0 + 0.1 * np.sin(70.0 * times), *steps(SEQUENCE, SPAN))
+    values = values_of(BLOCK)
+    none = respond(recording, values, ('coil_time_constant',), rtol=1e-12)
+    little = respond(recording, values | {'coil_time_constant': 1e-7}, (), rtol=1e-12)
+    assert (little.stretch - none.stretch) / 1e-7 == pytest.approx(
+        none.jacobian[:, 0], abs=1e-3 * np.max(np.abs(none.jacobian)))
+
+
+def test_response_is_that_of_an_independent_solver():
+    level_times, levels = steps(SEQUENCE, SPAN, 2)
+    times = np.sort(np.random.default_rng(0).uniform(0.0, 0.3, 500))
+    recording = Recording(times, 1.0 + 0.1 * np.sin(70.0 * times), level_times, levels)
+    found = respond(recording, values_with(EXTRAS), (), rtol=1e-10)
+    assert found.stretch == pytest.approx(
+        simulate(times, level_times, levels, extras=EXTRAS), abs=5e-7)
+
+
+@pytest.mark.parametrize(('targets', 'repeats', 'bounds', 'bias'), [
+    (SEQUENCE, 1, (.030, .14, .23, .041), 2.3e-5),
+    (SEQUENCE, REPEATS, (.008, .038, .060, .013), 3.1e-5),
+    ((1.4, 1.8, .8, 1.0), 12, (.004, .017, .015, .006), 2.8e-5)])
+def test_bounds_of_plain_steps_are_those_of_the_literature(targets, repeats, bounds, bias):
+    times = np.arange(2000) * 1e-3
+    recording = Recording(
+        times, 1.0 + 0.1 * np.sin(70.0 * times), *steps(targets, SPAN, repeats, begin=0.0))
+    values = values_of(BLOCK)
+    jacobian = respond(recording, values, DEFAULT_FREE).jacobian
+    std = 1e-3 * np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
+    std[1:3] *= 1.0 / values['damping_coefficient'], values['chain_limit']
+    assert 100.0 * std[:4] == pytest.approx(bounds, rel=0.07, abs=6e-4)
+    assert std[4] == pytest.approx(bias, rel=0.07)
+
+
+@pytest.mark.parametrize('start', NEAR_FAR)
+@pytest.mark.parametrize('rate', [1000, 200, 60])
+def test_estimates_lie_within_their_intervals_from_starts_ten_times_off(start, rate):
+    times = np.arange(int(1.2 * rate)) / rate
+    for seed in range(2):
+        found = identify(recorded(seed=seed, times=times), actuator=start)
+        assert found.verdict == 'identified', found.reason
+        off = relative(found)
+        assert len(off) == 4
+        assert max(map(abs, off.values())) < 4.0
+        assert found.parameters['shear_modulus'].std < 10.0 * 1000.0 / rate
+        assert found.noise_std == pytest.approx(1e-3, rel=0.2)
+
+
+def test_errors_of_many_runs_are_as_large_as_the_deviations_say():
+    errors = np.array([
+        [*relative(identify(recorded(seed=seed, repeats=3, times=TIMES[:500]))).values()]
+        for seed in range(24)])
+    # The mean square of 96 correlated normal errors.
+    assert 0.55 < np.sqrt(np.mean(errors ** 2)) < 1.45
+    assert np.mean(np.abs(errors) < 1.96) > 0.85
+
+
+def test_nine_parameters_are_found_at_once():
+    found = identify(recorded(extras=EXTRAS), free=NINE)
+    assert found.verdict == 'identified', found.reason
+    assert max(map(abs, relative(found).values())) < 4.0
+    for name, true in (
+            ('coil_time_constant', EXTRAS.coil), ('viscoelastic_ratio', EXTRAS.ratio),
+            ('viscoelastic_time', EXTRAS.time), ('constant_force', EXTRAS.force)):
+        x = found.parameters[name]
+        assert abs(x.value - true) < 4.0 * x.std, name
+
+
+def test_shaped_moves_alone_are_identified_with_a_warning():
+    found = identify(shaped(9), actuator=FAR)
+    assert found.verdict == 'identified', found.reason
+    assert max(map(abs, relative(found).values())) < 4.0
+    assert any('sixth of the information' in x for x in found.warnings)
+
+
+def test_time_unit_serves_where_geometry_is_unknown():
+    free = ('time_unit', 'damping_coefficient', 'chain_limit', 'remanence')
+    found = identify(recorded(), free=free, actuator=replace(BLOCK, density=400.0))
+    assert found.verdict == 'identified', found.reason
+    x = found.parameters['time_unit']
+    assert abs(x.value - T) < 4.0 * x.std < 1e-3 * T
+    assert found.actuator.time_unit == pytest.approx(x.value, rel=1e-12)
+
+
+def test_begin_in_motion_frees_the_initial_state():
+    whole = recorded()
+    late = slice(35, None)
+    level_times = whole.level_times[1:].copy()
+    level_times[0] = whole.time[35]
+    found = identify(Recording(
+        whole.time[late], whole.stretch[late], level_times, whole.levels[1:]))
+    assert found.verdict == 'identified', found.reason
+    assert not found.at_rest
+    assert found.names[-2:] == ('initial_stretch', 'initial_rate')
+    assert max(map(abs, relative(found).values())) < 4.0
+
+
+def test_one_in_a_hundred_outliers_moves_nothing_by_a_deviation():
+    clean = recorded()
+    before = identify(clean)
+    random = np.random.default_rng(3)
+    stretch = clean.stretch.copy()
+    places = random.choice(len(stretch), 12, replace=False)
+    stretch[places] = random.choice([0.2, 1.6, 3.0], 12)
+    after = identify(replace(clean, stretch=stretch))
+    assert after.verdict == 'identified'
+    assert after.outliers == 12
+    for name in after.names:
+        x = after.parameters[name]
+        assert abs(x.value - before.parameters[name].value) < x.std, name
+
+
+def test_correlated_noise_widens_the_intervals_and_is_no_misfit():
+    clean = recorded(noise=0.0)
+    errors, plain = [], identify(recorded()).parameters['shear_modulus'].std
+    for seed in range(6):
+        white = np.random.default_rng(seed).standard_normal(len(TIMES))
+        noise = 1e-3 * np.sqrt(1.0 - 0.9 ** 2) * lfilter([1.0], [1.0, -0.9], white)
+        found = identify(replace(clean, stretch=clean.stretch + noise))
+        assert found.verdict == 'identified', found.reason
+        assert found.widened > 1.5
+        assert any('not white' in x for x in found.warnings)
+        errors += relative(found).values()
+    assert plain > 0.0
+    assert np.sqrt(np.mean(np.square(errors))) < 1.6
+
+
+def test_pixels_of_eight_bits_are_said_and_covered():
+    recording = recorded(noise=0.0)
+    pixel = 0.8 / 255.0
+    found = identify(replace(
+        recording, stretch=np.round(recording.stretch / pixel) * pixel))
+    assert found.verdict == 'identified', found.reason
+    assert any('steps of 0.0031' in x for x in found.warnings)
+    assert max(map(abs, relative(found).values())) < 5.0
+
+
+@pytest.mark.parametrize(('extras', 'words'), [
+    (Extras(coil=5e-4), 'coil_time_constant'),
+    (Extras(ratio=0.1, time=2.0 * T), 'creep'),
+    (Extras(ratio=0.1, time=0.1), 'creep')])
+def test_what_the_model_leaves_out_rejects_it_by_name(extras, words):
+    found = identify(recorded(extras=extras))
+    assert found.verdict == 'model_rejected'
+    assert words in found.reason
+    assert 'autocorrelation' in found.reason
+
+
+def _drifting(recording: Recording) -> Recording:
+    return replace(recording, stretch=recording.stretch + 0.005 * recording.time)
+
+
+def _ringing_twice(recording: Recording) -> Recording:
+    return replace(recording, stretch=recording.stretch + 0.003 * np.sin(
+        2.0 * np.pi * 311.0 * recording.time))
+
+
+def _jittering(recording: Recording) -> Recording:
+    late = 1e-4 * np.random.default_rng(5).standard_normal(len(TIMES))
+    true = simulate(np.sort(np.clip(TIMES + late, 0.0, TIMES[-1])), *steps(SEQUENCE, SPAN, 9))
+    return replace(recording, stretch=true)
+
+
+@pytest.mark.parametrize(('change', 'word'), [
+    (_drifting, 'drift'), (_ringing_twice, 'second mode at 31'), (_jittering, 'jitter')])
+def test_what_the_sensor_does_rejects_the_model_by_name(change, word):
+    found = identify(change(recorded()))
+    assert found.verdict == 'model_rejected'
+    assert word in found.reason
+
+
+def test_foreign_motion_is_rejected_without_a_number():
+    recording = recorded()
+    found = identify(replace(recording, stretch=recording.stretch[::-1].copy()))
+    assert found.verdict == 'model_rejected'
+    assert all(np.isnan(found.parameters[x].value) for x in found.names)
+
+
+def test_ratios_alone_are_not_identifiable_and_said_to_be():
+    found = identify(recorded(), free=(*DEFAULT_FREE, 'density'))
+    assert found.verdict == 'not_identifiable'
+    for name in ('shear_modulus', 'density', 'remanence', 'damping_coefficient'):
+        assert np.isnan(found.parameters[name].value)
+        assert name in found.reason
+    assert 'weigh' in found.reason
+    assert np.isfinite(found.parameters['chain_limit'].value)
+
+
+def test_small_stretches_do_not_hold_the_chain_limit():
+    found = identify(recorded((1.02, 1.0)))
+    assert found.verdict == 'not_identifiable'
+    assert found.reason.startswith('chain_limit cannot be told')
+    assert 'larger stretches' in found.reason
+
+
+def test_gain_of_the_sensor_and_nine_more_are_not_read_out_of_one_shaped_pass():
+    found = identify(shaped(1), free=(*NINE, 'stretch_gain'))
+    assert found.verdict == 'not_identifiable'
+    assert np.isnan(found.parameters['chain_limit'].value)
+
+
+def test_profile_reaches_the_limit_at_the_ends_of_the_interval():
+    found = identify(recorded(repeats=2, times=TIMES[:400]))
+    values, deviance = np.array(profile(found, 'chain_limit', 9)).T
+    order = np.argsort(values)
+    x = found.parameters['chain_limit']
+    assert np.interp([x.low, x.high], values[order], deviance[order]) == pytest.approx(
+        [3.84, 3.84], rel=0.3)
+    with pytest.raises(BadInputError, match='density was not free: expected one of'):
+        profile(found, 'density')
+
+
+def test_sixty_uneven_points_of_a_figure_are_enough():
+    random = np.random.default_rng(11)
+    times = np.sort(random.uniform(0.0, 0.15, 60))
+    found = identify(recorded(noise=5e-3, times=times, repeats=1), actuator=FAR)
+    assert found.verdict == 'identified', found.reason
+    assert max(map(abs, relative(found).values())) < 4.0
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    ({'stretch': np.ones(1200)}, 'stays within 0.*expected a motion'),
+    ({'stretch': 1.0 + 1e-3 * np.random.default_rng(0).standard_normal(1200)},
+     'expected a motion'),
+    ({'stretch': np.clip(recorded().stretch, 0.0, 1.35)}, 'cut off .* times at .*1.35'),
+    ({'stretch': 10.0 * recorded().stretch}, None),
+    ({'stretch': 25.0 * recorded().stretch}, 'in mm'),
+    ({'levels': 1000.0 * steps(SEQUENCE, SPAN, 9)[1]}, 'in mT'),
+    ({'time': TIMES[::-1]}, 'expected increasing times'),
+    ({'time': TIMES[:5]}, '5 time and 1200 stretch'),
+    ({'stretch': np.where(TIMES == 0.5, np.nan, 1.1)}, '1 that are not finite')])
+def test_arrays_that_hold_no_motion_are_refused_with_a_reason(change, message):
+    recording = recorded()
+    if message is None:
+        assert identify(replace(recording, **change)).verdict != 'identified'
+        return
+    with pytest.raises(BadInputError, match=message):
+        replace(recording, **change)
