@@ -53,6 +53,24 @@ def test_a_node_that_is_told_to_end_while_it_is_imported_ends_without_a_word(
     assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
 
 
+def test_a_node_that_is_told_to_end_while_it_compiles_ends_before_it_has(ros_env):
+    code = """
+import os, signal, sys
+from hmsa_ros.core import warmup
+from hmsa_ros.entry import plant
+class Options:
+    def __iter__(self):
+        os.kill(os.getpid(), signal.SIGTERM)
+        yield None
+warmup._DELIVERIES = Options()
+sys.argv[1:] = []
+sys.exit(plant())
+"""
+    done = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
+
+
 def test_an_interrupt_that_python_drops_still_ends_a_command(ros_env):
     done = subprocess.run(
         [sys.executable, '-c', IN_A_DESTRUCTOR], capture_output=True, text=True, check=False,

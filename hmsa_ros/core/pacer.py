@@ -19,7 +19,7 @@ class Pacer:
     factor : float
         As given.
     paused : bool
-        Whether time stands still.
+        Whether time is held.
 
     """
 

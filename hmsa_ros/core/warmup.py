@@ -16,6 +16,7 @@ from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.simulation import ActuatorSimulation
 from hmsa_ros.core.two_step import plan_two_step_batch
+from hmsa_ros.ending import ENDING
 
 _MILLISECOND = 1_000_000
 # What reaches every kernel with every type of argument.
@@ -41,9 +42,16 @@ def warm_up(*, batch: bool = False) -> float:
     float
         Seconds that it took.
 
+    Raises
+    ------
+    KeyboardInterrupt
+        If a signal that was noted asks for the end.
+
     """
     begin = perf_counter()
     for options in _DELIVERIES:
+        # Compiling takes seconds: a process that is to end does so in between.
+        ENDING.check()
         planner = Planner(paper_actuator(), replace(options, lead_time=0))
         plant = ActuatorSimulation(paper_actuator())
         for now, stretch in ((0, 1.2), (_MILLISECOND, 1.1)):

@@ -200,8 +200,8 @@ class SimulatedDevice(Outbox):
         """
         Bring the time into line with a clock, as far as it is not to be simulated.
 
-        A device that has not begun, one that stands still, and one whose clock jumps goes on
-        from the clock's time; where the clock has jumped back it starts again. Samples stay on
+        A device that has not begun, one that is held, and one whose clock jumps goes on from
+        the clock's time; where the clock has jumped back it starts again. Samples stay on
         the grid from time zero.
 
         Parameters

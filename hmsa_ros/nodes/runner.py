@@ -121,7 +121,7 @@ def _initialise(arguments: Sequence[str]) -> None:
     if os.environ.get('NO_COLOR') and not os.environ.get('RCUTILS_COLORIZED_OUTPUT'):
         os.environ['RCUTILS_COLORIZED_OUTPUT'] = '0'
     prepare_middleware()
-    # What rcl says of bad arguments is in its error too, which is told below in one line.
+    # What rcl says of bad arguments is in its error too, which is printed below in one line.
     set_logger_level('rcl', LoggingSeverity.FATAL)
     try:
         rclpy.init(
