@@ -15,6 +15,7 @@ from rosbags.rosbag2 import Reader as RosbagsReader
 
 from hmsa_ros.bag import metadata
 from hmsa_ros.bag.reader import BagReader
+from hmsa_ros.bag.reception import judge, WARN
 from hmsa_ros.bag.recording import Limits, lost_by_topic, Recording
 from hmsa_ros.bag.recover import recover
 from hmsa_ros.bag.writer import BagWriter, Topic
@@ -175,3 +176,60 @@ def test_a_killed_writer_loses_nothing_it_has_flushed(tmp_path):
         with RosbagsReader(tmp_path / f'recovered{attempt}') as reader:
             assert [stamp for _, stamp, _ in reader.messages()] == list(
                 range(result.message_count))
+
+
+def test_files_that_are_full_at_once_do_not_hold_up_the_writing(tmp_path):
+    definition = 'uint8 data\n' * 2000
+    recording = Recording(
+        BagWriter(tmp_path / 'bag'), Limits(flush_period=0.05, max_size=1024))
+    recording.add_topic(Topic('/a', 'std_msgs/msg/UInt8', definition))
+    recording.put([message(i) for i in range(20_000)], 100_000)
+    status = recording.close()
+    assert status.written == {'/a': 20_000}
+    assert status.crowded > 0
+    assert judge(status, 'recording', 0, flush_period=0.5)[0] == WARN
+    # The burst, and what the clock has allowed since.
+    assert len(BagReader(tmp_path / 'bag').files) < 60
+
+
+def test_what_is_declared_is_no_part_of_the_size_of_a_file(tmp_path):
+    recording = Recording(BagWriter(tmp_path / 'bag'), Limits(max_size=1024))
+    recording.add_topic(Topic('/a', 'std_msgs/msg/UInt8', 'uint8 data\n' * 2000))
+    recording.put([message(i) for i in range(100)], 500)
+    recording.close()
+    assert [file.message_count for file in metadata.read(
+        tmp_path / 'bag' / 'metadata.yaml').files] == [29, 29, 29, 13]
+
+
+def test_time_that_jumps_to_and_fro_does_not_make_a_file_each_time(tmp_path):
+    recording = Recording(BagWriter(tmp_path / 'bag'), Limits())
+    recording.add_topic(TOPIC)
+    for i in range(500):
+        recording.put([message(i)], 5)
+        recording.begin_anew()
+    status = recording.close()
+    assert status.crowded > 400
+    assert status.written == {'/a': 500}
+
+
+def test_an_end_that_takes_too_long_is_cut_off_and_counted(tmp_path, monkeypatch):
+    monkeypatch.setattr('hmsa_ros.bag.recording.END_SECONDS', 0.0)
+    recording = Recording(BagWriter(tmp_path / 'bag'), Limits())
+    recording.add_topic(TOPIC)
+    for i in range(200_000):
+        recording.put([message(i)], 5)
+    status = recording.close()
+    lost = sum(lost_by_topic(status.overflowed, status.dropped).values())
+    assert lost > 0
+    assert sum(status.written.values()) + lost == 200_000
+
+
+def test_a_bag_is_not_complete_before_its_recorder_has_closed_it(tmp_path):
+    writer = BagWriter(tmp_path / 'bag')
+    number = writer.add_topic(TOPIC)
+    writer.write([(number, 1, 1, 1, PAYLOAD)])
+    writer.split()
+    writer.abandon()  # as when the disk is full: no file is open, all are whole
+    assert not BagReader(tmp_path / 'bag').complete
+    writer.close()
+    assert BagReader(tmp_path / 'bag').complete

@@ -6,64 +6,35 @@ happen in the thread. What cannot be kept is counted by topic, never dropped in 
 """
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 import threading
 import time
 from typing import NamedTuple
 
-from hmsa_ros.bag.writer import BagWriter, MIN_FILE_SIZE, Topic
-from hmsa_ros.errors import BadInputError, BagError
+from hmsa_ros.bag.sink import Limits, Message, Sink
+from hmsa_ros.bag.writer import BagWriter, Topic
+from hmsa_ros.errors import BagError
+
+__all__ = ['Limits', 'lost_by_topic', 'Message', 'Recording', 'Status']
 
 # What a queued message takes in memory besides its payload.
 MESSAGE_OVERHEAD = 250
 RETRY_SECONDS = 1.0
+#: After so long the end does not wait any more: what is not yet written is counted as lost.
+END_SECONDS = 10.0
+# On top of it, for a disk that does not answer.
+_GRACE_SECONDS = 5.0
 
-Message = tuple[int, int, int, int, bytes]
-
-
-@dataclass(frozen=True)
-class Limits:
-    """
-    When to flush, when to split and how much to keep in memory.
-
-    Attributes
-    ----------
-    flush_period : float
-        Seconds after which at the latest a message is with the operating system; above 0.
-    max_size : int
-        Size in bytes at which a file is split; 0 for never, else at least 1024.
-    max_duration_ns : int
-        Time span at which a file is split, in nanoseconds; 0 for never.
-    cache_size : int
-        Bytes of queued messages at which new ones are counted as lost; at least 1.
-    snapshot_ns : int
-        In nanoseconds: above 0, messages are kept in memory for this long and only written
-        when a snapshot is asked for.
-
-    """
-
-    flush_period: float = 0.5
-    max_size: int = 0
-    max_duration_ns: int = 0
-    cache_size: int = 100 * 2**20
-    snapshot_ns: int = 0
-
-    def __post_init__(self) -> None:
-        if not self.flush_period > 0.0:
-            raise BadInputError(f'flush period is {self.flush_period} s: expected above 0')
-        if self.max_size and self.max_size < MIN_FILE_SIZE:
-            raise BadInputError(
-                f'largest file size is {self.max_size} bytes: expected 0 for no limit, or at '
-                f'least {MIN_FILE_SIZE}')
-        if self.max_duration_ns < 0 or self.snapshot_ns < 0:
-            raise BadInputError('a duration is negative: expected at least 0')
-        if self.cache_size < 1:
-            raise BadInputError(f'cache size is {self.cache_size}: expected at least 1 byte')
 
 
 class Status(NamedTuple):
-    """State of a recording: file, error, counts by topic and memory in use."""
+    """
+    State of a recording.
+
+    File, error, counts by topic, memory in use, the seconds for which the oldest message has
+    waited, and how often a new file was due too soon after the last ones.
+    """
 
     file: str
     error: str
@@ -72,6 +43,8 @@ class Status(NamedTuple):
     dropped: Mapping[str, int]
     queued_bytes: int
     peak_bytes: int
+    behind: float
+    crowded: int
 
 
 @dataclass
@@ -84,7 +57,15 @@ class _Request:
     error: BaseException | None = None
 
 
-_Item = Topic | Mapping[str, str] | _Request | tuple[list[Message], int]
+class _Batch(NamedTuple):
+    """Messages, what they take in memory, and since when they wait."""
+
+    messages: list[Message]
+    size: int
+    since: float
+
+
+_Item = Topic | Mapping[str, str] | _Request | _Batch
 
 
 class Recording:
@@ -119,8 +100,9 @@ class Recording:
         self._error = ''
         self._next_retry = 0.0
         self._rest: Iterator[Message] | None = None
-        self._rest_size = 0
-        self._ring: deque[tuple[list[Message], int]] = deque()
+        self._batch = _Batch([], 0, 0.0)
+        self._deadline = float('inf')
+        self._sink = Sink(writer, limits, self._release)
         self._thread = threading.Thread(target=self._run, name='writer', daemon=True)
         self._thread.start()
 
@@ -134,11 +116,6 @@ class Recording:
         ----------
         topic : hmsa_ros.bag.writer.Topic
             What will be recorded.
-
-        Returns
-        -------
-        int
-            Number of the topic in messages.
 
         """
         with self._condition:
@@ -166,13 +143,12 @@ class Recording:
         size = payload_bytes + MESSAGE_OVERHEAD * len(messages)
         with self._condition:
             if self._queued + size > self._limits.cache_size:
-                for message in messages:
-                    self._overflowed[message[0]] = self._overflowed.get(message[0], 0) + 1
+                self._lose(messages)
                 return
             self._queued += size
             self._peak = max(self._peak, self._queued)
             wake = not self._items
-            self._items.append((messages, size))
+            self._items.append(_Batch(messages, size, time.monotonic()))
             if wake:
                 self._condition.notify()
 
@@ -191,21 +167,8 @@ class Recording:
             self._condition.notify()
 
     def split(self) -> str:
-        """
-        Go on in a new file, after all that has been put so far.
-
-        Returns
-        -------
-        str
-            Name of the new file.
-
-        Raises
-        ------
-        BagError
-            If it cannot be done.
-
-        """
-        return self._ask(self._split)
+        """Go on in a new file, after all that has been put so far."""
+        return self._ask(self._writer.split)
 
     def begin_anew(self) -> None:
         """
@@ -214,42 +177,25 @@ class Recording:
         For when time has jumped back: a snapshot does not reach back beyond it either.
         """
         with self._condition:
-            self._items.append(_Request(self._begin_anew))
+            self._items.append(_Request(self._sink.begin_anew))
             self._condition.notify()
 
     def snapshot(self) -> str:
-        """
-        Write what is kept in memory.
-
-        Returns
-        -------
-        str
-            How many messages were written, in words.
-
-        Raises
-        ------
-        BagError
-            If it cannot be done.
-
-        """
-        return self._ask(self._snapshot)
+        """Write what is kept in memory."""
+        return self._ask(self._sink.snapshot)
 
     def status(self) -> Status:
-        """
-        Return the state.
-
-        Returns
-        -------
-        Status
-            As of now.
-
-        """
+        """Return the state."""
         with self._condition:
+            batch = self._batch if self._rest is not None else next(
+                (item for item in self._items if isinstance(item, _Batch)), None)
             return Status(
                 self._writer.file_name, self._error, self._writer.topic_counts(),
                 {self._topics[number].name: count
                  for number, count in self._overflowed.items()},
-                dict(self._writer.dropped), self._queued, self._peak)
+                dict(self._writer.dropped), self._queued, self._peak,
+                0.0 if batch is None else time.monotonic() - batch.since,
+                self._sink.pace.refused)
 
     def close(self, last_words: Callable[[Status], Mapping[str, str]] | None = None) -> Status:
         """
@@ -260,16 +206,18 @@ class Recording:
         last_words : callable, optional
             Gets the state when everything is written and returns custom data to add.
 
-        Returns
-        -------
-        Status
-            The last state; ``error`` says what could not be written.
-
         """
         with self._condition:
             self._closing = True
+            self._deadline = time.monotonic() + END_SECONDS
             self._condition.notify()
-        self._thread.join()
+        self._thread.join(END_SECONDS + _GRACE_SECONDS)
+        if self._thread.is_alive():
+            # It waits for the disk and cannot be waited for: the bag stays as a kill leaves it.
+            self._error = (f'the disk of {self._writer.folder} has not answered for '
+                           f'{_GRACE_SECONDS:g} s: the bag is not closed')
+            self._give_up()
+            return self.status()
         try:
             self._writer.flush()
         except OSError as error:
@@ -323,19 +271,20 @@ class Recording:
             if closing and self._error:
                 # One last try; it may be the file alone that cannot grow any more.
                 self._retry(now=True)
-            if closing and (self._error or not self._items and self._rest is None):
+            if closing and (self._error or self._is_late()
+                            or not self._items and self._rest is None):
                 self._give_up()
                 return
 
     def _take_items(self) -> None:
         """Write everything that is queued."""
         if self._rest is not None:
-            self._write(self._rest, self._rest_size)
-        while self._items:
+            self._write(self._rest, self._batch)
+        while self._items and not self._is_late():
             item = self._items[0]
-            if isinstance(item, tuple):
+            if isinstance(item, _Batch):
                 self._items.popleft()
-                self._write(iter(item[0]), item[1])
+                self._write(iter(item.messages), item)
             elif isinstance(item, _Request):
                 self._items.popleft()
                 self._answer(item)
@@ -346,69 +295,25 @@ class Recording:
                 self._items.popleft()
                 self._writer.note(item)
 
-    def _write(self, messages: Iterator[Message], size: int) -> None:
+    def _write(self, messages: Iterator[Message], batch: _Batch) -> None:
         """Write messages; on failure what is left waits for the next try."""
-        self._rest, self._rest_size = messages, size
-        if self._limits.snapshot_ns:
-            self._keep(list(messages), size)
-        elif self._limits.max_size or self._limits.max_duration_ns:
-            self._write_splitting(messages)
-            self._release(size)
-        else:
-            self._writer.write(messages)
-            self._release(size)
+        self._rest, self._batch = messages, batch
+        self._sink.put(messages, batch.size, self._queued)
         self._rest = None
+
+    def _is_late(self) -> bool:
+        """Return whether the end has taken too long."""
+        return time.monotonic() > self._deadline
+
+    def _lose(self, messages: Iterable[Message]) -> None:
+        """Count messages that will not be written."""
+        for message in messages:
+            self._overflowed[message[0]] = self._overflowed.get(message[0], 0) + 1
 
     def _release(self, size: int) -> None:
         """Give memory back to the queue."""
         with self._condition:
             self._queued -= size
-
-    def _write_splitting(self, messages: Iterator[Message]) -> None:
-        """Write one message after the other, with a new file where a limit is reached."""
-        writer, limits = self._writer, self._limits
-        for message in messages:
-            if (limits.max_size and writer.file_size >= limits.max_size) or (
-                    limits.max_duration_ns
-                    and writer.file_duration_ns >= limits.max_duration_ns):
-                writer.split()
-            writer.write((message,))
-
-    def _keep(self, messages: list[Message], size: int) -> None:
-        """Keep messages in memory for a snapshot, the oldest giving way."""
-        self._ring.append((messages, size))
-        newest = messages[-1][1]
-        while self._ring and (
-                self._ring[0][0][-1][1] < newest - self._limits.snapshot_ns
-                or self._queued > self._limits.cache_size * 9 // 10):
-            self._release(self._ring.popleft()[1])
-
-    def _snapshot(self) -> str:
-        """Write the messages kept in memory."""
-        if not self._limits.snapshot_ns:
-            raise BagError('there is no snapshot to take: every message is recorded; expected '
-                           'snapshot mode')
-        newest = self._ring[-1][0][-1][1] if self._ring else 0
-        count = 0
-        while self._ring:
-            messages, size = self._ring.popleft()
-            wanted = [message for message in messages
-                      if message[1] >= newest - self._limits.snapshot_ns]
-            self._writer.write(wanted)
-            self._release(size)
-            count += len(wanted)
-        self._writer.flush()
-        return f'{count} messages written'
-
-    def _split(self) -> str:
-        """Go on in a new file."""
-        return self._writer.split()
-
-    def _begin_anew(self) -> str:
-        """Go on in a new file, without what is kept for a snapshot."""
-        while self._ring:
-            self._release(self._ring.popleft()[1])
-        return self._writer.file_name if self._writer.is_file_empty else self._writer.split()
 
     @staticmethod
     def _answer(request: _Request) -> None:
@@ -448,17 +353,15 @@ class Recording:
 
     def _give_up(self) -> None:
         """Count what is left in the queue as lost, and answer who waits."""
-        left = list(self._rest or ())
         with self._condition:
+            self._lose(self._rest or ())
             for item in self._items:
-                if isinstance(item, tuple):
-                    left += item[0]
+                if isinstance(item, _Batch):
+                    self._lose(item.messages)
                 elif isinstance(item, _Request):
                     item.error = BagError('the recording has ended')
                     item.done.set()
             self._items.clear()
-            for message in left:
-                self._overflowed[message[0]] = self._overflowed.get(message[0], 0) + 1
 
 
 def _not_closed(error: OSError) -> str:
@@ -491,8 +394,3 @@ def lost_by_topic(*counts: Mapping[str, int]) -> dict[str, int]:
         for topic, number in count.items():
             total[topic] = total.get(topic, 0) + number
     return total
-
-
-def duration_ns(seconds: float) -> int:
-    """Return seconds as whole nanoseconds."""
-    return round(seconds * 1e9)

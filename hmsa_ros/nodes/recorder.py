@@ -11,7 +11,6 @@ the bag when it is cleaned up.
 from bisect import bisect_left
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 import datetime
 import json
 import os
@@ -30,7 +29,8 @@ from std_srvs.srv import Trigger
 from hmsa_ros import __version__
 from hmsa_ros.bag.definitions import message_definition, type_hash
 from hmsa_ros.bag.qos import Qos
-from hmsa_ros.bag.recording import Limits, lost_by_topic, Message, Recording, Status
+from hmsa_ros.bag.reception import judge, RecordedTopic
+from hmsa_ros.bag.recording import Limits, lost_by_topic, Recording, Status
 from hmsa_ros.bag.writer import BagWriter, parse_custom_data, PRESETS, Topic
 from hmsa_ros.errors import BadInputError, BagError
 from hmsa_ros.nodes import interface
@@ -120,21 +120,6 @@ _SETPOINTS = {
     for topic in (interface.JOINT_TRAJECTORY, interface.SETPOINT)}
 
 
-@dataclass
-class _Recorded:
-    """A topic being recorded: its subscription and what is known of its publishers."""
-
-    name: str
-    type: str
-    number: int
-    qos: QoSProfile
-    offered: tuple[Qos, ...]
-    publishers: int = 0
-    last: dict[bytes, int] = field(default_factory=dict)
-    received: int = 0
-    missed: int = 0
-
-
 class Recorder(ManagedNode):
     """
     ROS 2 node that records.
@@ -171,7 +156,7 @@ class Recorder(ManagedNode):
             tuple(map(self._full_name, values['record.topics'])), values['record.all_topics'],
             values['record.regex'], tuple(map(self._full_name, values['record.exclude_topics'])),
             values['record.exclude_regex'])
-        self._topics: dict[str, _Recorded] = {}
+        self._topics: dict[str, RecordedTopic] = {}
         self._refused: dict[str, str] = {}
         # While inactive it is paused.
         self._paused = True
@@ -323,7 +308,7 @@ class Recorder(ManagedNode):
         number = self._recording.add_topic(self._describe(name, type_name, offered, hashes))
         qos = subscription(offered, self._parameters_in['record.queue_depth'])
         if known is None:
-            recorded = _Recorded(name, type_name, number, qos, offered)
+            recorded = RecordedTopic(name, type_name, number, qos, offered)
             self._topics[name] = recorded
             self._capture.add(recorded, RawSubscription(self, message_type, name, qos))
             self.get_logger().info(f'subscribed to {name} ({type_name})')
@@ -411,28 +396,10 @@ class Recorder(ManagedNode):
         if self._sim_time is not None:
             self._note({'time_jumps': str(self._sim_time.jumps)})
 
-    def _take_in(self, topic: _Recorded, messages: list[Taken]) -> None:
+    def _take_in(self, topic: RecordedTopic, messages: list[Taken]) -> None:
         """Count gaps and hand the messages to the writer."""
-        clock, number, last = self._sim_time, topic.number, topic.last
-        batch: list[Message] = []
-        size = 0
-        paused = self._paused
-        for source, received, sequence, publisher, data in messages:
-            before = last.get(publisher)
-            if before is not None:
-                if sequence <= before:
-                    continue  # seen already, through the subscription this one replaces
-                if not paused:
-                    topic.missed += sequence - before - 1
-            last[publisher] = sequence
-            if paused:
-                continue
-            # Not every middleware stamps on reception.
-            stamp = received or time.time_ns()
-            batch.append((number, stamp if clock is None else clock.at(stamp), source, sequence,
-                          data))
-            size += len(data)
-        topic.received += len(batch)
+        batch, size = topic.take(
+            messages, None if self._sim_time is None else self._sim_time.at, paused=self._paused)
         if batch:
             self._recording.put(batch, size)
 
@@ -551,17 +518,12 @@ class Recorder(ManagedNode):
         state = ('inactive' if not self.active else 'paused' if self._paused
                  else 'waiting for /clock'
                  if self._sim_time is not None and not self._sim_time.started else 'recording')
-        if status.error:
-            level, text = DiagnosticStatus.ERROR, status.error
-        elif total:
-            level, text = DiagnosticStatus.WARN, f'{state}, {total} messages lost'
-        elif self._sim_time is not None and (
-                self._sim_time.ignored or self.count_publishers(interface.CLOCK_TOPIC.name) > 1):
-            level, text = DiagnosticStatus.WARN, (
-                f'{state}; {self.count_publishers(interface.CLOCK_TOPIC.name)} publishers of '
-                '/clock, the first one is followed')
-        else:
-            level, text = DiagnosticStatus.OK, state
+        clocks = 0 if self._sim_time is None else self.count_publishers(
+            interface.CLOCK_TOPIC.name)
+        level, text = judge(
+            status, state, total, flush_period=self._parameters_in['storage.flush_period'],
+            clocks=clocks, clock_ignored=self._sim_time is not None and bool(
+                self._sim_time.ignored))
         values = {
             'bag': str(self.folder),
             'file': status.file,
@@ -571,6 +533,8 @@ class Recorder(ManagedNode):
             'written': str(sum(status.written.values())),
             'lost': str(total),
             'queued_bytes': str(status.queued_bytes),
+            'behind': f'{status.behind:.3f}',
+            'files_refused': str(status.crowded),
             **({} if self._sim_time is None else {
                 'time_jumps': str(self._sim_time.jumps),
                 'clock_ignored': str(self._sim_time.ignored)}),
@@ -579,7 +543,7 @@ class Recorder(ManagedNode):
         message = DiagnosticArray()
         message.header.stamp = self.get_clock().now().to_msg()
         message.status = [DiagnosticStatus(
-            level=level, name=f'{self.get_fully_qualified_name().lstrip("/")}: bag',
+            level=bytes((level,)), name=f'{self.get_fully_qualified_name().lstrip("/")}: bag',
             message=text, hardware_id='',
             values=[KeyValue(key=key, value=value) for key, value in values.items()])]
         self._diagnostics.publish(message)

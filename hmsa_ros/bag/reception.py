@@ -1,0 +1,127 @@
+"""What a recorder makes of messages received and of its own state, without ROS."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+import time
+from typing import Any
+
+from hmsa_ros.bag.qos import Qos
+from hmsa_ros.bag.recording import Message, Status
+
+OK, WARN, ERROR = range(3)
+# Between two flushes messages wait: only more than that is told.
+_BEHIND_PERIODS = 4.0
+_BEHIND_SECONDS = 1.0
+
+
+@dataclass
+class RecordedTopic:
+    """
+    A topic being recorded: its subscription and what is known of its publishers.
+
+    Attributes
+    ----------
+    name, type : str
+        Topic and message type.
+    number : int
+        Of the topic in the bag.
+    qos : object
+        With which it is subscribed to.
+    offered : tuple of hmsa_ros.bag.qos.Qos
+        What its publishers offer.
+    publishers : int
+        How many there were at the last look.
+    last : dict of bytes to int
+        Last sequence number by publisher.
+    received, missed : int
+        Messages taken, and gaps in the sequence numbers.
+
+    """
+
+    name: str
+    type: str
+    number: int
+    qos: Any
+    offered: tuple[Qos, ...]
+    publishers: int = 0
+    last: dict[bytes, int] = field(default_factory=dict)
+    received: int = 0
+    missed: int = 0
+
+    def take(
+            self, messages: Iterable[tuple[int, int, int, bytes, bytes]],
+            at: Callable[[int], int] | None, *, paused: bool) -> tuple[list[Message], int]:
+        """
+        Count gaps and return what is to be written, with the length of all payloads.
+
+        Parameters
+        ----------
+        messages : iterable of tuple
+            Source and reception stamp in nanoseconds, sequence number, publisher, payload.
+        at : callable or None
+            Returns the log time at a moment of system time; None for that moment itself.
+        paused : bool
+            Whether nothing is recorded now; what passes meanwhile is not missed.
+
+        """
+        batch: list[Message] = []
+        size = 0
+        for source, received, sequence, publisher, data in messages:
+            before = self.last.get(publisher)
+            if before is not None:
+                if sequence <= before:
+                    continue  # seen already, through the subscription this one replaces
+                if not paused:
+                    self.missed += sequence - before - 1
+            self.last[publisher] = sequence
+            if paused:
+                continue
+            # Not every middleware stamps on reception.
+            stamp = received or time.time_ns()
+            batch.append((self.number, stamp if at is None else at(stamp), source, sequence, data))
+            size += len(data)
+        self.received += len(batch)
+        return batch, size
+
+
+def judge(
+        status: Status, state: str, lost: int, *, flush_period: float, clocks: int = 0,
+        clock_ignored: bool = False) -> tuple[int, str]:
+    """
+    Return the level and the sentence for the diagnostics of a recorder.
+
+    Parameters
+    ----------
+    status : hmsa_ros.bag.recording.Status
+        Of its recording.
+    state : str
+        ``'recording'``, ``'paused'``, ...
+    lost : int
+        Messages lost so far.
+    flush_period : float
+        In seconds, above 0.
+    clocks : int
+        Publishers of ``/clock``.
+    clock_ignored : bool
+        Whether one of them is not followed.
+
+    Returns
+    -------
+    tuple of int and str
+        `OK`, `WARN` or `ERROR`, and why.
+
+    """
+    if status.error:
+        return ERROR, status.error
+    reasons = []
+    if lost:
+        reasons.append(f'{lost} messages lost')
+    if status.behind > max(_BEHIND_SECONDS, _BEHIND_PERIODS * flush_period):
+        reasons.append(f'writing is {status.behind:.1f} s behind')
+    if status.crowded:
+        reasons.append('files would follow each other more often than once a second: they '
+                       'become longer than asked for')
+    text = ', '.join([state, *reasons])
+    if clock_ignored or clocks > 1:
+        return WARN, f'{text}; {clocks} publishers of /clock, the first one is followed'
+    return (WARN if reasons else OK), text
