@@ -99,6 +99,16 @@ def wait_until(
     return result
 
 
+@pytest.fixture(autouse=True)
+def bags_are_whole_for_rosbags(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Hold every bag that a test leaves whole against rosbags, which drops topics silently."""
+    folder = request.getfixturevalue('tmp_path') if 'tmp_path' in request.fixturenames else None
+    yield
+    if folder is not None:
+        from bags import hold_against_rosbags
+        hold_against_rosbags(folder)
+
+
 @pytest.fixture(name='wait_until')
 def wait_until_fixture() -> Callable[..., Any]:
     """Return `wait_until`, for test modules that cannot import this one."""

@@ -177,6 +177,19 @@ def test_metadata_exist_from_the_start_and_are_read_back(tmp_path):
     assert metadata.from_map(metadata.to_map(end), 'test') == end
 
 
+def test_publishers_that_come_later_hide_nothing_from_other_readers(tmp_path):
+    with BagWriter(tmp_path / 'bag') as writer:
+        number = writer.add_topic(topic(profiles=PROFILES[:1]))
+        writer.write([(number, 1, 1, 1, payload(1))])
+        assert writer.add_topic(topic(profiles=PROFILES)) == number
+        writer.write([(number, 2, 2, 2, payload(2))])
+        writer.split()
+        writer.write([(number, 3, 3, 3, payload(3))])
+    with RosbagsReader(tmp_path / 'bag') as reader:
+        assert [stamp for _, stamp, _ in reader.messages()] == [1, 2, 3]
+    assert BagReader(tmp_path / 'bag').topics['/a'].profiles == PROFILES
+
+
 def test_notes_survive_without_a_clean_end(tmp_path):
     writer = BagWriter(tmp_path / 'bag')
     writer.note({'planner.zeta': '0.1'})

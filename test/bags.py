@@ -1,0 +1,25 @@
+"""Bags held against rosbags, a reader that knows nothing of this package."""
+
+from collections import Counter
+from pathlib import Path
+
+from rosbags.rosbag2 import Reader
+
+from hmsa_ros.bag.metadata import FILE_NAME
+from hmsa_ros.bag.reader import BagReader
+from hmsa_ros.errors import HmsaError
+
+
+def hold_against_rosbags(folder):
+    """Hold every bag in a folder that is whole against what rosbags reads, topic by topic."""
+    for path in Path(folder).rglob(FILE_NAME):
+        try:
+            reader = BagReader(path.parent)
+            expected = Counter(reader.counts())
+        except HmsaError:
+            continue
+        if reader.problems or not reader.complete:
+            continue
+        with Reader(path.parent) as other:
+            found = Counter(connection.topic for connection, _, _ in other.messages())
+        assert found == +expected, f'rosbags reads {found} of {path.parent}'
