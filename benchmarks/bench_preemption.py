@@ -86,16 +86,16 @@ def own_time(name: str, parameters: dict[str, str], count: int) -> Row:
     try:
         node = PlannerNode()
         source = node._time_source
+        channel = node._channels['actuator']
         spans = []
         for i in range(count):
             # Simulated time, handed in as /clock would: requests lie 3 ms apart in it.
             source.clock_callback(Clock(clock=to_time(10**9 + i * _SPACING_NS)))
             message = Float64(data=float(_TARGETS[i % _TARGETS.size]))
             begin = thread_time()
-            node._on_setpoint('actuator', message.data)
+            channel._on_setpoint(message)
             spans.append(thread_time() - begin)
-            node._on_poll()
-        refused = node._refused
+        refused = node._runtime.refused
         node.destroy_node()
     finally:
         rclpy.try_shutdown()

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
 
+from hmsa_ros.core.drafting import finish
 from hmsa_ros.core.group import PlannerGroup, Progress
 from hmsa_ros.core.history import Deviation
 from hmsa_ros.core.model import natural_frequency
@@ -81,8 +82,11 @@ class Joint:
         plant.advance(time)
 
     def resume(self):
-        found = self.group.resume(['x'], self.now)
-        assert self.stops or found.stopped == {}
+        if not self.group.may_resume('x'):
+            return None
+        found = finish(self.group.draft_resumption('x', self.now))
+        assert self.stops or not found.refusal
+        self.group.resume('x', found, self.now)
         return found
 
     def residual(self, stretch):
@@ -101,7 +105,7 @@ def group(**options):
 
 def test_each_joint_is_planned_as_it_would_be_alone():
     joints = group()
-    drafts = joints.draft_request(dict.fromkeys(BLOCKS, SOME), None, START)
+    drafts = finish(joints.draft_request(dict.fromkeys(BLOCKS, SOME), None, START))
     assert joints.take(drafts, START)
     assert joints.number == 1
     for name, block in BLOCKS.items():
@@ -117,35 +121,34 @@ def test_each_joint_is_planned_as_it_would_be_alone():
 @pytest.mark.parametrize('name', BLOCKS)
 def test_what_one_joint_cannot_do_none_does(bad, name):
     joints = group()
-    joints.take(joints.draft_request(dict.fromkeys(BLOCKS, SOME), None, START), START)
+    joints.take(finish(joints.draft_request(dict.fromkeys(BLOCKS, SOME), None, START)), START)
     before = {name: x.plan for name, x in joints.planners.items()}
     with pytest.raises(RefusedError, match=f'^joint (left|{name}): '):
-        joints.draft_request(
-            {x: [bad if x == name else (1.2, bad[1])] for x in BLOCKS}, None, START + MS)
+        finish(joints.draft_request(
+            {x: [bad if x == name else (1.2, bad[1])] for x in BLOCKS}, None, START + MS))
     assert all(joints.planners[x].plan is plan for x, plan in before.items())
 
 
 def test_stop_and_setpoint_and_progress():
     joints = group()
     assert joints.progress(START)[0] == Progress()
-    joints.take(joints.draft_setpoint('left', 1.2, START), START)
-    assert joints.draft_setpoint('left', 1.2, START + LEAD) == {}
+    joints.take(finish(joints.draft_setpoint('left', 1.2, START)), START)
+    assert finish(joints.draft_setpoint('left', 1.2, START + LEAD)) == {}
     assert joints.next_event(START) == START
     found, each = joints.progress(START + LEAD)
     assert (found, each['right']) == (Progress('moving', 1, 1, ''), Progress())
     assert each['left'] == Progress('moving', 1, 1, '1.2')
     now = START + 2 * MS
-    joints.take(joints.draft_request(dict.fromkeys(BLOCKS, SOME), None, now), now)
+    joints.take(finish(joints.draft_request(dict.fromkeys(BLOCKS, SOME), None, now)), now)
     stop = now + 3 * MS
-    joints.take(joints.draft_stop(stop), stop)
+    joints.take(finish(joints.draft_stop(stop)), stop)
     for planner in joints.planners.values():
         planner.due(stop + LEAD)
         assert abs(planner.state(stop + 10**9).rate) < 1e-8
     end = joints.progress(stop + 10**9)[0]
     assert (end.state, end.setpoint) == ('at_rest', end.setpoints)
-    assert joints.next_event(stop + 10**9) == joints.planners['left'].next_due
+    assert joints.next_event(stop + 10**9) is None
     joints.restart()
-    assert not joints.pending
     assert joints.next_event(START) is None
 
 
@@ -154,9 +157,9 @@ def test_simultaneous_arrival_is_that_of_the_slowest_to_the_nanosecond(period):
     joints = group(period=period)
     now = START // MS * MS
     alone = group(period=period)
-    alone.take(alone.draft_request(dict.fromkeys(BLOCKS, SOME), None, now), now)
+    alone.take(finish(alone.draft_request(dict.fromkeys(BLOCKS, SOME), None, now)), now)
     joints.simultaneous = True
-    joints.take(joints.draft_request(dict.fromkeys(BLOCKS, SOME), None, now), now)
+    joints.take(finish(joints.draft_request(dict.fromkeys(BLOCKS, SOME), None, now)), now)
     for k in range(3):
         sooner = [x.plan.segments[k] for x in alone.planners.values()]
         found = [x.plan.segments[k] for x in joints.planners.values()]
@@ -164,7 +167,7 @@ def test_simultaneous_arrival_is_that_of_the_slowest_to_the_nanosecond(period):
         assert {x.arrival for x in found} == {max(x.arrival for x in sooner)}
         for one, other in zip(sooner, found, strict=True):
             assert other.begin - one.begin == other.arrival - one.arrival >= 0
-            assert other.spell == one.begin
+            assert other.since == one.begin
     for name, planner in joints.planners.items():
         plant = ActuatorSimulation(BLOCKS[name], time=now)
         for level in planner.due(now + 10**9):
@@ -182,10 +185,11 @@ def test_simultaneous_arrival_is_that_of_the_slowest_to_the_nanosecond(period):
 def test_joint_in_motion_is_not_held_back():
     joints = group()
     joints.simultaneous = True
-    joints.take(joints.draft_setpoint('left', 1.2, START), START)
+    joints.take(finish(joints.draft_setpoint('left', 1.2, START)), START)
     joints.planners['left'].due(START + LEAD)
     now = START + 2 * MS
-    drafts = joints.draft_request(dict.fromkeys(BLOCKS, [(1.1, 44 * MS)]), None, now)
+    drafts = finish(joints.draft_request(
+        dict.fromkeys(BLOCKS, [(1.1, 44 * MS)]), None, now))
     assert drafts['left'].segments[0].begin == now + LEAD
     assert drafts['left'].levels[0].stamp == now + LEAD
     latest = max(x.segments[0].arrival for x in drafts.values())
@@ -195,8 +199,8 @@ def test_joint_in_motion_is_not_held_back():
 
 def test_preview_has_every_joint_at_every_change():
     joints = group()
-    joints.take(joints.draft_request(dict.fromkeys(BLOCKS, SOME), None, START), START)
-    stamps, samples = joints.preview()
+    joints.take(finish(joints.draft_request(dict.fromkeys(BLOCKS, SOME), None, START)), START)
+    stamps, samples = joints.preview(START, 100)
     assert stamps == sorted({
         x.stamp for p in joints.planners.values() for x in p.plan.levels if x.stamp > 0})
     for name, planner in joints.planners.items():
@@ -249,7 +253,7 @@ def test_the_rest_of_a_sequence_keeps_its_times():
     anew = joint.planner.plan
     assert (anew.number, anew.kept) == (1, 0)
     assert [x.stretch for x in anew.segments] == [1.1, 1.2, 1.4]
-    assert [x.spell for x in anew.segments] == [x.spell for x in plan.segments]
+    assert [x.since for x in anew.segments] == [x.since for x in plan.segments]
     for segment, step in zip(anew.segments, (0.1, 0.1, 0.2), strict=True):
         joint.wait((segment.arrival - joint.now) / MS)
         assert joint.residual(segment.stretch) < step * RESIDUAL
@@ -259,19 +263,19 @@ def test_setpoint_there_is_no_time_left_for_is_left_out():
     joint = Joint(lead_time=5 * MS)
     joint.planner.request([(1.1, 44 * MS), (1.3, 60 * MS)], None, START)
     level, _ = joint.planner.due(START + 10 * MS)
-    draft = joint.planner.draft_resumption(START + 39 * MS)
+    draft = finish(joint.planner.draft_resumption(START + 39 * MS))
     assert (draft.missed, [x.stretch for x in draft.segments]) == (0, [1.1, 1.3])
     # The first move begins 36 ms late: its time is over before it is.
     assert joint.news(START + 41 * MS, level.flux_density) == Deviation(36 * MS)
-    draft = joint.planner.draft_resumption(START + 41 * MS)
+    draft = finish(joint.planner.draft_resumption(START + 41 * MS))
     assert (draft.missed, [x.stretch for x in draft.segments]) == (1, [1.3])
     assert draft.segments[0].begin == START + 46 * MS
     # It would do with less of a rest at the first.
     joint.planner.set_options(replace(joint.planner.options, short_spell='continue'))
-    draft = joint.planner.draft_resumption(START + 41 * MS)
+    draft = finish(joint.planner.draft_resumption(START + 41 * MS))
     assert (draft.missed, [x.stretch for x in draft.segments]) == (0, [1.1, 1.3])
     joint.planner.restart()
-    assert joint.planner.draft_resumption(START) is None
+    assert finish(joint.planner.draft_resumption(START)) is None
 
 
 def test_what_cannot_be_resumed_is_stopped():
@@ -279,9 +283,9 @@ def test_what_cannot_be_resumed_is_stopped():
     joint.planner.setpoint(1.4, START)
     joint.planner.due(START + 2 * MS)
     joint.planner.set_options(replace(joint.planner.options, flux_density_max=0.1))
-    found = joint.group.resume(['x'], START + 3 * MS)
-    assert found.resumed == 0
-    assert 'stretch 1.4 needs a flux density of' in found.stopped['x']
+    found = finish(joint.group.draft_resumption('x', START + 3 * MS))
+    assert 'stretch 1.4 needs a flux density of' in found.refusal
+    joint.group.resume('x', found, START + 3 * MS)
     rest = joint.planner.state(START + 10**9)
     assert abs(rest.rate) < 1e-9
     assert rest.stretch != pytest.approx(1.4)
@@ -297,7 +301,7 @@ def test_missed_levels_are_dropped_and_the_rest_is_planned_from_what_happens():
     assert joint.planner.drop_missed(joint.now, 0) == 3
     assert joint.planner.drop_missed(joint.now, 0) == 0
     found = joint.resume()
-    assert (found.resumed, joint.planner.plan.segments[-1].stretch) == (1, 1.4)
+    assert found.draft.segments[-1].stretch == 1.4
     joint.wait(120)
     assert joint.residual(1.4) < 0.4 * RESIDUAL
 
@@ -396,12 +400,12 @@ def test_commands_that_are_late_for_ever_are_not_planned_anew_for_ever():
     joint.wait(300)
     count = len(joint.deviations)
     assert 3 <= count < 12
-    assert joint.group.resume(['x'], joint.now).given_up == ('x',)
+    assert joint.resume() is None
     # A new request is a new beginning, and so is a command in time.
     joint.delay = 0
-    drafts = joint.group.draft_setpoint('x', 1.3, joint.now)
+    drafts = finish(joint.group.draft_setpoint('x', 1.3, joint.now))
     joint.group.take(drafts, joint.now)
-    assert joint.group.resume(['x'], joint.now).resumed == 1
+    assert joint.resume().draft is not None
     joint.wait(100)
     assert len(joint.deviations) == count
     assert joint.residual(1.3) < 0.1 * RESIDUAL
@@ -491,5 +495,5 @@ def test_block_that_cannot_be_where_it_is_held_is_refused():
 def test_code_of_a_refusal_stays():
     joints = group()
     with pytest.raises(RefusedError) as caught:
-        joints.draft_setpoint('top', 9.0, START)
+        finish(joints.draft_setpoint('top', 9.0, START))
     assert caught.value.code is Code.OUT_OF_RANGE

@@ -167,7 +167,7 @@ def test_a_future_request_keeps_the_running_plan_until_then():
     before = rig.planner.plan
     stamp = START + LEAD + 90 * MS
     plan = rig.request([(1.05, 30), (1.0, 60)], stamp)
-    kept = [x for x in plan.ahead if x.stamp < stamp]
+    kept = [x for x in plan.ahead(rig.now) if x.stamp < stamp]
     assert kept == [x for x in before.levels if x.stamp < stamp][-len(kept):]
     # The setpoints still under way stay in the plan; what never arrives says so.
     assert [(x.stretch, x.begin - START - LEAD) for x in plan.segments] == [
@@ -334,7 +334,7 @@ def test_repeated_single_points_a_little_ahead_are_followed():
     rig.wait(120)
     assert rig.at_rest(target)
     # Old levels and segments do not pile up.
-    assert len(rig.planner.plan.ahead) < 40
+    assert len(rig.planner.plan.ahead(rig.now)) < 40
     assert len(rig.planner.plan.levels) < 72
     assert len(rig.planner.plan.segments) < 40
 
@@ -344,7 +344,7 @@ def test_the_plan_forgets_what_is_over():
     for i in range(30):
         rig.setpoint(1.1 + 0.1 * (i % 2))
         rig.wait(70)
-    assert len(rig.planner.plan.ahead) <= 4
+    assert len(rig.planner.plan.ahead(rig.now)) <= 4
     # Some more are kept until there is news of them.
     assert len(rig.planner.plan.levels) < 40
     assert len(rig.planner.plan.segments) <= 2

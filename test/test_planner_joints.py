@@ -11,11 +11,12 @@ from lifecycle_msgs.srv import ChangeState
 import pytest
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+from trajectory_msgs.msg import JointTrajectory
 
 from hmsa_ros.core.model import natural_frequency
 from hmsa_ros.core.parameters import paper_actuator
@@ -32,6 +33,7 @@ from hmsa_ros.nodes.conversions import (
 )
 from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.timekeeping import StepWatch
+from hmsa_ros.runtime.planner import PlannerRuntime
 
 pytestmark = pytest.mark.ros
 
@@ -130,6 +132,12 @@ class Rig:
         self.at(START)
 
     @property
+    def runtime(self) -> PlannerRuntime:
+        """What the node connects to the wire."""
+        runtime: PlannerRuntime = self.planner._runtime
+        return runtime
+
+    @property
     def driver(self) -> Driver:
         """The only driver."""
         driver, = self.drivers.values()
@@ -167,11 +175,10 @@ class Rig:
             self.at(min(self.now + step, end))
             self.spin(
                 lambda: all(
-                    sum(x.stamp - x.model.options.lead_time <= self.now
-                        for x in planner.plan.levels[planner._unsent:]) == 0
-                    for planner in self.planner._group.planners.values()),
+                    x.next_stamp is None or x.next_stamp - x.options.lead_time > self.now
+                    for x in self.runtime.group.planners.values()),
                 'what is due')
-            sent = self.planner._sent + self.planner._beats
+            sent = self.runtime.sent + self.runtime.heartbeats
             self.spin(
                 lambda sent=sent: sum(
                     x.received for x in self.drivers.values()) >= sent,
@@ -230,36 +237,6 @@ def test_joints_of_one_trajectory_get_what_each_would_alone(rig):
         len(x.positions) == len(x.velocities) == len(x.effort) == 3 for x in plan.points)
 
 
-REFUSED = {
-    'one is missing': (('left', 'top'), 'unknown_joint', "lacks 'right': expected all of"),
-    'none': ((), 'unknown_joint', "lacks 'left'"),
-    'twice': (('left', 'right', 'top', 'left'), 'unknown_joint', "'left' twice"),
-    'unknown': (('left', 'right', 'knee'), 'unknown_joint', "has 'knee': expected names among"),
-}
-
-
-def test_trajectory_that_one_joint_cannot_take_none_takes(rig):
-    planner = rig(*OTHERS, joints=JOINTS)
-    planner.send(trajectory(JOINTS, *SEQUENCE[:2]))
-    plans = {x: y.plan for x, y in planner.planner._group.planners.items()}
-    for names, code, text in REFUSED.values():
-        message = JointTrajectory(
-            joint_names=names, points=[JointTrajectoryPoint(
-                positions=[1.1] * len(names))])
-        message.points[0].time_from_start.sec = 1
-        assert text in planner.send(message, code).message
-    for field, value in (('positions', [1.1]), ('velocities', [0.0, 0.0, 0.5])):
-        message = trajectory(JOINTS, (1.1, SPELL))
-        setattr(message.points[0], field, value)
-        assert f'has {field if field != "positions" else 1}' in planner.send(
-            message, 'bad_input').message
-    # Top alone has so weak a coil.
-    answer = planner.send(trajectory(JOINTS, (1.5, SPELL)), 'flux_limit')
-    assert answer.level == ERROR
-    assert 'joint top: stretch 1.52 needs a flux density of' in answer.message
-    assert {x: y.plan for x, y in planner.planner._group.planners.items()} == plans
-
-
 def test_some_joints_only_by_parameter_and_one_by_its_own_setpoint(rig):
     planner = rig(joints=JOINTS)
     planner.send(trajectory(('left',), (1.1, SPELL)), 'unknown_joint')
@@ -268,7 +245,7 @@ def test_some_joints_only_by_parameter_and_one_by_its_own_setpoint(rig):
         Parameter('simultaneous_arrival', value=True)])
     assert all(x.successful for x in results)
     planner.send(trajectory(('right', 'top'), (1.1, SPELL)))
-    groups = planner.planner._group.planners
+    groups = planner.runtime.group.planners
     assert not groups['left'].plan.segments
     assert groups['right'].plan.segments[0].arrival == groups['top'].plan.segments[0].arrival
     setpoints = planner.ros.publisher(
@@ -279,35 +256,6 @@ def test_some_joints_only_by_parameter_and_one_by_its_own_setpoint(rig):
     answer = planner.ros.call(Trigger, 'planner/stop')
     assert answer.success
     assert all(x.plan.number >= 1 for x in groups.values())
-
-
-# -- signs of life ------------------------------------------------------------------------------
-
-
-def test_heartbeat_repeats_the_last_level_and_changes_nothing(rig):
-    planner = rig('-p', 'heartbeat_period:=0.02')
-    arrived = planner.driver.arrived
-    planner.at(START + 500 * MS)
-    # Nothing before the first command.
-    assert arrived == []
-    planner.send(to_trajectory([(1.1, SPELL)], 'actuator'))
-    begin = planner.now
-    for k in range(40):
-        planner.clock.set(begin + k * 5 * MS)
-        planner.ros.executor.spin_once(0.005)
-    planner.now = begin + 200 * MS
-    levels = planner.planner._group.planners['actuator'].plan.ahead
-    known = len(arrived)
-    planner.at(begin + 250 * MS)
-    planner.spin(lambda: len(arrived) > known, 'a heartbeat while holding')
-    changes = [x for k, x in enumerate(arrived) if k == 0 or x[1] != arrived[k - 1][1]]
-    assert changes == [(x.stamp, x.flux_density) for x in levels]
-    assert len(arrived) > 5
-    assert all(x[0] <= y[0] for x, y in zip(arrived, arrived[1:], strict=False))
-    assert arrived[-1] == (begin + 250 * MS + LEAD, levels[-1].flux_density)
-    result, = planner.ros.set_parameters('planner', [Parameter('heartbeat_period', value=0.0)])
-    assert result.successful
-    assert planner.planner._heartbeat.is_canceled()
 
 
 # -- taking over --------------------------------------------------------------------------------
@@ -346,20 +294,6 @@ def test_first_request_waits_for_the_state_in_force(rig, ros):
     assert (point[0].positions[0], point[0].velocities[0]) == (1.15, 3.0)
     planner.run(START + 150 * MS)
     assert driver.residual(1.25) < 0.1 * RESIDUAL
-
-
-def test_samples_of_others_only_delay_the_first_request(rig, ros):
-    planner = rig('-p', 'takeover_timeout:=0.05')
-    samples = ros.node.create_publisher(JointState, 'joint_states', 10)
-    ros.spin_until(lambda: planner.planner.count_publishers('joint_states'), 'the publisher')
-    answer = ros.call(Trigger, 'planner/stop')
-    assert answer.success
-    assert 'as soon as the state in force is known' in answer.message
-    planner.verdict(code='accepted', plan=1)
-    planner.send(to_trajectory([(1.1, SPELL)], 'actuator'))
-    assert not samples.get_subscription_count()
-    planner.run(START + 150 * MS)
-    assert planner.driver.residual(1.1) < 0.1 * RESIDUAL
 
 
 def test_planner_that_is_killed_is_followed_by_one_that_takes_over(ros, start, make_clock):
@@ -454,69 +388,35 @@ def test_late_command_is_noticed_and_the_rest_planned_anew(rig):
     assert driver.residual(1.4) < 0.2 * RESIDUAL
 
 
-def test_commands_that_come_late_together_change_nothing_and_are_found_out(rig):
-    slender = replace(paper_actuator(), damping_coefficient=1e-3)
-    planner = rig('-p', f'actuator.damping_coefficient:={slender.damping_coefficient}')
-    driver = planner.driver
-    driver.actuator, driver.plant = slender, ActuatorSimulation(slender, time=START)
-    planner.send(to_trajectory([(1.2, SPELL)], 'actuator'))
-    planner.run(START + 3 * MS)
-    driver.hold_back = True
-    planner.run(START + LEAD + 20 * MS)
-    driver.release()
-    driver.advance(planner.now)
-    # Both commands of the new plan, which ends at the level in force.
-    driver.hold_back = True
-    planner.verdict(code='replanned', replanned=1)
-    told = len(driver.told)
-    planner.run(planner.now + LEAD + 30 * MS)
-    assert len({from_command(x)[1] for x in driver.held}) == 2
-    driver.release()
-    driver.advance(planner.now)
-    assert len(driver.told) == told
-    assert driver.residual(1.2) > 0.01
-    planner.ros.set_parameters('planner', [Parameter('heartbeat_period', value=0.02)])
-    while int(planner.values()['replanned']) < 2:
-        planner.run(planner.now + 4 * MS)
-    planner.run(planner.now + LEAD + 40 * MS)
-    assert driver.residual(1.2) < 0.2 * RESIDUAL
-    assert int(planner.values()['replanned']) == 2
+# -- what nobody should send --------------------------------------------------------------------
 
 
-def test_lead_time_too_short_is_told_once_and_not_planned_for_again_and_again(rig):
-    planner = rig('-p', 'lead_time:=0.002')
-    driver = planner.driver
-    planner.send(to_trajectory([(1.2, SPELL)], 'actuator'))
-    held: list[tuple[int, Any]] = []
-    for _ in range(60):
-        # Each command is 5 ms on its way.
-        driver.hold_back = True
-        planner.run(planner.now + 2 * MS)
-        held += [(planner.now + 5 * MS, x) for x in driver.held]
-        driver.held = [x for at, x in held if at <= planner.now]
-        held = [x for x in held if x[0] > planner.now]
-        driver.release()
-        driver.hold_back = True
-        driver.advance(planner.now)
-        planner.ros.executor.spin_once(0.005)
-    status = planner.verdict(code='late')
-    assert status.level == WARN
-    assert 'raise lead_time to more than 0.00' in status.message
-    assert 1 <= int(planner.values()['replanned']) <= 3
-    assert len(driver.arrived) < 20
+def test_long_trajectory_leaves_room_for_signs_of_life_and_for_a_stop(rig, ros):
+    planner = rig('-p', 'heartbeat_period:=0.02')
+    planner.send(to_trajectory([(1.05, SPELL)], 'actuator'))
+    # Each spin lets a little simulated time go by, as the planner would not see it otherwise.
+    planner.run(START + 200 * MS)
+    planner.trajectories.publish(to_trajectory(
+        [(1.1 + 0.1 * (k % 2), (k + 1) * SPELL) for k in range(20_000)], 'actuator',
+        frame='long'))
+    planner.spin(lambda: planner.runtime.wake == 0, 'the planning')
+    before = planner.runtime.heartbeats
+    planner.run(planner.now + 60 * MS)
+    assert planner.runtime.heartbeats > before
+    assert ros.call(Trigger, 'planner/stop').message == 'accepted'
+    planner.verdict(code='accepted', request='', plan=2)
+    assert planner.runtime.wake != 0
 
 
-def test_jump_ahead_while_a_plan_runs_is_planned_anew(rig):
-    planner = rig()
-    planner.send(to_trajectory(SEQUENCE, 'actuator'))
-    planner.run(START + 30 * MS)
-    planner.at(START + LEAD + 2 * SPELL)
-    planner.driver.advance(planner.now)
-    status = planner.verdict(code='replanned', replanned=1)
-    assert status.level == WARN
-    planner.run(START + 2 * LEAD + 4 * SPELL)
-    planner.verdict(state='at_rest', stretch='1.4')
-    assert planner.driver.residual(1.4) < 0.2 * RESIDUAL
+def test_trajectory_that_is_too_long_or_garbage_is_refused(rig):
+    planner = rig('-p', 'max_points:=100')
+    points = [(1.1, (k + 1) * SPELL) for k in range(101)]
+    status = planner.send(to_trajectory(points, 'actuator'), 'too_long')
+    assert 'has 101 setpoints: expected at most 100' in status.message
+    planner.trajectories.publish(
+        serialize_message(to_trajectory(points[:2], 'actuator'))[:60])
+    assert 'cannot be decoded' in planner.verdict(code='bad_input', request='').message
+    planner.send(to_trajectory(points[:2], 'actuator'))
 
 
 # -- states and parameters ----------------------------------------------------------------------
@@ -535,7 +435,7 @@ def test_deactivated_it_comes_to_rest_and_activated_again_it_takes_over(rig, ros
     change(Transition.TRANSITION_DEACTIVATE)
     planner.verdict(code='stopped')
     assert planner.send(to_trajectory(SEQUENCE, 'actuator'), 'inactive').level == ERROR
-    sent = planner.planner._sent + planner.planner._beats
+    sent = planner.runtime.sent + planner.runtime.heartbeats
     planner.spin(lambda: len(driver.arrived) == sent, 'the last commands')
     driver.advance(START + 500 * MS)
     rest = driver.plant.stretch
@@ -545,7 +445,7 @@ def test_deactivated_it_comes_to_rest_and_activated_again_it_takes_over(rig, ros
     samples = ros.publisher(JointState, 'joint_states', 10, subscribers=0)
     ros.spin_until(lambda: planner.planner.count_publishers('joint_states'), 'the publisher')
     change(Transition.TRANSITION_ACTIVATE)
-    assert planner.planner._sent + planner.planner._beats == sent
+    assert planner.runtime.sent + planner.runtime.heartbeats == sent
     planner.trajectories.publish(to_trajectory([(1.3, SPELL)], 'actuator', frame='again'))
 
     def answered() -> bool:
@@ -581,8 +481,8 @@ def test_changed_block_and_lead_time_are_taken_by_the_next_plan(rig):
             replace(paper_actuator(), remanence=remanence, damping_coefficient=0.3),
             Options(flux_density_min=-0.5, flux_density_max=0.5, lead_time=100 * MS))
         assert [(x.stamp, x.flux_density) for x in (
-            planner.planner._group.planners[name].plan.ahead)] == [
-            (x.stamp, x.flux_density) for x in alone.setpoint(1.2, START).ahead]
+            planner.runtime.group.planners[name].plan.ahead(START))] == [
+            (x.stamp, x.flux_density) for x in alone.setpoint(1.2, START).ahead(START)]
     # 1.2 is held, which a block of so short chains cannot.
     result, = planner.ros.set_parameters('planner', [
         Parameter('right.actuator.chain_limit', value=0.05)])
@@ -606,18 +506,18 @@ def test_two_clocks_are_told_of_and_their_quarrel_makes_no_storm(rig, make_ros):
         Clock, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
     before = len(planner.statuses)
     for k in range(20):
-        jumps = planner.planner._jumps
+        jumps = planner.runtime.clock_jumps
         planner.clock.set(START + k * MS)
 
         def back(k: int = k, jumps: int = jumps) -> bool:
             clock.publish(to_clock(START // 2 + k))
-            return planner.planner._jumps > jumps
+            return planner.runtime.clock_jumps > jumps
 
         planner.spin(back, 'a jump')
     planner.spin(
         lambda: any('2 publishers on /clock' in x.status[0].message for x in arrays),
         'diagnostics')
-    assert planner.planner._replanned == 0
+    assert planner.runtime.following.replanned == 0
     assert sum(
         x.values[0].value == 'clock_jumped' for x in planner.statuses[before:]) < 10
 
@@ -643,10 +543,10 @@ def test_plan_is_dropped_when_the_wall_clock_is_set_back(ros, serve):
     statuses = ros.collect(interface.STATUS.type, 'planner/status', interface.STATUS.qos)
     setpoints = ros.publisher(Float64, 'planner/setpoint', interface.SETPOINT.qos)
     setpoints.publish(Float64(data=1.1))
-    ros.spin_until(lambda: planner._engaged, 'the plan')
+    ros.spin_until(lambda: planner._runtime._engaged, 'the plan')
     # As if the last reading had been ten seconds ahead of this one.
     planner._steps._offset += 10**10
     ros.spin_until(
         lambda: statuses and statuses[-1].values[0].value == 'clock_jumped', 'the verdict')
     assert 'the clock jumped back by 10.0' in statuses[-1].message
-    assert not planner._engaged
+    assert not planner._runtime._engaged

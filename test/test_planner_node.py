@@ -462,7 +462,7 @@ def test_changed_shaper_and_limits_are_taken_from_the_next_request_on(bench):
     planner.run(END)
     assert len(planner.commands) == 6
     planner.request((1.1, SPELL))
-    assert len(planner.core.plan.ahead) == 2
+    assert len(planner.core.plan.ahead(planner.now)) == 2
     assert 'expected -0.5 T to 0.2 T' in planner.send(
         trajectory((1.8, SPELL)), 'flux_limit').message
     planner.check()

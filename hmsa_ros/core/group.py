@@ -1,15 +1,16 @@
 """
 Planners of several joints that take a request together or not at all.
 
-Knows no ROS. One joint is a group of one, planned as by its planner alone.
+One joint is a group of one, planned as by its planner alone.
 """
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import groupby
 import math
 
+from hmsa_ros.core.drafting import Steps
 from hmsa_ros.core.history import Deviation
 from hmsa_ros.core.planner import Planner
 from hmsa_ros.core.status import RefusedError
@@ -21,6 +22,8 @@ _ATTEMPTS = 3
 _AT_REST = 1e-6
 # The first of these that some joint is in is that of all.
 _STATES = ('moving', 'waiting', 'holding', 'settling', 'at_rest', 'idle')
+# Setpoints whose arrivals are compared between two pauses.
+_COMPARED = 100
 
 
 @dataclass(frozen=True)
@@ -48,25 +51,19 @@ class Progress:
 @dataclass(frozen=True)
 class Resumption:
     """
-    What became of plans that were to be made anew.
+    How a joint goes on whose plan reality has left.
 
     Attributes
     ----------
-    resumed : int
-        Joints whose sequence goes on.
-    missed : int
-        Setpoints that were left out.
-    stopped : mapping of str to str
-        Joints that come to rest instead, and why.
-    given_up : tuple of str
-        Joints whose plan stays as it is, since it was made anew in vain several times running.
+    draft : Draft or None
+        To be taken; None if there is nothing left to do.
+    refusal : str
+        Why it comes to rest instead of going on; empty if it goes on.
 
     """
 
-    resumed: int = 0
-    missed: int = 0
-    stopped: Mapping[str, str] = field(default_factory=dict)
-    given_up: tuple[str, ...] = ()
+    draft: Draft | None
+    refusal: str = ''
 
 
 class PlannerGroup:
@@ -103,7 +100,7 @@ class PlannerGroup:
 
     def draft_request(
             self, points: Mapping[str, Sequence[tuple[float, int]]], stamp: int | None,
-            now: int) -> dict[str, Draft]:
+            now: int) -> Steps[dict[str, Draft]]:
         """
         Work out a setpoint sequence for some joints or all.
 
@@ -128,18 +125,21 @@ class PlannerGroup:
             If it cannot be carried out by one of them; it is named.
 
         """
-        drafts = self._each(
+        drafts = yield from self._each(
             points, lambda name: self.planners[name].draft_request(points[name], stamp, now))
-        return self._together(drafts) if self.simultaneous else drafts
+        if self.simultaneous:
+            return (yield from self._together(drafts))
+        return drafts
 
-    def draft_setpoint(self, name: str, stretch: float, now: int) -> dict[str, Draft]:
+    def draft_setpoint(self, name: str, stretch: float, now: int) -> Steps[dict[str, Draft]]:
         """Work out a single stretch for one joint; `draft_request` says more."""
-        return self._each(
-            [name], lambda name: self.planners[name].draft_setpoint(stretch, now))
+        return (yield from self._each(
+            [name], lambda name: self.planners[name].draft_setpoint(stretch, now)))
 
-    def draft_stop(self, now: int) -> dict[str, Draft]:
+    def draft_stop(self, now: int) -> Steps[dict[str, Draft]]:
         """Work out how all joints come to rest; `draft_request` says more."""
-        return self._each(self.planners, lambda name: self.planners[name].draft_stop(now))
+        return (yield from self._each(
+            self.planners, lambda name: self.planners[name].draft_stop(now)))
 
     def take(self, drafts: Mapping[str, Draft], now: int) -> bool:
         """
@@ -164,48 +164,26 @@ class PlannerGroup:
         self.number += bool(drafts)
         return bool(drafts)
 
-    def resume(self, names: Iterable[str], now: int) -> Resumption:
-        """
-        Plan what is left of the running plans anew, and stop the joints for which that fails.
+    def draft_resumption(self, name: str, now: int) -> Steps[Resumption]:
+        """Work out how what is left of a joint's plan goes on, or how the joint stops."""
+        planner = self.planners[name]
+        try:
+            return Resumption((yield from planner.draft_resumption(now)))
+        except RefusedError as error:
+            return Resumption((yield from planner.draft_stop(now)), str(error))
 
-        Where commands come late for ever, so would those of every new plan: a joint whose plan
-        was made anew several times with no command in time since is left alone.
-
-        Parameters
-        ----------
-        names : iterable of str
-            Joints.
-        now : int
-            Current time in ns.
-
-        Returns
-        -------
-        Resumption
-            What became of it.
-
-        """
-        resumed = missed = 0
-        stopped = {}
-        given_up = []
-        for name in names:
-            if not self.may_resume(name):
-                given_up.append(name)
-                continue
-            self._attempts[name] += 1
-            planner = self.planners[name]
-            try:
-                draft = planner.draft_resumption(now)
-            except RefusedError as error:
-                stopped[name] = str(error)
-                draft = planner.draft_stop(now)
-            else:
-                resumed += draft is not None
-                missed += 0 if draft is None else draft.missed
-            planner.take(draft, now)
-        return Resumption(resumed, missed, stopped, tuple(given_up))
+    def resume(self, name: str, found: Resumption, now: int) -> None:
+        """Take a joint's plan that has been made anew."""
+        self._attempts[name] += 1
+        self.planners[name].take(found.draft, now)
 
     def may_resume(self, name: str) -> bool:
-        """Return whether `resume` would plan for a joint anew."""
+        """
+        Return whether a joint's plan may be made anew.
+
+        Where commands come late for ever, so would those of every new plan: a plan that was
+        made anew several times with no command in time since is left as it is.
+        """
         return self._attempts[name] < _ATTEMPTS
 
     def applied(
@@ -237,11 +215,11 @@ class PlannerGroup:
 
     def _each(
             self, names: Iterable[str],
-            draft: Callable[[str], Draft | None]) -> dict[str, Draft]:
+            draft: Callable[[str], Steps[Draft | None]]) -> Steps[dict[str, Draft]]:
         drafts = {}
         for name in names:
             try:
-                made = draft(name)
+                made = yield from draft(name)
             except RefusedError as error:
                 if len(self.planners) == 1:
                     raise
@@ -250,29 +228,19 @@ class PlannerGroup:
                 drafts[name] = made
         return drafts
 
-    def _together(self, drafts: dict[str, Draft]) -> dict[str, Draft]:
-        """Have moves begin later that would arrive before the slowest of their spell."""
-        arrivals = [
-            max((x for x in spell if x is not None), default=None) for spell in zip(
-                *([x.arrival for x in draft.segments] for draft in drafts.values()),
-                strict=True)]
-        return {
-            name: draft.delayed([
-                latest - segment.arrival
-                if latest is not None and segment.arrival is not None
-                and self._rests(draft, segment) else 0
-                for latest, segment in zip(arrivals, draft.segments, strict=True)])
-            for name, draft in drafts.items()}
-
-    def _rests(self, draft: Draft, segment: PlannedSegment) -> bool:
-        """Whether a joint can as well begin a move later, since it rests until then."""
-        level = next(x for x in draft.levels if x.stamp == segment.begin)
-        model = level.model
-        load = level.in_force / model.units.load
-        return (
-            abs(level.rate) * model.units.time <= _AT_REST
-            and math.isclose(
-                load, model.holding(level.stretch), rel_tol=_AT_REST, abs_tol=_AT_REST))
+    def _together(self, drafts: dict[str, Draft]) -> Steps[dict[str, Draft]]:
+        """Have moves begin later that would arrive before the slowest to the same setpoint."""
+        delays: dict[str, list[int]] = {name: [] for name in drafts}
+        for number, row in enumerate(zip(*(x.segments for x in drafts.values()), strict=True)):
+            latest = max((x.arrival for x in row if x.arrival is not None), default=None)
+            for (name, draft), segment in zip(drafts.items(), row, strict=True):
+                delays[name].append(
+                    latest - segment.arrival
+                    if latest is not None and segment.arrival is not None
+                    and _rests(draft, segment) else 0)
+            if number % _COMPARED == _COMPARED - 1:
+                yield
+        return {name: draft.delayed(delays[name]) for name, draft in drafts.items()}
 
     # -- what comes of them --------------------------------------------------------------------
 
@@ -280,11 +248,6 @@ class PlannerGroup:
         """Drop all plans, after the clock has jumped back."""
         for planner in self.planners.values():
             planner.restart()
-
-    @property
-    def pending(self) -> bool:
-        """Whether commands remain to be handed out."""
-        return any(x.pending for x in self.planners.values())
 
     def next_event(self, now: int) -> int | None:
         """
@@ -303,8 +266,10 @@ class PlannerGroup:
 
         """
         times = [
-            time for planner in self.planners.values()
-            for time in (planner.next_due, *_changes(planner.plan, now)) if time is not None]
+            planner.next_stamp - planner.options.lead_time
+            for planner in self.planners.values() if planner.next_stamp is not None]
+        for planner in self.planners.values():
+            times += _changes(planner.plan, now)
         return min(times, default=None)
 
     def progress(self, now: int) -> tuple[Progress, dict[str, Progress]]:
@@ -335,9 +300,18 @@ class PlannerGroup:
             min((x.state for x in busy), key=_STATES.index), last.setpoint,
             last.setpoints), each
 
-    def preview(self) -> tuple[list[int], dict[str, list[tuple[float, float, float]]]]:
+    def preview(
+            self, begin: int,
+            limit: int) -> tuple[list[int], dict[str, list[tuple[float, float, float]]]]:
         """
         Sample the plans of all joints wherever the level of one changes.
+
+        Parameters
+        ----------
+        begin : int
+            Time in ns: from the level on that is in force then.
+        limit : int
+            Largest number of changes.
 
         Returns
         -------
@@ -350,28 +324,38 @@ class PlannerGroup:
         """
         stamps = sorted({
             level.stamp for planner in self.planners.values()
-            for level in planner.plan.ahead})
+            for level in planner.plan.ahead(begin, limit)})[:limit]
         return stamps, {
             name: _samples(planner.plan, stamps) for name, planner in self.planners.items()}
 
 
+def _rests(draft: Draft, segment: PlannedSegment) -> bool:
+    """Whether a joint can as well begin a move later, since it rests until then."""
+    level = draft.levels[bisect_left(draft.levels, segment.begin, key=lambda x: x.stamp)]
+    model = level.model
+    return (
+        abs(level.rate) * model.units.time <= _AT_REST
+        and math.isclose(
+            level.in_force / model.units.load, model.holding(level.stretch), rel_tol=_AT_REST,
+            abs_tol=_AT_REST))
+
+
 def _samples(plan: Plan, stamps: Sequence[int]) -> list[tuple[float, float, float]]:
     """Return stretch, rate in 1/s and flux density in T of a plan at increasing times in ns."""
-    begins = [x.stamp for x in plan.levels]
     samples: list[tuple[float, float, float]] = []
-    for index, group in groupby(
-            stamps, key=lambda x: max(bisect_right(begins, x) - 1, 0)):
-        level = plan.levels[index]
+    for place, group in groupby(stamps, key=plan.place):
+        level = plan.levels[place]
         times = [max(x, level.stamp) for x in group]
         samples += [(*x, level.flux_density) for x in level.sample(times)]
     return samples
 
 
 def _changes(plan: Plan, now: int) -> Iterable[int]:
-    """Return the times after now at which the progress of a plan changes."""
-    for segment in plan.segments:
-        if segment.spell > now:
-            yield segment.spell
+    """Return the next times after now at which the progress of a plan changes."""
+    place = bisect_right(plan.segments, now, key=lambda x: x.since)
+    for segment in plan.segments[place:place + 1]:
+        yield segment.since
+    for segment in plan.segments[max(place - 1, 0):place + 1]:
         if segment.arrival is not None and segment.arrival > now:
             yield segment.arrival
 
@@ -379,7 +363,7 @@ def _changes(plan: Plan, now: int) -> Iterable[int]:
 def _progress(plan: Plan, now: int) -> Progress:
     """Return how far a plan has come."""
     count = len(plan.segments) - plan.kept
-    place = bisect_right([x.spell for x in plan.segments], now) - 1
+    place = plan.under_way(now)
     if place < plan.kept:
         return Progress('waiting' if count else 'idle', 0, count)
     segment = plan.segments[place]

@@ -6,6 +6,11 @@ import math
 
 from hmsa_ros.core.timeline import PlannedLevel
 
+# How near a prediction must come to the planned one for what follows to hold as planned: half a
+# nanosecond, to which stamps are rounded, makes some 1e-8 of stretch at full speed. The rate is
+# meant relative to the natural frequency.
+_AS_PLANNED = 3e-8
+
 
 @dataclass(frozen=True)
 class Deviation:
@@ -33,6 +38,9 @@ class History:
     """
     The levels of a plan, and how much of it has happened.
 
+    Only what has been handed out is predicted anew where reality differs, so that the work
+    does not grow with the plan; `predicted` catches up as far as somebody needs it.
+
     Attributes
     ----------
     levels : tuple of PlannedLevel
@@ -41,12 +49,16 @@ class History:
         How many of them, the first ones, have been handed out; at least 1.
     known : int
         Place of the last one that is known to have taken effect.
+    stale : int or None
+        Place of the first level whose prediction does not follow from the one before; None for
+        none. It is never among those handed out.
 
     """
 
     levels: tuple[PlannedLevel, ...]
     sent: int = 1
     known: int = 0
+    stale: int | None = None
 
     def unheard(self, now: int) -> int:
         """
@@ -74,6 +86,10 @@ class History:
                 return i + 1 - first
         return 0
 
+    def handed_out(self, end: int) -> 'History':
+        """Return the history after all levels up to a place have been handed out."""
+        return replace(self.predicted(end), sent=end)
+
     def without(self, start: int, end: int) -> 'History':
         """
         Take levels out that never were in force, and never will be.
@@ -89,9 +105,9 @@ class History:
             In which the level before them stays in force.
 
         """
-        levels = self.levels[:start] + self.levels[end:]
-        handed = max(min(self.sent, end) - start, 0)
-        return replace(self, levels=predicted(levels, start), sent=self.sent - handed)
+        sent = self.sent - max(min(self.sent, end) - start, 0)
+        return History(
+            self.levels[:start] + self.levels[end:], sent, self.known, start).predicted(sent)
 
     def with_news(
             self, stamp: int, flux_density: float,
@@ -124,7 +140,7 @@ class History:
                 flux_density, levels[known].flux_density):
             return self, None
         sent = range(known + 1, self.sent)
-        found = self._place(sent, stamp, flux_density, tolerance)
+        found = self._find(sent, stamp, flux_density, tolerance)
         if found is not None:
             passed = range(known + 1, found)
             news = replace(levels[found], stamp=stamp)
@@ -139,16 +155,46 @@ class History:
             news = replace(before, stamp=stamp, flux_density=flux_density)
             rest = passed.stop
             deviation = Deviation(lost=self._changes(passed), foreign=True)
-        after = [
-            replace(x, stamp=max(x.stamp, stamp)) if i < self.sent else x
-            for i, x in enumerate(levels[rest:], rest)]
-        changed = (*levels[:known + 1], news, *after)
-        count = known + 2 + max(self.sent - rest, 0)
+        after = tuple(replace(x, stamp=max(x.stamp, stamp)) for x in levels[rest:self.sent])
+        changed = (*levels[:known + 1], news, *after, *levels[self.sent:])
+        count = known + 2 + len(after)
         if deviation == Deviation():
-            return History(changed, count, known + 1), deviation
-        return History(predicted(changed, known + 1), count, known + 1), deviation
+            stale = None if self.stale is None else self.stale + count - self.sent
+            return History(changed, count, known + 1, stale), deviation
+        return History(changed, count, known + 1, known + 1).predicted(count), deviation
 
-    def _place(
+    def predicted(self, end: int) -> 'History':
+        """
+        Work out anew what is stale.
+
+        Parameters
+        ----------
+        end : int
+            Place up to which predictions are wanted.
+
+        Returns
+        -------
+        History
+            Each level with the state that the one before it leads to; stale no more from where
+            that is what was planned.
+
+        """
+        if self.stale is None or self.stale >= end:
+            return self
+        anew: list[PlannedLevel] = []
+        for place in range(self.stale, end):
+            before = anew[-1] if anew else self.levels[place - 1]
+            anew.append(self.levels[place].after(before))
+            if place >= self.sent and agree(anew[-1], self.levels[place]):
+                break
+        stop = self.stale + len(anew)
+        settled = stop < end or stop == len(self.levels) or (
+            stop > self.sent and agree(anew[-1], self.levels[stop - 1]))
+        return replace(
+            self, levels=self.levels[:self.stale] + tuple(anew) + self.levels[stop:],
+            stale=None if settled else stop)
+
+    def _find(
             self, sent: range, stamp: int, flux_density: float, tolerance: int) -> int | None:
         """Return which of the levels that were sent has taken effect."""
         levels = self.levels
@@ -161,33 +207,20 @@ class History:
                 return i
         return None
 
-    def _changes(self, places: range) -> int:
+    def _changes(self, places: Sequence[int]) -> int:
         """Return how many of some levels are another one than that before."""
         return sum(
             self.levels[i].flux_density != self.levels[i - 1].flux_density for i in places)
 
 
-def predicted(levels: Sequence[PlannedLevel], start: int) -> tuple[PlannedLevel, ...]:
-    """
-    Return levels with their predictions worked out anew.
-
-    Parameters
-    ----------
-    levels : sequence of PlannedLevel
-        By stamp.
-    start : int
-        Place of the first whose prediction is to be worked out, at least 1.
-
-    Returns
-    -------
-    tuple of PlannedLevel
-        Each with the state that the one before it leads to.
-
-    """
-    anew = list(levels[:start])
-    for level in levels[start:]:
-        anew.append(level.after(anew[-1]))
-    return tuple(anew)
+def agree(one: PlannedLevel, other: PlannedLevel) -> bool:
+    """Return whether two predictions are the same but for what rounding makes of them."""
+    model = one.model
+    return (
+        abs(one.stretch - other.stretch) <= _AS_PLANNED
+        and abs(one.rate - other.rate) * model.units.time
+        <= _AS_PLANNED * model.frequency(one.stretch)
+        and _same(one.in_force, other.in_force))
 
 
 def _same(one: float, other: float) -> bool:

@@ -1,6 +1,6 @@
 """Plans for a sequence of setpoints (Eq. 14), each from where the last one really ends."""
 
-from collections.abc import Sequence
+from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass
 import math
 
@@ -15,7 +15,7 @@ from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.units import Units
 from hmsa_ros.errors import BadInputError
 
-#: What to do with a spell that ends before the move does.
+#: What to do with a setpoint that ends before the move to it does.
 SHORT_SPELL = ('refuse', 'continue')
 
 
@@ -123,6 +123,34 @@ def plan_sequence(
     """
     if not setpoints:
         raise RefusedError(Code.BAD_INPUT, 'no setpoint given: expected at least one')
+    return tuple(segments(
+        setpoints, material, start=start, shaper=shaper, limits=limits, delivery=delivery,
+        order=order, units=units, short_spell=short_spell))
+
+
+def segments(
+        setpoints: Iterable[Setpoint], material: NondimensionalParameters, *,
+        start: State | None = None, shaper: str = 'two_step', limits: Limits | None = None,
+        delivery: Delivery = IDEAL, order: int = 2, units: Units | None = None,
+        short_spell: str = 'refuse') -> Generator[Segment, None, None]:
+    """
+    Plan a sequence setpoint by setpoint, as they are asked for.
+
+    Arguments and errors are those of `plan_sequence`.
+
+    Yields
+    ------
+    Segment
+        Of each setpoint.
+
+    Raises
+    ------
+    RefusedError
+        If a setpoint cannot be had.
+    BadInputError
+        If an argument is out of range.
+
+    """
     if short_spell not in SHORT_SPELL:
         raise BadInputError(
             f'short_spell is {short_spell!r}: expected one of {", ".join(SHORT_SPELL)}')
@@ -132,8 +160,10 @@ def plan_sequence(
     state = start or State(1.0)
     check_stretch(state.stretch, material, 'start stretch')
     begin = 0.0
-    segments = []
-    for number, setpoint in enumerate(setpoints, 1):
+    upcoming = iter(setpoints)
+    setpoint = next(upcoming, None)
+    while setpoint is not None:
+        following = next(upcoming, None)
         move = _rounded(
             shape(Request(
                 state, setpoint.stretch, material, limits, delivery, order, units)),
@@ -146,20 +176,21 @@ def plan_sequence(
                     f'the move from stretch {state.stretch:.6g} to {setpoint.stretch:g} takes '
                     f'{units.time_text(move.duration)}, its span is '
                     f'{units.time_text(setpoint.span)}: expected a span of at least the move')
-            levels, duration = move.levels, move.duration
-            if number < len(setpoints):
-                levels = tuple(x for x in levels if x.time < setpoint.span)
-                duration = math.inf
-            move = Move(
-                Code.SPELL_TOO_SHORT, levels, duration,
-                f'the span {units.time_text(setpoint.span)} ends before stretch '
-                f'{setpoint.stretch:g} is reached, which takes '
-                f'{units.time_text(move.duration)}')
+            move = _cut(move, setpoint, units, last=following is None)
         end = _follow(state, move, setpoint.span, material, delivery.slew)
-        segments.append(Segment(setpoint, begin, state, end, move))
+        yield Segment(setpoint, begin, state, end, move)
         begin += setpoint.span
         state = end
-    return tuple(segments)
+        setpoint = following
+
+
+def _cut(move: Move, setpoint: Setpoint, units: Units, *, last: bool) -> Move:
+    """Return a move that its setpoint leaves no time for; the last one is finished."""
+    levels = move.levels if last else tuple(x for x in move.levels if x.time < setpoint.span)
+    return Move(
+        Code.SPELL_TOO_SHORT, levels, move.duration if last else math.inf,
+        f'the span {units.time_text(setpoint.span)} ends before stretch '
+        f'{setpoint.stretch:g} is reached, which takes {units.time_text(move.duration)}')
 
 
 def _rounded(move: Move, delivery: Delivery) -> Move:

@@ -32,6 +32,7 @@ class Code(str, Enum):
     UNKNOWN_JOINT = 'unknown_joint'
     NOT_INCREASING = 'not_increasing'
     IN_THE_PAST = 'in_the_past'
+    TOO_LONG = 'too_long'
     NO_TIME = 'no_time'
     INACTIVE = 'inactive'
 
@@ -91,6 +92,9 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'The whole sequence lies in the past by the clock of the planner.',
         'Stamp with the same clock as the planner: use_sim_time must agree on both sides. '
         'Stamp 0 means now.'),
+    Code.TOO_LONG: (
+        'The trajectory has more setpoints than the parameter max_points allows.',
+        'Send it in parts, each stamped with its start, or raise max_points.'),
     Code.NO_TIME: (
         'The planner follows simulated time, and no message has come on /clock yet.',
         'Start what publishes /clock, or set use_sim_time to false.'),

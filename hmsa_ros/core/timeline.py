@@ -166,7 +166,7 @@ class Model:
             state.load * other.units.load / self.units.load)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class PlannedLevel:
     """
     A change of level.
@@ -256,7 +256,7 @@ class PlannedLevel:
             in_force=state.load * units.load)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class PlannedSegment:
     """
     One setpoint on the timeline.
@@ -273,9 +273,8 @@ class PlannedSegment:
         Which command it is.
     reason : str
         Why it is not the one asked for; empty if it is.
-    spell : int
-        Time in ns at which the setpoint takes over from the one before; the move may begin
-        later.
+    since : int
+        Time in ns from which the setpoint holds; the move may begin later.
 
     """
 
@@ -284,7 +283,7 @@ class PlannedSegment:
     arrival: int | None
     code: Code
     reason: str
-    spell: int
+    since: int
 
 
 @dataclass(frozen=True)
@@ -302,9 +301,6 @@ class Plan:
         By time.
     kept : int
         How many of them, the first ones, belong to earlier requests.
-    past : int
-        How many levels, the first ones, are over and kept only until it is known when they
-        took effect.
 
     """
 
@@ -312,16 +308,24 @@ class Plan:
     levels: tuple[PlannedLevel, ...]
     segments: tuple[PlannedSegment, ...]
     kept: int = 0
-    past: int = 0
 
-    @property
-    def ahead(self) -> tuple[PlannedLevel, ...]:
-        """Levels from the one in force on, when it was made; none that is in force for ever."""
-        return tuple(x for x in self.levels[self.past:] if x.stamp >= 0)
+    def ahead(self, now: int, limit: int | None = None) -> tuple[PlannedLevel, ...]:
+        """Return levels from the one in force on; none that is in force for ever."""
+        first = self.place(now)
+        first += self.levels[first].stamp < 0
+        return self.levels[first:None if limit is None else first + limit]
 
     def level(self, time: int) -> PlannedLevel:
         """Return the level in force at a time, the first one before that."""
-        return self.levels[max(bisect_right([x.stamp for x in self.levels], time) - 1, 0)]
+        return self.levels[self.place(time)]
+
+    def place(self, time: int) -> int:
+        """Return the place of the level in force at a time, that of the first before it."""
+        return max(bisect_right(self.levels, time, key=lambda x: x.stamp) - 1, 0)
+
+    def under_way(self, time: int) -> int:
+        """Return the place of the setpoint that holds at a time, -1 before the first."""
+        return bisect_right(self.segments, time, key=lambda x: x.since) - 1
 
 
 @dataclass(frozen=True)
@@ -340,6 +344,8 @@ class Draft:
         request.
     missed : int
         How many setpoints are left out, since their time is over.
+    warning : PlannedSegment or None
+        The first that is not reached by the command that was asked for, and only roughly.
 
     """
 
@@ -348,6 +354,7 @@ class Draft:
     segments: tuple[PlannedSegment, ...]
     resumed: int | None = None
     missed: int = 0
+    warning: PlannedSegment | None = None
 
     def delayed(self, delays: Sequence[int]) -> 'Draft':
         """
@@ -356,7 +363,7 @@ class Draft:
         Parameters
         ----------
         delays : sequence of int
-            In ns, one for each segment; 0 where it does not begin at rest, or where its spell
+            In ns, one for each segment; 0 where it does not begin at rest, or where its setpoint
             has no room.
 
         Returns

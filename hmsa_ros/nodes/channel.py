@@ -6,10 +6,11 @@ from rclpy.node import Node
 from sensor_msgs.msg import MagneticField
 from std_msgs.msg import Float64
 
-from hmsa_ros.core.planner import PlannedLevel
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import conversions, interface
 from hmsa_ros.nodes.timekeeping import Seldom
+from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.runtime.records import Send, Target
 
 
 class JointChannel:
@@ -24,29 +25,18 @@ class JointChannel:
         Its name.
     joints : sequence of str
         All joints of the planner.
-    on_setpoint : callable
-        Called with the joint and a stretch.
-    on_applied : callable
-        Called with the joint, a stamp in ns and the flux density in T that is in force from
-        then on.
-
-    Attributes
-    ----------
-    applied : tuple of int and float, or None
-        The newest such news.
+    runtime : PlannerRuntime
+        Takes setpoints and news.
+    serve : callable
+        Called after each.
 
     """
 
     def __init__(
-            self, node: Node, joint: str, joints: Sequence[str],
-            on_setpoint: Callable[[str, float], None],
-            on_applied: Callable[[str, int, float], None]) -> None:
+            self, node: Node, joint: str, joints: Sequence[str], runtime: PlannerRuntime,
+            serve: Callable[[], None]) -> None:
         """Create publisher and subscriptions."""
-        self._node = node
-        self._joint = joint
-        self._on_setpoint_of = on_setpoint
-        self._on_applied_of = on_applied
-        self.applied: tuple[int, float] | None = None
+        self._node, self._joint, self._runtime, self._serve = node, joint, runtime, serve
         self._tell_ignored = Seldom()
         topic = interface.of_joint(interface.FLUX_DENSITY_COMMAND, joint, joints)
         self._command = node.create_publisher(topic.type, topic.name, topic.qos)
@@ -55,31 +45,19 @@ class JointChannel:
         topic = interface.of_joint(interface.FLUX_DENSITY_APPLIED, joint, joints)
         node.create_subscription(topic.type, topic.name, self._on_applied, topic.qos)
 
-    def send(self, stamp: int, level: PlannedLevel, frame: str) -> None:
-        """
-        Send a command.
-
-        Parameters
-        ----------
-        stamp : int
-            Time in ns from which it applies.
-        level : PlannedLevel
-            Which flux density.
-        frame : str
-            Of the coil.
-
-        """
-        self._command.publish(conversions.to_command(stamp, level.flux_density, frame))
+    def send(self, command: Send, frame: str) -> None:
+        """Publish a command in the frame of the coil."""
+        self._command.publish(
+            conversions.to_command(command.stamp, command.flux_density, frame))
 
     def _on_setpoint(self, message: Float64) -> None:
-        self._on_setpoint_of(self._joint, message.data)
+        self._runtime.request(Target(self._joint, message.data))
+        self._serve()
 
     def _on_applied(self, message: MagneticField) -> None:
         try:
-            stamp, flux_density = conversions.from_command(message)
+            self._runtime.applied(self._joint, *conversions.from_command(message))
         except BadInputError as error:
             if self._tell_ignored():
                 self._node.get_logger().error(f'news of joint {self._joint} ignored: {error}')
-            return
-        self.applied = stamp, flux_density
-        self._on_applied_of(self._joint, stamp, flux_density)
+        self._serve()

@@ -13,13 +13,12 @@ from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from hmsa_ros.core.schedule import obeyed
-from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.errors import BadInputError, excerpt
+from hmsa_ros.errors import BadInputError
 
 if TYPE_CHECKING:
     # Numba comes along with the planner, which a recorder has no use for.
-    from hmsa_ros.core.planner import Plan
+    from hmsa_ros.runtime.records import StatusChanged
 
 # Anybody may send a status; Python refuses to read numbers of thousands of digits.
 _WHOLE = re.compile('[0-9]{1,18}')
@@ -96,120 +95,6 @@ def from_command(message: MagneticField) -> tuple[int, float]:
     return stamp, float(field.z)
 
 
-def from_trajectory(
-        message: JointTrajectory, joint: str) -> tuple[list[tuple[float, int]], int | None]:
-    """
-    Return the setpoints of a trajectory and its stamp.
-
-    Parameters
-    ----------
-    message : trajectory_msgs.msg.JointTrajectory
-        For one joint.
-    joint : str
-        Name that it must have.
-
-    Returns
-    -------
-    points : list of (float, int)
-        Stretch, and time from the start in ns.
-    stamp : int or None
-        In ns; None for stamp 0, which means now.
-
-    Raises
-    ------
-    RefusedError
-        If the joint is another one, sizes do not fit, or a point asks for motion or effort.
-
-    """
-    names = list(message.joint_names)
-    if names != [joint]:
-        raise RefusedError(
-            Code.UNKNOWN_JOINT, f'joint_names is {excerpt(names)}: expected [{joint!r}]')
-    points = []
-    for number, point in enumerate(message.points):
-        if len(point.positions) != 1:
-            raise RefusedError(
-                Code.BAD_INPUT,
-                f'point {number} has {len(point.positions)} positions: expected 1, the stretch')
-        for name in ('velocities', 'accelerations', 'effort'):
-            values = list(getattr(point, name))
-            if values not in ([], [0.0]):
-                raise RefusedError(
-                    Code.BAD_INPUT,
-                    f'point {number} has {name} {excerpt(values)}: expected none, the actuator '
-                    'comes to rest at each setpoint')
-        points.append((float(point.positions[0]), from_time(point.time_from_start)))
-    stamp = from_time(message.header.stamp)
-    return points, (None if stamp == 0 else stamp)
-
-
-def from_trajectories(
-        message: JointTrajectory, joints: Sequence[str], *, partial: bool = False
-) -> tuple[dict[str, list[tuple[float, int]]], int | None]:
-    """
-    Return the setpoints of a trajectory for several joints and its stamp.
-
-    Parameters
-    ----------
-    message : trajectory_msgs.msg.JointTrajectory
-        For all joints, in any order.
-    joints : sequence of str
-        Names of the joints there are; with a single one, `from_trajectory` says more.
-    partial : bool
-        Whether it may be for some of them only.
-
-    Returns
-    -------
-    points : dict of str to list of (float, int)
-        By joint: stretch, and time from the start in ns.
-    stamp : int or None
-        In ns; None for stamp 0, which means now.
-
-    Raises
-    ------
-    RefusedError
-        If the joints are others, sizes do not fit, or a point asks for motion or effort.
-
-    """
-    if len(joints) == 1:
-        single, start = from_trajectory(message, joints[0])
-        return {joints[0]: single}, start
-    names = list(message.joint_names)
-    if twice := sorted({x for x in names if names.count(x) > 1}):
-        raise RefusedError(
-            Code.UNKNOWN_JOINT,
-            f'joint_names has {excerpt(twice[0])} twice: expected each joint once')
-    if unknown := [x for x in names if x not in joints]:
-        raise RefusedError(
-            Code.UNKNOWN_JOINT,
-            f'joint_names has {excerpt(unknown[0])}: expected names among {", ".join(joints)}')
-    missing = [x for x in joints if x not in names]
-    if not names or missing and not partial:
-        raise RefusedError(
-            Code.UNKNOWN_JOINT,
-            f'joint_names lacks {missing[0]!r}: expected all of {", ".join(joints)} (the '
-            'parameter allow_partial_joints lets a message be for some of them)')
-    points: dict[str, list[tuple[float, int]]] = {name: [] for name in names}
-    for number, point in enumerate(message.points):
-        if len(point.positions) != len(names):
-            raise RefusedError(
-                Code.BAD_INPUT,
-                f'point {number} has {len(point.positions)} positions: expected {len(names)}, '
-                'one for each of joint_names')
-        for field in ('velocities', 'accelerations', 'effort'):
-            values = list(getattr(point, field))
-            if values and values != [0.0] * len(names):
-                raise RefusedError(
-                    Code.BAD_INPUT,
-                    f'point {number} has {field} {excerpt(values)}: expected none, the '
-                    'actuators come to rest at each setpoint')
-        time = from_time(point.time_from_start)
-        for name, position in zip(names, point.positions, strict=True):
-            points[name].append((float(position), time))
-    stamp = from_time(message.header.stamp)
-    return points, (None if stamp == 0 else stamp)
-
-
 def to_trajectory(
         setpoints: Iterable[tuple[float | Sequence[float], int]], joints: str | Sequence[str], *,
         stamp: int = 0, frame: str = '') -> JointTrajectory:
@@ -248,41 +133,11 @@ def _to_duration(nanoseconds: int) -> Duration:
     return Duration(sec=sec, nanosec=nanosec)
 
 
-def to_plan(plan: 'Plan', joint: str) -> JointTrajectory:
-    """
-    Return a plan's preview: one point at each change of level still ahead of its start.
-
-    Parameters
-    ----------
-    plan : Plan
-        At least one request old.
-    joint : str
-        Its name.
-
-    Returns
-    -------
-    trajectory_msgs.msg.JointTrajectory
-        Stamped with the first change; positions, velocities and effort are the predicted
-        stretch, stretch rate and the flux density from then on.
-
-    """
-    levels = plan.ahead
-    start = levels[0].stamp if levels else 0
-    return JointTrajectory(
-        header=Header(stamp=to_time(start)), joint_names=[joint],
-        points=[
-            JointTrajectoryPoint(
-                positions=[level.stretch], velocities=[level.rate],
-                effort=[level.flux_density],
-                time_from_start=_to_duration(level.stamp - start))
-            for level in levels])
-
-
-def to_plans(
+def to_plan(
         stamps: Sequence[int],
         samples: Mapping[str, Sequence[tuple[float, float, float]]]) -> JointTrajectory:
     """
-    Return the preview of several joints' plans: a point at each change of level of any.
+    Return a preview: a point at each change of level of any joint.
 
     Parameters
     ----------
@@ -294,7 +149,7 @@ def to_plans(
     Returns
     -------
     trajectory_msgs.msg.JointTrajectory
-        As `to_plan` makes it for one joint.
+        Stamped with the first change; positions, velocities and effort are what the samples say.
 
     """
     start = stamps[0] if stamps else 0
@@ -306,6 +161,19 @@ def to_plans(
             positions=stretches, velocities=rates, effort=flux_densities,
             time_from_start=_to_duration(stamp - start)))
     return message
+
+
+def to_planner_status(status: 'StatusChanged') -> DiagnosticStatus:
+    """Return a planner's verdict and progress, those of each joint too if there are several."""
+    verdict, progress, each = status.verdict, status.progress, status.each
+    values: dict[str, object] = {
+        'code': verdict.code, 'request': verdict.request, 'plan': status.plan,
+        **vars(progress), 'late': status.late, 'replanned': status.replanned, **verdict.figures}
+    if len(each) > 1:
+        for name, of_joint in each.items():
+            values |= {f'{name}.{key}': value for key, value in vars(of_joint).items()}
+    return to_status(
+        'planner: request', ', '.join(each), bytes([verdict.severity]), verdict.message, values)
 
 
 def to_status(

@@ -22,6 +22,10 @@ from hmsa_ros.nodes.parameters import (
     JOINT,
     ParameterSpec,
 )
+from hmsa_ros.runtime.records import Settings
+
+_OPTIONS = Options()
+_SETTINGS = Settings()
 
 #: Parameters that a joint may have a value of its own for.
 OWN = (
@@ -50,20 +54,20 @@ SPECS = (
     JOINT,
     JOINTS,
     ParameterSpec(
-        'allow_partial_joints', False,
+        'allow_partial_joints', _SETTINGS.allow_partial_joints,
         'Whether a trajectory may be for some of the joints; the others go on as planned.',
         read_only=False),
     ParameterSpec(
         'simultaneous_arrival', False,
-        'Whether joints that would arrive before the slowest of a spell begin later, so that '
+        'Whether joints that would arrive at a setpoint before the slowest begin later, so that '
         'all arrive at the same time; one that is still moving is not held back.',
         read_only=False),
     ParameterSpec(
         'frame_id', 'coil', 'Frame of the coil in the stamped commands, and of the markers.'),
     MARKER_SCALE,
     ParameterSpec(
-        'lead_time', 0.05, 'How far ahead of the time it applies a command is sent.', 's',
-        0.0, 1e6, read_only=False),
+        'lead_time', _OPTIONS.lead_time / NANOSECONDS,
+        'How far ahead of the time it applies a command is sent.', 's', 0.0, 1e6, read_only=False),
     ParameterSpec(
         'command_mode', 'continuous',
         'Whether commands are stamped with any time, or on the grid of command_period.',
@@ -72,27 +76,33 @@ SPECS = (
         'command_period', 0.001, 'Period of the grid in command_mode sampled.', 's',
         1e-9, 1e3),
     ParameterSpec(
-        'short_spell', 'refuse', 'What to do with a spell that ends before its move does.',
+        'max_points', _SETTINGS.max_points,
+        'Largest number of setpoints in one trajectory, those of all joints together.', '',
+        1, 10_000_000, read_only=False),
+    ParameterSpec(
+        'short_spell', _OPTIONS.short_spell,
+        'What to do with a setpoint that ends before the move to it does.',
         choices=SHORT_SPELL, read_only=False),
     ParameterSpec(
-        'heartbeat_period', 0.2,
+        'heartbeat_period', _SETTINGS.heartbeat_period / NANOSECONDS,
         'How often the level in force is sent again, as a sign of life; 0 for never.', 's',
         0.0, 1e3, read_only=False),
     ParameterSpec(
-        'replan_late', True,
+        'replan_late', _SETTINGS.replan_late,
         'Whether the rest of a sequence is planned anew after a command has come late.',
         read_only=False),
     ParameterSpec(
-        'lateness_tolerance', 5e-6,
+        'lateness_tolerance', _SETTINGS.lateness_tolerance / NANOSECONDS,
         'How late a command may take effect without a new plan. The jitter of a good driver '
         'lies below the default, and what it leaves below the errors of any model.', 's',
         0.0, 1.0, read_only=False),
     ParameterSpec(
-        'takeover_timeout', 0.5,
+        'takeover_timeout', _SETTINGS.takeover_timeout / NANOSECONDS,
         'How long the first request waits for a sample of the state in force, if somebody '
         'publishes samples; 0 for not at all.', 's', 0.0, 60.0),
     ParameterSpec(
-        'takeover_max_age', 0.5, 'Age up to which such a sample counts.', 's', 0.0, 1e6),
+        'takeover_max_age', _SETTINGS.takeover_max_age / NANOSECONDS,
+        'Age up to which such a sample counts.', 's', 0.0, 1e6),
     AUTOSTART,
 )
 
@@ -135,6 +145,15 @@ def options_from(values: Mapping[str, Any]) -> Options:
 def nanoseconds(seconds: float) -> int:
     """Return a time in s in ns."""
     return round(float(seconds) * NANOSECONDS)
+
+
+def settings_from(values: JointParameters) -> Settings:
+    """Return how a runtime deals with time, as parameters for all joints say."""
+    return Settings(
+        **{x: nanoseconds(values[x]) for x in (
+            'heartbeat_period', 'lateness_tolerance', 'takeover_timeout', 'takeover_max_age')},
+        replan_late=bool(values['replan_late']), max_points=int(values['max_points']),
+        allow_partial_joints=bool(values['allow_partial_joints']))
 
 
 def group_from(parameters: JointParameters) -> PlannerGroup:

@@ -1,0 +1,403 @@
+"""
+Requests worked out as drafts, step by step, without changing the plan in force.
+
+Each function is a generator that pauses after a bounded amount of work and returns the draft:
+whoever plans a long sequence can do other things in between. `finish` does it at once.
+"""
+
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+import math
+from typing import TypeVar
+
+from hmsa_ros.core.history import agree
+from hmsa_ros.core.kernels import work_space
+from hmsa_ros.core.moves import Level, Move, State
+from hmsa_ros.core.sequence import Segment, segments, Setpoint
+from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.core.stopping import brake, holdable
+from hmsa_ros.core.timeline import Draft, Model, Plan, PlannedLevel, PlannedSegment
+from hmsa_ros.core.units import NANOSECONDS
+
+T = TypeVar('T')
+#: Work that pauses now and then.
+Steps = Generator[None, None, T]
+
+# How hard to brake where the hardest does not lead to a plan, from the nearest stop on.
+_BRAKE_SHARES = (0.5, 0.1, 0.02, 0.0)
+# How many natural periods later to try again where a plan cannot be made anew at once.
+_PATIENCE = (0.0, 0.15, 0.3, 0.45, 0.6)
+# Codes of plans that do not do what was asked for.
+_WARNINGS = (Code.TOO_DAMPED, Code.INDISTINGUISHABLE, Code.SPELL_TOO_SHORT)
+# Setpoints that are checked between two pauses, which takes some 0.1 ms.
+_CHECKED = 200
+
+
+def finish(steps: Steps[T]) -> T:
+    """Do work without a pause and return its result."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            result: T = end.value
+            return result
+
+
+@dataclass(frozen=True)
+class Outset:
+    """
+    What a draft is worked out from.
+
+    Attributes
+    ----------
+    plan : Plan
+        In force.
+    model : Model
+        To plan with.
+    begin : int
+        Time in ns that the draft begins at the soonest.
+    state : State
+        Predicted then.
+    stale : int or None
+        Place of the first level of the plan whose prediction does not hold any more.
+
+    """
+
+    plan: Plan
+    model: Model
+    begin: int
+    state: State
+    stale: int | None = None
+
+    def on_grid(self, time: int) -> int:
+        """Return the next multiple of the command period."""
+        return on_grid(time, self.model)
+
+    def is_target(self, stretch: float) -> bool:
+        """Return whether the plan ends at a stretch, is on the way and has nothing between."""
+        planned = self.plan.segments
+        return bool(planned) and planned[-1].stretch == stretch \
+            and planned[-1].since <= self.begin
+
+
+def on_grid(time: int, model: Model) -> int:
+    """Return the next time in ns that a command may be stamped with."""
+    period = model.options.period
+    return time if period == 0 else -(-time // period) * period
+
+
+def check_points(points: Sequence[tuple[float, int]]) -> Steps[None]:
+    """
+    Check the setpoints of a sequence.
+
+    Parameters
+    ----------
+    points : sequence of (float, int)
+        Stretch, and time in ns from the start of the sequence until which it lasts.
+
+    Raises
+    ------
+    RefusedError
+        If there are none, one is not a stretch, or times do not increase.
+
+    """
+    if not points:
+        raise RefusedError(
+            Code.BAD_INPUT, 'the trajectory has no points: expected at least one')
+    previous = -1
+    for number, (stretch, time) in enumerate(points):
+        check_target(stretch)
+        if time <= previous:
+            raise RefusedError(
+                Code.NOT_INCREASING,
+                f'time_from_start of point {number} is {time / NANOSECONDS:g} s'
+                + (f' after {previous / NANOSECONDS:g} s: expected strictly increasing '
+                   'times' if number else ': expected at least 0 s'))
+        previous = time
+        if number % _CHECKED == _CHECKED - 1:
+            yield
+
+
+def check_target(stretch: float) -> None:
+    """
+    Check that a number can be a stretch.
+
+    Raises
+    ------
+    RefusedError
+        If not.
+
+    """
+    if not (math.isfinite(stretch) and stretch > 0.0):
+        raise RefusedError(
+            Code.BAD_INPUT, f'stretch is {stretch:g}: expected a finite number greater than 0')
+
+
+def draft_sequence(
+        outset: Outset, points: Sequence[tuple[float, int]], base: int,
+        now: int) -> Steps[Draft | None]:
+    """
+    Plan a sequence.
+
+    Parameters
+    ----------
+    outset : Outset
+        From where; it begins at the start of the sequence or, if that is over, as soon as
+        possible.
+    points : sequence of (float, int)
+        Stretch, and time in ns from the start until which it lasts; checked.
+    base : int
+        Start in ns.
+    now : int
+        Current time in ns, for messages.
+
+    Returns
+    -------
+    Draft or None
+        None where the request changes nothing.
+
+    Raises
+    ------
+    RefusedError
+        If it cannot be carried out.
+
+    """
+    begin = outset.begin
+    if points[0][1] == 0 and len(points) > 1 and base == begin:
+        # A first point at time 0 that repeats where the actuator is asks for nothing.
+        here = outset.state.stretch
+        if abs(points[0][0] - here) > 1e-6:
+            raise RefusedError(
+                Code.SPELL_TOO_SHORT,
+                f'the first point asks for stretch {points[0][0]:g} at time_from_start 0, the '
+                f'actuator is at {here:.6g}: expected a time that leaves room for the move')
+    if base + points[-1][1] <= begin:
+        raise _over(points, base, now)
+    setpoints = []
+    left = begin
+    for number, (stretch, time) in enumerate(points):
+        if base + time > begin:
+            end = outset.on_grid(base + time)
+            if end == left:
+                raise RefusedError(
+                    Code.SPELL_TOO_SHORT,
+                    f'stretch {stretch:g} begins and ends within one command period of '
+                    f'{outset.model.options.period / NANOSECONDS:g} s: expected a longer span')
+            setpoints.append(Setpoint(stretch, outset.model.time(end - left)))
+            left = end
+        if number % _CHECKED == _CHECKED - 1:
+            yield
+    if len(setpoints) == 1 and outset.is_target(setpoints[0].stretch):
+        return None
+    return (yield from _draft(outset, setpoints))
+
+
+def draft_target(outset: Outset, stretch: float) -> Steps[Draft | None]:
+    """Plan a move to one stretch that is held then; None where it changes nothing."""
+    if outset.is_target(stretch):
+        return None
+    return (yield from _draft(outset, [Setpoint(stretch, math.inf)]))
+
+
+def draft_stop(outset: Outset) -> Steps[Draft]:
+    """
+    Plan how to come to rest as near as the flux density limits allow.
+
+    The load that brakes hardest is held until the first turning point, then the load that
+    holds that stretch: a two-step command whose target is chosen by its beta_p. Where one
+    brake does not do, on a grid, through ramps or at a limit, it is a move to a stretch near by.
+
+    Parameters
+    ----------
+    outset : Outset
+        From where.
+
+    Returns
+    -------
+    Draft
+        Of one setpoint.
+
+    """
+    model, state = outset.model, outset.state
+    work = work_space()
+    found = brake(model, work, state)
+    if (holdable(model, found.stretch) == found.stretch
+            and (model.delivery.ideal or found.duration == 0.0)):
+        move = Move(Code.HOLD, tuple(
+            [Level(0.0, found.load)] * (found.duration > 0.0)
+            + [Level(found.duration, model.holding(found.stretch))]),
+            found.duration, 'stopped')
+        end = State(found.stretch, 0.0, move.levels[-1].load)
+        levels, placed = _placed(model, outset.begin, Segment(
+            Setpoint(found.stretch, math.inf), 0.0, state, end, move))
+        return Draft(outset.begin, tuple(levels), (placed,))
+    for share in _BRAKE_SHARES:
+        stretch = holdable(model, brake(model, work, state, share).stretch)
+        try:
+            return (yield from _draft(outset, [Setpoint(stretch, math.inf)], 'two_step'))
+        except RefusedError:
+            yield
+    # Nothing stops it at once: let it settle.
+    return (yield from _draft(
+        outset, [Setpoint(holdable(model, state.stretch), math.inf)], 'step'))
+
+
+def later_outsets(outset: Outset) -> Iterator[int]:
+    """Yield times in ns to begin at where there is no way from the motion at the first."""
+    model = outset.model
+    period = 2.0 * math.pi / model.frequency(outset.state.stretch)
+    for share in _PATIENCE:
+        yield outset.on_grid(outset.begin + model.ns(share * period))
+
+
+def draft_resumption(outset: Outset) -> Steps[Draft | None]:
+    """
+    Plan what is left of the running plan anew, until it is on its way again.
+
+    Parameters
+    ----------
+    outset : Outset
+        From where.
+
+    Returns
+    -------
+    Draft or None
+        Setpoints end when they did; one that there is no time left for is left out. From where
+        the new plan meets the running one it goes on as that. None if nothing is left to do.
+
+    Raises
+    ------
+    RefusedError
+        If it cannot be carried out from there.
+
+    """
+    planned = outset.plan.segments
+    first = max(outset.plan.under_way(outset.begin), 0)
+    refusal: RefusedError | None = None
+    for index in range(first, len(planned)):
+        # Left out setpoints make room for the next one, which is gone to at once.
+        try:
+            draft = yield from _rejoining(outset, index)
+        except RefusedError as error:
+            refusal = refusal or error
+            if error.code is not Code.SPELL_TOO_SHORT:
+                break
+            yield
+            continue
+        anew = replace(
+            draft.segments[0], since=min(planned[index].since, draft.segments[0].since))
+        return replace(
+            draft, segments=(anew, *draft.segments[1:]), resumed=first, missed=index - first)
+    if refusal is not None:
+        raise refusal
+    return None
+
+
+def _rejoining(outset: Outset, index: int) -> Steps[Draft]:
+    """Plan the setpoints from a place on, until the running plan is met."""
+    planned = outset.plan.segments
+    levels: list[PlannedLevel] = []
+    placed: list[PlannedSegment] = []
+    for segment in _planned(outset.model, outset.state, _left(outset, index)):
+        more, one = _placed(outset.model, outset.begin, segment)
+        levels += more
+        placed.append(one)
+        following = index + len(placed)
+        place = _meeting(outset, segment.end, following) if following < len(planned) else None
+        if place is not None:
+            levels += outset.plan.levels[place:]
+            placed += planned[following:]
+            break
+        yield
+    return Draft(outset.begin, tuple(levels), tuple(placed))
+
+
+def _left(outset: Outset, index: int) -> Iterator[Setpoint]:
+    """Yield the setpoints of the running plan from a place on, with the time left for them."""
+    planned = outset.plan.segments
+    left = outset.begin
+    for place in range(index, len(planned) - 1):
+        end = planned[place + 1].since
+        yield Setpoint(planned[place].stretch, outset.model.time(end - left))
+        left = end
+    yield Setpoint(planned[-1].stretch, math.inf)
+
+
+def _meeting(outset: Outset, state: State, following: int) -> int | None:
+    """Return from which level on the running plan continues a state at a setpoint's begin."""
+    planned = outset.plan.segments[following]
+    place = outset.plan.place(planned.begin)
+    level = outset.plan.levels[place]
+    if (level.stamp != planned.begin or level.model is not outset.model
+            or outset.stale is not None and place < outset.stale):
+        return None
+    unit = level.model.units
+    here = replace(
+        level, stretch=state.stretch, rate=state.rate / unit.time,
+        in_force=state.load * unit.load)
+    return place if agree(here, level) else None
+
+
+def _draft(
+        outset: Outset, setpoints: Iterable[Setpoint], shaper: str = '') -> Steps[Draft]:
+    """Plan setpoints and place them on the timeline."""
+    levels: list[PlannedLevel] = []
+    placed: list[PlannedSegment] = []
+    warning: PlannedSegment | None = None
+    for segment in _planned(outset.model, outset.state, setpoints, shaper):
+        more, one = _placed(outset.model, outset.begin, segment)
+        levels += more
+        placed.append(one)
+        if warning is None and one.code in _WARNINGS:
+            warning = one
+        yield
+    return Draft(outset.begin, tuple(levels), tuple(placed), warning=warning)
+
+
+def _planned(
+        model: Model, state: State, setpoints: Iterable[Setpoint],
+        shaper: str = '') -> Iterator[Segment]:
+    options = model.options
+    return segments(
+        setpoints, model.material, start=state, shaper=shaper or options.shaper,
+        limits=model.limits, delivery=model.delivery, order=options.order, units=model.units,
+        short_spell=options.short_spell)
+
+
+def _placed(
+        model: Model, begin: int, segment: Segment) -> tuple[list[PlannedLevel], PlannedSegment]:
+    """Place a planned move on the timeline, in SI units."""
+    unit = model.units
+    start = begin + model.ns(segment.begin)
+    state = segment.start
+    if math.isnan(state.load):
+        raise ValueError('a segment on the timeline knows the load it starts from')
+    levels = []
+    time = 0.0
+    for number, level in enumerate(segment.move.levels):
+        if number:
+            state = model.follow(state, segment.move.levels[number - 1].load, level.time - time)
+        time = level.time
+        levels.append(PlannedLevel(
+            start + model.ns(time), level.load * unit.load, state.stretch,
+            state.rate / unit.time, state.load * unit.load, model))
+    duration = segment.move.duration
+    return levels, PlannedSegment(
+        segment.setpoint.stretch, start,
+        None if math.isinf(duration) else start + model.ns(duration),
+        segment.move.code, segment.move.reason, start)
+
+
+def _over(points: Sequence[tuple[float, int]], base: int, now: int) -> RefusedError:
+    """Return the refusal of a sequence that is over."""
+    stretch, last = points[-1]
+    if last == 0:
+        return RefusedError(
+            Code.SPELL_TOO_SHORT,
+            f'stretch {stretch:g} is due at time_from_start 0: expected time for the move')
+    return RefusedError(
+        Code.IN_THE_PAST,
+        f'the sequence stamped {base / NANOSECONDS:.3f} s ends at '
+        f'{(base + last) / NANOSECONDS:.3f} s, now is {now / NANOSECONDS:.3f} s: '
+        'expected an end ahead by more than lead_time; do sender and planner use the '
+        'same clock (use_sim_time)?')

@@ -1,0 +1,61 @@
+"""Simulated time of which only the newest message counts."""
+
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.capture import decode, RawSubscription
+
+
+class NewestClock:
+    """
+    Sets a node's clock from /clock when it is read.
+
+    The executor would keep an event for each message, without limit where the node cannot keep
+    up with them. A subscription that is read here keeps the newest message alone.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Whose clock it is; its own subscription of /clock is replaced.
+
+    """
+
+    def __init__(self, node: Node) -> None:
+        """Subscribe, if the node follows simulated time already."""
+        self._node = node
+        self._source = node._time_source
+        self._subscription: RawSubscription | None = None
+        self._source._subscribe_to_clock_topic = self._subscribe
+        if self._source._clock_sub is not None:
+            node.destroy_subscription(self._source._clock_sub)
+            self._source._clock_sub = None
+            self._subscribe()
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the node follows simulated time."""
+        return bool(self._source.ros_time_is_active)
+
+    def _subscribe(self) -> None:
+        if self._subscription is None:
+            topic = interface.CLOCK_TOPIC
+            self._subscription = RawSubscription(self._node, topic.type, topic.name, topic.qos)
+
+    def read(self) -> int:
+        """Return the node's time in ns, by the newest message if it is simulated."""
+        if self._subscription is not None and self.simulated:
+            for taken in self._subscription.take()[-1:]:
+                try:
+                    self._source.clock_callback(decode(taken.data, Clock))
+                except BadInputError as error:
+                    self._node.get_logger().error(
+                        f'message on /clock passed over: {error}', throttle_duration_sec=1.0)
+        return int(self._node.get_clock().now().nanoseconds)
+
+    def destroy(self) -> None:
+        """Read no more."""
+        if self._subscription is not None:
+            self._subscription.destroy()
+            self._subscription = None

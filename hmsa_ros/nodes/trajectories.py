@@ -1,0 +1,143 @@
+"""
+Trajectories read bit by bit from their serialized form.
+
+rclpy makes objects of all points at once, which takes seconds and gigabytes for a million. Here
+the header is read first, so that a trajectory that is too long costs nothing, and the points
+when they are asked for.
+"""
+
+from collections.abc import Iterator, Sequence
+import struct
+
+from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.errors import BadInputError, excerpt
+from hmsa_ros.runtime.records import Trajectory
+
+# What a message begins with: the representation, and options of two bytes.
+_PREAMBLE = 4
+_LITTLE = b'\x00\x01'
+_BIG = b'\x00\x00'
+# The least that a point takes: four lengths and a duration.
+_LEAST_POINT = 24
+# More joints than any planner has.
+_MOST_JOINTS = 1000
+_TOO_SHORT = 'the trajectory cannot be decoded: it ends too early'
+
+
+class _Cursor:
+    """Reads CDR, the form that messages have on the wire: everything aligned to its size."""
+
+    def __init__(self, data: bytes) -> None:
+        if data[:2] not in (_LITTLE, _BIG) or len(data) < _PREAMBLE:
+            raise BadInputError('the trajectory cannot be decoded: expected plain CDR')
+        self._data = memoryview(data)[_PREAMBLE:]
+        self._order = '<' if data[:2] == _LITTLE else '>'
+        self._place = 0
+
+    @property
+    def left(self) -> int:
+        """Bytes that are left."""
+        return len(self._data) - self._place
+
+    def take(self, kind: str, count: int = 1) -> tuple[float, ...]:
+        """
+        Return numbers of a kind of the module struct.
+
+        Raises
+        ------
+        BadInputError
+            If the message ends before.
+
+        """
+        if not count:
+            return ()
+        size = struct.calcsize(f'<{kind}')
+        place = -(-self._place // size) * size
+        if place + count * size > len(self._data):
+            raise BadInputError(_TOO_SHORT)
+        self._place = place + count * size
+        return struct.unpack_from(f'{self._order}{count}{kind}', self._data, place)
+
+    def count(self) -> int:
+        """Return the length of what follows."""
+        return int(self.take('I')[0])
+
+    def time(self) -> int:
+        """Return a stamp or a duration in ns."""
+        seconds, = self.take('i')
+        nanoseconds, = self.take('I')
+        return int(seconds) * NANOSECONDS + int(nanoseconds)
+
+    def text(self) -> str:
+        """
+        Return a string.
+
+        Raises
+        ------
+        BadInputError
+            If the message ends before.
+
+        """
+        length = self.count()
+        if length > self.left:
+            raise BadInputError(_TOO_SHORT)
+        self._place += length
+        text = bytes(self._data[self._place - length:self._place])
+        return text.rstrip(b'\0').decode('utf-8', 'replace')
+
+
+def read_trajectory(data: bytes) -> Trajectory:
+    """
+    Return the request that a serialized trajectory_msgs/JointTrajectory makes.
+
+    Parameters
+    ----------
+    data : bytes
+        As it arrives.
+
+    Returns
+    -------
+    Trajectory
+        Its points are read when they are asked for.
+
+    Raises
+    ------
+    BadInputError
+        If it cannot be decoded.
+
+    """
+    cursor = _Cursor(data)
+    stamp, name = cursor.time(), cursor.text()
+    many = cursor.count()
+    if many > _MOST_JOINTS:
+        raise BadInputError(
+            f'the trajectory names {many} joints: expected at most {_MOST_JOINTS}')
+    names = tuple(cursor.text() for _ in range(many))
+    count = cursor.count()
+    if _LEAST_POINT * count > cursor.left + 4:
+        raise BadInputError(_TOO_SHORT)
+    return Trajectory(names, _points(cursor, names, count), count, stamp or None, name)
+
+
+def _points(
+        cursor: _Cursor, names: Sequence[str],
+        count: int) -> Iterator[tuple[Sequence[float], int]]:
+    """Yield stretches and time from the start in ns of each point."""
+    rest = (0.0,) * len(names)
+    for number in range(count):
+        positions = cursor.take('d', cursor.count())
+        if len(positions) != len(names):
+            raise RefusedError(
+                Code.BAD_INPUT,
+                f'point {number} has {len(positions)} positions: expected {len(names)}, '
+                'one for each of joint_names')
+        for field in ('velocities', 'accelerations', 'effort'):
+            values = cursor.take('d', cursor.count())
+            if values not in ((), rest):
+                raise RefusedError(
+                    Code.BAD_INPUT,
+                    f'point {number} has {field} {excerpt(list(values))}: expected none, the '
+                    'actuator comes to rest at each setpoint')
+        yield positions, cursor.time()
+

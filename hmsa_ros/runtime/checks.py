@@ -1,0 +1,55 @@
+"""Whether a request is for joints that a planner has, and not for too many setpoints."""
+
+from collections.abc import Sequence
+
+from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.errors import excerpt
+from hmsa_ros.runtime.records import Request, Settings, Target, Trajectory
+
+
+def check_joints(request: Request, joints: Sequence[str], settings: Settings) -> None:
+    """
+    Check whom a request is for.
+
+    Parameters
+    ----------
+    request : Request
+        Of any kind.
+    joints : sequence of str
+        All there are.
+    settings : Settings
+        What is allowed.
+
+    Raises
+    ------
+    RefusedError
+        If a joint is another one, there twice or missing, or there are too many setpoints.
+
+    """
+    if isinstance(request, Target) and request.joint not in joints:
+        raise RefusedError(
+            Code.UNKNOWN_JOINT, f'joint {request.joint!r}: expected one of {", ".join(joints)}')
+    if not isinstance(request, Trajectory):
+        return
+    names = request.joints
+    if len(joints) == 1 and names != tuple(joints):
+        raise _unknown(f'is {excerpt(list(names))}: expected {list(joints)}')
+    if twice := sorted({x for x in names if names.count(x) > 1}):
+        raise _unknown(f'has {excerpt(twice[0])} twice: expected each joint once')
+    if unknown := [x for x in names if x not in joints]:
+        raise _unknown(f'has {excerpt(unknown[0])}: expected names among {", ".join(joints)}')
+    missing = [x for x in joints if x not in names]
+    if not names or missing and not settings.allow_partial_joints:
+        raise _unknown(
+            f'lacks {missing[0]!r}: expected all of {", ".join(joints)} (the parameter '
+            'allow_partial_joints lets a message be for some of them)')
+    count = request.count * len(names)
+    if count > settings.max_points:
+        raise RefusedError(
+            Code.TOO_LONG,
+            f'the trajectory has {count} setpoints: expected at most {settings.max_points}, the '
+            'parameter max_points; send it in parts, each stamped with its start')
+
+
+def _unknown(reason: str) -> RefusedError:
+    return RefusedError(Code.UNKNOWN_JOINT, f'joint_names {reason}')

@@ -1,0 +1,116 @@
+"""How late commands take effect, and what helps: delays of transport and of the driver differ."""
+
+from collections import deque
+from enum import Enum
+
+from hmsa_ros.core.units import NANOSECONDS
+
+# Commands that are compared, and the least number that says something.
+_RECENT = 16
+_ENOUGH = 3
+# Commands of a joint whose time of sending is remembered.
+_REMEMBERED = 64
+# A driver's delay is called constant where sending earlier or later explains it less than this.
+_CONSTANT = 0.5
+
+
+class Cause(Enum):
+    """Why commands take effect late."""
+
+    UNKNOWN = 'unknown'
+    PLANNER = 'planner'
+    TRANSPORT = 'transport'
+    DRIVER = 'driver'
+
+
+class Lateness:
+    """
+    Counts late commands and tells what they have in common.
+
+    A command that arrives late is the later the later it was sent. One that a driver applies
+    late is as late as any other, however far ahead of its stamp it was sent.
+
+    Attributes
+    ----------
+    count : int
+        Late commands.
+    largest : int
+        How late the latest was, in ns.
+
+    """
+
+    def __init__(self) -> None:
+        """Begin with none."""
+        self.count = 0
+        self.largest = 0
+        self._sent: dict[str, dict[int, int]] = {}
+        # How late, and how long ahead of its stamp it was sent, in ns.
+        self._recent: deque[tuple[int, int]] = deque(maxlen=_RECENT)
+
+    def sent(self, joint: str, stamp: int, now: int) -> None:
+        """Remember when a command was sent; times in ns."""
+        sent = self._sent.setdefault(joint, {})
+        sent.pop(stamp, None)
+        sent[stamp] = now
+        if len(sent) > _REMEMBERED:
+            del sent[next(iter(sent))]
+
+    def note(self, late: int, joint: str, stamp: int) -> None:
+        """
+        Count a late command.
+
+        Parameters
+        ----------
+        late : int
+            By how many ns.
+        joint : str
+            Whose it is.
+        stamp : int
+            Time in ns at which it was to take effect.
+
+        """
+        self.count += 1
+        self.largest = max(self.largest, late)
+        sent = self._sent.get(joint, {}).get(stamp)
+        if sent is not None:
+            self._recent.append((late, stamp - sent))
+
+    @property
+    def cause(self) -> Cause:
+        """What delays the commands, as far as the last ones tell."""
+        if self._recent and self._recent[-1][1] < 0:
+            return Cause.PLANNER
+        if len(self._recent) < _ENOUGH:
+            return Cause.UNKNOWN
+        late = [x for x, _ in self._recent]
+        under_way = [x + ahead for x, ahead in self._recent]
+        spread, explained = max(late) - min(late), max(under_way) - min(under_way)
+        if spread < _CONSTANT * explained:
+            return Cause.DRIVER
+        return Cause.TRANSPORT if explained < _CONSTANT * spread else Cause.UNKNOWN
+
+    def advice(self, lead_time: int) -> str:
+        """
+        Return what helps.
+
+        Parameters
+        ----------
+        lead_time : int
+            How far ahead commands are sent, in ns.
+
+        Returns
+        -------
+        str
+            The rest of a sentence.
+
+        """
+        cause = self.cause
+        if cause is Cause.DRIVER:
+            return (
+                f'the driver applies commands up to {self.largest / 1e6:.3f} ms after their '
+                'stamps however early they are sent, so a larger lead_time does not help: let '
+                'the driver write that much earlier, or raise lateness_tolerance to more than '
+                f'{self.largest / NANOSECONDS:.3g} s, since a constant delay leaves no vibration')
+        needed = (lead_time + self.largest) / NANOSECONDS
+        return f'raise lead_time to more than {needed:.3g} s' + (
+            ', unless the driver itself is that slow' if cause is Cause.UNKNOWN else '')

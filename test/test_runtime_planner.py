@@ -1,0 +1,536 @@
+"""A planner at work without ROS: late commands, take-over, signs of life, long trajectories."""
+
+from dataclasses import replace
+import math
+
+import pytest
+
+from hmsa_ros.core.group import PlannerGroup
+from hmsa_ros.core.model import natural_frequency
+from hmsa_ros.core.parameters import paper_actuator
+from hmsa_ros.core.planner import Options, Planner
+from hmsa_ros.core.simulation import ActuatorSimulation
+from hmsa_ros.errors import HmsaError
+from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.runtime.records import (
+    Note,
+    PlanChanged,
+    Send,
+    Settings,
+    Severity,
+    StatusChanged,
+    Stop,
+    Target,
+    Trajectory,
+)
+
+MS = 1_000_000
+START = 1000 * MS
+LEAD = 50 * MS
+HOLD = 44 * MS
+SEQUENCE = ((1.1, HOLD), (1.2, 2 * HOLD), (1.4, 3 * HOLD))
+RESIDUAL = 1e-6
+QUIET = Settings(heartbeat_period=0, takeover_timeout=0)
+
+
+def trajectory(*points, joints=('a',), stamp=None, name=''):
+    """Return a request of the same stretches for all joints."""
+    return Trajectory(
+        tuple(joints), [((x,) * len(joints), t) for x, t in points], len(points), stamp, name)
+
+
+class Rig:
+    """A runtime and actuators that obey it, whose commands may be held back on their way."""
+
+    def __init__(self, *, settings=QUIET, joints=('a',), blocks=None, **options):
+        self.options = Options(flux_density_min=-0.5, flux_density_max=0.5, **options)
+        self.blocks = blocks or dict.fromkeys(joints, paper_actuator())
+        self.now = START
+        self.steady = 0
+        # What each look at a clock takes.
+        self.effort = 0
+        self.observable = True
+        self.group = PlannerGroup({
+            x: Planner(block, self.options) for x, block in self.blocks.items()})
+        self.runtime = PlannerRuntime(
+            self.group, settings, clock=self.clock, steady=self.look,
+            observable=lambda: self.observable)
+        self.runtime.active = True
+        self.plants = {
+            x: ActuatorSimulation(block, time=START) for x, block in self.blocks.items()}
+        self.outputs = []
+        self.sent = []
+        self.wire = []
+        self.transport = 0
+        self.driver = lambda: 0
+        self.hold_back = False
+
+    def clock(self):
+        return self.now
+
+    def look(self):
+        self.steady += self.effort
+        self.now += self.effort
+        return self.steady
+
+    @property
+    def planner(self):
+        return next(iter(self.group.planners.values()))
+
+    @property
+    def plant(self):
+        return next(iter(self.plants.values()))
+
+    def tick(self):
+        new = self.runtime.tick(self.now)
+        self.outputs += new
+        for x in new:
+            if isinstance(x, Send):
+                self.sent.append((self.now, x))
+                self.wire.append((self.now + self.transport, x))
+        return new
+
+    def deliver(self):
+        """Let arrive what is no longer on its way."""
+        if self.hold_back:
+            return
+        arrived = [x for x in self.wire if x[0] <= self.now]
+        self.wire = [x for x in self.wire if x[0] > self.now]
+        for _, x in arrived:
+            plant = self.plants[x.joint]
+            stamp = max(x.stamp, plant.time)
+            delay = self.driver() if x.flux_density != plant.schedule.current else 0
+            plant.command(stamp + delay, x.flux_density)
+
+    def advance(self):
+        """Let the actuators move on, and tell what takes effect."""
+        for name, plant in self.plants.items():
+            while (stamp := plant.schedule.next_stamp) is not None and stamp <= self.now:
+                before = plant.schedule.current
+                plant.advance(stamp)
+                if plant.schedule.current != before:
+                    self.runtime.applied(name, plant.time, plant.schedule.current)
+            plant.advance(self.now)
+
+    def run(self, end, step=2 * MS):
+        while self.now < end:
+            self.tick()
+            self.now = min(self.now + step, end)
+            self.deliver()
+            self.advance()
+        self.tick()
+
+    @property
+    def status(self):
+        return [x for x in self.outputs if isinstance(x, StatusChanged)][-1]
+
+    def codes(self):
+        return [x.verdict.code for x in self.outputs if isinstance(x, StatusChanged)]
+
+    def notes(self):
+        return [x.message for x in self.outputs if isinstance(x, Note)]
+
+    def observe(self, age=0):
+        for name, plant in self.plants.items():
+            self.runtime.observed(
+                name, self.now - age, plant.stretch, plant.rate, plant.flux_density)
+
+    def residual(self, stretch, joint='a'):
+        plant, block = self.plants[joint], self.blocks[joint]
+        frequency = float(natural_frequency(stretch, block.nondimensional))
+        return math.hypot(
+            plant.stretch - stretch, plant.rate * block.time_unit / frequency)
+
+
+# -- requests -----------------------------------------------------------------------------------
+
+
+def test_sequence_is_sent_in_time_and_ends_at_rest():
+    rig = Rig()
+    assert rig.runtime.request(trajectory(*SEQUENCE, name='x')).code == 'accepted'
+    rig.run(START + LEAD + 3 * HOLD)
+    alone = Planner(paper_actuator(), rig.options)
+    alone.request(SEQUENCE, None, START)
+    assert [(x.stamp, x.flux_density) for _, x in rig.sent] == [
+        (x.stamp, x.flux_density) for x in alone.due(START + 10**9)]
+    assert all(0 <= x.stamp - now <= LEAD for now, x in rig.sent)
+    status = rig.status
+    assert (status.verdict.request, status.plan, status.late) == ('x', 1, 0)
+    assert (status.progress.state, status.progress.setpoint) == ('at_rest', 3)
+    assert rig.residual(1.4) < 0.2 * RESIDUAL
+    assert rig.runtime.wake is None
+
+
+def test_request_while_inactive_or_without_time_is_refused():
+    rig = Rig()
+    rig.runtime.active = False
+    assert rig.runtime.request(Stop()).code == 'inactive'
+    rig.runtime.active = True
+    rig.now = 0
+    verdict = rig.runtime.request(trajectory(*SEQUENCE, name='x'))
+    assert (verdict.code, verdict.request, verdict.severity) == ('no_time', 'x', Severity.ERROR)
+    assert 'expected messages on /clock' in verdict.message
+    assert rig.runtime.report()[2]['refused'] == 2
+
+
+def test_plan_that_cannot_be_computed_is_a_refusal_too(monkeypatch):
+    def fails(*_):
+        raise HmsaError('the integration ran out of steps')
+        yield
+
+    rig = Rig()
+    rig.runtime.request(trajectory(*SEQUENCE))
+    plan = rig.planner.plan
+    monkeypatch.setattr(Planner, 'draft_setpoint', fails)
+    verdict = rig.runtime.request(Target('a', 1.2))
+    assert (verdict.code, verdict.message) == ('not_converged', 'the integration ran out of steps')
+    assert rig.planner.plan is plan
+
+
+@pytest.mark.parametrize(('joints', 'text'), [
+    (('a', 'c'), "lacks 'b': expected all of a, b, c"), ((), "lacks 'a'"),
+    (('a', 'b', 'c', 'a'), "'a' twice"), (('a', 'b', 'knee'), "has 'knee': expected names among"),
+])
+def test_trajectory_that_one_joint_cannot_take_none_takes(joints, text):
+    weak = replace(paper_actuator(), remanence=0.01)
+    rig = Rig(blocks={'a': paper_actuator(), 'b': paper_actuator(), 'c': weak})
+    assert text in rig.runtime.request(trajectory(*SEQUENCE, joints=joints)).message
+    verdict = rig.runtime.request(trajectory((1.5, HOLD), joints=('a', 'b', 'c')))
+    assert verdict.code == 'flux_limit'
+    assert 'joint c: stretch 1.5 needs a flux density of' in verdict.message
+    assert rig.group.number == 0
+    assert 'joint' in rig.runtime.request(Target('knee', 1.1)).message
+
+
+def test_some_joints_only_if_allowed_and_one_by_its_own_target():
+    rig = Rig(joints=('a', 'b', 'c'))
+    rig.runtime.change(
+        replace(QUIET, allow_partial_joints=True), {}, simultaneous=True)
+    assert rig.runtime.request(trajectory(*SEQUENCE, joints=('b', 'c'))).code == 'accepted'
+    assert not rig.group.planners['a'].plan.segments
+    assert rig.runtime.request(Target('a', 1.3)).code == 'accepted'
+    assert rig.runtime.request(Target('a', 1.3)).code == 'unchanged'
+    assert rig.group.number == 2
+    rig.run(START + LEAD + 3 * HOLD)
+    assert max(rig.residual(1.3), rig.residual(1.4, 'b')) < 0.3 * RESIDUAL
+
+
+# -- long trajectories --------------------------------------------------------------------------
+
+
+def zigzag(count, name='long', **more):
+    """Return a long request that makes its points one by one."""
+    return Trajectory(
+        ('a',), (((1.1 + 0.1 * (k % 2),), (k + 1) * HOLD) for k in range(count)), count,
+        name=name, **more)
+
+
+def test_long_trajectory_is_planned_in_slices_with_signs_of_life_in_between():
+    rig = Rig(settings=replace(QUIET, heartbeat_period=20 * MS))
+    rig.runtime.request(Target('a', 1.05))
+    rig.run(START + LEAD + HOLD)
+    rig.effort = MS // 5
+    plan = rig.planner.plan
+    assert rig.runtime.request(zigzag(1000)).code == 'waiting'
+    spent = []
+    while rig.planner.plan is plan:
+        before = rig.now
+        rig.tick()
+        spent.append(rig.now - before)
+        assert rig.runtime.wake == 0 or rig.planner.plan is not plan
+        rig.now += MS
+    assert max(spent) < 6 * MS
+    beats = [now for now, x in rig.sent if x.flux_density == plan.levels[-1].flux_density]
+    assert max(y - x for x, y in zip(beats, beats[1:], strict=False)) < 30 * MS
+    rig.effort = 0
+    # It begins when it can, and the first setpoint lasts as long as the others.
+    segments = rig.planner.plan.segments[-1000:]
+    assert rig.now < segments[0].since < rig.now + 10**9
+    assert {y.since - x.since for x, y in zip(segments, segments[1:], strict=False)} == {HOLD}
+    rig.run(segments[2].since)
+    assert rig.residual(segments[1].stretch) < 0.1 * RESIDUAL
+    assert rig.runtime.following.lateness.count == 0
+
+
+def test_stop_is_answered_at_once_whatever_is_planned():
+    rig = Rig()
+    rig.runtime.request(trajectory(*SEQUENCE))
+    rig.run(START + LEAD + 3 * MS)
+    rig.effort = MS // 5
+    rig.runtime.request(zigzag(10_000))
+    rig.tick()
+    before = rig.now
+    assert rig.runtime.request(Stop()).code == 'accepted'
+    assert rig.now - before < 10 * MS
+    rig.tick()
+    assert ('superseded', 'long') in [
+        (x.verdict.code, x.verdict.request) for x in rig.outputs if isinstance(x, StatusChanged)]
+    assert rig.runtime.wake != 0
+    assert rig.status.verdict.code == 'accepted'
+
+
+def test_refused_request_leaves_the_one_alone_that_is_being_planned():
+    rig = Rig()
+    rig.runtime.request(trajectory(*SEQUENCE))
+    rig.effort = MS // 5
+    rig.runtime.request(zigzag(200))
+    assert rig.runtime.request(Target('a', 9.0)).code == 'out_of_range'
+    while rig.runtime.wake == 0:
+        rig.tick()
+    assert rig.status.verdict.code == 'accepted'
+    assert rig.status.progress.setpoints == 200
+
+
+def test_trajectory_beyond_the_limit_is_refused_before_a_point_is_read():
+    rig = Rig(settings=replace(QUIET, max_points=100))
+
+    def unreadable():
+        raise AssertionError
+        yield
+
+    verdict = rig.runtime.request(Trajectory(('a',), unreadable(), 101))
+    assert verdict.code == 'too_long'
+    assert 'has 101 setpoints: expected at most 100, the parameter max_points' in verdict.message
+    assert rig.runtime.request(zigzag(100)).code == 'accepted'
+
+
+def test_late_command_in_a_long_plan_makes_only_the_next_setpoints_anew():
+    rig = Rig()
+    rig.runtime.request(zigzag(300))
+    while rig.runtime.wake == 0:
+        rig.tick()
+    before = rig.planner.plan
+    rig.run(before.segments[1].since + MS)
+    rig.hold_back = True
+    rig.run(before.segments[3].since + 9 * MS)
+    rig.hold_back = False
+    rig.run(before.segments[7].since)
+    after = rig.planner.plan
+    assert rig.status.replanned >= 1
+    assert len(after.segments) == 300
+    assert all(x is y for x, y in zip(after.segments[6:], before.segments[6:], strict=True))
+    assert rig.residual(after.segments[6].stretch) < 0.1 * RESIDUAL
+    state = rig.planner.state(rig.now)
+    assert state.stretch == pytest.approx(rig.plant.stretch, abs=1e-7)
+
+
+def test_preview_of_a_long_plan_comes_in_parts():
+    rig = Rig()
+    rig.runtime.request(zigzag(400))
+    while rig.runtime.wake == 0:
+        rig.tick()
+    levels = {x.stamp: x for x in rig.planner.plan.levels}
+    rig.run(START + LEAD + 400 * HOLD, step=HOLD)
+    parts = [x for x in rig.outputs if isinstance(x, PlanChanged)]
+    assert len(parts) == 3
+    shown = {}
+    for part in parts:
+        assert len(part.stamps) <= 500
+        shown |= dict(zip(part.stamps, part.samples['a'], strict=True))
+    assert sorted(shown) == sorted(x for x in levels if x > 0)
+    assert all(shown[x][2] == levels[x].flux_density for x in shown)
+
+
+# -- signs of life ------------------------------------------------------------------------------
+
+
+def test_heartbeat_repeats_the_last_level_and_changes_nothing():
+    rig = Rig(settings=replace(QUIET, heartbeat_period=20 * MS))
+    rig.run(START + 100 * MS)
+    # Nothing before the first command.
+    assert rig.sent == []
+    rig.runtime.request(trajectory((1.1, HOLD)))
+    rig.run(START + 400 * MS)
+    sent = [(x.stamp, x.flux_density) for _, x in rig.sent]
+    assert sent == sorted(sent, key=lambda x: x[0])
+    changes = [x for k, x in enumerate(sent) if k == 0 or x[1] != sent[k - 1][1]]
+    assert changes == [
+        (x.stamp, x.flux_density) for x in rig.planner.plan.levels if x.stamp > 0]
+    assert 12 <= rig.runtime.heartbeats == len(sent) - len(changes)
+    assert rig.residual(1.1) < 0.1 * RESIDUAL
+    rig.runtime.change(QUIET, {}, simultaneous=False)
+    rig.run(START + 500 * MS)
+    assert len(rig.sent) == len(sent)
+    assert rig.runtime.wake is None
+
+
+# -- taking over --------------------------------------------------------------------------------
+
+PATIENT = replace(QUIET, takeover_timeout=500 * MS)
+
+
+def test_first_request_waits_for_the_state_in_force():
+    rig = Rig(settings=PATIENT)
+    rig.plant.set_state(1.15, 3.0, 0.06)
+    assert rig.runtime.request(trajectory((1.3, HOLD))).code == 'waiting'
+    assert rig.runtime.wants_samples
+    rig.runtime.request(Target('a', 1.25, name='second'))
+    rig.observe(age=600 * MS)
+    rig.runtime.observed('knee', rig.now, 1.0, 0.0, 0.0)
+    rig.runtime.observed('a', rig.now, 1.0, math.nan, 0.0)
+    rig.tick()
+    assert rig.runtime.wants_samples
+    assert rig.codes() == ['none']
+    rig.observe()
+    rig.run(START + 150 * MS)
+    assert not rig.runtime.wants_samples
+    assert rig.status.plan == 2
+    assert rig.residual(1.25) < 0.1 * RESIDUAL
+
+
+def test_patience_with_samples_of_others_has_an_end():
+    rig = Rig(settings=PATIENT)
+    rig.runtime.request(Stop())
+    rig.tick()
+    assert rig.runtime.wants_samples
+    rig.steady += 501 * MS
+    rig.tick()
+    assert rig.status.verdict.code == 'accepted'
+    assert 'no sample of joint a on joint_states' in rig.notes()[0]
+
+
+def test_nobody_is_waited_for_where_nobody_gives_samples():
+    rig = Rig(settings=PATIENT)
+    rig.observable = False
+    assert rig.runtime.request(Target('a', 1.1)).code == 'accepted'
+
+
+def test_impossible_sample_is_ignored_with_a_note():
+    rig = Rig(settings=PATIENT)
+    rig.runtime.request(Target('a', 1.1))
+    rig.runtime.observed('a', rig.now, 9.0, 0.0, 0.0)
+    rig.tick()
+    assert rig.status.verdict.code == 'accepted'
+    assert 'sample of joint a ignored: stretch in force is 9' in rig.notes()[0]
+
+
+# -- late commands ------------------------------------------------------------------------------
+
+
+def test_late_command_is_noticed_and_the_rest_planned_anew():
+    rig = Rig()
+    rig.runtime.request(trajectory(*SEQUENCE, name='x'))
+    rig.run(START + 20 * MS)
+    rig.hold_back = True
+    rig.run(START + LEAD + HOLD + 9 * MS)
+    rig.hold_back = False
+    rig.run(START + LEAD + 4 * HOLD)
+    status = rig.status
+    assert (status.verdict.code, status.verdict.request) == ('replanned', 'x')
+    assert status.verdict.severity is Severity.WARN
+    assert (status.late >= 1, status.replanned) == (True, 1)
+    assert (status.progress.state, status.progress.setpoint, status.plan) == ('at_rest', 3, 1)
+    assert rig.residual(1.4) < 0.2 * RESIDUAL
+
+
+def test_commands_that_come_late_together_change_nothing_and_are_found_out():
+    slender = replace(paper_actuator(), damping_coefficient=1e-3)
+    rig = Rig(blocks={'a': slender})
+    rig.runtime.request(trajectory((1.2, HOLD)))
+    rig.run(START + 3 * MS)
+    rig.hold_back = True
+    rig.run(START + LEAD + 20 * MS)
+    rig.hold_back = False
+    rig.deliver()
+    rig.advance()
+    rig.tick()
+    assert rig.status.replanned == 1
+    # Both commands of the new plan, which ends at the level in force.
+    rig.hold_back = True
+    rig.run(rig.now + LEAD + 30 * MS)
+    rig.hold_back = False
+    rig.deliver()
+    rig.advance()
+    assert rig.residual(1.2) > 0.01
+    rig.runtime.change(replace(QUIET, heartbeat_period=20 * MS), {}, simultaneous=False)
+    rig.run(rig.now + 3 * LEAD + 40 * MS)
+    assert rig.residual(1.2) < 0.2 * RESIDUAL
+    assert rig.status.replanned == 2
+
+
+def test_lead_time_too_short_is_told_and_not_planned_for_again_and_again():
+    rig = Rig(lead_time=2 * MS)
+    rig.transport = 5 * MS
+    rig.runtime.request(trajectory((1.2, HOLD)))
+    rig.run(START + 120 * MS, step=MS // 2)
+    verdict = rig.status.verdict
+    assert (verdict.code, verdict.severity) == ('late', Severity.WARN)
+    assert 'raise lead_time to more than 0.00' in verdict.message
+    assert verdict.figures['largest_lateness'] > 1e-3
+    assert 1 <= rig.status.replanned <= 3
+    assert len(rig.sent) < 20
+
+
+@pytest.mark.parametrize(('transport', 'driver', 'advice'), [
+    (0, 500_000, 'however early they are sent'),
+    (54_000_000, 0, 'raise lead_time to more than 0.05'),
+])
+def test_slow_driver_and_slow_transport_are_told_apart(transport, driver, advice):
+    rig = Rig(settings=replace(QUIET, replan_late=False))
+    jitter = iter(range(0, 10**9, 7919))
+    rig.transport = transport
+    rig.driver = lambda: driver + next(jitter) % 20_000 if driver else 0
+    rig.runtime.request(zigzag(12))
+    rig.run(START + LEAD + 12 * HOLD)
+    severity, message, counts = rig.runtime.report()
+    assert severity is Severity.WARN
+    assert counts['late'] >= 12
+    assert advice in message
+    assert ('lateness_tolerance' in message) is bool(driver)
+
+
+def test_jump_ahead_while_a_plan_runs_is_planned_anew():
+    rig = Rig()
+    rig.runtime.request(trajectory(*SEQUENCE))
+    rig.run(START + 30 * MS)
+    rig.now = START + LEAD + 2 * HOLD
+    rig.deliver()
+    rig.advance()
+    rig.tick()
+    assert (rig.status.verdict.code, rig.status.replanned) == ('replanned', 1)
+    assert any('raise lead_time' in x for x in rig.notes())
+    rig.run(START + 2 * LEAD + 4 * HOLD)
+    assert rig.residual(1.4) < 0.2 * RESIDUAL
+
+
+def test_foreign_level_is_noted_and_planned_for():
+    rig = Rig()
+    rig.runtime.request(trajectory((1.2, HOLD)))
+    rig.run(START + 150 * MS)
+    rig.plant.command(rig.now + MS, 0.0)
+    rig.run(START + 300 * MS)
+    assert any('0 T took effect, which was not commanded' in x for x in rig.notes())
+    assert rig.residual(1.2) < 0.2 * RESIDUAL
+
+
+# -- states and time ----------------------------------------------------------------------------
+
+
+def test_deactivated_it_comes_to_rest_and_then_sends_nothing():
+    rig = Rig(settings=replace(QUIET, heartbeat_period=10 * MS))
+    rig.runtime.request(trajectory(*SEQUENCE))
+    rig.run(START + 3 * MS)
+    rig.runtime.deactivate()
+    rig.tick()
+    assert rig.status.verdict.code == 'stopped'
+    sent = len(rig.sent)
+    rig.run(START + 500 * MS)
+    assert len(rig.sent) == sent
+    assert 1.0 < rig.plant.stretch < 1.1
+    assert rig.residual(rig.plant.stretch) < 0.1 * RESIDUAL
+    assert rig.runtime.request(Target('a', 1.1)).code == 'inactive'
+
+
+def test_clock_that_is_set_back_drops_the_plan_and_tells_so_once():
+    rig = Rig()
+    rig.runtime.request(trajectory(*SEQUENCE))
+    rig.run(START + 20 * MS)
+    for _ in range(5):
+        rig.runtime.clock_set_back(10 * MS)
+    rig.tick()
+    assert rig.codes().count('clock_jumped') == 1
+    assert 'the clock jumped back by 0.010 s' in rig.status.verdict.message
+    assert (rig.status.progress.state, rig.runtime.clock_jumps) == ('idle', 5)
+    assert rig.runtime.wake is None
+    assert rig.runtime.request(Target('a', 1.1)).code == 'accepted'
+    assert rig.planner.plan.levels[0].stretch == 1.0
