@@ -136,13 +136,29 @@ class Intake:
             file.blocks.append(block)
 
     def check_size(self, size: int, what: str) -> None:
-        """Refuse what is larger than the memory it may take."""
+        """
+        Refuse what is larger than the memory it may take.
+
+        Raises
+        ------
+        BagError
+            If it is.
+
+        """
         if size > self._max_chunk_size:
             raise BagError(f'a {what} of {size} bytes is larger than the {self._max_chunk_size} '
                            'bytes allowed')
 
     def take(self, file: ScannedFile, record: McapRecord) -> None:
-        """Take in a schema, a channel or metadata."""
+        """
+        Take in a schema, a channel or metadata.
+
+        Raises
+        ------
+        BagError
+            If it is larger than is allowed.
+
+        """
         if isinstance(record, Schema):
             if self._is_new(file, file.schemas, record):
                 self._keep(len(record.data))

@@ -90,6 +90,15 @@ class _Content(ReadDataStream):
         self._fields = 0
 
     def read(self, length: int) -> bytes:
+        """
+        Return the next bytes.
+
+        Raises
+        ------
+        BagError
+            If there are not so many, or too many fields.
+
+        """
         self._fields += 1
         if self._fields > 4 * limits.MAP_ENTRIES:
             raise BagError(
