@@ -58,6 +58,7 @@ def test_page_does_what_it_says(page, ros_env, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 @pytest.mark.xdist_group('sphinx')
 def test_pages_are_built_without_a_warning(tmp_path):
     built = subprocess.run(
