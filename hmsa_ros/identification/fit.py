@@ -231,7 +231,7 @@ class _Search:
             places = np.arange(first, len(matrix))
             matrix[places, places] += prior
             gradient[first:] -= prior * (shifts - self._middle)
-        size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+        size = np.sqrt(np.maximum(np.diag(matrix), 1e-12))
         return matrix / np.outer(size, size), gradient, size
 
     def _fit(

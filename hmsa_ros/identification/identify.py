@@ -203,7 +203,7 @@ def _conclude(
 
 def _inverse(information: Array) -> Array:
     """Return the inverse of an information matrix, large where it is singular."""
-    size = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    size = np.sqrt(np.maximum(np.diag(information), 1e-12))
     values, vectors = np.linalg.eigh(information / np.outer(size, size))
     values = np.maximum(values, 1e-13 * values[-1])
     found: Array = (vectors / values) @ vectors.T / np.outer(size, size)

@@ -13,7 +13,7 @@ from hmsa_ros.errors import BadInputError
 FEWEST = 12
 # Motion below this share of the stretch, or of the scatter from sample to sample, is none.
 _LEAST_MOTION = 1e-7
-_TIMES_SCATTER = 4.0
+_TIMES_SCATTER = 6.0
 # A crest is cut off where the value stays exactly at an extreme between samples that differ by
 # this share of the whole range.
 _CLIPPED_SLOPE = 0.01
@@ -109,14 +109,13 @@ class Recording:
                 f'{self.label} has flux densities up to {np.max(np.abs(self.levels)):.6g} T: '
                 'expected tesla; is it in mT?')
         spread = float(np.quantile(self.stretch, 0.99) - np.quantile(self.stretch, 0.01))
-        # White noise alone spreads by 4.65 of its deviation; a motion is slow from one to next.
-        scatter = float(np.median(np.abs(np.diff(self.stretch)))) / 0.954
-        jitter = scatter / 1.414
+        # White noise spreads by 4.65 of its deviation, and so much from one sample to the next.
+        jitter = float(np.median(np.abs(np.diff(self.stretch)))) / 0.954
         during = self.levels[np.searchsorted(
             self.level_times, [self.time[0], self.time[-1]], side='right').clip(1) - 1]
         inside = (self.level_times > self.time[0]) & (self.level_times < self.time[-1])
         driven = np.ptp(np.append(during, self.levels[inside])) > 0.0
-        still = spread < _LEAST_MOTION or (not driven and spread < _TIMES_SCATTER * 1.5 * jitter)
+        still = spread < _LEAST_MOTION or (not driven and spread < _TIMES_SCATTER * jitter)
         if driven and not still:
             still = self._unmoved(jitter)
         if still:
