@@ -6,7 +6,15 @@ name (``/left/plant.actuator.density``), the value as JSON. Bags of version 0.1 
 part of the node's name only (``plant.actuator.density``).
 """
 
+from collections import deque
 from collections.abc import Mapping
+import json
+from typing import Any
+
+#: Setpoints kept for the custom data of a bag.
+MAX_SETPOINTS = 1000
+# And of what length altogether.
+_SETPOINTS_LENGTH = 2**18
 
 
 def parameter_key(node: str, name: str) -> str:
@@ -81,3 +89,29 @@ def parameters_of(custom_data: Mapping[str, str], node: str, space: str) -> dict
         return exact
     alike = [values for name, values in nodes.items() if name.rsplit('/', 1)[-1] == node]
     return alike[0] if len(alike) == 1 else {}
+
+
+class SetpointLog:
+    """The latest setpoints that were sent, as they go into the custom data of a bag."""
+
+    def __init__(self) -> None:
+        self._entries: deque[str] = deque(maxlen=MAX_SETPOINTS)
+        self._changed = False
+
+    def add(self, entry: Mapping[str, Any]) -> None:
+        """Take in a setpoint, or a sequence of them."""
+        self._entries.append(json.dumps(entry))
+        self._changed = True
+
+    def news(self) -> dict[str, str]:
+        """Return the custom data if they have changed, as many as are of a reasonable length."""
+        if not self._changed:
+            return {}
+        self._changed = False
+        length, latest = 0, deque[str]()
+        for text in reversed(self._entries):
+            length += len(text)
+            if latest and length > _SETPOINTS_LENGTH:
+                break
+            latest.appendleft(text)
+        return {'setpoints': f'[{", ".join(latest)}]'}

@@ -9,7 +9,7 @@ the bag when it is cleaned up.
 """
 
 from bisect import bisect_left
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 import datetime
 import json
@@ -28,18 +28,20 @@ from std_srvs.srv import Trigger
 
 from hmsa_ros import __version__
 from hmsa_ros.bag.definitions import message_definition, type_hash
+from hmsa_ros.bag.experiment import SetpointLog
 from hmsa_ros.bag.qos import Qos
 from hmsa_ros.bag.reception import judge, RecordedTopic
 from hmsa_ros.bag.recording import Limits, lost_by_topic, Recording, Status
-from hmsa_ros.bag.writer import BagWriter, parse_custom_data, PRESETS, Topic
+from hmsa_ros.bag.writer import BagWriter, parse_custom_data, Topic
 from hmsa_ros.errors import BadInputError, BagError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.capture import Capture, decode, RawSubscription, SimulatedTime, Taken
 from hmsa_ros.nodes.conversions import from_time
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.message_types import interface_class, type_name_of
-from hmsa_ros.nodes.parameters import declare, ParameterSpec
+from hmsa_ros.nodes.parameters import declare
 from hmsa_ros.nodes.qos import stored, subscription
+from hmsa_ros.nodes.recorder_parameters import PARAMETERS
 from hmsa_ros.nodes.remote_parameters import RemoteParameters
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.nodes.selection import Selection
@@ -47,72 +49,10 @@ from hmsa_ros.nodes.selection import Selection
 DIAGNOSTICS_SECONDS = 1.0
 # Between being told to end and the last look at what has come.
 _LINGER_SECONDS = 0.1
-# Setpoints kept for the bag's custom data: how many, and of what length altogether.
-MAX_SETPOINTS = 1000
-_SETPOINTS_LENGTH = 2**18
 # One look in so many asks for the publishers of every topic, changed in number or not.
 _FULL_LOOK = 10
 # Nodes whose parameters are asked for.
 _MAX_NODES = 256
-
-PARAMETERS = (
-    ParameterSpec(
-        'storage.uri', '',
-        'Folder of the bag, which must not exist; empty for a name with date and time.'),
-    ParameterSpec(
-        'storage.storage_preset_profile', 'none',
-        'Compression: none, fastwrite (none, without checksums), lz4, zstd_fast or zstd_small.',
-        choices=tuple(PRESETS)),
-    ParameterSpec(
-        'storage.max_bagfile_size', 0,
-        'Size at which a new file is begun, 0 for never, else at least 1024.', 'B', 0),
-    ParameterSpec(
-        'storage.max_bagfile_duration', 0,
-        'Time span at which a new file is begun, 0 for never.', 's', 0),
-    ParameterSpec(
-        'storage.max_cache_size', 100 * 2**20,
-        'Memory for messages that wait to be written; what comes on top is counted as lost.',
-        'B', 2**16),
-    ParameterSpec(
-        'storage.custom_data', [], 'Pairs key=value that are stored in the bag.'),
-    ParameterSpec(
-        'storage.flush_period', 0.5,
-        'Time after which at the latest a message survives the end of the process.', 's',
-        0.01, 3600.0),
-    ParameterSpec(
-        'storage.fsync', False,
-        'Whether each flush waits for the disk, so that messages survive a power cut too.'),
-    ParameterSpec(
-        'record.topics', [],
-        'Topics to record; with no selection at all, every topic is recorded.'),
-    ParameterSpec('record.all_topics', False, 'Whether to record every topic.'),
-    ParameterSpec(
-        'record.regex', '', 'Topics in which this regular expression is found are recorded.'),
-    ParameterSpec('record.exclude_topics', [], 'Topics not to record.'),
-    ParameterSpec(
-        'record.exclude_regex', '',
-        'Topics in which this regular expression is found are not recorded.'),
-    ParameterSpec('record.start_paused', False, 'Whether to begin paused.'),
-    ParameterSpec(
-        'record.topic_polling_interval.sec', 0, 'Whole seconds between looks for new topics.',
-        's', 0, 3600),
-    ParameterSpec(
-        'record.topic_polling_interval.nsec', 100_000_000, 'Nanoseconds on top of them.', 'ns',
-        0, 999_999_999),
-    ParameterSpec(
-        'record.queue_depth', 10_000,
-        'Messages of a topic that the middleware keeps until they are taken.', '', 1, 1_000_000),
-    ParameterSpec(
-        'record.snapshot_mode', False,
-        'Whether messages are only kept in memory until ~/snapshot is called.'),
-    ParameterSpec(
-        'record.snapshot_duration', 10.0, 'Time that a snapshot reaches back.', 's', 1e-3, 1e6),
-    ParameterSpec(
-        'experiment.nodes', [interface.PLANNER, interface.PLANT],
-        'Nodes whose parameters are stored in the bag; a name without slash is that of a node '
-        'in any namespace.'),
-)
-
 
 # Topics with setpoints, by the last part of their names.
 _SETPOINTS = {
@@ -163,8 +103,7 @@ class Recorder(ManagedNode):
         self._resumes = not values['record.start_paused']
         self._sim_time = SimulatedTime() if self.get_parameter('use_sim_time').value else None
         self._experiment: dict[str, str] = {'hmsa_ros.version': __version__}
-        self._setpoints: deque[str] = deque(maxlen=MAX_SETPOINTS)
-        self._setpoints_noted = True
+        self._setpoints = SetpointLog()
         self._setpoint_topics: set[str] = set()
         self._said_ready = False
         self._polls = 0
@@ -425,22 +364,7 @@ class Recorder(ManagedNode):
                 for point in message.points]
         else:
             entry['stretch'] = message.data
-        text = json.dumps(entry)
-        self._setpoints.append(text)
-        self._setpoints_noted = False
-
-    def _note_setpoints(self) -> None:
-        """Store the latest setpoints, as many as are of a reasonable length."""
-        if self._setpoints_noted:
-            return
-        self._setpoints_noted = True
-        length, latest = 0, deque[str]()
-        for text in reversed(self._setpoints):
-            length += len(text)
-            if latest and length > _SETPOINTS_LENGTH:
-                break
-            latest.appendleft(text)
-        self._note({'setpoints': f'[{", ".join(latest)}]'})
+        self._setpoints.add(entry)
 
     def _on_parameter_event(self, event: ParameterEvent) -> None:
         """Store a change of a parameter of the experiment's nodes."""
@@ -512,7 +436,7 @@ class Recorder(ManagedNode):
         status = self._recording.status()
         lost = self._lost(status)
         total = sum(lost.values())
-        self._note_setpoints()
+        self._note(self._setpoints.news())
         # In the bag at once, so that it is known after a crash too.
         self._note({'lost': self._lost_text(lost)})
         state = ('inactive' if not self.active else 'paused' if self._paused
@@ -565,7 +489,7 @@ class Recorder(ManagedNode):
         # What was sent before and got lost on the way comes again meanwhile.
         time.sleep(_LINGER_SECONDS)
         self._capture.stop()
-        self._note_setpoints()
+        self._note(self._setpoints.news())
         status = self._recording.close(
             lambda last: {'lost': self._lost_text(self._lost(last))})
         lost = self._lost(status)
