@@ -60,8 +60,12 @@ def test_residual_counts_from_the_last_change_of_the_field():
     time = np.arange(200)
     flux = np.where(time < 50, 0.0, np.where(time < 56, 0.2, 0.1))
     stretch = np.where(time < 56, 1.0 + 0.0005 * time, 1.1)
+    stretch[60] += 0.005
     stretch[100] += 0.002
-    residual, error = settled(np.column_stack([stretch, 0.0 * time, flux]), 1.11, 0.1)
+    values = np.column_stack([stretch, 0.0 * time, flux])
+    # The last change brings back the level of the samples before and after it.
+    applied = [(50, 0.2), (56, 0.1), (60, 0.2), (60, 0.1), (500, 0.3)]
+    residual, error = settled(time, values, applied, 1.11, 0.1)
     assert residual == pytest.approx(0.02)
     assert error == pytest.approx(0.1)
 

@@ -99,7 +99,7 @@ def move(
     rig.setpoint(target)
     await_change(rig, mark, patience)
     rig.let_pass(pause, patience)
-    return settled(rig.samples(mark)[1], target, target - start)
+    return settled(*rig.samples(mark), rig.applied, target, target - start)
 
 
 def await_change(rig: Rig, mark: int, patience: float = 60.0) -> None:

@@ -106,7 +106,7 @@ def _replanned(rig: Rig, counter: str) -> Seen:
     await_change(rig, mark)
     rig.let_pass(0.6, 60.0)
     rig.fresh('plant', 'planner')
-    residual, error = settled(rig.samples(mark)[1], 1.2, 0.2)
+    residual, error = settled(*rig.samples(mark), rig.applied, 1.2, 0.2)
     count, told = rig.value('plant', counter), rig.value('planner', 'late')
     replanned = rig.value('planner', 'replanned')
     return Seen(

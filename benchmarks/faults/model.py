@@ -34,7 +34,7 @@ def _mismatch(rig: Rig, name: str) -> Seen:
         rig.let_pass(0.3)
         stamps, values = rig.samples(mark)
         worst = max(worst, _difference(truth, stamps, values, rig.commands[sent:]))
-        residuals.append(settled(values, 1.2, 0.2)[0])
+        residuals.append(settled(stamps, values, rig.applied, 1.2, 0.2)[0])
         if number + 1 < len(_SHARES):
             planner.end()
             plant.end()

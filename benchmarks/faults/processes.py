@@ -55,7 +55,7 @@ def _planner_killed(rig: Rig) -> Seen:
     rig.setpoint(1.1)
     await_change(rig, mark)
     rig.let_pass(0.06, 60.0)
-    residual, error = settled(rig.samples(mark)[1], 1.1, 0.1)
+    residual, error = settled(*rig.samples(mark), rig.applied, 1.1, 0.1)
     rig.fresh('planner')
     return Seen(
         f'field changed by {left:g} T on its own; at {moving:.1g}/s when asked again; '
@@ -99,7 +99,7 @@ def _planner_stopped(rig: Rig) -> Seen:
     planner.send(signal.SIGCONT)
     rig.let_pass(1.5)
     rig.fresh('plant', 'planner')
-    residual, error = settled(rig.samples()[1], 1.4, 0.2)
+    residual, error = settled(*rig.samples(), rig.applied, 1.4, 0.2)
     late, trips = rig.value('planner', 'late'), rig.value('plant', 'timeouts')
     return Seen(
         f'{trips:g} alarm of the watchdog, {late:g} late, {rig.value("planner", "replanned"):g} '

@@ -737,14 +737,19 @@ def hushed(log: Path) -> Iterator[TextIO]:
             os.dup2(before.fileno(), 2)
 
 
-def settled(values: np.ndarray, target: float, step: float) -> tuple[float, float]:
+def settled(
+        stamps: np.ndarray, values: np.ndarray, applied: Sequence[tuple[int, float]],
+        target: float, step: float) -> tuple[float, float]:
     """
     Measure what is left of a move after the last change of the flux density in force.
 
     Parameters
     ----------
-    values : ndarray, shape (n, 3)
-        Samples from before the move until long after it.
+    stamps, values : ndarray, shape (n,) and (n, 3)
+        Samples from before the move until long after it, stamped in ns.
+    applied : sequence of (int, float)
+        What the plant tells of the changes: stamp in ns and level. Samples do not show one
+        that is superseded within a sample.
     target : float
         Stretch that was asked for.
     step : float
@@ -763,8 +768,8 @@ def settled(values: np.ndarray, target: float, step: float) -> tuple[float, floa
         If too few samples have come since.
 
     """
-    changes = np.flatnonzero(np.diff(values[:, 2]))
-    rest = values[changes[-1] + 1 if changes.size else 0:, 0]
+    last = max((stamp for stamp, _ in applied if stamp <= stamps[-1]), default=0)
+    rest = values[stamps > last, 0]
     if rest.size < 10:
         raise HmsaError(f'{rest.size} samples since the last change: expected some more')
     return float(np.ptp(rest)) / abs(step), abs(float(rest[-1]) - target) / abs(step)

@@ -76,7 +76,7 @@ def _forward(rig: Rig) -> Seen:
     rig.spin_until(jumped, 'the jump')
     rig.let_pass(1.5)
     rig.fresh('planner')
-    _, error = settled(rig.samples()[1], 1.3, 0.1)
+    _, error = settled(*rig.samples(), rig.applied, 1.3, 0.1)
     late = rig.value('planner', 'late')
     worst = moves(rig, start=1.3)
     return Seen(
