@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from hmsa_ros.core.delivery import Delivery, pieces
+from hmsa_ros.core.delivery import Delivery, pieces, ramps
 from hmsa_ros.core.model import (
     acceleration,
     critical_zeta,
@@ -22,7 +22,7 @@ from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.sequence import plan_sequence, Setpoint
 from hmsa_ros.core.shapers import get_shaper, SHAPERS
 from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.core.simulation import ActuatorSimulation
+from hmsa_ros.core.simulation import ActuatorSimulation, endpoint
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.errors import BadInputError
 
@@ -261,3 +261,22 @@ def test_pre_emption_and_stop_leave_no_vibration_behind(options):
     assert arrivals[-1] is not None
     assert np.ptp(samples[58:60]) < 1e-6
     assert np.ptp(samples[-40:]) < 1e-6
+
+
+def test_through_ramps_every_moving_start_finds_rest_within_the_limits():
+    model = paper_actuator()
+    load, time = model.flux_density_unit, model.time_unit
+    limits, slew = Limits(-0.5 / load, 0.5 / load), 50.0 / load * time
+    random = np.random.default_rng(2)
+    for _ in range(400):
+        start, target = random.uniform(0.6, 1.8, 2)
+        held = float(elastic_force(start, 5.0)) + random.normal(0.0, 0.3)
+        state = State(
+            start, random.normal(0.0, 0.3),
+            float(np.clip(held, limits.minimum, limits.maximum)))
+        move = get_shaper('two_step')(Request(
+            state, target, model.nondimensional, limits, Delivery(slew=slew)))
+        assert all(limits.minimum <= x.load <= limits.maximum for x in move.levels)
+        parts, _ = ramps(move.levels, state.load, move.duration, slew)
+        end = endpoint(parts, move.duration, model.nondimensional, start, state.rate)
+        assert math.hypot(end[0] - target, end[1]) < 1e-9

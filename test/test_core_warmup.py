@@ -6,7 +6,7 @@ import sys
 
 PROGRAM = """
 import json
-from hmsa_ros.core import kernels, law, two_step_kernel
+from hmsa_ros.core import kernels, law, shooting_kernel, two_step_kernel
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.simulation import ActuatorSimulation
@@ -14,7 +14,7 @@ from hmsa_ros.core.warmup import warm_up
 
 def signatures():
     return {
-        name: len(kernel.signatures) for module in (law, kernels, two_step_kernel)
+        name: len(kernel.signatures) for module in (law, kernels, shooting_kernel, two_step_kernel)
         for name, kernel in vars(module).items()
         if hasattr(kernel, 'signatures')}
 

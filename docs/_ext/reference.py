@@ -39,7 +39,8 @@ PACKAGE = Path(errors.__file__).parent
 # parameters of one type described together (PR03), symbols that begin a description (PR08,
 # RT04), results with a name (RT02).
 IGNORED = frozenset({'ES01', 'EX01', 'SA01', 'GL02', 'GL03', 'PR03', 'PR08', 'RT04', 'RT02'})
-NOT_PUBLIC = re.compile(r'\.(__main__|cli|compiling|dop853|kernels|law|two_step_kernel|warmup)\b')
+NOT_PUBLIC = re.compile(
+    r'\.(__main__|cli|compiling|dop853|kernels|law|\w+_kernel|warmup)\b')
 
 
 def interface_entries(kind: type) -> list[Any]:

@@ -10,23 +10,13 @@ derivatives that come out of the integration.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-import math
 
 import numpy as np
 
-from hmsa_ros.core import kernels, law
+from hmsa_ros.core import shooting_kernel
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.moves import Level, State
 from hmsa_ros.core.parameters import NondimensionalParameters
-
-_RTOL = 1e-13
-_ITERATIONS = 25
-# A Newton step that must be cut shorter than this leads nowhere.
-_LEAST_SHARE = 0.01
-# Trials leave the first guess by this factor at the most.
-_FARTHEST = 10.0
-#: Distance from rest at the target, as a share of the move, at which a command is accepted.
-_ACCEPTED = 1e-10
 
 
 @dataclass(frozen=True)
@@ -77,38 +67,6 @@ class Template:
             np.array([x.time for x in levels]), np.array([x.load for x in levels]), d_times,
             d_loads)
 
-    def moved(self, change: Array) -> 'Template':
-        """
-        Return the template with changed unknowns.
-
-        Parameters
-        ----------
-        change : ndarray, shape (2,)
-            Of the unknowns.
-
-        Returns
-        -------
-        Template
-            Derivatives are constant.
-
-        """
-        return Template(
-            self.times + self.d_times @ change, self.loads + self.d_loads @ change,
-            self.d_times, self.d_loads)
-
-    def levels(self) -> tuple[Level, ...]:
-        """
-        Return the levels.
-
-        Returns
-        -------
-        tuple of Level
-            Without derivatives.
-
-        """
-        return tuple(
-            Level(float(t), float(x)) for t, x in zip(self.times, self.loads, strict=True))
-
 
 def solve(
         template: Template, state: State, load: float, target: float,
@@ -138,83 +96,11 @@ def solve(
         solution was found from this guess.
 
     """
-    frequency = law.natural_frequency(target, material.packed)
-    move = abs(target - state.stretch) + abs(state.rate) / frequency
-    found = _end(template, state, load, target, frequency, material, slew)
-    if found is None:
+    times, loads = template.times.copy(), template.loads.copy()
+    status, duration = shooting_kernel.solve(
+        times, loads, template.d_times, template.d_loads, float(state.stretch),
+        float(state.rate), float(load), float(target), float(slew), material.packed)
+    if status != shooting_kernel.SOLVED:
         return None
-    farthest = _FARTHEST * (np.max(np.abs(template.loads)) + abs(load) + 1.0)
-    longest = _FARTHEST * template.times[-1]
-    for _ in range(_ITERATIONS):
-        error, jacobian, duration = found
-        size = float(np.hypot(*error))
-        try:
-            change = np.asarray(-np.linalg.solve(jacobian, error), dtype=np.float64)
-        except np.linalg.LinAlgError:
-            return None
-        if not np.all(np.isfinite(change)):
-            return None
-        share = 1.0
-        while share > _LEAST_SHARE:
-            trial = template.moved(share * change)
-            result = None
-            # A wild trial is not worth its integration.
-            if np.max(np.abs(trial.loads)) < farthest and trial.times[-1] < longest:
-                result = _end(trial, state, load, target, frequency, material, slew)
-            if result is not None and np.hypot(*result[0]) < (1.0 - 0.1 * share) * size:
-                break
-            share *= 0.5
-        else:
-            # No way down: rounding, if the end is as near as rounding allows.
-            return (template.levels(), duration) if size <= _ACCEPTED * move else None
-        template, found = trial, result
-        if float(np.hypot(*result[0])) <= 1e-14 * move:
-            return template.levels(), result[2]
-    return None
-
-
-def _end(
-        template: Template, state: State, load: float, target: float, frequency: float,
-        material: NondimensionalParameters, slew: float) -> tuple[Array, Array, float] | None:
-    """Return distance from rest at the target, its derivatives and the duration."""
-    made = _pieces(template, load, slew)
-    if made is None:
-        return None
-    durations, loads, slopes, d_durations, d_loads = made
-    jacobian = np.empty((2, 2))
-    status, stretch, rate = kernels.respond(
-        state.stretch, state.rate, durations, loads, slopes, d_durations, d_loads,
-        material.packed, _RTOL, jacobian)
-    if status != kernels.DONE or not np.all(np.isfinite(jacobian)):
-        return None
-    jacobian[1] /= frequency
-    return (np.array([stretch - target, rate / frequency]), jacobian, float(np.sum(durations)))
-
-
-def _pieces(
-        template: Template, load: float, slew: float
-) -> tuple[Array, Array, Array, Array, Array] | None:
-    """Return durations, loads, slopes and their derivatives; None if a ramp does not fit."""
-    count = len(template.times)
-    rows = []
-    d_load = np.zeros(2)
-    for i in range(count):
-        level, d_level = template.loads[i], template.d_loads[i]
-        last = i == count - 1
-        span = 0.0 if last else template.times[i + 1] - template.times[i]
-        d_span = np.zeros(2) if last else template.d_times[i + 1] - template.d_times[i]
-        if not math.isinf(slew):
-            sign = math.copysign(1.0, level - load)
-            ramp = abs(level - load) / slew
-            d_ramp = sign * (d_level - d_load) / slew
-            rows.append((ramp, load, sign * slew, d_ramp, d_load))
-            span, d_span = span - ramp, d_span - d_ramp
-        if not last:
-            if span < 0.0:
-                return None
-            rows.append((span, level, 0.0, d_span, d_level))
-        load, d_load = level, d_level
-    return (
-        np.array([x[0] for x in rows]), np.array([x[1] for x in rows]),
-        np.array([x[2] for x in rows]), np.array([x[3] for x in rows]),
-        np.array([x[4] for x in rows]))
+    levels = tuple(Level(t, x) for t, x in zip(times.tolist(), loads.tolist(), strict=True))
+    return levels, duration

@@ -1,8 +1,13 @@
 """The two-step command, on ideal and on real hardware."""
 
 from collections.abc import Callable, Sequence
+import contextlib
+from itertools import product
 import math
 
+import numpy as np
+
+from hmsa_ros.core import law
 from hmsa_ros.core.moves import Level, Move
 from hmsa_ros.core.shapers.minimum_time import minimum_time
 from hmsa_ros.core.shapers.request import Request
@@ -15,6 +20,8 @@ _LATER = 4
 # Ramps slower than this are refused without a search, which would take seconds.
 _MOST_HALF_PERIODS = 40
 _SHORTEST_STRIDE = 0.05
+# Ramps to begin the search for two swings with, in quarters of a period.
+_SWINGS = (0.3, 0.1, 0.7, 0.03, 1.2)
 
 # A command and the time at which it is at rest; None if there is none.
 Attempt = tuple[tuple[Level, ...], float] | None
@@ -69,11 +76,7 @@ def two_step(request: Request) -> Move:
     if plan.code is not Code.TWO_STEP or not inside:
         if state.rate == 0.0:
             request.check([Level(0.0, plan.beta_p)])
-        return minimum_time(
-            request,
-            f'no single intermediate flux density within the limits leads from stretch '
-            f'{state.stretch:.6g} at rate {state.rate / request.units.time:.4g} to rest at '
-            f'{target:g}: two are used')
+        return _two_levels(request, holding)
     ideal = (Level(0.0, plan.beta_p), Level(plan.tau_p, holding))
     if request.delivery.ideal:
         return Move(Code.TWO_STEP, ideal, plan.tau_p)
@@ -148,6 +151,11 @@ def _ramped(request: Request, first: Level, last: Level) -> Move:
 
     most = min(least + 2 * _LATER, _MOST_HALF_PERIODS)
     for half_periods in range(least, most, 2):
+        if half_periods == least + 2 and request.state.rate != 0.0:
+            # Sooner there than by waiting for a later half period.
+            found = _swings(request, last.load)
+            if found is not None:
+                return Move(Code.MINIMUM_TIME, *found, _no_single(request))
         between = first.load
         if half_periods > 1:
             between = start + change / (1.0 + decay ** half_periods)
@@ -155,11 +163,55 @@ def _ramped(request: Request, first: Level, last: Level) -> Move:
         found = _follow(ideal, slower)
         if found is not None and _inside(request, found[0]):
             return Move(Code.TWO_STEP, *found)
+    if request.state.rate != 0.0:
+        with contextlib.suppress(RefusedError):
+            return minimum_time(request, _no_single(request))
     raise RefusedError(
         Code.SLEW_LIMIT,
         f'no command through ramps of {request.units.slew_text(slew)} brings stretch '
         f'{request.target:g} to rest: expected a slew limit of about '
         f'{request.units.slew_text(abs(change) / last.time)}')
+
+
+def _no_single(request: Request) -> str:
+    state = request.state
+    return (f'no single intermediate flux density within the limits leads from stretch '
+            f'{state.stretch:.6g} at rate {state.rate / request.units.time:.4g} to rest at '
+            f'{request.target:g}: two are used')
+
+
+def _two_levels(request: Request, holding: float) -> Move:
+    """Use two levels where one does not do."""
+    if request.delivery.period == 0.0 and math.isfinite(request.delivery.slew):
+        found = _swings(request, holding)
+        if found is not None:
+            return Move(Code.MINIMUM_TIME, *found, _no_single(request))
+    return minimum_time(request, _no_single(request))
+
+
+def _swings(request: Request, holding: float) -> Attempt:
+    """
+    Solve for two levels that ramps only just reach, the fastest way where no level is held.
+
+    Bounded in its rate of change, the fastest load ramps without a pause and turns twice.
+    """
+    slew, start = request.delivery.slew, request.load
+    longest = 0.5 * math.pi / law.natural_frequency(request.target, request.material.packed)
+    for share, rest, sign in product(_SWINGS, _SWINGS, (1.0, -1.0)):
+        high = start + sign * slew * share * longest
+        low = holding - sign * slew * rest * longest
+        if sign * (high - low) <= 0.0:
+            continue
+        turn = share * longest
+        guess = Template(
+            np.array([0.0, turn, turn + abs(high - low) / slew]), np.array([high, low, holding]),
+            sign / slew * np.array([[0.0, 0.0], [1.0, 0.0], [2.0, -1.0]]),
+            np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]]))
+        found = solve(
+            guess, request.state, start, request.target, request.material, slew)
+        if found is not None and _inside(request, found[0]):
+            return found
+    return None
 
 
 def _inside(request: Request, levels: Sequence[Level]) -> bool:
