@@ -240,7 +240,12 @@ class ActuatorSimulation:
 
     def advance(self, time: int) -> None:
         """
-        Integrate to a time in ns, as `Actuators.advance`.
+        Integrate to a time, as `Actuators.advance`.
+
+        Parameters
+        ----------
+        time : int
+            In ns.
 
         Raises
         ------

@@ -55,10 +55,17 @@ class Device(Protocol):
 
     def receive(self, joint: int, stamp: int, level: float) -> None:
         """
-        Take a level in T that applies from a stamp in ns on, 0 for at once.
+        Take a level, which supersedes all that are stamped at or after it.
 
-        It supersedes all that are stamped at or after it. One that cannot be obeyed is refused
-        with `BadInputError`, and changes nothing.
+        Parameters
+        ----------
+        joint : int
+            Its place.
+        stamp : int
+            Time in ns from which it applies, 0 for at once.
+        level : float
+            In T; one that cannot be obeyed is refused with `BadInputError`.
+
         """
 
     def advance(self, time: int) -> None:
