@@ -98,8 +98,18 @@ class SetpointLog:
         self._entries: deque[str] = deque(maxlen=MAX_SETPOINTS)
         self._changed = False
 
-    def add(self, entry: Mapping[str, Any]) -> None:
-        """Take in a setpoint, or a sequence of them."""
+    def add(self, topic: str, received_ns: int, message: Any) -> None:
+        """Take in a message with a setpoint (``data``) or a sequence of them (``points``)."""
+        entry: dict[str, Any] = {'topic': topic, 'received': received_ns}
+        if hasattr(message, 'points'):
+            stamp = message.header.stamp
+            entry['stamp'] = stamp.sec * 10**9 + stamp.nanosec
+            entry['points'] = [
+                [list(point.positions),
+                 point.time_from_start.sec + point.time_from_start.nanosec * 1e-9]
+                for point in message.points]
+        else:
+            entry['stretch'] = message.data
         self._entries.append(json.dumps(entry))
         self._changed = True
 

@@ -1,6 +1,6 @@
 """What a recorder makes of messages received and of its own state, without ROS."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 import time
 from typing import Any
@@ -125,3 +125,30 @@ def judge(
     if clock_ignored or clocks > 1:
         return WARN, f'{text}; {clocks} publishers of /clock, the first one is followed'
     return (WARN if reasons else OK), text
+
+
+def figures(status: Status, lost: Mapping[str, int]) -> dict[str, str]:
+    """
+    Return what the diagnostics of a recorder say of its recording.
+
+    Parameters
+    ----------
+    status : hmsa_ros.bag.recording.Status
+        Of its recording.
+    lost : mapping of str to int
+        Messages lost, by topic.
+
+    Returns
+    -------
+    dict of str to str
+        By key; ``behind`` in seconds.
+
+    """
+    return {
+        'file': status.file,
+        'written': str(sum(status.written.values())),
+        'lost': str(sum(lost.values())),
+        'queued_bytes': str(status.queued_bytes),
+        'behind': f'{status.behind:.3f}',
+        'files_refused': str(status.crowded),
+        **{f'lost.{name}': str(count) for name, count in lost.items() if count}}

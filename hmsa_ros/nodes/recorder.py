@@ -10,7 +10,7 @@ the bag when it is cleaned up.
 
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 import datetime
 import json
 import os
@@ -30,7 +30,7 @@ from hmsa_ros import __version__
 from hmsa_ros.bag.definitions import message_definition, type_hash
 from hmsa_ros.bag.experiment import SetpointLog
 from hmsa_ros.bag.qos import Qos
-from hmsa_ros.bag.reception import judge, RecordedTopic
+from hmsa_ros.bag.reception import figures, judge, RecordedTopic
 from hmsa_ros.bag.recording import Limits, lost_by_topic, Recording, Status
 from hmsa_ros.bag.writer import BagWriter, parse_custom_data, Topic
 from hmsa_ros.errors import BadInputError, BagError
@@ -86,8 +86,6 @@ class Recorder(ManagedNode):
         self.failure: BagError | None = None
         self._closed = True
         self.autostart()
-
-    # States ----------------------------------------------------------------------------------
 
     def configure(self) -> None:
         """Open the bag and start receiving."""
@@ -173,8 +171,6 @@ class Recorder(ManagedNode):
         """Return the full, remapped name of a topic or node."""
         resolved: str = self.resolve_topic_name(name)
         return resolved
-
-    # Discovery -------------------------------------------------------------------------------
 
     def _on_poll(self) -> None:
         """Look for new topics, new publishers, and parameters of the experiment's nodes."""
@@ -292,8 +288,6 @@ class Recorder(ManagedNode):
             self.get_logger().info(
                 f'ready: subscribed to all {len(self._selection.topics)} topics')
 
-    # Messages, in the capture thread ---------------------------------------------------------
-
     def _deliver(self, taken: Sequence[tuple[Any, list[Taken]]]) -> None:
         """Stamp, count and pass on what has been received."""
         clock = self._sim_time
@@ -342,8 +336,6 @@ class Recorder(ManagedNode):
         if batch:
             self._recording.put(batch, size)
 
-    # Experiment ------------------------------------------------------------------------------
-
     def _note(self, values: Mapping[str, str]) -> None:
         """Store something about the experiment."""
         new = {key: value for key, value in values.items()
@@ -354,17 +346,7 @@ class Recorder(ManagedNode):
 
     def _on_setpoint(self, name: str, message: Any) -> None:
         """Store a setpoint or a sequence of them."""
-        entry: dict[str, Any] = {'topic': name, 'received': self.get_clock().now().nanoseconds}
-        if hasattr(message, 'points'):
-            stamp = message.header.stamp
-            entry['stamp'] = stamp.sec * 10**9 + stamp.nanosec
-            entry['points'] = [
-                [list(point.positions),
-                 point.time_from_start.sec + point.time_from_start.nanosec * 1e-9]
-                for point in message.points]
-        else:
-            entry['stretch'] = message.data
-        self._setpoints.add(entry)
+        self._setpoints.add(name, self.get_clock().now().nanoseconds, message)
 
     def _on_parameter_event(self, event: ParameterEvent) -> None:
         """Store a change of a parameter of the experiment's nodes."""
@@ -373,8 +355,6 @@ class Recorder(ManagedNode):
             self._note(followed.texts(
                 (parameter.name, parameter.value)
                 for parameter in [*event.new_parameters, *event.changed_parameters]))
-
-    # Services and diagnostics ----------------------------------------------------------------
 
     def _on_pause(
             self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -407,17 +387,18 @@ class Recorder(ManagedNode):
     def _on_split(
             self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Go on in a new file."""
-        try:
-            response.message, response.success = self._recording.split(), True
-        except BagError as error:
-            response.message = str(error)
-        return response
+        return self._answer(response, self._recording.split)
 
     def _on_snapshot(
             self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Write what is kept in memory."""
+        return self._answer(response, self._recording.snapshot)
+
+    @staticmethod
+    def _answer(response: Trigger.Response, action: Callable[[], str]) -> Trigger.Response:
+        """Do what was asked for and say how it went."""
         try:
-            response.message, response.success = self._recording.snapshot(), True
+            response.message, response.success = action(), True
         except BagError as error:
             response.message = str(error)
         return response
@@ -450,19 +431,13 @@ class Recorder(ManagedNode):
                 self._sim_time.ignored))
         values = {
             'bag': str(self.folder),
-            'file': status.file,
             'state': state,
             'subscribed': f'{len(self._topics)}/{self._wanted_count()}',
             'received': str(sum(topic.received for topic in self._topics.values())),
-            'written': str(sum(status.written.values())),
-            'lost': str(total),
-            'queued_bytes': str(status.queued_bytes),
-            'behind': f'{status.behind:.3f}',
-            'files_refused': str(status.crowded),
+            **figures(status, lost),
             **({} if self._sim_time is None else {
                 'time_jumps': str(self._sim_time.jumps),
                 'clock_ignored': str(self._sim_time.ignored)}),
-            **{f'lost.{name}': str(count) for name, count in lost.items() if count},
         }
         message = DiagnosticArray()
         message.header.stamp = self.get_clock().now().to_msg()
@@ -478,8 +453,6 @@ class Recorder(ManagedNode):
             self.get_logger().error(sentence)
         else:
             self.get_logger().warning(sentence)
-
-    # End -------------------------------------------------------------------------------------
 
     def close(self) -> None:
         """Record what has arrived, close the bag and print the counts."""
