@@ -104,7 +104,7 @@ $(VENV)/.bench: $(VENV)/.installed
 	@touch $@
 
 # Compiled now and cached, so that no command waits for it.
-$(VENV)/.kernels: $(VENV)/.installed $(wildcard hmsa_ros/core/*.py)
+$(VENV)/.kernels: $(VENV)/.installed $(wildcard hmsa_ros/core/*.py hmsa_ros/identification/kernels.py)
 	$(BIN)/python -m hmsa_ros.core.warmup
 	@touch $@
 
