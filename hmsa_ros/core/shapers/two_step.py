@@ -209,6 +209,13 @@ def _swings(request: Request, holding: float) -> Attempt:
             np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]]))
         found = solve(
             guess, request.state, start, request.target, request.material, slew)
+        if found is not None and request.delivery.resolution > 0.0:
+            # Once more for the heights, at times that commands can carry and ramps can keep.
+            later = [Level(request.delivery.rounded(x.time) + i * request.delivery.resolution,
+                           x.load) for i, x in enumerate(found[0])]
+            found = solve(
+                Template.of(later, [('load', 0), ('load', 1)]), request.state, start,
+                request.target, request.material, slew) or found
         if found is not None and _inside(request, found[0]):
             return found
     return None
