@@ -1,123 +1,78 @@
 """
-Launch files, executed and held against the package they start.
+The launch files: what they start, and these very processes run.
 
-ROS 2's launch is not on the package index: what the files use of it is in `launch_api`, with the
-signatures of Jazzy, and the processes they describe are started for real.
+ROS 2's launch is not on the package index. What the files decide is a module of ours; where
+launch is installed, it runs the files for real, too.
 """
 
-from collections.abc import Mapping
 from importlib import import_module
 from importlib.util import find_spec
-import inspect
 from pathlib import Path
-import re
+import signal
 import sys
 
-from launch_api import (
-    DeclareLaunchArgument,
-    description,
-    evaluate,
-    LaunchError,
-    MODULES,
-    Started,
-)
 import pytest
 
+from hmsa_ros.bag.reader import BagReader
+from hmsa_ros.bag.verify import verify
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.session.launching import DEMO, failure, REPLAY
+
 ROOT = Path(__file__).resolve().parent.parent
-FILES = sorted((ROOT / 'launch').glob('*.launch.py'))
-# What must be given.
-NEEDED: Mapping[str, Mapping[str, str]] = {
-    'demo.launch.py': {}, 'replay.launch.py': {'bag': 'some_bag'}}
+FILES = {'demo': (DEMO, {}), 'replay': (REPLAY, {'bag': 'some_bag'})}
 COMMON = {'namespace', 'params_file', 'record', 'rviz', 'rviz_config', 'log_level'}
 # Declared by rclpy on every node.
 EVERY_NODE = {'use_sim_time'}
+SECONDS = 120.0
+NOTHING = 1e-9
+# Not the folder launch/ beside this one, which has no file __init__.py.
+REAL = getattr(find_spec('launch'), 'origin', None) is not None
 
 
-@pytest.fixture(params=FILES, ids=lambda path: path.name)
-def launch_file(request: pytest.FixtureRequest) -> Path:
-    """Return each launch file."""
-    path: Path = request.param
-    return path
+@pytest.fixture(params=FILES)
+def started(request):
+    """Return for each launch file what it starts with some arguments."""
+    file, needed = FILES[request.param]
+    return lambda **given: file.evaluate({**needed, **given}, ROOT)
 
 
-@pytest.fixture
-def started(launch_file, tmp_path):
-    """Return an evaluator of a launch file: what it starts, by executable."""
-    def start(**arguments: str) -> dict[str, Started]:
-        processes = evaluate(
-            launch_file, {**NEEDED[launch_file.name], **arguments}, tmp_path)
-        assert len({x.executable for x in processes}) == len(processes)
-        return {x.executable: x for x in processes}
-
-    return start
+def nodes(started):
+    """Return the processes by name."""
+    return {x.name: x for x in started.nodes}
 
 
-def demo(folder: Path, **arguments: str) -> dict[str, Started]:
-    """Return what the demonstration starts, by executable."""
-    return {x.executable: x
-            for x in evaluate(ROOT / 'launch' / 'demo.launch.py', arguments, folder)}
+def demo(**given):
+    return nodes(DEMO.evaluate(given, ROOT))
 
 
-def arguments_of(path: Path) -> dict[str, DeclareLaunchArgument]:
-    """Return the declared arguments by name."""
-    return {x.name: x for x in description(path).entities
-            if isinstance(x, DeclareLaunchArgument)}
+@pytest.mark.parametrize('name', FILES)
+def test_there_is_a_file_for_each_and_every_argument_is_described(name):
+    file, needed = FILES[name]
+    text = (ROOT / 'launch' / f'{name}.launch.py').read_text()
+    assert f'description({name.upper()})' in text
+    assert {x.name for x in file.arguments} > COMMON
+    assert all(x.description for x in file.arguments)
+    assert {x.name for x in file.arguments if x.default is None} == set(needed)
 
 
-def test_there_is_a_launch_file_for_the_demonstration_and_for_replaying():
-    assert [path.name for path in FILES] == ['demo.launch.py', 'replay.launch.py']
+def test_what_cannot_be_is_refused(started):
+    with pytest.raises(BadInputError, match="record is 'perhaps': expected one of true, false"):
+        started(record='perhaps')
+    with pytest.raises(BadInputError, match="params_file is '/nowhere': expected an existing"):
+        started(params_file='/nowhere')
 
 
-@pytest.mark.skipif(
-    getattr(find_spec('launch'), 'origin', None) is None,
-    reason='the real launch is not on the package index')
-def test_signatures_are_those_of_the_installed_launch():
-    for name, contents in MODULES.items():
-        for ours in contents:
-            real = inspect.signature(getattr(import_module(name), ours.__name__).__init__)
-            for parameter in inspect.signature(ours.__init__).parameters.values():
-                assert real.parameters[parameter.name].kind == parameter.kind
-
-
-def test_every_argument_is_described_and_those_of_every_launch_file_are_there(launch_file):
-    arguments = arguments_of(launch_file)
-    assert set(arguments) > COMMON
-    for argument in arguments.values():
-        assert argument.description
-    assert {name for name, x in arguments.items() if x.default_value is None} == set(
-        NEEDED[launch_file.name])
-
-
-def test_every_argument_is_used(launch_file):
-    used = re.findall(r"LaunchConfiguration\('(\w+)'\)", launch_file.read_text())
-    assert set(used) == set(arguments_of(launch_file))
-
-
-def test_arguments_that_are_yes_or_no_take_nothing_else(launch_file, started):
-    for name, argument in arguments_of(launch_file).items():
-        if argument.choices is not None:
-            assert argument.choices == ['true', 'false']
-            with pytest.raises(LaunchError, match=f"'perhaps' is no valid choice for {name}"):
-                started(**{name: 'perhaps'})
-
-
-def test_bag_to_replay_must_be_given(tmp_path):
-    with pytest.raises(LaunchError, match='required launch argument bag'):
-        evaluate(ROOT / 'launch' / 'replay.launch.py', {}, tmp_path)
-
-
-def test_nodes_are_executables_of_this_package_under_their_own_names(started):
-    for process in started().values():
-        assert process.package == 'hmsa_ros'
-        assert f'__node:={process.executable}' in process.arguments
-        assert callable(import_module(f'hmsa_ros.nodes.{process.executable}').main)
+def test_bag_to_replay_must_be_given_and_the_rate_be_a_number():
+    with pytest.raises(BadInputError, match='launch argument bag is missing'):
+        REPLAY.evaluate({}, ROOT)
+    with pytest.raises(BadInputError, match="rate is 'fast': expected a number"):
+        REPLAY.evaluate({'bag': 'x', 'rate': 'fast'}, ROOT)
 
 
 def test_only_parameters_that_the_nodes_declare_are_set(started):
-    for process in started().values():
-        module = import_module(f'hmsa_ros.nodes.{process.executable}')
+    for process in started().nodes:
+        module = import_module(f'hmsa_ros.nodes.{process.name}')
         declared = {spec.name: spec for spec in module.PARAMETERS}
-        assert process.parameters
         assert set(process.parameters) <= set(declared) | EVERY_NODE
         for name, value in process.parameters.items():
             if name in declared:
@@ -125,81 +80,121 @@ def test_only_parameters_that_the_nodes_declare_are_set(started):
                 declared[name].check(value)
 
 
-def test_every_node_gets_the_parameter_file_the_namespace_and_the_log_level(
-        launch_file, started):
-    processes = started(namespace='left', params_file='mine.yaml', log_level='warn')
-    for process in processes.values():
-        assert process.files == ['mine.yaml']
-        assert '__ns:=/left' in process.arguments
-        index = process.arguments.index('--log-level')
-        assert process.arguments[index + 1] == 'warn'
-
-
-def test_files_named_by_default_are_installed(started):
-    processes = started(rviz='true')
-    for process in processes.values():
-        for file in process.files:
-            assert Path(file).is_file()
-    rviz = processes['rviz2']
-    assert rviz.arguments[:2] == ['-d', str(ROOT / 'config' / 'rviz' / 'hmsa.rviz')]
-    assert Path(rviz.arguments[1]).is_file()
+def test_every_node_gets_the_parameter_file_the_namespace_and_the_log_level(started, tmp_path):
+    file = tmp_path / 'mine.yaml'
+    file.touch()
+    for process in started(
+            namespace='left', params_file=str(file), log_level='warn').nodes:
+        words = process.ros_arguments()
+        assert words[:6] == [
+            '-r', '__ns:=/left', '--log-level', 'warn', '--params-file', str(file)]
 
 
 def test_rviz_starts_only_when_asked_for_in_the_namespace_of_the_nodes(started):
-    assert 'rviz2' not in started()
-    assert '__ns:=/left' in started(rviz='true', namespace='left')['rviz2'].arguments
+    assert started().rviz is None
+    rviz = started(rviz='true', namespace='left').rviz
+    assert rviz.options == ('-d', str(ROOT / 'config' / 'rviz' / 'hmsa.rviz'))
+    assert Path(rviz.options[1]).is_file()
+    assert '__ns:=/left' in rviz.ros_arguments()
 
 
-def test_recorder_can_be_left_out_and_told_where_to_write(launch_file, started):
-    assert 'recorder' not in started(record='false')
-    name = 'bag' if launch_file.name == 'demo.launch.py' else 'record_to'
-    # A name that looks like a number stays a name.
-    recorder = started(**{name: '2026'})['recorder']
-    assert recorder.parameters['storage.uri'] == '2026'
+def test_recorder_can_be_left_out_and_a_bag_be_called_like_a_number(started):
+    assert 'recorder' not in nodes(started(record='false'))
+    assert '-p storage.uri:="2026"' in ' '.join(demo(bag='2026')['recorder'].ros_arguments())
 
 
-def test_plant_can_be_left_to_a_driver_of_hardware(tmp_path):
-    assert set(demo(tmp_path, plant='false')) == {'planner', 'recorder'}
+def test_time_is_simulated_if_the_plant_is():
+    followers = {name: x.parameters['use_sim_time'] for name, x in demo().items()}
+    assert followers == {'recorder': True, 'plant': False, 'planner': True}
+    assert demo()['plant'].parameters['publish_clock']
+    assert Path(demo()['plant'].params_file) == ROOT / 'config' / 'demo.yaml'
+    driver = demo(plant='false')
+    assert {name: x.parameters['use_sim_time'] for name, x in driver.items()} == {
+        'recorder': False, 'planner': False}
+    # 20,000 samples a second are for slow motion.
+    wall = demo(use_sim_time='false')['plant']
+    assert not wall.parameters['publish_clock']
+    assert not wall.params_file
 
 
-@pytest.mark.parametrize('simulated', [True, False])
-def test_under_simulated_time_the_plant_leads_and_the_others_follow(tmp_path, simulated):
-    processes = demo(tmp_path, use_sim_time=str(simulated).lower())
-    assert processes['plant'].parameters == {
-        'use_sim_time': False, 'publish_clock': simulated}
-    for follower in ('planner', 'recorder'):
-        assert processes[follower].parameters['use_sim_time'] is simulated
+def test_a_process_that_fails_ends_everything_and_one_that_is_ended_does_not_fail():
+    assert not failure('recorder', 0, ending=False)
+    assert not failure('recorder', -signal.SIGINT, ending=True)
+    assert failure('recorder', -signal.SIGINT, ending=False)
+    assert failure('recorder', 1, ending=True).startswith('the recorder ended with status 1')
+    assert failure('recorder', -signal.SIGKILL, ending=True)
 
 
-def test_in_a_replay_the_player_leads_sends_commands_alone_and_ends_it_all(tmp_path):
-    processes = {x.executable: x for x in evaluate(
-        ROOT / 'launch' / 'replay.launch.py', {'bag': 'b', 'rate': '0.5'}, tmp_path)}
-    player = processes['player']
-    assert player.parameters['use_sim_time'] is False
-    assert player.parameters['play.rate'] == 0.5
-    assert player.parameters['play.topics_to_filter'] == ['flux_density_command']
-    assert player.ends_all
-    for follower in ('plant', 'recorder'):
-        assert processes[follower].parameters['use_sim_time'] is True
-        assert not processes[follower].ends_all
+class ByHand:
+    """Starts the processes of a launch file and, at the end, ends them."""
+
+    def __init__(self, start):
+        self._start = start
+
+    def run(self, name, **given):
+        started = FILES[name][0].evaluate(given, ROOT)
+        self._processes = {x.name: self._start(*x.command()) for x in started.nodes}
+        self._last = started.last
+
+    def wait(self):
+        assert self._processes[self._last].wait(SECONDS) == 0
+        self.end()
+
+    def end(self):
+        for process in self._processes.values():
+            if process.alive():
+                assert process.stop(signal.SIGINT, SECONDS) == 0, process.output
+
+
+class ByLaunch:
+    """Runs the files by ROS 2's launch."""
+
+    def __init__(self, start):
+        self._start = start
+
+    def run(self, name, **given):
+        self._process = self._start(
+            sys.executable, '-c', 'import sys; from ros2cli.cli import main; sys.exit(main())',
+            'launch', str(ROOT / 'launch' / f'{name}.launch.py'),
+            *(f'{key}:={value}' for key, value in given.items()))
+
+    def wait(self, status=0):
+        assert self._process.wait(SECONDS) == status, self._process.output
+        return self._process.output
+
+    def end(self):
+        assert self._process.stop(signal.SIGINT, SECONDS) == 0, self._process.output
 
 
 @pytest.mark.ros
-def test_demonstration_starts_as_described(tmp_path, start, ros, wait_until):
-    from rcl_interfaces.srv import GetParameters
-    bag = tmp_path / 'run'
-    processes = demo(tmp_path, namespace='left', use_sim_time='true', bag=str(bag))
-    for executable, process in processes.items():
-        start(sys.executable, '-m', 'hmsa_ros', executable, *process.arguments)
-    expected = {
-        'plant': {'use_sim_time': False, 'publish_clock': True, 'publish_rate': 20000.0},
-        'planner': {'use_sim_time': True, 'lead_time': 0.01},
-        'recorder': {'use_sim_time': True, 'storage.uri': str(bag)}}
-    for node, values in expected.items():
-        response = ros.call(
-            GetParameters, f'/left/{node}/get_parameters',
-            GetParameters.Request(names=list(values)))
-        for value, found in zip(values.values(), response.values, strict=True):
-            kind = {bool: 'bool_value', float: 'double_value', str: 'string_value'}[type(value)]
-            assert getattr(found, kind) == value
-    wait_until((bag / 'metadata.yaml').exists, f'a bag in {bag}')
+@pytest.mark.slow
+@pytest.mark.parametrize('way', [ByHand, *([ByLaunch] if REAL else [])])
+def test_a_demonstration_is_recorded_and_its_replay_is_the_same(start, tmp_path, way):
+    bags = [tmp_path / 'first', tmp_path / 'second']
+    launch = way(start)
+    launch.run('demo', namespace='left', bag=str(bags[0]))
+    send = start.hmsa('send', '1.1:0.02', '0.9:0.02', '--wait', '--recorded', '--namespace',
+                      'left', '--timeout', str(SECONDS))
+    assert send.wait(SECONDS) == 0, send.output
+    launch.end()
+    launch.run('replay', namespace='left', bag=str(bags[0]), record_to=str(bags[1]))
+    launch.wait()
+    assert list(BagReader(bags[0]).messages(['/left/planner/joint_trajectory']))
+    first, second = (verify(bag)[0] for bag in bags)
+    assert second.command_count == first.command_count > 3
+    assert second.largest_difference < NOTHING
+
+
+if REAL:
+    @pytest.mark.ros
+    @pytest.mark.parametrize(('given', 'expected'), [
+        ({'params_file': '/nowhere'}, 'expected an existing file'),
+        ({'bag': '{there}'}, 'the recorder ended with status'),
+        ({'rviz': 'true', 'rviz_config': str(ROOT / 'nowhere')}, 'expected an existing file'),
+    ])
+    def test_launch_fails_when_a_node_does(start, tmp_path, given, expected):
+        (tmp_path / 'run').mkdir()
+        launch = ByLaunch(start)
+        launch.run('demo', **{
+            key: value.format(there=tmp_path / 'run') for key, value in given.items()})
+        assert expected in launch.wait(1)

@@ -26,11 +26,13 @@ def add_parser(subparsers: Any) -> None:
         epilog='example: hmsa send 1.10:2 1.20:2 --wait')
     parser.add_argument(
         'setpoints', nargs='+', type=setpoint_of_joints, metavar='STRETCH:SECONDS',
-        help='stretch to come to rest at, and seconds from leaving the last setpoint to '
-             'leaving this one; with several joints one stretch for all, or one a joint, as in '
+        help='stretch to come to rest at, and how long this setpoint lasts in s (move plus '
+             'hold); with several joints one stretch for all, or one a joint, as in '
              '1.10,1.20:2')
     parser.add_argument(
         '--wait', action='store_true', help='report until the sequence has been carried out')
+    parser.add_argument(
+        '--recorded', action='store_true', help='wait for a recorder that listens, and then send')
     parser.add_argument(
         '--namespace', default='', metavar='NS', help='namespace of the planner')
     parser.add_argument(
@@ -38,8 +40,7 @@ def add_parser(subparsers: Any) -> None:
         help='joint, or joints with commas between (default actuator)')
     parser.add_argument(
         '--timeout', type=float, default=10.0, metavar='S',
-        help='patience with a silent planner, and beyond the length of the sequence with one '
-             'that is slow (default 10 s)')
+        help='seconds to wait for a reply, and past the end of the sequence (default 10 s)')
     parser.set_defaults(run=run)
 
 
@@ -73,7 +74,10 @@ def run(arguments: argparse.Namespace) -> int:
             namespace=arguments.namespace, joints=arguments.joint.split(','),
             timeout=arguments.timeout) as client:
         client.find_planner()
-        verdict = client.send(arguments.setpoints)
+        if arguments.recorded:
+            client.find_recorder()
+        # A planner that has just started may not have heard the time yet.
+        verdict = client.send(arguments.setpoints, time_begins=True)
         print(verdict.message)
         if not arguments.wait:
             return 0

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from time import monotonic
+from time import monotonic, sleep
 from uuid import uuid4
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -17,6 +17,8 @@ from hmsa_ros.nodes.conversions import to_trajectory, whole
 from hmsa_ros.nodes.visitor import leave, visit
 
 _SLICE_SECONDS = 0.05
+# The first start after an installation compiles the kernels.
+_COMPILE_SECONDS = 300.0
 
 
 @dataclass(frozen=True)
@@ -172,11 +174,48 @@ class PlannerClient:
 
         """
         where = self._namespace or '/'
-        self.spin_until(
-            lambda: self._verdict is not _SILENCE
-            and self._publisher.get_subscription_count() > 0,
+        failure = (
             f'no planner in namespace {where}; start one with hmsa planner, with the same '
-            'ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE as here', each)
+            'ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE as here')
+
+        def found() -> bool:
+            return (self._verdict is not _SILENCE
+                    and self._publisher.get_subscription_count() > 0)
+
+        # One whose node is there but does not listen yet is compiling its kernels.
+        self.spin_until(lambda: found() or self._planner_starts(), failure, each)
+        self.spin_until(
+            lambda: found() or not self._planner_starts(), 'the planner does not listen', each,
+            max(self._timeout, _COMPILE_SECONDS))
+        self.spin_until(found, failure, each)
+
+    def _planner_starts(self) -> bool:
+        """Return whether the planner's node is there."""
+        return (interface.PLANNER, f'/{self._namespace.strip("/")}') in (
+            self.node.get_node_names_and_namespaces())
+
+    def find_recorder(self) -> None:
+        """
+        Wait until somebody who records subscribes to what is sent, and with it to all else.
+
+        Raises
+        ------
+        HmsaError
+            If there is nobody.
+
+        """
+        def recorded() -> bool:
+            # Recorders, rosbag2's too, offer to split the bag.
+            recorders = {
+                service.rpartition('/')[0] for service, _ in
+                self.node.get_service_names_and_types() if service.endswith('/split_bagfile')}
+            heard = self.node.get_subscriptions_info_by_topic(self._publisher.topic_name)
+            return any(
+                f'{x.node_namespace.rstrip("/")}/{x.node_name}' in recorders for x in heard
+            ) and self._publisher.get_subscription_count() >= len(heard)
+
+        self.spin_until(
+            recorded, f'no recorder of {self._publisher.topic_name}; start one with hmsa recorder')
 
     def send(
             self, setpoints: Sequence[tuple[float | Sequence[float], float]], *,
@@ -227,6 +266,8 @@ class PlannerClient:
                 return self._verdict
             if not time_begins or self._verdict.code != 'no_time' or monotonic() > deadline:
                 raise BadInputError(f'the planner refused: {self._verdict.message}')
+            self._executor.spin_once(timeout_sec=_SLICE_SECONDS)
+            sleep(_SLICE_SECONDS)
 
     def follow(
             self, verdict: Verdict, *, each: Callable[[Verdict], None] | None = None,

@@ -196,13 +196,11 @@ def _start(session: Session, bag: Path) -> None:
     """Start the three nodes; time stands still until all are ready."""
     for node in (
             NodeProcess('plant', {
-                'publish_clock': 'true', 'start_paused': 'true',
-                'real_time_factor': str(REAL_TIME_FACTOR),
-                'publish_rate': str(PUBLISH_RATE)}),
-            NodeProcess('planner', {'use_sim_time': 'true', 'lead_time': str(LEAD_TIME)}),
+                'publish_clock': True, 'start_paused': True,
+                'real_time_factor': REAL_TIME_FACTOR, 'publish_rate': PUBLISH_RATE}),
+            NodeProcess('planner', {'use_sim_time': True, 'lead_time': LEAD_TIME}),
             NodeProcess('recorder', {
-                'use_sim_time': 'true', 'storage.uri': str(bag),
-                'record.topics': '[' + ', '.join(_TOPICS) + ']'})):
+                'use_sim_time': True, 'storage.uri': str(bag), 'record.topics': _TOPICS})):
         ENDING.check()
         session.start(node)
 

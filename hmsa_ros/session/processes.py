@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 import ctypes
 from dataclasses import dataclass
+import json
 import os
 from pathlib import Path
 import signal
@@ -25,29 +26,41 @@ class NodeProcess:
     Attributes
     ----------
     name : str
-        One of the ``hmsa`` node commands.
-    parameters : mapping of str to str
-        Parameters as ``-p`` takes them.
+        One of the ``hmsa`` node commands, or the executable of another package.
+    parameters : mapping of str to object
+        Booleans, numbers, strings and lists of strings.
+    namespace, params_file, log_level : str
+        Empty for none.
+    options : tuple of str
+        What comes before ``--ros-args``.
 
     """
 
     name: str
-    parameters: Mapping[str, str]
+    parameters: Mapping[str, object]
+    namespace: str = ''
+    params_file: str = ''
+    log_level: str = ''
+    options: tuple[str, ...] = ()
+
+    def ros_arguments(self) -> list[str]:
+        """Return what follows ``--ros-args``; parameters take precedence over the file."""
+        words = []
+        if self.namespace:
+            words += ['-r', f'__ns:=/{self.namespace.lstrip("/")}']
+        if self.log_level:
+            words += ['--log-level', self.log_level]
+        if self.params_file:
+            words += ['--params-file', self.params_file]
+        for key, value in self.parameters.items():
+            # JSON is YAML, and in it a string that looks like a number stays a string.
+            words += ['-p', f'{key}:={json.dumps(value)}']
+        return words
 
     def command(self) -> list[str]:
-        """
-        Return the command line.
-
-        Returns
-        -------
-        list of str
-            With this Python.
-
-        """
-        words = [sys.executable, '-m', 'hmsa_ros', self.name, '--ros-args']
-        for key, value in self.parameters.items():
-            words += ['-p', f'{key}:={value}']
-        return words
+        """Return the command line, with this Python."""
+        return [sys.executable, '-m', 'hmsa_ros', self.name, *self.options, '--ros-args',
+                *self.ros_arguments()]
 
 
 class Session:
