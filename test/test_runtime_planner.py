@@ -521,6 +521,20 @@ def test_deactivated_it_comes_to_rest_and_then_sends_nothing():
     assert rig.runtime.request(Target('a', 1.1)).code == 'inactive'
 
 
+def test_activated_again_it_does_not_go_on_from_what_was_seen_before():
+    rig = Rig(settings=PATIENT)
+    rig.observe()
+    assert rig.runtime.request(Target('a', 1.3)).code == 'accepted'
+    rig.run(START + LEAD + 3 * MS)
+    rig.runtime.deactivate()
+    rig.run(START + 200 * MS)
+    rig.runtime.active = True
+    assert rig.runtime.request(Target('a', 1.1)).code == 'waiting'
+    rig.observe()
+    rig.run(START + 400 * MS)
+    assert rig.residual(1.1) < RESIDUAL
+
+
 def test_clock_that_is_set_back_drops_the_plan_and_tells_so_once():
     rig = Rig()
     rig.runtime.request(trajectory(*SEQUENCE))

@@ -170,6 +170,8 @@ class PlannerRuntime:
         """Come to rest, for which all commands are sent now, and take no more requests."""
         self.active = False
         self._patience = None
+        # What is seen before the joints have come to rest is not where they are later.
+        self._samples.clear()
         self._queue.clear()
         now = self._clock()
         if self._engaged and now:
