@@ -197,8 +197,8 @@ def check_bag(folder: Path, kind: str, killed: str) -> Cycle:
     from hmsa_ros.bag.info import lost_messages
     from hmsa_ros.bag.reader import BagReader
     from hmsa_ros.bag.recover import recover
-    from hmsa_ros.bag.verify import verify
     from hmsa_ros.errors import HmsaError
+    from hmsa_ros.runs.verify import verify
 
     found = Cycle(kind, killed)
     bag = folder

@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 
 from hmsa_ros.bag.reader import BagReader, read_messages
+from hmsa_ros.contract import topics
 from hmsa_ros.errors import BadInputError, complain, HmsaError
 
 APPLICATION = 'hmsa_ros'
-#: Topics in the namespace of the nodes, as `hmsa_ros.nodes.interface` has them.
-JOINT_STATES = 'joint_states'
-MARKERS = ('plant/markers', 'planner/markers')
+JOINT_STATES = topics.JOINT_STATES.name
+MARKERS = tuple(
+    topics.from_outside(topics.MARKERS.name, node) for node in topics.MARKERS.publishers)
 #: Rerun's timeline of the times at which messages were received.
 TIMELINE = 'message_log_time'
 
@@ -128,8 +129,8 @@ def show(bag: str | os.PathLike[str], recording: Any, namespace: str = '') -> No
     recording.send_blueprint(blueprint(namespace))
     for file in reader.files:
         recording.log_file_from_path(file)
-    topics = [topic for name in MARKERS if (topic := f'{root}/{name}') in found]
-    for message in read_messages(bag, topics) if topics else ():
+    markers = [topic for name in MARKERS if (topic := f'{root}/{name}') in found]
+    for message in read_messages(bag, markers) if markers else ():
         recording.set_time(TIMELINE, timestamp=np.datetime64(message.log_time_ns, 'ns'))
         for marker in message.message.markers:
             _log_marker(recording, views(namespace)['Actuators'], marker)

@@ -39,7 +39,8 @@ def modules(package: str) -> list[str]:
             if path.stem != '__init__']
 
 
-@pytest.mark.parametrize('package', ['core', 'device', 'runtime', 'bag', 'studies'])
+@pytest.mark.parametrize(
+    'package', ['core', 'device', 'runtime', 'bag', 'studies', 'contract', 'runs', 'report'])
 def test_physics_runtime_bags_and_studies_import_without_ros_each_module_by_itself(package):
     result = run(BLOCKED.format(blocked=ROS) + f"""
 import importlib

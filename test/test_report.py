@@ -18,6 +18,7 @@ from rosbags.typesys import get_typestore, Stores
 from hmsa_ros.bag.definitions import message_definition
 from hmsa_ros.bag.writer import BagWriter, Topic
 from hmsa_ros.cli import main
+from hmsa_ros.contract.parameters import ACTUATOR_FIELDS
 from hmsa_ros.core.parameters import NondimensionalParameters, paper_actuator
 from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.residual import residual_vibration
@@ -25,23 +26,16 @@ from hmsa_ros.core.simulation import ActuatorSimulation, simulate
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.report import charts
-from hmsa_ros.report.evaluation import (
-    evaluate,
-    in_force,
-    plan_points,
-    timing,
-    without_repeats,
-)
+from hmsa_ros.report.evaluation import evaluate, plan_points, timing
 from hmsa_ros.report.page import page
 from hmsa_ros.report.picture import draw
-from hmsa_ros.report.reading import (
-    ACTUATOR_FIELDS,
+from hmsa_ros.runs.bags import read_runs
+from hmsa_ros.runs.levels import in_force, Level, without_repeats
+from hmsa_ros.runs.topics import (
     APPLIED,
     COMMAND,
     JOINT_STATES,
-    Level,
     PLAN,
-    read_runs,
     SETPOINT,
     STATUS,
     TRAJECTORY,
@@ -544,7 +538,7 @@ def test_a_bag_that_rosbags_wrote_will_do(tmp_path, bag):
     expected, = parts_of(bag)
     assert part.evaluation.results == expected.evaluation.results
     assert part.run.summary.lost is None
-    assert 'not told' in ' '.join(Page(page([part])).words)
+    assert 'not counted' in ' '.join(Page(page([part])).words)
 
 
 def test_each_namespace_of_a_bag_is_a_run(tmp_path):

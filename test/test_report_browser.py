@@ -11,7 +11,7 @@ from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.report import charts
 from hmsa_ros.report.evaluation import evaluate, timing
 from hmsa_ros.report.page import page
-from hmsa_ros.report.reading import read_runs
+from hmsa_ros.runs.bags import read_runs
 
 pytestmark = pytest.mark.skipif(
     find_browser() is None,

@@ -425,7 +425,7 @@ class Topics(Generated):
         for topic in interface_entries(interface.Topic):
             if not topic.meaning or not (topic.publishers or topic.subscribers):
                 self.missing(
-                    f'topic {topic.name} in hmsa_ros.nodes.interface has no meaning, or no '
+                    f'topic {topic.name} in hmsa_ros.contract.topics has no meaning, or no '
                     'publishers and subscribers: expected both beside its name')
             rows.append((
                 f'`{topic.name}`',
@@ -444,7 +444,7 @@ class Services(Generated):
         for service in services:
             if not service.meaning:
                 self.missing(
-                    f'service {service.name} in hmsa_ros.nodes.interface has no meaning: '
+                    f'service {service.name} in hmsa_ros.contract.topics has no meaning: '
                     'expected one for each node that serves it')
         return table(
             ('node', 'name', 'meaning'),

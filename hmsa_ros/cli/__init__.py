@@ -9,6 +9,7 @@ that ``hmsa --help`` answers at once.
 import argparse
 from collections.abc import Sequence
 from importlib import import_module
+import os
 import sys
 from typing import Any, NoReturn
 
@@ -18,8 +19,8 @@ from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, complain, HmsaError
 
 COMMANDS = (
-    'demo', 'init', 'plan', 'send', 'identify', 'watch', 'node', 'bag', 'report', 'figures',
-    'robustness', 'sweep', 'completion')
+    'demo', 'init', 'plan', 'send', 'identify', 'watch', 'node', 'bag', 'report', 'export',
+    'figures', 'robustness', 'sweep', 'completion')
 
 
 class _Help(argparse.HelpFormatter):
@@ -72,6 +73,8 @@ def build_parser() -> Parser:
     subparsers = parser.add_subparsers(metavar='COMMAND', required=True)
     for name in COMMANDS:
         import_module(f'hmsa_ros.cli.{name}').add_parser(subparsers)
+    for command in subparsers.choices.values():
+        command.set_defaults(parser=command)
     return parser
 
 
@@ -92,11 +95,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    arguments = build_parser().parse_args(split_ros_args(words))
+    arguments, unknown = build_parser().parse_known_args(split_ros_args(words))
+    if unknown:
+        arguments.parser.error(f'unrecognized arguments: {" ".join(unknown)}')
     arguments.ros_args = words[len(split_ros_args(words)):]
     ENDING.interrupt()
     try:
         status: int = arguments.run(arguments)
+        sys.stdout.flush()
         return status
     except BadInputError as error:
         return complain(error, 2)
@@ -108,6 +114,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         # The reader of our output (head, less) has gone: there is nobody left to tell.
         sys.stderr.close()
         return 0
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        # What could not be written is tried again at the end of Python otherwise.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return complain(HmsaError(
+            f'standard output cannot be written ({error.strerror}): expected room on it'), 1)
 
 
 def split_ros_args(words: list[str]) -> list[str]:

@@ -3,6 +3,7 @@
 import argparse
 from dataclasses import asdict
 import json
+from pathlib import Path
 import sys
 from typing import Any
 
@@ -52,6 +53,10 @@ def add_parser(subparsers: Any) -> None:
     verify.add_argument(
         '--tolerance', type=float, default=1e-9, metavar='D',
         help='largest difference of the stretch that passes (default %(default)g)')
+    verify.add_argument(
+        '--params-file', type=Path, metavar='YAML',
+        help='parameter file (YAML) of the actuator, where the bag does not contain its '
+             'parameters')
     verify.add_argument('--json', action='store_true', help='print one JSON object')
     verify.set_defaults(run=run, action=_verify)
     for action in (info, recover, verify):
@@ -100,15 +105,24 @@ def _info(arguments: argparse.Namespace) -> int:
 
 def _verify(arguments: argparse.Namespace) -> int:
     """Compare recorded and integrated motion; 1 if they differ."""
-    from hmsa_ros.bag.verify import verify
+    from hmsa_ros.runs.bags import read_runs
+    from hmsa_ros.runs.parameters import read_parameter_file
+    from hmsa_ros.runs.verify import verify_run
+
     if not arguments.tolerance >= 0.0:
         raise BadInputError(f'tolerance is {arguments.tolerance:g}: expected at least 0')
+    parameters = read_parameter_file(arguments.params_file) if arguments.params_file else None
     with progress('verifying'):
-        results = verify(arguments.bag, max_chunk_size=arguments.max_chunk_size)
+        runs = read_runs(
+            arguments.bag, parameters=parameters, max_chunk_size=arguments.max_chunk_size)
+        results = [verify_run(x) for x in runs]
+    problems = list(runs[0].summary.problems) if runs[0].summary else []
+    for problem in problems:
+        print(f'hmsa: note: {printable(problem)}', file=sys.stderr)
     passed = all(result.largest_difference <= arguments.tolerance for result in results)
     if arguments.json:
         print(json.dumps({
-            'passed': passed, 'tolerance': arguments.tolerance,
+            'passed': passed, 'tolerance': arguments.tolerance, 'problems': problems,
             'actuators': [asdict(result) for result in results]}, indent=2))
     else:
         for result in results:

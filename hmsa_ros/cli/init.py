@@ -7,7 +7,7 @@ import json
 import math
 from pathlib import Path
 import sys
-from typing import Any, TYPE_CHECKING
+from typing import Any, cast, TYPE_CHECKING
 
 from hmsa_ros.cli.quantities import (
     BY_KEY,
@@ -18,7 +18,9 @@ from hmsa_ros.cli.quantities import (
     QUANTITIES,
     Quantity,
 )
+from hmsa_ros.contract.parameters import PUBLISH_RATE
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.files import write_text
 
 if TYPE_CHECKING:
     from hmsa_ros.core.parameters import ActuatorParameters
@@ -27,6 +29,8 @@ if TYPE_CHECKING:
 _JOINT = 'actuator'
 _FILE = Path('actuator.yaml')
 _FOLLOWS = {'half_thickness': 'as --half-length', 'flux_min': 'minus --flux-max'}
+# What differs much from one elastomer to another, and no data sheet gives.
+_GUESSES = ('zeta', 'j_lim')
 # The coil's reach that is hardly a motion.
 _HARDLY = 0.01
 
@@ -124,6 +128,7 @@ def run(arguments: argparse.Namespace) -> int:
                 f'{"is" if len(missing) == 1 else "are"} not given: give them, or add --yes for '
                 'the defaults')
         given, joints = _ask(given, joints)
+    guessed = [key for key in _GUESSES if key in missing and arguments.yes]
     for key, quantity in BY_KEY.items():
         if key not in given and not (key == 'zeta' and DAMPING.key in given):
             given[key] = default_of(quantity, given)
@@ -133,8 +138,13 @@ def run(arguments: argparse.Namespace) -> int:
 
     found = scales(actuator, coil)
     doubts = _doubts(given, found)
+    if guessed:
+        doubts.append(
+            f'{" and ".join(f"{BY_KEY[x].words} {given[x]:g}" for x in guessed)} '
+            f'{"is a guess" if len(guessed) == 1 else "are guesses"}: a plan is as exact as '
+            'they are; measure them, or give them')
     joints = joints or [_JOINT]
-    _write(path, file_text(path, actuator, coil, joints, found))
+    write_text(path, file_text(path, actuator, coil, joints, found))
     for doubt in doubts:
         print(f'hmsa: warning: {doubt}', file=sys.stderr)
     if arguments.json:
@@ -144,7 +154,7 @@ def run(arguments: argparse.Namespace) -> int:
                        for key, x in asdict(found).items()},
             'warnings': doubts}, indent=2))
         return 0
-    for line in table(found, coil):
+    for line in table(found):
         print(line)
     print(f'\n{path} written; to use it:')
     for node in ('plant', 'planner'):
@@ -239,7 +249,7 @@ def _doubts(given: Mapping[str, float], found: 'Scales') -> list[str]:
     return doubts
 
 
-def table(found: 'Scales', coil: 'Coil') -> list[str]:
+def table(found: 'Scales') -> list[str]:
     """
     Return what follows from the parameters, a line each.
 
@@ -247,8 +257,6 @@ def table(found: 'Scales', coil: 'Coil') -> list[str]:
     ----------
     found : Scales
         As worked out.
-    coil : Coil
-        For which.
 
     Returns
     -------
@@ -263,9 +271,9 @@ def table(found: 'Scales', coil: 'Coil') -> list[str]:
         ('critical damping at rest',
          f'{found.critical_damping:.4g} N s/m, zeta {found.critical_zeta:.4g}'),
         ('limiting stretches', '{:.4f} and {:.4f}'.format(*found.stretch_limits)),
-        *((f'flux density for {stretch:g}', f'{1e3 * flux:.4g} mT' + (
-            '' if coil.flux_density_min <= flux <= coil.flux_density_max
-            else ' (more than the coil has)')) for stretch, flux in found.flux_densities),
+        ('shape c1', f'{found.c1:.4g}'),
+        *((f'flux density for {stretch:.6g}', f'{1e3 * flux:.4g} mT')
+          for stretch, flux in found.flux_densities),
         ('coil holds stretches', _range(found.held)),
         ('two steps reach from rest',
          'nothing' if found.reached == (1.0, 1.0) else _range(found.reached)),
@@ -317,7 +325,7 @@ def file_text(
         f'#   hmsa plant --ros-args --params-file {path.name}',
         f'#   hmsa planner --ros-args --params-file {path.name}',
         '#', '# What follows from them (worked out once: hmsa init does it anew):',
-        *(f'#   {line}' for line in table(found, coil)),
+        *(f'#   {line}' for line in table(found)),
         '/**:', '  ros__parameters:']
     texts = {x.parameter: (x.text, x.unit) for x in (*QUANTITIES, DAMPING)}
     for name, value in _parameters(actuator, coil).items():
@@ -338,16 +346,18 @@ def file_text(
 
 def _sampling(actuator: 'ActuatorParameters') -> list[str]:
     """Return lines with the plant's sample rate, if its default misses the actuator's peaks."""
-    from hmsa_ros.device.health import enough_samples, LARGEST_SAMPLE_RATE, SAMPLE_RATE
+    from hmsa_ros.device.health import enough_samples
 
-    enough = enough_samples(actuator)
-    if enough <= SAMPLE_RATE:
+    default, largest = cast(float, PUBLISH_RATE.default), cast(float, PUBLISH_RATE.maximum)
+    # Twice what just shows the peaks.
+    enough = 2.0 * enough_samples(actuator)
+    if enough <= default:
         return []
     digits = 10 ** (math.floor(math.log10(enough)) - 1)
-    rate = min(math.ceil(enough / digits) * digits, LARGEST_SAMPLE_RATE)
+    rate = min(math.ceil(enough / digits) * digits, largest)
     return [
         '/**/plant:', '  ros__parameters:',
-        '    # Samples per second: at least ten in a period of the actuator [Hz].',
+        '    # Samples per second: at least twenty in a period of the actuator [Hz].',
         f'    publish_rate: {_number(rate)}']
 
 
@@ -363,12 +373,3 @@ def _number(value: float) -> str:
     text = repr(float(value))
     mantissa, letter, exponent = text.partition('e')
     return f'{mantissa}.0e{exponent}' if letter and '.' not in mantissa else text
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding='utf-8')
-    except OSError as error:
-        raise BadInputError(
-            f'cannot write {path}: {error.strerror or error}; expected a folder with write '
-            'permission (--out)') from error

@@ -1,12 +1,14 @@
 """``hmsa plan``: plan a sequence without ROS."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import json
 import math
+from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.setpoints import setpoint
+from hmsa_ros.errors import BadInputError
 
 if TYPE_CHECKING:
     from hmsa_ros.core.sequence import Segment
@@ -25,27 +27,31 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         'plan', help='plan a sequence of setpoints without ROS',
         description='Plan a sequence of setpoints, nondimensional as in the paper: a stretch '
-                    'and the span of time for which it lasts, in units of L sqrt(rho/G).',
+                    'and the span of time for which it lasts, in units of L sqrt(rho/G). With '
+                    '--params-file spans are in seconds, and flux densities in tesla are '
+                    'printed.',
         epilog='example: hmsa plan 1.10:10 1.20:10 1.40:10 --json')
     parser.add_argument(
         'setpoints', nargs='+', type=setpoint, metavar='STRETCH:SPAN',
-        help='stretch to come to rest at, and time from leaving the last setpoint to leaving '
-             'this one')
+        help='stretch to come to rest at, and how long this setpoint lasts (move plus hold)')
     parser.add_argument(
         '--start', type=float, default=1.0, metavar='S',
         help='stretch at rest at the start (default 1)')
     parser.add_argument(
-        '--zeta', type=float, default=0.2, metavar='Z',
+        '--zeta', type=float, metavar='Z',
         help='nondimensional damping coefficient, at least 0 (default 0.2)')
     parser.add_argument(
-        '--j-lim', type=float, default=5.0, metavar='J',
+        '--j-lim', type=float, metavar='J',
         help='chain limit of the Gent model, above 0 (default 5)')
     parser.add_argument(
-        '--c1', type=float, default=2.0, metavar='C',
+        '--c1', type=float, metavar='C',
         help='shape 2 H^2/L^2, above 0 (default 2)')
     parser.add_argument(
-        '--shaper', default='two_step', metavar='NAME',
+        '--shaper', metavar='NAME',
         help='two_step (default), robust, minimum_time, step, zv, zvd or ei')
+    parser.add_argument(
+        '--params-file', type=Path, metavar='YAML',
+        help='parameter file (YAML) of planner and plant, for a plan in seconds and tesla')
     parser.add_argument('--json', action='store_true', help='print JSON in full precision')
     parser.set_defaults(run=run)
 
@@ -70,20 +76,86 @@ def run(arguments: argparse.Namespace) -> int:
         If a setpoint cannot be had or a parameter is out of range.
 
     """
+    if arguments.params_file is not None:
+        return _run_si(arguments)
     from hmsa_ros.core.moves import State
     from hmsa_ros.core.parameters import NondimensionalParameters
     from hmsa_ros.core.sequence import plan_sequence, Setpoint
 
-    material = NondimensionalParameters(arguments.zeta, arguments.j_lim, arguments.c1)
+    given = {name: value for name in ('zeta', 'j_lim', 'c1')
+             if (value := getattr(arguments, name)) is not None}
     segments = plan_sequence(
-        [Setpoint(*x) for x in arguments.setpoints], material, start=State(arguments.start),
-        shaper=arguments.shaper)
+        [Setpoint(*x) for x in arguments.setpoints], NondimensionalParameters(**given),
+        start=State(arguments.start), shaper=arguments.shaper or 'two_step')
     rows = [_row(segment) for segment in segments]
     if arguments.json:
         print(json.dumps({'segments': rows}, indent=2))
     else:
-        _print_table(rows, segments)
+        _print_table(
+            rows, ('stretch', 'span', 'b_p', 'tau_p', 'b_1'),
+            'nondimensional: time in L sqrt(rho/G), b = sqrt(Br B/(mu0 G))')
+        _print_reasons(segments)
     return 0
+
+
+def _run_si(arguments: argparse.Namespace) -> int:
+    """Plan in seconds and tesla for the actuator of a parameter file."""
+    from hmsa_ros.contract.actuator import actuator_from
+    from hmsa_ros.contract.parameters import (
+        ACTUATOR,
+        FLUX_DENSITY_MAX,
+        FLUX_DENSITY_MIN,
+        SLEW_LIMIT,
+    )
+    from hmsa_ros.contract.topics import PLANNER
+    from hmsa_ros.core.moves import State
+    from hmsa_ros.core.sequence import plan_sequence, Setpoint
+    from hmsa_ros.core.timeline import Model, Options
+    from hmsa_ros.runs.parameters import read_parameter_file, values_of
+
+    fixed = [f'--{name.replace("_", "-")}' for name in ('zeta', 'j_lim', 'c1')
+             if getattr(arguments, name) is not None]
+    if fixed:
+        raise BadInputError(
+            f'both --params-file and {", ".join(fixed)} are given: expected either, the file '
+            'sets them')
+    values = values_of(
+        read_parameter_file(arguments.params_file), PLANNER,
+        (*ACTUATOR, FLUX_DENSITY_MIN, FLUX_DENSITY_MAX, SLEW_LIMIT))
+    actuator = actuator_from(values)
+    model = Model(actuator, Options(
+        flux_density_min=values['flux_density_min'], flux_density_max=values['flux_density_max'],
+        slew_limit=values['slew_limit'] or math.inf))
+    time, load = actuator.time_unit, actuator.flux_density_unit
+    segments = plan_sequence(
+        [Setpoint(stretch, span / time) for stretch, span in arguments.setpoints],
+        model.material, start=State(arguments.start), shaper=arguments.shaper or 'two_step',
+        limits=model.limits, delivery=model.delivery, units=model.units)
+    rows = [_si_row(x, time, load) for x in segments]
+    group = actuator.nondimensional
+    if arguments.json:
+        print(json.dumps({
+            'c1': group.c1, 'zeta': group.zeta, 'j_lim': group.j_lim, 'time_unit': time,
+            'flux_density_unit': load, 'segments': rows}, indent=2))
+    else:
+        _print_table(
+            rows, ('stretch', 'span', 'flux_density_p', 'time_p', 'flux_density_1'),
+            f'times in s, flux densities in T; c1 {group.c1:.6g}, zeta {group.zeta:.6g}, '
+            f'time unit {time:.6g} s')
+        _print_reasons(segments)
+    return 0
+
+
+def _si_row(segment: 'Segment', time: float, load: float) -> dict[str, Any]:
+    """Return a segment with its times in s and its flux densities in T as well."""
+    row: dict[str, Any] = _row(segment)
+    levels = segment.move.levels
+    return row | {
+        'span': row['span'] * time,
+        'time_p': None if row['tau_p'] is None else row['tau_p'] * time,
+        'flux_density_p': None if row['beta_p'] is None else row['beta_p'] * load,
+        'flux_density_1': levels[-1].load * load,
+        'levels': [[x.time * time, x.load * load] for x in levels]}
 
 
 def _row(segment: 'Segment') -> dict[str, float | str | None]:
@@ -110,20 +182,23 @@ def _row(segment: 'Segment') -> dict[str, float | str | None]:
 
 
 def _print_table(
-        rows: Sequence[dict[str, float | str | None]], segments: Sequence['Segment']) -> None:
+        rows: Sequence[Mapping[str, float | str | None]], columns: Sequence[str], caption: str
+) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(caption='nondimensional: time in L sqrt(rho/G), b = sqrt(Br B/(mu0 G))')
-    for name in ('stretch', 'span', 'b_p', 'tau_p', 'b_1'):
+    table = Table(caption=caption)
+    for name in columns:
         table.add_column(name, justify='right')
     table.add_column('status')
     for row in rows:
         table.add_row(*(
-            '-' if row[name] is None else f'{row[name]:.6g}'
-            for name in ('stretch', 'span', 'b_p', 'tau_p', 'b_1')), str(row['status']))
-    console = Console()
-    console.print(table)
+            '-' if row[name] is None else f'{row[name]:.6g}' for name in columns),
+            str(row['status']))
+    Console().print(table)
+
+
+def _print_reasons(segments: Sequence['Segment']) -> None:
     for segment in segments:
         if segment.move.reason:
-            console.print(f'note: {segment.move.reason}', highlight=False, soft_wrap=True)
+            print(f'note: {segment.move.reason}')

@@ -9,6 +9,15 @@ from dataclasses import dataclass
 import math
 import re
 
+from hmsa_ros.contract.parameters import (
+    ACTUATOR,
+    ACTUATOR_FIELDS,
+    FLUX_DENSITY_MAX,
+    FLUX_DENSITY_MIN,
+    ParameterSpec,
+    SLEW_LIMIT,
+    ZETA,
+)
 from hmsa_ros.errors import BadInputError
 
 _UNITS: dict[str, dict[str, float]] = {
@@ -23,6 +32,7 @@ _UNITS: dict[str, dict[str, float]] = {
 _NUMBER = re.compile(r'\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*')
 _NAME = re.compile(r'[A-Za-z](?:_?[A-Za-z0-9])*')
 
+_BLOCK = dict(zip(ACTUATOR_FIELDS, ACTUATOR, strict=True))
 _REVIEW = 'Wu et al., Multifunctional Materials 3 (2020) 042003'
 _ZHAO = 'Zhao et al., J. Mech. Phys. Solids 124 (2019) 244'
 
@@ -65,6 +75,18 @@ class Quantity:
     usual: tuple[float, float]
     source: str
     hints: tuple[tuple[float, float, str], ...] = ()
+
+    @classmethod
+    def of(
+            cls, key: str, spec: ParameterSpec, text: str, usual: tuple[float, float],
+            source: str, hints: tuple[tuple[float, float, str], ...] = (), *,
+            follows: bool = False) -> 'Quantity':
+        """Return the quantity that a parameter of the nodes is; `follows` others by default."""
+        default = spec.default if isinstance(spec.default, float) and not follows else None
+        return cls(
+            key, spec.name, text, spec.unit, default,
+            -math.inf if spec.minimum is None else spec.minimum,
+            math.inf if spec.maximum is None else spec.maximum, usual, source, hints)
 
     @property
     def option(self) -> str:
@@ -147,64 +169,59 @@ class Quantity:
 
 
 QUANTITIES: tuple[Quantity, ...] = (
-    Quantity(
-        'half_length', 'actuator.half_length',
-        'half length L of the block, across the field', 'm', 0.01, 1e-9, 1e3, (1e-5, 0.1),
-        f'from printed swimmers to moulded grippers in {_REVIEW}',
+    Quantity.of(
+        'half_length', _BLOCK['half_length'], 'half length L of the block, across the field',
+        (1e-5, 0.1), f'from printed swimmers to moulded grippers in {_REVIEW}',
         ((0.5, 1e3, 'was it meant in mm?'),)),
-    Quantity(
-        'half_thickness', 'actuator.half_thickness',
-        'half thickness H of the block, along the field', 'm', None, 1e-9, 1e3, (1e-5, 0.1),
+    Quantity.of(
+        'half_thickness', _BLOCK['half_thickness'],
+        'half thickness H of the block, along the field', (1e-5, 0.1),
         f'from printed swimmers to moulded grippers in {_REVIEW}',
-        ((0.5, 1e3, 'was it meant in mm?'),)),
-    Quantity(
-        'shear_modulus', 'actuator.shear_modulus', 'shear modulus G', 'Pa', 1e4, 1e-3, 1e12,
-        (1e3, 3e6),
+        ((0.5, 1e3, 'was it meant in mm?'),), follows=True),
+    Quantity.of(
+        'shear_modulus', _BLOCK['shear_modulus'], 'shear modulus G', (1e3, 3e6),
         f'from silicone gels to filled rubber; 303 kPa in {_ZHAO}',
         ((1e10, 1e12, 'metals have 25 to 80 GPa'), (1e8, 1e10, 'that is a hard plastic'),
          (1.0, 999.0, 'was it meant in kPa?'), (0.0, 1.0, 'was it meant in MPa?'))),
-    Quantity(
-        'density', 'actuator.density', 'density rho', 'kg/m^3', 1900.0, 1e-3, 1e6,
-        (900.0, 4000.0),
+    Quantity.of(
+        'density', _BLOCK['density'], 'density rho', (900.0, 4000.0),
         'silicone of 1000 to 1200 kg/m^3 with up to 40 % by volume of NdFeB powder of '
         '7600 kg/m^3',
         ((0.8, 1.3, 'that is air, or was it meant in g/cm^3?'),
          (1.3, 10.0, 'was it meant in g/cm^3?'), (7000.0, 9000.0, 'that is solid metal'))),
-    Quantity(
-        'remanence', 'actuator.remanence', 'residual flux density Br along the thickness', 'T',
-        0.1, 1e-9, 1e3, (0.005, 0.4),
+    Quantity.of(
+        'remanence', _BLOCK['remanence'], 'residual flux density Br along the thickness',
+        (0.005, 0.4),
         'isotropic NdFeB powder of 0.7 to 0.9 T diluted to 1 to 40 % by volume; 0.143 T in '
         + _ZHAO,
         ((1.5, 1e3, 'the strongest sintered NdFeB magnets, grade N55, have 1.5 T; was it meant '
           'in mT?'), (0.9, 1.5, 'that is a solid magnet'))),
-    Quantity(
-        'j_lim', 'actuator.chain_limit',
-        "limit J_lim of the chains' extension in the Gent model", '', 5.0, 1e-3, 1e9,
-        (0.5, 200.0),
+    Quantity.of(
+        'j_lim', _BLOCK['chain_limit'],
+        "limit J_lim of the chains' extension in the Gent model", (0.5, 200.0),
         'Gent, Rubber Chem. Technol. 69 (1996) 59, fits rubber with some 30 to 100; the paper '
         'takes 1 to 5'),
     Quantity(
-        'zeta', '', 'damping zeta, c/(8 L H sqrt(rho G))', '', 0.2, 0.0, 1e12, (0.005, 2.0),
+        'zeta', '', 'damping zeta, c/(8 L H sqrt(rho G))', '', ZETA, 0.0, 1e12, (0.005, 2.0),
         'where the paper takes 0.02 to 1.1'),
-    Quantity(
-        'flux_max', 'flux_density_max', "coil's largest flux density", 'T', 0.5, -1e3, 1e3,
-        (1e-3, 2.0),
+    Quantity.of(
+        'flux_max', FLUX_DENSITY_MAX, "coil's largest flux density", (1e-3, 2.0),
         'from Helmholtz coils, some 1 to 50 mT, to electromagnets, whose iron saturates near '
         '2 T', ((2.0, 1e3, 'was it meant in mT?'),)),
-    Quantity(
-        'flux_min', 'flux_density_min',
-        "coil's least flux density, negative in the other direction", 'T', None, -1e3, 1e3,
-        (-2.0, 0.0), 'since at 0 T the block is at rest, and coils reach some 2 T',
-        ((-1e3, -2.0, 'was it meant in mT?'),)),
-    Quantity(
-        'slew_limit', 'slew_limit', "rate of the amplifier's ramps, 0 for steps", 'T/s', 0.0,
-        0.0, 1e12, (0.0, math.inf), ''),
+    Quantity.of(
+        'flux_min', FLUX_DENSITY_MIN,
+        "coil's least flux density, negative in the other direction", (-2.0, 0.0),
+        'since at 0 T the block is at rest, and coils reach some 2 T',
+        ((-1e3, -2.0, 'was it meant in mT?'),), follows=True),
+    Quantity.of(
+        'slew_limit', SLEW_LIMIT, "rate of the amplifier's ramps, 0 for steps",
+        (0.0, math.inf), ''),
 )
 BY_KEY: Mapping[str, Quantity] = {x.key: x for x in QUANTITIES}
 #: In place of zeta.
-DAMPING = Quantity(
-    'damping', 'actuator.damping_coefficient', 'damping coefficient c', 'N s/m', None, 0.0, 1e12,
-    (0.0, math.inf), '')
+DAMPING = Quantity.of(
+    'damping', _BLOCK['damping_coefficient'], 'damping coefficient c', (0.0, math.inf), '',
+    follows=True)
 #: What nobody can know but the user: asked for, or given, or left to --yes.
 NEEDED = ('half_length', 'half_thickness', 'shear_modulus', 'density', 'remanence', 'j_lim',
           'zeta', 'flux_max')

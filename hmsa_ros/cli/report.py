@@ -6,9 +6,10 @@ from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.files import write_text
 
 if TYPE_CHECKING:
-    from hmsa_ros.report.reading import Run
+    from hmsa_ros.runs.record import Run
 
 
 def add_parser(subparsers: Any) -> None:
@@ -25,8 +26,8 @@ def add_parser(subparsers: Any) -> None:
         'report', help='show what happened in a run, from its bag',
         description='Show what happened in a run as one HTML page that needs no network: '
                     'response, command, phase plane, residuals against plain steps, plan '
-                    'against run, timing and losses. Any bag with joint states and flux density '
-                    'commands will do, in any namespace; several bags are shown together.',
+                    'against run, timing and losses. Any bag with joint states will do, in any '
+                    'namespace; several bags are shown together.',
         epilog='example: hmsa report hmsa_demo/run --out run.html --pdf run.pdf')
     parser.add_argument(
         'bags', nargs='+', type=Path, metavar='BAG', help='folder of a bag, or an .mcap file')
@@ -38,9 +39,9 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         '--pdf', type=Path, metavar='FILE', help='picture to write as well, for a paper')
     parser.add_argument(
-        '--params', type=Path, metavar='FILE',
+        '--params-file', '--params', dest='params', type=Path, metavar='YAML',
         help='parameter file (YAML) of the actuator as it really is (default: what the bag '
-             'tells)')
+             'contains)')
     parser.add_argument(
         '--joint', default='', metavar='NAME',
         help='actuator to show by its name in the joint states, or several with commas between '
@@ -76,15 +77,16 @@ def run(arguments: argparse.Namespace) -> int:
     from hmsa_ros.report.charts import Part, RUN_COLOURS
     from hmsa_ros.report.evaluation import evaluate, timing
     from hmsa_ros.report.page import page
-    from hmsa_ros.report.reading import read_actuator, read_runs
+    from hmsa_ros.runs.bags import read_runs
+    from hmsa_ros.runs.parameters import read_parameter_file
 
     joints = [x for x in arguments.joint.split(',') if x]
-    actuator = None if arguments.params is None else read_actuator(arguments.params)
+    parameters = None if arguments.params is None else read_parameter_file(arguments.params)
     with progress() as update:
         runs: list[Run] = []
         for bag in bags:
             runs += read_runs(
-                bag, actuator=actuator, joints=joints, progress=update)
+                bag, parameters=parameters, joints=joints, progress=update)
         parts = []
         for i, each in enumerate(_labelled(runs)):
             update('evaluating', i / len(runs))
@@ -92,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
                 each, evaluate(each), timing(each),
                 RUN_COLOURS[i % len(RUN_COLOURS)] if len(runs) > 1 else ''))
         update('writing', None)
-        _write(out, page(parts))
+        write_text(out, page(parts))
         for path, kind in ((arguments.png, 'png'), (arguments.pdf, 'pdf')):
             if path is not None:
                 from hmsa_ros.report.picture import draw
@@ -135,13 +137,3 @@ def _check_targets(targets: list[Path], bags: list[Path]) -> None:
             raise BadInputError(
                 f'cannot write {target}: {target.parent} is no folder; expected one that '
                 'exists')
-
-
-def _write(path: Path, text: str) -> None:
-    """Write a page."""
-    try:
-        path.write_text(text, encoding='utf-8')
-    except OSError as error:
-        raise BadInputError(
-            f'cannot write {path}: {error.strerror or error}; expected a folder with write '
-            'permission') from error

@@ -18,7 +18,7 @@ from hmsa_ros.core.status import Code
 from hmsa_ros.core.two_step import CODES, plan_two_step, plan_two_step_batch
 from hmsa_ros.errors import BadInputError
 
-#: Stretches whose flux density is told, where the material allows them.
+#: Stretches whose flux density is given, where the coil reaches them.
 STRETCHES = (0.6, 0.8, 0.9, 1.05, 1.1, 1.2, 1.4, 2.0)
 #: Stretch of the move whose duration is told, where the coil allows it.
 USUAL_TARGET = 1.1
@@ -72,6 +72,8 @@ class Scales:
         L sqrt(rho/G) in s.
     frequency : float
         Undamped natural frequency about rest, stretch 1, in Hz.
+    c1 : float
+        Shape 2 H^2/L^2.
     zeta, critical_zeta : float
         Nondimensional damping, and that above which small motion about rest does not oscillate.
     damping, critical_damping : float
@@ -79,7 +81,7 @@ class Scales:
     flux_density_unit : float
         Flux density of the load 1, mu0 G/Br in T.
     flux_densities : tuple of (float, float)
-        Stretches, and the flux density in T that holds each.
+        Stretches within the coil's reach, and the flux density in T that holds each.
     stretch_limits : tuple of float
         Stretches at which the chains are fully extended.
     held : tuple of float
@@ -95,6 +97,7 @@ class Scales:
 
     time_unit: float
     frequency: float
+    c1: float
     zeta: float
     critical_zeta: float
     damping: float
@@ -166,14 +169,23 @@ def scales(actuator: ActuatorParameters, coil: Coil) -> Scales:
     return Scales(
         time_unit=actuator.time_unit,
         frequency=float(natural_frequency(1.0, material)) / (2.0 * math.pi) / actuator.time_unit,
-        zeta=material.zeta, critical_zeta=critical, damping=actuator.damping_coefficient,
+        c1=material.c1, zeta=material.zeta, critical_zeta=critical,
+        damping=actuator.damping_coefficient,
         critical_damping=critical * per_zeta, flux_density_unit=unit,
         flux_densities=tuple(
             (x, float(elastic_force(x, material)) * unit)
-            for x in STRETCHES if lower < x < upper),
+            for x in _shown(held[0], held[1])),
         stretch_limits=(lower, upper), held=(held[0], held[1]),
         reached=(reached[0], reached[1]), target=target,
         duration=tau * actuator.time_unit)
+
+
+def _shown(least: float, largest: float) -> tuple[float, ...]:
+    """Return the usual stretches that a coil holds, or else half and all of its reach."""
+    usual = tuple(x for x in STRETCHES if least <= x <= largest)
+    return usual or tuple(
+        1.0 + share * (end - 1.0) for end, share in (
+            (least, 1.0), (least, 0.5), (largest, 0.5), (largest, 1.0)) if end != 1.0)
 
 
 def _boundary(holds: Callable[[float], bool], inside: float, outside: float) -> float:

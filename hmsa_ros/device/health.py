@@ -7,8 +7,6 @@ import math
 from hmsa_ros.core.model import natural_frequency
 from hmsa_ros.core.parameters import ActuatorParameters
 
-#: Samples per second of a device, unless it is told otherwise, and at most.
-SAMPLE_RATE, LARGEST_SAMPLE_RATE = 1000.0, 1e6
 _OK, _WARN, _ERROR = 0, 1, 2
 # Below, peaks of a vibration lie between samples.
 _SAMPLES_A_PERIOD = 10.0

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import AutoMinorLocator, NullLocator
 
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.files import replacing
 
 # Okabe and Ito's palette, told apart with every kind of colour vision.
 BLACK = '#000000'
@@ -98,11 +99,9 @@ def picture(
         figure = Figure(figsize=(width, height), layout='constrained')
         FigureCanvasAgg(figure)
         yield figure
-        try:
+        with replacing(path) as beside:
             # Without the entries that name matplotlib's version and the time.
-            figure.savefig(path, format=kind, metadata=_METADATA[kind])
-        except OSError as error:
-            raise unwritable(path, error) from error
+            figure.savefig(beside, format=kind, metadata=_METADATA[kind])
 
 
 def unwritable(path: Path, error: OSError) -> BadInputError:

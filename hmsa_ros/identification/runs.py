@@ -10,8 +10,8 @@ from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.recording import Recording
-from hmsa_ros.report.evaluation import in_force, without_repeats
-from hmsa_ros.report.reading import read_runs
+from hmsa_ros.runs.bags import read_runs
+from hmsa_ros.runs.levels import in_force, without_repeats
 
 
 def read_bag(
@@ -44,7 +44,7 @@ def read_bag(
         If there is no bag, or several actuators and none is named.
 
     """
-    runs = read_runs(path, actuator=actuator, joints=[joint] if joint else [])
+    runs = read_runs(path, joints=[joint] if joint else [])
     if len(runs) > 1:
         raise BadInputError(
             f'{path} has the actuators {", ".join(x.joint or x.label for x in runs)}: name one '

@@ -16,7 +16,13 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.nodes.parameters import declare, JOINT, ParameterSpec, refusal
+from hmsa_ros.nodes.parameters import (
+    declare,
+    descriptor,
+    JOINT,
+    ParameterSpec,
+    refusal,
+)
 
 JOINTS = ParameterSpec(
     'joints', [],
@@ -181,7 +187,7 @@ def declare_joints(
             declared[spec.name] = spec
             try:
                 value = node.declare_parameter(
-                    spec.name, _TYPES[type(spec.default)], spec.descriptor()).value
+                    spec.name, _TYPES[type(spec.default)], descriptor(spec)).value
             except ParameterException as error:
                 raise refusal(node, spec) from error
             if value is not None:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import math
 from typing import Any
 
+from hmsa_ros.contract.parameters import FLUX_DENSITY_MAX, FLUX_DENSITY_MIN, SLEW_LIMIT
 from hmsa_ros.core.group import PlannerGroup
 from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.sequence import SHORT_SPELL
@@ -37,16 +38,9 @@ OWN = (
     ParameterSpec(
         'robust_order', 2, 'Number of chained two-step commands of the shaper robust.', '',
         1, 16, read_only=False),
-    ParameterSpec(
-        'slew_limit', 0.0,
-        'Rate at which the amplifier ramps to a commanded level; 0 for steps.', 'T/s',
-        0.0, 1e12, read_only=False),
-    ParameterSpec(
-        'flux_density_min', -0.5, 'Least flux density that the coil may be asked for.', 'T',
-        -1e3, 1e3, read_only=False),
-    ParameterSpec(
-        'flux_density_max', 0.5, 'Largest flux density that the coil may be asked for.', 'T',
-        -1e3, 1e3, read_only=False),
+    replace(SLEW_LIMIT, read_only=False),
+    replace(FLUX_DENSITY_MIN, read_only=False),
+    replace(FLUX_DENSITY_MAX, read_only=False),
 )
 
 SPECS = (

@@ -10,13 +10,12 @@ from rclpy.clock import Clock, ClockType
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
+from hmsa_ros.contract.parameters import PUBLISH_RATE
 from hmsa_ros.core.pacer import Pacer
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.core.warmup import warm_up
 from hmsa_ros.device.health import (
     CommandHealth,
-    LARGEST_SAMPLE_RATE,
-    SAMPLE_RATE,
     too_few_samples,
 )
 from hmsa_ros.device.protocol import Sample
@@ -55,9 +54,7 @@ PARAMETERS = (
         'published.', 's', 0.0, 1e3),
     ParameterSpec(
         'seed', 0, 'Of the noise: the same seed gives the same run.', '', 0, 2**31 - 1),
-    ParameterSpec(
-        'publish_rate', SAMPLE_RATE, "Samples per second of the plant's own time.", 'Hz',
-        1e-3, LARGEST_SAMPLE_RATE),
+    PUBLISH_RATE,
     ParameterSpec(
         'publish_scalars', 'auto',
         'Whether stretch and stretch_rate are published beside joint_states; auto for a single '

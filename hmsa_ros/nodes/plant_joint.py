@@ -8,8 +8,16 @@ from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import MagneticField
 from std_msgs.msg import Float64
 
+from hmsa_ros.contract.actuator import actuator_from
+from hmsa_ros.contract.parameters import (
+    ACTUATOR,
+    COIL_TIME_CONSTANT,
+    INITIAL_STRETCH,
+    MISMATCH,
+    ParameterSpec,
+    SLEW_LIMIT,
+)
 from hmsa_ros.core.actuators import check_stretch, Setup
-from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.device.protocol import Change, Kind, Notice
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
@@ -18,29 +26,15 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import conversions, interface
 from hmsa_ros.nodes.guard import CommandInput
 from hmsa_ros.nodes.managed import ManagedNode
-from hmsa_ros.nodes.parameters import ACTUATOR, INITIAL_STRETCH, ParameterSpec
 from hmsa_ros.nodes.timekeeping import Seldom
-
-MISMATCH = tuple(
-    ParameterSpec(
-        f'mismatch.{spec.name.partition(".")[2]}', 1.0,
-        f'Factor on {spec.name}: what the plant has more or less of than the planner knows.',
-        '', 1e-3, 1e3)
-    for spec in ACTUATOR)
 
 #: Parameters that each joint may have values of its own for.
 OWN = (
     *ACTUATOR,
     INITIAL_STRETCH,
     *MISMATCH,
-    ParameterSpec(
-        'slew_limit', 0.0,
-        'Rate at which the amplifier ramps to a commanded level; 0 for steps.', 'T/s',
-        0.0, 1e12),
-    ParameterSpec(
-        'coil_time_constant', 0.0,
-        'Time constant of the first-order lag with which the field follows the amplifier; 0 for '
-        'none.', 's', 0.0, 1e3),
+    SLEW_LIMIT,
+    COIL_TIME_CONSTANT,
     ParameterSpec(
         'stretch_noise', 0.0, 'Standard deviation of the published stretch.', '', 0.0, 1e3),
     ParameterSpec(
@@ -210,9 +204,7 @@ def joint_from(values: Mapping[str, Any]) -> SimulatedJoint:
         If a value is out of range.
 
     """
-    names = [spec.name.partition('.')[2] for spec in ACTUATOR]
-    actuator = ActuatorParameters(**{
-        name: values[f'actuator.{name}'] * values[f'mismatch.{name}'] for name in names})
+    actuator = actuator_from(values)
     if values['reset_stretch']:
         check_stretch(
             values['reset_stretch'], actuator.nondimensional, 'reset_stretch')

@@ -16,7 +16,7 @@ import numpy as np
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.report.evaluation import Evaluation, MoveResult, Timing
-from hmsa_ros.report.reading import Run
+from hmsa_ros.runs.record import Run
 
 # Okabe and Ito's palette, told apart with every kind of colour vision.
 BLUE, ORANGE, GREEN, PURPLE = '#0072B2', '#E69F00', '#009E73', '#CC79A7'

@@ -5,7 +5,7 @@ Times are in s from the first command of the run; stamps stay integer nanosecond
 """
 
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 import math
 
@@ -23,11 +23,11 @@ from hmsa_ros.core.model import (
 from hmsa_ros.core.moves import Level as PlannedLoad
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.residual import residual_vibration
-from hmsa_ros.core.schedule import CommandSchedule, Superseding
 from hmsa_ros.core.simulation import simulate
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.report.reading import Level, Run, Times
+from hmsa_ros.runs.levels import in_force, lateness_of, Level, without_repeats
+from hmsa_ros.runs.record import Run, Times
 
 # Stretches that differ by less are one setpoint: what comes back from a flux density in double
 # precision is some 1e-12 off.
@@ -36,8 +36,10 @@ _SAME = 1e-6
 _AT_REST = 1e-3
 # A change of level that took effect within so many s of its stamp was in time.
 _PUNCTUAL = 1e-6
-# Stamps of what took effect may be rounded, in ns.
-_ROUNDED_STAMP = 1000
+# Plain steps are simulated with this many points a period of the actuator at least, up to so many.
+_POINTS_A_PERIOD, _MOST_POINTS = 100, 2_000_000
+#: Samples a period below which peaks are missed.
+FEW_SAMPLES = 10
 # Clocks further apart than this are different clocks.
 _SAME_CLOCK = 60.0
 
@@ -179,58 +181,15 @@ def evaluate(run: Run, moves: Sequence[Move] | None = None) -> Evaluation:
     found = tuple(find_moves(run, levels, plan) if moves is None else moves)
     zero = levels[0].stamp if levels else int(run.time[0])
     time = (run.time - zero) / NANOSECONDS
-    unshaped = _unshaped(run, time, found, zero, start)
+    *unshaped, grid, fine = _unshaped(run, time, found, zero, start)
     results = []
     previous = start
     for move in found:
-        results.append(_measure(run, time, unshaped[0], move, move.stretch - previous, zero))
+        results.append(_measure(run, time, (grid, fine), move, move.stretch - previous, zero))
         previous = move.stretch
     return Evaluation(
-        zero, time, start, levels, found, tuple(results), unshaped, plan, _predict(run, plan))
-
-
-def in_force(messages: Iterable[Sequence[Level]]) -> tuple[Level, ...]:
-    """
-    Return the changes of level that were left when each message had replaced what it replaces.
-
-    Parameters
-    ----------
-    messages : iterable of sequence of Level
-        In the order received; each supersedes all levels stamped at or after its first.
-
-    Returns
-    -------
-    tuple of Level
-        By stamp.
-
-    """
-    levels: Superseding[Level] = Superseding()
-    for message in messages:
-        for level in sorted(message, key=lambda x: x.stamp):
-            levels.put(level.stamp, level)
-    return tuple(levels)
-
-
-def without_repeats(commands: Sequence[Level]) -> tuple[tuple[Level, ...], int]:
-    """
-    Leave out the commands that change nothing, by which a planner shows that it is alive.
-
-    Parameters
-    ----------
-    commands : sequence of Level
-        In the order received.
-
-    Returns
-    -------
-    commands : tuple of Level
-        Those that change the level at their stamp, or replace levels after it.
-    repeats : int
-        How many were left out.
-
-    """
-    schedule = CommandSchedule(math.nan)
-    kept = tuple(x for x in commands if schedule.insert(x.stamp, x.flux_density))
-    return kept, len(commands) - len(kept)
+        zero, time, start, levels, found, tuple(results), (unshaped[0], unshaped[1]), plan,
+        _predict(run, plan))
 
 
 def find_moves(
@@ -364,31 +323,52 @@ def _start(run: Run, levels: Sequence[Level], plan: Sequence[Level]) -> float:
 
 def _unshaped(
         run: Run, time: Array, moves: Sequence[Move], zero: int,
-        start: float) -> tuple[Array, Array]:
-    """Simulate plain steps to the levels that held the targets."""
+        start: float) -> tuple[Array, Array, Array, Array]:
+    """Simulate plain steps: stretch and rate at the samples; times and stretch between, too."""
     stretch, rate = np.full_like(time, start), np.zeros_like(time)
+    nothing = np.full_like(time, np.nan), np.full_like(time, np.nan), time, \
+        np.full_like(time, np.nan)
     if not moves:
-        return np.full_like(time, np.nan), np.full_like(time, np.nan)
+        return nothing
     unit = run.plant.time_unit
     begins = [(x.begin - zero) / NANOSECONDS for x in moves]
     running = time >= begins[0]
+    grid = _fine(time[running], period_of(run))
     lower, upper = stretch_limits(run.plant.nondimensional)
     margin = 1e-6 * (min(upper, 2.0) - lower)
     try:
-        stretch[running], nondimensional_rate = simulate(
+        fine, fine_rate = simulate(
             [x / unit for x in begins],
             [x.flux_densities[-1] / run.plant.flux_density_unit for x in moves],
-            time[running] / unit, run.plant.nondimensional,
+            grid / unit, run.plant.nondimensional,
             stretch=min(max(start, lower + margin), upper - margin))
     except HmsaError:
-        return np.full_like(time, np.nan), np.full_like(time, np.nan)
-    rate[running] = nondimensional_rate / unit
-    return stretch, rate
+        return nothing
+    places = np.searchsorted(grid, time[running])
+    stretch[running], rate[running] = fine[places], fine_rate[places] / unit
+    return stretch, rate, grid, fine
+
+
+def _fine(time: Array, period: float) -> Array:
+    """Return times with more between them where samples are too few for the peaks."""
+    if len(time) < 2:
+        return time
+    spacing = max(period / _POINTS_A_PERIOD, (time[-1] - time[0]) / _MOST_POINTS)
+    if np.max(np.diff(time)) <= spacing:
+        return time
+    return np.union1d(time, np.arange(time[0], time[-1], spacing))
+
+
+def period_of(run: Run) -> float:
+    """Return the period in s of small undamped motion about rest."""
+    material = run.plant.nondimensional
+    return 2.0 * math.pi / float(natural_frequency(1.0, material)) * run.plant.time_unit
 
 
 def _measure(
-        run: Run, time: Array, unshaped: Array, move: Move, step: float, zero: int) -> MoveResult:
-    """Measure one setpoint."""
+        run: Run, time: Array, unshaped: tuple[Array, Array], move: Move, step: float,
+        zero: int) -> MoveResult:
+    """Measure one setpoint; unshaped are times and stretch of plain steps."""
     begin, arrival, end = (
         (x - zero) / NANOSECONDS for x in (move.begin, move.arrival, move.end))
     window = {'arrival': arrival, 'end': end, 'step': step}
@@ -397,7 +377,7 @@ def _measure(
     if np.count_nonzero(after) >= 2 and step != 0.0:
         error = float(np.max(np.abs(run.stretch[after] - move.stretch)) / abs(step))
         residual = residual_vibration(time, run.stretch, **window)
-        plain = residual_vibration(time, unshaped, **window)
+        plain = residual_vibration(*unshaped, **window)
     unit = run.planner.flux_density_unit
     return MoveResult(
         stretch=move.stretch, b_p=float(signed_root(move.flux_densities[0] / unit)),
@@ -579,38 +559,10 @@ def timing(run: Run) -> Timing:
     recorded: Times = np.sort(run.logged)
     usual = float(np.median(interval)) if len(interval) else math.inf
     gaps = np.rint(interval / usual) - 1.0
-    lateness, unapplied = _lateness(commands, run.applied, int(run.time[-1]))
+    lateness, unapplied = lateness_of(commands, run.applied, int(run.time[-1]))
     return Timing(
         commands, repeats, lead, lateness, delay, interval, _seconds(np.diff(recorded)),
         int(np.sum(gaps[gaps > 0.0])) if len(interval) else 0, unapplied)
-
-
-def _lateness(
-        commands: Sequence[Level], applied: Sequence[Level], last: int) -> tuple[Array, int]:
-    """Return how long after its stamp each command took effect, and how many never did."""
-    if not applied:
-        return np.empty(0), 0
-    result = np.full(len(commands), np.nan)
-    unapplied = 0
-    # What was replaced before its time never took effect.
-    standing = in_force((x,) for x in commands)
-    places = {x: i for i, x in enumerate(commands)}
-    before: Level | None = min(applied, key=lambda x: x.stamp)
-    for i, command in enumerate(standing):
-        until = next(
-            (x.stamp for x in standing[i + 1:] if _same_level(x, command)), math.inf)
-        when = [x.stamp for x in applied if _same_level(x, command)
-                and command.stamp - _ROUNDED_STAMP <= x.stamp < until - _ROUNDED_STAMP]
-        if when:
-            result[places[command]] = (min(when) - command.stamp) / NANOSECONDS
-        elif command.stamp < last and not (before and _same_level(before, command)):
-            unapplied += 1
-        before = command
-    return result, unapplied
-
-
-def _same_level(one: Level, other: Level) -> bool:
-    return math.isclose(one.flux_density, other.flux_density, rel_tol=1e-9, abs_tol=1e-12)
 
 
 def _seconds(nanoseconds: Times) -> Array:

@@ -14,6 +14,8 @@ import math
 import numpy as np
 
 from hmsa_ros import __version__
+from hmsa_ros.bag.info import BagSummary
+from hmsa_ros.contract.parameters import ACTUATOR, ACTUATOR_FIELDS
 from hmsa_ros.core.model import critical_zeta, stretch_limits
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.units import NANOSECONDS
@@ -21,15 +23,13 @@ from hmsa_ros.errors import HmsaError
 from hmsa_ros.report import charts
 from hmsa_ros.report.assets import SCRIPT, STYLE
 from hmsa_ros.report.charts import Figure, Part, percent, TimeUnit
-from hmsa_ros.report.evaluation import plan_points
-from hmsa_ros.report.reading import ACTUATOR_FIELDS, APPLIED, Run
+from hmsa_ros.report.evaluation import FEW_SAMPLES, period_of, plan_points
+from hmsa_ros.runs.record import Run
+from hmsa_ros.runs.topics import APPLIED
 
 _POLICY = (
     "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
     'img-src data: blob:; font-src data:')
-_UNITS = {
-    'shear_modulus': 'Pa', 'density': 'kg/m³', 'half_length': 'm', 'half_thickness': 'm',
-    'remanence': 'T', 'chain_limit': '1', 'damping_coefficient': 'N s/m'}
 # Plans and requests of long runs are cut here; the figures show all of them.
 _MOST_ROWS = 1000
 # Longer tables scroll.
@@ -186,8 +186,8 @@ def document(title: str, body: Sequence[str], figures: Sequence[Figure]) -> str:
         '<link rel="icon" href="data:,">',
         f'<title>{escape(title)}</title>', f'<style>{STYLE}</style>', '</head>',
         '<body>', *body,
-        # Inside a script only "</" could end it.
-        '<script type="application/json" id="report-data">' + data.replace('</', '<\\/')
+        # Inside a script "</" could end it, and "<!--" keep it from ending.
+        '<script type="application/json" id="report-data">' + data.replace('<', '\\u003c')
         + '</script>',
         f'<script>{_plotly()}</script>', f'<script>{SCRIPT}</script>', '</body>', '</html>', ''])
 
@@ -250,7 +250,7 @@ def _tiles(parts: Sequence[Part]) -> str:
         f'{len(x.timing.commands)}' + (
             f' ({x.timing.late} late)' if len(x.timing.lead) or len(x.timing.lateness) else ''),
         f'{1.0 / np.median(x.timing.interval):.6g}' if len(x.timing.interval) else '–',
-        'not told' if x.run.summary.lost is None else str(x.run.summary.lost)] for x in parts]
+        _lost(x.run.summary)] for x in parts]
     if len(parts) == 1:
         return '<div class="tiles">' + ''.join(
             f'<div><b>{escape(value)}</b><span>{escape(name)}</span></div>'
@@ -287,6 +287,11 @@ def _notes_of(part: Part) -> Iterable[str]:
                'was asked for, or lasts a period of the actuator.')
     if part.evaluation.results and not np.isfinite(part.evaluation.unshaped[0]).any():
         yield 'Plain steps cannot be simulated: the levels are too large to follow.'
+    samples = period_of(part.run) / np.median(part.timing.interval) \
+        if len(part.timing.interval) else math.inf
+    if samples < FEW_SAMPLES:
+        yield (f'The recording has {samples:.3g} samples a period of the actuator: expected at '
+               f'least {FEW_SAMPLES}, since peaks between samples are missed; raise publish_rate.')
     if not len(part.timing.lead) and part.run.commands:
         yield ('The recorder kept another clock than the stamps: how far ahead commands were '
                'sent is not known (record with use_sim_time where time is simulated).')
@@ -438,22 +443,29 @@ def _timing(parts: Sequence[Part]) -> str:
          'jitter [ms]'], rows)
 
 
+def _lost(summary: BagSummary | None) -> str:
+    """Return how many messages were lost, as far as the bag counts them."""
+    return 'not counted' if summary is None or summary.lost is None else str(summary.lost)
+
+
 def _losses(parts: Sequence[Part]) -> str:
     """Return the table of topics."""
     rows: list[Row] = []
-    told = True
+    counted = True
     for part in dict.fromkeys(x.run.path for x in parts):
         run = next(x.run for x in parts if x.run.path == part)
-        told = told and run.summary.lost is not None
+        if run.summary is None:
+            continue
+        counted = counted and run.summary.lost is not None
         for topic in run.summary.topics:
             rows.append([
                 run.label, topic.name, topic.type, Cell(str(topic.count), topic.count),
                 cell(math.nan if topic.rate is None else topic.rate, '.1f'),
-                Cell('not told' if topic.lost is None else str(topic.lost),
+                Cell('not counted' if topic.lost is None else str(topic.lost),
                      math.nan if topic.lost is None else topic.lost)])
-    words = '' if told else text(
+    words = '' if counted else text(
         'A recorder that counts what it misses stores that in the bag (hmsa recorder does); '
-        'where it is not told, gaps in the stamps of the samples are all there is to go by.')
+        'where it does not, gaps in the stamps of the samples are all there is to go by.')
     return words + table(
         'loss-table', 'What is in the bags.',
         ['bag', 'topic', 'type', 'messages', 'a second', 'lost'], rows)
@@ -474,8 +486,9 @@ def _parameters(parts: Sequence[Part]) -> str:
             header += [f'{prefix}plant', f'{prefix}as planned']
             columns += [run.plant, run.planner]
     rows: list[Row] = [
-        [name.replace('_', ' '), _UNITS[name], *(cell(getattr(x, name)) for x in columns)]
-        for name in ACTUATOR_FIELDS]
+        [name.replace('_', ' '), (spec.unit or '1').replace('^3', '³'),
+         *(cell(getattr(x, name)) for x in columns)]
+        for name, spec in zip(ACTUATOR_FIELDS, ACTUATOR, strict=True)]
     groups = [x.nondimensional for x in columns]
     limits = [stretch_limits(x.nondimensional) for x in columns]
     rows += [

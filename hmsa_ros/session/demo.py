@@ -22,8 +22,9 @@ from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import from_time
-from hmsa_ros.report.evaluation import evaluate, Move, MoveResult, without_repeats
-from hmsa_ros.report.reading import read_runs
+from hmsa_ros.report.evaluation import evaluate, Move, MoveResult
+from hmsa_ros.runs.bags import read_runs
+from hmsa_ros.runs.levels import without_repeats
 from hmsa_ros.session.client import PlannerClient
 from hmsa_ros.session.processes import NodeProcess, Session
 
@@ -248,7 +249,7 @@ def _evaluate(bag: Path, picture: Path, exits: dict[str, int]) -> DemoResult:
     """Read the run back from the bag, measure it and draw it."""
     from hmsa_ros.figures.run import draw_run
 
-    run, = read_runs(bag, actuator=paper_actuator())
+    run, = read_runs(bag)
     levels = without_repeats(run.commands)[0]
     if len(levels) != 2 * len(SEQUENCE):
         raise HmsaError(

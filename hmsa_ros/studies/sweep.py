@@ -6,7 +6,7 @@ and not by the memory, and a row that cannot be planned says why in its status.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 import csv
 from dataclasses import dataclass
 import math
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from hmsa_ros.core.model import Array, signed_root
 from hmsa_ros.core.two_step import CODES, plan_two_step_batch
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.files import replacing
 
 #: What can be swept, with the value of what is not.
 DEFAULTS = {'start': 1.0, 'target': 1.1, 'zeta': 0.2, 'j_lim': 5.0, 'c1': 2.0}
@@ -415,19 +416,10 @@ def open_writer(path: Path | None) -> Iterator[Callable[[Block], None]]:
         raise BadInputError(f'{path} is a folder: expected the name of a file')
     if kind == '.parquet':
         _arrow()
-    unfinished = path.with_name(path.name + '.part')
-    try:
+    with replacing(path) as beside:
         if kind == '.csv':
-            with unfinished.open('w', newline='', encoding='utf-8') as file:
+            with beside.open('w', newline='', encoding='utf-8') as file:
                 yield CsvWriter(file).write
         else:
-            with ParquetWriter(unfinished) as writer:
+            with ParquetWriter(beside) as writer:
                 yield writer.write
-        unfinished.replace(path)
-    except OSError as error:
-        raise BadInputError(
-            f'cannot write {path}: {error.strerror or error}; expected a folder with write '
-            'permission') from error
-    finally:
-        with suppress(OSError):
-            unfinished.unlink(missing_ok=True)

@@ -1,0 +1,75 @@
+"""``hmsa export``: the samples and levels of a run as tables."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from hmsa_ros.cli.progress import progress
+from hmsa_ros.errors import BadInputError
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    Add the command.
+
+    Parameters
+    ----------
+    subparsers : argparse action
+        Where to add it.
+
+    """
+    parser = subparsers.add_parser(
+        'export', help='write the samples and levels of a run as CSV or Parquet',
+        description='Write the samples of a run (time in s from the first sample, stretch, '
+                    'stretch rate in 1/s, flux density in T) to FILE, and the levels that drove '
+                    'it (time, flux density) beside it, to a file whose name ends in _levels.',
+        epilog='example: hmsa export hmsa_demo/run --out run.csv')
+    parser.add_argument(
+        'run_path', type=Path, metavar='RUN', help='folder of a bag, or an .mcap file')
+    parser.add_argument(
+        '--out', type=Path, required=True, metavar='FILE',
+        help='file to write, ending in .csv or .parquet; one of that name is replaced')
+    parser.add_argument(
+        '--joint', default='', metavar='NAME', help='actuator, where the bag has several')
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """
+    Read and write.
+
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+        As parsed.
+
+    Returns
+    -------
+    int
+        Exit status.
+
+    Raises
+    ------
+    HmsaError
+        If the bag cannot be read or a file cannot be written.
+
+    """
+    from hmsa_ros.runs.bags import read_runs
+    from hmsa_ros.runs.tables import levels_of, samples_of, write_table
+
+    out: Path = arguments.out
+    with progress() as update:
+        runs = read_runs(
+            arguments.run_path, joints=[arguments.joint] if arguments.joint else [],
+            progress=update)
+    if len(runs) > 1:
+        raise BadInputError(
+            f'{arguments.run_path} has the runs {", ".join(x.label for x in runs)}: expected '
+            'one; name its actuator with --joint')
+    write_table(out, samples_of(runs[0]))
+    print(out)
+    if runs[0].levels:
+        levels = out.with_name(f'{out.stem}_levels{out.suffix}')
+        write_table(levels, levels_of(runs[0]))
+        print(levels)
+    return 0

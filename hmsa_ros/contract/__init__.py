@@ -1,0 +1,1 @@
+"""What nodes, bags, files and reports agree on: topics, parameters, units, defaults."""

@@ -1,0 +1,71 @@
+"""Writing files: complete under their name, or not at all."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+import os
+from pathlib import Path
+import stat
+
+from hmsa_ros.errors import BadInputError
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """
+    Write a file beside its name and rename it once it is complete.
+
+    Parameters
+    ----------
+    path : Path
+        What is to be written or replaced; a link is followed, a device written to directly.
+
+    Yields
+    ------
+    Path
+        To write to. It is removed if writing fails, and the old file stays.
+
+    Raises
+    ------
+    BadInputError
+        If the file cannot be written, or is a link to nothing.
+
+    """
+    try:
+        if path.is_symlink() and not path.exists():
+            raise BadInputError(
+                f'cannot write {path}: it is a link to nothing; remove it or name another file')
+        target = path.resolve()
+        if target.exists() and not stat.S_ISREG(target.stat().st_mode):
+            yield target
+            return
+        beside = target.with_name(f'.{target.name}.{os.getpid()}.part')
+        try:
+            yield beside
+            os.replace(beside, target)
+        finally:
+            beside.unlink(missing_ok=True)
+    except OSError as error:
+        raise BadInputError(
+            f'cannot write {path}: {error.strerror or error}; expected a folder with write '
+            'permission and room') from error
+
+
+def write_text(path: Path, text: str) -> None:
+    """
+    Write a text as UTF-8, or leave the file as it was.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    text : str
+        All of it; a name that is no UTF-8 in it is shown with replacement characters.
+
+    Raises
+    ------
+    BadInputError
+        If it cannot be written.
+
+    """
+    with replacing(path) as beside:
+        beside.write_bytes(text.encode('utf-8', 'replace'))

@@ -1,0 +1,130 @@
+"""Levels of the field: commanded, superseded, repeated, and applied."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from hmsa_ros.core.model import Array
+from hmsa_ros.core.schedule import CommandSchedule, Superseding
+from hmsa_ros.core.units import NANOSECONDS
+
+# Stamps of what took effect may be rounded, in ns.
+_ROUNDED_STAMP = 1000
+
+
+@dataclass(frozen=True)
+class Level:
+    """
+    A command, or a change of level in a plan.
+
+    Attributes
+    ----------
+    stamp : int
+        Time in ns from which it applies.
+    flux_density : float
+        In T.
+    sent : int
+        Time in ns at which it was recorded.
+    stretch, rate : float
+        Predicted at the stamp, the rate in 1/s; NaN for a command.
+
+    """
+
+    stamp: int
+    flux_density: float
+    sent: int
+    stretch: float = math.nan
+    rate: float = math.nan
+
+
+def in_force(messages: Iterable[Sequence[Level]]) -> tuple[Level, ...]:
+    """
+    Return the changes of level that were left when each message had replaced what it replaces.
+
+    Parameters
+    ----------
+    messages : iterable of sequence of Level
+        In the order received; each supersedes all levels stamped at or after its first.
+
+    Returns
+    -------
+    tuple of Level
+        By stamp.
+
+    """
+    levels: Superseding[Level] = Superseding()
+    for message in messages:
+        for level in sorted(message, key=lambda x: x.stamp):
+            levels.put(level.stamp, level)
+    return tuple(levels)
+
+
+def without_repeats(commands: Sequence[Level]) -> tuple[tuple[Level, ...], int]:
+    """
+    Leave out the commands that change nothing, by which a planner shows that it is alive.
+
+    Parameters
+    ----------
+    commands : sequence of Level
+        In the order received.
+
+    Returns
+    -------
+    commands : tuple of Level
+        Those that change the level at their stamp, or replace levels after it.
+    repeats : int
+        How many were left out.
+
+    """
+    schedule = CommandSchedule(math.nan)
+    kept = tuple(x for x in commands if schedule.insert(x.stamp, x.flux_density))
+    return kept, len(commands) - len(kept)
+
+
+def lateness_of(
+        commands: Sequence[Level], applied: Sequence[Level], last: int) -> tuple[Array, int]:
+    """
+    Return how long after its stamp each command took effect, and how many never did.
+
+    Parameters
+    ----------
+    commands : sequence of Level
+        As `without_repeats` returns them.
+    applied : sequence of Level
+        What took effect; empty if nobody reported it.
+    last : int
+        End of the recording in ns: what was due later is not missed.
+
+    Returns
+    -------
+    lateness : ndarray, shape (m,)
+        In s, one a command; NaN for one that never took effect. Empty without ``applied``.
+    unapplied : int
+        Changes of level that were due, not superseded, and never took effect.
+
+    """
+    if not applied:
+        return np.empty(0), 0
+    result = np.full(len(commands), np.nan)
+    unapplied = 0
+    # What was replaced before its time never took effect.
+    standing = in_force((x,) for x in commands)
+    places = {x: i for i, x in enumerate(commands)}
+    before: Level | None = min(applied, key=lambda x: x.stamp)
+    for i, command in enumerate(standing):
+        until = next(
+            (x.stamp for x in standing[i + 1:] if _same_level(x, command)), math.inf)
+        when = [x.stamp for x in applied if _same_level(x, command)
+                and command.stamp - _ROUNDED_STAMP <= x.stamp < until - _ROUNDED_STAMP]
+        if when:
+            result[places[command]] = (min(when) - command.stamp) / NANOSECONDS
+        elif command.stamp < last and not (before and _same_level(before, command)):
+            unapplied += 1
+        before = command
+    return result, unapplied
+
+
+def _same_level(one: Level, other: Level) -> bool:
+    return math.isclose(one.flux_density, other.flux_density, rel_tol=1e-9, abs_tol=1e-12)

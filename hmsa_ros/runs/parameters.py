@@ -1,0 +1,263 @@
+"""Parameters of a run: as a recorder stored them, or from a parameter file of the nodes."""
+
+from collections.abc import Iterable, Mapping
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from hmsa_ros.bag.experiment import parameters_of
+from hmsa_ros.contract.actuator import actuator_from
+from hmsa_ros.contract.parameters import ACTUATOR, JOINT, ParameterSpec
+from hmsa_ros.contract.topics import PLANNER, PLANT
+from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
+from hmsa_ros.errors import BadInputError, excerpt
+
+# Parameter files have some dozens of entries.
+_LARGEST_FILE = 1 << 20
+_DEEPEST = 32
+
+
+def number_of(value: object) -> float | None:
+    """Return a number as a float; None for anything else, NaN or a number too large."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return None if math.isnan(number) else number
+
+
+def of_joint(parameters: Mapping[str, object], joint: str, name: str) -> object:
+    """Return what is set for one joint, or else for all; None for what is not set."""
+    node, _, parameter = name.partition('.')
+    own = parameters.get(f'{node}.{joint}.{parameter}')
+    return parameters.get(name) if own is None else own
+
+
+def recorded(custom_data: Mapping[str, str], space: str) -> dict[str, object]:
+    """
+    Return the parameters of planner and plant in a namespace that a recorder stored.
+
+    Parameters
+    ----------
+    custom_data : mapping of str to str
+        Of a bag.
+    space : str
+        Namespace.
+
+    Returns
+    -------
+    dict of str to object
+        By ``'node.name'``; what is no JSON stays a text.
+
+    """
+    parameters: dict[str, object] = {}
+    for node in (PLANNER, PLANT):
+        for name, text in parameters_of(custom_data, node, space).items():
+            try:
+                parameters[f'{node}.{name}'] = json.loads(text)
+            except (ValueError, RecursionError):
+                parameters[f'{node}.{name}'] = text
+    return parameters
+
+
+def named_joint(parameters: Mapping[str, object]) -> str:
+    """Return the joint that the nodes of a single one name; empty if they do not."""
+    for node in (PLANT, PLANNER):
+        several = parameters.get(f'{node}.joints')
+        if isinstance(several, list) and several:
+            return str(several[0]) if len(several) == 1 else ''
+        if name := parameters.get(f'{node}.{JOINT.name}'):
+            return str(name)
+    return ''
+
+
+def actuators(
+        parameters: Mapping[str, object], given: Mapping[str, object], joint: str
+) -> tuple[ActuatorParameters, ActuatorParameters, bool, list[str]]:
+    """
+    Return the block of the plant and of the planner.
+
+    Parameters
+    ----------
+    parameters : mapping of str to object
+        As `recorded` returns them.
+    given : mapping of str to object
+        From a parameter file: what the block really is. Empty without one.
+    joint : str
+        Whose.
+
+    Returns
+    -------
+    plant, planner : ActuatorParameters
+        The example block where nothing is known.
+    known : bool
+        Whether something is.
+    notes : list of str
+        What a reader should know.
+
+    Raises
+    ------
+    BadInputError
+        If what is given describes no block.
+
+    """
+    found: dict[str, ActuatorParameters] = {}
+    notes = []
+    for node in (PLANT, PLANNER):
+        values = {x: number_of(of_joint(parameters, joint, f'{node}.{x}')) for x in _NAMES}
+        if all(values[x.name] is not None for x in ACTUATOR):
+            try:
+                found[node] = actuator_from({k: v for k, v in values.items() if v is not None})
+            except BadInputError as error:
+                notes.append(f'The parameters of the {node} in the bag cannot be used: {error}.')
+    if given:
+        own = {f'{PLANT}.{x.name}': of_joint(given, joint, f'{PLANT}.{x.name}')
+               for x in ACTUATOR}
+        found[PLANT] = actuator_from(values_of(
+            {name: value for name, value in own.items() if value is not None}, PLANT, ACTUATOR))
+    if not found:
+        notes.append(
+            "The recording does not contain the actuator's parameters: those of the example "
+            'block are used, so that what is simulated here (plain steps, prediction, '
+            'equilibria, b and tau) may not be your actuator; name a parameter file with '
+            '--params-file.')
+    plant = found.get(PLANT) or found.get(PLANNER) or paper_actuator()
+    planner = found.get(PLANNER) or plant
+    if plant != planner:
+        notes.append(
+            'The planner took other parameters for the actuator than the plant has: see the '
+            'table of parameters.')
+    return plant, planner, bool(found), notes
+
+
+_NAMES = tuple(
+    name for x in ACTUATOR for name in (x.name, f'mismatch.{x.name.partition(".")[2]}'))
+
+
+def read_parameter_file(path: str | Path) -> dict[str, object]:
+    """
+    Read a parameter file of the nodes.
+
+    Parameters
+    ----------
+    path : str or Path
+        YAML as ROS 2 has it.
+
+    Returns
+    -------
+    dict of str to object
+        By ``'node.name'`` for planner and plant.
+
+    Raises
+    ------
+    BadInputError
+        If the file cannot be read or sets no parameter of the actuator.
+
+    """
+    entries = list(_entries(Path(path)))
+    found: dict[str, object] = {}
+    for node in (PLANNER, PLANT):
+        # What is meant for all nodes comes first, so that a node's own goes before it.
+        for own in (False, True):
+            found |= {f'{node}.{name}': value for key, name, value in entries
+                      if (key.rpartition('/')[2] == node) == own
+                      and (own or key.rpartition('/')[2] in ('', '*', '**'))}
+    if not any(name.partition('.')[2].endswith(x.name) for name in found for x in ACTUATOR):
+        raise BadInputError(
+            f'{path} sets no parameter of the actuator: expected some of '
+            + ', '.join(x.name for x in ACTUATOR))
+    return found
+
+
+def values_of(
+        parameters: Mapping[str, object], node: str, specs: Iterable[ParameterSpec]
+) -> dict[str, Any]:
+    """
+    Return the numbers that a node has: what is set, else the default.
+
+    Parameters
+    ----------
+    parameters : mapping of str to object
+        As `read_parameter_file` returns them.
+    node : str
+        Which node.
+    specs : iterable of ParameterSpec
+        Numbers.
+
+    Returns
+    -------
+    dict of str to float
+        By name.
+
+    Raises
+    ------
+    BadInputError
+        If a value is no number or out of range.
+
+    """
+    values = {}
+    for spec in specs:
+        value = parameters.get(f'{node}.{spec.name}', spec.default)
+        number = number_of(value)
+        if number is None:
+            raise BadInputError(
+                f'parameter {spec.name} is {excerpt(value)}: expected a number, '
+                f'{spec.range_text()}')
+        spec.check(number)
+        values[spec.name] = number
+    return values
+
+
+def _entries(path: Path) -> 'list[tuple[str, str, object]]':
+    """Return node, dotted name and value of each parameter in a file; no node if it has none."""
+    try:
+        if path.stat().st_size > _LARGEST_FILE:
+            raise BadInputError(
+                f'{path} has {path.stat().st_size} bytes: expected a parameter file of at most '
+                f'{_LARGEST_FILE}')
+        document = _load(path.read_text(encoding='utf-8'))
+    except (OSError, ValueError, RecursionError) as error:
+        if isinstance(error, BadInputError):
+            raise
+        reason = getattr(error, 'strerror', None) or ' '.join(str(error).split())
+        raise BadInputError(
+            f'{path} cannot be read ({reason}): expected a parameter file (YAML)') from error
+    flat: dict[str, object] = {}
+    _flatten(document, '', flat, 0, path)
+    entries = []
+    for name, value in flat.items():
+        node, found, parameter = name.rpartition('ros__parameters.')
+        entries.append((node.rstrip('.'), parameter, value) if found else ('', name, value))
+    return entries
+
+
+def _load(text: str) -> Any:
+    """Read YAML without aliases, which ROS does not take either and which can grow endlessly."""
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):
+                raise ValueError('it has an alias (*), which ROS does not take either')
+            return super().compose_node(parent, index)
+
+    try:
+        return yaml.load(text, Loader)
+    except yaml.YAMLError as error:
+        raise ValueError(str(error)) from error
+
+
+def _flatten(
+        value: object, name: str, found: dict[str, object], depth: int, path: Path) -> None:
+    """Collect the values of nested mappings by dotted name."""
+    if depth > _DEEPEST:
+        raise BadInputError(
+            f'{path} is nested more than {_DEEPEST} deep: expected a parameter file (YAML)')
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            _flatten(inner, f'{name}.{key}' if name else str(key), found, depth + 1, path)
+    else:
+        found[name] = value

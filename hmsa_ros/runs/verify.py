@@ -1,0 +1,266 @@
+"""
+Checking a run against the model: what drove the actuator, integrated once more.
+
+The state is that of the first sample; from there on every sample of the stretch must come out
+again. Where the plant reported which levels took effect and when, these are integrated, so that
+late, refused and repeated commands and its watchdog are accounted for; recorded disturbing
+forces are applied too. Measurement noise is not: it is the difference that is left.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+import heapq
+import math
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hmsa_ros.bag import limits
+from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.runs.bags import read_runs
+from hmsa_ros.runs.levels import lateness_of, without_repeats
+from hmsa_ros.runs.parameters import number_of, of_joint
+from hmsa_ros.runs.record import Run
+from hmsa_ros.runs.topics import APPLIED, COMMAND, FORCE, JOINT_STATES
+
+if TYPE_CHECKING:
+    # Numba comes along with it, which other commands on bags have no use for.
+    from hmsa_ros.core.simulation import ActuatorSimulation
+
+# Samples further from the others than this are of another run, or garbage; in ns.
+_LARGEST_LEAP = 3600 * NANOSECONDS
+_COMMAND, _FORCE, _SAMPLE = range(3)
+
+
+@dataclass(frozen=True)
+class Verification:
+    """
+    Recorded against integrated motion.
+
+    Attributes
+    ----------
+    states, commands : str
+        The topics compared.
+    sample_count, command_count : int
+        Messages compared and applied.
+    late_count : int
+        Commands that came after their stamp, so that the moment of their effect is not known;
+        none where the plant reported it.
+    largest_difference : float
+        Of the stretch, dimensionless.
+    where : float
+        Time of it after the first sample, in seconds.
+    note : str
+        What a reader should know: losses, noise, what was left out.
+    left_out : int
+        Messages that could not be used, since they are not what their topic is for.
+    unapplied_count : int
+        Changes of level that were commanded and never took effect, as the plant reported.
+
+    """
+
+    states: str
+    commands: str
+    sample_count: int
+    command_count: int
+    late_count: int
+    largest_difference: float
+    where: float
+    note: str = ''
+    left_out: int = 0
+    unapplied_count: int = 0
+
+
+def verify(
+        path: str | os.PathLike[str], *, parameters: Mapping[str, object] | None = None,
+        max_chunk_size: int = limits.CHUNK_SIZE) -> list[Verification]:
+    """
+    Integrate the recorded commands of a bag and compare with the recorded stretch.
+
+    Parameters
+    ----------
+    path : path
+        Folder of a bag, or one ``.mcap`` file.
+    parameters : mapping of str to object, optional
+        As for `hmsa_ros.runs.bags.read_runs`.
+    max_chunk_size : int
+        As for `BagReader`.
+
+    Returns
+    -------
+    list of Verification
+        One for each actuator in the bag.
+
+    Raises
+    ------
+    BadInputError
+        If the bag has no commands with the response to them, the actuator's parameters are not
+        known, or it holds several runs after each other.
+    HmsaError
+        If the integration does not get through.
+
+    """
+    return [verify_run(run) for run in read_runs(
+        Path(path), parameters=parameters, max_chunk_size=max_chunk_size)]
+
+
+def verify_run(run: Run) -> Verification:
+    """
+    Integrate what drove one actuator and compare with its samples.
+
+    Parameters
+    ----------
+    run : Run
+        With commands or applied levels, and parameters.
+
+    Returns
+    -------
+    Verification
+        The largest difference, and what may explain it.
+
+    Raises
+    ------
+    BadInputError
+        If there is nothing to integrate, the actuator is not known, or there are several runs.
+    HmsaError
+        If the integration does not get through.
+
+    """
+    if run.summary is not None and len(run.summary.files) > 1 and (
+            jumps := run.summary.custom_data.get('time_jumps', '0')) != '0':
+        raise BadInputError(
+            f'in {run.path} time jumped back {jumps} times: expected one run; name one of its '
+            f'files, for example {run.path / run.summary.files[0][0]}')
+    if COMMAND not in run.topics and not run.levels:
+        raise BadInputError(
+            f'{run.path} holds no {COMMAND} and no field: expected a run with what drove the '
+            'actuator; its topics are ' + (', '.join(run.topics.values()) or 'none'))
+    if not run.parameters_known:
+        raise BadInputError(
+            f'{run.path} does not contain the parameters of the plant: name a parameter file '
+            'with --params-file')
+    replay = _Replay(run)
+    replay.run()
+    unapplied = lateness_of(
+        without_repeats(run.commands)[0], run.applied, int(run.time[-1]))[1]
+    left_out = run.left_out + replay.left_out
+    return Verification(
+        run.topics.get(JOINT_STATES, str(run.path)), run.topics.get(COMMAND, ''), replay.samples,
+        len(run.commands) - replay.refused, replay.late, replay.largest,
+        replay.where / NANOSECONDS, '; '.join(_notes(run, left_out, unapplied)),
+        left_out, unapplied)
+
+
+class _Replay:
+    """An actuator that is driven anew by what was recorded of it."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._window = _one_run(run)
+        self.samples = self.late = self.refused = 0
+        self.left_out = len(run.time) - (self._window.stop - self._window.start)
+        self.largest, self.where = 0.0, 0
+
+    def run(self) -> None:
+        """Integrate from the first sample to the last."""
+        run, first = self._run, self._window.start
+        simulation = _start(run, first)
+        for _, kind, stamp, value in heapq.merge(
+                self._samples(), self._commands(first), self._forces(), key=lambda x: x[:2]):
+            if kind == _SAMPLE:
+                simulation.advance(stamp)
+                difference = abs(simulation.stretch - value)
+                if difference > self.largest or math.isnan(difference):
+                    self.largest, self.where = difference, stamp - int(run.time[first])
+                self.samples += 1
+                continue
+            try:
+                if kind == _FORCE:
+                    simulation.force(stamp, value)
+                elif simulation.command(stamp, value) > 0 and not run.applied:
+                    self.late += 1
+            except BadInputError:
+                self.left_out += 1
+                self.refused += kind == _COMMAND
+
+    def _samples(self) -> 'Iterator[tuple[int, int, int, float]]':
+        """Return when each sample was recorded, its stamp and stretch."""
+        run, window = self._run, self._window
+        logged = np.maximum.accumulate(run.logged[window])
+        for at, stamp, stretch in zip(
+                logged.tolist(), run.time[window].tolist(), run.stretch[window].tolist(),
+                strict=True):
+            yield at, _SAMPLE, stamp, stretch
+
+    def _commands(self, first: int) -> 'Iterator[tuple[int, int, int, float]]':
+        """Return what took effect, which is known from the begin; or what was commanded."""
+        run = self._run
+        begin = int(run.time[first])
+        if run.applied or not run.commands:
+            for level in run.levels:
+                if level.stamp > begin:
+                    yield int(run.logged[first]) - 1, _COMMAND, level.stamp, level.flux_density
+            return
+        for level in run.commands:
+            if level.sent > run.logged[first] or level.stamp > begin:
+                yield level.sent, _COMMAND, level.stamp, level.flux_density
+
+    def _forces(self) -> 'Iterator[tuple[int, int, int, float]]':
+        for sent, stamp, newton in self._run.forces:
+            yield sent, _FORCE, stamp, newton
+
+
+def _one_run(run: Run) -> slice:
+    """Return the samples without a leap of time between them; the most, if there are several."""
+    ends = [0, *(np.flatnonzero(np.diff(run.time) > _LARGEST_LEAP) + 1).tolist(), len(run.time)]
+    return max((slice(*x) for x in zip(ends, ends[1:], strict=False)),
+               key=lambda x: x.stop - x.start)
+
+
+def _start(run: Run, first: int) -> 'ActuatorSimulation':
+    """Return the simulation of the recorded actuator as it is at its first sample."""
+    from hmsa_ros.core.simulation import ActuatorSimulation
+
+    stamp = int(run.time[first])
+    simulation = ActuatorSimulation(
+        run.plant, time=stamp, slew_limit=run.number('plant.slew_limit') or math.inf,
+        coil_time_constant=run.number('plant.coil_time_constant'))
+    # What had taken effect by then is in force; a slow coil may still be on its way there.
+    past = [x.flux_density for x in sorted(run.applied, key=lambda x: x.stamp)
+            if x.stamp <= stamp]
+    field = float(run.flux_density[first])
+    if math.isnan(field):
+        before = [x.flux_density for x in run.levels if x.stamp <= stamp]
+        field = before[-1] if before else 0.0
+    simulation.set_state(
+        float(run.stretch[first]), float(run.rate[first]), field, past[-1] if past else None)
+    return simulation
+
+
+def _notes(run: Run, left_out: int, unapplied: int) -> Iterator[str]:
+    """Return what makes the recorded samples differ from the motion, or is lost."""
+    counts = {} if run.summary is None else {x.name: x.lost for x in run.summary.topics}
+    lost = [f'{count} of {name}' for role in (COMMAND, APPLIED, FORCE)
+            if (name := run.topics.get(role)) and (count := counts.get(name))]
+    if lost:
+        yield (f'the recorder lost messages, {" and ".join(lost)}: expected differences from '
+               'there on')
+    noise = [
+        f'{name} {value:g}' for name, none in (
+            ('stretch_noise', 0.0), ('rate_noise', 0.0), ('stretch_bias', 0.0),
+            ('stretch_gain', 1.0))
+        if (value := number_of(of_joint(run.parameters, run.joint, f'plant.{name}')))
+        not in (None, none)]
+    if noise:
+        yield (f'the samples are measured with {" and ".join(noise)}: expected differences of '
+               'that size, from the first sample on')
+    if unapplied:
+        yield (f'{unapplied} commands never took effect, as {run.topics[APPLIED]} shows: '
+               'nobody applied them')
+    elif run.commands and APPLIED in run.topics and not run.applied:
+        yield f'{run.topics[APPLIED]} reports no level: nobody applied the commands'
+    if left_out:
+        yield f'left out: {left_out} of the messages, since they are not what their topic is for'

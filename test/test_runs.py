@@ -1,0 +1,136 @@
+"""A run as a record: parameters from files, verification, tables, and files that stay whole."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hmsa_ros.cli import main
+from hmsa_ros.core.parameters import paper_actuator
+from hmsa_ros.core.simulation import ActuatorSimulation
+from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.files import replacing, write_text
+from hmsa_ros.runs.levels import Level
+from hmsa_ros.runs.parameters import number_of, read_parameter_file, recorded, values_of
+from hmsa_ros.runs.record import Run
+from hmsa_ros.runs.tables import levels_of, samples_of, write_table
+from hmsa_ros.runs.topics import APPLIED, COMMAND
+from hmsa_ros.runs.verify import verify_run
+
+BEGIN = NANOSECONDS
+STEP = 1_000_000
+
+
+def moved(*, applied=True, commands=((10, 0.01),)):
+    """Return a run of 100 samples in which commands, (sample, T), were obeyed or not."""
+    simulation = ActuatorSimulation(paper_actuator(), time=BEGIN)
+    levels = [Level(BEGIN + at * STEP, flux, BEGIN) for at, flux in commands]
+    rows = []
+    for level in levels if applied else ():
+        simulation.command(level.stamp, level.flux_density)
+    for k in range(100):
+        simulation.advance(BEGIN + k * STEP)
+        rows.append((simulation.stretch, simulation.rate, simulation.flux_density))
+    time = BEGIN + STEP * np.arange(100)
+    stretch, rate, field = np.array(rows).T
+    in_force = [Level(BEGIN, 0.0, BEGIN), *(levels if applied else ())]
+    return Run(
+        'run', 'actuator', Path('run'), time, time, stretch, rate, field,
+        commands=tuple(levels), applied=tuple(in_force), parameters_known=True,
+        topics={COMMAND: '/flux_density_command', APPLIED: '/flux_density_applied'})
+
+
+def test_a_command_that_nobody_applied_is_said_though_the_motion_fits():
+    found = verify_run(moved(applied=False))
+    assert (found.largest_difference, found.unapplied_count) == (0.0, 1)
+    assert 'nobody applied them' in found.note
+    found = verify_run(moved())
+    assert (found.unapplied_count, found.note) == (0, '')
+    assert found.largest_difference < 1e-12
+
+
+def test_a_table_has_the_samples_in_full_precision_and_the_levels_at_their_times(tmp_path):
+    run = moved()
+    for columns, name in ((samples_of(run), 'a.csv'), (levels_of(run), 'b.csv')):
+        write_table(tmp_path / name, columns)
+        with (tmp_path / name).open(encoding='utf-8', newline='') as file:
+            rows = list(csv.DictReader(file))
+        for key, values in columns.items():
+            assert [float(row[key]) for row in rows] == values.tolist()
+    assert [float(row['time']) for row in rows] == [0.0, 0.01]
+
+
+@pytest.mark.parametrize('text', [
+    'a: &a {b: *a}',
+    '\n'.join(['a0: &a0 [x, x]', *(f'a{i}: &a{i} [*a{i - 1}, *a{i - 1}]' for i in range(1, 27))]),
+    '[' * 3000, '{a: ' * 100 + '1' + '}' * 100, 'actuator.density: ' + '1' * 5000,
+    'a: 2001-99-99', 'actuator.density: [1]', 'actuator.density: ' + '1' * 400,
+    'actuator.density: .nan'], ids=[
+        'loop', 'bomb', 'deep list', 'deep map', 'endless number', 'bad date', 'list',
+        'large number', 'NaN'])
+def test_parameter_files_that_are_none_are_refused_in_a_sentence(tmp_path, text):
+    file = tmp_path / 'bad.yaml'
+    file.write_text(text)
+    from hmsa_ros.contract.parameters import ACTUATOR
+    with pytest.raises(BadInputError, match='expected'):
+        values_of(read_parameter_file(file), 'plant', ACTUATOR)
+
+
+def test_a_parameter_file_sets_what_a_node_has_above_what_all_have(tmp_path):
+    file = tmp_path / 'ours.yaml'
+    file.write_text(
+        'plant:\n  ros__parameters:\n    actuator.density: 2.0\n'
+        '/**:\n  ros__parameters:\n    actuator: {density: 1.0, remanence: 0.2}\n')
+    found = read_parameter_file(file)
+    assert (found['plant.actuator.density'], found['planner.actuator.density']) == (2.0, 1.0)
+    assert found['plant.actuator.remanence'] == 0.2
+
+
+@pytest.mark.parametrize('text', ['9' * 400, '9' * 5000, '[' * 200_000, 'NaN', '"x"'])
+def test_recorded_parameters_that_are_no_numbers_are_no_numbers(text):
+    found = recorded({'/plant.use_sim_time': 'false', '/plant.slew_limit': text}, '/')
+    assert number_of(found['plant.slew_limit']) is None
+
+
+def test_a_file_that_fails_half_way_leaves_the_old_one(tmp_path):
+    path = tmp_path / 'x.txt'
+    write_text(path, 'old')
+
+    def fail():
+        with replacing(path) as beside:
+            beside.write_text('half')
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+    assert path.read_text() == 'old'
+    assert list(tmp_path.iterdir()) == [path]
+    link = tmp_path / 'link'
+    link.symlink_to(tmp_path / 'nowhere')
+    with pytest.raises(BadInputError, match='a link to nothing'):
+        write_text(link, 'x')
+    assert not (tmp_path / 'nowhere').exists()
+
+
+def test_plan_in_seconds_and_tesla_is_the_nondimensional_plan(tmp_path, capsys):
+    block = paper_actuator()
+    file = tmp_path / 'a.yaml'
+    file.write_text(
+        f'/**:\n  ros__parameters:\n    actuator.shear_modulus: {block.shear_modulus}\n')
+    assert main(['plan', f'1.1:{10 * block.time_unit}', '--params-file', str(file), '--json']) == 0
+    found, = json.loads(capsys.readouterr().out)['segments']
+    assert main(['plan', '1.1:10', '--json']) == 0
+    plain, = json.loads(capsys.readouterr().out)['segments']
+    assert found['time_p'] == pytest.approx(plain['tau_p'] * block.time_unit, rel=1e-6)
+    assert found['flux_density_1'] == pytest.approx(
+        plain['beta_1'] * block.flux_density_unit, rel=1e-9)
+    assert found['levels'][1] == [found['time_p'], found['flux_density_1']]
+
+
+def test_an_unknown_option_points_to_the_help_of_its_command(capsys):
+    with pytest.raises(SystemExit):
+        main(['report', '--nonsense', 'x'])
+    assert capsys.readouterr().err.endswith('see hmsa report --help\n')
