@@ -130,7 +130,15 @@ class Sink:
             self._release(given_back)
 
     def snapshot(self) -> str:
-        """Write the messages kept in memory."""
+        """
+        Write the messages kept in memory.
+
+        Raises
+        ------
+        BagError
+            If every message is recorded.
+
+        """
         if not self._limits.snapshot_ns:
             raise BagError('there is no snapshot to take: every message is recorded; expected '
                            'snapshot mode')
