@@ -8,7 +8,8 @@ Measure speed and accuracy.
 NAME is planner, plant, preemption, joints, recorder, player or crash; without one all of these
 are run.
 Those of recorder, player and crash take some seven minutes together. faults injects faults into
-running nodes and fails if one is not answered as it should be; soak runs for hours.
+running nodes and fails if one is not answered as it should be; soak runs for hours;
+identification fits thousands of simulated runs.
 A page is a Markdown file with marks ``<!-- begin NAME -->`` and ``<!-- end NAME -->``, between
 which a table is put.
 """
@@ -31,7 +32,7 @@ _WIDTH = 120
 
 NAMES = ('planner', 'plant', 'preemption', 'joints', 'recorder', 'player', 'crash')
 #: Not run unless asked for: they take long and need the machine for themselves.
-LONG = ('faults', 'soak')
+LONG = ('faults', 'soak', 'identification')
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -112,6 +113,14 @@ def main(arguments: list[str] | None = None) -> int:
         from benchmarks import bench_preemption
 
         add(bench_preemption.compare(quick=options.quick))
+    if 'identification' in names:
+        from benchmarks import bench_identification
+
+        add(bench_identification.speed(quick=options.quick))
+        add(bench_identification.compare(quick=options.quick))
+        if not reports[-1].passed:
+            console.print('identification: not what is promised')
+            status = 1
     for name in ('joints', 'recorder', 'player', 'crash'):
         if name in names and _has_ros(name):
             sheet = importlib.import_module(f'benchmarks.bench_{name}').compare(

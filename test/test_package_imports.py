@@ -71,7 +71,7 @@ sys.exit(main())
 
 @pytest.mark.parametrize('command', ['demo', 'plan', 'send', 'planner', 'plant', 'recorder',
                                      'player', 'bag', 'figures', 'report', 'robustness', 'sweep',
-                                     'identify'])
+                                     'identify', 'excite'])
 def test_every_command_of_the_interface_answers_help(command):
     result = run(f"""
 import sys

@@ -19,8 +19,8 @@ from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, complain, HmsaError
 
 COMMANDS = (
-    'demo', 'init', 'plan', 'send', 'identify', 'watch', 'node', 'bag', 'report', 'export',
-    'figures', 'robustness', 'sweep', 'completion')
+    'demo', 'init', 'plan', 'send', 'identify', 'excite', 'watch', 'node', 'bag', 'report',
+    'export', 'figures', 'robustness', 'sweep', 'completion')
 
 
 class _Help(argparse.HelpFormatter):

@@ -1,0 +1,158 @@
+"""``hmsa excite``: the sequence of levels to record for identification."""
+
+import argparse
+import json
+import math
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+from hmsa_ros.errors import BadInputError
+
+if TYPE_CHECKING:
+    from hmsa_ros.identification.excitation import Excitation, Program
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    Add the command.
+
+    Parameters
+    ----------
+    subparsers : argparse action
+        Where to add it.
+
+    """
+    parser = subparsers.add_parser(
+        'excite', help='design the sequence to record for hmsa identify',
+        description='Design the sequence of levels whose recording tells most about the '
+                    'actuator, inside the limits of coil and stretch, ending at rest; and show '
+                    'what plain steps and the sequence of the paper tell in the same time.',
+        epilog='example: hmsa excite --params-file actuator.yaml --duration 2 --out levels.csv')
+    parser.add_argument(
+        '--params-file', type=Path, metavar='YAML', dest='params_file',
+        help='parameter file with the block as far as it is known, flux_density_min, '
+             'flux_density_max and slew_limit (default: those of the nodes)')
+    parser.add_argument(
+        '--duration', type=float, metavar='S',
+        help='duration in s (default 180 periods of the block)')
+    parser.add_argument(
+        '--free', default='', metavar='NAME,...', help='parameters to find, as in hmsa identify')
+    parser.add_argument(
+        '--stretch-min', type=float, default=0.6, metavar='X', dest='stretch_min',
+        help='least stretch of the motion (default 0.6)')
+    parser.add_argument(
+        '--stretch-max', type=float, default=2.0, metavar='X', dest='stretch_max',
+        help='largest stretch of the motion (default 2)')
+    parser.add_argument(
+        '--rate', type=float, default=1000.0, metavar='HZ',
+        help='samples per second of the sensor (default 1000)')
+    parser.add_argument(
+        '--noise', type=float, default=1e-3, metavar='X',
+        help='standard deviation of a sample of stretch (default 0.001)')
+    parser.add_argument(
+        '--out', type=Path, metavar='CSV',
+        help='file of time, flux_density to write; one of that name is replaced')
+    parser.add_argument('--json', action='store_true', help='print one JSON object')
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """
+    Design, write and print.
+
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+        As parsed.
+
+    Returns
+    -------
+    int
+        Exit status.
+
+    Raises
+    ------
+    BadInputError
+        If a file or a number cannot be used.
+
+    """
+    from hmsa_ros.identification.excitation import Bounds, excite
+    from hmsa_ros.identification.files import read_belief
+    from hmsa_ros.identification.quantities import DEFAULT_FREE
+
+    belief = read_belief(arguments.params_file)
+    bounds = Bounds(
+        belief.number('flux_density_min', -0.5), belief.number('flux_density_max', 0.5),
+        belief.number('slew_limit', 0.0) or math.inf, arguments.stretch_min,
+        arguments.stretch_max)
+    found = excite(
+        belief.actuator, bounds, duration=arguments.duration, rate=arguments.rate,
+        noise=arguments.noise, free=[x for x in arguments.free.split(',') if x] or DEFAULT_FREE)
+    if arguments.out is not None:
+        rows = zip(found.best.level_times, found.best.levels, strict=True)
+        lines = ['time,flux_density', *(f'{x:.9f},{y:.9g}' for x, y in rows)]
+        try:
+            arguments.out.write_text('\n'.join(lines) + '\n', encoding='utf-8')
+        except OSError as error:
+            raise BadInputError(
+                f'cannot write {arguments.out}: {error.strerror or error}; expected a folder '
+                'with write permission') from error
+    if arguments.json:
+        print(json.dumps({
+            'duration': found.duration, **_record(found.best), 'improvement': _finite(
+                found.improvement), 'plain': _record(found.plain),
+            'paper': _record(found.paper)}, indent=2, allow_nan=False))
+        return 0
+    for line in table(found):
+        print(line)
+    if arguments.out is not None:
+        print(f'{arguments.out} written')
+    return 0
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _record(program: 'Program') -> dict[str, Any]:
+    """Return a sequence as JSON."""
+    return {
+        'levels': [[x, y] for x, y in zip(
+            program.level_times.tolist(), program.levels.tolist(), strict=True)],
+        'std': {name: _finite(x) for name, x in program.std.items()},
+        'stretch_min': program.reach[0], 'stretch_max': program.reach[1],
+        'ends_at_rest': program.ends_at_rest}
+
+
+def table(found: 'Excitation') -> list[str]:
+    """
+    Return what the sequences tell, a line each.
+
+    Parameters
+    ----------
+    found : Excitation
+        As designed.
+
+    Returns
+    -------
+    list of str
+        Aligned.
+
+    """
+    programs = (found.best, found.plain, found.paper)
+    lines = [
+        f'{len(found.best.levels)} levels in {found.duration:.4g} s, stretch '
+        f'{found.best.reach[0]:.3f} to {found.best.reach[1]:.3f}, '
+        + ('at rest at the end' if found.best.ends_at_rest else 'still moving at the end'),
+        f'{"standard deviation":<22}{"this":>12}{"plain steps":>14}{"paper":>12}']
+    for name in found.best.std:
+        cells = [_share(name, x.std[name]) for x in programs]
+        lines.append(f'{name:<22}{cells[0]:>12}{cells[1]:>14}{cells[2]:>12}')
+    return [*lines, f'the worst parameter is {found.improvement:.1f} times as well known as '
+            'after one pass of plain steps']
+
+
+def _share(name: str, value: float) -> str:
+    if not math.isfinite(value):
+        return 'unknown'
+    return f'{value:.1e}' if name == 'stretch_bias' else f'{100.0 * value:.2g} %'

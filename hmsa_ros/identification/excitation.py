@@ -1,0 +1,453 @@
+"""
+What to record: the sequence of levels that tells most about the parameters.
+
+D-optimal design (V. V. Fedorov, "Theory of Optimal Experiments", Academic Press 1972): of all
+sequences of a duration inside the limits of coil, slew and stretch, one with a large
+determinant of the information matrix, which makes the confidence ellipsoid small. A pattern of
+levels and dwells is repeated; levels and dwells are sought at random and improved one by one.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from hmsa_ros.core import model
+from hmsa_ros.core.delivery import Delivery
+from hmsa_ros.core.model import Array
+from hmsa_ros.core.moves import Limits, State
+from hmsa_ros.core.parameters import ActuatorParameters
+from hmsa_ros.core.sequence import plan_sequence, Setpoint
+from hmsa_ros.core.status import RefusedError
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification.quantities import check_free, DEFAULT_FREE, derivative, values_of
+from hmsa_ros.identification.recording import Recording
+from hmsa_ros.identification.response import respond
+
+_PATTERN = 5  # levels in the pattern that is repeated
+_HALVINGS = 6  # of the search for the largest pattern inside the limits
+_FIRST, _STEPS = 24, 300  # random patterns, and steps that improve the best
+_LAST = 4.0  # durations of a period that the last move and its rest take
+_SHORTEST = 3.0  # duration in periods that holds a sequence at all
+_MARGIN = 0.95  # of the way to the limits of the chains
+#: The paper's sequence, and a pass of plain steps; stretches.
+PAPER = (1.1, 1.2, 1.4)
+PLAIN = (1.1, 1.4, 1.0)
+_WEIGHT = 2.0  # of the worst parameter against the volume
+_WINDOW = 30.0  # periods over which patterns are compared
+_REST = 1e-3  # deviation from rest at the end, stretch
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """
+    What a sequence has to keep within.
+
+    Attributes
+    ----------
+    flux_density_min, flux_density_max : float
+        In T.
+    slew_limit : float
+        In T/s; infinite for steps.
+    stretch_min, stretch_max : float
+        Of the whole motion.
+
+    Raises
+    ------
+    BadInputError
+        If a range is empty or does not hold rest.
+
+    """
+
+    flux_density_min: float = -0.5
+    flux_density_max: float = 0.5
+    slew_limit: float = math.inf
+    stretch_min: float = 0.6
+    stretch_max: float = 2.0
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        if not self.flux_density_min <= 0.0 < self.flux_density_max < math.inf:
+            raise BadInputError(
+                f'flux densities from {self.flux_density_min:g} to {self.flux_density_max:g} T: '
+                'expected a range with 0 T in it')
+        if not 0.0 < self.stretch_min < 1.0 < self.stretch_max < math.inf:
+            raise BadInputError(
+                f'stretches from {self.stretch_min:g} to {self.stretch_max:g}: expected a range '
+                'with 1 inside')
+        if not self.slew_limit > 0.0:
+            raise BadInputError(
+                f'slew limit is {self.slew_limit:g} T/s: expected a number above 0')
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """
+    A sequence of levels and what it tells.
+
+    Attributes
+    ----------
+    level_times, levels : ndarray, shape (m,)
+        Flux density in T from each time in s on.
+    std : dict of str to float
+        Standard deviation that its recording leaves, by name; relative but for those that may
+        be 0.
+    information : float
+        Logarithm of the determinant of the information matrix; minus infinity if singular.
+    reach : tuple of float
+        Least and largest stretch.
+    ends_at_rest : bool
+        Whether nothing moves at the end.
+
+    """
+
+    level_times: Array
+    levels: Array
+    std: dict[str, float]
+    information: float
+    reach: tuple[float, float]
+    ends_at_rest: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Excitation:
+    """
+    The sequence to record, beside others of the same duration.
+
+    Attributes
+    ----------
+    duration : float
+        In s.
+    best, plain, paper : Program
+        The one to record, plain steps to 1.1, 1.4 and 1, and the paper's shaped sequence.
+
+    """
+
+    duration: float
+    best: Program
+    plain: Program
+    paper: Program
+
+    @property
+    def improvement(self) -> float:
+        """
+        Smallest ratio of the deviations of the plain steps to those of the best.
+
+        The bias of the sensor is left out: it is the noise over the root of the number of
+        samples, whatever moves.
+        """
+        return min(_ratios(self.plain.std, self.best.std))
+
+
+def _ratios(one: Mapping[str, float], other: Mapping[str, float]) -> list[float]:
+    """Return how much larger deviations are than others, of all but the sensor's bias."""
+    names = [x for x in one if x != 'stretch_bias'] or list(one)
+    return [one[x] / other[x] for x in names]
+
+
+class Designer:
+    """
+    Searches sequences for one actuator.
+
+    Parameters
+    ----------
+    actuator : ActuatorParameters
+        The block as far as it is known.
+    bounds : Bounds
+        What to keep within.
+    duration : float
+        Of the sequence in s.
+    rate : float
+        Samples per second.
+    noise : float
+        Standard deviation of a sample.
+    free : sequence of str
+        What shall be found.
+
+    Raises
+    ------
+    BadInputError
+        If the duration holds no sequence, or a number is out of range.
+
+    """
+
+    def __init__(
+            self, actuator: ActuatorParameters, bounds: Bounds, duration: float, *,
+            rate: float = 1000.0, noise: float = 1e-3,
+            free: Sequence[str] = DEFAULT_FREE) -> None:
+        """Check duration and rate."""
+        self._actuator, self._bounds, self._noise = actuator, bounds, noise
+        self._free = check_free(free)
+        self._values = values_of(actuator)
+        self._group = actuator.nondimensional
+        self.period = 2.0 * math.pi * actuator.time_unit / float(
+            model.natural_frequency(1.0, self._group))
+        if not (rate > 0.0 and math.isfinite(rate) and noise > 0.0):
+            raise BadInputError(
+                f'rate is {rate:g} Hz and noise {noise:g}: expected finite numbers above 0')
+        if not (_SHORTEST + _LAST) * self.period <= duration < math.inf:
+            raise BadInputError(
+                f'duration is {duration:g} s: expected at least '
+                f'{(_SHORTEST + _LAST) * self.period:.3g} s, {_SHORTEST + _LAST:g} periods')
+        if duration * rate > 1e6:
+            raise BadInputError(
+                f'{duration:g} s at {rate:g} Hz are more than a million samples: expected a '
+                'shorter sequence')
+        self.duration, self._rate = duration, rate
+        self._reference = dict.fromkeys(self._free, 1.0)
+        self.point = np.zeros(2 * _PATTERN)
+        count = int(duration * rate)
+        self._times = np.arange(count) / rate
+        self._dense = np.linspace(0.0, duration, max(int(40.0 * duration / self.period), 200))
+        lower, upper = model.stretch_limits(self._group)
+        if math.isinf(upper):
+            upper = 10.0
+        unit = actuator.flux_density_unit
+        low = max(bounds.stretch_min, 1.0 - _MARGIN * (1.0 - lower))
+        high = min(bounds.stretch_max, 1.0 + _MARGIN * (upper - 1.0))
+        self.stretches = low, high
+        self._range = (
+            max(bounds.flux_density_min, self._holding(low)),
+            min(bounds.flux_density_max, self._holding(high)))
+        self._unit = unit
+
+    def _holding(self, stretch: float) -> float:
+        return float(model.elastic_force(stretch, self._group)
+                     ) * self._actuator.flux_density_unit
+
+    def _recording(self, times: Array, level_times: Array, levels: Array) -> Recording:
+        # Only levels and times count.
+        return Recording(
+            times, np.linspace(1.0, 1.5, len(times)), level_times, levels,
+            self._bounds.slew_limit)
+
+    def judge(self, level_times: Array, levels: Array) -> Program | None:
+        """Return what a sequence tells, None if its motion cannot be followed."""
+        coarse = respond(
+            self._recording(self._dense, level_times, levels), self._values, (), rtol=1e-6)
+        if coarse is None:
+            return None
+        reach = float(np.min(coarse.stretch)), float(np.max(coarse.stretch))
+        late = self._dense > self.duration - 0.5 * self.period
+        rest = float(np.ptp(coarse.stretch[late])) < _REST
+        response = respond(
+            self._recording(self._times, level_times, levels), self._values, self._free,
+            rtol=1e-6)
+        if response is None:
+            return None
+        matrix = response.jacobian.T @ response.jacobian / self._noise ** 2
+        sign, size = np.linalg.slogdet(matrix)
+        if sign <= 0.0:
+            return Program(level_times, levels, dict.fromkeys(self._free, math.inf),
+                             -math.inf, reach, rest)
+        deviations = np.sqrt(np.maximum(np.diag(np.linalg.inv(matrix)), 0.0))
+        std = {}
+        for name, deviation in zip(self._free, deviations.tolist(), strict=True):
+            value = self._values[name]
+            absolute = abs(derivative(name, value)) * deviation
+            std[name] = absolute / abs(value) if value else absolute
+        return Program(level_times, levels, std, float(size), reach, rest)
+
+    def _ended(self, level_times: Array, levels: Array) -> tuple[Array, Array]:
+        """Return a sequence with a move to rest without field at its end."""
+        end = self.duration - _LAST * self.period
+        keep = level_times < end
+        level_times, levels = level_times[keep], levels[keep]
+        # Ramps have to be over before the last move begins.
+        state = respond(
+            self._recording(
+                np.linspace(0.0, end, 50), level_times, levels), self._values, (), rtol=1e-9)
+        time, level = self._actuator.time_unit, float(levels[-1])
+        slew = self._bounds.slew_limit / self._unit * time
+        try:
+            if state is None:
+                return np.append(level_times, end), np.append(levels, 0.0)
+            loads = (self._bounds.flux_density_min / self._unit,
+                     self._bounds.flux_density_max / self._unit)
+            segment, = plan_sequence(
+                [Setpoint(1.0, math.inf)], self._group,
+                start=State(float(state.stretch[-1]), float(state.rate[-1]) * time,
+                            level / self._unit),
+                limits=Limits(*loads), delivery=Delivery(slew=slew))
+            more = [(end + x.time * time, x.load * self._unit) for x in segment.move.levels]
+            if not math.isfinite(segment.move.duration):
+                more = [(end, 0.0)]
+        except (RefusedError, BadInputError):
+            more = [(end, 0.0)]
+        return (np.append(level_times, [x for x, _ in more]),
+                np.append(levels, [x for _, x in more]))
+
+    def _pattern(self, targets: Array, dwells: Array) -> tuple[Array, Array]:
+        """Return the levels of a pattern that is repeated; the first is rest without field."""
+        fields = [float(np.clip(x, *self._range)) for x in targets]
+        times, levels = [0.0], [0.0]
+        now, i = 0.5 * self.period, 0
+        while now < self.duration:
+            times.append(now)
+            levels.append(fields[i % len(fields)])
+            now += float(dwells[i % len(dwells)]) * self.period
+            i += 1
+        return np.array(times), np.array(levels)
+
+    def _inside(self, level_times: Array, levels: Array) -> bool:
+        """Whether a motion keeps within the limits of the stretch."""
+        response = respond(
+            self._recording(self._dense, level_times, levels), self._values, (), rtol=1e-4)
+        return response is not None and bool(
+            np.min(response.stretch) >= self._bounds.stretch_min
+            and np.max(response.stretch) <= self._bounds.stretch_max)
+
+    def _score(self, found: Program | None) -> float:
+        """Return the information of a sequence inside the limits, with a rest at its end."""
+        if found is None or not found.ends_at_rest:
+            return -math.inf
+        low, high = self._bounds.stretch_min, self._bounds.stretch_max
+        over = max(low - found.reach[0], found.reach[1] - high)
+        if over > 0.0:
+            return -math.inf
+        # The volume, and with as much weight the worst parameter against plain steps.
+        worst = min(_ratios(self._reference, found.std))
+        return found.information + _WEIGHT * len(self._free) * math.log(max(worst, 1e-300))
+
+    def _judged(self, point: Array) -> tuple[float, Program | None]:
+        """Judge a pattern, as large as the limits of the stretch let it be."""
+        small, large = 0.0, 1.0
+        for i in range(_HALVINGS):
+            middle = 1.0 if i == 0 else 0.5 * (small + large)
+            inside = self._inside(*self._pattern(
+                middle * point[:_PATTERN], point[_PATTERN:]))
+            small, large = (middle, large) if inside else (small, middle)
+            if small == 1.0:
+                break
+        if not small:
+            return -math.inf, None
+        found = self.judge(*self._ended(*self._pattern(
+            small * point[:_PATTERN], point[_PATTERN:])))
+        return self._score(found), found
+
+    def search(self, seed: int = 0) -> Program:
+        """
+        Return the best sequence that is found; the same seed gives the same one.
+
+        Raises
+        ------
+        BadInputError
+            If no sequence keeps within the limits.
+
+        """
+        if self.duration > _WINDOW * self.period:
+            # What is best in the long run is so already over some tens of periods.
+            part = Designer(
+                self._actuator, self._bounds, _WINDOW * self.period, rate=self._rate,
+                noise=self._noise, free=self._free)
+            part.search(seed)
+            found = self._judged(part.point)[1]
+            if found is not None and found.ends_at_rest:
+                return found
+        plain = self.plain()
+        if plain is not None and all(math.isfinite(x) for x in plain.std.values()):
+            self._reference = plain.std
+        random = np.random.default_rng(seed)
+        low, high = self._range
+
+        best, score, point = None, -math.inf, np.zeros(2 * _PATTERN)
+        for i in range(_FIRST):
+            trial = np.append(
+                random.uniform(low, high, _PATTERN), random.uniform(0.3, 5.0, _PATTERN))
+            if i == 0:
+                # Large steps to both sides, each with the time to ring.
+                trial = np.append([0.5 * high, high, low, 0.0, 0.3 * high], np.full(
+                    _PATTERN, 4.0))
+            value, found = self._judged(trial)
+            if value > score:
+                best, score, point = found, value, trial
+        width = 0.5
+        for i in range(_STEPS):
+            trial = point.copy()
+            place = i % len(trial)
+            size = (high - low) if place < _PATTERN else 2.0
+            trial[place] += width * size * random.standard_normal()
+            trial[:_PATTERN] = np.clip(trial[:_PATTERN], low, high)
+            trial[_PATTERN:] = np.clip(trial[_PATTERN:], 0.2, 6.0)
+            value, found = self._judged(trial)
+            if value > score:
+                best, score, point = found, value, trial
+            elif place == len(trial) - 1:
+                width = max(0.8 * width, 0.02)
+        if best is None:
+            raise BadInputError(
+                f'no sequence keeps within stretches of {self._bounds.stretch_min:g} to '
+                f'{self._bounds.stretch_max:g} and ends at rest: expected wider limits or a '
+                'longer duration')
+        self.point = point
+        return best
+
+    def plain(self, targets: Sequence[float] = PLAIN) -> Program | None:
+        """Return one pass of plain steps, smaller where they would break the limits."""
+        span = self.duration / len(targets)
+        times = np.append(0.0, span * (np.arange(len(targets)) + 1e-3))
+        for share in np.linspace(1.0, 0.1, 19).tolist():
+            levels = np.append(0.0, [self._holding(1.0 + share * (x - 1.0)) for x in targets])
+            if self._inside(times, levels):
+                return self.judge(times, levels)
+        return None
+
+    def paper(self) -> Program | None:
+        """Return the paper's sequence, shaped; None where there is no plan."""
+        time = self._actuator.time_unit
+        span = self.duration / len(PAPER)
+        try:
+            segments = plan_sequence([Setpoint(x, span / time) for x in PAPER], self._group)
+        except (RefusedError, BadInputError):
+            return None
+        rows = [(0.0, 0.0)] + [
+            (1e-3 * span + x.begin * time + y.time * time, y.load * self._unit)
+            for x in segments for y in x.move.levels]
+        table = np.array(rows)
+        return self.judge(table[:, 0], table[:, 1])
+
+
+def excite(
+        actuator: ActuatorParameters, bounds: Bounds | None = None, *,
+        duration: float | None = None, rate: float = 1000.0, noise: float = 1e-3,
+        free: Sequence[str] = DEFAULT_FREE) -> Excitation:
+    """
+    Design the sequence to record for identification.
+
+    Parameters
+    ----------
+    actuator : ActuatorParameters
+        The block as far as it is known.
+    bounds : Bounds, optional
+        Of coil and stretch.
+    duration : float, optional
+        In s; default 180 periods of the block.
+    rate : float
+        Samples per second.
+    noise : float
+        Standard deviation of a sample.
+    free : sequence of str
+        What shall be found.
+
+    Returns
+    -------
+    Excitation
+        The sequence, beside plain steps and the paper's.
+
+    Raises
+    ------
+    BadInputError
+        If no sequence is possible, or a number is out of range.
+
+    """
+    bounds = bounds or Bounds()
+    if duration is None:
+        duration = 180.0 * 2.0 * math.pi * actuator.time_unit / float(
+            model.natural_frequency(1.0, actuator.nondimensional))
+    designer = Designer(actuator, bounds, duration, rate=rate, noise=noise, free=free)
+    best = designer.search()
+    nothing = Program(
+        np.zeros(1), np.zeros(1), dict.fromkeys(best.std, math.inf), -math.inf, (1.0, 1.0), True)
+    return Excitation(
+        duration, best, designer.plain() or nothing, designer.paper() or nothing)
