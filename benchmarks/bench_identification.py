@@ -123,6 +123,8 @@ def _cell(
         estimates = [found.parameters[x] for x in DEFAULT_FREE]
         errors.append(np.array([x.value for x in estimates]) - true)
         inside.append([x.low <= y <= x.high for x, y in zip(estimates, true, strict=True)])
+    if not errors:
+        return np.full(len(DEFAULT_FREE), np.nan), float('nan'), durations, failed
     ratios = np.sqrt(np.mean(np.square(errors), axis=0)) / bound
     return ratios, float(np.mean(inside)), durations, failed
 

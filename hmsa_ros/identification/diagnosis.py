@@ -23,6 +23,8 @@ _SHARE, _DEVIATIONS = 0.02, 4.5
 # Residuals in motion this much above those at rest are of the model, not of the sensor.
 _IN_MOTION = 2.0
 _FEWEST_PARTS = 8
+_OUT = 0.5  # weight below which a sample does not count
+_SOON = 10  # samples after a change of level
 _NUMERICAL = 1e-6  # residuals below this are those of the integration
 _DISTANT = 0.1  # residual over motion from which on nothing was fitted
 
@@ -303,6 +305,23 @@ def in_motion(recording: Recording, fit: Fit) -> float:
     return float(fast / slow) if slow > 0.0 else 1.0
 
 
+def mistaken(recording: Recording, fit: Fit) -> bool:
+    """
+    Whether what did not count is motion: it lies right after the changes of level.
+
+    A fit to the levels at rest alone may take the few samples in motion for outliers.
+    """
+    out = fit.weights < _OUT
+    changes = recording.level_times[1:][np.diff(recording.levels) != 0.0]
+    if not np.any(out) or not len(changes):
+        return False
+    place = np.searchsorted(recording.time, changes)
+    last = np.searchsorted(changes, recording.time, side='right') - 1
+    after = (last >= 0) & (np.arange(len(out)) - place[last] < _SOON)
+    usual = float(np.mean(after))
+    return float(np.mean(after[out])) > usual + 0.4 * (1.0 - usual)
+
+
 def distant(recording: Recording, fit: Fit, found: Whiteness) -> bool:
     """Whether nothing of the motion was fitted."""
     return not found.white and fit.scale > _DISTANT * float(np.std(recording.stretch)) and abs(
@@ -349,6 +368,12 @@ def misfit(
         words = '; '.join(
             f'{x.name} ({x.share:.0%} of them, {x.deviations:.0f} deviations)' for x in seen[:3])
         return f'the model leaves {figures}, which look like {words}{_remedy(seen)}'
+    lost = int(np.count_nonzero(fit.weights < _OUT))
+    if lost > 1 and mistaken(recording, fit):
+        return (
+            f'{lost} samples right after changes of level are not those of the model, which '
+            f'leaves {figures} elsewhere: the motion itself is not described; are the levels '
+            'at their true times, and are enough samples in motion?')
     ratio = in_motion(recording, fit)
     if not found.white and ratio > _IN_MOTION and recording.quantum == 0.0 and (
             abs(float(found.autocorrelation[1])) > 0.3):

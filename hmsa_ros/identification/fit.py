@@ -88,19 +88,24 @@ def robust_scale(residual: Array) -> float:
     return max(float(one), float(two), _LEAST_SCALE)
 
 
-def weights_of(residual: Array, scale: float) -> Array:
-    """Return how far each residual counts."""
+def weights_of(residual: Array, scale: float, *, convex: bool = False) -> Array:
+    """Return how far each residual counts; convex: by Huber, none is left out altogether."""
     u = np.abs(residual) / scale
+    if convex:
+        all_count: Array = _FULL / np.maximum(u, _FULL)
+        return all_count
     weights: Array = np.where(
         u <= _FULL, 1.0, np.clip((_NONE - u) / (_NONE - _FULL), 0.0, 1.0)
         * _FULL / np.maximum(u, _FULL))
     return weights
 
 
-def loss(residual: Array, scale: float) -> float:
-    """Return Hampel's loss, bounded for each residual; its slope over it is the weight."""
+def loss(residual: Array, scale: float, *, convex: bool = False) -> float:
+    """Return Hampel's loss, bounded for each residual, or Huber's convex one."""
     u = np.abs(residual) / scale
     inner = np.minimum(u, _FULL)
+    if convex:
+        return float(np.sum(0.5 * inner ** 2 + _FULL * (u - inner)))
     middle = np.clip(u, _FULL, _NONE) - _FULL
     width = _NONE - _FULL
     loss = 0.5 * inner ** 2 + _FULL * (middle - 0.5 * middle ** 2 / width)
@@ -153,6 +158,8 @@ class _Search:
         self._recording, self._free, self._at_rest = recording, free, at_rest
         self._most = most
         self._passes = 0
+        # First no sample is left out, so that the few in motion are not taken for outliers.
+        self._convex = True
         # A switch lies anywhere in its interval: as far off as that in the mean.
         self._deviation = recording.earlier / math.sqrt(12.0)
         self._middle = -0.5 * recording.earlier
@@ -167,7 +174,8 @@ class _Search:
 
     def _loss(self, residual: Array, shifts: Array, scale: float) -> float:
         apart = float(np.sum((shifts - self._middle) ** 2))
-        return loss(residual, scale) + 0.5 * self._prior(scale) * apart / scale ** 2
+        return (loss(residual, scale, convex=self._convex)
+                + 0.5 * self._prior(scale) * apart / scale ** 2)
 
     def run(self, values: Mapping[str, float]) -> Fit | None:
         """Descend from start values."""
@@ -180,7 +188,7 @@ class _Search:
         scale = robust_scale(residual)
         damping, converged = 1e-4, False
         while self._passes < self._most:
-            weights = weights_of(residual, scale)
+            weights = weights_of(residual, scale, convex=self._convex)
             matrix, gradient, size = self._normal(response, residual, weights, shifts, scale)
             before = self._loss(residual, shifts, scale)
             while self._passes < self._most:
@@ -196,24 +204,34 @@ class _Search:
                 if trial is not None:
                     trial_residual = self._recording.stretch - trial.stretch
                     after = self._loss(trial_residual, trial_shifts, scale)
-                    if after <= before * (1.0 + 1e-12) + 1e-12:
+                    if after <= before + _SMALL ** 2:
                         break
                 damping = max(10.0 * damping, 1e-6)
                 if damping > _MAX_DAMPING:
-                    return self._fit(
-                        values, response, residual, scale, _at_bottom(scaled, scale))
+                    break
             else:
                 break
+            if trial is None or damping > _MAX_DAMPING:
+                if not self._convex:
+                    return self._fit(
+                        values, response, residual, scale, _at_bottom(scaled, scale))
+                self._convex, damping = False, 1e-4
+                continue
             # Switches at the end of their intervals never come to rest: the loss does.
             small = stride == 1.0 and (
                 float(scaled @ matrix @ scaled) <= (_SMALL * scale) ** 2
-                or len(shifts) > 0 and before - after < _SMALL ** 2)
+                or before - after < _SMALL ** 2)
             values, shifts, response, residual = (
                 trial_values, trial_shifts, trial, trial_residual)
-            old, scale = scale, robust_scale(residual)
-            if small and damping <= 1.0 and abs(scale - old) < 0.01 * old:
-                converged = True
-                break
+            if small and damping <= 1.0:
+                if not self._convex:
+                    converged = True
+                    break
+                self._convex = False
+            if self._convex or not scale < 2.0 * robust_scale(residual):
+                # Fixed once samples may be left out (Yohai, Ann. Statist. 15 (1987) 642), and
+                # never rising, so that it comes to an end.
+                scale = min(scale, robust_scale(residual))
             damping = max(0.1 * damping, 1e-12)
         return self._fit(values, response, residual, scale, converged)
 

@@ -24,7 +24,7 @@ from hmsa_ros.identification.quantities import (
     values_of,
 )
 from hmsa_ros.identification.recording import as_recording, Recording
-from hmsa_ros.identification.response import complete
+from hmsa_ros.identification.response import complete, respond
 from hmsa_ros.identification.result import Estimate, Identification, Verdict
 from hmsa_ros.identification.start import scan, segments, starts
 
@@ -123,7 +123,8 @@ def _good(recording: Recording, found: Fit) -> bool:
     return bool(
         found.converged
         and found.scale < _NEAR_WHITE * robust_scale(differences) / math.sqrt(2.0)
-        and np.count_nonzero(out[1:] & out[:-1]) <= _ADJACENT * len(out))
+        and np.count_nonzero(out[1:] & out[:-1]) <= _ADJACENT * len(out)
+        and not diagnosis.mistaken(recording, found))
 
 
 def _search(
@@ -142,10 +143,11 @@ def _search(
         return False
 
     given = starts(recording, values, free)
+    nearest = _nearest(recording, given, at_rest)
     # The likeliest first; then all time units, and what else was seen in the data.
-    if not tried(given[:1]) and not tried(
+    if not tried([nearest]) and not tried(
             scan(recording, values, free, at_rest=at_rest)):
-        tried(given[1:])
+        tried([x for x in given if x is not nearest])
     if not found:
         raise BadInputError(
             f'no start value leads to a motion that {recording.label} could be compared with: '
@@ -158,6 +160,18 @@ def _search(
     if not best.converged:
         best = fit(recording, best.values, free, at_rest=at_rest) or best
     return best, len(found), agreed
+
+
+def _nearest(
+        recording: Recording, given: Sequence[dict[str, float]], at_rest: bool
+) -> dict[str, float]:
+    """Return the first of the start values unless the last, those given, are nearer."""
+    misses = []
+    for candidate in (given[0], given[-1]):
+        response = respond(recording, candidate, (), at_rest=at_rest, rtol=1e-4)
+        misses.append(math.inf if response is None else float(
+            np.mean(np.abs(recording.stretch - response.stretch))))
+    return given[-1] if misses[1] < misses[0] else given[0]
 
 
 def _conclude(
