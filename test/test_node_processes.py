@@ -38,6 +38,9 @@ BAD = {
     'beyond_the_limits': (
         ['--ros-args', '-p', 'initial_stretch:=5.0'],
         'initial stretch is 5: expected a stretch between the limits 0.2520 and 2.6940'),
+    'mistyped_name': (
+        ['--ros-args', '-p', 'actuator.remanance:=0.1'],
+        'parameter actuator.remanance does not exist: expected one of the '),
     'unknown_argument': (['--speed', '3'], '--speed'),
     'unknown_ros_argument': (['--ros-args', '--speed'], "'--ros-args --speed'"),
     'malformed_remapping': (['--ros-args', '-r', 'nonsense'], "'-r nonsense'"),

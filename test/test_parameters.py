@@ -18,7 +18,13 @@ import yaml
 from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.errors import BadInputError
 import hmsa_ros.nodes
-from hmsa_ros.nodes.parameters import ACTUATOR, actuator_from, declare, ParameterSpec
+from hmsa_ros.nodes.parameters import (
+    ACTUATOR,
+    actuator_from,
+    check_names,
+    declare,
+    ParameterSpec,
+)
 from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.plant import PlantNode
 
@@ -223,6 +229,24 @@ def test_bad_value_is_refused_with_what_was_got_and_expected(make_ros, given, me
 def test_list_of_strings_can_be_empty_or_one(make_ros, given, expected):
     side = make_ros(cli_args=['--ros-args', *given])
     assert declare(side.node, [ParameterSpec('names', [], 'Names.')]) == {'names': expected}
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(('name', 'suggested'), [
+    ('lenght', 'length'), ('left.actuator.remanance', 'left.actuator.remanence'),
+    ('third.actuator.density', None), ('shaper', ''), ('play.rate', ''), ('left.shaper', ''),
+    ('qos_overrides.x', '')])
+def test_unknown_name_is_refused_unless_another_node_has_it(make_ros, name, suggested):
+    node = make_ros(cli_args=[
+        '--ros-args', '-p', f'{name}:=1.0', '-p', 'joints:=[left, right]']).node
+    declare(node, [
+        ParameterSpec('length', 1.0, 'Length.'), ParameterSpec('joints', [], 'Joints.'),
+        ParameterSpec('left.actuator.remanence', 1.0, 'Remanence.')])
+    if suggested == '':
+        check_names(node)
+        return
+    with pytest.raises(BadInputError, match=f'{name} does not exist.* {suggested or ""}'):
+        check_names(node)
 
 
 @pytest.mark.parametrize(('minimum', 'maximum', 'text'), [

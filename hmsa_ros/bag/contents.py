@@ -1,5 +1,6 @@
 """What a bag being written holds: its topics, counts, files and custom data."""
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
@@ -77,7 +78,7 @@ class Contents:
         self.dropped: dict[str, int] = {}
         self.ended = False
         self._ros_distro = ros_distro
-        self._counts: dict[int, int] = {}
+        self._counts: Counter[int] = Counter()
         self.note(custom_data)
 
     def note(self, values: Mapping[str, str]) -> None:
@@ -106,13 +107,12 @@ class Contents:
 
     def counts(self) -> dict[str, int]:
         """Return the number of messages written, by topic."""
-        return {topic.name: self._counts.get(number, 0)
+        return {topic.name: self._counts[number]
                 for number, topic in enumerate(self.topics)}
 
     def count(self, numbers: Iterable[int]) -> None:
         """Count messages written, each by its topic's number."""
-        for number in numbers:
-            self._counts[number] = self._counts.get(number, 0) + 1
+        self._counts.update(numbers)
 
     def lose(self, numbers: Iterable[int]) -> None:
         """Count messages that could not be written."""

@@ -1,31 +1,25 @@
 """
-One MCAP file being written: the mcap package's writer over a stream of ours.
+One MCAP file being written.
 
-The stream adds what the package lacks: a chunk is in the file whole or not at all, and room for
-the chunk and for the summary is taken on the disk before the writer is given a message, so that
-a full disk leaves a file that can still be closed.
+A chunk is in the file whole or not at all, and room for the chunk and for the summary is taken
+on the disk before, so that a full disk leaves a file that can still be closed.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-import errno
 import os
 from pathlib import Path
-import sys
-from typing import cast, IO
-
-from mcap.writer import CompressionType, Writer
 
 from hmsa_ros import __version__
 from hmsa_ros.bag import metadata, qos
+from hmsa_ros.bag.framing import Entries, Framing, MESSAGE_HEAD, Stream
 
 LIBRARY = f'hmsa_ros {__version__}'
 #: Name of the metadata record with the experiment.
 EXPERIMENT = 'hmsa_ros'
 #: Room is taken in steps of so many bytes.
 RESERVE_STEP = 256 * 1024
-# Head, index entry and message index entry of a message; of a channel in the indexes of a chunk.
-MESSAGE_HEAD = 31
+# A message with its index entry; a channel in the indexes of a chunk; a chunk.
 _MESSAGE_BYTES = MESSAGE_HEAD + 16
 _CHANNEL_BYTES = 25
 _CHUNK_BYTES = 256
@@ -35,51 +29,19 @@ _CHUNK_BYTES = 256
 class Preset:
     """How chunks are stored: compression, and whether with checksums."""
 
-    compression: CompressionType
+    compression: str = ''
     crc: bool = True
 
 
 # Names as rosbag2 has them, and lz4. With fastwrite rosbag2 leaves out chunks too; here they
-# stay, since the recovery of a cut file goes by them. The mcap package has one level of zstd.
+# stay, since the recovery of a cut file goes by them.
 PRESETS: Mapping[str, Preset] = {
-    'none': Preset(CompressionType.NONE),
-    'fastwrite': Preset(CompressionType.NONE, crc=False),
-    'lz4': Preset(CompressionType.LZ4),
-    'zstd_fast': Preset(CompressionType.ZSTD),
-    'zstd_small': Preset(CompressionType.ZSTD),
+    'none': Preset(),
+    'fastwrite': Preset(crc=False),
+    'lz4': Preset('lz4'),
+    'zstd_fast': Preset('zstd'),
+    'zstd_small': Preset('zstd'),
 }
-
-
-class _Stream:
-    """Keeps what is written until `flush`, which stores all of it or nothing."""
-
-    def __init__(self, descriptor: int) -> None:
-        self.descriptor = descriptor
-        self.stored = 0
-        self.broken = False
-        self._position = 0
-        self._pending: list[bytes] = []
-
-    def write(self, data: bytes) -> int:
-        self._pending.append(data)
-        self._position += len(data)
-        return len(data)
-
-    def tell(self) -> int:
-        return self._position
-
-    def flush(self) -> None:
-        view = memoryview(b''.join(self._pending))
-        try:
-            while view:
-                view = view[os.write(self.descriptor, view):]
-        except OSError:
-            # The writer counts this chunk already: nothing more can be added to the file.
-            self.broken = True
-            os.ftruncate(self.descriptor, self.stored)
-            raise
-        self._pending.clear()
-        self.stored = self._position
 
 
 class OutputFile:
@@ -99,8 +61,6 @@ class OutputFile:
     ----------
     counts : dict of int to int
         Messages stored, by topic.
-    start, end : int
-        Lowest and highest log time stored.
     overhead : int
         Bytes of what is no message: declarations and metadata records.
     noted : dict of str to str
@@ -119,19 +79,25 @@ class OutputFile:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         self.path = path
         self.number = number
-        self.counts: dict[int, int] = {}
-        self.start, self.end = 2**64 - 1, 0
         self.overhead = self.notes_size = 0
         self.noted: dict[str, str] = {}
-        self._stream = _Stream(descriptor)
+        self._stream = Stream(descriptor)
         self._schemas: dict[str, int] = {}
         self._ending = False
         self._end_size = self._notes_room = self._room = 0
-        # Chunks end with `write` alone.
-        self._writer = Writer(
-            cast('IO[bytes]', self._stream), chunk_size=sys.maxsize,
-            compression=preset.compression, enable_crcs=preset.crc, enable_data_crcs=preset.crc)
-        self._writer.start('ros2', LIBRARY)
+        self._framing = Framing(
+            self._stream, LIBRARY, preset.compression, crc=preset.crc)
+        self.counts = self._framing.counts
+
+    @property
+    def start(self) -> int:
+        """Return the lowest log time stored."""
+        return self._framing.start
+
+    @property
+    def end(self) -> int:
+        """Return the highest log time stored."""
+        return self._framing.end
 
     @property
     def size(self) -> int:
@@ -161,24 +127,17 @@ class OutputFile:
         self.reserve(0)
         self.overhead += size
         if kind not in self._schemas:
-            self._schemas[kind] = self._writer.register_schema(kind, encoding, data)
-        self._writer.register_channel(name, 'cdr', self._schemas[kind], values)
+            self._schemas[kind] = self._framing.add_schema(kind, encoding, data)
+        self._framing.add_channel(name, self._schemas[kind], values)
 
-    def write(self, entries: Sequence[tuple[int, int, int, int, bytes]], size: int) -> None:
+    def write(self, entries: Entries, size: int) -> None:
         """Store messages with ``size`` bytes of payload as one chunk."""
         index = _CHUNK_BYTES + _CHANNEL_BYTES * len({entry[0] for entry in entries})
         content = size + _MESSAGE_BYTES * len(entries) + self.overhead
         # What cannot be compressed becomes a little longer.
         self.reserve(content + content // 128 + 2 * index)
         self._end_size += index
-        add = self._writer.add_message
-        for topic, log_time, publish_time, sequence, data in entries:
-            add(topic + 1, log_time, data, publish_time, sequence & 0xFFFFFFFF)
-        self._writer.flush()  # type: ignore[no-untyped-call]
-        for topic, log_time, *_ in entries:
-            self.counts[topic] = self.counts.get(topic, 0) + 1
-            self.start = min(self.start, log_time)
-            self.end = max(self.end, log_time)
+        self._framing.add_chunk(entries)
 
     def describe(self, serialized_metadata: str, notes: Mapping[str, str]) -> None:
         """Store the record that rosbag2 has at both ends of a file, and the experiment."""
@@ -201,8 +160,7 @@ class OutputFile:
                 4 * (len(key) + len(value)) + 8 for key, value in values.items()))
         self._end_size += len(name) + 50
         before = self.size
-        self._writer.add_metadata(name, dict(values))
-        self._stream.flush()
+        self._framing.add_metadata(name, values)
         self.overhead += self.size - before
         return self.size - before
 
@@ -214,15 +172,12 @@ class OutputFile:
         Raises
         ------
         OSError
-            If it cannot be written, or a chunk could not be.
+            If it cannot be written.
 
         """
-        if self._stream.broken:
-            raise OSError(errno.EIO, f'{self.path.name} has been left in the middle of a chunk')
         self._ending = True
         self.describe(serialized_metadata, notes)
-        self._writer.finish()  # type: ignore[no-untyped-call]
-        self._stream.flush()
+        self._framing.finish()
         os.ftruncate(self._stream.descriptor, self.size)
         if fsync:
             self.sync()

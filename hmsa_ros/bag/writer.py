@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 import contextlib
 import errno
 import itertools
+import operator
 import os
 from pathlib import Path
 import re
@@ -19,13 +20,15 @@ from typing import NamedTuple
 from hmsa_ros import __version__
 from hmsa_ros.bag import metadata, qos
 from hmsa_ros.bag.contents import Contents, Topic
-from hmsa_ros.bag.output import MESSAGE_HEAD, OutputFile, PRESETS, RESERVE_STEP
+from hmsa_ros.bag.framing import MESSAGE_HEAD
+from hmsa_ros.bag.output import OutputFile, PRESETS, RESERVE_STEP
 from hmsa_ros.errors import BadInputError
 
 __all__ = ['BagWriter', 'Entry', 'MIN_FILE_SIZE', 'parse_custom_data', 'PRESETS', 'Topic']
 # Metadata records that a file may have in any case.
 _NOTES_SIZE = 2**20
 MIN_FILE_SIZE = 1024
+_TOPIC_OF = operator.itemgetter(0)
 
 
 class Entry(NamedTuple):
@@ -329,7 +332,7 @@ class BagWriter:
         if self._file is None:
             raise OSError('no file is open')
         self._file.write(self._waiting, self._waiting_size)
-        self._contents.count(entry[0] for entry in self._waiting)
+        self._contents.count(map(_TOPIC_OF, self._waiting))
         self._waiting, self._waiting_size = [], 0
 
     def _finish_file(self) -> None:

@@ -7,7 +7,7 @@ compiled it. An entry that cannot be read is compiled anew, and where no folder 
 the kernels are compiled in memory.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 import contextlib
 from functools import cache
 import hashlib
@@ -30,6 +30,7 @@ _SOURCES = (
     'compiling', 'dop853', 'kernels', 'law', 'shooting_kernel', 'two_step_kernel',
     '../identification/kernels')
 _HERE = Path(__file__).resolve().parent
+_listeners: list[Callable[[str], object]] = []
 
 
 def compiled(*, inline: bool = False, parallel: bool = False) -> Callable[..., Any]:
@@ -59,6 +60,24 @@ def compiled(*, inline: bool = False, parallel: bool = False) -> Callable[..., A
         return dispatcher
 
     return decorate
+
+
+@contextlib.contextmanager
+def announced(say: Callable[[str], object]) -> Iterator[None]:
+    """
+    Call a function with a sentence once, before the first kernel is compiled in this block.
+
+    Parameters
+    ----------
+    say : callable
+        For example the method of a logger.
+
+    """
+    _listeners.append(say)
+    try:
+        yield
+    finally:
+        _listeners.clear()
 
 
 @cache
@@ -170,10 +189,12 @@ class _Cache(caching.FunctionCache):
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the cached function, or None where it must be compiled."""
-        try:
-            return super().load_overload(sig, target_context)
-        except Exception:  # a damaged pickle may raise anything
-            return None
+        found = None
+        with contextlib.suppress(Exception):  # a damaged pickle may raise anything
+            found = super().load_overload(sig, target_context)
+        while found is None and _listeners:
+            _listeners.pop()('compiling the numerical kernels (once, some seconds) ...')
+        return found
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep a compiled function where the disk takes it."""

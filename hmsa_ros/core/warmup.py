@@ -6,12 +6,15 @@ loads for some tenths of one. Set-up commands run this module, and a planner cal
 before it takes requests.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 import sys
 from time import perf_counter
 
 import numpy as np
 
+from hmsa_ros.core.compiling import announced
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.simulation import ActuatorSimulation
@@ -28,12 +31,14 @@ _DELIVERIES = (
 )
 
 
-def warm_up(*, batch: bool = False) -> float:
+def warm_up(say: Callable[[str], object] = lambda _: None, *, batch: bool = False) -> float:
     """
     Run every kernel once.
 
     Parameters
     ----------
+    say : callable
+        Gets a sentence before the first kernel is compiled, if one must be.
     batch : bool
         Also the parallel one, which no node uses.
 
@@ -49,6 +54,12 @@ def warm_up(*, batch: bool = False) -> float:
 
     """
     begin = perf_counter()
+    with announced(say):
+        _run(batch=batch)
+    return perf_counter() - begin
+
+
+def _run(*, batch: bool) -> None:
     for options in _DELIVERIES:
         # Compiling takes seconds: a process that is to end does so in between.
         ENDING.check()
@@ -64,7 +75,6 @@ def warm_up(*, batch: bool = False) -> float:
         last.sample((last.stamp, last.stamp + _MILLISECOND))
     if batch:
         plan_two_step_batch(1.0, np.array([1.1, 1.2]))
-    return perf_counter() - begin
 
 
 def main() -> int:
@@ -77,8 +87,8 @@ def main() -> int:
         Exit status 0.
 
     """
-    print('compiling the numerical kernels (once, some seconds) ...', flush=True)
-    print(f'done in {warm_up(batch=True):.1f} s')
+    say = partial(print, flush=True)
+    print(f'loaded the numerical kernels in {warm_up(say, batch=True):.1f} s')
     return 0
 
 

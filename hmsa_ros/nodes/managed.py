@@ -13,7 +13,7 @@ from rosgraph_msgs.msg import Clock
 
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.nodes.parameter_service import CarefulParameterService
-from hmsa_ros.nodes.parameters import declare, ParameterSpec
+from hmsa_ros.nodes.parameters import check_names, declare, ParameterSpec
 
 AUTOSTART = ParameterSpec(
     'autostart', True,
@@ -109,7 +109,7 @@ class ManagedNode(LifecycleNode):
 
     def autostart(self) -> None:
         """
-        Configure and activate, if the parameter says so.
+        Refuse unknown parameters; configure and activate, if the parameter says so.
 
         Raises
         ------
@@ -117,6 +117,7 @@ class ManagedNode(LifecycleNode):
             If the node refuses; it refuses the start then.
 
         """
+        check_names(self)
         if not self._autostart:
             return
         for transition in (self.trigger_configure, self.trigger_activate):

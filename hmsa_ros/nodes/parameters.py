@@ -5,6 +5,8 @@ The files under ``config/`` are held against them by a test.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+import difflib
+from importlib import import_module
 import math
 from typing import Any
 
@@ -12,13 +14,14 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 
+from hmsa_ros.contract import topics
 from hmsa_ros.contract.actuator import actuator_from
 from hmsa_ros.contract.parameters import ACTUATOR, INITIAL_STRETCH, JOINT, ParameterSpec
 from hmsa_ros.errors import BadInputError, excerpt
 
 __all__ = [
-    'ACTUATOR', 'actuator_from', 'declare', 'descriptor', 'INITIAL_STRETCH', 'JOINT',
-    'ParameterSpec', 'refusal']
+    'ACTUATOR', 'actuator_from', 'check_names', 'declare', 'descriptor', 'INITIAL_STRETCH',
+    'JOINT', 'ParameterSpec', 'refusal']
 
 
 def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
@@ -92,6 +95,41 @@ def declare(node: Node, specs: Iterable[ParameterSpec]) -> Mapping[str, Any]:
         spec.check(value)
         values[spec.name] = value
     return values
+
+
+def check_names(node: Node) -> None:
+    """
+    Refuse start values of parameters that there are not, as a mistyped name gives them.
+
+    Files may have sections for several nodes, so that names of other nodes of the package pass.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        With all its parameters declared.
+
+    Raises
+    ------
+    BadInputError
+        If a name is unknown; the nearest one is suggested.
+
+    """
+    unknown = [x for x in node._parameter_overrides
+               if not node.has_parameter(x) and not x.startswith('qos_overrides.')]
+    if not unknown:
+        return
+    others = {spec.name for name in topics.NODES
+              for spec in import_module(f'hmsa_ros.nodes.{name}').PARAMETERS}
+    joints = node.get_parameter('joints').value or () if node.has_parameter('joints') else None
+    for name in unknown:
+        joint, _, rest = name.partition('.')
+        # A recorder has no parameter that would say which joints there are.
+        if name in others or rest in others and (joints is None or joint in joints):
+            continue
+        near = difflib.get_close_matches(name, [*node._parameters, *others], 1, 0.0)
+        raise BadInputError(
+            f'parameter {name} does not exist: expected one of the {node.get_name()}, such as '
+            f'{near[0]}')
 
 
 def refusal(node: Node, spec: ParameterSpec) -> BadInputError:

@@ -61,7 +61,7 @@ class PlannerNode(ManagedNode):
         self._channels: dict[str, JointChannel] = {}
         self._samples: Subscription | None = None
         self._several_clocks = False
-        seconds = warm_up()
+        seconds = warm_up(self.get_logger().info)
         if seconds > 1.0:
             self.get_logger().info(f'loaded the numerical kernels in {seconds:.1f} s')
         self.add_on_set_parameters_callback(self._on_parameters)

@@ -119,7 +119,7 @@ class PlantNode(ManagedNode):
         start = round(values['start_time'] * NANOSECONDS) if self._authority else 0
         factor = values['real_time_factor'] if self._authority else 1.0
         self._device = self._make_device(start)
-        warm_up()
+        warm_up(self.get_logger().info)
         self._pacer = Pacer(start, factor, paused=values['start_paused'])
         self._clock_published = 0
         self._measured = (start, monotonic_ns())
