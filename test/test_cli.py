@@ -127,7 +127,7 @@ def test_send_moves_several_joints_each_to_its_stretch_or_all_to_one(start, ros)
         names = 'left,right' if count.count(',') == 2 else 'left'
         send = start.hmsa('send', count, '--joint', names)
         assert send.wait(30.0) == 2
-        assert 'expected one for all, or one a joint' in send.stderr
+        assert 'expected one for all, or one per joint' in send.stderr
 
 
 @pytest.mark.ros

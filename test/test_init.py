@@ -219,8 +219,8 @@ def test_without_a_terminal_it_says_what_is_missing(tmp_path):
         cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert done.stderr == (
-        'hmsa: error: standard input is no terminal to ask on, and --flux-max is not given: '
-        'give them, or add --yes for the defaults\n')
+        'hmsa: error: standard input is not a terminal, and --flux-max is not given: give them, '
+        'or add --yes for the defaults\n')
     assert not (tmp_path / 'x.yaml').exists()
 
 
@@ -228,20 +228,20 @@ def test_without_a_terminal_it_says_what_is_missing(tmp_path):
 
 @pytest.mark.parametrize(('words', 'said'), [
     (['--shear-modulus', '79 GPa'], 'metals have'),
-    (['--shear-modulus', '30'], 'meant in kPa'),
+    (['--shear-modulus', '30'], 'did you mean kPa'),
     (['--density', '1.2'], 'that is air'),
-    (['--density', '1.9'], 'meant in g/cm^3'),
+    (['--density', '1.9'], 'did you mean g/cm^3'),
     (['--remanence', '1.6'], 'N55'),
-    (['--remanence', '80'], 'meant in mT'),
-    (['--half-thickness', '5'], 'half thickness 5 m is not usual (was it meant in mm?)'),
-    (['--half-length', '5'], 'half length 5 m is not usual (was it meant in mm?)'),
+    (['--remanence', '80'], 'did you mean mT'),
+    (['--half-thickness', '5'], 'half thickness 5 m is unusual (did you mean mm?)'),
+    (['--half-length', '5'], 'half length 5 m is unusual (did you mean mm?)'),
     (['--half-thickness', '0.1mm'], 'thin film'),
-    (['--flux-max', '50'], 'flux max 50 T is not usual (was it meant in mT?)'),
-    (['--flux-min', '0.01'], 'flux min 0.01 T is not usual'),
+    (['--flux-max', '50'], 'flux max 50 T is unusual (did you mean mT?)'),
+    (['--flux-min', '0.01'], 'flux min 0.01 T is unusual'),
     (['--zeta', '3'], 'zeta 3 is above the critical 2.44949'),
     (['--damping', '20'], 'zeta 5.73539'),
     (['--j-lim', '1000'], 'Gent'),
-    (['--flux-max', '1mT'], 'a stretch of 1.1 or 0.9 takes some'),
+    (['--flux-max', '1mT'], 'a stretch of 1.1 or 0.9 needs about'),
 ])
 def test_what_is_implausible_is_warned_of_with_the_usual_range(run, tmp_path, words, said):
     status, out, err = run('--yes', '--json', *words)
@@ -321,14 +321,14 @@ def test_what_is_given_is_not_asked_for(tmp_path):
         "coil's largest flux density",
         "coil's least flux density, negative in the other direction",
         "rate of the amplifier's ramps, 0 for steps",
-        'name of the joint, or several with commas between']
+        'joint name, or several separated by commas']
     assert parameters(tmp_path / 'actuator.yaml')['flux_density_max'] == 0.1
 
 
 def test_answers_that_end_early_write_nothing(tmp_path):
     status, _, err = ask(tmp_path, '5 mm\n\x04')
     assert status == 2
-    assert 'the answers ended before the last question' in err
+    assert 'the input ended before the last question' in err
     assert list(tmp_path.iterdir()) == []
 
 

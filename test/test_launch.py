@@ -14,8 +14,8 @@ import sys
 import pytest
 
 from hmsa_ros.bag.reader import BagReader
-from hmsa_ros.bag.verify import verify
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.runs.verify import verify
 from hmsa_ros.session.launching import DEMO, failure, REPLAY
 
 ROOT = Path(__file__).resolve().parent.parent

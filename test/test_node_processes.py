@@ -123,7 +123,7 @@ def test_signal_ends_planner_and_plant_at_work_with_status_0_and_no_word(ros, st
         # A busy machine may make a command late, which is said as a warning, or have to
         # compile first; of the end there is no word.
         assert all(
-            re.match(r'\[WARN].* (lead_time|late|planned anew)|\[INFO].* kernels', x)
+            re.match(r'\[WARN].* (lead_time|late|replanned)|\[INFO].* kernels', x)
             for x in process.stderr.splitlines()), process.stderr
 
 

@@ -31,7 +31,7 @@ from hmsa_ros.nodes.plant import PlantNode
 CONFIG = Path(__file__).resolve().parent.parent / 'config'
 DECLARED: dict[str, tuple[ParameterSpec, ...]] = {
     module.name: declared for module in pkgutil.iter_modules(hmsa_ros.nodes.__path__)
-    if (declared := getattr(
+    if not module.name.endswith('_parameters') and (declared := getattr(
         import_module(f'hmsa_ros.nodes.{module.name}'), 'PARAMETERS', None))}
 # Numbers that are a ratio or a count.
 DIMENSIONLESS = {

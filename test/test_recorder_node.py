@@ -210,7 +210,7 @@ def test_a_full_disk_is_told_and_nothing_is_lost_when_there_is_room_again(
     assert so_far == list(range(len(so_far)))
     assert len(so_far) > 1000
     (small_disk / 'filler').unlink()
-    recorder.process.wait_for_output('recording goes on in bag_1.mcap')
+    recorder.process.wait_for_output('recording continues in bag_1.mcap')
     publisher.publish(Float64(data=float(sent)))
     recorder.wait_for('written', str(sent + 1))
     reader = recorder.end()

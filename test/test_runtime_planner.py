@@ -499,7 +499,7 @@ def test_foreign_level_is_noted_and_planned_for():
     rig.run(START + 150 * MS)
     rig.plant.command(rig.now + MS, 0.0)
     rig.run(START + 300 * MS)
-    assert any('0 T took effect, which was not commanded' in x for x in rig.notes())
+    assert any('0 T took effect but was not commanded' in x for x in rig.notes())
     assert rig.residual(1.2) < 0.2 * RESIDUAL
 
 

@@ -331,7 +331,7 @@ def test_garbage_on_its_topics_neither_ends_nor_misleads_it(ros, ros_env, wait_u
                 assert text.isprintable()
             json.dumps(as_json(seen), allow_nan=False)
             return {name for name in ('joint_states', 'diagnostics', 'status', 'plan', 'command')
-                    if any(f'{name} left aside' in x for x in seen.waiting)}
+                    if any(f'{name} ignored' in x for x in seen.waiting)}
 
         names = wait_until(lambda: len(found := aside()) == 5 and found)
         assert len(names) == 5

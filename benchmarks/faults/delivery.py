@@ -17,7 +17,7 @@ from benchmarks.faults.table import Seen
 
 FAULTS = Register()
 _SLOW = 0.05
-# Until when what was planned anew has been carried out.
+# Until when what was replanned has been carried out.
 _AFTER_NS = round((LEAD + 0.03) * 1e9)
 
 

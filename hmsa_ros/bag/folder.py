@@ -75,12 +75,12 @@ class Folder:
                 if other:
                     self._problems.add(
                         f'{path} also holds {", ".join(other)}, which {metadata.FILE_NAME} does '
-                        'not name: passed over')
+                        'not name: skipped')
                 missing = [entry.name for entry in own if entry not in listed]
                 if missing:
                     self._problems.add(
-                        f'{metadata.FILE_NAME} does not name {", ".join(missing)}, which belongs '
-                        'to the bag: read all the same')
+                        f'{metadata.FILE_NAME} does not name {", ".join(missing)}, which '
+                        'belongs to the bag: read anyway')
                 return own
             return listed
         if not present:
@@ -103,8 +103,8 @@ class Folder:
             return False
         if entry.resolve().parent != self._path.resolve():
             self._problems.add(
-                f'{entry} is a link to {entry.resolve()}, out of the folder of the bag: passed '
-                'over; name that file to read it')
+                f'{entry} is a link to {entry.resolve()}, out of the folder of the bag: '
+                'skipped; name that file to read it')
             return False
         return True
 

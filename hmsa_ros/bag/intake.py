@@ -29,7 +29,7 @@ class Problems:
         self._known.add(sentence)
         self.sentences.append(
             printable(sentence) if len(self._known) <= limits.PROBLEMS
-            else 'there are more problems, which are not told')
+            else 'further problems are not listed')
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class Intake:
         try:
             self.check_size(max(block.size, block.length), 'chunk')
         except BagError as error:
-            self.problem(file, f': {error}, at byte {offset}: passed over')
+            self.problem(file, f': {error}, at byte {offset}: skipped')
         else:
             file.blocks.append(block)
 
@@ -188,7 +188,7 @@ class Intake:
             return False
         if len(known) >= limits.CHANNELS:
             self.problem(file, f' declares more than {limits.CHANNELS} of {what}: the rest is '
-                               'passed over')
+                               'skipped')
             return False
         return True
 

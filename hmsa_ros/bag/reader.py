@@ -10,7 +10,7 @@ in order of log time over all files of the bag, messages of equal stamp in the o
 written. ``message`` has the fields of the message type as attributes
 (``message.header.stamp.sec``). For raw payloads use `BagReader`.
 
-What cannot be read is passed over and said in `BagReader.problems`, one sentence each: a file
+What cannot be read is skipped and reported in `BagReader.problems`, one sentence each: a file
 that was cut off gives everything up to the cut, a damaged chunk costs that chunk.
 
 A bag may come from anybody: what it says of sizes is held against `hmsa_ros.bag.limits` before
@@ -197,7 +197,7 @@ class BagReader:
                 # Every chunk so far reaches beyond the start of this one.
                 self._intake.problem(
                     self._files[block.file], f': more than {most} bytes of chunks overlap in '
-                    f'time, at byte {block.offset}: passed over')
+                    f'time, at byte {block.offset}: skipped')
             else:
                 cursor = self._cursor(
                     block, wanted, 0 if start is None else start, _NEVER if end is None else end)
@@ -270,20 +270,20 @@ class BagReader:
             with file.path.open('rb') as stream:
                 content = block.content(stream.fileno())
         except (BagError, OSError) as error:
-            self._intake.problem(file, f': {error}, at byte {block.offset}: passed over')
+            self._intake.problem(file, f': {error}, at byte {block.offset}: skipped')
             return None
         cursor = Cursor((block.file, block.offset), content, topic_of, start, end)
         if cursor.problem:
             self._intake.problem(
-                file, f': {cursor.problem}, at byte {block.offset}: passed over')
+                file, f': {cursor.problem}, at byte {block.offset}: skipped')
         return cursor
 
     def _topic_of(self, file: ScannedFile, number: int) -> str | None:
-        """Return the topic of a channel, None if its messages are passed over."""
+        """Return the topic of a channel, None if its messages are skipped."""
         channel = file.channels.get(number)
         if channel is None:
             self._intake.problem(
-                file, f': channel {number} is nowhere declared: its messages are passed over')
+                file, f': channel {number} is not declared: its messages are skipped')
             return None
         known = self.topics.get(channel.topic)
         schema = file.schemas.get(channel.schema_id)

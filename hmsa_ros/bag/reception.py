@@ -119,8 +119,8 @@ def judge(
     if status.behind > max(_BEHIND_SECONDS, _BEHIND_PERIODS * flush_period):
         reasons.append(f'writing is {status.behind:.1f} s behind')
     if status.crowded:
-        reasons.append('files would follow each other more often than once a second: they '
-                       'become longer than asked for')
+        reasons.append('the limits ask for more than one file per second: files become longer '
+                       'than configured')
     text = ', '.join([state, *reasons])
     if clock_ignored or clocks > 1:
         return WARN, f'{text}; {clocks} publishers of /clock, the first one is followed'

@@ -331,8 +331,8 @@ class Recording:
         """Take note that writing is not possible."""
         self._error = f'cannot write to {self._writer.folder}: {_reason(error)}'
         self._report(
-            f'{self._error}; recording goes on in a new file when it is possible again, up to '
-            f'{self._limits.cache_size} bytes are kept until then', True)
+            f'{self._error}; recording resumes in a new file when possible, up to '
+            f'{self._limits.cache_size} bytes are buffered until then', True)
         self._writer.abandon()
         self._next_retry = time.monotonic() + RETRY_SECONDS
 
@@ -349,7 +349,7 @@ class Recording:
             self._writer.abandon()
             return
         self._error = ''
-        self._report(f'recording goes on in {name}', False)
+        self._report(f'recording continues in {name}', False)
 
     def _give_up(self) -> None:
         """Count what is left in the queue as lost, and answer who waits."""

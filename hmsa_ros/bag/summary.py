@@ -125,7 +125,7 @@ def _find_metadata(
             raise BagError('a metadata record is not called as the index says')
         intake.take(file, record)
     except (BagError, OverflowError) as error:
-        intake.problem(file, f': {error}, at byte {index.offset}: passed over')
+        intake.problem(file, f': {error}, at byte {index.offset}: skipped')
 
 
 def _check(statistics: Statistics, chunks: list[ChunkIndex], declared: int) -> None:

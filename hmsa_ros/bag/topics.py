@@ -45,7 +45,7 @@ class Topics:
         known = self.by_name.get(channel.topic)
         if known is None and len(self.by_name) >= limits.TOPICS:
             self._problems.add(f'the bag has more than {limits.TOPICS} topics: the rest is '
-                               'passed over')
+                               'skipped')
             return
         schema = file.schemas.get(channel.schema_id)
         described = self._described.get(channel.topic)
@@ -57,8 +57,8 @@ class Topics:
                 id=0, name=described.type if described is not None else '', encoding='', data=b'')
         if known is not None and known.type != schema.name:
             self._problems.add(
-                f'topic {channel.topic} has the types {known.type} and {schema.name}: '
-                f'the messages of type {schema.name} are passed over')
+                f'topic {channel.topic} has the types {known.type} and {schema.name}: the '
+                f'messages of type {schema.name} are skipped')
             return
         profiles = self._profiles(
             file, channel.topic, channel.metadata.get('offered_qos_profiles', ''))

@@ -42,7 +42,7 @@ def walk(intake: Intake, descriptor: int, file: ScannedFile) -> None:
         try:
             if len(file.blocks) > limits.CHUNKS:
                 intake.problem(file, f' has more than {limits.CHUNKS} chunks: the rest is '
-                                   'passed over')
+                                   'skipped')
                 break
             if opcode == Opcode.MESSAGE:
                 if length < records.MESSAGE_FIXED:
@@ -66,7 +66,7 @@ def walk(intake: Intake, descriptor: int, file: ScannedFile) -> None:
                     descriptor, len(MAGIC), end) == MAGIC
         except BagError as error:
             end_run()
-            intake.problem(file, f': {error}, at byte {offset}: passed over')
+            intake.problem(file, f': {error}, at byte {offset}: skipped')
         offset = end
     end_run()
     if not ended:
@@ -115,7 +115,7 @@ def _count(intake: Intake, descriptor: int, file: ScannedFile) -> None:
                 times[:] = (min(times[0], time), max(times[1], time)) if times else (
                     time, time)
         except BagError as error:
-            intake.problem(file, f': {error}, at byte {block.offset}: passed over')
+            intake.problem(file, f': {error}, at byte {block.offset}: skipped')
         if times and (block.start, block.end) != tuple(times):
             intake.problem(file, f': a chunk has other times than it says, at byte '
                                f'{block.offset}')
@@ -137,4 +137,4 @@ def _messages(intake: Intake, file: ScannedFile, content: bytes) -> Iterator[tup
                     raise BagError(f'a chunk holds a record of the kind {opcode:#x}')
                 intake.take(file, record)
             except BagError as error:
-                intake.problem(file, f': {error}: passed over')
+                intake.problem(file, f': {error}: skipped')

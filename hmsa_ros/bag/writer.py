@@ -385,7 +385,7 @@ def parse_custom_data(pairs: Iterable[str]) -> dict[str, str]:
     Parameters
     ----------
     pairs : iterable of str
-        For example ``('actuator=A3', 'operator=Kim')``; empty strings are passed over.
+        For example ``('actuator=A3', 'operator=Kim')``; empty strings are skipped.
 
     Returns
     -------

@@ -66,8 +66,8 @@ def build_parser() -> Parser:
     """
     parser = Parser(
         prog='hmsa',
-        description='Move hard-magnetic soft actuators to where they are told, fast and '
-                    'without residual vibration.',
+        description='Move hard-magnetic soft actuators to a target stretch, fast and without '
+                    'residual vibration.',
         epilog='example: hmsa demo')
     parser.add_argument('--version', action='version', version=f'hmsa_ros {__version__}')
     subparsers = parser.add_subparsers(metavar='COMMAND', required=True)
@@ -120,7 +120,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         # What could not be written is tried again at the end of Python otherwise.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return complain(HmsaError(
-            f'standard output cannot be written ({error.strerror}): expected room on it'), 1)
+            f'cannot write to standard output ({error.strerror}): expected free space'), 1)
 
 
 def split_ros_args(words: list[str]) -> list[str]:

@@ -25,20 +25,20 @@ def add_parser(subparsers: Any) -> None:
 
     """
     parser = subparsers.add_parser(
-        'bag', help='look into recordings and recover them',
-        description='Look into recordings (MCAP bags as rosbag2 writes them) and recover them.',
+        'bag', help='inspect, verify and recover bags',
+        description='Inspect, verify and recover recordings (MCAP bags as rosbag2 writes them).',
         epilog='example: hmsa bag info hmsa_demo/run')
     actions = parser.add_subparsers(metavar='ACTION', required=True)
     info = actions.add_parser(
-        'info', help='print what is in a bag',
+        'info', help='print the contents of a bag',
         description='Print topics, counts, rates, losses, duration and parameters of a bag.',
         epilog='example: hmsa bag info hmsa_demo/run --json')
     info.add_argument('bag', metavar='BAG', help='folder of a bag, or an .mcap file')
     info.add_argument('--json', action='store_true', help='print one JSON object')
     info.set_defaults(run=run, action=_info)
     recover = actions.add_parser(
-        'recover', help='make a readable bag out of a cut-off one',
-        description='Write everything that can be read of a bag to a new one.',
+        'recover', help='rescue a readable bag from a truncated one',
+        description='Copy everything readable in a bag to a new bag.',
         epilog='example: hmsa bag recover cut_off_run --out saved_run')
     recover.add_argument('bag', metavar='BAG', help='folder of a bag, or an .mcap file')
     recover.add_argument(
@@ -52,17 +52,16 @@ def add_parser(subparsers: Any) -> None:
     verify.add_argument('bag', metavar='BAG', help='folder of a bag, or an .mcap file')
     verify.add_argument(
         '--tolerance', type=float, default=1e-9, metavar='D',
-        help='largest difference of the stretch that passes (default %(default)g)')
+        help='largest difference in stretch that passes (default %(default)g)')
     verify.add_argument(
         '--params-file', type=Path, metavar='YAML',
-        help='parameter file (YAML) of the actuator, where the bag does not contain its '
-             'parameters')
+        help='parameter file (YAML) of the actuator, for a bag without its parameters')
     verify.add_argument('--json', action='store_true', help='print one JSON object')
     verify.set_defaults(run=run, action=_verify)
     for action in (info, recover, verify):
         action.add_argument(
             '--max-chunk', type=float, default=CHUNK_SIZE / MEBIBYTE, metavar='MIB',
-            help='largest chunk or message that is read, in MiB (default %(default)g)')
+            help='largest chunk or message to read, in MiB (default %(default)g)')
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -13,7 +13,7 @@ from typing import Any
 #: What follows ``--ros-args``.
 ROS_ARGUMENTS = {
     '-p': 'set a parameter, NAME:=VALUE', '-r': 'remap a name, FROM:=TO',
-    '--params-file': 'file with parameters', '--log-level': 'least severity that is logged',
+    '--params-file': 'file with parameters', '--log-level': 'lowest severity to log',
     '--enclave': 'security enclave', '--disable-rosout-logs': 'do not publish the log'}
 _ROS_FILES = ('--params-file',)
 # Values of options that are checked later than by the parser.
@@ -85,8 +85,8 @@ def add_parser(subparsers: Any) -> None:
 
     """
     parser = subparsers.add_parser(
-        'completion', help='print a script by which the shell completes hmsa',
-        description='Print a script by which the shell completes commands, options and files. '
+        'completion', help='print a shell completion script',
+        description='Print a script that lets the shell complete commands, options and files. '
                     'In ~/.bashrc or ~/.zshrc: eval "$(hmsa completion bash)", or zsh. For '
                     'fish: hmsa completion fish > ~/.config/fish/completions/hmsa.fish',
         epilog='example: hmsa completion bash')

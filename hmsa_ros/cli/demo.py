@@ -25,13 +25,13 @@ def add_parser(subparsers: Any) -> None:
 
     """
     parser = subparsers.add_parser(
-        'demo', help="run the paper's sequence as real ROS 2 processes",
-        description="Start planner, plant and recorder, send the paper's sequence, and show "
-                    'what was left of the vibration. Writes a bag, a picture and the logs.',
+        'demo', help="run the paper's sequence on real ROS 2 processes",
+        description="Start planner, plant and recorder, send the paper's sequence, and print "
+                    'the residual vibration. Writes a bag, a picture and the logs.',
         epilog='example: hmsa demo --out my_first_run')
     parser.add_argument(
         '--out', type=Path, metavar='DIR',
-        help='folder for the output (default hmsa_demo/ and the time of day)')
+        help='output folder (default hmsa_demo/ plus date and time)')
     parser.add_argument('--json', action='store_true', help='print the result as JSON')
     parser.set_defaults(run=run)
 

@@ -24,34 +24,36 @@ def add_parser(subparsers: Any) -> None:
     """
     parser = subparsers.add_parser(
         'excite', help='design the sequence to record for hmsa identify',
-        description='Design the sequence of levels whose recording tells most about the '
-                    'actuator, inside the limits of coil and stretch, ending at rest; and show '
-                    'what plain steps and the sequence of the paper tell in the same time.',
+        description='Design the sequence of levels that identifies the actuator best. It stays '
+                    'within the limits of coil and stretch and ends at rest. The table compares '
+                    "it with plain steps and with the paper's sequence, repeated for the same "
+                    'time.',
         epilog='example: hmsa excite --params-file actuator.yaml --duration 2 --out levels.csv')
     parser.add_argument(
         '--params-file', type=Path, metavar='YAML', dest='params_file',
-        help='parameter file with the block as far as it is known, flux_density_min, '
-             'flux_density_max and slew_limit (default: those of the nodes)')
+        help='parameter file with what is known of the block, flux_density_min, '
+             'flux_density_max and slew_limit (default: the defaults of the nodes)')
     parser.add_argument(
         '--duration', type=float, metavar='S',
         help='duration in s (default 180 periods of the block)')
     parser.add_argument(
-        '--free', default='', metavar='NAME,...', help='parameters to find, as in hmsa identify')
+        '--free', default='', metavar='NAME,...', help='parameters to identify, as in hmsa '
+                                                       'identify')
     parser.add_argument(
         '--stretch-min', type=float, default=0.6, metavar='X', dest='stretch_min',
-        help='least stretch of the motion (default 0.6)')
+        help='smallest stretch allowed (default 0.6)')
     parser.add_argument(
         '--stretch-max', type=float, default=2.0, metavar='X', dest='stretch_max',
-        help='largest stretch of the motion (default 2)')
+        help='largest stretch allowed (default 2)')
     parser.add_argument(
         '--rate', type=float, default=1000.0, metavar='HZ',
-        help='samples per second of the sensor (default 1000)')
+        help='sample rate of the sensor in Hz (default 1000)')
     parser.add_argument(
         '--noise', type=float, default=1e-3, metavar='X',
-        help='standard deviation of a sample of stretch (default 0.001)')
+        help='standard deviation of the stretch samples (default 0.001)')
     parser.add_argument(
         '--out', type=Path, metavar='CSV',
-        help='file of time, flux_density to write; one of that name is replaced')
+        help='CSV to write, with the columns time and flux_density; an existing file is replaced')
     parser.add_argument('--json', action='store_true', help='print one JSON object')
     parser.set_defaults(run=run)
 

@@ -22,15 +22,15 @@ def add_parser(subparsers: Any) -> None:
         'export', help='write the samples and levels of a run as CSV or Parquet',
         description='Write the samples of a run (time in s from the first sample, stretch, '
                     'stretch rate in 1/s, flux density in T) to FILE, and the levels that drove '
-                    'it (time, flux density) beside it, to a file whose name ends in _levels.',
+                    'it (time, flux density) to a second file whose name ends in _levels.',
         epilog='example: hmsa export hmsa_demo/run --out run.csv')
     parser.add_argument(
         'run_path', type=Path, metavar='RUN', help='folder of a bag, or an .mcap file')
     parser.add_argument(
         '--out', type=Path, required=True, metavar='FILE',
-        help='file to write, ending in .csv or .parquet; one of that name is replaced')
+        help='file to write, ending in .csv or .parquet; an existing file is replaced')
     parser.add_argument(
-        '--joint', default='', metavar='NAME', help='actuator, where the bag has several')
+        '--joint', default='', metavar='NAME', help='joint to export, if the bag has several')
     parser.set_defaults(run=run)
 
 

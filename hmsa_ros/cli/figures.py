@@ -21,11 +21,11 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         'figures', help="compute and draw the paper's Figures 2 to 10",
         description="Compute the paper's Figures 2 to 10 and write each as PNG and CSV "
-                    '(figure_02.png, figure_02.csv, ...). Files of these names are replaced.',
+                    '(figure_02.png, figure_02.csv, ...). Existing files are replaced.',
         epilog='example: hmsa figures --out figures')
     parser.add_argument(
         '--out', type=Path, default=Path('figures'), metavar='DIR',
-        help='folder to write to, made if need be (default figures)')
+        help='output folder, created if missing (default figures)')
     parser.set_defaults(run=run)
 
 
@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BadInputError(
-            f'cannot make the folder {folder}: {error.strerror}; expected a folder with write '
+            f'cannot create the folder {folder}: {error.strerror}; expected a folder with write '
             'permission (--out)') from error
 
     from hmsa_ros.figures.paper import FIGURES, write_figure

@@ -24,10 +24,10 @@ def add_parser(subparsers: Any) -> None:
 
     """
     parser = subparsers.add_parser(
-        'identify', help="find the actuator's parameters in a recording",
-        description="Find the actuator's parameters in a recording of its motion, with their "
-                    '95 % intervals, or say what the recording does not hold. RUN is a bag, or a '
-                    'CSV with a header and the columns time (s), stretch and, without '
+        'identify', help="identify the actuator's parameters from a recording",
+        description="Identify the actuator's parameters from a recording of its motion, with 95 "
+                    '% intervals, or report why the recording cannot determine them. RUN is a '
+                    'bag, or a CSV with a header and the columns time (s), stretch and, without '
                     '--commands, flux_density (T). No start values are needed.',
         epilog='example: hmsa identify camera.csv --commands levels.csv --out actuator.yaml')
     parser.add_argument(
@@ -40,22 +40,23 @@ def add_parser(subparsers: Any) -> None:
         help='parameter file with what is known, such as geometry and density')
     parser.add_argument(
         '--free', default='', metavar='NAME,...',
-        help='parameters to find (default shear_modulus, damping_coefficient, chain_limit, '
+        help='parameters to identify (default shear_modulus, damping_coefficient, chain_limit, '
              'remanence, stretch_bias); others: density, time_unit, stretch_gain, '
              'sensor_latency, coil_time_constant, constant_force, initial_stretch, '
              'initial_rate, viscoelastic_ratio, viscoelastic_time')
     parser.add_argument(
-        '--joint', default='', metavar='NAME', help='actuator, where a bag has several')
+        '--joint', default='', metavar='NAME', help='joint to identify, if the bag has several')
     parser.add_argument(
         '--profile', default='', metavar='NAME',
-        help='print the profile likelihood of this parameter as well')
+        help='also print the profile likelihood of this parameter')
     parser.add_argument(
         '--out', type=Path, metavar='YAML',
-        help='parameter file to write for planner and plant, if they are identified; one of that '
-             'name is replaced')
+        help='parameter file to write for planner and plant, only if identified; an existing '
+             'file is replaced')
     parser.add_argument(
         '--report', type=Path, metavar='HTML',
-        help='page to write: data, fit, residuals, intervals; one of that name is replaced')
+        help='HTML page to write: data, fit, residuals and intervals; an existing file is '
+             'replaced')
     parser.add_argument('--json', action='store_true', help='print one JSON object')
     parser.set_defaults(run=run)
 

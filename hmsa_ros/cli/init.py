@@ -46,11 +46,11 @@ def add_parser(subparsers: Any) -> None:
 
     """
     parser = subparsers.add_parser(
-        'init', help="write a parameter file for one's own actuator",
-        description="Write a parameter file for one's own actuator, which planner and plant "
-                    'take by --params-file, and print what follows from it: times, damping, '
-                    'flux densities and reach. What no option gives is asked for. Numbers are '
-                    'in SI units, or have their unit behind them: 10mm, "50 kPa".',
+        'init', help='write a parameter file for your own actuator',
+        description='Write a parameter file of your own actuator for planner and plant '
+                    '(--params-file), and print what follows from it: times, damping, flux '
+                    'densities and reach. Asks for each value that no option gives. Numbers are '
+                    'in SI units unless a unit follows: 10mm, "50 kPa".',
         epilog='example: hmsa init --half-length 5mm --half-thickness 5mm --density 1.9g/cm3 \\\n'
                '    --shear-modulus 30kPa --j-lim 20 --zeta 0.1 --remanence 80mT \\\n'
                '    --flux-max 200mT --out my_actuator.yaml')
@@ -65,14 +65,15 @@ def add_parser(subparsers: Any) -> None:
         help=f'{DAMPING.text} [{DAMPING.unit}], in place of --zeta')
     parser.add_argument(
         '--joint', default='', metavar='NAME',
-        help=f'name of the joint (default {_JOINT}), or several with commas between for '
-             'actuators alike')
+        help=f'joint name (default {_JOINT}), or several separated by commas for identical '
+             'actuators')
     parser.add_argument(
         '--out', type=Path, default=_FILE, metavar='FILE',
         help=f'file to write (default {_FILE})')
-    parser.add_argument('--force', action='store_true', help='replace a file of that name')
+    parser.add_argument('--force', action='store_true', help='replace an existing file')
     parser.add_argument(
-        '--yes', action='store_true', help='ask nothing: take the defaults for what is not given')
+        '--yes', action='store_true', help='do not ask; use the defaults for values that are '
+                                           'not given')
     parser.add_argument('--json', action='store_true', help='print one JSON object')
     parser.set_defaults(run=run)
 
@@ -123,7 +124,7 @@ def run(arguments: argparse.Namespace) -> int:
     if missing and not arguments.yes:
         if not sys.stdin.isatty():
             raise BadInputError(
-                'standard input is no terminal to ask on, and '
+                'standard input is not a terminal, and '
                 f'{", ".join(BY_KEY[x].option for x in missing)} '
                 f'{"is" if len(missing) == 1 else "are"} not given: give them, or add --yes for '
                 'the defaults')
@@ -141,8 +142,8 @@ def run(arguments: argparse.Namespace) -> int:
     if guessed:
         doubts.append(
             f'{" and ".join(f"{BY_KEY[x].words} {given[x]:g}" for x in guessed)} '
-            f'{"is a guess" if len(guessed) == 1 else "are guesses"}: a plan is as exact as '
-            'they are; measure them, or give them')
+            f'{"is a guess" if len(guessed) == 1 else "are guesses"}: a plan is only as exact '
+            'as its parameters; measure them and pass the values')
     joints = joints or [_JOINT]
     write_text(path, file_text(path, actuator, coil, joints, found))
     for doubt in doubts:
@@ -167,8 +168,8 @@ def _ask(
     """Ask for what is not given."""
     answers = dict(given)
     print(
-        'Numbers are in the unit shown, or have another behind them: 10 mm, 50 kPa. Enter takes '
-        'what stands in brackets.', file=sys.stderr)
+        'Numbers are in the unit shown unless another unit follows: 10 mm, 50 kPa. Press Enter '
+        'for the value in brackets.', file=sys.stderr)
     for quantity in QUANTITIES:
         key = quantity.key
         if key in answers or (key == 'zeta' and DAMPING.key in answers):
@@ -194,7 +195,7 @@ def _ask(
             answers[key] = value
             break
     while not joints:
-        text = _answer(f'name of the joint, or several with commas between [{_JOINT}]: ')
+        text = _answer(f'joint name, or several separated by commas [{_JOINT}]: ')
         try:
             joints = joint_names(text) or [_JOINT]
         except BadInputError as error:
@@ -208,7 +209,7 @@ def _answer(question: str) -> str:
     line = sys.stdin.readline()
     if not line:
         print(file=sys.stderr)
-        raise BadInputError('the answers ended before the last question: nothing is written')
+        raise BadInputError('the input ended before the last question: nothing was written')
     return line.strip()
 
 
@@ -239,13 +240,13 @@ def _doubts(given: Mapping[str, float], found: 'Scales') -> list[str]:
             'about rest does not oscillate, and there is no two-step command for it')
     if max(abs(x - 1.0) for x in found.held) < _HARDLY:
         doubts.append(
-            f'the coil stretches the block to {found.held[0]:.6g} to {found.held[1]:.6g} only: '
-            f'a stretch of 1.1 or 0.9 takes some {0.3 * found.flux_density_unit:.3g} T')
+            f'the coil only reaches stretches from {found.held[0]:.6g} to {found.held[1]:.6g}: '
+            f'a stretch of 1.1 or 0.9 needs about {0.3 * found.flux_density_unit:.3g} T')
     ratio = given['half_thickness'] / given['half_length']
     if not 0.05 <= ratio <= 20.0:
         doubts.append(
-            f'half thickness over half length is {ratio:.3g}: the model is of a block whose '
-            'sides are of one order, and a thin film or a long rod bends instead')
+            f'half thickness over half length is {ratio:.3g}: the model describes a block with '
+            'sides of similar length; a thin film or a long rod bends instead')
     return doubts
 
 
@@ -324,7 +325,7 @@ def file_text(
         '# Parameters of an actuator for planner and plant, written by hmsa init:',
         f'#   hmsa plant --ros-args --params-file {path.name}',
         f'#   hmsa planner --ros-args --params-file {path.name}',
-        '#', '# What follows from them (worked out once: hmsa init does it anew):',
+        '#', '# What follows from them (computed by hmsa init when it wrote this file):',
         *(f'#   {line}' for line in table(found)),
         '/**:', '  ros__parameters:']
     texts = {x.parameter: (x.text, x.unit) for x in (*QUANTITIES, DAMPING)}
@@ -338,7 +339,8 @@ def file_text(
     else:
         names = ', '.join(f"'{x}'" for x in joints)
         lines += [
-            '    # Names of the joints; all are alike but for what is set for one, such as',
+            '    # Names of the joints; all are identical except for what is set for one, such '
+            'as',
             f'    # {joints[0]}.actuator.remanence: {_number(actuator.remanence)}',
             f'    joints: [{names}]']
     return '\n'.join(lines + _sampling(actuator)) + '\n'
@@ -357,7 +359,7 @@ def _sampling(actuator: 'ActuatorParameters') -> list[str]:
     rate = min(math.ceil(enough / digits) * digits, largest)
     return [
         '/**/plant:', '  ros__parameters:',
-        '    # Samples per second: at least twenty in a period of the actuator [Hz].',
+        '    # Sample rate: at least 20 samples per period of the actuator [Hz].',
         f'    publish_rate: {_number(rate)}']
 
 

@@ -7,10 +7,10 @@ from typing import Any
 from hmsa_ros.ending import ENDING
 
 NODES = {
-    'planner': 'turn setpoint sequences into the shaped command stream',
+    'planner': 'plan shaped commands for setpoint sequences',
     'plant': 'simulate the actuator',
-    'recorder': 'write topics to a bag',
-    'player': 'send the messages of a bag again',
+    'recorder': 'record topics to a bag',
+    'player': 'replay a bag',
 }
 _EXAMPLES = {
     'planner': '-r __ns:=/left',

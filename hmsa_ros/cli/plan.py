@@ -26,17 +26,17 @@ def add_parser(subparsers: Any) -> None:
     """
     parser = subparsers.add_parser(
         'plan', help='plan a sequence of setpoints without ROS',
-        description='Plan a sequence of setpoints, nondimensional as in the paper: a stretch '
-                    'and the span of time for which it lasts, in units of L sqrt(rho/G). With '
-                    '--params-file spans are in seconds, and flux densities in tesla are '
-                    'printed.',
+        description='Plan a sequence of setpoints, nondimensional as in the paper: each '
+                    'setpoint is a stretch and how long it lasts (move plus hold), in units of '
+                    'L sqrt(rho/G). With --params-file times are in seconds and flux densities '
+                    'in tesla.',
         epilog='example: hmsa plan 1.10:10 1.20:10 1.40:10 --json')
     parser.add_argument(
         'setpoints', nargs='+', type=setpoint, metavar='STRETCH:SPAN',
         help='stretch to come to rest at, and how long this setpoint lasts (move plus hold)')
     parser.add_argument(
         '--start', type=float, default=1.0, metavar='S',
-        help='stretch at rest at the start (default 1)')
+        help='initial stretch, at rest (default 1)')
     parser.add_argument(
         '--zeta', type=float, metavar='Z',
         help='nondimensional damping coefficient, at least 0 (default 0.2)')
@@ -117,8 +117,8 @@ def _run_si(arguments: argparse.Namespace) -> int:
              if getattr(arguments, name) is not None]
     if fixed:
         raise BadInputError(
-            f'both --params-file and {", ".join(fixed)} are given: expected either, the file '
-            'sets them')
+            f'both --params-file and {", ".join(fixed)} are given: expected only one of them, '
+            'since the file sets these values')
     values = values_of(
         read_parameter_file(arguments.params_file), PLANNER,
         (*ACTUATOR, FLUX_DENSITY_MIN, FLUX_DENSITY_MAX, SLEW_LIMIT))

@@ -164,7 +164,7 @@ class Quantity:
         hint = next((f' ({words})' for begin, end, words in self.hints
                      if begin <= value <= end), '')
         return (
-            f'{self.words} {self.show(value)} is not usual{hint}: usual are {low:g} to '
+            f'{self.words} {self.show(value)} is unusual{hint}: the usual range is {low:g} to '
             f'{high:g}{self._unit}, {self.source}')
 
 
@@ -172,33 +172,33 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity.of(
         'half_length', _BLOCK['half_length'], 'half length L of the block, across the field',
         (1e-5, 0.1), f'from printed swimmers to moulded grippers in {_REVIEW}',
-        ((0.5, 1e3, 'was it meant in mm?'),)),
+        ((0.5, 1e3, 'did you mean mm?'),)),
     Quantity.of(
         'half_thickness', _BLOCK['half_thickness'],
         'half thickness H of the block, along the field', (1e-5, 0.1),
         f'from printed swimmers to moulded grippers in {_REVIEW}',
-        ((0.5, 1e3, 'was it meant in mm?'),), follows=True),
+        ((0.5, 1e3, 'did you mean mm?'),), follows=True),
     Quantity.of(
         'shear_modulus', _BLOCK['shear_modulus'], 'shear modulus G', (1e3, 3e6),
         f'from silicone gels to filled rubber; 303 kPa in {_ZHAO}',
         ((1e10, 1e12, 'metals have 25 to 80 GPa'), (1e8, 1e10, 'that is a hard plastic'),
-         (1.0, 999.0, 'was it meant in kPa?'), (0.0, 1.0, 'was it meant in MPa?'))),
+         (1.0, 999.0, 'did you mean kPa?'), (0.0, 1.0, 'did you mean MPa?'))),
     Quantity.of(
         'density', _BLOCK['density'], 'density rho', (900.0, 4000.0),
         'silicone of 1000 to 1200 kg/m^3 with up to 40 % by volume of NdFeB powder of '
         '7600 kg/m^3',
-        ((0.8, 1.3, 'that is air, or was it meant in g/cm^3?'),
-         (1.3, 10.0, 'was it meant in g/cm^3?'), (7000.0, 9000.0, 'that is solid metal'))),
+        ((0.8, 1.3, 'that is air, or did you mean g/cm^3?'),
+         (1.3, 10.0, 'did you mean g/cm^3?'), (7000.0, 9000.0, 'that is solid metal'))),
     Quantity.of(
         'remanence', _BLOCK['remanence'], 'residual flux density Br along the thickness',
         (0.005, 0.4),
         'isotropic NdFeB powder of 0.7 to 0.9 T diluted to 1 to 40 % by volume; 0.143 T in '
         + _ZHAO,
-        ((1.5, 1e3, 'the strongest sintered NdFeB magnets, grade N55, have 1.5 T; was it meant '
-          'in mT?'), (0.9, 1.5, 'that is a solid magnet'))),
+        ((1.5, 1e3, 'the strongest sintered NdFeB magnets, grade N55, have 1.5 T; did you mean '
+          'mT?'), (0.9, 1.5, 'that is a solid magnet'))),
     Quantity.of(
         'j_lim', _BLOCK['chain_limit'],
-        "limit J_lim of the chains' extension in the Gent model", (0.5, 200.0),
+        'chain extensibility limit J_lim of the Gent model', (0.5, 200.0),
         'Gent, Rubber Chem. Technol. 69 (1996) 59, fits rubber with some 30 to 100; the paper '
         'takes 1 to 5'),
     Quantity(
@@ -207,12 +207,12 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity.of(
         'flux_max', FLUX_DENSITY_MAX, "coil's largest flux density", (1e-3, 2.0),
         'from Helmholtz coils, some 1 to 50 mT, to electromagnets, whose iron saturates near '
-        '2 T', ((2.0, 1e3, 'was it meant in mT?'),)),
+        '2 T', ((2.0, 1e3, 'did you mean mT?'),)),
     Quantity.of(
         'flux_min', FLUX_DENSITY_MIN,
         "coil's least flux density, negative in the other direction", (-2.0, 0.0),
         'since at 0 T the block is at rest, and coils reach some 2 T',
-        ((-1e3, -2.0, 'was it meant in mT?'),), follows=True),
+        ((-1e3, -2.0, 'did you mean mT?'),), follows=True),
     Quantity.of(
         'slew_limit', SLEW_LIMIT, "rate of the amplifier's ramps, 0 for steps",
         (0.0, math.inf), ''),
@@ -273,7 +273,7 @@ def joint_names(text: str) -> list[str]:
     for name in names:
         if not _NAME.fullmatch(name):
             raise BadInputError(
-                f'joint {name!r}: expected letters, digits and single underscores, beginning '
+                f'joint {name!r}: expected letters, digits and single underscores, starting '
                 'with a letter')
         if names.count(name) > 1:
             raise BadInputError(f'joint {name!r} is named twice: expected different names')

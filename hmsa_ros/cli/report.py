@@ -23,29 +23,27 @@ def add_parser(subparsers: Any) -> None:
 
     """
     parser = subparsers.add_parser(
-        'report', help='show what happened in a run, from its bag',
-        description='Show what happened in a run as one HTML page that needs no network: '
-                    'response, command, phase plane, residuals against plain steps, plan '
-                    'against run, timing and losses. Any bag with joint states will do, in any '
-                    'namespace; several bags are shown together.',
+        'report', help='write an HTML report of a run from its bag',
+        description='Write a report of a run as one self-contained HTML page: response, '
+                    'command, phase plane, residuals against plain steps, plan against run, '
+                    'timing and losses. Any bag with joint states works, in any namespace; '
+                    'several bags share one page.',
         epilog='example: hmsa report hmsa_demo/run --out run.html --pdf run.pdf')
     parser.add_argument(
         'bags', nargs='+', type=Path, metavar='BAG', help='folder of a bag, or an .mcap file')
     parser.add_argument(
         '--out', type=Path, metavar='FILE',
-        help="page to write; one of that name is replaced (default: the first bag's name and "
-             '_report.html, in this folder)')
+        help='page to write; an existing file is replaced (default: NAME_report.html in this '
+             'folder, NAME being the first bag)')
     parser.add_argument('--png', type=Path, metavar='FILE', help='picture to write as well')
     parser.add_argument(
         '--pdf', type=Path, metavar='FILE', help='picture to write as well, for a paper')
     parser.add_argument(
         '--params-file', '--params', dest='params', type=Path, metavar='YAML',
-        help='parameter file (YAML) of the actuator as it really is (default: what the bag '
-             'contains)')
+        help='parameter file (YAML) of the real actuator (default: the parameters in the bag)')
     parser.add_argument(
         '--joint', default='', metavar='NAME',
-        help='actuator to show by its name in the joint states, or several with commas between '
-             '(default: those with commands)')
+        help='joint to show, or several separated by commas (default: those with commands)')
     parser.set_defaults(run=run)
 
 
@@ -124,7 +122,7 @@ def _check_targets(targets: list[Path], bags: list[Path]) -> None:
     """Refuse what cannot be written before the bags are read."""
     if len({x.resolve() for x in targets}) < len(targets):
         raise BadInputError(
-            'two of --out, --png and --pdf are one file: expected different files')
+            'two of --out, --png and --pdf name the same file: expected different files')
     for target in targets:
         if target.is_dir():
             raise BadInputError(f'cannot write {target}: it is a folder; expected a file')

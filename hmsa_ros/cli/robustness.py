@@ -34,19 +34,18 @@ def add_parser(subparsers: Any) -> None:
 
     """
     parser = subparsers.add_parser(
-        'robustness', help='compare the shapers where the model is in error',
-        description='Plan moves with each shaper and the nominal parameters, carry them out '
-                    'with shear modulus G, damping coefficient zeta and J_lim in error, and '
-                    'compare the residual: peak-to-peak stretch after arrival as a share of '
-                    'the step, without the steady offset. Prints a table; writes '
-                    'robustness.csv and a picture for each move, in place of files of these '
-                    'names.',
+        'robustness', help='compare the shapers under model error',
+        description='Plan moves with each shaper and the nominal parameters, simulate them with '
+                    'errors in shear modulus G, damping coefficient zeta and J_lim, and compare '
+                    'the residuals: peak-to-peak stretch after arrival as a share of the step, '
+                    'without the steady offset. Prints a table and writes robustness.csv and a '
+                    'picture of each move; existing files are replaced.',
         epilog='example: hmsa robustness --move 1.0:1.4 1.2:0.8 --errors 0.05 --order 2 3 4')
     parser.add_argument(
         '--move', nargs='+', type=_move, default=list(_MOVES), metavar='START:TARGET',
-        help='stretches at rest to move between (default 1.0:1.1 1.0:1.4 1.0:0.7)')
+        help='moves from one stretch at rest to another (default 1.0:1.1 1.0:1.4 1.0:0.7)')
     parser.add_argument(
-        '--shapers', metavar='NAME,...', help='names of shapers with commas (default all)')
+        '--shapers', metavar='NAME,...', help='shapers, separated by commas (default all)')
     parser.add_argument(
         '--errors', type=float, default=0.1, metavar='E',
         help='largest error in the table and the box, as a share (default 0.1); the curves go '
@@ -65,7 +64,7 @@ def add_parser(subparsers: Any) -> None:
         help='shape 2 H^2/L^2, above 0 (default 2)')
     parser.add_argument(
         '--out', type=Path, default=Path('robustness'), metavar='DIR',
-        help='folder to write to, made if need be (default robustness)')
+        help='output folder, created if missing (default robustness)')
     parser.add_argument('--json', action='store_true', help='print JSON in full precision')
     parser.set_defaults(run=run)
 
@@ -136,7 +135,7 @@ def _make(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BadInputError(
-            f'cannot make the folder {folder}: {error.strerror or error}; expected a folder '
+            f'cannot create the folder {folder}: {error.strerror or error}; expected a folder '
             'with write permission (--out)') from error
 
 
@@ -242,7 +241,7 @@ def _print_table(case: 'Case', results: 'list[Result]') -> None:
                      'the residual counts from when the two-step command arrives, or from half '
                      'a natural period on where there is none')
     if any(math.isnan(x.worst.residual) for x in results if x.move is not None):
-        notes.append('a question mark stands for a motion too close to a limiting stretch to '
-                     'be followed')
+        notes.append('a question mark marks a motion too close to a limiting stretch to '
+                     'integrate')
     for note in notes:
         console.print(f'note: {note}', highlight=False, soft_wrap=True)

@@ -27,17 +27,18 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         'setpoints', nargs='+', type=setpoint_of_joints, metavar='STRETCH:SECONDS',
         help='stretch to come to rest at, and how long this setpoint lasts in s (move plus '
-             'hold); with several joints one stretch for all, or one a joint, as in '
+             'hold); with several joints, one stretch for all or one per joint, as in '
              '1.10,1.20:2')
     parser.add_argument(
-        '--wait', action='store_true', help='report until the sequence has been carried out')
+        '--wait', action='store_true', help='report progress until the sequence has been '
+                                            'carried out')
     parser.add_argument(
-        '--recorded', action='store_true', help='wait for a recorder that listens, and then send')
+        '--recorded', action='store_true', help='wait until a recorder has subscribed, then send')
     parser.add_argument(
         '--namespace', default='', metavar='NS', help='namespace of the planner')
     parser.add_argument(
         '--joint', default='actuator', metavar='NAMES',
-        help='joint, or joints with commas between (default actuator)')
+        help='joint, or several separated by commas (default actuator)')
     parser.add_argument(
         '--timeout', type=float, default=10.0, metavar='S',
         help='seconds to wait for a reply, and past the end of the sequence (default 10 s)')

@@ -8,7 +8,7 @@ from typing import Any
 
 # Column, option, and what it is.
 _AXES = (
-    ('start', '--start', 'stretch at rest at the start (default 1)'),
+    ('start', '--start', 'initial stretch, at rest (default 1)'),
     ('target', '--target', 'stretch to come to rest at (default 1.1)'),
     ('zeta', '--zeta', 'nondimensional damping coefficient, at least 0 (default 0.2)'),
     ('j_lim', '--j-lim', 'chain limit of the Gent model, above 0 (default 5)'),
@@ -30,20 +30,20 @@ def add_parser(subparsers: Any) -> None:
         'sweep', help='plan over grids of parameters or a table of cases',
         description='Plan the two-step command for all combinations of the values given, '
                     'nondimensional as in the paper. GRID is a value, FIRST:LAST:POINTS or '
-                    'log:FIRST:LAST:POINTS, or several of them with commas between. A row that '
-                    'cannot be planned says why in its status; the others are planned all the '
-                    'same.',
+                    'log:FIRST:LAST:POINTS, or several of these separated by commas. A case '
+                    'that cannot be planned gives the reason in its status; the others are '
+                    'still planned.',
         epilog='example: hmsa sweep --zeta 0:2:1000 --j-lim log:0.1:100:50 --out sweep.csv')
     for _, option, text in _AXES:
         parser.add_argument(option, metavar='GRID', help=text)
     parser.add_argument(
         '--cases', type=Path, metavar='FILE.csv',
-        help='table with some of the columns start, target, zeta, j_lim, c1: each of its rows '
-             'is combined with the grids given for other columns')
+        help='CSV with some of the columns start, target, zeta, j_lim, c1; each row is combined '
+             'with the grids of the other columns')
     parser.add_argument(
         '--out', type=Path, metavar='FILE',
-        help='file to write, ending in .csv or .parquet; one of that name is replaced '
-             '(default: CSV on standard output)')
+        help='file to write, ending in .csv or .parquet; an existing file is replaced (default: '
+             'CSV on standard output)')
     parser.set_defaults(run=run)
 
 

@@ -35,29 +35,30 @@ def add_parser(subparsers: Any) -> None:
 
     """
     parser = subparsers.add_parser(
-        'watch', help='show live what goes on, in the terminal',
-        description='Show live, in a terminal of any size: stretch against target, command, '
-                    'progress of the plan, the verdict on the last request, and losses. q or '
-                    'Ctrl-C ends. Without a terminal it prints a line each second.',
+        'watch', help='show the running nodes live in the terminal',
+        description='Show stretch against target, command, progress of the plan, the verdict on '
+                    'the last request, and losses, live in the terminal. Quit with q or Ctrl-C. '
+                    'Without a terminal it prints one line per second.',
         epilog='example: hmsa watch --joint actuator --span 5')
     parser.add_argument(
         '--namespace', default='', metavar='NS', help='namespace of planner and plant')
     parser.add_argument(
         '--joint', default='', metavar='NAME',
-        help='joint to show, or several with commas between (default all)')
+        help='joint to show, or several separated by commas (default all)')
     parser.add_argument(
         '--span', type=float, default=10.0, metavar='S',
-        help='time that the charts reach back (default 10 s)')
+        help='time shown in the charts (default 10 s)')
     parser.add_argument(
         '--rate', type=float, default=5.0, metavar='HZ',
-        help='how often the view is renewed, 0.1 to 30 (default 5)')
+        help='refresh rate, 0.1 to 30 Hz (default 5)')
     parser.add_argument(
-        '--once', action='store_true', help='print one view and end; 1 if there is nothing')
+        '--once', action='store_true', help='print one view and exit; status 1 if there is '
+                                            'nothing to show')
     parser.add_argument(
         '--timeout', type=float, default=5.0, metavar='S',
-        help='patience of --once (default 5 s)')
+        help='seconds that --once waits (default 5)')
     parser.add_argument(
-        '--json', action='store_true', help='print a JSON object a second, on a line each')
+        '--json', action='store_true', help='print one JSON object per line, every second')
     parser.set_defaults(run=run)
 
 

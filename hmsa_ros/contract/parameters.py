@@ -114,7 +114,7 @@ ACTUATOR = (
         'actuator.remanence', 0.1, 'Residual flux density Br.', 'T', 1e-9, 1e3),
     ParameterSpec(
         'actuator.chain_limit', 5.0,
-        "Limit of the chains' extension J_lim of the Gent model; .inf for neo-Hookean.", '',
+        'Chain extensibility limit J_lim of the Gent model; .inf gives neo-Hookean.', '',
         1e-3, math.inf),
     ParameterSpec(
         'actuator.damping_coefficient', 8.0 * ZETA * 0.01 * 0.01 * math.sqrt(1900.0 * 1e4),
@@ -132,11 +132,11 @@ SLEW_LIMIT = ParameterSpec(
     'Rate at which the amplifier ramps to a commanded level; 0 for steps.', 'T/s', 0.0, 1e12)
 
 FLUX_DENSITY_MIN = ParameterSpec(
-    'flux_density_min', -0.5, 'Least flux density that the coil may be asked for.', 'T',
+    'flux_density_min', -0.5, "Lower limit of the coil's flux density.", 'T',
     -1e3, 1e3)
 
 FLUX_DENSITY_MAX = ParameterSpec(
-    'flux_density_max', 0.5, 'Largest flux density that the coil may be asked for.', 'T',
+    'flux_density_max', 0.5, "Upper limit of the coil's flux density.", 'T',
     -1e3, 1e3)
 
 COIL_TIME_CONSTANT = ParameterSpec(
@@ -144,13 +144,13 @@ COIL_TIME_CONSTANT = ParameterSpec(
     0.0, 1e3)
 
 PUBLISH_RATE = ParameterSpec(
-    'publish_rate', 1000.0, "Samples per second of the plant's own time.", 'Hz', 1e-3, 1e6)
+    'publish_rate', 1000.0, "Sample rate, in the plant's own time.", 'Hz', 1e-3, 1e6)
 
 #: Factors on the actuator's parameters, by which a plant differs from what the planner knows.
 MISMATCH = tuple(
     ParameterSpec(
         f'mismatch.{spec.name.partition(".")[2]}', 1.0,
-        f'Factor on {spec.name}: what the plant has more or less of than the planner knows.',
+        f"Factor on {spec.name}: the simulated actuator then differs from the planner's model.",
         '', 1e-3, 1e3)
     for spec in ACTUATOR)
 

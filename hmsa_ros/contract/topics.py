@@ -104,9 +104,10 @@ _TRIGGER = 'std_srvs/srv/Trigger'
 
 JOINT_TRAJECTORY = Topic(
     '~/joint_trajectory', _TRAJECTORY, RELIABLE,
-    'A sequence of setpoints. By its `time_from_start` each point is at rest at its `positions`, '
-    "having left the one before at that one's. Stamp 0 starts now; with a stamp ahead the "
-    'running plan is kept until then; a sequence that began in the past is joined where it is.',
+    'A sequence of setpoints. Each point says: be at rest at `positions` by `time_from_start`, '
+    "having left the previous point at that point's `time_from_start`. Stamp 0 starts now; a "
+    'future stamp keeps the running plan until then; a sequence that began in the past is '
+    'joined in the middle.',
     subscribers=(PLANNER, RECORDER))
 SETPOINT = Topic(
     '~/setpoint', _FLOAT, RELIABLE,
@@ -114,43 +115,44 @@ SETPOINT = Topic(
     subscribers=(PLANNER, RECORDER))
 PLAN = Topic(
     '~/plan', _TRAJECTORY, LATCHED,
-    'The plan: a point at each change of level, with the stretch and rate predicted there and '
-    'the flux density from then on.', publishers=(PLANNER,))
+    'The plan: a point at each change of level, with the predicted stretch and rate, and the '
+    'flux density from then on.', publishers=(PLANNER,))
 STATUS = Topic(
     '~/status', 'diagnostic_msgs/msg/DiagnosticStatus', LATCHED,
-    'The verdict on the last request, with a code and a sentence, and how far its sequence has '
-    'come.', publishers=(PLANNER,))
+    'The verdict on the last request, with a code and a sentence, and the progress of its '
+    'sequence.', publishers=(PLANNER,))
 FLUX_DENSITY_COMMAND = Topic(
     'flux_density_command', _FIELD, COMMAND,
-    'The shaped command. From its stamp on, which may lie ahead, z is the flux density in tesla; '
-    'x and y are 0. A message supersedes all earlier ones stamped at or after it.',
+    'The shaped command: from its stamp on, which may be in the future, z is the flux density '
+    'in tesla; x and y are 0. A message supersedes all earlier ones with the same or a later '
+    'stamp.',
     publishers=(PLANNER,), subscribers=(PLANT,))
 FLUX_DENSITY_APPLIED = Topic(
     'flux_density_applied', _FIELD, CHANGES,
-    'The level in force: one message at each change of level that takes effect, stamped with the '
-    'time at which it really did; z is the level from then on in tesla.',
+    'The applied level: one message per change of level, stamped with the time at which it took '
+    'effect; z is the level from then on, in tesla.',
     publishers=(PLANT,), subscribers=(PLANNER,))
 DISTURBANCE_FORCE = Topic(
     'disturbance_force', 'geometry_msgs/msg/WrenchStamped', RELIABLE,
-    'A force on the simulated actuator that nobody has planned for. From its stamp on (0: at '
-    'once) force.z pulls along the field in newton, until the next message; all else is 0.',
+    'An unplanned force on the simulated actuator: from its stamp on (0: immediately) until the '
+    'next message, force.z pulls along the field, in newtons; all other components are 0.',
     subscribers=(PLANT,))
 JOINT_STATES = Topic(
     'joint_states', 'sensor_msgs/msg/JointState', SAMPLES,
-    'Samples of the actuator: position is stretch, velocity stretch rate in 1/s, effort the flux '
-    'density in force in tesla.', publishers=(PLANT,), subscribers=(PLANNER,))
+    'Samples of the actuator: position is stretch, velocity stretch rate in 1/s, effort the '
+    'applied flux density in tesla.', publishers=(PLANT,), subscribers=(PLANNER,))
 STRETCH = Topic(
-    'stretch', _FLOAT, SAMPLES, 'The stretch alone, to plot and to echo.', publishers=(PLANT,))
+    'stretch', _FLOAT, SAMPLES, 'The stretch alone, for plotting and echo.', publishers=(PLANT,))
 STRETCH_RATE = Topic(
     'stretch_rate', _FLOAT, SAMPLES, 'The stretch rate alone, in 1/s.', publishers=(PLANT,))
 MARKERS = Topic(
     '~/markers', 'visualization_msgs/msg/MarkerArray', LATCHED,
-    "What a 3-D view shows. The plant's: each block as it is deformed, its magnetisation and the "
-    "field as arrows, at marker_rate while somebody subscribes. The planner's: each block as it "
-    'is to become, when that changes.', publishers=(PLANT, PLANNER))
+    'Markers for a 3-D view. The plant publishes each deformed block, with arrows for its '
+    'magnetisation and the field, at marker_rate while there is a subscriber; the planner '
+    'publishes each block at its target whenever that changes.', publishers=(PLANT, PLANNER))
 CLOCK_TOPIC = Topic(
     '/clock', 'rosgraph_msgs/msg/Clock', CLOCK,
-    'Simulated time, from the plant or the player if a parameter makes it the authority.',
+    'Simulated time, published by the plant or the player if a parameter enables it.',
     publishers=(PLANT, PLAYER))
 DIAGNOSTICS = Topic(
     '/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', RELIABLE,
@@ -158,27 +160,28 @@ DIAGNOSTICS = Topic(
 
 STOP = Service('~/stop', _TRIGGER, {
     PLANNER: 'Drops the rest of the sequence and comes to rest without vibration.',
-    PLAYER: 'Ends playing.'})
+    PLAYER: 'Ends playback.'})
 RESET = Service('~/reset', _TRIGGER, {
-    PLANT: 'Puts the actuators back to their initial states, or to reset_stretch and '
-           'reset_rate; time goes on.'})
+    PLANT: 'Returns the actuators to their initial states, or to reset_stretch and reset_rate; '
+           'time continues.'})
 STEP = Service('~/step', _TRIGGER, {
-    PLANT: 'Advances a paused plant by step_count samples, one unless set.'})
+    PLANT: 'Advances a paused plant by step_count samples (default 1).'})
 SET_PAUSED = Service('~/set_paused', 'std_srvs/srv/SetBool', {
-    PLANT: 'Stops simulated time, or lets it run.'})
+    PLANT: 'Pauses or resumes simulated time.'})
 PAUSE = Service('~/pause', _TRIGGER, {
-    RECORDER: 'Stops writing; what arrives meanwhile is left out.', PLAYER: 'Holds playing.'})
+    RECORDER: 'Pauses recording; messages that arrive meanwhile are not recorded.',
+    PLAYER: 'Pauses playback.'})
 RESUME = Service('~/resume', _TRIGGER, {
-    RECORDER: 'Writes again.', PLAYER: 'Goes on playing.'})
-TOGGLE_PAUSED = Service('~/toggle_paused', _TRIGGER, {PLAYER: 'Holds playing, or goes on.'})
+    RECORDER: 'Resumes recording.', PLAYER: 'Resumes playback.'})
+TOGGLE_PAUSED = Service('~/toggle_paused', _TRIGGER, {PLAYER: 'Pauses or resumes playback.'})
 IS_PAUSED = Service('~/is_paused', _TRIGGER, {
     RECORDER: '`success` says whether it is paused.',
     PLAYER: '`success` says whether it is paused.'})
-PLAY_NEXT = Service('~/play_next', _TRIGGER, {PLAYER: 'Sends one message of a paused bag.'})
+PLAY_NEXT = Service('~/play_next', _TRIGGER, {PLAYER: 'Sends the next message while paused.'})
 SNAPSHOT = Service('~/snapshot', _TRIGGER, {
-    RECORDER: 'Writes what a recorder in snapshot mode holds in memory.'})
+    RECORDER: 'Writes the messages that a recorder in snapshot mode holds in memory.'})
 SPLIT_BAGFILE = Service('~/split_bagfile', _TRIGGER, {
-    RECORDER: 'Closes the file and goes on in a new one.'})
+    RECORDER: 'Closes the current file and continues in a new one.'})
 
 
 def of_joint(name: str, joint: str, joints: Sequence[str]) -> str:

@@ -170,7 +170,7 @@ def draft_sequence(
             raise RefusedError(
                 Code.SPELL_TOO_SHORT,
                 f'the first point asks for stretch {points[0][0]:g} at time_from_start 0, the '
-                f'actuator is at {here:.6g}: expected a time that leaves room for the move')
+                f'actuator is at {here:.6g}: expected enough time for the move')
     if base + points[-1][1] <= begin:
         raise _over(points, base, now)
     setpoints = []
@@ -398,6 +398,5 @@ def _over(points: Sequence[tuple[float, int]], base: int, now: int) -> RefusedEr
     return RefusedError(
         Code.IN_THE_PAST,
         f'the sequence stamped {base / NANOSECONDS:.3f} s ends at '
-        f'{(base + last) / NANOSECONDS:.3f} s, now is {now / NANOSECONDS:.3f} s: '
-        'expected an end ahead by more than lead_time; do sender and planner use the '
-        'same clock (use_sim_time)?')
+        f'{(base + last) / NANOSECONDS:.3f} s, now is {now / NANOSECONDS:.3f} s: expected an '
+        'end more than lead_time ahead; do sender and planner use the same clock (use_sim_time)?')

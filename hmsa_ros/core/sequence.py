@@ -175,7 +175,8 @@ def segments(
                     Code.SPELL_TOO_SHORT,
                     f'the move from stretch {state.stretch:.6g} to {setpoint.stretch:g} takes '
                     f'{units.time_text(move.duration)}, its span is '
-                    f'{units.time_text(setpoint.span)}: expected a span of at least the move')
+                    f'{units.time_text(setpoint.span)}: expected a span at least as long as the '
+                    'move')
             move = _cut(move, setpoint, units, last=following is None)
         end = _follow(state, move, setpoint.span, material, delivery.slew)
         yield Segment(setpoint, begin, state, end, move)

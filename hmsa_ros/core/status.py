@@ -45,59 +45,60 @@ class Code(str, Enum):
 EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
     Code.TWO_STEP: ('The two-step command: beta_p until tau_p, then beta_1.', ''),
     Code.STEP: ('One step to the level that holds the target; it rings.', ''),
-    Code.HOLD: ('The actuator is there already and is held.', ''),
-    Code.ROBUST: ('A chain of two-step commands, which forgives errors of the model.', ''),
+    Code.HOLD: ('The actuator is already there and is held.', ''),
+    Code.ROBUST: ('A chain of two-step commands, which tolerates model errors.', ''),
     Code.MINIMUM_TIME: ('Full push, full brake, then the level that holds the target.', ''),
-    Code.LINEAR: ('A linear input shaper designed at the target; some vibration is left.', ''),
+    Code.LINEAR: ('A linear input shaper designed at the target; it leaves some vibration.', ''),
     Code.TOO_DAMPED: (
-        'The actuator is damped so heavily that it does not overshoot: no two-step command '
-        'exists, and a plain step, which does not ring either, takes its place.',
-        'Nothing needs mending; the shaper minimum_time arrives sooner.'),
+        'The actuator is too heavily damped to overshoot, so there is no two-step command. A '
+        'plain step, which does not ring either, is used instead.',
+        'No action needed; the shaper minimum_time arrives sooner.'),
     Code.INDISTINGUISHABLE: (
-        'So close to critical damping beta_p and beta_1 differ by less than the digits of a '
-        'double; a plain step takes the place of the two.',
-        'Nothing needs mending; the shaper minimum_time arrives sooner.'),
+        'So close to critical damping, beta_p and beta_1 agree to double precision; a plain '
+        'step is used instead.',
+        'No action needed; the shaper minimum_time arrives sooner.'),
     Code.OUT_OF_RANGE: (
-        'The stretch lies at or beyond a limit of the polymer chains (J_lim).',
-        'Ask for a stretch inside the interval that the message names, or correct '
+        'The stretch is at or beyond the limiting extension of the polymer chains (J_lim).',
+        'Choose a stretch inside the interval that the message names, or correct '
         'actuator.chain_limit.'),
     Code.FLUX_LIMIT: (
-        'The move needs more flux density than the coil may give.',
-        'Ask for a nearer stretch, go there in several setpoints, or widen flux_density_min '
+        'The move needs more flux density than the coil provides.',
+        'Choose a nearer stretch, approach it in several setpoints, or widen flux_density_min '
         'and flux_density_max if the coil allows it.'),
     Code.SLEW_LIMIT: (
         'The amplifier ramps too slowly for a command that leaves no vibration.',
-        'Raise slew_limit if the amplifier can do it, or ask for a smaller move.'),
+        'Raise slew_limit if the amplifier can do it, or choose a smaller move.'),
     Code.SPELL_TOO_SHORT: (
-        'A setpoint ends before the move to it does.',
+        'A setpoint is too short for the move to it.',
         'Give the setpoint at least the time that the message names, or set short_spell to '
-        'continue, which plans the next move from wherever the actuator is by then.'),
+        'continue, which plans the next move from the state reached by then.'),
     Code.NO_TWO_STEP: (
         'From this state of motion no two-step command leads to the target at rest.',
         'Wait until the actuator rests, or use the shaper minimum_time.'),
     Code.NOT_CONVERGED: (
-        'The search for the plan did not end.',
-        'Check the parameters of the actuator; report it with the request and the parameters '
-        'if they are right.'),
+        'The search for the plan did not converge.',
+        "Check the actuator's parameters; if they are right, report the error with the request "
+        'and the parameters.'),
     Code.BAD_INPUT: (
-        'The request cannot be read: a number is not finite, or a field is missing or too many.',
+        'The request cannot be read: a number is not finite, or a field is missing or '
+        'superfluous.',
         'Correct what the message names.'),
     Code.UNKNOWN_JOINT: (
-        'The trajectory names other joints than the planner has.',
+        'The trajectory names joints that the planner does not have.',
         'Use the names in the parameters joint or joints of the planner.'),
     Code.NOT_INCREASING: (
         'The times of the points do not increase.',
         'Give each point a larger time_from_start than the one before.'),
     Code.IN_THE_PAST: (
-        'The whole sequence lies in the past by the clock of the planner.',
+        "By the planner's clock, the whole sequence is in the past.",
         'Stamp with the same clock as the planner: use_sim_time must agree on both sides. '
         'Stamp 0 means now.'),
     Code.TOO_LONG: (
         'The trajectory has more setpoints than the parameter max_points allows.',
         'Send it in parts, each stamped with its start, or raise max_points.'),
     Code.NO_TIME: (
-        'The planner follows simulated time, and no message has come on /clock yet.',
-        'Start what publishes /clock, or set use_sim_time to false.'),
+        'The planner follows simulated time, and no message has arrived on /clock yet.',
+        'Start the publisher of /clock, or set use_sim_time to false.'),
     Code.INACTIVE: (
         'The planner is a managed node and is not active.',
         'Activate it: ros2 lifecycle set /planner activate.'),

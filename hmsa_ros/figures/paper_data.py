@@ -410,7 +410,7 @@ def write_csv(path: Path, data: Data) -> None:
     Parameters
     ----------
     path : Path
-        File to write; one of that name is replaced.
+        File to write; an existing file is replaced.
     data : tuple of Run or Sweep
         The numbers.
 

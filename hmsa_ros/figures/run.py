@@ -20,7 +20,7 @@ def draw_run(
     Parameters
     ----------
     path : str or Path
-        File to write; one of that name is replaced.
+        File to write; an existing file is replaced.
     time : array_like, shape (n,)
         Times of the samples in s, increasing; 0 is the start of the sequence.
     stretch, rate : array_like, shape (n,)

@@ -50,7 +50,7 @@ def draw_robustness(path: str | Path, case: Case, results: Sequence[Result]) -> 
     Parameters
     ----------
     path : str or Path
-        PNG file to write; one of that name is replaced.
+        PNG file to write; an existing file is replaced.
     case : Case
         What was studied.
     results : sequence of Result
@@ -135,7 +135,7 @@ def draw_sampled(path: str | Path, study: SampledStudy, *, period: float = 0.28)
     Parameters
     ----------
     path : str or Path
-        PNG file to write; one of that name is replaced.
+        PNG file to write; an existing file is replaced.
     study : SampledStudy
         The residuals.
     period : float
@@ -225,7 +225,7 @@ def draw_damped(path: str | Path, study: DampedStudy, *, zeta: float = 4.0) -> N
     Parameters
     ----------
     path : str or Path
-        PNG file to write; one of that name is replaced.
+        PNG file to write; an existing file is replaced.
     study : DampedStudy
         The times.
     zeta : float

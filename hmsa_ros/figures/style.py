@@ -78,7 +78,7 @@ def picture(
     Parameters
     ----------
     path : Path
-        File to write; one of that name is replaced.
+        File to write; an existing file is replaced.
     height, width : float
         Size in inches.
     kind : {'png', 'pdf'}

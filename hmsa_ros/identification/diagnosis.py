@@ -106,8 +106,9 @@ def weakness(fit: Fit, deviation: float, factors: Array) -> Weakness | None:
             words = ', '.join(
                 _change(fit, j, parts[j] * share, parts[chosen[0]]) for j in chosen)
             sentences.append(
-                f'{_listed([fit.free[j] for j in chosen])} are held only together: {words} '
-                'at the same time leaves the recorded stretch as it is within the noise')
+                f'{_listed([fit.free[j] for j in chosen])} are determined only in combination: '
+                f'{words} at the same time leaves the recorded stretch unchanged within the '
+                'noise')
     advice = list(dict.fromkeys(
         QUANTITIES[x].advice for x in names if QUANTITIES[x].advice))
     if {'shear_modulus', 'density', 'remanence'} <= set(fit.free) or (
@@ -115,7 +116,7 @@ def weakness(fit: Fit, deviation: float, factors: Array) -> Weakness | None:
         advice = [QUANTITIES['density'].advice]
     listed = '; '.join(sentences) or 'the recorded stretch hardly depends on them'
     return Weakness(names, (
-        f'{_listed(list(names))} cannot be told from this recording: {listed}. Instead, '
+        f'{_listed(list(names))} cannot be identified from this recording: {listed}. Instead, '
         f'{"; or ".join(advice[:3])}; or leave out of --free what is known'))
 
 

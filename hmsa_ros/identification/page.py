@@ -165,6 +165,6 @@ def _pairs(found: Identification) -> str:
         for i, name in enumerate(found.names)]
     words = '; '.join(f'{one} and {other} ({x:.3f})' for one, other, x in found.confounded())
     return text(
-        f'The data hardly tell apart: {words}.' if words else
+        f'The data hardly distinguish {words}.' if words else
         'No pair has a correlation of 0.95 or more.') + table(
             'correlation-table', 'Correlation of the estimates.', ['', *found.names], rows)

@@ -59,5 +59,5 @@ class JointChannel:
             self._runtime.applied(self._joint, *conversions.from_command(message))
         except BadInputError as error:
             if self._tell_ignored():
-                self._node.get_logger().error(f'news of joint {self._joint} ignored: {error}')
+                self._node.get_logger().error(f'update of joint {self._joint} ignored: {error}')
         self._serve()

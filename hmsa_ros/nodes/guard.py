@@ -136,8 +136,8 @@ class CommandInput:
                 self._obey(taken.data)
             else:
                 self._node.get_logger().warning(
-                    f'command on {self._topic.name} refused: it comes from another publisher '
-                    'than the one obeyed; end one of them, or set command_source to any',
+                    f'command on {self._topic.name} refused: it comes from a publisher other '
+                    'than the one obeyed; stop one of them, or set command_source to any',
                     throttle_duration_sec=60.0)
 
     def _obey(self, data: bytes) -> None:
@@ -146,7 +146,7 @@ class CommandInput:
         except BadInputError as error:
             self.unreadable += 1
             self._node.get_logger().error(
-                f'message on {self._topic.name} left aside: {error}',
+                f'message on {self._topic.name} ignored: {error}',
                 throttle_duration_sec=60.0)
             return
         self._take(message)

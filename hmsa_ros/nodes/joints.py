@@ -26,8 +26,8 @@ from hmsa_ros.nodes.parameters import (
 
 JOINTS = ParameterSpec(
     'joints', [],
-    'Names of the joints where there are several, or where one has parameters of its own, as '
-    'left.actuator.remanence; empty for the one named by joint.')
+    'Joint names, if there are several or if one has its own parameters, such as '
+    'left.actuator.remanence; empty for the single joint named by joint.')
 
 # A token of a ROS name: the joint is a part of the names of its topics.
 _TOKEN = re.compile(r'[A-Za-z][A-Za-z0-9_]*')
@@ -63,7 +63,7 @@ def joint_names(values: Mapping[str, Any]) -> tuple[str, ...]:
         if not _TOKEN.fullmatch(name) or '__' in name or name.endswith('_'):
             raise BadInputError(
                 f'parameter joints names {name!r}: expected letters, digits and single '
-                'underscores between them, a letter first')
+                'underscores, starting with a letter')
     for name in names:
         if names.count(name) > 1:
             raise BadInputError(
@@ -131,7 +131,7 @@ class JointParameters:
         Parameters
         ----------
         parameters : iterable of rclpy.parameter.Parameter
-            Those that were not declared here are passed over.
+            Those that were not declared here are skipped.
 
         Returns
         -------

@@ -17,7 +17,7 @@ from hmsa_ros.nodes.parameters import check_names, declare, ParameterSpec
 
 AUTOSTART = ParameterSpec(
     'autostart', True,
-    'Whether the node configures and activates itself at the start; if not, it waits for '
+    'Whether the node configures and activates itself at startup; otherwise it waits for '
     '~/change_state (ros2 lifecycle set).')
 
 
@@ -79,7 +79,7 @@ class ManagedNode(LifecycleNode):
                 take(message)
             else:
                 self.get_logger().error(
-                    f'time {message.clock.sec} s on /clock passed over: expected at least 0',
+                    f'time {message.clock.sec} s on /clock skipped: expected at least 0',
                     throttle_duration_sec=1.0)
 
         # For a subscription that is made later, when use_sim_time is set, and the one there is.

@@ -13,10 +13,10 @@ from hmsa_ros.nodes.parameters import actuator_from, ParameterSpec
 
 MARKER_SCALE = ParameterSpec(
     'marker_scale', 1.0,
-    'Metres shown in ~/markers for a metre; 1 is true to size.', '', 1e-6, 1e9)
+    'Scale of ~/markers: metres shown per metre; 1 is true to size.', '', 1e-6, 1e9)
 MARKER_RATE = ParameterSpec(
     'marker_rate', 30.0,
-    'How often ~/markers is published while somebody subscribes; 0 for never.', 'Hz',
+    'Rate of ~/markers while there is a subscriber; 0 for never.', 'Hz',
     0.0, 1e3)
 MARKER_FRAME = ParameterSpec('frame_id', 'coil', 'Frame of the markers.')
 

@@ -51,7 +51,7 @@ class NewestClock:
                     self._source.clock_callback(decode(taken.data, Clock))
                 except BadInputError as error:
                     self._node.get_logger().error(
-                        f'message on /clock passed over: {error}', throttle_duration_sec=1.0)
+                        f'message on /clock skipped: {error}', throttle_duration_sec=1.0)
         return int(self._node.get_clock().now().nanoseconds)
 
     def destroy(self) -> None:

@@ -33,10 +33,10 @@ OWN = (
     *(replace(x, read_only=False) for x in ACTUATOR),
     INITIAL_STRETCH,
     ParameterSpec(
-        'shaper', 'two_step', 'How a move is commanded.', choices=tuple(SHAPERS),
+        'shaper', 'two_step', 'Shaper that plans each move.', choices=tuple(SHAPERS),
         read_only=False),
     ParameterSpec(
-        'robust_order', 2, 'Number of chained two-step commands of the shaper robust.', '',
+        'robust_order', 2, 'Number of two-step commands that the shaper robust chains.', '',
         1, 16, read_only=False),
     replace(SLEW_LIMIT, read_only=False),
     replace(FLUX_DENSITY_MIN, read_only=False),
@@ -49,54 +49,55 @@ SPECS = (
     JOINTS,
     ParameterSpec(
         'allow_partial_joints', _SETTINGS.allow_partial_joints,
-        'Whether a trajectory may be for some of the joints; the others go on as planned.',
+        'Whether a trajectory may name only some of the joints; the others continue as planned.',
         read_only=False),
     ParameterSpec(
         'simultaneous_arrival', False,
-        'Whether joints that would arrive at a setpoint before the slowest begin later, so that '
-        'all arrive at the same time; one that is still moving is not held back.',
+        'Whether faster joints start a move later so that all joints arrive at the same time; a '
+        'joint that is still moving is not delayed.',
         read_only=False),
     ParameterSpec(
-        'frame_id', 'coil', 'Frame of the coil in the stamped commands, and of the markers.'),
+        'frame_id', 'coil', 'Frame of the coil, in commands and markers.'),
     MARKER_SCALE,
     ParameterSpec(
         'lead_time', _OPTIONS.lead_time / NANOSECONDS,
-        'How far ahead of the time it applies a command is sent.', 's', 0.0, 1e6, read_only=False),
+        'How long before its stamp a command is sent.', 's', 0.0, 1e6, read_only=False),
     ParameterSpec(
         'command_mode', 'continuous',
-        'Whether commands are stamped with any time, or on the grid of command_period.',
+        'Times at which commands may apply: any time, or only the grid of command_period.',
         choices=('continuous', 'sampled')),
     ParameterSpec(
-        'command_period', 0.001, 'Period of the grid in command_mode sampled.', 's',
+        'command_period', 0.001, 'Grid period in command_mode sampled.', 's',
         1e-9, 1e3),
     ParameterSpec(
         'max_points', _SETTINGS.max_points,
-        'Largest number of setpoints in one trajectory, those of all joints together.', '',
+        'Largest number of setpoints in one trajectory, summed over its joints.', '',
         1, 10_000_000, read_only=False),
     ParameterSpec(
         'short_spell', _OPTIONS.short_spell,
-        'What to do with a setpoint that ends before the move to it does.',
+        'What to do if a setpoint is too short for its move: refuse the request, or continue to '
+        'the next setpoint from the state reached.',
         choices=SHORT_SPELL, read_only=False),
     ParameterSpec(
         'heartbeat_period', _SETTINGS.heartbeat_period / NANOSECONDS,
-        'How often the level in force is sent again, as a sign of life; 0 for never.', 's',
+        'Heartbeat: period at which the current level is sent again; 0 for never.', 's',
         0.0, 1e3, read_only=False),
     ParameterSpec(
         'replan_late', _SETTINGS.replan_late,
-        'Whether the rest of a sequence is planned anew after a command has come late.',
+        'Whether to replan the rest of a sequence after a late command.',
         read_only=False),
     ParameterSpec(
         'lateness_tolerance', _SETTINGS.lateness_tolerance / NANOSECONDS,
-        'How late a command may take effect without a new plan. The jitter of a good driver '
-        'lies below the default, and what it leaves below the errors of any model.', 's',
+        'How late a command may take effect without replanning. The default exceeds the jitter '
+        'of a good driver.', 's',
         0.0, 1.0, read_only=False),
     ParameterSpec(
         'takeover_timeout', _SETTINGS.takeover_timeout / NANOSECONDS,
-        'How long the first request waits for a sample of the state in force, if somebody '
-        'publishes samples; 0 for not at all.', 's', 0.0, 60.0),
+        'How long the first request waits for a sample of the current state, if samples are '
+        'published; 0 for no wait.', 's', 0.0, 60.0),
     ParameterSpec(
         'takeover_max_age', _SETTINGS.takeover_max_age / NANOSECONDS,
-        'Age up to which such a sample counts.', 's', 0.0, 1e6),
+        'Largest age of a sample that is used for this.', 's', 0.0, 1e6),
     AUTOSTART,
 )
 

@@ -43,38 +43,39 @@ PARAMETERS = (
     JOINTS,
     ParameterSpec(
         'command_source', 'any',
-        'Whose commands are obeyed: those of any publisher, or only of the first until it is '
-        'gone.', choices=COMMAND_SOURCES),
+        'Publishers whose commands are obeyed: any, or only the first until it disappears.',
+        choices=COMMAND_SOURCES),
     ParameterSpec(
         'command_delay', 0.0,
-        'Transport delay: time from the arrival of a command until it is known.', 's', 0.0, 1e3),
+        'Simulated transport delay of commands.', 's', 0.0, 1e3),
     ParameterSpec(
         'measurement_delay', 0.0,
-        'Transport delay: time from taking a sample, which its stamp tells, until it is '
-        'published.', 's', 0.0, 1e3),
+        'Simulated transport delay of samples: they are published this long after their stamp.',
+        's', 0.0, 1e3),
     ParameterSpec(
-        'seed', 0, 'Of the noise: the same seed gives the same run.', '', 0, 2**31 - 1),
+        'seed', 0, 'Seed of the noise; the same seed gives the same run.', '', 0, 2**31 - 1),
     PUBLISH_RATE,
     ParameterSpec(
         'publish_scalars', 'auto',
-        'Whether stretch and stretch_rate are published beside joint_states; auto for a single '
-        'joint only.', choices=('auto', 'always', 'never')),
+        'Whether to publish stretch and stretch_rate besides joint_states; auto: only for a '
+        'single joint.', choices=('auto', 'always', 'never')),
     ParameterSpec(
         'publish_clock', False,
-        'Whether the plant is the authority on simulated time and publishes /clock; leave '
-        'use_sim_time of this node false then.'),
+        'Whether the plant publishes /clock as the source of simulated time; leave its own '
+        'use_sim_time false then.'),
     ParameterSpec(
         'real_time_factor', 1.0,
-        'Simulated seconds per second as authority on /clock; 0 for as fast as it can.', '',
+        'Simulated seconds per real second when the plant publishes /clock; 0 for as fast as '
+        'possible.', '',
         0.0, 1e6, read_only=False),
     ParameterSpec(
         'start_time', 1.0,
-        'Simulated time to begin at, above 0 since a ROS clock at 0 has not started.', 's',
+        'Initial simulated time; above 0, because a ROS clock at 0 has not started.', 's',
         1e-3, 1e9),
     ParameterSpec(
-        'start_paused', False, 'Whether to wait for ~/set_paused before time runs.'),
+        'start_paused', False, 'Whether to start paused, until ~/set_paused is called.'),
     ParameterSpec(
-        'step_count', 1, 'Samples that one call of ~/step advances.', '', 1, 100_000,
+        'step_count', 1, 'Number of samples that ~/step advances.', '', 1, 100_000,
         read_only=False),
     MARKER_FRAME,
     MARKER_RATE,
@@ -221,7 +222,7 @@ class PlantNode(ManagedNode):
             self.get_logger().warning(
                 f'the clock jumped {"ahead" if jump > 0 else "back"} by {abs(jump) / 1e9:.3f} s: '
                 'the simulation ' + (
-                    'goes on from there in its present state' if jump > 0
+                    'continues from there in its present state' if jump > 0
                     else 'starts again from its initial state'), throttle_duration_sec=1.0)
             self._publish_news()
         begin = monotonic_ns()
@@ -291,7 +292,7 @@ class PlantNode(ManagedNode):
         if not self._authority:
             response.message = 'the plant follows a clock: expected publish_clock true'
         elif not self._pacer.paused:
-            response.message = 'the plant runs: expected it paused (~/set_paused)'
+            response.message = 'the plant is running: expected it paused (~/set_paused)'
         elif not self.active:
             response.message = f'the plant is {self.state}: expected it active'
         else:

@@ -36,32 +36,35 @@ OWN = (
     SLEW_LIMIT,
     COIL_TIME_CONSTANT,
     ParameterSpec(
-        'stretch_noise', 0.0, 'Standard deviation of the published stretch.', '', 0.0, 1e3),
+        'stretch_noise', 0.0, 'Standard deviation of the noise on the published stretch.',
+        '', 0.0, 1e3),
     ParameterSpec(
-        'rate_noise', 0.0, 'Standard deviation of the published stretch rate.', '1/s',
+        'rate_noise', 0.0, 'Standard deviation of the noise on the published stretch rate.', '1/s',
         0.0, 1e9),
     ParameterSpec(
-        'stretch_bias', 0.0, 'Added to the published stretch by the sensor.', '', -1e3, 1e3),
+        'stretch_bias', 0.0, 'Sensor bias, added to the published stretch.', '', -1e3, 1e3),
     ParameterSpec(
         'stretch_gain', 1.0,
-        'Factor of the sensor on the published stretch and stretch rate.', '', 1e-3, 1e3),
+        'Sensor gain, a factor on the published stretch and stretch rate.', '', 1e-3, 1e3),
     ParameterSpec(
         'command_timeout', 1.0,
-        'Longest silence, in time that runs, of commands and heartbeats after the first one '
-        'before the coil goes to safe_flux; 0 for any.', 's', 0.0, 1e6),
+        'Watchdog: longest time without command or heartbeat, after the first one, before the '
+        'coil does what safe_flux says; 0 disables it. Paused time does not count.',
+        's', 0.0, 1e6),
     ParameterSpec(
         'safe_flux', 'hold',
-        'What the coil does then: hold what is commanded, zero at once, or ramp to zero. Use zero '
-        'or ramp for a real coil that must not be left on.', choices=SAFE_FLUX),
+        'What the coil does when the watchdog trips: hold the commanded level, go to zero, or '
+        'ramp to zero. Use zero or ramp for a real coil that must not be left on.',
+        choices=SAFE_FLUX),
     ParameterSpec(
-        'safe_ramp_rate', 1.0, 'Rate of the ramp to zero, in steps of a millisecond.', 'T/s',
+        'safe_ramp_rate', 1.0, 'Rate of the ramp to zero, which has steps of 1 ms.', 'T/s',
         1e-9, 1e12),
     ParameterSpec(
         'reset_stretch', 0.0,
-        'Stretch that ~/reset leads to, held by its flux density; 0 for initial_stretch.', '',
+        'Stretch after ~/reset, held by its equilibrium flux density; 0 for initial_stretch.', '',
         0.0, 1e3, read_only=False),
     ParameterSpec(
-        'reset_rate', 0.0, 'Stretch rate that ~/reset leads to.', '1/s', -1e9, 1e9,
+        'reset_rate', 0.0, 'Stretch rate after ~/reset.', '1/s', -1e9, 1e9,
         read_only=False),
 )
 
@@ -162,7 +165,7 @@ class PlantJoint:
             self.refused += 1
             if self._tell_refused():
                 self._node.get_logger().error(
-                    f'{self._of_me}command refused, the one in force stays: {error}')
+                    f'{self._of_me}command refused, the previous one stays in force: {error}')
 
     def _on_force(self, message: WrenchStamped) -> None:
         if not self._node.active:

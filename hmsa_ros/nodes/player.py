@@ -55,69 +55,75 @@ PARAMETERS = (
     ParameterSpec('storage.uri', '', 'Folder of the bag, or an .mcap file.'),
     ParameterSpec(
         'storage.max_chunk_size', CHUNK_SIZE,
-        'Largest chunk or message that is read; larger ones are passed over.', 'B', 1),
-    ParameterSpec('play.rate', 1.0, 'Speed as a multiple of the recorded one.', '', 1e-3, 1e3,
+        'Largest chunk or message to read; larger ones are skipped.', 'B', 1),
+    ParameterSpec('play.rate', 1.0, 'Playback speed relative to the recording.', '', 1e-3, 1e3,
                   read_only=False),
-    ParameterSpec('play.loop', False, 'Whether to begin again at the end.'),
-    ParameterSpec('play.start_paused', False, 'Whether to begin paused.'),
-    ParameterSpec('play.start_offset.sec', 0, 'Whole seconds to pass over at the start.', 's', 0),
+    ParameterSpec('play.loop', False, 'Whether to start again at the end.'),
+    ParameterSpec('play.start_paused', False, 'Whether to start paused.'),
+    ParameterSpec('play.start_offset.sec', 0, 'Whole seconds to skip at the start.', 's', 0),
     ParameterSpec(
-        'play.start_offset.nsec', 0, 'Nanoseconds on top of them.', 'ns', 0, 999_999_999),
+        'play.start_offset.nsec', 0, 'Nanoseconds to add to the seconds.', 'ns', 0, 999_999_999),
     ParameterSpec(
         'play.playback_duration.sec', -1,
-        'Whole seconds to play from the start, negative for all.', 's', -1),
+        'Whole seconds to play; negative for all.', 's', -1),
     ParameterSpec(
-        'play.playback_duration.nsec', 0, 'Nanoseconds on top of them.', 'ns', 0, 999_999_999),
+        'play.playback_duration.nsec', 0, 'Nanoseconds to add to the seconds.',
+        'ns', 0, 999_999_999),
     ParameterSpec(
         'play.seek', -1.0,
-        'Set while playing: go on from this time after the first message of the bag.', 's',
+        'Set while playing to jump to this time after the first message of the bag.', 's',
         -1.0, 1e9, read_only=False),
     ParameterSpec(
         'play.topics_to_filter', [],
-        'Topics to send, all others are left out; empty for all but commands.'),
+        'Topics to send; empty for all except commands.'),
     ParameterSpec(
         'play.regex_to_filter', '',
-        'Topics in which this regular expression is found are sent, all others are left out.'),
+        'Regular expression; only topics that contain a match are sent.'),
     ParameterSpec('play.exclude_topics_to_filter', [], 'Topics not to send.'),
     ParameterSpec(
         'play.exclude_regex_to_filter', '',
-        'Topics in which this regular expression is found are not sent.'),
+        'Regular expression; topics that contain a match are not sent.'),
     ParameterSpec(
         'play.allow_commands', [],
-        'Topics with commands that may be sent, besides those in play.topics_to_filter.'),
+        'Command topics that may be sent, besides those in play.topics_to_filter.'),
     ParameterSpec(
         'play.clock_publish_frequency', 0.0,
-        'Rate at which /clock is published in the time of the bag, 0 for not.', 'Hz', 0.0, 1e5),
+        "Rate at which /clock is published, in the bag's time; 0 for never.", 'Hz', 0.0, 1e5),
     ParameterSpec(
         'play.clock_publish_on_topic_publish', False,
-        'Whether /clock is published before each message.'),
+        'Whether to publish /clock before each message.'),
     ParameterSpec(
         'play.wait_for_subscribers', [],
         'Topics that must have a subscriber before anything is sent.'),
     ParameterSpec(
         'play.wait_for_nodes', [],
         'Managed nodes that must be active before anything is sent; if there are any, one of '
-        'them must be the subscriber of each topic in play.wait_for_subscribers.'),
+        'them must subscribe to each topic in play.wait_for_subscribers.'),
     ParameterSpec(
-        'play.wait_for_subscribers_timeout', 60.0, 'How long to wait for both.', 's', 0.0, 1e6),
+        'play.wait_for_subscribers_timeout', 60.0, 'How long to wait for subscribers and nodes.',
+        's', 0.0, 1e6),
     ParameterSpec(
         'play.discovery_time', 3.5,
-        'How long to look for subscribers that are there already; not waited for in full when '
-        'every topic has one, or those in play.wait_for_subscribers do.', 's', 0.0, 3600.0),
+        'How long to look for existing subscribers; ends early once every topic has one, or '
+        'every topic in play.wait_for_subscribers.', 's', 0.0, 3600.0),
     ParameterSpec('play.delay.sec', 0, 'Whole seconds to wait before playing.', 's', 0),
-    ParameterSpec('play.delay.nsec', 0, 'Nanoseconds on top of them.', 'ns', 0, 999_999_999),
+    ParameterSpec('play.delay.nsec', 0,
+        'Nanoseconds to add to the seconds.', 'ns', 0, 999_999_999),
     ParameterSpec(
-        'play.read_ahead_queue_size', 1000, 'Messages read ahead.', '', 1, 10_000_000),
+        'play.read_ahead_queue_size', 1000, 'Number of messages to read ahead.',
+        '', 1, 10_000_000),
     ParameterSpec(
         'play.realtime_priority', 1,
-        'Real-time priority of the thread that sends, where the system grants it; 0 for an '
-        'ordinary thread.', '', 0, 99),
+        'Real-time priority of the sending thread, if the system grants it; 0 for an ordinary '
+        'thread.', '', 0, 99),
     ParameterSpec(
         'play.wait_acked_timeout.sec', 20,
-        'Whole seconds to wait at the end for reliable subscribers, negative for not at all.',
+        'Whole seconds to wait at the end for acknowledgements of reliable subscribers; '
+        'negative for no wait.',
         's', -1),
     ParameterSpec(
-        'play.wait_acked_timeout.nsec', 0, 'Nanoseconds on top of them.', 'ns', 0, 999_999_999),
+        'play.wait_acked_timeout.nsec', 0, 'Nanoseconds to add to the seconds.',
+        'ns', 0, 999_999_999),
 )
 
 
@@ -315,7 +321,7 @@ class Player(ManagedNode):
             if missing and now >= begin + patience:
                 raise HmsaError(
                     f'no {", no ".join(missing)} within {patience:g} s: expected one; start it, '
-                    'or take it out of play.wait_for_subscribers and play.wait_for_nodes')
+                    'or remove it from play.wait_for_subscribers and play.wait_for_nodes')
 
     def _finish(self, transport: Transport) -> None:
         """Wait for reliable subscribers and say what was sent."""

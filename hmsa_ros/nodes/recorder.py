@@ -324,7 +324,7 @@ class Recorder(ManagedNode):
         """Go on in a new file: a simulation began anew, or a bag is played in a loop."""
         self.get_logger().warning(
             f'simulated time jumped back from {before * 1e-9:.3f} s to {now * 1e-9:.3f} s: '
-            'recording goes on in a new file')
+            'recording continues in a new file')
         self._recording.begin_anew()
         if self._sim_time is not None:
             self._note({'time_jumps': str(self._sim_time.jumps)})

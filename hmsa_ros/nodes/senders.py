@@ -78,7 +78,7 @@ def _left_out(
         node: Node, selection: Filter, name: str, info: TopicInfo, own_clock: bool) -> str:
     """Return why a topic that passes the filter is not sent, empty if it is."""
     if not is_full_name(name):
-        return 'it cannot be published, its name is no valid ROS name'
+        return 'it cannot be published, its name is not a valid ROS name'
     resolved = node.resolve_topic_name(name)
     if selection.withholds(name, resolved, info.type):
         return ('it carries commands; name it in play.topics_to_filter or '

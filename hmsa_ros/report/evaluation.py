@@ -137,7 +137,7 @@ class Evaluation:
         Stretch, and stretch rate in 1/s, simulated for plain steps; NaN without a move, and
         where they are too large to follow.
     plan : tuple of Level
-        Changes of level that were planned and not planned anew, by stamp.
+        Changes of level that were planned and not replanned, by stamp.
     predicted : tuple of ndarray, shape (n,)
         Stretch, and stretch rate in 1/s, by the plan; NaN before and without one.
 

@@ -130,8 +130,8 @@ def page(parts: Sequence[Part]) -> str:
         ('timing-section', 'Timing', text(
             'Lead: how far ahead of the time it applies a command was recorded; below 0 it came '
             'late. ' + (
-                'Lateness: how long after that time the change took effect, as the plant or the '
-                'driver told. ' if any(len(x.timing.lateness) for x in parts) else '')
+                'Lateness: how long after that time the change took effect, as reported by the '
+                'plant or the driver. ' if any(len(x.timing.lateness) for x in parts) else '')
             + 'Delay: how long after its stamp a sample was recorded. Times are those of the '
             "recorder's clock." + _repeats(parts))
          + place(charts.timings(parts, unit)) + _timing(parts)),
@@ -283,8 +283,8 @@ def _notes_of(part: Part) -> Iterable[str]:
     """Return the notes on one run."""
     yield from part.run.notes
     if part.run.commands and not part.evaluation.results:
-        yield ('No setpoint could be told from the commands: none of them holds a stretch that '
-               'was asked for, or lasts a period of the actuator.')
+        yield ('No setpoint could be identified from the commands: none of them holds a '
+               'requested stretch or lasts a period of the actuator.')
     if part.evaluation.results and not np.isfinite(part.evaluation.unshaped[0]).any():
         yield 'Plain steps cannot be simulated: the levels are too large to follow.'
     samples = period_of(part.run) / np.median(part.timing.interval) \
@@ -293,11 +293,11 @@ def _notes_of(part: Part) -> Iterable[str]:
         yield (f'The recording has {samples:.3g} samples a period of the actuator: expected at '
                f'least {FEW_SAMPLES}, since peaks between samples are missed; raise publish_rate.')
     if not len(part.timing.lead) and part.run.commands:
-        yield ('The recorder kept another clock than the stamps: how far ahead commands were '
-               'sent is not known (record with use_sim_time where time is simulated).')
+        yield ('The clock of the recorder differs from that of the stamps: the lead of the '
+               'commands is unknown (record with use_sim_time if time is simulated).')
     if part.timing.unapplied:
-        yield (f'{part.timing.unapplied} changes of level did not take effect by what '
-               f'{part.run.topics[APPLIED]} tells.')
+        yield (f'{part.timing.unapplied} changes of level did not take effect according to '
+               f'{part.run.topics[APPLIED]}.')
     if part.timing.missing:
         yield f'The stamps of the samples have gaps with room for {part.timing.missing} more.'
     for verdict in part.run.verdicts:
@@ -391,7 +391,7 @@ def _requests(parts: Sequence[Part], unit: TimeUnit) -> str:
     if not rows:
         return ''
     return table(
-        'request-table', 'What the planner said of the requests.',
+        'request-table', 'Verdicts of the planner on the requests.',
         ['run', f'time [{unit.name}]', 'level', 'code', 'message'], rows[:_MOST_ROWS])
 
 
@@ -417,7 +417,7 @@ def _plan(parts: Sequence[Part], unit: TimeUnit) -> str:
 
 def _repeats(parts: Sequence[Part]) -> str:
     count = sum(x.timing.repeats for x in parts)
-    return f' Left out are {count} commands that repeat the one before.' if count else ''
+    return f' {count} commands that repeat the one before are omitted.' if count else ''
 
 
 def _timing(parts: Sequence[Part]) -> str:
@@ -464,8 +464,8 @@ def _losses(parts: Sequence[Part]) -> str:
                 Cell('not counted' if topic.lost is None else str(topic.lost),
                      math.nan if topic.lost is None else topic.lost)])
     words = '' if counted else text(
-        'A recorder that counts what it misses stores that in the bag (hmsa recorder does); '
-        'where it does not, gaps in the stamps of the samples are all there is to go by.')
+        'hmsa recorder counts lost messages and stores the counts in the bag; with other '
+        'recorders, only gaps in the stamps of the samples show losses.')
     return words + table(
         'loss-table', 'What is in the bags.',
         ['bag', 'topic', 'type', 'messages', 'a second', 'lost'], rows)
@@ -503,14 +503,14 @@ def _parameters(parts: Sequence[Part]) -> str:
         ['largest stretch', '1', *(cell(x) for _, x in limits)],
     ]
     words = '' if all(x.run.parameters_known for x in parts) else text(
-        'Unknown: the bag does not tell the parameters, and the example block of the paper '
-        'stands in.')
+        'Unknown: the bag does not contain the parameters; the example block of the paper is '
+        'used instead.')
     recorded: list[Row] = [
         [part.run.label, key, json.dumps(value)] for part in parts
         for key, value in part.run.parameters.items()]
     more = '' if not recorded else (
         '<details><summary>All parameters that were recorded</summary>' + table(
-            'recorded-table', 'As the nodes had them.', ['run', 'parameter', 'value'], recorded)
+            'recorded-table', 'As set on the nodes.', ['run', 'parameter', 'value'], recorded)
         + '</details>')
     return words + table(
         'parameter-table', 'The block, and what follows from it.', header, rows) + more

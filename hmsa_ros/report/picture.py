@@ -28,7 +28,7 @@ def draw(path: Path, parts: Sequence[Part], kind: str) -> None:
     Parameters
     ----------
     path : Path
-        File to write; one of that name is replaced.
+        File to write; an existing file is replaced.
     parts : sequence of Part
         Runs, evaluated; at least one.
     kind : {'png', 'pdf'}

@@ -121,15 +121,14 @@ def actuators(
     if not found:
         notes.append(
             "The recording does not contain the actuator's parameters: those of the example "
-            'block are used, so that what is simulated here (plain steps, prediction, '
-            'equilibria, b and tau) may not be your actuator; name a parameter file with '
-            '--params-file.')
+            'block are used, so what is simulated here (plain steps, prediction, equilibria, b '
+            'and tau) may not match your actuator; name a parameter file with --params-file.')
     plant = found.get(PLANT) or found.get(PLANNER) or paper_actuator()
     planner = found.get(PLANNER) or plant
     if plant != planner:
         notes.append(
-            'The planner took other parameters for the actuator than the plant has: see the '
-            'table of parameters.')
+            'The planner and the plant had different parameters of the actuator: see the table '
+            'of parameters.')
     return plant, planner, bool(found), notes
 
 

@@ -74,7 +74,7 @@ def write_table(path: Path, columns: Mapping[str, Array]) -> None:
     Parameters
     ----------
     path : Path
-        Ending in .csv or .parquet; one of that name is replaced.
+        Ending in .csv or .parquet; an existing file is replaced.
     columns : mapping of str to ndarray
         Of one length; NaN is left empty in CSV.
 

@@ -41,8 +41,8 @@ def check_joints(request: Request, joints: Sequence[str], settings: Settings) ->
     missing = [x for x in joints if x not in names]
     if not names or missing and not settings.allow_partial_joints:
         raise _unknown(
-            f'lacks {missing[0]!r}: expected all of {", ".join(joints)} (the parameter '
-            'allow_partial_joints lets a message be for some of them)')
+            f'lacks {missing[0]!r}: expected all of {", ".join(joints)} (set '
+            'allow_partial_joints to let a message name only some of them)')
     count = request.count * len(names)
     if count > settings.max_points:
         raise RefusedError(

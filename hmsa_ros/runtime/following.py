@@ -92,7 +92,7 @@ class Following:
             return self._late(found.late, joint, stamp - found.late)
         if found.foreign and self._tell_foreign():
             return [Note(Severity.WARN, (
-                f'joint {joint}: {flux_density:g} T took effect, which was not commanded'))]
+                f'joint {joint}: {flux_density:g} T took effect but was not commanded'))]
         return []
 
     def drop_missed(self, now: int, tolerance: int) -> list[Note]:
@@ -186,16 +186,16 @@ class Following:
         self.replanned += 1
         missed = drafts[name].missed
         return Verdict(
-            Severity.WARN, 'replanned', 'commands took effect otherwise than planned: the rest '
-            'is planned anew' + (
-                f', without {missed} setpoints whose time is over' if missed else ''), request)
+            Severity.WARN, 'replanned', 'commands did not take effect as planned: the rest is '
+            'replanned' + (
+                f', without {missed} setpoints whose time has passed' if missed else ''), request)
 
     def abandon(self, work: Work, error: HmsaError, request: str) -> Verdict:
         """Leave a plan as it is that cannot even be stopped."""
         name, = work.joints
         self.astray.discard(name)
         return Verdict(
-            Severity.ERROR, 'not_converged', f'joint {name} cannot be planned for anew: {error}',
+            Severity.ERROR, 'not_converged', f'joint {name} cannot be replanned: {error}',
             request)
 
     def give_up(self, lead_time: int, request: str) -> Verdict:
@@ -204,6 +204,6 @@ class Following:
         largest = self.lateness.largest
         return Verdict(
             Severity.WARN, 'late',
-            f'commands come late again and again, by up to {largest / 1e6:.3f} ms, and '
-            f'vibration is left: {self.lateness.advice(lead_time)}', request,
+            f'commands are repeatedly late, by up to {largest / 1e6:.3f} ms, and leave '
+            f'vibration: {self.lateness.advice(lead_time)}', request,
             {'largest_lateness': largest / NANOSECONDS})

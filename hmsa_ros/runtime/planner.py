@@ -42,7 +42,7 @@ _STORM = NANOSECONDS
 # So far ahead that all there is gets sent.
 _FAR = 2**62
 _WAITING = Verdict(
-    Severity.OK, 'waiting', 'accepted: to be carried out as soon as the state in force is known')
+    Severity.OK, 'waiting', 'accepted: starts as soon as the current state is known')
 
 
 class PlannerRuntime:
@@ -163,7 +163,7 @@ class PlannerRuntime:
         self._give(Verdict(
             Severity.WARN, 'clock_jumped',
             f'the clock jumped back by {back / NANOSECONDS:.3f} s: the plan is dropped, and the '
-            'actuator taken to be at its initial stretch unless joint_states shows otherwise'),
+            'actuator is assumed at its initial stretch unless joint_states shows otherwise'),
             log=True)
 
     def deactivate(self) -> None:
@@ -272,7 +272,7 @@ class PlannerRuntime:
         for name, planner in self.group.planners.items():
             if name not in samples:
                 self._note(
-                    f'no sample of joint {name} on joint_states: it is taken to rest at its '
+                    f'no sample of joint {name} on joint_states: it is assumed at rest at its '
                     'initial stretch')
                 continue
             x = samples[name]
@@ -364,7 +364,7 @@ class PlannerRuntime:
             self._give(Verdict(Severity.OK, 'accepted', 'accepted', request.name))
         else:
             self._give(Verdict(
-                Severity.OK, 'unchanged', 'already on the way there: the plan stays',
+                Severity.OK, 'unchanged', 'already on the way there: the plan is unchanged',
                 request.name))
 
     def refuse(self, error: HmsaError, request: Request) -> Verdict:

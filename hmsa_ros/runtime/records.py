@@ -19,7 +19,7 @@ class Settings:
     heartbeat_period : int
         How often the level in force is sent again; 0 for never.
     replan_late : bool
-        Whether the rest of a sequence is planned anew where reality has left the plan.
+        Whether the rest of a sequence is replanned when reality has left the plan.
     lateness_tolerance : int
         How late a command may take effect without a new plan.
     takeover_timeout : int

@@ -74,7 +74,7 @@ class Verdict:
             whole(values.get('setpoint')), whole(values.get('setpoints')))
 
 
-_SILENCE = Verdict(0, 'no word of the planner yet', '', '', '', 0, 0)
+_SILENCE = Verdict(0, 'no reply from the planner yet', '', '', '', 0, 0)
 
 
 class PlannerClient:
@@ -185,7 +185,8 @@ class PlannerClient:
         # One whose node is there but does not listen yet is compiling its kernels.
         self.spin_until(lambda: found() or self._planner_starts(), failure, each)
         self.spin_until(
-            lambda: found() or not self._planner_starts(), 'the planner does not listen', each,
+            lambda: found() or not self._planner_starts(), 'the planner does not subscribe to '
+                                                           'requests', each,
             max(self._timeout, _COMPILE_SECONDS))
         self.spin_until(found, failure, each)
 
@@ -250,7 +251,7 @@ class PlannerClient:
             if np.size(stretch) not in (1, len(self._joints)):
                 raise BadInputError(
                     f'{np.size(stretch)} stretches for {len(self._joints)} joints '
-                    f'({", ".join(self._joints)}): expected one for all, or one a joint')
+                    f'({", ".join(self._joints)}): expected one for all, or one per joint')
             end += span
             if end >= 2**31:
                 raise BadInputError(f'the sequence lasts {end:g} s: expected less than 2^31 s')
@@ -261,7 +262,7 @@ class PlannerClient:
             self._publisher.publish(to_trajectory(points, self._joints, frame=request))
             self.spin_until(
                 lambda request=request: self._verdict.request == request,  # type: ignore[misc]
-                'the planner gave no verdict')
+                'the planner did not reply with a verdict')
             if self._verdict.level < DiagnosticStatus.ERROR[0]:
                 return self._verdict
             if not time_begins or self._verdict.code != 'no_time' or monotonic() > deadline:
@@ -299,12 +300,12 @@ class PlannerClient:
             now = self._verdict
             if now.request != verdict.request:
                 raise HmsaError(
-                    f'the sequence was not carried out: another request came in between '
+                    'the sequence was not completed: another request replaced it '
                     f'({now.message})')
             return now.setpoint == now.setpoints and now.state in ('at_rest', 'settling')
 
         self.spin_until(
-            done, 'the sequence has not come to its end',
+            done, 'the sequence has not finished',
             None if each is None else lambda: each(self._verdict),
             timeout)
         return self._verdict

@@ -115,7 +115,7 @@ def prepare(folder: Path) -> None:
     """
     if (folder / 'run').exists():
         raise BadInputError(
-            f'{folder} holds an earlier run: expected another folder (--out) or that one '
+            f'{folder} holds an earlier run: expected another folder (--out), or this one '
             'removed')
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -181,7 +181,7 @@ def run_demo(
             limit = 3.0 * total / REAL_TIME_FACTOR + _START_SECONDS
             client.follow(verdict, each=lambda _: report(), timeout=limit)
             client.spin_until(
-                lambda: watch.time - begin > total, 'simulated time stands still', report,
+                lambda: watch.time - begin > total, 'simulated time does not advance', report,
                 limit)
         progress('closing the bag', 1.0)
         exits = session.stop(('recorder',))

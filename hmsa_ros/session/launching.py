@@ -129,8 +129,8 @@ _COMMON = (
     _flag('record', 'Whether to record', 'true'),
     Argument('namespace', 'Namespace of the nodes'),
     _flag('rviz', 'Whether to start RViz, which must be installed', 'false'),
-    Argument('rviz_config', "What RViz shows; default this package's"),
-    Argument('log_level', 'Least severity that is logged: debug, info, warn, error or fatal',
+    Argument('rviz_config', "Configuration of RViz; default this package's"),
+    Argument('log_level', 'Lowest severity to log: debug, info, warn, error or fatal',
              'info'))
 
 
@@ -196,24 +196,24 @@ def _start_replay(values: Mapping[str, str], share: Path) -> Started:
 
 #: Planner, simulated plant and recorder.
 DEMO = LaunchFile((
-    _flag('plant', 'Whether to simulate; false for a driver of real hardware', 'true'),
+    _flag('plant', 'Whether to simulate the plant; false for a driver of real hardware', 'true'),
     Argument(
-        'use_sim_time', 'Whether time is that of /clock, which the plant publishes; auto: if the '
-        'plant is simulated', 'auto', ('auto', *_YES_OR_NO)),
+        'use_sim_time', 'Whether to use simulated time from /clock, which the plant publishes; '
+        'auto: if the plant is simulated', 'auto', ('auto', *_YES_OR_NO)),
     Argument(
         'params_file', 'Parameters of the nodes; default config/demo.yaml for a simulated plant '
         "in simulated time, otherwise the nodes' own defaults"),
     Argument(
-        'bag', 'Folder of the bag, which must not exist yet; default hmsa_ and the time of day'),
+        'bag', 'Folder of the bag, which must not exist yet; default hmsa_ plus date and time'),
     *_COMMON), _start_demo)
 
 #: A bag's commands to a fresh plant. The player publishes ``/clock`` from the bag.
 REPLAY = LaunchFile((
     Argument('bag', 'Folder of the bag to play', None),
     Argument(
-        'record_to', 'Folder of the new bag, which must not exist yet; default hmsa_replay_ and '
-        'the time of day'),
-    Argument('rate', 'Speed of playing', '1.0'),
+        'record_to', 'Folder of the new bag, which must not exist yet; default hmsa_replay_ '
+        'plus date and time'),
+    Argument('rate', 'Playback speed', '1.0'),
     Argument('params_file', "Parameters of the nodes; default the nodes' own defaults"),
     *_COMMON), _start_replay)
 

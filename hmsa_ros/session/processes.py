@@ -157,7 +157,7 @@ class Session:
 
         """
         lines = self.log(name).read_text(errors='replace').strip().splitlines()
-        return f'{lines[-1] if lines else "it said nothing"} (log: {self.log(name)})'
+        return f'{lines[-1] if lines else "it printed nothing"} (log: {self.log(name)})'
 
     def stop(self, order: Sequence[str] = ()) -> dict[str, int]:
         """

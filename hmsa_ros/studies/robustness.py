@@ -340,7 +340,7 @@ def write_csv(path: Path, studies: Sequence[tuple[Case, Sequence[Result]]]) -> N
     Parameters
     ----------
     path : Path
-        File to write; one of that name is replaced.
+        File to write; an existing file is replaced.
     studies : sequence of (Case, sequence of Result)
         What was studied.
 

@@ -33,7 +33,7 @@ MOST_POINTS = 10_000_000
 #: Rows planned at a time.
 BLOCK = 10_000
 
-_GRID = 'VALUE, FIRST:LAST:POINTS or log:FIRST:LAST:POINTS, several of them with commas'
+_GRID = 'VALUE, FIRST:LAST:POINTS, log:FIRST:LAST:POINTS, or several separated by commas'
 _STATUS = np.array([str(CODES[number]) for number in sorted(CODES)])
 
 

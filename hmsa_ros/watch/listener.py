@@ -320,7 +320,7 @@ class Listener:
         if not self._senders['planner']:
             sentences.append(f'no planner seen {where}: {mend}')
         sentences += [
-            f'{x.unreadable} messages on {x.topic} left aside ({x.complaint}): end the program '
+            f'{x.unreadable} messages on {x.topic} ignored ({x.complaint}): end the program '
             'that publishes them, or remap its topic'
             for x in self._sources if now - x.complained < _FORGET_SECONDS]
         return sentences

@@ -85,7 +85,7 @@ class History:
         count = len(self._low)
         order = np.arange(self._newest - count + 1, self._newest + 1) % count
         begins = np.linspace(0, count, columns, endpoint=False).astype(np.int64)
-        # NaN is passed over; a column without any value gives NaN.
+        # NaN is skipped; a column without any value gives NaN.
         return np.fmin.reduceat(self._low[order], begins), np.fmax.reduceat(
             self._high[order], begins)
 
