@@ -35,6 +35,10 @@ _NEAR_WHITE = 1.5
 _ADJACENT = 0.002
 # Simulations for each of the starts; the best one goes on.
 _FIRST_PASSES = 25
+# A time unit seen in the data is tried before the others up to this factor from the given one.
+_FAR = 4.0
+# As many fits at one optimum end the search.
+_ENOUGH = 2
 # Fits within this share of the deviations, or of the scale, are one optimum.
 _SAME = 0.02
 # A run whose fastest motion after a change of level is this much slower than a step's is shaped.
@@ -138,40 +142,49 @@ def _search(
             one = fit(recording, candidate, free, at_rest=at_rest, most=_FIRST_PASSES)
             if one is not None:
                 found.append(one)
-                if _good(recording, one):
+                if _good(recording, one) or _settled(recording, found):
                     return True
         return False
 
     given = starts(recording, values, free)
-    nearest = _nearest(recording, given, at_rest)
-    # The likeliest first; then all time units, and what else was seen in the data.
-    if not tried([nearest]) and not tried(
-            scan(recording, values, free, at_rest=at_rest)):
-        tried([x for x in given if x is not nearest])
+    nearest = min((given[0], given[-1]), key=lambda x: _miss(recording, x, at_rest))
+    # A frequency far from that of the values given may be one of the noise.
+    near = abs(math.log(nearest['time_unit'] / values['time_unit'])) < math.log(_FAR)
+    if not near or not tried([nearest]):
+        # All time units, and what else was seen in the data; the likeliest first.
+        others = [*scan(recording, values, free, at_rest=at_rest),
+                  *(x for x in given if not near or x is not nearest)]
+        tried(sorted(others, key=lambda x: _miss(recording, x, at_rest)))
     if not found:
         raise BadInputError(
             f'no start value leads to a motion that {recording.label} could be compared with: '
             'expected levels in T and a block as --params-file describes it; a level may be more '
             'than the block can hold')
-    scale = min(x.scale for x in found)
-    losses = [loss(x.residual, scale) for x in found]
-    best = found[int(np.argmin(losses))]
-    agreed = sum(x < (1.0 + _SAME) * min(losses) for x in losses)
+    best, agreed = _best(found)
     if not best.converged:
         best = fit(recording, best.values, free, at_rest=at_rest) or best
     return best, len(found), agreed
 
 
-def _nearest(
-        recording: Recording, given: Sequence[dict[str, float]], at_rest: bool
-) -> dict[str, float]:
-    """Return the first of the start values unless the last, those given, are nearer."""
-    misses = []
-    for candidate in (given[0], given[-1]):
-        response = respond(recording, candidate, (), at_rest=at_rest, rtol=1e-4)
-        misses.append(math.inf if response is None else float(
-            np.mean(np.abs(recording.stretch - response.stretch))))
-    return given[-1] if misses[1] < misses[0] else given[0]
+def _best(found: Sequence[Fit]) -> tuple[Fit, int]:
+    """Return the likeliest fit, and how many ended there."""
+    scale = min(x.scale for x in found)
+    losses = [loss(x.residual, scale) for x in found]
+    agreed = sum(x < (1.0 + _SAME) * min(losses) for x in losses)
+    return found[int(np.argmin(losses))], agreed
+
+
+def _settled(recording: Recording, found: Sequence[Fit]) -> bool:
+    """Whether several starts ended at the likeliest fit, though it leaves more than noise."""
+    best, agreed = _best(found)
+    return agreed >= _ENOUGH and best.converged and not diagnosis.mistaken(recording, best)
+
+
+def _miss(recording: Recording, candidate: Mapping[str, float], at_rest: bool) -> float:
+    """Return how far the motion of some values is from the recorded one in the mean."""
+    response = respond(recording, candidate, (), at_rest=at_rest, rtol=1e-4)
+    return math.inf if response is None else float(
+        np.mean(np.abs(recording.stretch - response.stretch)))
 
 
 def _conclude(
