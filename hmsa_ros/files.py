@@ -2,6 +2,8 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+import json
+import math
 import os
 from pathlib import Path
 import stat
@@ -69,3 +71,52 @@ def write_text(path: Path, text: str) -> None:
     """
     with replacing(path) as beside:
         beside.write_bytes(text.encode('utf-8', 'replace'))
+
+
+def make_folder(folder: Path) -> None:
+    """
+    Make the folder that a command writes to, unless it exists.
+
+    Parameters
+    ----------
+    folder : Path
+        Given by ``--out``.
+
+    Raises
+    ------
+    BadInputError
+        If it cannot be made.
+
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInputError(
+            f'cannot create the folder {folder}: {error.strerror or error}; expected a folder '
+            'with write permission (--out)') from error
+
+
+def json_text(document: object) -> str:
+    """
+    Return a document as JSON.
+
+    Parameters
+    ----------
+    document : object
+        Of dicts, lists and tuples.
+
+    Returns
+    -------
+    str
+        With null for each number that is not finite, for which JSON has no word.
+
+    """
+    return json.dumps(_known(document), indent=2, allow_nan=False)
+
+
+def _known(value: object) -> object:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: _known(x) for key, x in value.items()}
+    return [_known(x) for x in value] if isinstance(value, (list, tuple)) else value

@@ -2,15 +2,21 @@
 
 import builtins
 import csv
+import errno
 import io
 import json
+import os
 from pathlib import Path
+import signal
 import subprocess
 import sys
 
 import pytest
 
 from hmsa_ros.cli import main
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.figures import paper_data
+from hmsa_ros.studies import robustness
 
 ROOT = Path(__file__).resolve().parent.parent
 PNG = b'\x89PNG\r\n\x1a\n'
@@ -114,6 +120,35 @@ def test_robustness_says_what_could_not_be_had(run):
 def test_robustness_refuses_bad_input_in_one_line(refused, tmp_path, words, message):
     assert message in refused('robustness', *words)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize('module', [paper_data, robustness])
+def test_a_table_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch, module):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    path = tmp_path / 'table.csv'
+    path.write_text('old')
+    monkeypatch.setattr(csv, 'writer', full)
+    with pytest.raises(BadInputError, match=r'cannot write .*table.csv: No space left'):
+        module.write_csv(path, ())
+    assert path.read_text() == 'old'
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_sweep_that_is_ended_leaves_nothing_and_one_into_a_full_device_says_so(tmp_path):
+    words = [
+        sys.executable, '-m', 'hmsa_ros', 'sweep', '--zeta', '0:2:3000', '--j-lim', '1:9:3000']
+    process = subprocess.Popen([*words, '--out', 'sweep.csv'], cwd=tmp_path)
+    while not list(tmp_path.glob('.*.part')):
+        assert process.poll() is None
+    process.terminate()
+    assert process.wait() == 128 + signal.SIGTERM
+    assert not list(tmp_path.iterdir())
+    with Path('/dev/full').open('w') as full:
+        ended = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert (ended.returncode, ended.stderr.count('\n')) == (1, 1)
+    assert ended.stderr.startswith('hmsa: error: cannot write to standard output (No space left')
 
 
 def test_robustness_needs_a_folder_it_can_write_to(refused, tmp_path):

@@ -26,7 +26,7 @@ from hmsa_ros.core.simulation import ActuatorSimulation, simulate
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.report import charts
-from hmsa_ros.report.evaluation import evaluate, plan_points, timing
+from hmsa_ros.report.evaluation import evaluate, period_of, plan_points, timing
 from hmsa_ros.report.page import page
 from hmsa_ros.report.picture import draw
 from hmsa_ros.runs.bags import read_runs
@@ -107,14 +107,16 @@ def parameters(**nodes):
 
 
 def simulated(
-        sequence=SEQUENCE, *, space='', plant=ACTUATOR, period=PERIOD, shaper='two_step',
-        slew=0.0, noise=0.0, extra=0.0):
+        sequence=SEQUENCE, *, space='', actuator=ACTUATOR, plant=None, period=PERIOD,
+        shaper='two_step', slew=0.0, noise=0.0, extra=0.0):
     """Return the messages of a run: (log time, topic, type, message)."""
-    planner = Planner(ACTUATOR, Options(
+    planner = Planner(actuator, Options(
         shaper=shaper, lead_time=LEAD, slew_limit=slew or math.inf, flux_density_min=-0.5,
         flux_density_max=0.5))
-    simulation = ActuatorSimulation(plant, time=START, slew_limit=slew or math.inf)
-    ends = np.cumsum([round(span * UNIT * NANOSECONDS) for _, span in sequence]).tolist()
+    simulation = ActuatorSimulation(
+        plant or actuator, time=START, slew_limit=slew or math.inf)
+    ends = np.cumsum([
+        round(span * actuator.time_unit * NANOSECONDS) for _, span in sequence]).tolist()
     points = [(x, end) for (x, _), end in zip(sequence, ends, strict=True)]
     plan = planner.request(points, None, START)
     levels = [x for x in plan.levels if x.stamp >= 0]
@@ -351,6 +353,39 @@ def test_plain_steps_are_simulated_with_the_plant_that_was_recorded(tmp_path):
     assert np.max(np.abs(found.unshaped[0][found.time >= 0.0] - stretch)) < SAME
 
 
+def test_plain_steps_are_measured_between_samples_that_are_too_few(tmp_path):
+    small = replace(
+        ACTUATOR, half_length=1.0e-2 / 9.35, half_thickness=1.0e-2 / 9.35,
+        damping_coefficient=1e-3)
+    finely, coarsely = (
+        one(tmp_path / f'{period}', simulated(
+            ((1.4, 100.0),), actuator=small, period=period), **parameters(
+                planner=small, plant=small)) for period in (10_000, 1_000_000))
+    assert 1.0 / period_of(coarsely.run) == pytest.approx(836.0, rel=0.01)
+    expected, = (x.residual_unshaped for x in finely.evaluation.results)
+    found, = (x.residual_unshaped for x in coarsely.evaluation.results)
+    assert expected > 1.5
+    assert found == pytest.approx(expected, rel=5e-3)
+    words = ' '.join(Page(page([coarsely])).words)
+    assert '1.2 samples a period of the actuator' in words
+    assert 'raise publish_rate' in words
+    assert 'samples a period' not in ' '.join(Page(page([finely])).words)
+
+
+def test_a_block_that_did_not_move_has_no_residual(tmp_path):
+    stuck = [(time, topic, kind, joint_state(time, 1.0, 0.0, 0.0)
+              if topic == '/joint_states' else message)
+             for time, topic, kind, message in simulated()]
+    part = one(tmp_path / 'bag', stuck, **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    assert [(x.moved, math.isnan(x.residual)) for x in part.evaluation.results] == [
+        (False, True)] * 3
+    report = Page(page([part]))
+    words = ' '.join(report.words)
+    assert 'did not move largest residual' in ' '.join(words.split())
+    assert 'residual 0 %' not in words
+    assert [x['residual [%]'][1] for x in report.table('setpoint-table')] == ['did not move'] * 3
+
+
 @pytest.mark.parametrize('slew', [0.0, 20.0])
 def test_the_plan_predicts_a_plant_that_is_as_planned(tmp_path, slew):
     known = parameters(planner=ACTUATOR, plant=ACTUATOR)
@@ -526,14 +561,43 @@ def test_each_joint_of_a_planner_of_several_is_a_run(tmp_path, bag):
 
 # Bags of all kinds ---------------------------------------------------------------------------
 
-def test_a_bag_that_rosbags_wrote_will_do(tmp_path, bag):
-    with RosbagsWriter(
-            tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+def write_with_rosbags(folder, messages):
+    """Write a bag as a stranger does, without the parameters of any node."""
+    with RosbagsWriter(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         connections = {}
-        for time, topic, kind, message in sorted(simulated(), key=lambda x: x[0]):
+        for time, topic, kind, message in sorted(messages, key=lambda x: x[0]):
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
             writer.write(connections[topic], time, STORE.serialize_cdr(message, kind))
+    return folder
+
+
+def test_a_bag_without_parameters_is_verified_and_exported_with_a_parameter_file(
+        tmp_path, capsys):
+    folder = write_with_rosbags(tmp_path / 'bag', simulated(((1.1, 10.0),)))
+    file = tmp_path / 'block.yaml'
+    for value, status in ((ACTUATOR.density, 0), (2.0 * ACTUATOR.density, 1)):
+        file.write_text(
+            '/**:\n  ros__parameters:\n'
+            + ''.join(f'    actuator.{x}: {getattr(ACTUATOR, x)!r}\n' for x in ACTUATOR_FIELDS
+                      if x != 'density') + f'    actuator.density: {value!r}\n')
+        assert main([
+            'bag', 'verify', str(folder), '--params-file', str(file), '--json']) == status
+        actuator, = json.loads(capsys.readouterr().out)['actuators']
+        assert (actuator['largest_difference'] < SAME) is (status == 0)
+    assert main(['bag', 'verify', str(folder)]) == 2
+    assert '--params-file' in capsys.readouterr().err
+    assert main(['export', str(folder), '--out', str(tmp_path / 'run.csv')]) == 0
+    samples, levels = (
+        np.genfromtxt(tmp_path / x, delimiter=',', names=True)
+        for x in ('run.csv', 'run_levels.csv'))
+    run, = read_runs(folder)
+    assert samples['stretch'].tolist() == run.stretch.tolist()
+    assert levels['flux_density'].tolist() == [x.flux_density for x in run.commands]
+
+
+def test_a_bag_that_rosbags_wrote_will_do(tmp_path, bag):
+    write_with_rosbags(tmp_path / 'bag', simulated())
     part, = parts_of(tmp_path / 'bag')
     expected, = parts_of(bag)
     assert part.evaluation.results == expected.evaluation.results
@@ -858,12 +922,13 @@ def test_block_of_the_plant_is_the_one_that_a_mismatch_leaves(tmp_path):
     assert any('other parameters' in x for x in run.notes)
 
 
-def test_names_from_a_bag_cannot_become_markup(tmp_path):
-    name = 'a<b onload=x>&amp;"'
+@pytest.mark.parametrize('name', ['a<b onload=x>&amp;"', '<!--<script>'])
+def test_names_from_a_bag_cannot_become_markup(tmp_path, name):
     text = page(parts_of(write(tmp_path / name, simulated(), **parameters(plant=ACTUATOR))))
     report = Page(text)
     assert not [x for tag, x in report.tags if 'onload' in x]
     assert name in report.words
+    assert '<!--' not in text.replace(report.scripts[1][1], '')
     assert '</script' not in report.scripts[0][1].lower()
 
 

@@ -1,18 +1,22 @@
 """A run as a record: parameters from files, verification, tables, and files that stay whole."""
 
 import csv
+from dataclasses import replace
 import json
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from hmsa_ros.bag.info import BagSummary
 from hmsa_ros.cli import main
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.simulation import ActuatorSimulation
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import replacing, write_text
+from hmsa_ros.files import json_text, replacing, write_text
+from hmsa_ros.runs import bags
 from hmsa_ros.runs.levels import Level
 from hmsa_ros.runs.parameters import number_of, read_parameter_file, recorded, values_of
 from hmsa_ros.runs.record import Run
@@ -134,3 +138,26 @@ def test_an_unknown_option_points_to_the_help_of_its_command(capsys):
     with pytest.raises(SystemExit):
         main(['report', '--nonsense', 'x'])
     assert capsys.readouterr().err.endswith('see hmsa report --help\n')
+
+
+def test_json_has_null_for_what_is_no_number():
+    document = {'a': math.nan, 'b': [1.5, -math.inf], 'c': ({'d': True},)}
+    assert json.loads(json_text(document)) == {'a': None, 'b': [1.5, None], 'c': [{'d': True}]}
+
+
+@pytest.mark.parametrize('fault', ['chunk', 'nobody', 'nan'])
+def test_what_is_not_verified_whole_is_no_success(tmp_path, monkeypatch, capsys, fault):
+    run = moved(applied=fault != 'nobody')
+    problems = ('run_0.mcap: a chunk is damaged and passed over',) if fault == 'chunk' else ()
+    run = replace(run, summary=BagSummary('run', (), None, None, (), {}, {}, True, problems))
+    if fault == 'nan':
+        run.stretch[50] = math.nan
+    monkeypatch.setattr(bags, 'read_runs', lambda *_, **__: [run])
+    assert main(['bag', 'verify', 'run', '--json']) == 1
+    said = capsys.readouterr()
+    found = json.loads(said.out, parse_constant=pytest.fail)
+    assert not found['passed']
+    actuator, = found['actuators']
+    assert (fault in said.err) is (found['problems'] != [])
+    assert (actuator['unapplied_count'], actuator['largest_difference'] is None) == (
+        int(fault == 'nobody'), fault == 'nan')

@@ -479,6 +479,17 @@ def test_slow_driver_and_slow_transport_are_told_apart(transport, driver, advice
     assert ('lateness_tolerance' in message) is bool(driver)
 
 
+def test_driver_that_rounds_to_its_own_steps_is_early_and_not_foreign():
+    rig = Rig()
+    rig.driver = lambda: -40_000
+    rig.runtime.request(trajectory(*SEQUENCE))
+    rig.run(START + LEAD + 4 * HOLD)
+    assert not any('not commanded' in x for x in rig.notes())
+    said = rig.status.verdict.message
+    assert 'commands are repeatedly applied early, by up to 0.040 ms, and leave' in said
+    assert 'lateness_tolerance' in said
+
+
 def test_jump_ahead_while_a_plan_runs_is_planned_anew():
     rig = Rig()
     rig.runtime.request(trajectory(*SEQUENCE))

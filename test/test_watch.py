@@ -133,6 +133,17 @@ def test_a_frame_of_80_by_24_says_everything():
     assert len(lines) == 24
 
 
+def test_a_refusal_is_shown_to_its_end():
+    reason = (
+        'the stretch of point 3 is 2.4: expected between 0.643172 and 1.905871, where the flux '
+        'density of -0.2 T to 0.2 T holds the actuator and its chains are not at their end')
+    seen = replace(scene(), request=Request(2, reason, 'out_of_range', 'idle', 0, 0))
+    lines = [x.plain for x in Screen(10.0).lines(seen, 80, 24)]
+    place = next(i for i, x in enumerate(lines) if x.startswith('verdict  ERROR '))
+    assert reason in ' '.join(x[15:].strip() for x in lines[place:place + 4])
+    assert max(map(len, lines)) <= 80
+
+
 def test_many_joints_have_a_line_each_and_the_rest_is_counted():
     seen = scene(*(joint(f'joint_{i}', 1.0 + 0.01 * i) for i in range(64)))
     lines = [x.plain for x in Screen(10.0).lines(seen, 80, 24)]

@@ -2,7 +2,7 @@
 
 import argparse
 from dataclasses import asdict
-import json
+import math
 from pathlib import Path
 import sys
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 from hmsa_ros.bag.limits import CHUNK_SIZE, MEBIBYTE
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError, printable
+from hmsa_ros.files import json_text
 
 _LARGEST_CHUNK = 65536
 
@@ -47,7 +48,9 @@ def add_parser(subparsers: Any) -> None:
     verify = actions.add_parser(
         'verify', help='integrate the recorded commands and compare with the recorded stretch',
         description='Integrate the recorded commands with the recorded parameters and print '
-                    'the largest difference from the recorded stretch.',
+                    'the largest difference from the recorded stretch. The exit status is 1 if '
+                    'it is larger than the tolerance, if the bag is damaged, or if a command '
+                    'was never applied.',
         epilog='example: hmsa bag verify hmsa_demo/run --tolerance 1e-6')
     verify.add_argument('bag', metavar='BAG', help='folder of a bag, or an .mcap file')
     verify.add_argument(
@@ -103,13 +106,14 @@ def _info(arguments: argparse.Namespace) -> int:
 
 
 def _verify(arguments: argparse.Namespace) -> int:
-    """Compare recorded and integrated motion; 1 if they differ."""
+    """Compare recorded and integrated motion; 1 if they differ or something is missing."""
     from hmsa_ros.runs.bags import read_runs
     from hmsa_ros.runs.parameters import read_parameter_file
     from hmsa_ros.runs.verify import verify_run
 
-    if not arguments.tolerance >= 0.0:
-        raise BadInputError(f'tolerance is {arguments.tolerance:g}: expected at least 0')
+    if not 0.0 <= arguments.tolerance < math.inf:
+        raise BadInputError(
+            f'tolerance is {arguments.tolerance:g}: expected a finite number of at least 0')
     parameters = read_parameter_file(arguments.params_file) if arguments.params_file else None
     with progress('verifying'):
         runs = read_runs(
@@ -118,11 +122,13 @@ def _verify(arguments: argparse.Namespace) -> int:
     problems = list(runs[0].summary.problems) if runs[0].summary else []
     for problem in problems:
         print(f'hmsa: note: {printable(problem)}', file=sys.stderr)
-    passed = all(result.largest_difference <= arguments.tolerance for result in results)
+    # What cannot be read whole is not verified, and a command that nobody applied is a loss.
+    passed = not problems and all(
+        x.largest_difference <= arguments.tolerance and not x.unapplied_count for x in results)
     if arguments.json:
-        print(json.dumps({
+        print(json_text({
             'passed': passed, 'tolerance': arguments.tolerance, 'problems': problems,
-            'actuators': [asdict(result) for result in results]}, indent=2))
+            'actuators': [asdict(result) for result in results]}))
     else:
         for result in results:
             print(printable(

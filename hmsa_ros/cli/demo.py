@@ -2,13 +2,13 @@
 
 import argparse
 from datetime import datetime
-import json
 import os
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.ending import ENDING
+from hmsa_ros.files import json_text
 
 if TYPE_CHECKING:
     from hmsa_ros.session.demo import DemoResult
@@ -78,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
         console.print(f'interrupted; the bag so far: {folder / "run"}', highlight=False)
         return ENDING.status
     if arguments.json:
-        print(json.dumps(result.as_json(), indent=2))
+        print(json_text(result.as_json()))
     else:
         _print_table(result)
     return 0 if result.succeeded else 1

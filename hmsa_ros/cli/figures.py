@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from hmsa_ros.cli.progress import progress
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.files import make_folder
 
 
 def add_parser(subparsers: Any) -> None:
@@ -53,12 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
     """
     folder: Path = arguments.out
     # Before the slow imports: a bad folder is told at once.
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BadInputError(
-            f'cannot create the folder {folder}: {error.strerror}; expected a folder with write '
-            'permission (--out)') from error
+    make_folder(folder)
 
     from hmsa_ros.figures.paper import FIGURES, write_figure
 

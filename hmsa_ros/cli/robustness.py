@@ -1,12 +1,11 @@
 """``hmsa robustness``: what each shaper leaves of a move when the model is in error."""
 
 import argparse
-import json
 import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.files import json_text, make_folder
 
 if TYPE_CHECKING:
     from hmsa_ros.studies.robustness import Case, Result
@@ -105,7 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
              span=max(arguments.errors, min(2.0 * arguments.errors, LARGEST)))
         for start, target in dict.fromkeys(arguments.move)]
     folder: Path = arguments.out
-    _make(folder)
+    make_folder(folder)
     studies: list[tuple[Case, list[Result]]] = []
     console = Console(stderr=True)
     with Progress(
@@ -119,9 +118,9 @@ def run(arguments: argparse.Namespace) -> int:
                 progress.advance(task)
     files = _write(folder, studies)
     if arguments.json:
-        print(json.dumps({
+        print(json_text({
             'moves': [_record(case, results) for case, results in studies],
-            'files': [str(path) for path in files]}, indent=2))
+            'files': [str(path) for path in files]}))
         return 0
     for case, results in studies:
         _print_table(case, results)
@@ -130,26 +129,13 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BadInputError(
-            f'cannot create the folder {folder}: {error.strerror or error}; expected a folder '
-            'with write permission (--out)') from error
-
-
 def _write(folder: Path, studies: 'list[tuple[Case, list[Result]]]') -> list[Path]:
     """Write the numbers and the pictures."""
     from hmsa_ros.figures.studies import draw_robustness
-    from hmsa_ros.figures.style import unwritable
     from hmsa_ros.studies.robustness import write_csv
 
     files = [folder / 'robustness.csv']
-    try:
-        write_csv(files[0], studies)
-    except OSError as error:
-        raise unwritable(files[0], error) from error
+    write_csv(files[0], studies)
     for case, results in studies:
         files.append(folder / f'robustness_{case.start:g}_to_{case.target:g}.png')
         draw_robustness(files[-1], case, results)
@@ -175,20 +161,20 @@ def _record(case: 'Case', results: 'list[Result]') -> dict[str, Any]:
                 'levels': [[x.time, x.load] for x in result.move.levels],
                 'arrival': result.arrival,
                 'arrives': math.isfinite(result.move.duration),
-                'residual': _number(result.nominal),
+                'residual': result.nominal,
                 'worst': {
                     **{name: {
-                        'residual': _number(worst.residual),
+                        'residual': worst.residual,
                         'error': getattr(worst.errors, PARAMETERS[name])}
                         for name, worst in result.alone.items()},
                     'box': {
-                        'residual': _number(result.worst.residual),
+                        'residual': result.worst.residual,
                         'errors': {
                             name: getattr(result.worst.errors, attribute)
                             for name, attribute in PARAMETERS.items()}},
                 },
                 'curves': {
-                    name: {'errors': errors, 'residuals': [_number(x) for x in curve.tolist()]}
+                    name: {'errors': errors, 'residuals': curve.tolist()}
                     for name, curve in result.curves.items()},
             }
         records.append(record)
@@ -196,10 +182,6 @@ def _record(case: 'Case', results: 'list[Result]') -> dict[str, Any]:
         'start': case.start, 'target': case.target, 'zeta': case.material.zeta,
         'j_lim': case.material.j_lim, 'c1': case.material.c1, 'box': case.box,
         'shapers': records}
-
-
-def _number(value: float) -> float | None:
-    return None if math.isnan(value) else value
 
 
 def _print_table(case: 'Case', results: 'list[Result]') -> None:

@@ -205,7 +205,8 @@ class History:
         for i in same:
             if levels[i].stamp < stamp and levels[i].flux_density != levels[i - 1].flux_density:
                 return i
-        return None
+        # A driver that rounds to its own steps may be early, but leaves no change out for that.
+        return next((i for i in same if not self._changes(range(self.known + 1, i))), None)
 
     def _changes(self, places: Sequence[int]) -> int:
         """Return how many of some levels are another one than that before."""

@@ -91,10 +91,7 @@ def write_figure(figure: PaperFigure, folder: Path, *, points: int | None = None
     image = folder / f'figure_{figure.number:02d}.png'
     table = image.with_suffix('.csv')
     data = figure.compute(points or figure.default_points)
-    try:
-        paper_data.write_csv(table, data)
-    except OSError as error:
-        raise style.unwritable(table, error) from error
+    paper_data.write_csv(table, data)
     with style.picture(image, figure.height) as canvas:
         figure.draw(canvas, data)
     return [image, table]

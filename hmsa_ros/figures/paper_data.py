@@ -18,6 +18,7 @@ from hmsa_ros.core.sequence import plan_sequence, Segment, Setpoint
 from hmsa_ros.core.simulation import simulate
 from hmsa_ros.core.status import Code
 from hmsa_ros.core.two_step import CODES, plan_two_step_batch
+from hmsa_ros.files import replacing
 
 #: Span of each setpoint, as stated in the paper.
 SPAN = 10.0
@@ -416,11 +417,11 @@ def write_csv(path: Path, data: Data) -> None:
 
     Raises
     ------
-    OSError
+    BadInputError
         If it cannot be written.
 
     """
-    with path.open('w', newline='', encoding='utf-8') as file:
+    with replacing(path) as beside, beside.open('w', newline='', encoding='utf-8') as file:
         writer = csv.writer(file, lineterminator='\n')
         if isinstance(data, Sweep):
             writer.writerow(_SWEEP_COLUMNS)

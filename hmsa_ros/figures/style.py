@@ -17,7 +17,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import AutoMinorLocator, NullLocator
 
-from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import replacing
 
 # Okabe and Ito's palette, told apart with every kind of colour vision.
@@ -102,28 +101,6 @@ def picture(
         with replacing(path) as beside:
             # Without the entries that name matplotlib's version and the time.
             figure.savefig(beside, format=kind, metadata=_METADATA[kind])
-
-
-def unwritable(path: Path, error: OSError) -> BadInputError:
-    """
-    Return the error for a file or folder that cannot be written.
-
-    Parameters
-    ----------
-    path : Path
-        What was to be written.
-    error : OSError
-        What the system said.
-
-    Returns
-    -------
-    BadInputError
-        To raise.
-
-    """
-    return BadInputError(
-        f'cannot write {path}: {error.strerror or error}; expected a folder with write '
-        'permission')
 
 
 def finish(axes: Axes, x_label: str, y_label: str, letter: str = '') -> None:

@@ -42,6 +42,8 @@ _MANY_MARKERS = 100
 _BEFORE, _AFTER, _LEAST_PERCENT = 0.6, 3.0, 5.0
 # Of what a panel holds beyond what it shows at first.
 _PANEL_SPAN = 20.0
+#: Instead of a residual, which would be 0.
+NOT_MOVED = 'did not move'
 # Runs shorter than this are drawn in ms.
 _LONGEST_IN_MS = 2.0
 _DIGITS = 9
@@ -450,10 +452,16 @@ def _results(parts: Sequence[Part], number: int) -> list[MoveResult]:
 def _panel_title(parts: Sequence[Part], number: int) -> str:
     results = _results(parts, number)
     targets = ', '.join(dict.fromkeys(f'{x.stretch:.6g}' for x in results))
+    return f'{number + 1}. to {targets}: residual {residual_text(results, least=True)}'
+
+
+def residual_text(results: Sequence[MoveResult], digits: int = 3, *, least: bool = False) -> str:
+    """Return the largest residual of some moves in words, and the least before it if asked."""
+    if not all(x.moved for x in results):
+        return NOT_MOVED
     shares = [x.residual for x in results if math.isfinite(x.residual)] or [math.nan]
-    # Which is whose stands in the table.
-    left = ' to '.join(dict.fromkeys(percent(x) for x in (min(shares), max(shares))))
-    return f'{number + 1}. to {targets}: residual {left}'
+    return ' to '.join(dict.fromkeys(
+        percent(x, digits) for x in ([min(shares)] if least else []) + [max(shares)]))
 
 
 def percent(share: float, digits: int = 3) -> str:

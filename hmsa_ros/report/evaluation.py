@@ -40,6 +40,8 @@ _PUNCTUAL = 1e-6
 _POINTS_A_PERIOD, _MOST_POINTS = 100, 2_000_000
 #: Samples a period below which peaks are missed.
 FEW_SAMPLES = 10
+# Of the step: a block that covers less did not move.
+_MOVED = 0.1
 # Clocks further apart than this are different clocks.
 _SAME_CLOCK = 60.0
 
@@ -98,7 +100,10 @@ class MoveResult:
         Largest distance from the target after arrival, as a share of the step.
     residual, residual_unshaped : float
         Peak-to-peak stretch after arrival as a share of the step: recorded, and simulated for
-        plain steps on the same plant. NaN where there are no samples.
+        plain steps on the same plant. NaN where there are no samples, and of a block that did
+        not move.
+    moved : bool
+        Whether the block covered a tenth of the step at least, on the mean after arrival.
 
     """
 
@@ -112,6 +117,7 @@ class MoveResult:
     error: float
     residual: float
     residual_unshaped: float
+    moved: bool
 
 
 @dataclass(frozen=True)
@@ -374,16 +380,20 @@ def _measure(
     window = {'arrival': arrival, 'end': end, 'step': step}
     after = (time >= arrival) & (time <= end)
     error = residual = plain = math.nan
+    moved = True
     if np.count_nonzero(after) >= 2 and step != 0.0:
         error = float(np.max(np.abs(run.stretch[after] - move.stretch)) / abs(step))
-        residual = residual_vibration(time, run.stretch, **window)
+        before = run.stretch[max(int(np.searchsorted(time, begin, side='right')) - 1, 0)]
+        moved = bool((np.mean(run.stretch[after]) - before) / step >= _MOVED)
+        if moved:
+            residual = residual_vibration(time, run.stretch, **window)
         plain = residual_vibration(*unshaped, **window)
     unit = run.planner.flux_density_unit
     return MoveResult(
         stretch=move.stretch, b_p=float(signed_root(move.flux_densities[0] / unit)),
         tau_p=(arrival - begin) / run.planner.time_unit,
         b_1=float(signed_root(move.flux_densities[-1] / unit)), begin=begin, arrival=arrival,
-        end=end, error=error, residual=residual, residual_unshaped=plain)
+        end=end, error=error, residual=residual, residual_unshaped=plain, moved=moved)
 
 
 def _predict(run: Run, plan: Sequence[Level]) -> tuple[Array, Array]:

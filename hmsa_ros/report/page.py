@@ -22,7 +22,7 @@ from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.report import charts
 from hmsa_ros.report.assets import SCRIPT, STYLE
-from hmsa_ros.report.charts import Figure, Part, percent, TimeUnit
+from hmsa_ros.report.charts import Figure, NOT_MOVED, Part, percent, TimeUnit
 from hmsa_ros.report.evaluation import FEW_SAMPLES, period_of, plan_points
 from hmsa_ros.runs.record import Run
 from hmsa_ros.runs.topics import APPLIED
@@ -245,7 +245,7 @@ def _tiles(parts: Sequence[Part]) -> str:
         'commands', 'samples a second', 'messages lost']
     rows = [[
         str(len(x.evaluation.results)),
-        percent(largest(y.residual for y in x.evaluation.results)),
+        charts.residual_text(x.evaluation.results),
         percent(largest(y.residual_unshaped for y in x.evaluation.results)),
         f'{len(x.timing.commands)}' + (
             f' ({x.timing.late} late)' if len(x.timing.lead) or len(x.timing.lateness) else ''),
@@ -361,7 +361,7 @@ def _setpoints(parts: Sequence[Part]) -> str:
                 part.run.label, Cell(str(i), i), cell(x.stretch), cell(x.b_p, '.5f'),
                 cell(x.tau_p, '.5f'), cell(x.b_1, '.5f'), cell(x.begin * 1e3, '.3f'),
                 cell(x.arrival * 1e3, '.3f'), cell(x.end * 1e3, '.3f'), _percent(x.error),
-                _percent(x.residual), _percent(x.residual_unshaped),
+                _percent(x.residual) if x.moved else NOT_MOVED, _percent(x.residual_unshaped),
                 'plain step' if levels == 1 else f'{levels} levels'])
     if not rows:
         return text('No setpoint was carried out while the samples were recorded.')

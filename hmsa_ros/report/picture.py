@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 import numpy as np
 
 from hmsa_ros.figures import style
-from hmsa_ros.report.charts import decimate, Part, percent, time_unit, TimeUnit
+from hmsa_ros.report.charts import decimate, Part, residual_text, time_unit, TimeUnit
 
 _COLOURS = (
     style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY_BLUE, style.VERMILION,
@@ -156,4 +156,4 @@ def _title(parts: Sequence[Part], number: int) -> str:
     targets = '/'.join(dict.fromkeys(f'{x.stretch:.5g}' for x in results))
     if len(parts) > 1:
         return f'to {targets}'
-    return f'to {targets}: residual {percent(results[0].residual, 2)}'
+    return f'to {targets}: residual {residual_text(results, 2)}'

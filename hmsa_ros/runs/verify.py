@@ -21,7 +21,7 @@ from hmsa_ros.bag import limits
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.runs.bags import read_runs
-from hmsa_ros.runs.levels import lateness_of, without_repeats
+from hmsa_ros.runs.levels import in_force, lateness_of, without_repeats
 from hmsa_ros.runs.parameters import number_of, of_joint
 from hmsa_ros.runs.record import Run
 from hmsa_ros.runs.topics import APPLIED, COMMAND, FORCE, JOINT_STATES
@@ -144,8 +144,7 @@ def verify_run(run: Run) -> Verification:
             'with --params-file')
     replay = _Replay(run)
     replay.run()
-    unapplied = lateness_of(
-        without_repeats(run.commands)[0], run.applied, int(run.time[-1]))[1]
+    unapplied = _unapplied(run)
     left_out = run.left_out + replay.left_out
     return Verification(
         run.topics.get(JOINT_STATES, str(run.path)), run.topics.get(COMMAND, ''), replay.samples,
@@ -240,6 +239,16 @@ def _start(run: Run, first: int) -> 'ActuatorSimulation':
     return simulation
 
 
+def _unapplied(run: Run) -> int:
+    """Return how many changes of level were due and took no effect, as the plant reported."""
+    if APPLIED not in run.topics:
+        return 0
+    commands, last = without_repeats(run.commands)[0], int(run.time[-1])
+    if not run.applied:
+        return sum(x.stamp < last for x in in_force((x,) for x in commands))
+    return lateness_of(commands, run.applied, last)[1]
+
+
 def _notes(run: Run, left_out: int, unapplied: int) -> Iterator[str]:
     """Return what makes the recorded samples differ from the motion, or is lost."""
     counts = {} if run.summary is None else {x.name: x.lost for x in run.summary.topics}
@@ -260,7 +269,5 @@ def _notes(run: Run, left_out: int, unapplied: int) -> Iterator[str]:
     if unapplied:
         yield (f'{unapplied} commands never took effect, as {run.topics[APPLIED]} shows: '
                'nobody applied them')
-    elif run.commands and APPLIED in run.topics and not run.applied:
-        yield f'{run.topics[APPLIED]} reports no level: nobody applied the commands'
     if left_out:
         yield f'left out: {left_out} of the messages, since they are not what their topic is for'

@@ -90,6 +90,8 @@ class Following:
             self.astray.add(joint)
         if found.late > 0:
             return self._late(found.late, joint, stamp - found.late)
+        if found.late < 0:
+            self.lateness.earliest = max(self.lateness.earliest, -found.late)
         if found.foreign and self._tell_foreign():
             return [Note(Severity.WARN, (
                 f'joint {joint}: {flux_density:g} T took effect but was not commanded'))]
@@ -201,9 +203,8 @@ class Following:
     def give_up(self, lead_time: int, request: str) -> Verdict:
         """Return the verdict where commands come late for ever."""
         self.given_up.clear()
-        largest = self.lateness.largest
         return Verdict(
             Severity.WARN, 'late',
-            f'commands are repeatedly late, by up to {largest / 1e6:.3f} ms, and leave '
-            f'vibration: {self.lateness.advice(lead_time)}', request,
-            {'largest_lateness': largest / NANOSECONDS})
+            f'{self.lateness.words} and leave vibration: '
+            f'{self.lateness.advice(lead_time)}', request,
+            {'largest_lateness': self.lateness.largest / NANOSECONDS})

@@ -36,6 +36,8 @@ class Lateness:
         Late commands.
     largest : int
         How late the latest was, in ns.
+    earliest : int
+        How long before its stamp a command took effect, in ns.
 
     """
 
@@ -43,6 +45,7 @@ class Lateness:
         """Begin with none."""
         self.count = 0
         self.largest = 0
+        self.earliest = 0
         self._sent: dict[str, dict[int, int]] = {}
         # How late, and how long ahead of its stamp it was sent, in ns.
         self._recent: deque[tuple[int, int]] = deque(maxlen=_RECENT)
@@ -89,6 +92,15 @@ class Lateness:
             return Cause.DRIVER
         return Cause.TRANSPORT if explained < _CONSTANT * spread else Cause.UNKNOWN
 
+    @property
+    def words(self) -> str:
+        """What happens to commands, as the first half of a sentence."""
+        if self.largest:
+            return f'commands are repeatedly late, by up to {self.largest / 1e6:.3f} ms,'
+        if self.earliest:
+            return f'commands are repeatedly applied early, by up to {self.earliest / 1e6:.3f} ms,'
+        return 'commands are repeatedly lost, or overridden by somebody else,'
+
     def advice(self, lead_time: int) -> str:
         """
         Return what helps.
@@ -104,6 +116,12 @@ class Lateness:
             The rest of a sentence.
 
         """
+        if not self.largest and self.earliest:
+            return (
+                'let the driver apply commands at their stamps, or raise lateness_tolerance to '
+                f'more than {self.earliest / NANOSECONDS:.3g} s')
+        if not self.largest:
+            return 'see who else publishes commands, or what drops them'
         cause = self.cause
         if cause is Cause.DRIVER:
             return (

@@ -23,6 +23,7 @@ from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.simulation import check_stretch
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.files import replacing
 from hmsa_ros.studies.residual import arrival_of, Errors, residual, rest
 
 #: Parameters in error: name for a person, name in `Errors`.
@@ -346,11 +347,11 @@ def write_csv(path: Path, studies: Sequence[tuple[Case, Sequence[Result]]]) -> N
 
     Raises
     ------
-    OSError
+    BadInputError
         If it cannot be written.
 
     """
-    with path.open('w', newline='', encoding='utf-8') as file:
+    with replacing(path) as beside, beside.open('w', newline='', encoding='utf-8') as file:
         writer = csv.writer(file, lineterminator='\n')
         writer.writerow(_COLUMNS)
         for case, results in studies:

@@ -26,6 +26,8 @@ _ENDS = 2
 # Smallest range of a chart's axis.
 _LEAST_RANGE = 1e-3
 _MOST_REPORTS = 4
+# A warning may take this share of the rows; what comes before it is its name and level.
+_SHARE, _INDENT = 6, 15
 # A node that reports once a second and has not for so long is silent, in s.
 SILENT_AFTER = 3.5
 
@@ -78,7 +80,7 @@ class Screen:
             At most ``height`` lines of at most ``width``.
 
         """
-        foot = self._foot(scene, width)
+        foot = self._foot(scene, width, height // _SHARE)
         head = [self._head(scene, width)]
         room = height - len(head) - len(foot)
         lines = [*head, *self._joints(scene, width, max(room, 1)), *foot][:max(height, 1)]
@@ -98,7 +100,7 @@ class Screen:
         space = max(width - cell_len(left) - len(right), 2)
         return Text(left + ' ' * space + right, style='bold')
 
-    def _foot(self, scene: Scene, width: int) -> list[Text]:
+    def _foot(self, scene: Scene, width: int, rows: int) -> list[Text]:
         lines = [Text(('─' if self._unicode else '-') * width, style=_SOFT)]
         request = scene.request
         if request is not None:
@@ -109,13 +111,13 @@ class Screen:
                 line.append('  ').append(self._bar(scene.progress, max(width - 60, 10)))
                 line.append(f' {100.0 * scene.progress:.0f} %')
             lines.append(line)
-            lines.append(_judged('verdict', request.level, request.message))
+            lines += _judged('verdict', request.level, request.message, width, rows)
         for report in scene.reports[:_MOST_REPORTS]:
             silent = report.age > SILENT_AFTER
-            lines.append(_judged(
+            lines += _judged(
                 report.name, 3 if silent else report.level,
                 (f'silent for {report.age:.0f} s' if silent else report.message)
-                + _counts(report)))
+                + _counts(report), width, rows)
         for sentence in scene.waiting:
             lines += [Text(row, style=_WAITING) for row in _wrapped(sentence, width)]
         return lines
@@ -206,11 +208,15 @@ def _coloured(row: str, alone: tuple[int, ...]) -> Text:
     return text
 
 
-def _judged(name: str, level: int, message: str) -> Text:
+def _judged(name: str, level: int, message: str, width: int, rows: int) -> list[Text]:
+    """Return a level and its message; what is not OK takes up to some rows."""
     level = min(max(level, 0), len(LEVELS) - 1)
-    line = Text(f'{name:<8} ')
-    line.append(f'{LEVELS[level]:<5} ', style=_STYLES[level])
-    return line.append(message)
+    first = Text(f'{name:<8} ')
+    first.append(f'{LEVELS[level]:<5} ', style=_STYLES[level])
+    if level == 0 or rows < 2:
+        return [first.append(message)]
+    begin, *rest = _wrapped(message, width - _INDENT, rows) or ['']
+    return [first.append(begin), *(Text(' ' * _INDENT + x) for x in rest)]
 
 
 def _counts(report: Report) -> str:
@@ -218,9 +224,9 @@ def _counts(report: Report) -> str:
     return ''.join(f', {name.replace("_", " ")} {report.counts[name]}' for name in names)
 
 
-def _wrapped(sentence: str, width: int) -> list[str]:
+def _wrapped(sentence: str, width: int, rows: int | None = None) -> list[str]:
     from textwrap import wrap
-    return wrap(sentence, max(width, 10))
+    return wrap(sentence, max(width, 10), max_lines=rows, placeholder=' ...')
 
 
 def _time(stamp: float) -> str:
