@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from hmsa_ros.core.delivery import Delivery, pieces, ramps
+from hmsa_ros.core.delivery import Delivery, pieces
 from hmsa_ros.core.model import (
     acceleration,
     critical_zeta,
@@ -22,7 +22,7 @@ from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.sequence import plan_sequence, Setpoint
 from hmsa_ros.core.shapers import get_shaper, SHAPERS
 from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.core.simulation import ActuatorSimulation, endpoint
+from hmsa_ros.core.simulation import ActuatorSimulation, follow
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.errors import BadInputError
 
@@ -274,9 +274,9 @@ def test_through_ramps_every_moving_start_finds_rest_within_the_limits():
         state = State(
             start, random.normal(0.0, 0.3),
             float(np.clip(held, limits.minimum, limits.maximum)))
-        move = get_shaper('two_step')(Request(
-            state, target, model.nondimensional, limits, Delivery(slew=slew)))
+        request = Request(state, target, model.nondimensional, limits, Delivery(slew=slew))
+        move = get_shaper('two_step')(request)
         assert all(limits.minimum <= x.load <= limits.maximum for x in move.levels)
-        parts, _ = ramps(move.levels, state.load, move.duration, slew)
-        end = endpoint(parts, move.duration, model.nondimensional, start, state.rate)
-        assert math.hypot(end[0] - target, end[1]) < 1e-9
+        end = follow(
+            move.levels, state, move.duration, model.nondimensional, request.delivery)
+        assert math.hypot(end.stretch - target, end.rate) < 1e-9

@@ -6,7 +6,7 @@ import sys
 
 PROGRAM = """
 import json
-from hmsa_ros.core import kernels, law, shooting_kernel, two_step_kernel
+from hmsa_ros.core import kernels, lag_kernel, law, shooting_kernel, two_step_kernel
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.simulation import ActuatorSimulation
@@ -14,7 +14,8 @@ from hmsa_ros.core.warmup import warm_up
 
 def signatures():
     return {
-        name: len(kernel.signatures) for module in (law, kernels, shooting_kernel, two_step_kernel)
+        name: len(kernel.signatures)
+        for module in (law, kernels, lag_kernel, shooting_kernel, two_step_kernel)
         for name, kernel in vars(module).items()
         if hasattr(kernel, 'signatures')}
 
@@ -24,7 +25,8 @@ millisecond = 1_000_000
 for options in (
         {}, {'period': millisecond}, {'slew_limit': 30.0}, {'shaper': 'robust'},
         {'shaper': 'minimum_time'}, {'shaper': 'ei'}, {'shaper': 'step'},
-        {'period': millisecond, 'slew_limit': 100.0}, {'short_spell': 'continue'}):
+        {'period': millisecond, 'slew_limit': 100.0}, {'short_spell': 'continue'},
+        {'coil_time_constant': 3e-4}, {'coil_time_constant': 3e-4, 'period': millisecond}):
     planner = Planner(paper_actuator(), Options(
         flux_density_min=-0.5, flux_density_max=0.5, lead_time=0, **options))
     plant = ActuatorSimulation(

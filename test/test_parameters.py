@@ -284,6 +284,7 @@ def test_planner_and_plant_describe_the_same_block():
     planner, plant = (
         {x.name: replace(x, read_only=True) for x in DECLARED[node]}
         for node in ('planner', 'plant'))
-    common = {*(x.name for x in ACTUATOR), 'joint', 'initial_stretch', 'slew_limit'}
+    common = {*(x.name for x in ACTUATOR), 'joint', 'initial_stretch', 'slew_limit',
+              'coil_time_constant'}
     assert common <= planner.keys() & plant.keys()
     assert all(planner[x] == plant[x] for x in common)

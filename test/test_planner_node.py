@@ -209,6 +209,7 @@ def test_lead_time_of_the_parameter_is_kept(bench):
 @pytest.mark.parametrize(('arguments', 'options'), [
     (('-p', 'command_mode:=sampled', '-p', 'command_period:=0.0005'), {'period': MS // 2}),
     (('-p', 'slew_limit:=100.0'), {'slew_limit': 100.0}),
+    (('-p', 'coil_time_constant:=0.0005'), {'coil_time_constant': 5e-4}),
     (('-p', 'shaper:=robust', '-p', 'robust_order:=3'), {'shaper': 'robust', 'order': 3}),
     (('-p', 'flux_density_max:=0.2', '-p', 'shaper:=minimum_time'),
      {'flux_density_max': 0.2, 'shaper': 'minimum_time'}),

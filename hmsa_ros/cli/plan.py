@@ -103,6 +103,7 @@ def _run_si(arguments: argparse.Namespace) -> int:
     from hmsa_ros.contract.actuator import actuator_from
     from hmsa_ros.contract.parameters import (
         ACTUATOR,
+        COIL_TIME_CONSTANT,
         FLUX_DENSITY_MAX,
         FLUX_DENSITY_MIN,
         SLEW_LIMIT,
@@ -121,11 +122,12 @@ def _run_si(arguments: argparse.Namespace) -> int:
             'since the file sets these values')
     values = values_of(
         read_parameter_file(arguments.params_file), PLANNER,
-        (*ACTUATOR, FLUX_DENSITY_MIN, FLUX_DENSITY_MAX, SLEW_LIMIT))
+        (*ACTUATOR, FLUX_DENSITY_MIN, FLUX_DENSITY_MAX, SLEW_LIMIT, COIL_TIME_CONSTANT))
     actuator = actuator_from(values)
     model = Model(actuator, Options(
         flux_density_min=values['flux_density_min'], flux_density_max=values['flux_density_max'],
-        slew_limit=values['slew_limit'] or math.inf))
+        slew_limit=values['slew_limit'] or math.inf,
+        coil_time_constant=values['coil_time_constant']))
     time, load = actuator.time_unit, actuator.flux_density_unit
     segments = plan_sequence(
         [Setpoint(stretch, span / time) for stretch, span in arguments.setpoints],

@@ -2,7 +2,8 @@
 How commands reach the coil: at any time or on a grid, in steps or in ramps.
 
 A command names a level. Ideal hardware takes it up at once; sampled hardware takes commands at
-multiples of a period only; an amplifier with a slew limit ramps to the level.
+multiples of a period only; an amplifier with a slew limit ramps to the level; the field of a coil
+follows its amplifier with a lag of first order.
 """
 
 from collections.abc import Sequence
@@ -14,6 +15,9 @@ import numpy as np
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.moves import Level
 from hmsa_ros.errors import BadInputError
+
+# Time constants after which nothing is left of a lag.
+_SETTLED = 40.0
 
 
 @dataclass(frozen=True)
@@ -29,6 +33,8 @@ class Delivery:
         Largest change of the load per unit of time; infinite for steps.
     resolution : float
         Times of commands are rounded to multiples of this; 0 for none.
+    lag : float
+        Time constant with which the field follows the amplifier; 0 for at once.
 
     Raises
     ------
@@ -40,19 +46,40 @@ class Delivery:
     period: float = 0.0
     slew: float = math.inf
     resolution: float = 0.0
+    lag: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check both numbers."""
+        """Check the numbers."""
         if not 0.0 <= self.period < math.inf:
             raise BadInputError(
                 f'command period is {self.period:g}: expected a finite number of at least 0')
         if not self.slew > 0.0:
             raise BadInputError(f'slew limit is {self.slew:g}: expected a number above 0')
+        if not 0.0 <= self.lag < math.inf:
+            raise BadInputError(
+                f'coil time constant is {self.lag:g}: expected a finite number of at least 0')
 
     @property
     def ideal(self) -> bool:
         """Whether levels apply at any time and at once."""
-        return self.period == 0.0 and math.isinf(self.slew)
+        return self.period == 0.0 and math.isinf(self.slew) and self.lag == 0.0
+
+    def settling(self, change: float) -> float:
+        """
+        Return after what time nothing is left of a change of level.
+
+        Parameters
+        ----------
+        change : float
+            Of the load, signed.
+
+        Returns
+        -------
+        float
+            The ramp, and what the field lags behind.
+
+        """
+        return self.ramp(change) + _SETTLED * self.lag
 
     def rounded(self, time: float) -> float:
         """

@@ -16,7 +16,7 @@ from hmsa_ros.core.moves import Level, Move, State
 from hmsa_ros.core.sequence import Segment, segments, Setpoint
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.stopping import brake, holdable
-from hmsa_ros.core.timeline import Draft, Model, Plan, PlannedLevel, PlannedSegment
+from hmsa_ros.core.timeline import Draft, Model, Plan, PlannedLevel, PlannedSegment, scaled
 from hmsa_ros.core.units import NANOSECONDS
 
 T = TypeVar('T')
@@ -27,6 +27,8 @@ Steps = Generator[None, None, T]
 _BRAKE_SHARES = (0.5, 0.1, 0.02, 0.0)
 # How many natural periods later to try again where a plan cannot be made anew at once.
 _PATIENCE = (0.0, 0.15, 0.3, 0.45, 0.6)
+# How far off its stretch a field at rest may be, as a share of the load.
+_SETTLED = 1e-6
 # Codes of plans that do not do what was asked for.
 _WARNINGS = (Code.TOO_DAMPED, Code.INDISTINGUISHABLE, Code.SPELL_TOO_SHORT)
 # Setpoints that are checked between two pauses, which takes some 0.1 ms.
@@ -222,7 +224,7 @@ def draft_stop(outset: Outset) -> Steps[Draft]:
     work = work_space()
     found = brake(model, work, state)
     if (holdable(model, found.stretch) == found.stretch
-            and (model.delivery.ideal or found.duration == 0.0)):
+            and (model.delivery.ideal or found.duration == 0.0 and _settled(model, state))):
         move = Move(Code.HOLD, tuple(
             [Level(0.0, found.load)] * (found.duration > 0.0)
             + [Level(found.duration, model.holding(found.stretch))]),
@@ -240,6 +242,12 @@ def draft_stop(outset: Outset) -> Steps[Draft]:
     # Nothing stops it at once: let it settle.
     return (yield from _draft(
         outset, [Setpoint(holdable(model, state.stretch), math.inf)], 'step'))
+
+
+def _settled(model: Model, state: State) -> bool:
+    """Return whether the field of a coil that lags holds the stretch already."""
+    return model.delivery.lag == 0.0 or math.isclose(
+        state.load, model.holding(state.stretch), rel_tol=_SETTLED, abs_tol=_SETTLED)
 
 
 def later_outsets(outset: Outset) -> Iterator[int]:
@@ -334,7 +342,7 @@ def _meeting(outset: Outset, state: State, following: int) -> int | None:
     unit = level.model.units
     here = replace(
         level, stretch=state.stretch, rate=state.rate / unit.time,
-        in_force=state.load * unit.load)
+        in_force=state.load * unit.load, amplifier=scaled(state.amplifier, unit.load))
     return place if agree(here, level) else None
 
 
@@ -380,7 +388,8 @@ def _placed(
         time = level.time
         levels.append(PlannedLevel(
             start + model.ns(time), level.load * unit.load, state.stretch,
-            state.rate / unit.time, state.load * unit.load, model))
+            state.rate / unit.time, state.load * unit.load, model,
+            scaled(state.amplifier, unit.load)))
     duration = segment.move.duration
     return levels, PlannedSegment(
         segment.setpoint.stretch, start,

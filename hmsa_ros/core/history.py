@@ -221,7 +221,9 @@ def agree(one: PlannedLevel, other: PlannedLevel) -> bool:
         abs(one.stretch - other.stretch) <= _AS_PLANNED
         and abs(one.rate - other.rate) * model.units.time
         <= _AS_PLANNED * model.frequency(one.stretch)
-        and _same(one.in_force, other.in_force))
+        and _same(one.in_force, other.in_force)
+        and (one.amplifier is None) is (other.amplifier is None)
+        and _same(one.amplifier or 0.0, other.amplifier or 0.0))
 
 
 def _same(one: float, other: float) -> bool:

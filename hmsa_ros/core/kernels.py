@@ -53,7 +53,7 @@ def _derivative(l, v, s, r, beta, p, material):  # noqa: E741
 
 
 @compiled(inline=True)
-def _error(h, new_l, new_v, e5_l, e5_v, e3_l, e3_v, rtol):
+def error_of(h, new_l, new_v, e5_l, e5_v, e3_l, e3_v, rtol):
     """Return the error of a step in units of the tolerance, from both error estimates."""
     scale_l = 1.0 / (rtol * (1.0 + abs(new_l)))
     scale_v = 1.0 / (rtol * (1.0 + abs(new_v)))
@@ -98,7 +98,7 @@ def step(k, l, v, s, r, beta, slope, p, q, h, material, rtol):  # noqa: E741
         e3_v += ERROR_3[j] * k[j, 1]
     new_l = l + h * d0
     new_v = v + h * d1
-    error = _error(h, new_l, new_v, e5_l, e5_v, e3_l, e3_v, rtol)
+    error = error_of(h, new_l, new_v, e5_l, e5_v, e3_l, e3_v, rtol)
     return new_l, new_v, s + h * d2, r + h * d3, error
 
 
@@ -110,7 +110,7 @@ def first_step(l, v, beta, material, rtol):  # noqa: E741
 
 
 @compiled(inline=True)
-def _attainable(rtol, l, v, frequency):  # noqa: E741
+def attainable(rtol, l, v, frequency):  # noqa: E741
     """
     Return a tolerance that rounding lets a step keep.
 
@@ -147,11 +147,11 @@ def advance(k, l, v, s, r, beta, slope, p, q, duration, material, rtol, h):  # n
             return DONE, l, v, s, r, h
         span = min(h, left)
         rate = natural_frequency(l, material)
-        if _attainable(0.0, l, v, rate) > _RESOLVED and v * (l - 1.0) > 0.0:
+        if attainable(0.0, l, v, rate) > _RESOLVED and v * (l - 1.0) > 0.0:
             v, s, r = -v, -s, -r
         new_l, new_v, new_s, new_r, error = step(
             k, l, v, s, r, beta + slope * done, slope, p + q * done, q, span, material,
-            _attainable(rtol, l, v, rate))
+            attainable(rtol, l, v, rate))
         if error <= 1.0:
             l, v, s, r = new_l, new_v, new_s, new_r  # noqa: E741
             done = duration if span == left else done + span
@@ -183,7 +183,7 @@ def turning_point(k, l, v, direction, beta, move, material, rtol):  # noqa: E741
     for _ in range(_MAX_TURN_STEPS):
         new_l, new_v, new_s, new_r, error = step(
             k, l, v, s, r, beta, 0.0, 1.0, 0.0, h, material,
-            _attainable(rtol, l, v, rate))
+            attainable(rtol, l, v, rate))
         if not error <= 1.0:
             h = resize(h, error)
             continue
@@ -196,7 +196,7 @@ def turning_point(k, l, v, direction, beta, move, material, rtol):  # noqa: E741
         h = resize(h, error)
         armed = direction * v > 0.0
         rate = natural_frequency(l, material)
-        if _attainable(0.0, l, v, rate) > _RESOLVED:
+        if attainable(0.0, l, v, rate) > _RESOLVED:
             return TOO_CLOSE, t, l, s, 0.0
         fast = rate + 3.0 * material[ZETA]
         if (abs(v) < _AT_REST * move * fast and abs(a) < _AT_REST * move * fast * fast):
@@ -349,11 +349,11 @@ def _plain_step(k, l, v, beta, slope, excess, decay, h, material, rtol):  # noqa
         e3_v += ERROR_3[j] * k[j, 1]
     new_l = l + h * d0
     new_v = v + h * d1
-    return new_l, new_v, _error(h, new_l, new_v, e5_l, e5_v, e3_l, e3_v, rtol)
+    return new_l, new_v, error_of(h, new_l, new_v, e5_l, e5_v, e3_l, e3_v, rtol)
 
 
 @compiled()
-def _follow(k, l, v, h, beta, slope, excess, decay, duration, material, rtol):  # noqa: E741
+def follow_one(k, l, v, h, beta, slope, excess, decay, duration, material, rtol):  # noqa: E741
     """Integrate one actuator as `advance` does; returns status, state and step length."""
     if h <= 0.0:
         h = first_step(l, v, beta + excess, material, rtol)
@@ -364,14 +364,14 @@ def _follow(k, l, v, h, beta, slope, excess, decay, duration, material, rtol):  
             return DONE, l, v, h
         span = min(h, left)
         rate = natural_frequency(l, material)
-        if _attainable(0.0, l, v, rate) > _RESOLVED and v * (l - 1.0) > 0.0:
+        if attainable(0.0, l, v, rate) > _RESOLVED and v * (l - 1.0) > 0.0:
             v = -v
         rest = excess
         if excess != 0.0:
             rest *= math.exp(-decay * done)
         new_l, new_v, error = _plain_step(
             k, l, v, beta + slope * done, slope, rest, decay, span, material,
-            _attainable(rtol, l, v, rate))
+            attainable(rtol, l, v, rate))
         if error <= 1.0:
             l, v = new_l, new_v  # noqa: E741
             done = duration if span == left else done + span
@@ -398,7 +398,7 @@ def follow(k, first, last, wanted, state, drive, material, durations, rtol, stat
             continue
         beta, slope, excess, decay = drive[i, 0], drive[i, 1], drive[i, 2], drive[i, 3]
         duration = durations[i]
-        status[i], l, v, h = _follow(  # noqa: E741
+        status[i], l, v, h = follow_one(  # noqa: E741
             k, state[i, 0], state[i, 1], state[i, 2], beta, slope, excess, decay, duration,
             material[i], rtol)
         if status[i] != DONE:

@@ -11,7 +11,7 @@ from hmsa_ros.errors import BadInputError
 @dataclass(frozen=True)
 class State:
     """
-    Stretch, stretch rate and the load in force, nondimensional.
+    Stretch, stretch rate, the load in force and the amplifier's output, nondimensional.
 
     Attributes
     ----------
@@ -21,13 +21,21 @@ class State:
         Per unit of nondimensional time.
     load : float
         Signed load beta in force; NaN for the one that holds the stretch. It matters where a
-        slew limit makes the next level start from it.
+        slew limit makes the next level start from it, or where the field lags.
+    amplifier : float or None
+        Load that a field that lags is following; None where the two are the same.
 
     """
 
     stretch: float
     rate: float = 0.0
     load: float = math.nan
+    amplifier: float | None = None
+
+    @property
+    def ramps_from(self) -> float:
+        """Load of the amplifier, from which it ramps to the next level."""
+        return self.load if self.amplifier is None else self.amplifier
 
 
 @dataclass(frozen=True)

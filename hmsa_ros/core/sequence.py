@@ -1,7 +1,7 @@
 """Plans for a sequence of setpoints (Eq. 14), each from where the last one really ends."""
 
 from collections.abc import Generator, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 from hmsa_ros.core.delivery import Delivery, IDEAL, ramps
@@ -10,7 +10,7 @@ from hmsa_ros.core.moves import Level, Limits, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.shapers import get_shaper
 from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.core.simulation import check_stretch, endpoint, longest_motion
+from hmsa_ros.core.simulation import check_stretch, follow, longest_motion
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.units import Units
 from hmsa_ros.errors import BadInputError
@@ -178,7 +178,7 @@ def segments(
                     f'{units.time_text(setpoint.span)}: expected a span at least as long as the '
                     'move')
             move = _cut(move, setpoint, units, last=following is None)
-        end = _follow(state, move, setpoint.span, material, delivery.slew)
+        end = _follow(state, move, setpoint.span, material, delivery)
         yield Segment(setpoint, begin, state, end, move)
         begin += setpoint.span
         state = end
@@ -203,15 +203,14 @@ def _rounded(move: Move, delivery: Delivery) -> Move:
 
 def _follow(
         state: State, move: Move, span: float, material: NondimensionalParameters,
-        slew: float) -> State:
+        delivery: Delivery) -> State:
     """Return the state at the end of the span, or where the last ramp ends."""
     end = move.levels[-1].time if math.isinf(move.duration) else move.duration
     if math.isfinite(span):
         end = max(end, span)
-    load = state.load
-    if math.isnan(load):
-        load = float(elastic_force(state.stretch, material))
-    parts, last = ramps(move.levels, load, end, slew)
-    end = min(end, max(parts[-1][0], 0.0) + longest_motion(last, material))
-    stretch, rate = endpoint(parts, end, material, state.stretch, state.rate)
-    return State(stretch, rate, last)
+    if math.isnan(state.load):
+        state = replace(state, load=float(elastic_force(state.stretch, material)))
+    parts, last = ramps(move.levels, state.ramps_from, end, delivery.slew)
+    settled = longest_motion(last, material) + delivery.settling(0.0)
+    end = min(end, max(parts[-1][0], 0.0) + settled)
+    return follow(move.levels, state, end, material, delivery)

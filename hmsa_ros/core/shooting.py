@@ -1,34 +1,42 @@
 """
-Commands with two free numbers, solved for rest at the target.
+Commands with free numbers, solved for rest at the target.
 
 The two-step command on ideal hardware has a solver of its own, `two_step_kernel.shoot`.
 Everything else, a command on a grid, through ramps, or with two intermediate levels of given
 height, has two unknowns as well, and they meet the same two conditions: stretch at the target,
-rate zero, at the instant at which the last level is in force. Newton solves them with the
-derivatives that come out of the integration.
+rate zero, at the instant at which the last level is in force. Where the field lags it has to
+arrive there too, for which a third number is free. Newton solves them with the derivatives that
+come out of the integration.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hmsa_ros.core import shooting_kernel
+from hmsa_ros.core.delivery import Delivery
 from hmsa_ros.core.model import Array
-from hmsa_ros.core.moves import Level, State
-from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.core.moves import Level
+
+if TYPE_CHECKING:
+    from hmsa_ros.core.shapers.request import Request
+
+#: A command and the time at which it is at rest; None if there is none.
+Attempt = tuple[tuple[Level, ...], float] | None
 
 
 @dataclass(frozen=True)
 class Template:
     """
-    Levels with their derivatives by the two unknowns.
+    Levels with their derivatives by the unknowns, two or, for a field that lags, three.
 
     Attributes
     ----------
     times, loads : ndarray, shape (n,)
         Of the levels; the first at time 0, the last holds the target.
-    d_times, d_loads : ndarray, shape (n, 2)
+    d_times, d_loads : ndarray, shape (n, 2) or (n, 3)
         Derivatives by the unknowns.
 
     """
@@ -48,7 +56,7 @@ class Template:
         levels : sequence of Level
             First guess.
         unknowns : sequence of (str, int)
-            Two of ``('load', i)`` and ``('time', i)``. A time moves all later levels with it.
+            Some of ``('load', i)`` and ``('time', i)``. A time moves all later levels with it.
 
         Returns
         -------
@@ -56,8 +64,8 @@ class Template:
             At the first guess.
 
         """
-        d_times = np.zeros((len(levels), 2))
-        d_loads = np.zeros((len(levels), 2))
+        d_times = np.zeros((len(levels), len(unknowns)))
+        d_loads = np.zeros((len(levels), len(unknowns)))
         for column, (kind, index) in enumerate(unknowns):
             if kind == 'load':
                 d_loads[index, column] = 1.0
@@ -68,26 +76,18 @@ class Template:
             d_loads)
 
 
-def solve(
-        template: Template, state: State, load: float, target: float,
-        material: NondimensionalParameters, slew: float) -> tuple[tuple[Level, ...], float] | None:
+def solve(template: Template, request: 'Request', delivery: Delivery | None = None) -> Attempt:
     """
-    Solve a template for rest at the target.
+    Solve a template for rest at the target of a request.
 
     Parameters
     ----------
     template : Template
         First guess.
-    state : State
-        At the start.
-    load : float
-        In force before the first level.
-    target : float
-        Stretch to come to rest at.
-    material : NondimensionalParameters
-        zeta, J_lim and c1.
-    slew : float
-        Largest change of the load per unit of time; infinite for steps.
+    request : Request
+        The move.
+    delivery : Delivery, optional
+        In place of the request's; its slew limit and lag count.
 
     Returns
     -------
@@ -96,10 +96,13 @@ def solve(
         solution was found from this guess.
 
     """
+    delivery = delivery or request.delivery
     times, loads = template.times.copy(), template.loads.copy()
+    state = request.state
     status, duration = shooting_kernel.solve(
         times, loads, template.d_times, template.d_loads, float(state.stretch),
-        float(state.rate), float(load), float(target), float(slew), material.packed)
+        float(state.rate), float(request.field), float(request.load), float(request.target),
+        float(delivery.slew), float(delivery.lag), request.material.packed)
     if status != shooting_kernel.SOLVED:
         return None
     levels = tuple(Level(t, x) for t, x in zip(times.tolist(), loads.tolist(), strict=True))

@@ -1,5 +1,5 @@
 """
-Compiled Newton for commands of levels with two free numbers, for `hmsa_ros.core.shooting`.
+Compiled Newton for commands of levels with free numbers, for `hmsa_ros.core.shooting`.
 
 As in `hmsa_ros.core.kernels`, everything is nondimensional and nothing checks its arguments.
 """
@@ -10,7 +10,8 @@ import numpy as np
 
 from hmsa_ros.core.compiling import compiled
 from hmsa_ros.core.kernels import DONE, respond, STUCK
-from hmsa_ros.core.law import natural_frequency
+from hmsa_ros.core.lag_kernel import respond_late
+from hmsa_ros.core.law import elastic_stiffness, natural_frequency
 
 SOLVED = 0
 UNSOLVED = 1
@@ -38,27 +39,27 @@ def _pieces(times, loads, d_times, d_loads, load, slew, durations, begins, slope
             d_begins):
     """Fill in the pieces of the load and their derivatives; -1 if a ramp does not fit."""
     count = 0
-    d_load_0 = d_load_1 = 0.0
-    levels = times.size
+    levels, unknowns = d_times.shape
+    d_load = np.zeros(unknowns)
+    d_span = np.zeros(unknowns)
     for i in range(levels):
         last = i == levels - 1
-        span = d_span_0 = d_span_1 = 0.0
+        span = 0.0
+        d_span[:] = 0.0
         if not last:
             span = times[i + 1] - times[i]
-            d_span_0 = d_times[i + 1, 0] - d_times[i, 0]
-            d_span_1 = d_times[i + 1, 1] - d_times[i, 1]
+            for c in range(unknowns):
+                d_span[c] = d_times[i + 1, c] - d_times[i, c]
         if slew < math.inf:
             sign = math.copysign(1.0, loads[i] - load)
             durations[count] = abs(loads[i] - load) / slew
             begins[count] = load
             slopes[count] = sign * slew
-            d_durations[count, 0] = sign * (d_loads[i, 0] - d_load_0) / slew
-            d_durations[count, 1] = sign * (d_loads[i, 1] - d_load_1) / slew
-            d_begins[count, 0] = d_load_0
-            d_begins[count, 1] = d_load_1
             span -= durations[count]
-            d_span_0 -= d_durations[count, 0]
-            d_span_1 -= d_durations[count, 1]
+            for c in range(unknowns):
+                d_durations[count, c] = sign * (d_loads[i, c] - d_load[c]) / slew
+                d_begins[count, c] = d_load[c]
+                d_span[c] -= d_durations[count, c]
             count += 1
         if not last:
             if span < -_ROUNDING:
@@ -66,79 +67,129 @@ def _pieces(times, loads, d_times, d_loads, load, slew, durations, begins, slope
             durations[count] = max(span, 0.0)
             begins[count] = loads[i]
             slopes[count] = 0.0
-            d_durations[count, 0] = d_span_0
-            d_durations[count, 1] = d_span_1
-            d_begins[count] = d_loads[i]
+            for c in range(unknowns):
+                d_durations[count, c] = d_span[c]
+                d_begins[count, c] = d_loads[i, c]
             count += 1
         load = loads[i]
-        d_load_0 = d_loads[i, 0]
-        d_load_1 = d_loads[i, 1]
+        for c in range(unknowns):
+            d_load[c] = d_loads[i, c]
     return count
 
 
 @compiled()
-def solve(times, loads, d_times, d_loads, l, v, load, target, slew, material):  # noqa: E741
-    """
-    Move levels along two unknowns until they end at rest at the target, in place.
+def _newton(jacobian, misses, step):
+    """Write the Newton step for two or three unknowns, by Cramer's rule."""
+    if step.size == 2:
+        a, b = jacobian[0, 0], jacobian[0, 1]
+        c, d = jacobian[1, 0], jacobian[1, 1]
+        determinant = a * d - b * c
+        step[0] = -(d * misses[0] - b * misses[1]) / determinant
+        step[1] = -(a * misses[1] - c * misses[0]) / determinant
+        return
+    determinant = 0.0
+    for i in range(3):
+        j, m = (i + 1) % 3, (i + 2) % 3
+        determinant += jacobian[0, i] * (
+            jacobian[1, j] * jacobian[2, m] - jacobian[1, m] * jacobian[2, j])
+    for i in range(3):
+        j, m = (i + 1) % 3, (i + 2) % 3
+        value = 0.0
+        for row in range(3):
+            up, down = (row + 1) % 3, (row + 2) % 3
+            value += misses[row] * (
+                jacobian[up, j] * jacobian[down, m] - jacobian[up, m] * jacobian[down, j])
+        step[i] = -value / determinant
 
-    ``d_times`` and ``d_loads`` (n, 2) are the derivatives of ``times`` and ``loads`` (n,).
-    Returns the status and the duration, the last ramp included.
+
+@compiled()
+def _place(values, first, slopes, unknowns, share, step):
+    """Write what is linear in the unknowns, a share of a step on from where they are."""
+    for i in range(values.size):
+        values[i] = first[i]
+        for c in range(step.size):
+            values[i] += slopes[i, c] * (unknowns[c] + share * step[c])
+
+
+@compiled()
+def solve(
+        times, loads, d_times, d_loads, l, v, field, load, target, slew, lag,  # noqa: E741
+        material):
+    """
+    Move levels along unknowns until they end at rest at the target, in place.
+
+    ``d_times`` and ``d_loads`` (n, 2) are the derivatives of ``times`` and ``loads`` (n,) by two
+    unknowns. With a lag of the field there are three: the ``field`` has to arrive at the last
+    load as well, and what ramps begin at the amplifier's ``load``. Returns the status and the
+    duration, the last ramp included.
     """
     room = 2 * times.size
+    unknowns = d_times.shape[1]
     durations, begins, slopes = np.empty(room), np.empty(room), np.empty(room)
-    d_durations, d_begins = np.empty((room, 2)), np.empty((room, 2))
-    jacobian = np.empty((2, 2))
+    d_durations, d_begins = np.empty((room, unknowns)), np.empty((room, unknowns))
+    jacobian = np.empty((unknowns, unknowns))
     first_times, first_loads = times.copy(), loads.copy()
     rate = natural_frequency(target, material)
+    stiffness = elastic_stiffness(target, material)
     move = abs(target - l) + abs(v) / rate
+    if lag > 0.0:
+        move += abs(field - loads[-1]) / stiffness
     farthest = _FARTHEST * (np.max(np.abs(loads)) + abs(load) + 1.0)
     longest = _FARTHEST * times[-1]
-    x = y = 0.0  # where the unknowns are
-    d_x = d_y = 0.0  # the step to try
+    x = np.zeros(unknowns)  # where the unknowns are
+    step = np.zeros(unknowns)  # to try
+    misses = np.zeros(unknowns)
     share = 1.0
     size = math.inf
     rtol = max(_FINE, min(_COARSE, 1e-6 * move))
     duration = math.nan
     passes = 0
     while passes < _ITERATIONS:
-        new_x, new_y = x + share * d_x, y + share * d_y
-        for i in range(times.size):
-            times[i] = first_times[i] + d_times[i, 0] * new_x + d_times[i, 1] * new_y
-            loads[i] = first_loads[i] + d_loads[i, 0] * new_x + d_loads[i, 1] * new_y
-        status, new_size, miss, speed, count = STUCK, math.inf, 0.0, 0.0, 0
+        _place(times, first_times, d_times, x, share, step)
+        _place(loads, first_loads, d_loads, x, share, step)
+        status, new_size, count = STUCK, math.inf, 0
         # A wild trial is not worth its integration.
         if np.max(np.abs(loads)) < farthest and times[-1] < longest:
             count = _pieces(
                 times, loads, d_times, d_loads, load, slew, durations, begins, slopes,
                 d_durations, d_begins)
-            if count > 0:
+            if count > 0 and lag > 0.0:
+                status, end, speed, late = respond_late(
+                    l, v, field, durations[:count], begins[:count], slopes[:count],
+                    d_durations[:count], d_begins[:count], lag, material, rtol, jacobian)
+                misses[2] = (late - loads[-1]) / stiffness
+            elif count > 0:
                 status, end, speed = respond(
                     l, v, durations[:count], begins[:count], slopes[:count],
                     d_durations[:count], d_begins[:count], material, rtol, jacobian)
-                miss, speed = end - target, speed / rate
-                new_size = math.hypot(miss, speed)
+            if count > 0:
+                misses[0], misses[1] = end - target, speed / rate
+                new_size = math.hypot(misses[0], misses[1])
+                if lag > 0.0:
+                    new_size = math.hypot(new_size, misses[2])
         better = status == DONE and new_size < (1.0 - 0.1 * share) * size
         if not better and size < math.inf:
             share *= 0.5
             if share > _LEAST_SHARE and not size <= _ACCEPTED * move:
                 continue
             # No way down: rounding, if the end is as near as rounding allows.
-            for i in range(times.size):
-                times[i] = first_times[i] + d_times[i, 0] * x + d_times[i, 1] * y
-                loads[i] = first_loads[i] + d_loads[i, 0] * x + d_loads[i, 1] * y
+            _place(times, first_times, d_times, x, 0.0, step)
+            _place(loads, first_loads, d_loads, x, 0.0, step)
             return SOLVED if rtol == _FINE and size <= _ACCEPTED * move else UNSOLVED, duration
         if not better:
             return UNSOLVED, duration
-        x, y, size = new_x, new_y, new_size
+        x += share * step
+        size = new_size
         duration = np.sum(durations[:count])
         if rtol == _FINE and size <= _WANTED * move:
             return SOLVED, duration
-        a, b = jacobian[0, 0], jacobian[0, 1]
-        c, d = jacobian[1, 0] / rate, jacobian[1, 1] / rate
-        determinant = a * d - b * c
-        d_x = -(d * miss - b * speed) / determinant
-        d_y = -(a * speed - c * miss) / determinant
-        if not math.isfinite(d_x + d_y):
+        for c in range(unknowns):
+            jacobian[1, c] /= rate
+            if lag > 0.0:
+                # The last load holds the target: it is not an unknown.
+                jacobian[2, c] /= stiffness
+        _newton(jacobian, misses, step)
+        if not math.isfinite(np.sum(step)):
             return UNSOLVED, duration
         share = 1.0
         passes += 1

@@ -11,16 +11,17 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hmsa_ros.core import kernels, law
+from hmsa_ros.core import kernels, lag_kernel, law
 from hmsa_ros.core.actuators import Actuators, check_stretch, RTOL, Setup
-from hmsa_ros.core.delivery import Piece
+from hmsa_ros.core.delivery import Delivery, Piece, ramps
 from hmsa_ros.core.model import Array, damping
+from hmsa_ros.core.moves import Level, State
 from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.core.schedule import CommandSchedule
 from hmsa_ros.errors import BadInputError, HmsaError
 
 __all__ = [
-    'ActuatorSimulation', 'check_stretch', 'endpoint', 'longest_motion', 'RTOL', 'simulate',
+    'ActuatorSimulation', 'check_stretch', 'follow', 'longest_motion', 'RTOL', 'simulate',
     'too_large', 'unshaped']
 
 # Time constants after which nothing is left of a motion, and periods after which nobody knows
@@ -33,7 +34,8 @@ _STUCK = 'the integration ran out of steps: the load is too large to follow'
 def simulate(
         switches: ArrayLike, loads: ArrayLike, times: ArrayLike,
         material: NondimensionalParameters, *, stretch: float = 1.0, rate: float = 0.0,
-        slopes: ArrayLike | None = None, rtol: float = RTOL) -> tuple[Array, Array]:
+        slopes: ArrayLike | None = None, rtol: float = RTOL, lag: float = 0.0,
+        field: float = math.nan) -> tuple[Array, Array]:
     """
     Sample the response to a piecewise constant or linear load.
 
@@ -53,6 +55,10 @@ def simulate(
         Change of the load per unit of time from each switch on; default none.
     rtol : float
         Relative tolerance.
+    lag : float
+        Time constant with which the field follows these loads; 0 for at once.
+    field : float
+        Load in force at the first switch, for a lag; default the first of ``loads``.
 
     Returns
     -------
@@ -68,56 +74,83 @@ def simulate(
 
     """
     switches, loads, times = _vector(switches), _vector(loads), _vector(times)
-    ramps = np.zeros_like(loads) if slopes is None else _vector(slopes)
+    slope = np.zeros_like(loads) if slopes is None else _vector(slopes)
     if not (switches.ndim == 1 and switches.size and switches.shape == loads.shape
-            == ramps.shape and times.ndim == 1):
+            == slope.shape and times.ndim == 1):
         raise BadInputError(
-            f'switches {switches.shape}, loads {loads.shape}, slopes {ramps.shape}, times '
+            f'switches {switches.shape}, loads {loads.shape}, slopes {slope.shape}, times '
             f'{times.shape}: expected one-dimensional arrays, the first three of one length')
-    if not all(np.all(np.isfinite(a)) for a in (switches, loads, ramps, times)):
+    if not all(np.all(np.isfinite(a)) for a in (switches, loads, slope, times)):
         raise BadInputError('switches, loads, slopes and times must be finite numbers')
     if np.any(np.diff(switches) < 0.0) or np.any(np.diff(times) < 0.0) or (
             times.size and times[0] < switches[0]):
         raise BadInputError(
             'switches and times must not decrease, and no time may lie before the first switch')
     check_stretch(stretch, material)
-    out = np.empty((2, times.size))
-    status = kernels.trajectory(
-        float(stretch), float(rate), switches, loads, ramps, times, material.packed,
-        float(rtol), out[0], out[1])
+    out = np.empty((3, times.size))
+    if lag > 0.0:
+        status = lag_kernel.trajectory_late(
+            float(stretch), float(rate), float(loads[0] if math.isnan(field) else field),
+            switches, loads, slope, float(lag), times, material.packed, float(rtol), out)
+    else:
+        status = kernels.trajectory(
+            float(stretch), float(rate), switches, loads, slope, times, material.packed,
+            float(rtol), out[0], out[1])
     if status != kernels.DONE:
         raise HmsaError(_STUCK)
     return out[0], out[1]
 
 
-def endpoint(
-        pieces: Sequence[Piece], end: float, material: NondimensionalParameters,
-        stretch: float, rate: float) -> tuple[float, float]:
+def follow(
+        levels: Sequence[Level], state: State, end: float, material: NondimensionalParameters,
+        delivery: Delivery) -> State:
     """
-    Return where a piecewise linear load leads, without checks: for those who plan.
+    Return where levels lead, without checks: for those who plan.
 
     Parameters
     ----------
-    pieces : sequence of (float, float, float)
-        Switch, load and slope of each, as `hmsa_ros.core.delivery.ramps` returns them.
+    levels : sequence of Level
+        By time, the first at the start.
+    state : State
+        At the start; it knows the load in force.
     end : float
-        Time of the state that is wanted, not before the last switch.
+        Time of the state that is wanted, not before the last level.
     material : NondimensionalParameters
         zeta, J_lim and c1.
-    stretch, rate : float
-        State at the first switch.
+    delivery : Delivery
+        How the levels reach the coil.
 
     Returns
     -------
-    stretch, rate : float
+    State
         At the end.
 
-    Raises
-    ------
-    HmsaError
-        If the integration does not get through.
-
     """
+    pieces, last = ramps(levels, state.ramps_from, end, delivery.slew)
+    if delivery.lag > 0.0:
+        return _follow_late(pieces, last, state, end, material, delivery.lag)
+    stretch, rate = _endpoint(pieces, end, material, state.stretch, state.rate)
+    return State(stretch, rate, last)
+
+
+def _follow_late(
+        pieces: Sequence[Piece], last: float, state: State, end: float,
+        material: NondimensionalParameters, lag: float) -> State:
+    switches, loads, slopes = np.array(pieces).T.copy()
+    out = np.empty((3, 1))
+    status = lag_kernel.trajectory_late(
+        float(state.stretch), float(state.rate), float(state.load), switches, loads, slopes, lag,
+        np.array([float(end)]), material.packed, RTOL, out)
+    if status != kernels.DONE:
+        raise HmsaError(_STUCK)
+    stretch, rate, field = out[:, 0].tolist()
+    return State(stretch, rate, field, last)
+
+
+def _endpoint(
+        pieces: Sequence[Piece], end: float, material: NondimensionalParameters,
+        stretch: float, rate: float) -> tuple[float, float]:
+    """Return stretch and rate to which a piecewise linear load leads."""
     work = kernels.work_space()
     for i, (begin, load, slope) in enumerate(pieces):
         until = pieces[i + 1][0] if i + 1 < len(pieces) else end

@@ -12,15 +12,21 @@ from dataclasses import dataclass, field, replace
 import math
 
 from hmsa_ros.core import law
-from hmsa_ros.core.delivery import Delivery, pieces, ramps
+from hmsa_ros.core.delivery import Delivery, pieces
 from hmsa_ros.core.moves import Level, Limits, State
 from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.core.sequence import SHORT_SPELL
 from hmsa_ros.core.shapers import get_shaper
-from hmsa_ros.core.simulation import endpoint, longest_motion, simulate
+from hmsa_ros.core.simulation import follow, longest_motion, simulate
 from hmsa_ros.core.status import Code
 from hmsa_ros.core.units import NANOSECONDS, Units
 from hmsa_ros.errors import BadInputError
+
+
+def scaled(value: float | None, unit: float) -> float | None:
+    """Return a value in another unit, if there is one."""
+    return None if value is None else value * unit
+
 
 #: Stamp of a level that has been in force at rest for ever.
 ALWAYS = -2**62
@@ -47,6 +53,8 @@ class Options:
         Largest change of the flux density in T/s; infinite for steps.
     order : int
         Of the robust shaper.
+    coil_time_constant : float
+        In s: the field follows the amplifier with this lag of first order; 0 for at once.
 
     """
 
@@ -58,6 +66,7 @@ class Options:
     period: int = 0
     slew_limit: float = math.inf
     order: int = 2
+    coil_time_constant: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -112,7 +121,7 @@ class Model:
             'limits': Limits(options.flux_density_min / load, options.flux_density_max / load),
             'delivery': Delivery(
                 options.period / NANOSECONDS / time, options.slew_limit / load * time,
-                1.0 / NANOSECONDS / time),
+                1.0 / NANOSECONDS / time, options.coil_time_constant / time),
         }
         for name, value in worked_out.items():
             object.__setattr__(self, name, value)
@@ -152,10 +161,7 @@ class Model:
             At the end.
 
         """
-        parts, last = ramps((Level(0.0, load),), state.load, duration, self.delivery.slew)
-        stretch, rate = endpoint(
-            parts, duration, self.material, state.stretch, state.rate)
-        return State(stretch, rate, last)
+        return follow((Level(0.0, load),), state, duration, self.material, self.delivery)
 
     def taken_from(self, state: State, other: 'Model') -> State:
         """Return a state of another model in the units of this one."""
@@ -163,7 +169,8 @@ class Model:
             return state
         return State(
             state.stretch, state.rate / other.units.time * self.units.time,
-            state.load * other.units.load / self.units.load)
+            state.load * other.units.load / self.units.load,
+            scaled(scaled(state.amplifier, other.units.load), 1.0 / self.units.load))
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,6 +190,9 @@ class PlannedLevel:
         Flux density in T predicted at the stamp, from which a slew limit ramps to the level.
     model : Model
         Under which the motion from the stamp on is predicted.
+    amplifier : float or None
+        Output of the amplifier in T predicted at the stamp; None where the field does not lag
+        behind it.
 
     """
 
@@ -192,6 +202,7 @@ class PlannedLevel:
     rate: float
     in_force: float
     model: Model = field(repr=False)
+    amplifier: float | None = None
 
     def at(self, time: int) -> State:
         """
@@ -209,14 +220,25 @@ class PlannedLevel:
 
         """
         model = self.model
-        load = self.in_force / model.units.load
         if self.stamp == ALWAYS:
-            return State(self.stretch, 0.0, load)
-        end = self.flux_density / model.units.load
-        longest = model.delivery.ramp(end - load) + longest_motion(end, model.material)
+            return State(self.stretch, 0.0, self.in_force / model.units.load)
         return model.follow(
-            State(self.stretch, self.rate * model.units.time, load), end,
-            min(max(model.time(time - self.stamp), 0.0), longest))
+            self._begin(), self.flux_density / model.units.load,
+            min(max(model.time(time - self.stamp), 0.0), self._longest()))
+
+    def _begin(self) -> State:
+        """Return the state at the stamp in the units of the model."""
+        units = self.model.units
+        return State(
+            self.stretch, self.rate * units.time, self.in_force / units.load,
+            scaled(self.amplifier, 1.0 / units.load))
+
+    def _longest(self) -> float:
+        """Return for how long the motion is worth following."""
+        model = self.model
+        end = self.flux_density / model.units.load
+        return model.delivery.settling(end - self._begin().ramps_from) \
+            + longest_motion(end, model.material)
 
     def sample(self, times: Sequence[int]) -> list[tuple[float, float]]:
         """
@@ -237,14 +259,14 @@ class PlannedLevel:
             return [(self.stretch, self.rate)] * len(times)
         model = self.model
         end = self.flux_density / model.units.load
-        load = self.in_force / model.units.load
-        longest = model.delivery.ramp(end - load) + longest_motion(end, model.material)
+        longest = self._longest()
         after = [min(model.time(x - self.stamp), longest) for x in times]
         switches, loads, slopes, _ = pieces(
-            (Level(0.0, end),), load, after[-1], model.delivery.slew)
+            (Level(0.0, end),), self._begin().ramps_from, after[-1], model.delivery.slew)
         stretch, rate = simulate(
             switches, loads, after, model.material, stretch=self.stretch,
-            rate=self.rate * model.units.time, slopes=slopes)
+            rate=self.rate * model.units.time, slopes=slopes, lag=model.delivery.lag,
+            field=self.in_force / model.units.load)
         return list(zip(stretch.tolist(), (rate / model.units.time).tolist(), strict=True))
 
     def after(self, level: 'PlannedLevel') -> 'PlannedLevel':
@@ -253,7 +275,7 @@ class PlannedLevel:
         units = level.model.units
         return replace(
             self, stretch=state.stretch, rate=state.rate / units.time,
-            in_force=state.load * units.load)
+            in_force=state.load * units.load, amplifier=scaled(state.amplifier, units.load))
 
 
 @dataclass(frozen=True, slots=True)

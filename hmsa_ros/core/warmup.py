@@ -28,6 +28,7 @@ _DELIVERIES = (
     Options(shaper='minimum_time'),
     Options(shaper='robust', slew_limit=100.0),
     Options(shaper='zvd', period=_MILLISECOND),
+    Options(coil_time_constant=5e-4),
 )
 
 

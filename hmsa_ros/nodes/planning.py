@@ -5,7 +5,12 @@ from dataclasses import replace
 import math
 from typing import Any
 
-from hmsa_ros.contract.parameters import FLUX_DENSITY_MAX, FLUX_DENSITY_MIN, SLEW_LIMIT
+from hmsa_ros.contract.parameters import (
+    COIL_TIME_CONSTANT,
+    FLUX_DENSITY_MAX,
+    FLUX_DENSITY_MIN,
+    SLEW_LIMIT,
+)
 from hmsa_ros.core.group import PlannerGroup
 from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.sequence import SHORT_SPELL
@@ -39,6 +44,7 @@ OWN = (
         'robust_order', 2, 'Number of two-step commands that the shaper robust chains.', '',
         1, 16, read_only=False),
     replace(SLEW_LIMIT, read_only=False),
+    replace(COIL_TIME_CONSTANT, read_only=False),
     replace(FLUX_DENSITY_MIN, read_only=False),
     replace(FLUX_DENSITY_MAX, read_only=False),
 )
@@ -134,7 +140,8 @@ def options_from(values: Mapping[str, Any]) -> Options:
         period=0 if values['command_mode'] == 'continuous'
         else nanoseconds(values['command_period']),
         slew_limit=float(values['slew_limit']) or math.inf,
-        order=int(values['robust_order']))
+        order=int(values['robust_order']),
+        coil_time_constant=float(values['coil_time_constant']))
 
 
 def nanoseconds(seconds: float) -> int:

@@ -1,5 +1,7 @@
 """The fastest command within the load limits: full push, full brake, hold."""
 
+import contextlib
+from dataclasses import replace
 import math
 
 from scipy.optimize import brentq
@@ -7,6 +9,12 @@ from scipy.optimize import brentq
 from hmsa_ros.core import kernels, law
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.moves import Level, Move, State
+from hmsa_ros.core.shapers.lagged import (
+    at_rest,
+    fastest_on_grid,
+    push_brake_push,
+    three_levels,
+)
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.shooting import solve, Template
 from hmsa_ros.core.status import Code, RefusedError
@@ -53,6 +61,8 @@ def minimum_time(request: Request, reason: str = '') -> Move:
     holding = request.holding_load()
     state, target = request.state, request.target
     frequency = _frequency(request)
+    if request.delivery.lag > 0.0:
+        return _late(request, holding, frequency, reason)
     if abs(target - state.stretch) <= _AT_REST and abs(state.rate) <= _AT_REST * frequency:
         return Move(Code.HOLD, (Level(0.0, holding),), 0.0)
     least, most = _bounds(request, holding, frequency)
@@ -61,14 +71,37 @@ def minimum_time(request: Request, reason: str = '') -> Move:
         found = _attempt(
             request, holding, holding + share * (least - holding),
             holding + share * (most - holding))
-        if found is not None and all(
-                request.limits.minimum <= x.load <= request.limits.maximum for x in found[0]):
+        if found is not None and request.keeps(found[0]):
             return Move(Code.MINIMUM_TIME, *found, reason)
     raise RefusedError(
         Code.NOT_CONVERGED,
         f'no command of two levels within the limits was found from stretch '
         f'{state.stretch:.6g} at rate {state.rate / request.units.time:.4g} to rest at '
         f'{target:g}')
+
+
+def _late(request: Request, holding: float, frequency: float, reason: str) -> Move:
+    """Push, brake and push again, so that the field arrives with the stretch."""
+    if at_rest(request, holding):
+        return Move(Code.HOLD, (Level(0.0, holding),), 0.0)
+    if request.delivery.period > 0.0:
+        found = fastest_on_grid(request, _bounds(request, holding, frequency))
+        if found is not None:
+            return Move(Code.MINIMUM_TIME, *found, reason)
+        return three_levels(request, Code.MINIMUM_TIME, reason)
+    least, most = _bounds(request, holding, frequency)
+    work = kernels.work_space()
+    for share in _SHARES:
+        low, high = holding + share * (least - holding), holding + share * (most - holding)
+        direction = _direction(work, request, low, high)
+        push, brake = (high, low) if direction > 0.0 else (low, high)
+        with contextlib.suppress(RefusedError):
+            plain = _attempt(replace(request, delivery=replace(
+                request.delivery, lag=0.0, resolution=0.0)), holding, low, high)
+            found = plain and push_brake_push(request, plain[0], push, brake)
+            if found is not None and request.keeps(found[0]):
+                return Move(Code.MINIMUM_TIME, *found, reason)
+    return three_levels(request, Code.MINIMUM_TIME, reason)
 
 
 def _attempt(
@@ -87,8 +120,7 @@ def _attempt(
     levels = (Level(0.0, push), Level(max(pushing, up), brake),
               Level(max(pushing, up) + max(braking, down), holding))
     found = solve(
-        Template.of(levels, [('time', 1), ('time', 2)]), request.state, request.load,
-        request.target, request.material, delivery.slew)
+        Template.of(levels, [('time', 1), ('time', 2)]), request)
     if found is not None and delivery.resolution > 0.0:
         return _on_time(request, found[0]) or found
     return found
@@ -108,8 +140,7 @@ def _on_grid(
                   holding + (brake[0] - holding) * brake[1] / (second * period)),
             Level((first + second) * period, holding))
         found = solve(
-            Template.of(levels, [('load', 0), ('load', 1)]), request.state, request.load,
-            request.target, request.material, request.delivery.slew)
+            Template.of(levels, [('load', 0), ('load', 1)]), request)
         if found is not None:
             return found
     return None
@@ -120,8 +151,7 @@ def _on_time(
     """Solve once more for the heights, with the times as commands can carry them."""
     rounded = [Level(request.delivery.rounded(x.time), x.load) for x in levels]
     return solve(
-        Template.of(rounded, [('load', 0), ('load', 1)]), request.state, request.load,
-        request.target, request.material, request.delivery.slew)
+        Template.of(rounded, [('load', 0), ('load', 1)]), request)
 
 
 def _frequency(request: Request) -> float:

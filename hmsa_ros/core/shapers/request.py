@@ -48,10 +48,19 @@ class Request:
 
     @property
     def load(self) -> float:
+        """Output of the amplifier before the move."""
+        return self.field if self.state.amplifier is None else self.state.amplifier
+
+    @property
+    def field(self) -> float:
         """Load in force before the move."""
         if math.isfinite(self.state.load):
             return self.state.load
         return float(law.elastic_force(self.state.stretch, self.material.packed))
+
+    def keeps(self, levels: Sequence[Level]) -> bool:
+        """Return whether levels are inside the load limits."""
+        return all(self.limits.minimum <= x.load <= self.limits.maximum for x in levels)
 
     def to(self, target: float) -> 'Request':
         """

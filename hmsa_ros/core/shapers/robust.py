@@ -9,6 +9,7 @@ oscillator gives the levels of n convolved ZV shapers.
 """
 
 from dataclasses import replace
+import math
 
 from hmsa_ros.core import law
 from hmsa_ros.core.delivery import IDEAL
@@ -56,12 +57,16 @@ def robust(request: Request) -> Move:
             for x in chain.levels[:-1]]
         chain = _chain(ideal, [*waypoints, request.target])
         if chain.code is not Code.ROBUST:
-            return replace(
-                move, reason=f'no chain of order {request.order} leads to stretch '
-                             f'{request.target:g} ({chain.code}): a single two-step command is '
-                             'used')
-    return chain if request.delivery.ideal else _chain(
-        request, [*waypoints, request.target])
+            return _single(move, request, chain)
+    if not request.delivery.ideal:
+        chain = _chain(request, [*waypoints, request.target])
+    return chain if chain.code is Code.ROBUST else _single(move, request, chain)
+
+
+def _single(move: Move, request: Request, chain: Move) -> Move:
+    return replace(move, reason=(
+        f'no chain of order {request.order} leads to stretch {request.target:g} ({chain.code}): '
+        'a single two-step command is used'))
 
 
 def _chain(request: Request, waypoints: list[float]) -> Move:
@@ -74,6 +79,9 @@ def _chain(request: Request, waypoints: list[float]) -> Move:
         if move.code is not Code.TWO_STEP:
             return move
         last = move.levels[-1]
+        if levels and begin > levels[-1].time and request.delivery.period > 0.0:
+            # At rest at the end of a ramp: the next command waits for the grid.
+            begin = math.ceil(begin / request.delivery.period - 1e-9) * request.delivery.period
         levels += [Level(begin + x.time, x.load) for x in move.levels]
         begin += move.duration
         if begin == levels[-1].time:

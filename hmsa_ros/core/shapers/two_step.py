@@ -1,17 +1,19 @@
 """The two-step command, on ideal and on real hardware."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 import contextlib
+from dataclasses import replace
 from itertools import product
 import math
 
 import numpy as np
 
 from hmsa_ros.core import law
-from hmsa_ros.core.moves import Level, Move
+from hmsa_ros.core.moves import Level, Limits, Move
+from hmsa_ros.core.shapers.lagged import at_rest, settle, three_levels
 from hmsa_ros.core.shapers.minimum_time import minimum_time
 from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.core.shooting import solve, Template
+from hmsa_ros.core.shooting import Attempt, solve, Template
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.two_step import plan_two_step
 
@@ -22,9 +24,6 @@ _MOST_HALF_PERIODS = 40
 _SHORTEST_STRIDE = 0.05
 # Ramps to begin the search for two swings with, in quarters of a period.
 _SWINGS = (0.3, 0.1, 0.7, 0.03, 1.2)
-
-# A command and the time at which it is at rest; None if there is none.
-Attempt = tuple[tuple[Level, ...], float] | None
 
 
 def two_step(request: Request) -> Move:
@@ -54,6 +53,8 @@ def two_step(request: Request) -> Move:
         was found.
 
     """
+    if request.delivery.lag > 0.0:
+        return _late(request)
     holding = request.holding_load()
     state, material, target = request.state, request.material, request.target
     plan = plan_two_step(
@@ -85,6 +86,29 @@ def two_step(request: Request) -> Move:
     return _ramped(request, *ideal)
 
 
+def _late(request: Request) -> Move:
+    """Have the field arrive with the stretch, by a level more."""
+    holding = request.holding_load()
+    if at_rest(request, holding):
+        return Move(Code.HOLD, (Level(0.0, holding),), 0.0)
+    plain = replace(
+        request, delivery=replace(request.delivery, lag=0.0, period=0.0),
+        limits=Limits())
+    try:
+        move = two_step(plain)
+    except RefusedError:
+        move = None
+    if move is not None and math.isinf(move.duration):
+        return move
+    if move is not None and move.code is Code.TWO_STEP:
+        found = settle(request, move)
+        if found is not None:
+            return found
+    return three_levels(request, Code.MINIMUM_TIME, (
+        'no single intermediate flux density and a push that settles the field lead within the '
+        f'limits to rest at {request.target:g}: three are used'))
+
+
 def _sampled(request: Request, first: Level, last: Level) -> Move:
     """
     Place the command on the grid: one level, and another for its last period.
@@ -111,12 +135,11 @@ def _sampled(request: Request, first: Level, last: Level) -> Move:
             guess = (levels[0], Level((count - 1) * each, between),
                      Level(count * each, last.load))
             return solve(
-                Template.of(guess, [('load', 0), ('load', 1)]), request.state, request.load,
-                request.target, request.material, request.delivery.slew)
+                Template.of(guess, [('load', 0), ('load', 1)]), request)
 
         exact = (first, Level((count - 1) * fitting, first.load), last)
         found = _follow(exact, stretched)
-        if found is not None and _inside(request, found[0]):
+        if found is not None and request.keeps(found[0]):
             return Move(Code.TWO_STEP, *found)
     raise RefusedError(
         Code.NO_TWO_STEP,
@@ -146,8 +169,8 @@ def _ramped(request: Request, first: Level, last: Level) -> Move:
             abs(levels[0].load - start) - abs(levels[1].load - levels[0].load))
         guess = (levels[0], Level(levels[1].time + shift, levels[1].load))
         return solve(
-            Template.of(guess, [('load', 0), ('time', 1)]), request.state, start,
-            request.target, request.material, slew / aim)
+            Template.of(guess, [('load', 0), ('time', 1)]), request,
+            replace(request.delivery, slew=slew / aim))
 
     most = min(least + 2 * _LATER, _MOST_HALF_PERIODS)
     for half_periods in range(least, most, 2):
@@ -161,7 +184,7 @@ def _ramped(request: Request, first: Level, last: Level) -> Move:
             between = start + change / (1.0 + decay ** half_periods)
         ideal = (Level(0.0, between), Level(half_periods * last.time, last.load))
         found = _follow(ideal, slower)
-        if found is not None and _inside(request, found[0]):
+        if found is not None and request.keeps(found[0]):
             return Move(Code.TWO_STEP, *found)
     if request.state.rate != 0.0:
         with contextlib.suppress(RefusedError):
@@ -207,23 +230,16 @@ def _swings(request: Request, holding: float) -> Attempt:
             np.array([0.0, turn, turn + abs(high - low) / slew]), np.array([high, low, holding]),
             sign / slew * np.array([[0.0, 0.0], [1.0, 0.0], [2.0, -1.0]]),
             np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]]))
-        found = solve(
-            guess, request.state, start, request.target, request.material, slew)
+        found = solve(guess, request)
         if found is not None and request.delivery.resolution > 0.0:
             # Once more for the heights, at times that commands can carry and ramps can keep.
             later = [Level(request.delivery.rounded(x.time) + i * request.delivery.resolution,
                            x.load) for i, x in enumerate(found[0])]
             found = solve(
-                Template.of(later, [('load', 0), ('load', 1)]), request.state, start,
-                request.target, request.material, slew) or found
-        if found is not None and _inside(request, found[0]):
+                Template.of(later, [('load', 0), ('load', 1)]), request) or found
+        if found is not None and request.keeps(found[0]):
             return found
     return None
-
-
-def _inside(request: Request, levels: Sequence[Level]) -> bool:
-    return all(
-        request.limits.minimum <= x.load <= request.limits.maximum for x in levels)
 
 
 def _follow(

@@ -1,0 +1,308 @@
+"""
+Commands for a field that lags behind its amplifier: stretch, rate and field arrive together.
+
+One more condition takes one more number: a level of a short push, which settles the field,
+before the level that holds the target. On a grid the heights of three levels are solved for,
+through ramps and at any time two heights and a time.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import product
+import math
+
+from hmsa_ros.core import law
+from hmsa_ros.core.delivery import Delivery
+from hmsa_ros.core.moves import Level, Limits, Move
+from hmsa_ros.core.shapers.request import Request
+from hmsa_ros.core.shooting import Attempt, solve, Template
+from hmsa_ros.core.status import Code, RefusedError
+
+# Lengths of the settling push to try, in time constants of the lag. The first one passes the
+# holding level by as much as the level before falls short of it; shorter ones would save at most
+# 0.4 time constants and need far more field.
+_PUSHES = (math.log(2.0), 1.0, 1.5, 2.2, 3.2, 4.6, 7.0)
+# Shares of the way from no lag to the lag for which a command is followed in smaller strides.
+_SHORTEST_STRIDE = 0.03
+# Lengths of three levels of free heights, in half periods at the target.
+_LENGTHS = (0.7, 0.85, 1.0, 1.2, 1.4, 1.7, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0)
+_FREE_LOADS = [('load', 0), ('load', 1), ('load', 2)]
+# Periods of the grid beyond the least number, and shares of the limits' heights.
+_MORE_PERIODS = (0, 1, 2, 3, 4, 6, 9)
+_SHARES = (1.0, 0.5, 0.25, 0.1)
+_AT_REST = 1e-9
+
+
+def at_rest(request: Request, holding: float) -> bool:
+    """
+    Return whether stretch, rate and field are those of the target already.
+
+    Parameters
+    ----------
+    request : Request
+        The move.
+    holding : float
+        Load that holds the target.
+
+    Returns
+    -------
+    bool
+        To what a prediction resolves.
+
+    """
+    packed = request.material.packed
+    frequency = law.natural_frequency(request.target, packed)
+    stiffness = law.elastic_stiffness(request.target, packed)
+    state = request.state
+    return (abs(state.stretch - request.target) <= _AT_REST
+            and abs(state.rate) <= _AT_REST * frequency
+            and max(abs(request.field - holding), abs(request.load - holding) * (
+                not math.isinf(request.delivery.slew))) <= _AT_REST * stiffness)
+
+
+def settle(request: Request, plain: Move) -> Move | None:
+    """
+    Have the field arrive with the stretch, starting from the command for a field without lag.
+
+    Parameters
+    ----------
+    request : Request
+        The move.
+    plain : Move
+        Two levels, for the same request without the lag, and without the grid if there is one.
+
+    Returns
+    -------
+    Move or None
+        With three levels, on a grid up to four; None where none was found within the limits.
+
+    """
+    attempt = _sampled if request.delivery.period > 0.0 else _pushed
+    found = attempt(request, plain)
+    return None if found is None else Move(plain.code, *found, plain.reason)
+
+
+def _pushed(request: Request, plain: Move) -> Attempt:
+    """Solve for two heights and a time, with the shortest push that the limits allow."""
+    first, last = plain.levels
+    delivery = request.delivery
+
+    def slower(length: float) -> Callable[[Attempt, float, float], Attempt]:
+        def closer(found: Attempt, share: float, aim: float) -> Attempt:
+            lag = aim * delivery.lag
+            before = (first, first, last) if found is None else found[0]
+            # What the field has not settled of the first level, undone by the push.
+            left = math.exp(-length)
+            passed = (last.load - before[0].load) * left / (1.0 - left)
+            if not math.isinf(delivery.slew):
+                passed = math.copysign(min(
+                    abs(passed), delivery.slew * lag * math.log1p(left)), passed)
+            middle = Level(
+                last.time + length * lag * left / (1.0 - left), last.load + passed)
+            if found is not None:
+                middle = Level(
+                    before[1].time + (aim - share) * delivery.lag * length * left / (1.0 - left),
+                    middle.load)
+            return solve(
+                _template((before[0], middle, last), length * lag, delivery), request,
+                replace(delivery, lag=lag))
+        return closer
+
+    for length in _PUSHES:
+        found = _follow(slower(length))
+        if found is not None and request.keeps(found[0]):
+            return found
+    return None
+
+
+def _template(
+        levels: tuple[Level, Level, Level], held: float, delivery: Delivery) -> Template:
+    """Return levels with the first two heights and the time of the second free."""
+    first, second, last = levels
+    change = second.load - first.load
+    template = Template.of(
+        (first, second, Level(second.time + delivery.ramp(change) + held, last.load)),
+        [('load', 0), ('load', 1), ('time', 1)])
+    if not math.isinf(delivery.slew):
+        slope = math.copysign(1.0 / delivery.slew, change)
+        template.d_times[2, 0] = -slope
+        template.d_times[2, 1] = slope
+    return template
+
+
+def _sampled(request: Request, plain: Move) -> Attempt:
+    """
+    Solve for three heights on the grid.
+
+    The second of them lasts a period; the last one, which settles the field, long enough not to
+    ask for much more than the limits.
+    """
+    first, last = plain.levels
+    period, lag = request.delivery.period, request.delivery.lag
+    slow = 0.0 if math.isinf(request.delivery.slew) else request.delivery.ramp(
+        last.load - request.load)
+    shortest = max(1, math.ceil(_PUSHES[0] * lag / period))
+    for more, longer in product(_MORE_PERIODS, (0, 1, 2)):
+        push = shortest * (1 + longer)
+        count = max(push + 2, math.ceil((last.time + lag + slow) / period)) + more
+        late = (count - push) * period - last.time
+        between = first.load + (last.load - first.load) * min(max(late / period, 0.0), 1.0)
+        levels = (first, Level((count - push - 1) * period, between),
+                  Level((count - push) * period, last.load), Level(count * period, last.load))
+        found = solve(Template.of(levels, _FREE_LOADS), request)
+        if found is not None and request.keeps(found[0]):
+            return found
+    return None
+
+
+def _follow(closer: Callable[[Attempt, float, float], Attempt]) -> Attempt:
+    """Follow a command from no lag to the real one, in smaller strides where it must be."""
+    found: Attempt = None
+    share, stride = 0.0, 1.0
+    while share < 1.0:
+        aim = min(1.0, share + stride)
+        attempt = closer(found, share, aim)
+        if attempt is not None:
+            found, share = attempt, aim
+        elif stride > _SHORTEST_STRIDE:
+            stride *= 0.5
+        else:
+            return None
+    return found
+
+
+def three_levels(request: Request, code: Code, reason: str) -> Move:
+    """
+    Come to rest by three levels of free heights: the shortest of those within the limits.
+
+    Parameters
+    ----------
+    request : Request
+        The move, from any state of motion and of the field.
+    code : Code
+        Of the move.
+    reason : str
+        Why it is not another command.
+
+    Returns
+    -------
+    Move
+        Four levels.
+
+    Raises
+    ------
+    RefusedError
+        If there is none of up to seven half periods.
+
+    """
+    holding = request.holding_load()
+    for length in _lengths(request, holding):
+        times = [i * length for i in range(4)]
+        begin = 0.5 * (request.load + holding)
+        guess = tuple(
+            Level(t, x) for t, x in zip(times, (begin, holding, holding, holding), strict=True))
+        found = solve(Template.of(guess, _FREE_LOADS), request)
+        if found is not None and request.keeps(found[0]):
+            return Move(code, *found, reason)
+    raise RefusedError(*_refusal(request))
+
+
+def _lengths(request: Request, holding: float) -> Iterator[float]:
+    """Yield how long each of three levels may last."""
+    delivery = request.delivery
+    half = math.pi / law.natural_frequency(request.target, request.material.packed)
+    ramp = delivery.ramp(holding - request.load)
+    before = 0.0
+    for share in _LENGTHS:
+        each = (share * half + delivery.lag + ramp) / 3.0
+        if delivery.period > 0.0:
+            each = math.ceil(each / delivery.period) * delivery.period
+        each = delivery.rounded(each)
+        if each > before:
+            before = each
+            yield each
+
+
+def _refusal(request: Request) -> tuple[Code, str]:
+    units, delivery, limits = request.units, request.delivery, request.limits
+    text = (f'no command for a coil time constant of {units.time_text(delivery.lag)} brings '
+            f'stretch {request.target:g} and the field to rest together within ')
+    if not math.isinf(delivery.slew):
+        return Code.SLEW_LIMIT, text + (
+            f'ramps of {units.slew_text(delivery.slew)} and flux densities of '
+            f'{_limits_text(request, limits)}: expected faster ramps, wider limits or a smaller '
+            'move')
+    return Code.FLUX_LIMIT, text + (
+        f'flux densities of {_limits_text(request, limits)}: expected wider limits, a smaller '
+        'move or several setpoints')
+
+
+def _limits_text(request: Request, limits: Limits) -> str:
+    text = request.units.load_text
+    return f'{text(limits.minimum)} to {text(limits.maximum)}'
+
+
+def push_brake_push(
+        request: Request, plain: tuple[Level, ...], push: float, brake: float) -> Attempt:
+    """
+    Solve for the times of the fastest command: push, brake and push between two loads.
+
+    Parameters
+    ----------
+    request : Request
+        The move.
+    plain : tuple of Level
+        Command of push and brake for the same request without a lag.
+    push, brake : float
+        Loads to use.
+
+    Returns
+    -------
+    tuple of (tuple of Level, float), or None
+        The command and its duration; None if no such command was found.
+
+    """
+    delivery = request.delivery
+    holding = request.holding_load()
+    # The second push ends when the field, at the brake's level before, is at the holding load.
+    length = math.log1p((holding - brake) / (push - holding))
+    def closer(found: Attempt, share: float, aim: float) -> Attempt:
+        lag = aim * delivery.lag
+        if found is None:
+            second, third = plain[1].time, plain[2].time
+        else:
+            second, third = found[0][1].time, found[0][2].time
+        up = delivery.ramp(push - brake)
+        end = third + up + lag * length + delivery.ramp(push - holding)
+        guess = (Level(0.0, push), Level(second, brake), Level(third, push), Level(end, holding))
+        return solve(
+            Template.of(guess, [('time', 1), ('time', 2), ('time', 3)]), request,
+            replace(delivery, lag=lag))
+
+    found = _follow(closer)
+    if found is None:
+        return None
+    times = [x.time for x in found[0]]
+    if any(late <= early for early, late in zip(times, times[1:], strict=False)):
+        return None
+    if delivery.resolution > 0.0:
+        rounded = [Level(delivery.rounded(x.time), x.load) for x in found[0]]
+        return solve(Template.of(rounded, _FREE_LOADS), request) or found
+    return found
+
+
+def fastest_on_grid(request: Request, loads: tuple[float, float]) -> Attempt:
+    """Return the shortest three levels on the grid that keep the limits, if there are any."""
+    period = request.delivery.period
+    holding = request.holding_load()
+    half = math.pi / law.natural_frequency(request.target, request.material.packed)
+    most = math.ceil((2.0 * half + 3.0 * request.delivery.lag) / period) + 6
+    for count in range(3, most):
+        last = max(1, min(count // 3, math.ceil(_PUSHES[0] * request.delivery.lag / period)))
+        first = max(1, (count - last) // 2)
+        guess = (Level(0.0, 0.5 * (loads[0] + holding)), Level(first * period, holding),
+                 Level((count - last) * period, holding), Level(count * period, holding))
+        found = solve(Template.of(guess, _FREE_LOADS), request)
+        if found is not None and request.keeps(found[0]):
+            return found
+    return None

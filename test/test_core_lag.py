@@ -1,0 +1,157 @@
+"""Plans through the lag of a coil: stretch, rate and field arrive together."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from hmsa_ros.core.delivery import Delivery, ramps
+from hmsa_ros.core.model import elastic_force
+from hmsa_ros.core.moves import Limits, State
+from hmsa_ros.core.parameters import NondimensionalParameters, paper_actuator
+from hmsa_ros.core.planner import Options, Planner
+from hmsa_ros.core.sequence import plan_sequence, Setpoint
+from hmsa_ros.core.shapers import get_shaper
+from hmsa_ros.core.shapers.request import Request
+from hmsa_ros.core.simulation import ActuatorSimulation, simulate
+from hmsa_ros.core.status import Code, RefusedError
+
+PAPER = NondimensionalParameters()
+LIMITS = Limits(-2.5, 2.5)
+# Distance from rest as a share of the move, by an integration of another kind.
+AT_REST = 1e-9
+MS = 1_000_000
+HARDWARE = [{}, {'period': 0.11}, {'period': 0.4}, {'slew': 1.5}, {'slew': 0.4},
+            {'period': 0.11, 'slew': 1.5}]
+
+
+def rates(_, state, load, slope, lag):
+    """Equation 11 and the coil, written out once more; the time is that of a piece."""
+    stretch, rate, field = state
+    j, c1 = PAPER.j_lim, PAPER.c1
+    chain = 1.0 - (2.0 / stretch + stretch ** 2 - 3.0) / j
+    force = (stretch - stretch ** -2) / chain + 0.5 * PAPER.zeta * c1 * rate
+    mass = (stretch ** -3 + c1) / 6.0
+    return rate, (field - force + 0.25 * stretch ** -4 * rate ** 2) / mass, (
+        load + slope * _ - field) / lag
+
+
+def end_of(move, request):
+    """Integrate a command with SciPy to where it is said to be at rest."""
+    delivery = request.delivery
+    pieces, _ = ramps(move.levels, request.load, move.duration, delivery.slew)
+    state = [request.state.stretch, request.state.rate, request.field]
+    for (begin, load, slope), after in itertools.zip_longest(pieces, pieces[1:]):
+        span = (after[0] if after else move.duration) - begin
+        if span > 0.0:
+            state = solve_ivp(
+                rates, (0.0, span), state, method='DOP853', rtol=1e-12, atol=1e-14,
+                args=(load, slope, delivery.lag)).y[:, -1]
+    return state
+
+
+@pytest.mark.parametrize('hardware', HARDWARE, ids=str)
+@pytest.mark.parametrize('shaper', ['two_step', 'robust', 'minimum_time'])
+def test_stretch_rate_and_field_arrive_together_from_any_state_within_the_limits(
+        shaper, hardware):
+    random = np.random.default_rng(16)
+    for number in range(6):
+        start, target = random.uniform(0.75, 1.5, 2)
+        held = float(elastic_force(start, PAPER))
+        state = (
+            State(start, 0.0, held),
+            State(start, random.uniform(-0.4, 0.4), held + random.uniform(-0.4, 0.4), held),
+            State(start, 0.0, held + random.uniform(-0.3, 0.3), held))[number % 3]
+        request = Request(
+            state, target, PAPER, LIMITS,
+            Delivery(lag=10.0 ** random.uniform(-3.0, -0.3), **hardware))
+        move = get_shaper(shaper)(request)
+        stretch, rate, field = end_of(move, request)
+        off = max(abs(stretch - target), abs(rate), abs(field - elastic_force(target, PAPER)))
+        assert off < AT_REST * max(abs(target - start), 0.02)
+        assert request.keeps(move.levels)
+        assert move.code is not Code.STEP
+        period = hardware.get('period', 0.0)
+        for level in move.levels if period else ():
+            assert level.time / period == pytest.approx(round(level.time / period), abs=1e-9)
+
+
+@pytest.mark.parametrize('slew', [math.inf, 1.5])
+def test_with_less_and_less_lag_the_plan_becomes_the_one_without(slew):
+    plain = get_shaper('two_step')(Request(State(1.0), 1.3, PAPER, delivery=Delivery(slew=slew)))
+    for lag in (1e-2, 1e-4, 1e-6):
+        move = get_shaper('two_step')(
+            Request(State(1.0), 1.3, PAPER, delivery=Delivery(slew=slew, lag=lag)))
+        assert len(move.levels) == 3
+        assert move.levels[0].load == pytest.approx(plain.levels[0].load, abs=10.0 * lag)
+        assert move.duration == pytest.approx(plain.duration, abs=3.0 * lag)
+
+
+def test_a_field_that_has_not_settled_is_no_rest():
+    held = float(elastic_force(1.2, PAPER))
+    shaper = get_shaper('two_step')
+    delivery = Delivery(lag=0.1)
+    assert shaper(Request(State(1.2, 0.0, held), 1.2, PAPER, delivery=delivery)).code is Code.HOLD
+    request = Request(State(1.2, 0.0, held + 0.1), 1.2, PAPER, LIMITS, delivery)
+    stretch, rate, field = end_of(shaper(request), request)
+    assert (stretch, rate, field) == pytest.approx((1.2, 0.0, held), abs=1e-10)
+
+
+def test_limits_that_leave_no_room_to_settle_the_field_are_named():
+    held = float(elastic_force(1.3, PAPER))
+    with pytest.raises(RefusedError, match='coil time constant.*wider limits') as refusal:
+        get_shaper('two_step')(Request(
+            State(1.0), 1.3, PAPER, Limits(-1.0, held), Delivery(lag=0.1)))
+    assert refusal.value.code is Code.FLUX_LIMIT
+
+
+@pytest.mark.parametrize('slew', [math.inf, 1.5])
+def test_predicted_motion_under_a_lag_is_that_of_the_independent_integration(slew):
+    delivery = Delivery(slew=slew, lag=0.2)
+    segments = plan_sequence(
+        [Setpoint(1.2, 0.7), Setpoint(0.9, math.inf)], PAPER, delivery=delivery,
+        short_spell='continue')
+    request = Request(segments[1].start, 0.9, PAPER, delivery=delivery)
+    assert segments[1].start.load != segments[1].start.amplifier
+    assert np.max(np.abs(np.subtract(
+        end_of(segments[1].move, request), (0.9, 0.0, elastic_force(0.9, PAPER))))) < 1e-9
+    late, _ = simulate([0.0], [1.0], [1.0], PAPER, lag=0.2, field=0.0)
+    assert late[0] == pytest.approx(solve_ivp(
+        rates, (0.0, 1.0), [1.0, 0.0, 0.0], method='DOP853', rtol=1e-12, atol=1e-13,
+        args=(1.0, 0.0, 0.2)).y[0, -1], abs=1e-10)
+
+
+@pytest.mark.parametrize('options', [
+    {}, {'period': MS}, {'slew_limit': 60.0}, {'shaper': 'robust'}, {'shaper': 'minimum_time'},
+    {'shaper': 'minimum_time', 'period': MS}], ids=str)
+def test_pre_emption_and_stop_through_a_slow_coil_leave_no_vibration_behind(options):
+    planner = Planner(paper_actuator(), Options(
+        flux_density_min=-0.5, flux_density_max=0.5, lead_time=MS, coil_time_constant=5e-4,
+        **options))
+    plant = ActuatorSimulation(
+        paper_actuator(), slew_limit=options.get('slew_limit', math.inf),
+        coil_time_constant=5e-4)
+    requests = {0: 1.4, 3: 0.9, 7: 1.2, 8: 1.25, 60: 1.3, 63: 'stop'}
+    samples = []
+    for time in range(160):
+        now = time * MS
+        request = requests.get(time)
+        if request == 'stop':
+            planner.stop(now)
+        elif request is not None:
+            planner.setpoint(request, now)
+        for level in planner.due(now):
+            assert plant.command(level.stamp, level.flux_density) == 0
+            assert level.stamp % options.get('period', 1) == 0
+            assert -0.5 <= level.flux_density <= 0.5
+        plant.advance(now)
+        predicted = planner.state(now)
+        assert predicted.stretch == pytest.approx(plant.stretch, abs=1e-9)
+        assert predicted.load * paper_actuator().flux_density_unit == pytest.approx(
+            plant.flux_density, abs=1e-9)
+        samples.append(plant.stretch)
+    assert planner.plan.segments[-1].arrival is not None
+    assert np.ptp(samples[58:60]) < 1e-6
+    assert np.ptp(samples[-40:]) < 1e-6
