@@ -9,6 +9,7 @@ below a limit, so that times compare at equal accuracy.
 
 from collections.abc import Callable
 from dataclasses import replace
+import math
 import os
 from pathlib import Path
 import statistics
@@ -24,7 +25,11 @@ from benchmarks import contenders
 from benchmarks.measure import Contender, loosest, race, Report, Row, stopwatch
 from benchmarks.reference import Actuator, two_step
 from hmsa_ros.core import kernels, two_step_kernel
+from hmsa_ros.core.delivery import Delivery
+from hmsa_ros.core.moves import State
 from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.core.shapers.request import Request
+from hmsa_ros.core.shapers.two_step import two_step as shaper
 from hmsa_ros.core.two_step import HOLD_TOLERANCE, plan_two_step, plan_two_step_batch
 
 MOVES = [(1.0, 1.1), (1.1, 1.2), (1.2, 1.4), (1.0, 0.9), (0.9, 0.8), (0.8, 0.7), (1.0, 0.85),
@@ -103,6 +108,22 @@ def _ours(reference: Reference) -> list[Contender]:
         for rtol in (1e-10, 1e-12)]
 
 
+def _shaped(reference: Reference, lag: float) -> Contender:
+    """Time the shaper, to which a lag of the coil is one more unknown."""
+    requests = [
+        Request(State(start), target, MATERIAL, delivery=Delivery(lag=lag))
+        for start, target in MOVES]
+
+    def loads() -> list[float]:
+        return [shaper(x).levels[0].load for x in requests]
+
+    # The reference knows no lag.
+    error = reference.error(loads()) if lag == 0.0 else math.nan
+    return Contender(
+        'shaper two_step', f'lag {lag:g}' if lag else 'no lag', stopwatch(loads, len(MOVES)),
+        error)
+
+
 def _batches(reference: Reference, copies: int) -> list[Contender]:
     """Time the batch function on one thread and on all."""
     start, target = np.tile(np.array(MOVES), (copies, 1)).T
@@ -178,6 +199,7 @@ def compare(*, quick: bool = False) -> Report:
     # Short batches find both cores free now and then, even on a busy machine.
     entries = _ours(reference) + _batches(reference, 20)
     ours = entries[0].error
+    entries += [_shaped(reference, lag) for lag in (0.0, 0.1)]
     missing = []
     with tempfile.TemporaryDirectory() as folder:
         if contenders.compiler():

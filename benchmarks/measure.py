@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+import math
 import os
 import platform
 import statistics
@@ -220,7 +221,7 @@ class Report:
                 ratio = f'{row.least / base:.3g}'
                 if row.least / base >= 1000.0:
                     ratio = f'{row.least / base:,.0f}'
-            error = '-' if row.error is None else f'{row.error:.1e}'
+            error = '-' if row.error is None or math.isnan(row.error) else f'{row.error:.1e}'
             body.append([
                 row.name, row.setting, text_of_time(row.least), text_of_time(row.median), ratio,
                 error, row.note])

@@ -108,13 +108,15 @@ def parameters(**nodes):
 
 def simulated(
         sequence=SEQUENCE, *, space='', actuator=ACTUATOR, plant=None, period=PERIOD,
-        shaper='two_step', slew=0.0, noise=0.0, extra=0.0):
+        shaper='two_step', slew=0.0, lag=0.0, noise=0.0, extra=0.0):
     """Return the messages of a run: (log time, topic, type, message)."""
     planner = Planner(actuator, Options(
-        shaper=shaper, lead_time=LEAD, slew_limit=slew or math.inf, flux_density_min=-0.5,
+        shaper=shaper, lead_time=LEAD, slew_limit=slew or math.inf, coil_time_constant=lag,
+        flux_density_min=-0.5,
         flux_density_max=0.5))
     simulation = ActuatorSimulation(
-        plant or actuator, time=START, slew_limit=slew or math.inf)
+        plant or actuator, time=START, slew_limit=slew or math.inf,
+        coil_time_constant=lag)
     ends = np.cumsum([
         round(span * actuator.time_unit * NANOSECONDS) for _, span in sequence]).tolist()
     points = [(x, end) for (x, _), end in zip(sequence, ends, strict=True)]
@@ -386,12 +388,14 @@ def test_a_block_that_did_not_move_has_no_residual(tmp_path):
     assert [x['residual [%]'][1] for x in report.table('setpoint-table')] == ['did not move'] * 3
 
 
-@pytest.mark.parametrize('slew', [0.0, 20.0])
-def test_the_plan_predicts_a_plant_that_is_as_planned(tmp_path, slew):
+@pytest.mark.parametrize(('slew', 'lag'), [(0.0, 0.0), (20.0, 0.0), (0.0, 5e-4), (60.0, 5e-4)])
+def test_the_plan_predicts_a_plant_that_is_as_planned(tmp_path, slew, lag):
     known = parameters(planner=ACTUATOR, plant=ACTUATOR)
     if slew:
         known |= {'planner.slew_limit': str(slew), 'plant.slew_limit': str(slew)}
-    part = one(tmp_path / 'bag', simulated(slew=slew), **known)
+    if lag:
+        known |= {'planner.coil_time_constant': str(lag), 'plant.coil_time_constant': str(lag)}
+    part = one(tmp_path / 'bag', simulated(slew=slew, lag=lag), **known)
     difference = part.run.stretch - part.evaluation.predicted[0]
     assert np.count_nonzero(np.isfinite(difference)) > 2000
     assert np.nanmax(np.abs(difference)) < SAME

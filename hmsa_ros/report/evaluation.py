@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from hmsa_ros.core.delivery import pieces
+from hmsa_ros.core.delivery import late, pieces
 from hmsa_ros.core.model import (
     Array,
     elastic_force,
@@ -407,7 +407,8 @@ def _predict(run: Run, plan: Sequence[Level]) -> tuple[Array, Array]:
     if not plan:
         return predicted[0], predicted[1]
     slew = run.number('planner.slew_limit') / actuator.flux_density_unit * actuator.time_unit
-    load = float(elastic_force(plan[0].stretch, material))
+    lag = run.number('planner.coil_time_constant') / actuator.time_unit
+    load = field = float(elastic_force(plan[0].stretch, material))
     for i, point in enumerate(plan):
         until = plan[i + 1].stamp if i + 1 < len(plan) else max(int(run.time[-1]), point.stamp)
         duration = (until - point.stamp) / NANOSECONDS / actuator.time_unit
@@ -416,6 +417,9 @@ def _predict(run: Run, plan: Sequence[Level]) -> tuple[Array, Array]:
         switches, loads, slopes, load = pieces(
             (PlannedLoad(0.0, point.flux_density / actuator.flux_density_unit),), load,
             duration, slew or math.inf)
+        begun = field
+        if lag:
+            field = late(list(zip(switches, loads, slopes, strict=True)), duration, field, lag)
         part = slice(
             int(np.searchsorted(run.time, point.stamp)), int(np.searchsorted(
                 run.time, until, side='right' if i + 1 == len(plan) else 'left')))
@@ -425,7 +429,8 @@ def _predict(run: Run, plan: Sequence[Level]) -> tuple[Array, Array]:
             predicted[:, part] = simulate(
                 switches, loads,
                 (run.time[part] - point.stamp) / NANOSECONDS / actuator.time_unit, material,
-                stretch=point.stretch, rate=point.rate * actuator.time_unit, slopes=slopes)
+                stretch=point.stretch, rate=point.rate * actuator.time_unit, slopes=slopes,
+                lag=lag, field=begun)
         except HmsaError:
             # A plan of other parameters than are known here: nothing to compare.
             continue

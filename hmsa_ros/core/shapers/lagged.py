@@ -105,7 +105,7 @@ def _pushed(request: Request, plain: Move) -> Attempt:
                     middle.load)
             return solve(
                 _template((before[0], middle, last), length * lag, delivery), request,
-                replace(delivery, lag=lag))
+                delivery if aim == 1.0 else replace(delivery, lag=lag))
         return closer
 
     for length in _PUSHES:
