@@ -82,7 +82,7 @@ def printable(text: str) -> str:
 
 def excerpt(value: object) -> str:
     """
-    Return a value from elsewhere as a message may tell of it.
+    Return a value from elsewhere, shortened for a message.
 
     Parameters
     ----------

@@ -3,7 +3,7 @@ Show a bag in the Rerun viewer: ``python -m hmsa_ros.rerun_view BAG``.
 
 Needs rerun-sdk (``pip install rerun-sdk``). Rerun's own reader of MCAP files takes stretch, rate
 and flux density from the bag; the markers, which it does not know, are turned into its boxes and
-arrows here. What is shown where stands in `blueprint`.
+arrows here. `blueprint` says what is shown where.
 """
 
 import argparse

@@ -17,7 +17,6 @@ A block says by its info string what becomes of it:
     It must be well formed; parameters in it must exist.
 """
 
-import ast
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -546,22 +545,15 @@ def _check_hmsa(words: list[str]) -> None:
 def _check_launch(name: str, rest: list[str]) -> None:
     file = ROOT / 'launch' / name
     _require(file.is_file(), f'no launch file {name!r}')
-    tree = ast.parse(file.read_text())
-    constants = {
-        node.targets[0].id: node.value for node in tree.body
-        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)}
-    known = {
-        node.args[0].value: node for node in ast.walk(tree)
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
-        and node.func.id == 'DeclareLaunchArgument' and isinstance(node.args[0], ast.Constant)}
+    from hmsa_ros.session import launching
+
+    known = {x.name: x for x in getattr(launching, name.partition('.')[0].upper()).arguments}
     for word in rest:
         if ':=' in word:
             argument, _, value = word.partition(':=')
             _require(argument in known, f'{name} has no argument {argument!r}')
-            for given in (x.value for x in known[argument].keywords if x.arg == 'choices'):
-                choices = constants[given.id] if isinstance(given, ast.Name) else given
-                _require(value in ast.literal_eval(choices),
-                         f'{name}: {argument} cannot be {value!r}')
+            _require(not known[argument].choices or value in known[argument].choices,
+                     f'{name}: {argument} cannot be {value!r}')
 
 
 def _check_message(kind: str, words: list[str]) -> None:

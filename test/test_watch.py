@@ -21,7 +21,7 @@ import pyte
 import pytest
 
 from hmsa_ros.watch.chart import limits, strip
-from hmsa_ros.watch.scene import History, Joint, Report, Request, Scene
+from hmsa_ros.watch.scene import History, Joint, Report, RequestState, Scene
 from hmsa_ros.watch.screen import as_json, line, Screen
 
 WAIT_SECONDS = 60.0
@@ -45,7 +45,7 @@ def scene(*joints):
     return Scene(
         'domain 42  /', 100.0, stamp=12.5, age=0.01, sample_rate=1000.0,
         joints=joints or (joint(),), progress=0.25,
-        request=Request(0, 'accepted', 'accepted', 'moving', 1, 3),
+        request=RequestState(0, 'accepted', 'accepted', 'moving', 1, 3),
         reports=[Report('planner', 1, '2 commands sent late', {'sent': 6, 'late': 2}),
                  Report('plant', 0, 'commands in time', {'late': 0}, age=9.0)])
 
@@ -137,7 +137,7 @@ def test_a_refusal_is_shown_to_its_end():
     reason = (
         'the stretch of point 3 is 2.4: expected between 0.643172 and 1.905871, where the flux '
         'density of -0.2 T to 0.2 T holds the actuator and its chains are not at their end')
-    seen = replace(scene(), request=Request(2, reason, 'out_of_range', 'idle', 0, 0))
+    seen = replace(scene(), request=RequestState(2, reason, 'out_of_range', 'idle', 0, 0))
     lines = [x.plain for x in Screen(10.0).lines(seen, 80, 24)]
     place = next(i for i, x in enumerate(lines) if x.startswith('verdict  ERROR '))
     assert reason in ' '.join(x[15:].strip() for x in lines[place:place + 4])

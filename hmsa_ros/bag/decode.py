@@ -22,7 +22,7 @@ class TopicInfo:
     Attributes
     ----------
     name, type : str
-        Topic and message type; the type is empty if the bag does not tell.
+        Topic and message type; the type is empty if the bag does not have it.
     encoding : str
         Of the messages, ``'cdr'``.
     definition_encoding, definition : str

@@ -148,7 +148,7 @@ def type_hash(type_name: str) -> str:
     Returns
     -------
     str
-        ``'RIHS01_'`` and 64 hexadecimal digits; empty if the environment does not tell.
+        ``'RIHS01_'`` and 64 hexadecimal digits; empty if the environment does not have it.
 
     """
     path = _find(type_name, '.json')

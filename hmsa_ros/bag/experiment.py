@@ -1,5 +1,5 @@
 """
-What a bag tells of the experiment: the parameters of its nodes.
+What a bag contains of the experiment: the parameters of its nodes.
 
 The recorder stores them as custom data under the node's full name, a dot and the parameter's
 name (``/left/plant.actuator.density``), the value as JSON. Bags of version 0.1 have the last

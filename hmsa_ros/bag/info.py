@@ -26,7 +26,7 @@ class TopicSummary:
     rate : float or None
         Messages a second over the length of the bag; None where that is not defined.
     lost : int or None
-        Messages known to be lost; None if the recorder did not tell.
+        Messages known to be lost; None if the recorder did not count.
     reliability, durability : str
         Of the publishers, several separated by a slash; empty if unknown.
 
@@ -91,7 +91,7 @@ class BagSummary:
 
     @property
     def lost(self) -> int | None:
-        """Return the number of lost messages, None if the recorder did not tell."""
+        """Return the number of lost messages, None if the recorder did not count."""
         counts = [topic.lost for topic in self.topics if topic.lost is not None]
         return sum(counts) if counts else None
 
@@ -157,7 +157,7 @@ def lost_messages(custom_data: Mapping[str, str]) -> dict[str, int] | None:
     Returns
     -------
     dict of str to int or None
-        By topic; None if the bag does not tell.
+        By topic; None if the bag does not say.
 
     """
     try:

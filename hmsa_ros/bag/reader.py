@@ -259,7 +259,7 @@ class BagReader:
     def _cursor(
             self, block: Block, topics: Collection[str] | None = None, start: int = 0,
             end: int = _NEVER) -> Cursor | None:
-        """Return the messages of a chunk or run in the order stored; tell of damage."""
+        """Return the messages of a chunk or run in the order stored; report damage."""
         file = self._files[block.file]
 
         def topic_of(channel: int) -> str | None:

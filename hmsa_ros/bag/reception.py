@@ -9,7 +9,7 @@ from hmsa_ros.bag.qos import Qos
 from hmsa_ros.bag.recording import Message, Status
 
 OK, WARN, ERROR = range(3)
-# Between two flushes messages wait: only more than that is told.
+# Between two flushes messages wait: only more than that is reported.
 _BEHIND_PERIODS = 4.0
 _BEHIND_SECONDS = 1.0
 

@@ -48,7 +48,7 @@ class Status(NamedTuple):
 
 
 @dataclass
-class _Request:
+class _Task:
     """Something the thread is asked to do, and its answer."""
 
     action: Callable[[], str]
@@ -65,7 +65,7 @@ class _Batch(NamedTuple):
     since: float
 
 
-_Item = Topic | Mapping[str, str] | _Request | _Batch
+_Item = Topic | Mapping[str, str] | _Task | _Batch
 
 
 class Recording:
@@ -177,7 +177,7 @@ class Recording:
         For when time has jumped back: a snapshot does not reach back beyond it either.
         """
         with self._condition:
-            self._items.append(_Request(self._sink.begin_anew))
+            self._items.append(_Task(self._sink.begin_anew))
             self._condition.notify()
 
     def snapshot(self) -> str:
@@ -233,7 +233,7 @@ class Recording:
 
     def _ask(self, action: Callable[[], str]) -> str:
         """Have the thread do something and return its answer."""
-        request = _Request(action)
+        request = _Task(action)
         with self._condition:
             if self._closing:
                 raise BagError('the recording has ended')
@@ -285,7 +285,7 @@ class Recording:
             if isinstance(item, _Batch):
                 self._items.popleft()
                 self._write(iter(item.messages), item)
-            elif isinstance(item, _Request):
+            elif isinstance(item, _Task):
                 self._items.popleft()
                 self._answer(item)
             elif isinstance(item, Topic):
@@ -316,7 +316,7 @@ class Recording:
             self._queued -= size
 
     @staticmethod
-    def _answer(request: _Request) -> None:
+    def _answer(request: _Task) -> None:
         """Do what was asked for."""
         try:
             request.answer = request.action()
@@ -358,7 +358,7 @@ class Recording:
             for item in self._items:
                 if isinstance(item, _Batch):
                     self._lose(item.messages)
-                elif isinstance(item, _Request):
+                elif isinstance(item, _Task):
                     item.error = BagError('the recording has ended')
                     item.done.set()
             self._items.clear()

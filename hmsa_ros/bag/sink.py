@@ -1,4 +1,4 @@
-"""What becomes of recorded messages: written, split into files, or kept for a snapshot."""
+"""Where recorded messages go: written, split into files, or kept for a snapshot."""
 
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -78,7 +78,7 @@ class _Pace:
 
 class Sink:
     """
-    What becomes of messages: written, split into files, or kept for a snapshot.
+    Writes messages, splits them into files, or keeps them for a snapshot.
 
     Parameters
     ----------

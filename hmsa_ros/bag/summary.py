@@ -49,7 +49,7 @@ def read_summary(intake: Intake, descriptor: int, file: ScannedFile) -> bool:
 def _take_summary(
         intake: Intake, descriptor: int, file: ScannedFile, summary: bytes,
         start: int) -> bool:
-    """Take in the records of a summary; False if they do not tell everything."""
+    """Take in the records of a summary; False if they are not complete."""
     chunks: list[ChunkIndex] = []
     notes: list[MetadataIndex] = []
     statistics: Statistics | None = None

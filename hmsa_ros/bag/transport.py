@@ -119,7 +119,7 @@ class Transport:
         return self._steps > 0
 
     def sent(self, when: int) -> None:
-        """Note that a message has left, and tell who asked for it."""
+        """Note that a message has left, and answer who requested it."""
         self.position = when
         if self._answers:
             with self.change:

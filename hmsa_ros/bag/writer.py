@@ -76,7 +76,7 @@ class BagWriter:
 
     Notes
     -----
-    The writer does not split by itself: `file_size` and `file_duration_ns` tell its user when.
+    The writer does not split by itself: `file_size` and `file_duration_ns` let its user decide.
     Until `close`, ``metadata.yaml`` says that the recording has not ended.
 
     """

@@ -19,8 +19,8 @@ from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, complain, HmsaError
 
 COMMANDS = (
-    'demo', 'init', 'plan', 'send', 'identify', 'excite', 'watch', 'node', 'bag', 'report',
-    'export', 'figures', 'robustness', 'sweep', 'completion')
+    'demo', 'init', 'excite', 'identify', 'plan', 'node', 'send', 'watch', 'bag', 'report',
+    'export', 'sweep', 'robustness', 'figures', 'completion')
 
 
 class _Help(argparse.HelpFormatter):
@@ -111,7 +111,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return ENDING.status
     except BrokenPipeError:
-        # The reader of our output (head, less) has gone: there is nobody left to tell.
+        # The reader of our output (head, less) has gone: there is nobody left to report to.
         sys.stderr.close()
         return 0
     except OSError as error:
@@ -125,7 +125,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def split_ros_args(words: list[str]) -> list[str]:
     """
-    Return what stands before ``--ros-args``: the rest is not argparse's to read.
+    Return what comes before ``--ros-args``: argparse does not read the rest.
 
     Parameters
     ----------

@@ -128,7 +128,7 @@ def _record(program: 'Program') -> dict[str, Any]:
 
 def table(found: 'Excitation') -> list[str]:
     """
-    Return what the sequences tell, a line each.
+    Return the information in the sequences, a line each.
 
     Parameters
     ----------

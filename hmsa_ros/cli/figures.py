@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     """
     folder: Path = arguments.out
-    # Before the slow imports: a bad folder is told at once.
+    # Before the slow imports: a bad folder is reported immediately.
     make_folder(folder)
 
     from hmsa_ros.figures.paper import FIGURES, write_figure

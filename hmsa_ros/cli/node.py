@@ -42,7 +42,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """
-    Run the node until it is told to end.
+    Run the node until it is asked to end.
 
     Parameters
     ----------

@@ -40,7 +40,7 @@ _ZHAO = 'Zhao et al., J. Mech. Phys. Solids 124 (2019) 244'
 @dataclass(frozen=True)
 class Quantity:
     """
-    A number that is asked for.
+    A number that the user gives.
 
     Attributes
     ----------
@@ -222,7 +222,7 @@ BY_KEY: Mapping[str, Quantity] = {x.key: x for x in QUANTITIES}
 DAMPING = Quantity.of(
     'damping', _BLOCK['damping_coefficient'], 'damping coefficient c', (0.0, math.inf), '',
     follows=True)
-#: What nobody can know but the user: asked for, or given, or left to --yes.
+#: What only the user can know: given, or entered, or left to --yes.
 NEEDED = ('half_length', 'half_thickness', 'shear_modulus', 'density', 'remanence', 'j_lim',
           'zeta', 'flux_max')
 
@@ -266,7 +266,7 @@ def joint_names(text: str) -> list[str]:
     Raises
     ------
     BadInputError
-        If one is no ROS name or stands there twice.
+        If one is not a ROS name or is named twice.
 
     """
     names = text.replace(',', ' ').split()

@@ -29,7 +29,7 @@ _BRAKE_SHARES = (0.5, 0.1, 0.02, 0.0)
 _PATIENCE = (0.0, 0.15, 0.3, 0.45, 0.6)
 # How far off its stretch a field at rest may be, as a share of the load.
 _SETTLED = 1e-6
-# Codes of plans that do not do what was asked for.
+# Codes of plans that do not do what was requested.
 _WARNINGS = (Code.TOO_DAMPED, Code.INDISTINGUISHABLE, Code.SPELL_TOO_SHORT)
 # Setpoints that are checked between two pauses, which takes some 0.1 ms.
 _CHECKED = 200

@@ -251,7 +251,7 @@ class PlannerGroup:
 
     def next_event(self, now: int) -> int | None:
         """
-        Return when there is something to do or to tell next.
+        Return when there is something to do or to report next.
 
         Parameters
         ----------

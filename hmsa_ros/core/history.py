@@ -64,7 +64,7 @@ class History:
         """
         Count levels that never took effect, although that cannot have been told.
 
-        What is told are changes. Commands that come so late that they apply all at once make
+        Only changes are reported. Commands that come so late that they apply all at once make
         none if the last of them is the level in force: those before it never were.
 
         Parameters

@@ -70,7 +70,7 @@ class Move:
     duration : float
         Time until rest at the target; infinite where it is only approached.
     reason : str
-        Why it is not the command that was asked for; empty if it is.
+        Why it is not the requested command; empty if it is.
 
     """
 

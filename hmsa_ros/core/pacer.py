@@ -3,7 +3,7 @@
 
 class Pacer:
     """
-    Tells how far a simulation should have got.
+    Computes how far a simulation should have got.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ from hmsa_ros.errors import BadInputError
 
 #: Stretches whose flux density is given, where the coil reaches them.
 STRETCHES = (0.6, 0.8, 0.9, 1.05, 1.1, 1.2, 1.4, 2.0)
-#: Stretch of the move whose duration is told, where the coil allows it.
+#: Stretch of the move whose duration is given, where the coil allows it.
 USUAL_TARGET = 1.1
 # Search for the reach: points of the first look on either side, and halvings after it.
 _LOOK = 400

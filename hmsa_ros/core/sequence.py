@@ -59,7 +59,7 @@ class Segment:
     Attributes
     ----------
     setpoint : Setpoint
-        What was asked for.
+        As requested.
     begin : float
         Time at which the move begins, from the start of the sequence.
     start, end : State
@@ -134,7 +134,7 @@ def segments(
         delivery: Delivery = IDEAL, order: int = 2, units: Units | None = None,
         short_spell: str = 'refuse') -> Generator[Segment, None, None]:
     """
-    Plan a sequence setpoint by setpoint, as they are asked for.
+    Plan a sequence setpoint by setpoint, each when it is requested.
 
     Arguments and errors are those of `plan_sequence`.
 

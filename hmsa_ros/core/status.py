@@ -8,7 +8,7 @@ from hmsa_ros.errors import BadInputError
 
 class Code(str, Enum):
     """
-    What became of a move or a request; the value is what messages and files carry.
+    The outcome of a move or a request; the value is what messages and files carry.
 
     The first eight are plans that can be carried out, the others refusals.
     """

@@ -294,7 +294,7 @@ class PlannedSegment:
     code : Code
         Which command it is.
     reason : str
-        Why it is not the one asked for; empty if it is.
+        Why it is not the requested one; empty if it is.
     since : int
         Time in ns from which the setpoint holds; the move may begin later.
 
@@ -367,7 +367,7 @@ class Draft:
     missed : int
         How many setpoints are left out, since their time is over.
     warning : PlannedSegment or None
-        The first that is not reached by the command that was asked for, and only roughly.
+        The first that is not reached by the requested command, and only roughly.
 
     """
 

@@ -62,7 +62,7 @@ def crosses(k, l, v, target, material, rtol):  # noqa: E741
     Return whether the response to the target's own load passes the target.
 
     Below critical damping it always does. Above, it is followed until it has, or until the
-    linearised motion tells: with eigenvalues a < b < 0 and deviation x it creeps in from its
+    linearised motion says: with eigenvalues a < b < 0 and deviation x it creeps in from its
     own side unless (v - a x) x < 0.
     """
     if material[ZETA] < critical_zeta(target, material):

@@ -15,7 +15,7 @@ _SAMPLES_A_PERIOD = 10.0
 @dataclass(frozen=True)
 class CommandHealth:
     """
-    What has become of the commands of all joints.
+    The fate of the commands of all joints: late, refused, silent.
 
     Attributes
     ----------

@@ -1,5 +1,5 @@
 """
-What to record: the sequence of levels that tells most about the parameters.
+What to record: the sequence of levels with the most information on the parameters.
 
 D-optimal design (V. V. Fedorov, "Theory of Optimal Experiments", Academic Press 1972): of all
 sequences of a duration inside the limits of coil, slew and stretch, one with a large
@@ -84,7 +84,7 @@ class Bounds:
 @dataclass(frozen=True, eq=False)
 class Program:
     """
-    A sequence of levels and what it tells.
+    A sequence of levels and the information in it.
 
     Attributes
     ----------
@@ -223,7 +223,7 @@ class Designer:
             self._bounds.slew_limit)
 
     def judge(self, level_times: Array, levels: Array) -> Program | None:
-        """Return what a sequence tells, None if its motion cannot be followed."""
+        """Return the information in a sequence, None if its motion cannot be followed."""
         coarse = respond(
             self._recording(self._dense, level_times, levels), self._values, (), rtol=1e-6)
         if coarse is None:

@@ -146,7 +146,7 @@ class Identification:
         return found
 
     def confounded(self) -> list[tuple[str, str, float]]:
-        """Return pairs of parameters that the data hardly tell apart, with their correlation."""
+        """Return pairs of parameters that the data hardly distinguish, with their correlation."""
         matrix = self.correlation
         return [
             (self.names[i], self.names[j], float(matrix[i, j]))

@@ -27,7 +27,7 @@ def read_bag(
     joint : str
         Name of the actuator; not needed where there is one.
     actuator : ActuatorParameters, optional
-        The block, where the bag does not tell.
+        The block, if the bag does not contain it.
 
     Returns
     -------
@@ -50,7 +50,9 @@ def read_bag(
             f'{path} has the actuators {", ".join(x.joint or x.label for x in runs)}: name one '
             'with --joint')
     run = runs[0]
-    levels = run.applied or in_force((x,) for x in without_repeats(run.commands)[0])
+    # A recorder gets the latched changes of before after the first new one.
+    levels = sorted(run.applied, key=lambda x: x.stamp) or in_force(
+        (x,) for x in without_repeats(run.commands)[0])
     if not levels:
         raise BadInputError(
             f'{path} has no command that took effect: expected the levels of the field')

@@ -374,7 +374,7 @@ class Capture:
 
 class SimulatedTime:
     """
-    Tells the simulated time at which a message was received.
+    Finds the simulated time at which a message was received.
 
     The time of a message is that of the last ``/clock`` message received before it, by the
     stamps of the middleware, however late either is taken. Of several publishers of ``/clock``

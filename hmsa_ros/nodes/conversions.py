@@ -76,7 +76,7 @@ def from_command(message: MagneticField) -> tuple[int, float]:
     Returns
     -------
     tuple of int and float
-        Stamp 0 means at once.
+        Stamp 0 means immediately.
 
     Raises
     ------
@@ -203,7 +203,7 @@ def to_status(
 
 
 def whole(text: str | None) -> int:
-    """Return the whole number that a status tells, 0 where it tells none."""
+    """Return the whole number in a status, 0 where it has none."""
     return int(text) if text and _WHOLE.fullmatch(text) else 0
 
 

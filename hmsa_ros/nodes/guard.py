@@ -1,8 +1,8 @@
 """
 Whose commands an actuator obeys: notices a second publisher, and refuses it if told to.
 
-Publishers are told apart by their identifiers (GIDs): those of the graph, and that of each
-message, which rclpy does not tell and `hmsa_ros.nodes.capture` does.
+Publishers are distinguished by their identifiers (GIDs): those of the graph, and that of each
+message, which rclpy does not provide and `hmsa_ros.nodes.capture` does.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""Markers on the wire: the plant's of what is, the planner's of where it is to go."""
+"""Publishes markers: the plant's of the present state, the planner's of the target."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

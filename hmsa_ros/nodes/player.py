@@ -374,7 +374,7 @@ class Player(ManagedNode):
 
     def _on_is_paused(
             self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Tell by ``success`` whether playing is paused."""
+        """Say by ``success`` whether playback is paused."""
         response.success = self._transport.paused
         response.message = 'paused' if response.success else 'playing'
         return response

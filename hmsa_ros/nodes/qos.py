@@ -76,7 +76,7 @@ def publisher(recorded: Sequence[Qos]) -> QoSProfile:
     Parameters
     ----------
     recorded : sequence of Qos
-        What the publishers offered; empty if the bag does not tell.
+        What the publishers offered; empty if the bag does not have it.
 
     Returns
     -------

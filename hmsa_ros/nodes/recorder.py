@@ -51,7 +51,7 @@ DIAGNOSTICS_SECONDS = 1.0
 _LINGER_SECONDS = 0.1
 # One look in so many asks for the publishers of every topic, changed in number or not.
 _FULL_LOOK = 10
-# Nodes whose parameters are asked for.
+# Nodes whose parameters are requested.
 _MAX_NODES = 256
 
 # Topics with setpoints, by the last part of their names.
@@ -258,7 +258,7 @@ class Recorder(ManagedNode):
     def _describe(
             self, name: str, type_name: str, offered: tuple[Qos, ...],
             hashes: Iterable[str]) -> Topic:
-        """Return what the bag is told of a topic."""
+        """Return what the bag stores of a topic."""
         try:
             encoding, definition = message_definition(type_name)
         except BagError as error:
@@ -281,7 +281,7 @@ class Recorder(ManagedNode):
         return len(self._topics) + len(missing)
 
     def _say_ready(self) -> None:
-        """Tell, once, that every topic asked for by name is subscribed to."""
+        """Log, once, that every topic requested by name is subscribed to."""
         if not self._said_ready and self._selection.topics \
                 and self._wanted_count() == len(self._topics):
             self._said_ready = True
@@ -379,7 +379,7 @@ class Recorder(ManagedNode):
 
     def _on_is_paused(
             self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Tell by ``success`` whether recording is paused."""
+        """Say by ``success`` whether recording is paused."""
         response.success = self._paused
         response.message = 'paused' if self._paused else 'recording'
         return response

@@ -1,4 +1,4 @@
-"""Parameters of other nodes, asked for step by step, without waiting."""
+"""Parameters of other nodes, requested step by step, without waiting."""
 
 from collections.abc import Callable, Iterable
 import json
@@ -17,7 +17,7 @@ _PATIENCE_SECONDS = 2.0
 
 class RemoteParameters:
     """
-    The parameters of a node, asked for once it is there and again when it comes back.
+    The parameters of a node, requested once it is there and again when it comes back.
 
     Parameters
     ----------

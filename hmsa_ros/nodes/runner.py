@@ -38,7 +38,7 @@ def spin(node: Node, ending: Callable[[], bool]) -> None:
     node : rclpy.node.Node
         Node to serve.
     ending : callable
-        Tells whether to end.
+        Whether to end.
 
     """
     executor = EventsExecutor(context=node.context)

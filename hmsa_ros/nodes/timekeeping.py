@@ -7,7 +7,7 @@ _STEP_NS = 5_000_000
 
 
 class StepWatch:
-    """Tells when a clock has been set back."""
+    """Detects that a clock has been set back."""
 
     def __init__(self) -> None:
         """Begin with the first readings."""
@@ -42,7 +42,7 @@ class StepWatch:
 
 class Seldom:
     """
-    Says once in a while that it is time to tell something again.
+    Says once in a while that it is time to report something again.
 
     A logger's own throttle looks for the place in the code that it is called from before it
     decides, which takes up to a millisecond: too long for what may come a thousand times a

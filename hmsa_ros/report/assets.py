@@ -81,7 +81,7 @@ SCRIPT = """
   const FONT = getComputedStyle(document.body).fontFamily;
   const narrow = () => window.innerWidth < 600;
 
-  // Colours stand in the figures as they are in light mode.
+  // Colours in the figures are those of light mode.
   const coloured = figure => JSON.parse(JSON.stringify(figure).replace(
     /#[0-9A-F]{6}/g, colour => dark.matches ? given.dark[colour] || colour : colour));
 

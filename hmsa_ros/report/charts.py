@@ -232,7 +232,7 @@ def _grouped(data: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 # Of several runs what was recorded is compared; what is simulated is shown on a click.
 _SIMULATED = ('plain steps', 'plan')
-# What each kind of curve looks like, everywhere: colour, and what tells it apart without.
+# What each kind of curve looks like, everywhere: colour, and what distinguishes it without.
 _KINDS: dict[str, dict[str, Any]] = {
     'recorded': {'color': BLUE, 'width': 2.2},
     'plain steps': {'color': VERMILION, 'width': 1.2, 'dash': '5px,2px'},

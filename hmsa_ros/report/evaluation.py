@@ -1,5 +1,5 @@
 """
-What a run amounts to: its setpoints, what was left of the vibration, and what was predicted.
+The evaluation of a run: its setpoints, residual vibration, and prediction.
 
 Times are in s from the first command of the run; stamps stay integer nanoseconds.
 """
@@ -85,7 +85,7 @@ class Move:
 @dataclass(frozen=True)
 class MoveResult:
     """
-    What became of one setpoint.
+    The result of one setpoint.
 
     Attributes
     ----------
@@ -201,7 +201,7 @@ def evaluate(run: Run, moves: Sequence[Move] | None = None) -> Evaluation:
 def find_moves(
         run: Run, levels: Sequence[Level], plan: Sequence[Level]) -> list[Move]:
     """
-    Tell the setpoints of a run by its commands.
+    Find the setpoints of a run from its commands.
 
     A setpoint is reached with the level that holds it. Which levels do is told, in this order,
     by the stretches that were asked for (the level whose equilibrium is one of them; or the
@@ -278,7 +278,7 @@ def _group(
             arrival += round(0.5 * period[hold] * NANOSECONDS)
         elif slew:
             change = abs(levels[hold].flux_density - levels[hold - 1].flux_density)
-            # A bag may tell of any slew limit.
+            # A bag may contain any slew limit.
             arrival += round(min(change / slew, 1e6) * NANOSECONDS)
         if arrival < min(end, last):
             moves.append(Move(target, stamp, arrival, end, tuple(
@@ -287,7 +287,7 @@ def _group(
 
 
 def _held_until(run: Run, begin: int, target: float, left: int, last: int) -> int:
-    """Return until when the last setpoint was asked for, at most the end of the record."""
+    """Return until when the last setpoint was requested, at most the end of the record."""
     for request in reversed(run.requests):
         stretch, duration = request.points[-1] if request.points else (math.nan, None)
         if request.sent <= begin and abs(stretch - target) < _SAME:
@@ -303,7 +303,7 @@ def _held_until(run: Run, begin: int, target: float, left: int, last: int) -> in
 
 
 def _asked(run: Run) -> list[float]:
-    """Return the stretches that were asked for, sorted."""
+    """Return the requested stretches, sorted."""
     asked = {x for request in run.requests for x, _ in request.points if math.isfinite(x)}
     for verdict in run.verdicts:
         # Rounded for the message: a request says it better.
@@ -518,7 +518,7 @@ class Timing:
         Empty if the recorder kept another clock than the stamps.
     lateness : ndarray, shape (k,)
         How long after its stamp each change of level took effect, in s, by what the plant or the
-        driver told; NaN for one that it did not tell of. Empty if it tells of none.
+        driver reported; NaN for one that it did not report. Empty if it reported none.
     delay : ndarray, shape (n,)
         How long after its stamp each sample was recorded, in s; empty likewise.
     interval : ndarray, shape (n - 1,)
@@ -528,7 +528,7 @@ class Timing:
     missing : int
         Samples that gaps in the stamps have room for.
     unapplied : int
-        Changes of level that were due and did not take effect by what was told.
+        Changes of level that were due and did not take effect as reported.
 
     """
 

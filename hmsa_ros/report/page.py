@@ -351,7 +351,7 @@ def _percent(share: float) -> Cell:
 
 
 def _setpoints(parts: Sequence[Part]) -> str:
-    """Return the table of what became of the setpoints."""
+    """Return the table of the setpoints and their results."""
     rows: list[Row] = []
     for part in parts:
         for i, (move, x) in enumerate(zip(

@@ -18,7 +18,7 @@ from hmsa_ros.core.schedule import obeyed
 from hmsa_ros.errors import BadInputError, BagError
 from hmsa_ros.runs.levels import Level
 from hmsa_ros.runs.parameters import actuators, named_joint, recorded
-from hmsa_ros.runs.record import Request, Run, Verdict
+from hmsa_ros.runs.record import RecordedRequest, Run, Verdict
 from hmsa_ros.runs.samples import nanoseconds_of, SampleReader
 from hmsa_ros.runs.topics import (
     APPLIED,
@@ -183,7 +183,7 @@ class _Collected:
     # Of all joints, as they were received.
     plans: list[_Trajectory] = field(default_factory=list)
     trajectories: list[_Trajectory] = field(default_factory=list)
-    setpoints: dict[str, list[Request]] = field(default_factory=dict)
+    setpoints: dict[str, list[RecordedRequest]] = field(default_factory=dict)
     statuses: list[_Status] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     left_out: int = 0
@@ -229,7 +229,7 @@ class _Collected:
             self.trajectories.append(_Trajectory.of(sent, content))
         elif role == SETPOINT:
             self.setpoints.setdefault(joint, []).append(
-                Request(sent, 0, ((float(content.data), None),)))
+                RecordedRequest(sent, 0, ((float(content.data), None),)))
         else:
             self.statuses.append(_Status.of(sent, content))
 
@@ -249,13 +249,13 @@ class _Collected:
                 x for i, x in enumerate(levels) if i == 0 or len(plan.joints) == 1
                 or x.flux_density != levels[i - 1].flux_density)
 
-    def _requests(self, joint: str, key: str) -> list[Request]:
+    def _requests(self, joint: str, key: str) -> list[RecordedRequest]:
         """Return what was asked of a joint, by time."""
         requests = list(self.setpoints.get(key, ()))
         for asked in self.trajectories:
             place = _place(asked.joints, joint)
             if place is not None:
-                requests.append(Request(asked.sent, asked.stamp, tuple(
+                requests.append(RecordedRequest(asked.sent, asked.stamp, tuple(
                     (x.positions[place], x.time) for x in asked.points
                     if len(x.positions) == max(len(asked.joints), 1))))
         return sorted(requests, key=lambda x: x.sent)

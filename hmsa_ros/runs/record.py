@@ -19,9 +19,9 @@ Times = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Request:
+class RecordedRequest:
     """
-    What the planner was asked for.
+    A request to the planner.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class Run:
         Disturbing forces in the order they were recorded: recorded at, stamp (ns), newton.
     plans : tuple of tuple of Level
         Plans in the order they were recorded.
-    requests : tuple of Request
+    requests : tuple of RecordedRequest
         In the order they were recorded.
     verdicts : tuple of Verdict
         In the order they were recorded, each once.
@@ -131,7 +131,7 @@ class Run:
     applied: tuple[Level, ...] = ()
     forces: tuple[tuple[int, int, float], ...] = ()
     plans: tuple[tuple[Level, ...], ...] = ()
-    requests: tuple[Request, ...] = ()
+    requests: tuple[RecordedRequest, ...] = ()
     verdicts: tuple[Verdict, ...] = ()
     parameters: Mapping[str, object] = field(default_factory=dict)
     plant: ActuatorParameters = field(default_factory=paper_actuator)

@@ -52,7 +52,7 @@ def topics_by_joint(reader: BagReader) -> dict[str, dict[str, dict[str, str]]]:
             if f'/{topic.name}'.endswith(f'/{role}'):
                 names[role].append((topic.name[:-len(role)].rstrip('/'), topic.name))
             elif role == SETPOINT and re.search(rf'/{node}/[^/]+/{last}$', f'/{topic.name}'):
-                # .../planner/JOINT/setpoint stands beside .../JOINT/flux_density_command.
+                # .../planner/JOINT/setpoint goes with .../JOINT/flux_density_command.
                 space, _, joint = topic.name[:-len(last) - 1].rpartition('/')
                 names[role].append((f'{space[:-len(node)]}{joint}', topic.name))
     if not names[JOINT_STATES]:

@@ -1,4 +1,4 @@
-"""What becomes of commands: late, lost and foreign ones, and the new plans they call for."""
+"""Late, lost and foreign commands, and the new plans that they call for."""
 
 from collections.abc import Mapping
 from time import monotonic_ns
@@ -14,7 +14,7 @@ from hmsa_ros.runtime.slices import Clock, in_time, Work
 
 
 class Seldom:
-    """Says at most once a second that it is time to tell something again."""
+    """Says at most once a second that it is time to report something again."""
 
     def __init__(self) -> None:
         """Begin with a first time at once."""
@@ -47,7 +47,7 @@ class Following:
     astray : set of str
         Joints whose plan reality has left.
     given_up : list of str
-        Joints whose plan stays as it is, though left, for `give_up` to tell of.
+        Joints whose plan stays as it is, though left, for `give_up` to report.
     replanned : int
         Plans made anew.
 
@@ -72,7 +72,7 @@ class Following:
         self.astray.clear()
         self._suspected.clear()
 
-    # -- commands and what becomes of them -----------------------------------------------------
+    # -- commands and their effects -------------------------------------------------------------
 
     def sent(self, joint: str, stamp: int, now: int) -> list[Note]:
         """Take in that a command was handed out."""
@@ -114,7 +114,7 @@ class Following:
         before, self._suspected = self._suspected, {}
         for name, planner in self._group.planners.items():
             if name not in self.newest:
-                # Nobody tells.
+                # Nobody reports what took effect.
                 continue
             stamp = planner.unheard(now - planner.options.lead_time)
             if stamp is None:

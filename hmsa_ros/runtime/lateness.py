@@ -25,7 +25,7 @@ class Cause(Enum):
 
 class Lateness:
     """
-    Counts late commands and tells what they have in common.
+    Counts late commands and finds what they have in common.
 
     A command that arrives late is the later the later it was sent. One that a driver applies
     late is as late as any other, however far ahead of its stamp it was sent.
@@ -80,7 +80,7 @@ class Lateness:
 
     @property
     def cause(self) -> Cause:
-        """What delays the commands, as far as the last ones tell."""
+        """What delays the commands, judged by the last ones."""
         if self._recent and self._recent[-1][1] < 0:
             return Cause.PLANNER
         if len(self._recent) < _ENOUGH:

@@ -47,7 +47,7 @@ _WAITING = Verdict(
 
 class PlannerRuntime:
     """
-    Plans requests in slices, sends commands in time and follows what becomes of them.
+    Plans requests in slices, sends commands in time and follows their effects.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ class PlannerRuntime:
             self, group: PlannerGroup, settings: Settings, *, clock: Clock,
             steady: Clock = monotonic_ns,
             observable: Callable[[], bool] = lambda: True) -> None:
-        """Begin at rest, inactive, and tell so."""
+        """Begin at rest, inactive, and report it."""
         self.group = group
         self.settings = settings
         self.active = False
@@ -352,7 +352,7 @@ class PlannerRuntime:
         """Begin to carry out a request."""
         self.following.astray -= drafts.keys()
         changed = self.group.take(drafts, now)
-        # At once: to tell of it takes time.
+        # First, since reporting takes time.
         self._send_until(self._clock())
         warnings = [x.warning for x in drafts.values() if x.warning is not None]
         if changed:

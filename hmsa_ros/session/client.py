@@ -132,7 +132,7 @@ class PlannerClient:
         Parameters
         ----------
         condition : callable
-            Tells whether to go on.
+            Whether to continue.
         failure : str
             What to say if it does not come true.
         each : callable, optional

@@ -45,7 +45,7 @@ _TOPICS = (
 @dataclass(frozen=True)
 class SetpointResult(MoveResult):
     """
-    What became of one setpoint, from the bag.
+    The result of one setpoint, from the bag.
 
     Attributes
     ----------
@@ -153,7 +153,7 @@ def run_demo(
     HmsaError
         If a process fails or the bag does not hold the run.
     KeyboardInterrupt
-        If the end was asked for; the processes are ended whatever happens.
+        If the end was requested; the processes are ended whatever happens.
 
     """
     bag = folder / 'run'
@@ -194,7 +194,7 @@ def run_demo(
 
 
 def _start(session: Session, bag: Path) -> None:
-    """Start the three nodes; time stands still until all are ready."""
+    """Start the three nodes; time is paused until all are ready."""
     for node in (
             NodeProcess('plant', {
                 'publish_clock': True, 'start_paused': True,

@@ -21,7 +21,7 @@ from hmsa_ros.core.status import Code
 from hmsa_ros.core.two_step import plan_two_step
 from hmsa_ros.errors import BadInputError
 
-# Peak-to-peak of a decaying motion stands after one period, or once it has died out.
+# Peak-to-peak of a decaying motion is final after one period, or once it has died out.
 _PERIODS = 2.0
 _DECADES = 12.0
 # 150 samples a period miss 2e-4 of an extremum.

@@ -188,7 +188,7 @@ def _case(cells: Sequence[str], names: Sequence[str], where: str) -> list[float]
 
 
 @dataclass(frozen=True)
-class Block:
+class Rows:
     """
     Rows of a sweep, planned.
 
@@ -259,7 +259,7 @@ class Sweep:
         if self.size > MOST_POINTS:
             raise too_many(self.size)
 
-    def blocks(self, rows: int = BLOCK) -> Iterator[Block]:
+    def blocks(self, rows: int = BLOCK) -> Iterator[Rows]:
         """
         Plan the sweep, block by block.
 
@@ -270,7 +270,7 @@ class Sweep:
 
         Yields
         ------
-        Block
+        Rows
             In order.
 
         """
@@ -285,7 +285,7 @@ class Sweep:
             plans = plan_two_step_batch(
                 inputs['start'], inputs['target'], zeta=inputs['zeta'], j_lim=inputs['j_lim'],
                 c1=inputs['c1'])
-            yield Block(inputs, _STATUS[plans.status], {
+            yield Rows(inputs, _STATUS[plans.status], {
                 'beta_p': plans.beta_p, 'b_p': signed_root(plans.beta_p),
                 'tau_p': plans.tau_p, 'beta_1': plans.beta_1,
                 'b_1': signed_root(plans.beta_1)})
@@ -307,13 +307,13 @@ class CsvWriter:
         self._writer = csv.writer(file, lineterminator='\n')
         self._writer.writerow(COLUMNS)
 
-    def write(self, block: Block) -> None:
+    def write(self, block: Rows) -> None:
         """
         Write a block.
 
         Parameters
         ----------
-        block : Block
+        block : Rows
             Rows.
 
         """
@@ -356,13 +356,13 @@ class ParquetWriter:
         """Write the footer."""
         self._writer.close()
 
-    def write(self, block: Block) -> None:
+    def write(self, block: Rows) -> None:
         """
         Write a block.
 
         Parameters
         ----------
-        block : Block
+        block : Rows
             Rows.
 
         """
@@ -383,7 +383,7 @@ def _arrow() -> tuple[Any, Any]:
 
 
 @contextmanager
-def open_writer(path: Path | None) -> Iterator[Callable[[Block], None]]:
+def open_writer(path: Path | None) -> Iterator[Callable[[Rows], None]]:
     """
     Open what the blocks of a sweep are written to.
 
@@ -396,7 +396,7 @@ def open_writer(path: Path | None) -> Iterator[Callable[[Block], None]]:
     Yields
     ------
     callable
-        Writes a `Block`.
+        Writes a `Rows`.
 
     Raises
     ------

@@ -23,7 +23,7 @@ from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.capture import decode, RawSubscription, Taken
 from hmsa_ros.nodes.conversions import from_time, whole
 from hmsa_ros.nodes.visitor import leave, visit
-from hmsa_ros.watch.scene import History, Joint, Report, Request, Scene
+from hmsa_ros.watch.scene import History, Joint, Report, RequestState, Scene
 
 # Of the samples since the last look no more than these are kept: all of them at 1 kHz.
 _SAMPLES = 200
@@ -101,7 +101,7 @@ class Listener:
         self._commands: dict[str, tuple[_Source, CommandSchedule]] = {}
         self._joints: dict[str, Joint] = {}
         self._heard: dict[tuple[str, str, str], tuple[float, Report]] = {}
-        self._request: Request | None = None
+        self._request: RequestState | None = None
         self._targets: dict[str, float] = {}
         self._planned_joints: tuple[str, ...] = ()
         self._plan_span: tuple[int, int] | None = None
@@ -192,7 +192,7 @@ class Listener:
             self._targets = {
                 key.rpartition('.')[0] or printable(message.hardware_id): _number(value)
                 for key, value in values.items() if key.rpartition('.')[2] == 'stretch'}
-            self._request = Request(
+            self._request = RequestState(
                 message.level[0], printable(message.message), values.get('code', ''),
                 values.get('state', ''), whole(values.get('setpoint')),
                 whole(values.get('setpoints')))
@@ -243,7 +243,7 @@ class Listener:
         for name, (source, schedule) in self._commands.items():
             for message in source.new():
                 schedule.insert(from_time(message.header.stamp), message.magnetic_field.z)
-            # Where no sample tells the time, the newest counts.
+            # Where no sample has the time, the newest counts.
             value = schedule.apply_until(math.inf if self._stamp is None else self._stamp)
             joint = self._joints.get(name or self._only_joint())
             if joint is not None:

@@ -121,7 +121,7 @@ class Joint:
 
 
 @dataclass
-class Request:
+class RequestState:
     """
     What the planner says of its last request.
 
@@ -190,7 +190,7 @@ class Scene:
         Samples that arrived a second; NaN without one.
     joints : list of Joint
         In the order of the samples.
-    request : Request or None
+    request : RequestState or None
         What the planner says; None before it does.
     progress : float
         Share of the plan that is done; NaN without a plan.
@@ -207,7 +207,7 @@ class Scene:
     age: float = math.nan
     sample_rate: float = math.nan
     joints: Sequence[Joint] = field(default_factory=list)
-    request: Request | None = None
+    request: RequestState | None = None
     progress: float = math.nan
     reports: Sequence[Report] = field(default_factory=list)
     waiting: Sequence[str] = field(default_factory=list)

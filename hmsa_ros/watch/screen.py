@@ -12,7 +12,7 @@ from hmsa_ros.core.model import Array
 from hmsa_ros.watch.chart import dots, limits, strip
 from hmsa_ros.watch.scene import Joint, LEVELS, Report, Scene
 
-#: Counters that tell of trouble: shown before the others, and in a line.
+#: Counters of trouble: shown before the others, and in a line.
 TROUBLES = ('late', 'replanned', 'lost', 'refused', 'failed', 'timeouts')
 # Levels by word and colour, never by colour alone.
 _STYLES = ('green', 'yellow', 'bold red', 'yellow')

@@ -1,4 +1,4 @@
-"""What a shaper is asked for, and the checks that all shapers share."""
+"""What a shaper gets, and the checks that all shapers share."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -122,7 +122,7 @@ class Request:
 
     def plain(self, code: Code, reason: str) -> Move:
         """
-        Return the plain step in place of what was asked for.
+        Return the plain step in place of the requested command.
 
         Parameters
         ----------
