@@ -1,7 +1,7 @@
 """
 Measure speed and accuracy.
 
-    python -m benchmarks [NAME ...] [--quick] [--json FILE] [--page FILE]
+    python -m benchmarks [NAME ...] [--quick] [--runs N] [--json FILE] [--page FILE]
     python -m benchmarks faults [--only KEY ...] [--quick] [--json FILE] [--page FILE]
     python -m benchmarks soak [--hours H] [--minutes M] [--factor F] [--picture FILE] [--quick]
 
@@ -62,6 +62,8 @@ def main(arguments: list[str] | None = None) -> int:
                         help='renew the tables of a page of the documentation')
     parser.add_argument('--only', action='append', default=[], metavar='KEY',
                         help='faults: beginning of the key of a fault to inject')
+    parser.add_argument('--runs', type=int, default=None,
+                        help='identification: simulated runs of each kind (default 200)')
     parser.add_argument('--hours', type=float, default=8.0,
                         help='soak: simulated time (default 8)')
     parser.add_argument('--minutes', type=float, default=float('inf'),
@@ -117,7 +119,9 @@ def main(arguments: list[str] | None = None) -> int:
         from benchmarks import bench_identification
 
         add(bench_identification.speed(quick=options.quick))
-        add(bench_identification.compare(quick=options.quick))
+        add(bench_identification.robustness(quick=options.quick))
+        add(bench_identification.compare(
+            quick=options.quick, runs=options.runs or bench_identification.RUNS))
         if not reports[-1].passed:
             console.print('identification: not what is promised')
             status = 1

@@ -301,6 +301,21 @@ def test_profile_reaches_the_limit_at_the_ends_of_the_interval():
         profile(found, 'density')
 
 
+def test_block_without_limit_of_its_chains_is_identified():
+    block = replace(BLOCK, chain_limit=np.inf)
+    level_times, levels = steps(SEQUENCE, SPAN, 3)
+    times = TIMES[:500]
+    stretch = simulate(times, level_times, levels, replace(block, chain_limit=1e12))
+    stretch += 1e-3 * np.random.default_rng(2).standard_normal(len(times))
+    free = tuple(x for x in DEFAULT_FREE if x != 'chain_limit')
+    found = identify(
+        Recording(times, stretch, level_times, levels), free=free, actuator=replace(
+            block, shear_modulus=1.3 * block.shear_modulus, remanence=0.08))
+    assert found.verdict == 'identified', found.reason
+    assert found.parameters['chain_limit'].value == np.inf
+    assert max(map(abs, relative(found).values())) < 4.0
+
+
 def test_sixty_uneven_points_of_a_figure_are_enough():
     random = np.random.default_rng(11)
     times = np.sort(random.uniform(0.0, 0.15, 60))

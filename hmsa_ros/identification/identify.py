@@ -91,6 +91,9 @@ def identify(
         recording = as_recording(time, stretch, level_times, levels, slew_limit)
     free = check_free(free)
     values = complete(values_of(actuator or paper_actuator(), known), ())
+    if 'chain_limit' in free:
+        # Endless chains are no start: the derivative by their inverse is taken of the limit.
+        values['chain_limit'] = min(values['chain_limit'], 1e9)
     at_rest = _begins_at_rest(recording) and not {'initial_stretch', 'initial_rate'} & set(free)
     if not at_rest:
         values['initial_stretch'] = float(np.median(recording.stretch[:3]))

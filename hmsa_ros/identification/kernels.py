@@ -4,25 +4,40 @@ Compiled kernel: the response to recorded levels with its derivatives by the par
 The equation of motion in the energy form, divided by the density and L^2, in seconds::
 
     m(l) l'' + m'(l) l'^2 / 2 + d l' + a psi'(l) + sum_i gamma_i a (psi'(l) - w_i) = k B + f
-    w_i' = (psi'(l) - w_i) / tau_i        tau_c B' = u - B        m(l) = (l^-3 + c1) / 6
+    w_i' = (psi'(l) - w_i) / tau_i        tau_c B' = u - B
 
-``u`` is the piecewise linear level of the amplifier, ``B`` the field behind the lag of the
-coil, known in closed form. The variational equations by all wanted parameters are integrated
-beside the state with DOP853. Places in ``theta`` are named below; after `FIRST_BRANCH` come
-gamma and tau of each Maxwell branch in turn. Nothing here checks its arguments.
+Inertia and elastic force are those of `hmsa_ros.core.law`, whatever the law, in units of the
+time in which the stiffness with all branches is 1. ``u`` is the piecewise linear level of the
+amplifier, ``B`` the field behind the lag of the coil, known in closed form. The variational
+equations by all wanted parameters are integrated beside the state with DOP853. Places in
+``theta`` are named below; after `FIRST_BRANCH` come gamma and tau of each Maxwell branch in
+turn. Nothing here checks its arguments.
 """
 
 import math
 
 import numpy as np
 
+from hmsa_ros.core import law
 from hmsa_ros.core.compiling import compiled
 from hmsa_ros.core.dop853 import ERROR_3, ERROR_5, MATRIX, NODES, STAGES, WEIGHTS
+from hmsa_ros.core.law import (
+    acceleration_slopes,
+    BY_CONSTANT,
+    BY_LOAD,
+    BY_MODULUS,
+    CONSTANTS,
+    elastic_force,
+    elastic_stiffness,
+    mass,
+    motion,
+)
 
 # Places in theta.
-STIFFNESS, DAMPING, DRIVE, FORCE, LAG, CHAIN, STRETCH, RATE, FIRST_BRANCH = range(9)
-#: Beyond all places: the time at which piece m begins is wanted as this plus m.
-SWITCH = 1000
+STIFFNESS, DAMPING, DRIVE, FORCE, LAG, STRETCH, RATE, FIRST_BRANCH = range(8)
+#: Beyond all places: constant i of the law is wanted as the first plus i, the time at which
+#: piece m begins as the second plus m.
+CONSTANT, SWITCH = 500, 1000
 
 # Phase of the fastest motion over which a quintic interpolates to about 1e-8.
 _SMOOTH = 0.45
@@ -31,73 +46,81 @@ _MAX_STEPS, _STEPS_PER_SAMPLE = 20_000, 20
 
 
 @compiled()
-def elastic(l, i_j):  # noqa: E741
-    """Return psi', psi'' and the derivative of psi' by 1/J_lim of the Gent law."""
-    q = (l - 1.0) * (l - 1.0) * (l + 2.0) / l
-    g = 1.0 - q * i_j
-    if not (l > 0.0 and g > 0.0):
-        return math.nan, math.nan, math.nan
-    e = l - 1.0 / (l * l)
-    i_g = 1.0 / g
-    return e * i_g, (1.0 + 2.0 / (l * l * l) + 2.0 * e * e * i_j * i_g) * i_g, e * q * i_g * i_g
+def constant_slope(l, i, material, slopes):  # noqa: E741
+    """Return the derivative of psi' by constant i of the law; ``slopes`` is for work."""
+    acceleration_slopes(l, 0.0, 0.0, material, slopes)
+    return -slopes[BY_CONSTANT + i] / slopes[BY_LOAD]
 
 
 @compiled()
-def _slope(y, n, count, field, field_lag, theta, c1, wanted, partial, out):
+def _unit_of(theta, branches):
+    """Return share, total and root of the stiffness with all branches, and their inverses."""
+    share = 1.0
+    for b in range(branches):
+        share += theta[FIRST_BRANCH + 2 * b]
+    total = theta[STIFFNESS] * share
+    speed = math.sqrt(total)
+    return share, total, speed, 1.0 / total, 1.0 / speed
+
+
+@compiled()
+def _slope(y, n, count, field, field_lag, theta, unit, material, wanted, partial, slopes, out):
     """
     Right-hand side of the equations and of their derivatives.
 
     ``y`` holds ``n`` rows (stretch, rate, branches) of ``1 + count`` columns (value and its
-    derivatives by the wanted parameters); ``out`` takes the slopes alike.
+    derivatives by the wanted parameters); ``out`` takes the slopes alike. ``unit`` is what
+    `_unit_of` returns; ``partial`` and ``slopes`` are for work.
     """
     w = 1 + count
     l = y[0]  # noqa: E741
     v = y[w]
-    p1, p2, p_c = elastic(l, theta[CHAIN])
-    a, d, k = theta[STIFFNESS], theta[DAMPING], theta[DRIVE]
-    i_l = 1.0 / l
-    i_l4 = i_l * i_l * i_l * i_l
-    i_m = 6.0 / (i_l4 * l + c1)
-    share = 1.0
-    force = k * field + theta[FORCE] - d * v + 0.25 * v * v * i_l4
+    a, k = theta[STIFFNESS], theta[DRIVE]
+    share, total, speed, per_total, per_speed = unit
     held = 0.0
     for b in range(n - 2):
-        gamma = theta[FIRST_BRANCH + 2 * b]
-        share += gamma
-        held += gamma * y[(2 + b) * w]
-    force += a * (held - share * p1)
-    acc = force * i_m
-    acc_l = (-a * share * p2 - v * v * i_l4 * i_l + 0.5 * acc * i_l4) * i_m
-    acc_v = (0.5 * v * i_l4 - d) * i_m
+        held += theta[FIRST_BRANCH + 2 * b] * y[(2 + b) * w]
+    load = (k * field + theta[FORCE] + a * held) * per_total
+    acc, acc_l, acc_v, i_m = motion(l, v * per_speed, load, material)
+    acc *= total
+    acc_l *= total
+    acc_v *= speed
     for c in range(w):
         out[c] = y[w + c]
         out[w + c] = acc_l * y[c] + acc_v * y[w + c]
     out[w] = acc
-    for b in range(n - 2):
-        row = (2 + b) * w
-        acc_w = a * theta[FIRST_BRANCH + 2 * b] * i_m
-        rate = 1.0 / theta[FIRST_BRANCH + 2 * b + 1]
-        for c in range(1, w):
-            out[w + c] += acc_w * y[row + c]
-            out[row + c] = rate * (p2 * y[c] - y[row + c])
-        out[row] = rate * (p1 - y[row])
-    partial[STIFFNESS] = (held - share * p1) * i_m
+    if n > 2:
+        p1, p2 = elastic_force(l, material), elastic_stiffness(l, material)
+        for b in range(n - 2):
+            row = (2 + b) * w
+            acc_w = a * theta[FIRST_BRANCH + 2 * b] * i_m
+            rate = 1.0 / theta[FIRST_BRANCH + 2 * b + 1]
+            for c in range(1, w):
+                out[w + c] += acc_w * y[row + c]
+                out[row + c] = rate * (p2 * y[c] - y[row + c])
+            out[row] = rate * (p1 - y[row])
+            partial[FIRST_BRANCH + 2 * b] = a * (y[row] - p1) * i_m
+    if count == 0:
+        return
+    acceleration_slopes(l, v * per_speed, load, material, slopes)
+    partial[STIFFNESS] = held * i_m + share * slopes[BY_MODULUS]
     partial[DAMPING] = -v * i_m
     partial[DRIVE] = field * i_m
     partial[FORCE] = i_m
     partial[LAG] = k * field_lag * i_m
-    partial[CHAIN] = -a * share * p_c * i_m
-    for b in range(n - 2):
-        partial[FIRST_BRANCH + 2 * b] = a * (y[(2 + b) * w] - p1) * i_m
     for j in range(count):
-        if wanted[j] < STRETCH or (
-                FIRST_BRANCH <= wanted[j] < SWITCH and (wanted[j] - FIRST_BRANCH) % 2 == 0):
-            out[w + 1 + j] += partial[wanted[j]]
+        place = wanted[j]
+        if place < STRETCH or (
+                FIRST_BRANCH <= place < CONSTANT and (place - FIRST_BRANCH) % 2 == 0):
+            out[w + 1 + j] += partial[place]
+        elif CONSTANT <= place < SWITCH:
+            by = slopes[BY_CONSTANT + place - CONSTANT]
+            out[w + 1 + j] += total * by
+            for b in range(n - 2):
+                out[(2 + b) * w + 1 + j] -= by / (i_m * theta[FIRST_BRANCH + 2 * b + 1])
         for b in range(n - 2):
             row, tau = (2 + b) * w, theta[FIRST_BRANCH + 2 * b + 1]
-            if wanted[j] == CHAIN:
-                out[row + 1 + j] += p_c / tau
-            elif wanted[j] == FIRST_BRANCH + 2 * b + 1:
+            if place == FIRST_BRANCH + 2 * b + 1:
                 out[row + 1 + j] -= (p1 - y[row]) / (tau * tau)
 
 
@@ -113,7 +136,9 @@ def _field(dt, level, slope, excess, excess_lag, lag):
 
 
 @compiled()
-def _step(k, y, new, n, count, dt, h, drive, theta, c1, wanted, partial, rtol, unit):
+def _step(
+        k, y, new, n, count, dt, h, drive, theta, unit, material, wanted, partial, slopes, rtol,
+        fastest):
     """Make one DOP853 step, whose first slope is in ``k[0]``; return the scaled error."""
     size = n * (1 + count)
     w = 1 + count
@@ -129,7 +154,8 @@ def _step(k, y, new, n, count, dt, h, drive, theta, c1, wanted, partial, rtol, u
             new[c] = y[c] + h * new[c]
         field, field_lag = _field(
             dt + h * NODES[i], drive[0], drive[1], drive[2], drive[3], theta[LAG])
-        _slope(new, n, count, field, field_lag, theta, c1, wanted, partial, k[i])
+        _slope(new, n, count, field, field_lag, theta, unit, material, wanted,
+            partial, slopes, k[i])
     for c in range(size):
         new[c] = 0.0
     for j in range(STAGES):
@@ -141,7 +167,7 @@ def _step(k, y, new, n, count, dt, h, drive, theta, c1, wanted, partial, rtol, u
         new[c] = y[c] + h * new[c]
     e5 = e3 = 0.0
     for i in range(2):
-        scale = rtol * (1.0 + abs(new[0])) if i == 0 else rtol * (unit + abs(new[w]))
+        scale = rtol * (1.0 + abs(new[0])) if i == 0 else rtol * (fastest + abs(new[w]))
         one = three = 0.0
         for j in range(STAGES):
             one += ERROR_5[j] * k[j, i * w]
@@ -171,17 +197,17 @@ def _interpolate(x, h, y, start, new, end, w, c):
 
 @compiled()
 def respond(
-        theta, c1, branches, wanted, start, begins, levels, slopes, field, times, rtol, stretch,
-        rate, jacobian):
+        theta, material, branches, wanted, start, begins, levels, ramps, field, times, rtol,
+        stretch, rate, jacobian):
     """
     Sample the response and its derivatives at increasing times.
 
-    Parameters: ``theta`` and ``wanted``, places in it, as the module says; ``start``
-    derivatives of the initial stretch by the wanted parameters; the amplifier's level is
-    ``levels[m] + slopes[m] (t - begins[m])`` from ``begins[m]`` on, the field at ``begins[0]``
-    is ``field``, a branch has relaxed there. ``stretch``, ``rate`` (n,) and ``jacobian``
-    (n, wanted) take the samples; before the begin the motion is uniform. Returns whether the
-    motion was followed to its end.
+    Parameters: ``theta`` and ``wanted``, places in it, as the module says; ``material`` as the
+    law packs it, whose damping is set; ``start`` derivatives of the initial stretch by the
+    wanted parameters; the amplifier's level is ``levels[m] + ramps[m] (t - begins[m])`` from
+    ``begins[m]`` on, the field at ``begins[0]`` is ``field``, a branch has relaxed there.
+    ``stretch``, ``rate`` (n,) and ``jacobian`` (n, wanted) take the samples; before the begin
+    the motion is uniform. Returns whether the motion was followed to its end.
     """
     n, count = 2 + branches, wanted.size
     w = 1 + count
@@ -189,17 +215,21 @@ def respond(
     k = np.zeros((STAGES, size))
     y, new, end = np.zeros(size), np.zeros(size), np.zeros(size)
     partial = np.zeros(theta.size)
+    slopes = np.zeros(BY_CONSTANT + material.size - CONSTANTS)
     drive = np.zeros(4)
     y[0], y[w] = theta[STRETCH], theta[RATE]
-    p1, p2, p_c = elastic(y[0], theta[CHAIN])
+    p1, p2 = elastic_force(y[0], material), elastic_stiffness(y[0], material)
     for b in range(branches):
         y[(2 + b) * w] = p1
     for j in range(count):
         y[1 + j] = start[j]
         if wanted[j] == RATE:
             y[w + 1 + j] = 1.0
+        by = 0.0
+        if CONSTANT <= wanted[j] < SWITCH:
+            by = constant_slope(y[0], wanted[j] - CONSTANT, material, slopes)
         for b in range(branches):
-            y[(2 + b) * w + 1 + j] = p2 * start[j] + (p_c if wanted[j] == CHAIN else 0.0)
+            y[(2 + b) * w + 1 + j] = p2 * start[j] + by
     lag = theta[LAG]
     t, piece, i = begins[0], 0, 0
     while i < times.size and times[i] < t:
@@ -208,17 +238,19 @@ def respond(
         for j in range(count):
             jacobian[i, j] = y[1 + j] + (times[i] - t) * y[w + 1 + j]
         i += 1
-    drive[0], drive[1] = levels[0], slopes[0]
-    drive[2] = field - (levels[0] - slopes[0] * lag)
-    drive[3] = slopes[0]
+    drive[0], drive[1] = levels[0], ramps[0]
+    drive[2] = field - (levels[0] - ramps[0] * lag)
+    drive[3] = ramps[0]
     fresh = True
-    unit = math.sqrt(abs(theta[STIFFNESS]) * 6.0 / (1.0 + c1))
-    h = 0.2 / unit
+    unit = _unit_of(theta, branches)
+    material[law.DAMPING] = theta[DAMPING] / unit[2]
+    fastest = math.sqrt(theta[STIFFNESS] / mass(1.0, material))
+    h = 0.2 / fastest
     for _ in range(_MAX_STEPS + _STEPS_PER_SAMPLE * times.size):
         if fresh:
             now, now_lag = _field(
                 t - begins[piece], drive[0], drive[1], drive[2], drive[3], lag)
-            _slope(y, n, count, now, now_lag, theta, c1, wanted, partial, k[0])
+            _slope(y, n, count, now, now_lag, theta, unit, material, wanted, partial, slopes, k[0])
             fresh = False
         while i < times.size and times[i] <= t:
             stretch[i] = y[0]
@@ -229,23 +261,23 @@ def respond(
         if i == times.size:
             return True
         limit = begins[piece + 1] if piece + 1 < begins.size else math.inf
-        _, p2, _ = elastic(y[0], theta[CHAIN])
-        smooth = _SMOOTH / math.sqrt(theta[STIFFNESS] * p2 * 6.0 / (y[0] ** -3 + c1))
+        p2 = elastic_stiffness(y[0], material)
+        smooth = _SMOOTH / math.sqrt(theta[STIFFNESS] * p2 / mass(y[0], material))
         target = min(limit, times[i] if times[i] - t >= smooth else t + smooth)
         step = min(h, target - t)
         error = _step(
-            k, y, new, n, count, t - begins[piece], step, drive, theta, c1, wanted, partial,
-            rtol, unit)
+            k, y, new, n, count, t - begins[piece], step, drive, theta, unit, material,
+            wanted, partial, slopes, rtol, fastest)
         if not error <= 1.0:
             h = 0.2 * step if not error < math.inf else step * max(
                 0.2, 0.9 * error ** -0.125)
-            if not h > 1e-12 / unit:
+            if not h > 1e-12 / fastest:
                 return False
             continue
         after = target if step == target - t else t + step
         now, now_lag = _field(
             after - begins[piece], drive[0], drive[1], drive[2], drive[3], lag)
-        _slope(new, n, count, now, now_lag, theta, c1, wanted, partial, end)
+        _slope(new, n, count, now, now_lag, theta, unit, material, wanted, partial, slopes, end)
         while i < times.size and times[i] < after:
             x = (times[i] - t) / step
             stretch[i], rate[i] = _interpolate(x, step, y, k[0], new, end, w, 0)
@@ -263,13 +295,13 @@ def respond(
                 begins[piece + 1] - begins[piece], drive[0], drive[1], drive[2], drive[3], lag)
             piece += 1
             jump = levels[piece] - before
-            drive[0], drive[1] = levels[piece], slopes[piece]
-            drive[2] = before - (levels[piece] - slopes[piece] * lag)
-            drive[3] = before_lag + slopes[piece]
+            drive[0], drive[1] = levels[piece], ramps[piece]
+            drive[2] = before - (levels[piece] - ramps[piece] * lag)
+            drive[3] = before_lag + ramps[piece]
             fresh = True
             if jump != 0.0:
                 # By a lag of 0, or by a later switch: what the step lacks is an impulse.
-                impulse = theta[DRIVE] * jump * 6.0 / (y[0] ** -3 + c1)
+                impulse = theta[DRIVE] * jump / mass(y[0], material)
                 for j in range(count):
                     if wanted[j] == SWITCH + piece or (wanted[j] == LAG and lag <= 0.0):
                         y[w + 1 + j] -= impulse

@@ -165,7 +165,7 @@ def actuator_of(values: Mapping[str, float]) -> ActuatorParameters:
     return ActuatorParameters(
         shear_modulus=values['shear_modulus'], density=values['density'],
         half_length=values['half_length'], half_thickness=values['half_thickness'],
-        remanence=values['remanence'], chain_limit=min(values['chain_limit'], 1e9),
+        remanence=values['remanence'], chain_limit=values['chain_limit'],
         damping_coefficient=values['damping_coefficient'])
 
 

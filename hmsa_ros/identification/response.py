@@ -8,7 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import mu_0
 
-from hmsa_ros.core.model import Array, equilibrium_stretch
+from hmsa_ros.core.law import (
+    BY_CONSTANT,
+    CONSTANTS,
+    elastic_force,
+    elastic_stiffness,
+    equilibrium_stretch,
+    GENT,
+    KIND,
+    pack,
+)
+from hmsa_ros.core.model import Array
 from hmsa_ros.identification import kernels
 from hmsa_ros.identification.quantities import derivative, QUANTITIES
 from hmsa_ros.identification.recording import pieces, Recording
@@ -53,8 +63,8 @@ def _chain(
     f = per_force * values['constant_force']
     theta = np.zeros(kernels.FIRST_BRANCH + 2 * branches)
     theta[:kernels.FIRST_BRANCH] = (
-        a, d, k, f, values['coil_time_constant'], 1.0 / values['chain_limit'],
-        values['initial_stretch'], values['initial_rate'])
+        a, d, k, f, values['coil_time_constant'], values['initial_stretch'],
+        values['initial_rate'])
     density = values['density']
     by_density = {
         kernels.STIFFNESS: -a / density, kernels.DAMPING: -d / density,
@@ -65,7 +75,7 @@ def _chain(
         'remanence': {kernels.DRIVE: k / values['remanence']},
         'damping_coefficient': {kernels.DAMPING: per_damping},
         'constant_force': {kernels.FORCE: per_force},
-        'chain_limit': {kernels.CHAIN: -1.0 / values['chain_limit'] ** 2},
+        'chain_limit': {kernels.CONSTANT: -1.0 / values['chain_limit'] ** 2},
         'coil_time_constant': {kernels.LAG: 1.0},
         'initial_stretch': {kernels.STRETCH: 1.0}, 'initial_rate': {kernels.RATE: 1.0}}
     if branches:
@@ -161,16 +171,19 @@ def respond(
         place = np.searchsorted(begins, level_times[uncertain])
         wanted = np.append(wanted, kernels.SWITCH + place)
     start = np.zeros(len(wanted))
-    if at_rest and not _set_rest(theta, float(levels[0]), wanted, start):
+    material = pack(0.0, values['chain_limit'], 2.0 * (
+        values['half_thickness'] / values['half_length']) ** 2)
+    if 'chain_limit' in free:
+        material[KIND] = GENT
+    if at_rest and not _set_rest(theta, material, float(levels[0]), wanted, start):
         return None
     if not at_rest:
         start[wanted == kernels.STRETCH] = 1.0
     n = len(times)
     stretch, rate, raw = np.empty(n), np.empty(n), np.empty((n, len(wanted)))
-    c1 = 2.0 * (values['half_thickness'] / values['half_length']) ** 2
     if not kernels.respond(
-            theta, c1, branches, wanted, start, begins, levels, slopes, float(levels[0]), times,
-            rtol, stretch, rate, raw):
+            theta, material, branches, wanted, start, begins, levels, slopes, float(levels[0]),
+            times, rtol, stretch, rate, raw):
         return None
     gain = values['stretch_gain']
     mixing = np.zeros((inner_count, len(free)))
@@ -189,19 +202,23 @@ def respond(
         gain * stretch + values['stretch_bias'], rate, jacobian, gain * raw[:, inner_count:])
 
 
-def _set_rest(theta: Array, level: float, wanted: NDArray[np.int64], start: Array) -> bool:
+def _set_rest(
+        theta: Array, material: Array, level: float, wanted: NDArray[np.int64], start: Array
+) -> bool:
     """Begin at the rest of a level; return whether there is one."""
-    a, k, f, chain = theta[[
-        kernels.STIFFNESS, kernels.DRIVE, kernels.FORCE, kernels.CHAIN]]
-    rest = float(equilibrium_stretch((k * level + f) / a, 1.0 / max(chain, 1e-9)))
-    p1, p2, p_c = kernels.elastic(rest, chain)
-    if not math.isfinite(p2):
+    a, k, f = theta[[kernels.STIFFNESS, kernels.DRIVE, kernels.FORCE]]
+    rest = equilibrium_stretch((k * level + f) / a, material)
+    force, stiffness = elastic_force(rest, material), elastic_stiffness(rest, material)
+    if not math.isfinite(stiffness):
         return False
     theta[kernels.STRETCH], theta[kernels.RATE] = rest, 0.0
-    slopes = {kernels.STIFFNESS: -p1, kernels.DRIVE: level, kernels.FORCE: 1.0,
-              kernels.CHAIN: -a * p_c}
+    slopes = {kernels.STIFFNESS: -force, kernels.DRIVE: level, kernels.FORCE: 1.0}
+    work = np.zeros(BY_CONSTANT + len(material) - CONSTANTS)
     for j, i in enumerate(wanted.tolist()):
-        start[j] = slopes.get(i, 0.0) / (a * p2)
+        slope = slopes.get(i, 0.0)
+        if kernels.CONSTANT <= i < kernels.SWITCH:
+            slope = -a * kernels.constant_slope(rest, i - kernels.CONSTANT, material, work)
+        start[j] = slope / (a * stiffness)
     return True
 
 
