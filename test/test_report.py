@@ -26,9 +26,10 @@ from hmsa_ros.core.simulation import ActuatorSimulation, simulate
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.report import charts
-from hmsa_ros.report.evaluation import evaluate, period_of, plan_points, timing
+from hmsa_ros.report.evaluation import evaluate, period_of, plan_points
 from hmsa_ros.report.page import page
 from hmsa_ros.report.picture import draw
+from hmsa_ros.report.timing import timing
 from hmsa_ros.runs.bags import read_runs
 from hmsa_ros.runs.levels import in_force, Level, without_repeats
 from hmsa_ros.runs.topics import (
@@ -346,7 +347,7 @@ def test_plain_steps_are_simulated_with_the_plant_that_was_recorded(tmp_path):
         tmp_path / 'bag', simulated(plant=plant), **parameters(planner=ACTUATOR, plant=plant))
     found = part.evaluation
     assert max(x.residual for x in found.results) > 0.01
-    assert any('other parameters' in x for x in part.run.notes)
+    assert any('different parameters' in x for x in part.run.notes)
     time = found.time[found.time >= 0.0]
     loads = [x.flux_density / plant.flux_density_unit for x in part.run.commands[1::2]]
     stretch, _ = simulate(
@@ -439,7 +440,7 @@ def test_a_recorder_on_another_clock_leaves_lead_and_delay_open(tmp_path):
     part = one(tmp_path / 'bag', messages, **parameters(plant=ACTUATOR))
     assert len(part.timing.lead) == len(part.timing.delay) == 0
     assert [x.stretch for x in part.evaluation.results] == [1.1, 1.2, 1.4]
-    assert 'another clock' in ' '.join(Page(page([part])).words)
+    assert 'clock of the recorder differs' in ' '.join(Page(page([part])).words)
 
 
 def applied(messages, late=0, space=''):
@@ -923,7 +924,7 @@ def test_block_of_the_plant_is_the_one_that_a_mismatch_leaves(tmp_path):
         **parameters(planner=ACTUATOR, plant=ACTUATOR),
         **{'plant.mismatch.density': json.dumps(2100.0 / ACTUATOR.density)}))
     assert run.plant.density == pytest.approx(2100.0, rel=1e-12)
-    assert any('other parameters' in x for x in run.notes)
+    assert any('different parameters' in x for x in run.notes)
 
 
 @pytest.mark.parametrize('name', ['a<b onload=x>&amp;"', '<!--<script>'])
@@ -1050,7 +1051,7 @@ def _bad(tmp_path, case):
     if case == 'a bag to write':
         return [str(good), '--out', str(good / 'good_0.mcap')], 'may be part of a bag'
     if case == 'two files of one name':
-        return [str(good), '--png', 'x.html', '--out', 'x.html'], 'are one file'
+        return [str(good), '--png', 'x.html', '--out', 'x.html'], 'name the same file'
     if case == 'a full disk':
         return [str(good), '--out', '/dev/full'], 'cannot write /dev/full'
     (tmp_path / 'bad.yaml').write_text('a: [1')

@@ -9,8 +9,9 @@ from test_report import ACTUATOR, applied, parameters, parts_of, simulated, writ
 
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.report import charts
-from hmsa_ros.report.evaluation import evaluate, timing
+from hmsa_ros.report.evaluation import evaluate
 from hmsa_ros.report.page import page
+from hmsa_ros.report.timing import timing
 from hmsa_ros.runs.bags import read_runs
 
 pytestmark = pytest.mark.skipif(

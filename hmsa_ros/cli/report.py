@@ -73,8 +73,9 @@ def run(arguments: argparse.Namespace) -> int:
     _check_targets(targets, bags)
 
     from hmsa_ros.report.charts import Part, RUN_COLOURS
-    from hmsa_ros.report.evaluation import evaluate, timing
+    from hmsa_ros.report.evaluation import evaluate
     from hmsa_ros.report.page import page
+    from hmsa_ros.report.timing import timing
     from hmsa_ros.runs.bags import read_runs
     from hmsa_ros.runs.parameters import read_parameter_file
 

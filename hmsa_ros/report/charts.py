@@ -15,7 +15,8 @@ import numpy as np
 
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.report.evaluation import Evaluation, MoveResult, Timing
+from hmsa_ros.report.evaluation import Evaluation, MoveResult
+from hmsa_ros.report.timing import Timing
 from hmsa_ros.runs.record import Run
 
 # Okabe and Ito's palette, told apart with every kind of colour vision.
@@ -37,9 +38,9 @@ _MOST_PHASE_POINTS = 8_000
 _PHASE_GRID = 1000.0
 # Markers are smaller where there are more of them.
 _MANY_MARKERS = 100
-# Of an arrival's panel: how long before and after, in durations of the move, and how many
-# percent of the step at least.
-_BEFORE, _AFTER, _LEAST_PERCENT = 0.6, 3.0, 5.0
+#: Of an arrival's panel: how long before and after, in durations of the move, and how many
+#: percent of the step at least.
+BEFORE, AFTER, LEAST_PERCENT = 0.6, 3.0, 5.0
 # Of what a panel holds beyond what it shows at first.
 _PANEL_SPAN = 20.0
 #: Instead of a residual, which would be 0.
@@ -51,21 +52,7 @@ _DIGITS = 9
 
 @dataclass(frozen=True)
 class Part:
-    """
-    One run of a report.
-
-    Attributes
-    ----------
-    run : Run
-        As read from a bag.
-    evaluation : Evaluation
-        Its measures.
-    timing : Timing
-        When commands and samples came.
-    colour : str
-        In the figures; empty for a run on its own, whose curves differ in colour.
-
-    """
+    """One run of a report; without a colour it is on its own and its curves differ in theirs."""
 
     run: Run
     evaluation: Evaluation
@@ -87,21 +74,7 @@ class TimeUnit:
 
 @dataclass(frozen=True)
 class Figure:
-    """
-    One figure.
-
-    Attributes
-    ----------
-    key : str
-        Identifies its place in the page.
-    alt : str
-        What it shows, for who cannot see it.
-    height : int
-        In pixels.
-    data, layout : list and dict
-        As Plotly takes them, without colours of text and lines.
-
-    """
+    """One figure: what it shows in words, its height in px, and what Plotly takes."""
 
     key: str
     alt: str
@@ -111,20 +84,7 @@ class Figure:
 
 
 def time_unit(parts: Sequence[Part]) -> TimeUnit:
-    """
-    Return the unit for the time axes.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-        Runs to show.
-
-    Returns
-    -------
-    TimeUnit
-        Milliseconds for short runs.
-
-    """
+    """Return the unit for the time axes: milliseconds for short runs."""
     longest = max(
         float(np.max(np.abs(x.evaluation.time[[0, -1]]))) for x in parts)
     return TimeUnit(1e-3, 'ms') if longest <= _LONGEST_IN_MS else TimeUnit(1.0, 's')
@@ -132,20 +92,9 @@ def time_unit(parts: Sequence[Part]) -> TimeUnit:
 
 def decimate(x: Array, y: Array, buckets: int = BUCKETS) -> tuple[Array, Array]:
     """
-    Thin out a curve, keeping the least and the largest value of every interval.
+    Thin out a curve, keeping the ends and the extremes of intervals of equally many points.
 
-    Parameters
-    ----------
-    x, y : ndarray, shape (n,)
-        The curve; points that are not finite are left out.
-    buckets : int
-        Number of intervals of equally many points.
-
-    Returns
-    -------
-    x, y : ndarray, shape (m,)
-        Unchanged if there are few points, else at most two for each interval and the ends.
-
+    Points that are not finite are left out; a curve of few points is otherwise unchanged.
     """
     finite = np.isfinite(y)
     if not finite.all():
@@ -171,20 +120,7 @@ def _extremes(y: Array, buckets: int) -> Any:
 
 
 def numbers(values: Any) -> list[float | None]:
-    """
-    Return numbers for JSON.
-
-    Parameters
-    ----------
-    values : array_like
-        Numbers.
-
-    Returns
-    -------
-    list of float or None
-        To nine significant digits; None for what is not finite.
-
-    """
+    """Return numbers for JSON, to nine digits; None for what is not finite."""
     return [float(f'{x:.{_DIGITS}g}') if math.isfinite(x) else None
             for x in np.asarray(values, dtype=np.float64).tolist()]
 
@@ -195,27 +131,31 @@ def text(words: str) -> str:
 
 
 def _curve(
-        name: str, x: Any, y: Any, group: str, *, mode: str = 'lines', **style: Any
+        part: Part, what: str, x: Any, y: Any, *, mode: str = 'lines', **style: Any
 ) -> dict[str, Any]:
-    """Return a curve; its style is the line's, but for the names of a trace's own settings."""
+    """
+    Return a curve: what it shows of a run.
+
+    Its style is the line's, but for the names of a trace's own settings. The group is what a
+    click in the legend hides.
+    """
+    if 'lines' in mode and what in _KINDS:
+        style = {**_KINDS[what], **style}
+        if part.colour:
+            style['color'] = part.colour
+            if what in _SIMULATED:
+                style['visible'] = 'legendonly'
     own: dict[str, Any] = {k: style.pop(k) for k in (
         'marker', 'visible', 'xaxis', 'yaxis', 'hovertemplate', 'opacity', 'cliponaxis')
         if k in style}
     trace = {
-        'type': 'scatter', 'mode': mode, 'name': text(name), 'legendgroup': group,
-        'x': numbers(x), 'y': numbers(y), **own}
+        'type': 'scatter', 'mode': mode, 'x': numbers(x), 'y': numbers(y),
+        'name': text(f'{part.run.label}: {what}' if part.colour else what),
+        'legendgroup': part.run.label if part.colour and what not in _SIMULATED else what, **own}
     if 'lines' in mode:
         # Plotly's own thinning bends lines at rest by a pixel or two.
         trace['line'] = {'simplify': False, **style}
     return trace
-
-
-def _names(part: Part, what: str) -> tuple[str, str]:
-    """Return a curve's name and the group that a click in the legend hides."""
-    if not part.colour:
-        return what, what
-    name = f'{part.run.label}: {what}'
-    return name, (what if what in _SIMULATED else part.run.label)
 
 
 def _grouped(data: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -242,62 +182,28 @@ _KINDS: dict[str, dict[str, Any]] = {
 }
 
 
-def _kind(part: Part, kind: str, **more: Any) -> dict[str, Any]:
-    style = {**_KINDS[kind], **more}
-    if part.colour:
-        style['color'] = part.colour
-        if kind in _SIMULATED:
-            style['visible'] = 'legendonly'
-    return style
-
-
 def _axis(title: str, **more: Any) -> dict[str, Any]:
     return {'title': {'text': title}, 'exponentformat': 'power', **more}
 
 
 def response(parts: Sequence[Part], unit: TimeUnit) -> Figure:
-    """
-    Return setpoints, response and command over time.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-        Runs to show.
-    unit : TimeUnit
-        Of the time axis.
-
-    Returns
-    -------
-    Figure
-        Command above, stretch below.
-
-    """
+    """Return the command, and below it setpoints and response, over time."""
     data = []
     for part in parts:
         run, found = part.run, part.evaluation
-        name, group = _names(part, 'plain steps')
-        data.append(_curve(
-            name, *decimate(unit.of(found.time), found.unshaped[0]), group,
-            **_kind(part, 'plain steps')))
-        name, group = _names(part, 'recorded')
-        data.append(_curve(
-            name, *decimate(unit.of(found.time), run.stretch), group,
-            **_kind(part, 'recorded')))
-        name, group = _names(part, 'plan')
-        data.append(_curve(
-            name, *decimate(unit.of(found.time), found.predicted[0]), group,
-            **_kind(part, 'plan')))
+        data += [
+            _curve(part, what, *decimate(unit.of(found.time), stretch)) for what, stretch in (
+                ('plain steps', found.unshaped[0]), ('recorded', run.stretch),
+                ('plan', found.predicted[0]))]
         if found.results:
-            name, group = _names(part, 'target')
             spans = [(x.begin, x.end, math.nan) for x in found.results]
             data.append(_curve(
-                name, unit.of(np.ravel(spans)),
-                np.ravel([(x.stretch, x.stretch, math.nan) for x in found.results]), group,
+                part, 'target', unit.of(np.ravel(spans)),
+                np.ravel([(x.stretch, x.stretch, math.nan) for x in found.results]),
                 color=GREY, width=1.2, dash='2px,2px'))
-            name, group = _names(part, 'planned arrival')
             data.append(_curve(
-                name, unit.of([x.arrival for x in found.results]),
-                [x.stretch for x in found.results], group, mode='markers',
+                part, 'planned arrival', unit.of([x.arrival for x in found.results]),
+                [x.stretch for x in found.results], mode='markers',
                 marker={
                     'symbol': 'diamond-open', 'size': _size(9, found.results),
                     'color': part.colour or BLACK}))
@@ -309,26 +215,32 @@ def response(parts: Sequence[Part], unit: TimeUnit) -> Figure:
             'yaxis2': _axis('flux density B [mT]', domain=[0.68, 1.0], anchor='x')})
 
 
+def commanded(part: Part) -> tuple[list[float], list[float]]:
+    """Return times in s and levels in mT of the command, from the first sample to the last."""
+    run, found = part.run, part.evaluation
+    times = [found.seconds(x.stamp) for x in found.levels]
+    values = [x.flux_density * 1e3 for x in found.levels]
+    # The last level holds to the end of the record.
+    times.append(max(times[-1], float(found.time[-1])))
+    values.append(values[-1])
+    if found.time[0] < times[0] and math.isfinite(run.flux_density[0]):
+        times.insert(0, float(found.time[0]))
+        values.insert(0, float(run.flux_density[0]) * 1e3)
+    return times, values
+
+
 def _commands(part: Part, unit: TimeUnit) -> list[dict[str, Any]]:
     """Return the curves of the flux density."""
     run, found = part.run, part.evaluation
     data = []
     if found.levels:
-        times = [found.seconds(x.stamp) for x in found.levels]
-        values = [x.flux_density * 1e3 for x in found.levels]
-        # The last level holds to the end of the record.
-        times.append(max(times[-1], float(found.time[-1])))
-        values.append(values[-1])
-        if found.time[0] < times[0] and math.isfinite(run.flux_density[0]):
-            times.insert(0, float(found.time[0]))
-            values.insert(0, float(run.flux_density[0]) * 1e3)
+        times, values = commanded(part)
         switches = {x.stamp for x in found.levels}
         size = 6 if len(found.levels) <= _MANY_MARKERS else 3
         sizes = [size if round(x * NANOSECONDS) + found.zero in switches else 0 for x in times]
-        name, group = _names(part, 'command')
         data.append(_curve(
-            name, unit.of(times), values, group, mode='lines+markers', yaxis='y2',
-            marker={'size': sizes}, **_kind(part, 'command')))
+            part, 'command', unit.of(times), values, mode='lines+markers', yaxis='y2',
+            marker={'size': sizes}))
         place = np.searchsorted([x.stamp for x in found.levels], run.time, side='right') - 1
         expected = np.array([*(x.flux_density for x in found.levels)])[np.maximum(place, 0)]
         follows = np.abs(run.flux_density - expected)[place >= 0]
@@ -336,17 +248,15 @@ def _commands(part: Part, unit: TimeUnit) -> list[dict[str, Any]]:
                 np.nanmax(follows) <= 1e-9 * np.max(np.abs(expected))):
             return data
     if np.isfinite(run.flux_density).any():
-        name, group = _names(part, 'field in force')
-        x, y = decimate(unit.of(found.time), run.flux_density * 1e3)
-        data.append(_curve(name, x, y, group, yaxis='y2', **_kind(part, 'field in force')))
+        data.append(_curve(
+            part, 'field in force', *decimate(unit.of(found.time), run.flux_density * 1e3),
+            yaxis='y2'))
     elif run.applied:
-        name, group = _names(part, 'field in force')
         told = sorted(run.applied, key=lambda x: x.stamp)
         x = unit.of([*(found.seconds(x.stamp) for x in told), max(
             found.seconds(told[-1].stamp), float(found.time[-1]))])
         y = np.array([x.flux_density for x in (*told, told[-1])]) * 1e3
-        data.append(_curve(name, x, y, group, yaxis='y2', **_kind(
-            part, 'field in force', shape='hv')))
+        data.append(_curve(part, 'field in force', x, y, yaxis='y2', shape='hv'))
     return data
 
 
@@ -357,20 +267,9 @@ def _size(usual: int, results: Sequence[MoveResult]) -> int:
 
 def phase(parts: Sequence[Part]) -> tuple[Figure, float]:
     """
-    Return the phase plane with the equilibria.
+    Return the phase plane with the equilibria, and the smallest share of a run in it.
 
-    Parameters
-    ----------
-    parts : sequence of Part
-        Runs to show.
-
-    Returns
-    -------
-    figure : Figure
-        Stretch rate over stretch.
-    shown : float
-        Smallest share of a run that is drawn: what moves on and on fills the plane.
-
+    What moves on and on fills the plane, so that a part of it is enough.
     """
     data, shown = [], 1.0
     for part in parts:
@@ -379,15 +278,13 @@ def phase(parts: Sequence[Part]) -> tuple[Figure, float]:
                 ('plain steps', found.unshaped), ('recorded', (run.stretch, run.rate))):
             x, y, share = _orbit(stretch, rate)
             shown = min(shown, share)
-            name, group = _names(part, kind)
-            data.append(_curve(name, x, y, group, **_kind(part, kind)))
-        name, group = _names(part, 'equilibrium')
+            data.append(_curve(part, kind, x, y))
         places = sorted({x.stretch for x in found.results})
         data.append(_curve(
-            name, places, [0.0] * len(places), group, mode='markers',
+            part, 'equilibrium', places, [0.0] * len(places), mode='markers',
             marker={'symbol': 'circle', 'size': 8, 'color': part.colour or BLACK}))
         data.append(_curve(
-            name, [found.start], [0.0], group, mode='markers',
+            part, 'equilibrium', [found.start], [0.0], mode='markers',
             marker={'symbol': 'circle-open', 'size': 9, 'color': part.colour or BLACK}))
     return Figure(
         'phase', 'Stretch rate over stretch, with the equilibria', 480, _grouped(data), {
@@ -423,34 +320,27 @@ def _orbit(stretch: Array, rate: Array) -> tuple[Array, Array, float]:
 
 
 def panels(parts: Sequence[Part]) -> list[tuple[int, str]]:
-    """
-    Choose the arrivals to show.
+    """Return number, from 0 on, and title of each arrival to show; those of a number share one."""
+    return [(i, _panel_title(parts, i)) for i in worst(parts, MOST_PANELS)]
 
-    Parameters
-    ----------
-    parts : sequence of Part
-        Runs to show; setpoints of the same number are shown together.
 
-    Returns
-    -------
-    list of (int, str)
-        Number of the setpoint from 0 on, and the panel's title.
-
-    """
+def worst(parts: Sequence[Part], most: int) -> list[int]:
+    """Return the numbers, from 0 on, of the setpoints with the largest residuals."""
     count = max((len(x.evaluation.results) for x in parts), default=0)
     ranked = sorted(range(count), key=lambda i: -max(
-        (x.residual for x in _results(parts, i) if math.isfinite(x.residual)), default=0.0))
-    return [(i, _panel_title(parts, i)) for i in sorted(ranked[:MOST_PANELS])]
+        (x.residual if x.moved else math.inf for x in results_of(parts, i)
+         if math.isfinite(x.residual) or not x.moved), default=0.0))
+    return sorted(ranked[:most])
 
 
-def _results(parts: Sequence[Part], number: int) -> list[MoveResult]:
+def results_of(parts: Sequence[Part], number: int) -> list[MoveResult]:
     """Return the results of one setpoint in all runs that have it."""
     return [x.evaluation.results[number] for x in parts
             if number < len(x.evaluation.results)]
 
 
 def _panel_title(parts: Sequence[Part], number: int) -> str:
-    results = _results(parts, number)
+    results = results_of(parts, number)
     targets = ', '.join(dict.fromkeys(f'{x.stretch:.6g}' for x in results))
     return f'{number + 1}. to {targets}: residual {residual_text(results, least=True)}'
 
@@ -465,45 +355,15 @@ def residual_text(results: Sequence[MoveResult], digits: int = 3, *, least: bool
 
 
 def percent(share: float, digits: int = 3) -> str:
-    """
-    Return a share in percent.
-
-    Parameters
-    ----------
-    share : float
-        Not in percent.
-    digits : int
-        Significant ones.
-
-    Returns
-    -------
-    str
-        With the unit; a dash for what is not known.
-
-    """
+    """Return a share in percent to some significant digits; a dash for what is not known."""
     return f'{100.0 * share:.{digits}g} %' if math.isfinite(share) else '–'
 
 
 def arrival(parts: Sequence[Part], number: int) -> Figure:
-    """
-    Return the zoom on one arrival.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-        Runs to show.
-    number : int
-        Which setpoint, from 0 on.
-
-    Returns
-    -------
-    Figure
-        Distance from the target in percent of the step over the time after arrival.
-
-    """
+    """Return the zoom on one arrival: distance from the target in percent of the step."""
     data = []
-    view, height = [0.0, 0.0], _LEAST_PERCENT
-    results = [x for x in _results(parts, number) if x.end > x.begin]
+    view, height = [0.0, 0.0], LEAST_PERCENT
+    results = [x for x in results_of(parts, number) if x.end > x.begin]
     unit = TimeUnit(1e-3, 'ms') if max(
         (x.arrival - x.begin for x in results), default=1.0) < 1.0 else TimeUnit(1.0, 's')
     for part in parts:
@@ -517,8 +377,8 @@ def arrival(parts: Sequence[Part], number: int) -> Figure:
         inside = (found.time >= result.begin) & (
             found.time <= min(result.end, result.arrival + _PANEL_SPAN * duration))
         time = unit.of(found.time[inside] - result.arrival)
-        view = [min(view[0], -_BEFORE * float(unit.of(duration))), max(
-            view[1], float(unit.of(min(result.end - result.arrival, _AFTER * duration))))]
+        view = [min(view[0], -BEFORE * float(unit.of(duration))), max(
+            view[1], float(unit.of(min(result.end - result.arrival, AFTER * duration))))]
         if math.isfinite(result.error):
             height = max(height, 110.0 * result.error)
         for kind, stretch in (
@@ -526,11 +386,10 @@ def arrival(parts: Sequence[Part], number: int) -> Figure:
                 ('plan', found.predicted[0])):
             if part.colour and kind in _SIMULATED:
                 continue
-            name, group = _names(part, kind)
             data.append(_curve(
-                name, *decimate(
+                part, kind, *decimate(
                     time, 100.0 * (stretch[inside] - result.stretch) / abs(step),
-                    _PANEL_BUCKETS), group, **_kind(part, kind)))
+                    _PANEL_BUCKETS)))
     height = min(height, 150.0)
     title = _panel_title(parts, number)
     return Figure(
@@ -545,42 +404,28 @@ def arrival(parts: Sequence[Part], number: int) -> Figure:
 
 
 def residuals(parts: Sequence[Part]) -> Figure:
-    """
-    Return the residuals of all setpoints, shaped against plain steps.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-        Runs to show.
-
-    Returns
-    -------
-    Figure
-        In percent of the step, on a logarithmic axis.
-
-    """
+    """Return the residuals of all setpoints, shaped against plain steps."""
     data = []
     for part in parts:
         results = part.evaluation.results
         for what, values, symbol in (
                 ('recorded', [x.residual for x in results], 'circle'),
                 ('plain steps', [x.residual_unshaped for x in results], 'square-open')):
-            name, group = _names(part, what)
             data.append(_curve(
-                name, np.arange(1, len(results) + 1),
+                part, what, np.arange(1, len(results) + 1),
                 # A logarithmic axis has no place for 0.
-                [100.0 * x if x > 0.0 else math.nan for x in values], group, mode='markers',
+                [100.0 * x if x > 0.0 else math.nan for x in values], mode='markers',
                 marker={
                     'symbol': symbol, 'size': _size(10, results), 'line': {'width': 1.5},
                     'color': part.colour or _KINDS[what]['color']}))
             # Here both are results: one click for both.
-            data[-1]['legendgroup'] = part.run.label if part.colour else group
+            data[-1]['legendgroup'] = part.run.label if part.colour else what
     count = max((len(x.evaluation.results) for x in parts), default=0)
     axis = _axis('setpoint', range=[0.5, count + 0.5])
     if count <= MOST_PANELS:
         axis |= {'tickmode': 'array', 'tickvals': list(range(1, count + 1)), 'ticktext': [
             f'{i + 1}: ' + '/'.join(dict.fromkeys(
-                f'{x.stretch:.5g}' for x in _results(parts, i))) for i in range(count)]}
+                f'{x.stretch:.5g}' for x in results_of(parts, i))) for i in range(count)]}
     return Figure(
         'residuals', 'Residual vibration of each setpoint, recorded and for plain steps', 340,
         _grouped(data), {
@@ -599,32 +444,16 @@ def _decades(data: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def prediction(parts: Sequence[Part], unit: TimeUnit) -> Figure:
-    """
-    Return the distance between what was planned and what was recorded.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-        Runs to show.
-    unit : TimeUnit
-        Of the time axis.
-
-    Returns
-    -------
-    Figure
-        Recorded minus predicted stretch over time; no curves without a plan.
-
-    """
+    """Return recorded minus predicted stretch over time; no curves without a plan."""
     data = []
     for part in parts:
         found = part.evaluation
         difference = part.run.stretch - found.predicted[0]
         if np.isfinite(difference).any():
-            name, group = _names(part, 'recorded')
             data.append(_curve(
-                name if part.colour else 'recorded − predicted',
-                *decimate(unit.of(found.time), difference), group,
-                **_kind(part, 'recorded', width=1.2)))
+                part, 'recorded', *decimate(unit.of(found.time), difference), width=1.2))
+            if not part.colour:
+                data[-1]['name'] = 'recorded − predicted'
     return Figure(
         'prediction', 'Recorded minus predicted stretch over time', 300, _grouped(data), {
             'xaxis': _axis(f'time from the first command [{unit.name}]'),
@@ -632,53 +461,33 @@ def prediction(parts: Sequence[Part], unit: TimeUnit) -> Figure:
 
 
 def timings(parts: Sequence[Part], unit: TimeUnit) -> Figure:
-    """
-    Return when commands and samples came.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-        Runs to show.
-    unit : TimeUnit
-        Of the time axis.
-
-    Returns
-    -------
-    Figure
-        Lead of the commands, delay of the samples, and their intervals.
-
-    """
+    """Return lead of the commands, delay of the samples, and their intervals."""
     data = []
     for part in parts:
         found, timing = part.evaluation, part.timing
         time = unit.of(found.time)
         told = np.isfinite(timing.lateness)
+        stamps = unit.of([found.seconds(x.stamp) for x in timing.commands])
+        markers: dict[str, Any] = {'mode': 'markers', 'yaxis': 'y3', 'cliponaxis': False}
         if len(timing.lead):
-            name, group = _names(part, 'command lead')
             data.append(_curve(
-                name, unit.of([found.seconds(x.stamp) for x in timing.commands]),
-                timing.lead * 1e3, group, mode='markers', yaxis='y3', cliponaxis=False,
+                part, 'command lead', stamps, timing.lead * 1e3, **markers,
                 marker={'size': 7, 'color': part.colour or BLUE, 'symbol': 'circle'}))
         if told.any():
-            name, group = _names(part, 'lateness of the command')
             data.append(_curve(
-                name, unit.of([found.seconds(x.stamp) for x in timing.commands])[told],
-                timing.lateness[told] * 1e3, group, mode='markers', yaxis='y3',
-                cliponaxis=False,
+                part, 'lateness of the command', stamps[told], timing.lateness[told] * 1e3,
+                **markers,
                 marker={'size': 8, 'color': part.colour or VERMILION, 'symbol': 'x-thin-open'}))
-        name, group = _names(part, 'sample delay')
         colour = part.colour or VERMILION
         if len(timing.delay):
             data.append(_curve(
-                name, *decimate(time, timing.delay * 1e3), group, yaxis='y2', color=colour,
-                width=1.2))
-        name, group = _names(part, 'interval as recorded')
+                part, 'sample delay', *decimate(time, timing.delay * 1e3), yaxis='y2',
+                color=colour, width=1.2))
         data.append(_curve(
-            name, *decimate(time[1:], timing.arrival_interval * 1e3), group, color=colour,
-            width=0.8, dash='2px,1px', opacity=0.8))
-        name, group = _names(part, 'interval of the stamps')
+            part, 'interval as recorded', *decimate(time[1:], timing.arrival_interval * 1e3),
+            color=colour, width=0.8, dash='2px,1px', opacity=0.8))
         data.append(_curve(
-            name, *decimate(time[1:], timing.interval * 1e3), group,
+            part, 'interval of the stamps', *decimate(time[1:], timing.interval * 1e3),
             color=part.colour or BLACK, width=1.6))
     return Figure(
         'timing', 'Lead of the commands, delay and interval of the samples', 640, _grouped(data), {

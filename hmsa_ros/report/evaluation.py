@@ -26,24 +26,20 @@ from hmsa_ros.core.residual import residual_vibration
 from hmsa_ros.core.simulation import simulate
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.runs.levels import in_force, lateness_of, Level, without_repeats
-from hmsa_ros.runs.record import Run, Times
+from hmsa_ros.runs.levels import in_force, Level, without_repeats
+from hmsa_ros.runs.record import Run
 
 # Stretches that differ by less are one setpoint: what comes back from a flux density in double
 # precision is some 1e-12 off.
 _SAME = 1e-6
 # Stretch rates below this share of the natural frequency are rest, to a planner's precision.
 _AT_REST = 1e-3
-# A change of level that took effect within so many s of its stamp was in time.
-_PUNCTUAL = 1e-6
 # Plain steps are simulated with this many points a period of the actuator at least, up to so many.
 _POINTS_A_PERIOD, _MOST_POINTS = 100, 2_000_000
 #: Samples a period below which peaks are missed.
 FEW_SAMPLES = 10
 # Of the step: a block that covers less did not move.
 _MOVED = 0.1
-# Clocks further apart than this are different clocks.
-_SAME_CLOCK = 60.0
 
 
 @dataclass(frozen=True)
@@ -165,22 +161,7 @@ class Evaluation:
 
 
 def evaluate(run: Run, moves: Sequence[Move] | None = None) -> Evaluation:
-    """
-    Measure a run.
-
-    Parameters
-    ----------
-    run : Run
-        As read from a bag.
-    moves : sequence of Move, optional
-        Setpoints; default what `find_moves` finds.
-
-    Returns
-    -------
-    Evaluation
-        The measures.
-
-    """
+    """Measure a run; the setpoints are what `find_moves` finds, unless they are given."""
     levels = in_force((x,) for x in without_repeats(run.commands)[0])
     plan = in_force(run.plans)
     start = _start(run, levels, plan)
@@ -468,22 +449,7 @@ class PlanPoint:
 
 
 def plan_points(run: Run, evaluation: Evaluation) -> list[PlanPoint]:
-    """
-    Compare the plan with what was recorded.
-
-    Parameters
-    ----------
-    run : Run
-        As read from a bag.
-    evaluation : Evaluation
-        Of that run.
-
-    Returns
-    -------
-    list of PlanPoint
-        By time.
-
-    """
+    """Compare the plan of a run with what was recorded, by time."""
     commanded = {x.stamp: x.flux_density for x in evaluation.levels}
     stretch, rate = evaluation.predicted
     # Of each point the first sample, and behind the last point the end.
@@ -500,85 +466,3 @@ def plan_points(run: Run, evaluation: Evaluation) -> list[PlanPoint]:
             evaluation.seconds(point.stamp), point.flux_density,
             commanded.get(point.stamp, math.nan), *values))
     return points
-
-
-@dataclass(frozen=True)
-class Timing:
-    """
-    When commands and samples came.
-
-    Attributes
-    ----------
-    commands : tuple of Level
-        Those that change something, in the order received.
-    repeats : int
-        How many commands changed nothing.
-    lead : ndarray, shape (m,)
-        How far ahead of its stamp each command was recorded, in s; below 0 for a late one.
-        Empty if the recorder kept another clock than the stamps.
-    lateness : ndarray, shape (k,)
-        How long after its stamp each change of level took effect, in s, by what the plant or the
-        driver reported; NaN for one that it did not report. Empty if it reported none.
-    delay : ndarray, shape (n,)
-        How long after its stamp each sample was recorded, in s; empty likewise.
-    interval : ndarray, shape (n - 1,)
-        Between the stamps of two samples, in s.
-    arrival_interval : ndarray, shape (n - 1,)
-        Between the times at which they were recorded, in s.
-    missing : int
-        Samples that gaps in the stamps have room for.
-    unapplied : int
-        Changes of level that were due and did not take effect as reported.
-
-    """
-
-    commands: tuple[Level, ...]
-    repeats: int
-    lead: Array
-    lateness: Array
-    delay: Array
-    interval: Array
-    arrival_interval: Array
-    missing: int
-    unapplied: int
-
-    @property
-    def late(self) -> int:
-        """Commands that took effect, or else were recorded, after the time they apply from."""
-        if len(self.lateness):
-            return int(np.count_nonzero(self.lateness > _PUNCTUAL))
-        return int(np.count_nonzero(self.lead < 0.0))
-
-
-def timing(run: Run) -> Timing:
-    """
-    Return when commands and samples came.
-
-    Parameters
-    ----------
-    run : Run
-        As read from a bag.
-
-    Returns
-    -------
-    Timing
-        In s.
-
-    """
-    commands, repeats = without_repeats(run.commands)
-    delay = _seconds(run.logged - run.time)
-    interval = _seconds(np.diff(run.time))
-    lead = _seconds(np.array([x.stamp - x.sent for x in commands], dtype=np.int64))
-    if abs(float(np.median(delay))) > _SAME_CLOCK:
-        delay, lead = np.empty(0), np.empty(0)
-    recorded: Times = np.sort(run.logged)
-    usual = float(np.median(interval)) if len(interval) else math.inf
-    gaps = np.rint(interval / usual) - 1.0
-    lateness, unapplied = lateness_of(commands, run.applied, int(run.time[-1]))
-    return Timing(
-        commands, repeats, lead, lateness, delay, interval, _seconds(np.diff(recorded)),
-        int(np.sum(gaps[gaps > 0.0])) if len(interval) else 0, unapplied)
-
-
-def _seconds(nanoseconds: Times) -> Array:
-    return np.asarray(nanoseconds / NANOSECONDS, dtype=np.float64)

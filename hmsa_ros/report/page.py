@@ -60,25 +60,7 @@ Row = list[Cell | str]
 
 
 def page(parts: Sequence[Part]) -> str:
-    """
-    Return a report.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-        Runs, evaluated; at least one.
-
-    Returns
-    -------
-    str
-        HTML.
-
-    Raises
-    ------
-    HmsaError
-        If Plotly is not installed.
-
-    """
+    """Return a report on one run or several, as HTML; fails if Plotly is not installed."""
     unit = charts.time_unit(parts)
     figures: list[Figure] = []
 
@@ -156,24 +138,7 @@ def page(parts: Sequence[Part]) -> str:
 
 
 def document(title: str, body: Sequence[str], figures: Sequence[Figure]) -> str:
-    """
-    Return a page that needs nothing else.
-
-    Parameters
-    ----------
-    title : str
-        Plain text.
-    body : sequence of str
-        HTML with a place for each figure.
-    figures : sequence of Figure
-        To be drawn in their places.
-
-    Returns
-    -------
-    str
-        HTML.
-
-    """
+    """Return a page, as HTML, whose body has a place for each figure; it needs nothing else."""
     data = json.dumps(
         {'figures': [
             {'key': x.key, 'height': x.height, 'data': x.data, 'layout': x.layout}

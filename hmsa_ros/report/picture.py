@@ -6,19 +6,27 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
-import numpy as np
 
 from hmsa_ros.figures import style
-from hmsa_ros.report.charts import decimate, Part, residual_text, time_unit, TimeUnit
+from hmsa_ros.report.charts import (
+    AFTER,
+    BEFORE,
+    commanded,
+    decimate,
+    LEAST_PERCENT,
+    Part,
+    residual_text,
+    results_of,
+    time_unit,
+    TimeUnit,
+    worst,
+)
 
 _COLOURS = (
     style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY_BLUE, style.VERMILION,
     style.BLACK)
 # Panels of arrivals in a row.
 _PANELS = 3
-# Of an arrival's panel: how long before and after, in durations of the move, and percent of
-# the step at least.
-_BEFORE, _AFTER, _LEAST_PERCENT = 0.6, 3.0, 5.0
 
 
 def draw(path: Path, parts: Sequence[Part], kind: str) -> None:
@@ -41,12 +49,7 @@ def draw(path: Path, parts: Sequence[Part], kind: str) -> None:
 
     """
     unit = time_unit(parts)
-    count = max(len(x.evaluation.results) for x in parts)
-    ranked = sorted(range(count), key=lambda i: -max(
-        (x.evaluation.results[i].residual for x in parts
-         if i < len(x.evaluation.results)
-         and math.isfinite(x.evaluation.results[i].residual)), default=0.0))
-    shown = sorted(ranked[:_PANELS])
+    shown = worst(parts, _PANELS)
     rows = [['command'] * 3 + ['phase'] * 3, ['response'] * 3 + ['phase'] * 3]
     if shown:
         # Panels of two columns each; where there are fewer, they are wider.
@@ -94,14 +97,9 @@ def _draw_run(axes: dict[str, Axes], part: Part, unit: TimeUnit, colour: str) ->
     run, found = part.run, part.evaluation
     time = unit.of(found.time)
     if found.levels:
-        times = unit.of([found.seconds(x.stamp) for x in found.levels])
-        values = [x.flux_density * 1e3 for x in found.levels]
-        times = np.append(times, max(float(times[-1]), float(time[-1])))
-        values.append(values[-1])
-        if time[0] < times[0] and math.isfinite(run.flux_density[0]):
-            times = np.append(time[0], times)
-            values.insert(0, float(run.flux_density[0]) * 1e3)
-        axes['command'].step(times, values, where='post', **_styled(style.SHAPED, colour))
+        times, values = commanded(part)
+        axes['command'].step(
+            unit.of(times), values, where='post', **_styled(style.SHAPED, colour))
     for i, x in enumerate(found.results):
         axes['response'].plot(
             unit.of([x.begin, x.end]), [x.stretch, x.stretch], **style.TARGET,
@@ -128,7 +126,7 @@ def _draw_arrival(
     x = found.results[number]
     step = abs(x.stretch - (found.results[number - 1].stretch if number else found.start))
     duration = x.arrival - x.begin
-    view = (-_BEFORE * duration, min(x.end - x.arrival, _AFTER * duration))
+    view = (-BEFORE * duration, min(x.end - x.arrival, AFTER * duration))
     inside = (found.time >= x.arrival + view[0]) & (found.time <= x.arrival + view[1])
     time = (found.time[inside] - x.arrival) * 1e3
     curves = [(part.run.stretch, style.SHAPED)]
@@ -144,15 +142,12 @@ def _draw_arrival(
 
 def _height(parts: Sequence[Part], number: int) -> float:
     """Return how far an arrival's panel reaches from 0, in percent."""
-    errors = [
-        x.evaluation.results[number].error for x in parts if number < len(x.evaluation.results)]
-    return min(150.0, max(
-        [_LEAST_PERCENT, *(110.0 * x for x in errors if math.isfinite(x))]))
+    return min(150.0, max([LEAST_PERCENT, *(
+        110.0 * x.error for x in results_of(parts, number) if math.isfinite(x.error))]))
 
 
 def _title(parts: Sequence[Part], number: int) -> str:
-    results = [
-        x.evaluation.results[number] for x in parts if number < len(x.evaluation.results)]
+    results = results_of(parts, number)
     targets = '/'.join(dict.fromkeys(f'{x.stretch:.5g}' for x in results))
     if len(parts) > 1:
         return f'to {targets}'
