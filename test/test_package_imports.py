@@ -69,7 +69,7 @@ sys.exit(main())
     assert 'hmsa' in result.stdout
 
 
-@pytest.mark.parametrize('command', ['demo', 'plan', 'send', 'planner', 'plant', 'recorder',
+@pytest.mark.parametrize('command', ['demo', 'plan', 'send', 'run', 'planner', 'plant', 'recorder',
                                      'player', 'bag', 'figures', 'report', 'robustness', 'sweep',
                                      'identify', 'excite'])
 def test_every_command_of_the_interface_answers_help(command):

@@ -19,7 +19,7 @@ from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, complain, HmsaError
 
 COMMANDS = (
-    'demo', 'init', 'excite', 'identify', 'plan', 'node', 'send', 'watch', 'bag', 'report',
+    'demo', 'init', 'excite', 'identify', 'plan', 'node', 'send', 'run', 'watch', 'bag', 'report',
     'export', 'sweep', 'robustness', 'figures', 'completion')
 
 

@@ -63,7 +63,8 @@ def run(arguments: argparse.Namespace) -> int:
     folder = arguments.out or Path('hmsa_demo') / datetime.now().strftime('%Y-%m-%d_%H-%M-%S')
     # Set before anything of ROS is imported: this process joins the nodes' domain.
     os.environ.update(local_environment())
-    from hmsa_ros.session.demo import prepare, run_demo
+    from hmsa_ros.session.demo import run_demo
+    from hmsa_ros.session.experiment import prepare
 
     prepare(folder)
     ENDING.note()

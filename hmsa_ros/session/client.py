@@ -8,6 +8,7 @@ from uuid import uuid4
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.experimental.events_executor import EventsExecutor
+from std_srvs.srv import Trigger
 
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.ending import ENDING
@@ -19,6 +20,9 @@ from hmsa_ros.nodes.visitor import leave, visit
 _SLICE_SECONDS = 0.05
 # The first start after an installation compiles the kernels.
 _COMPILE_SECONDS = 300.0
+# To come to rest, perhaps in slow motion; and until a planner that does not answer is gone.
+_STOP_SECONDS = 15.0
+_GONE_SECONDS = 3.0
 
 
 @dataclass(frozen=True)
@@ -103,6 +107,7 @@ class PlannerClient:
         self._executor = EventsExecutor(context=self.node.context)
         self._executor.add_node(self.node)
         self._verdict: Verdict = _SILENCE
+        self._requested = ''
         topic = interface.STATUS
         self.node.create_subscription(
             topic.type, interface.from_outside(topic.name, interface.PLANNER),
@@ -258,7 +263,7 @@ class PlannerClient:
             points.append((stretch, round(end * NANOSECONDS)))
         deadline = monotonic() + self._timeout
         while True:
-            request = uuid4().hex
+            request = self._requested = uuid4().hex
             self._publisher.publish(to_trajectory(points, self._joints, frame=request))
             self.spin_until(
                 lambda request=request: self._verdict.request == request,  # type: ignore[misc]
@@ -309,3 +314,31 @@ class PlannerClient:
             None if each is None else lambda: each(self._verdict),
             timeout)
         return self._verdict
+
+    def stop(self) -> bool:
+        """
+        Have the planner drop what is ahead and come to rest; signals do not cut this short.
+
+        Returns
+        -------
+        bool
+            Whether it says that it rests.
+
+        """
+        stop = self.node.create_client(
+            interface.STOP.type, interface.from_outside(interface.STOP.name, interface.PLANNER))
+        begin = monotonic()
+        future = None
+        while monotonic() - begin < _STOP_SECONDS:
+            self._executor.spin_once(timeout_sec=_SLICE_SECONDS)
+            if future is None:
+                # What was sent last may be on its way: the stop must come after it.
+                patient = monotonic() - begin < _GONE_SECONDS
+                if stop.service_is_ready() and (
+                        self._verdict.request == self._requested or not patient):
+                    future = stop.call_async(Trigger.Request())
+                elif not patient:
+                    return False
+            elif future.done() and self._verdict.state in ('at_rest', 'settling', 'idle'):
+                return bool(future.result().success)
+        return False

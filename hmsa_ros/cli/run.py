@@ -1,0 +1,226 @@
+"""``hmsa run``: a whole experiment with one command."""
+
+import argparse
+from datetime import datetime
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+from hmsa_ros.cli.progress import progress
+from hmsa_ros.cli.setpoints import setpoint_of_joints
+from hmsa_ros.ending import ENDING
+from hmsa_ros.errors import BadInputError
+
+if TYPE_CHECKING:
+    from hmsa_ros.report.outcome import Arrival
+    from hmsa_ros.session.experiment import Conducted, Experiment
+
+NOT_MEASURED = 'predicted, not measured'
+
+
+def add_parser(subparsers: Any) -> None:
+    """
+    Add the command.
+
+    Parameters
+    ----------
+    subparsers : argparse action
+        Where to add it.
+
+    """
+    parser = subparsers.add_parser(
+        'run', help='carry out a whole experiment: check, record, send, measure',
+        description='Carry out an experiment with the planner and the plant or driver that run, '
+                    'or with simulated ones: check that all are there and agree, start a '
+                    'recorder and wait until it listens, send the sequence, close the bag, and '
+                    'measure whether each setpoint was reached. Ctrl-C brings the actuator to '
+                    'rest and closes the bag.',
+        epilog='example: hmsa run 1.10:0.2 1.20:0.2 1.00:0.2 --simulate')
+    parser.add_argument(
+        'setpoints', nargs='+', type=setpoint_of_joints, metavar='STRETCH:SECONDS',
+        help='stretch to come to rest at, and how long this setpoint lasts in s (move plus '
+             'hold); with several joints one stretch for all, or one a joint')
+    parser.add_argument(
+        '--simulate', action='store_true',
+        help='start a planner and a simulated plant for this run, which lead simulated time')
+    parser.add_argument(
+        '--params-file', type=Path, metavar='YAML', dest='params_file',
+        help='parameter file: of the nodes to start, or to hold those that run against')
+    parser.add_argument(
+        '--feedback', default='off', metavar='MODE', help='off (default): open loop')
+    parser.add_argument(
+        '--tolerance', type=float, metavar='X',
+        help='offset and residual vibration of a setpoint that counts as reached, as a share of '
+             'the step, noise of the sensor apart (default 0.02)')
+    parser.add_argument('--report', action='store_true', help='write report.html as well')
+    parser.add_argument(
+        '--out', type=Path, metavar='DIR',
+        help='folder for the output (default hmsa_run/ and the time of day)')
+    parser.add_argument('--json', action='store_true', help='print the result as JSON')
+    parser.add_argument(
+        '--namespace', default='', metavar='NS', help='namespace of the planner')
+    parser.add_argument(
+        '--joint', default='actuator', metavar='NAMES',
+        help='joint, or joints with commas between (default actuator)')
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """
+    Carry out the experiment.
+
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+        As parsed.
+
+    Returns
+    -------
+    int
+        0 only if all that was measured arrived and every process ended cleanly.
+
+    Raises
+    ------
+    HmsaError
+        If a check or a process fails.
+
+    """
+    from rich.console import Console
+
+    tolerance = _tolerance(arguments)
+    folder = arguments.out or Path('hmsa_run') / datetime.now().strftime('%Y-%m-%d_%H-%M-%S')
+    if arguments.simulate:
+        from hmsa_ros.session.processes import local_environment
+        # Set before anything of ROS is imported: this process joins the nodes' domain.
+        os.environ.update(local_environment())
+    experiment = _experiment(arguments, folder)
+    from hmsa_ros.session.experiment import conduct, prepare
+
+    prepare(folder)
+    ENDING.note()
+    console = Console(stderr=True)
+    try:
+        with progress() as update:
+            done = conduct(experiment, dict(os.environ), update)
+            ENDING.check()
+            update('evaluating the bag', None)
+            measured = _measure(experiment, tolerance) if done.measured else []
+            report = _report(experiment.bag, folder / 'report.html') if (
+                arguments.report and done.measured) else None
+    except KeyboardInterrupt:
+        console.print(
+            f'interrupted; the bag so far: {experiment.bag}' if experiment.bag.exists()
+            else 'interrupted', highlight=False, soft_wrap=True)
+        return ENDING.status
+    verdict, reason = _verdict(measured, done)
+    if arguments.json:
+        print(json.dumps({
+            'verdict': verdict, 'reason': reason, 'setpoints': [_record(x) for x in measured],
+            'notes': list(done.notes), 'exits': done.exits, 'bag': str(experiment.bag),
+            'report': None if report is None else str(report)}, indent=2, allow_nan=False))
+    else:
+        _print(measured, reason, done, experiment.bag, report)
+    return 0 if verdict in ('arrived', NOT_MEASURED) else 1
+
+
+def _tolerance(arguments: argparse.Namespace) -> float:
+    """Return the tolerance; refuse what cannot be used."""
+    from hmsa_ros.report.outcome import TOLERANCE
+
+    if arguments.feedback != 'off':
+        raise BadInputError(
+            f'feedback {arguments.feedback!r} is not available: expected off, which carries out '
+            'the plan in open loop')
+    tolerance = TOLERANCE if arguments.tolerance is None else arguments.tolerance
+    if not 0.0 < tolerance < math.inf:
+        raise BadInputError(f'tolerance is {tolerance:g}: expected a share above 0')
+    return float(tolerance)
+
+
+def _experiment(arguments: argparse.Namespace, folder: Path) -> 'Experiment':
+    from hmsa_ros.runs.parameters import read_parameter_file
+    from hmsa_ros.session.experiment import Experiment
+    from hmsa_ros.session.simulated import simulated_nodes
+
+    expected = {} if arguments.params_file is None else read_parameter_file(
+        arguments.params_file)
+    nodes = simulated_nodes(
+        expected, str(arguments.params_file or ''), arguments.namespace
+    ) if arguments.simulate else ()
+    return Experiment(
+        folder, tuple(arguments.setpoints), nodes, arguments.namespace,
+        tuple(arguments.joint.split(',')), expected)
+
+
+def _measure(experiment: 'Experiment', tolerance: float) -> 'list[Arrival]':
+    """Read the bag and measure each joint."""
+    from hmsa_ros.report.outcome import arrivals
+    from hmsa_ros.runs.bags import read_runs
+
+    several = len(experiment.joints) > 1
+    found = []
+    for each in read_runs(experiment.bag, joints=experiment.joints if several else ()):
+        place = experiment.joints.index(each.joint) if several else 0
+        targets = [x[place] if len(x) > 1 else x[0] for x, _ in experiment.setpoints]
+        found += arrivals(each, targets, tolerance)
+    return found
+
+
+def _report(bag: Path, path: Path) -> Path:
+    from hmsa_ros.files import write_text
+    from hmsa_ros.report.charts import Part
+    from hmsa_ros.report.evaluation import evaluate
+    from hmsa_ros.report.page import page
+    from hmsa_ros.report.timing import timing
+    from hmsa_ros.runs.bags import read_runs
+
+    write_text(path, page([Part(x, evaluate(x), timing(x), '') for x in read_runs(bag)]))
+    return path
+
+
+def _verdict(measured: 'list[Arrival]', done: 'Conducted') -> tuple[str, str]:
+    """Return the verdict on all setpoints, and a sentence with the figures."""
+    if not done.measured:
+        return NOT_MEASURED, f'{NOT_MEASURED}: nobody publishes joint_states'
+    missed = [x for x in measured if x.verdict != 'arrived']
+    if not missed:
+        return 'arrived', f'all {len(measured)} moves arrived and stayed within tolerance'
+    rest = f'; {len(missed) - 1} more of {len(measured)} failed' if len(missed) > 1 else ''
+    return missed[0].verdict, f'{missed[0].sentence()}{rest}'
+
+
+def _record(arrival: 'Arrival') -> dict[str, Any]:
+    """Return a setpoint as JSON."""
+    from dataclasses import asdict
+
+    return {key: None if isinstance(x, float) and not math.isfinite(x) else x
+            for key, x in asdict(arrival).items()}
+
+
+def _print(
+        measured: 'list[Arrival]', reason: str, done: 'Conducted', bag: Path,
+        report: Path | None) -> None:
+    from rich.box import SIMPLE
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    if measured:
+        table = Table(box=SIMPLE, collapse_padding=True, pad_edge=False, caption=(
+            'measured after arrival: mean stretch, its distance from the target, and vibration '
+            'from peak to peak'))
+        for name in ('target', 'reached', 'offset', 'residual', 'arrival ms'):
+            table.add_column(name, justify='right', no_wrap=True)
+        table.add_column('verdict', no_wrap=True)
+        for x in measured:
+            table.add_row(
+                f'{x.joint} {x.stretch:g}' if len({y.joint for y in measured}) > 1
+                else f'{x.stretch:g}', f'{x.reached:.5f}', f'{x.offset:+.1e}',
+                f'{x.residual:.1e}', f'{x.arrival * 1e3:.3f}', x.verdict.replace('_', ' '))
+        console.print(table)
+    for line in (
+            *(f'note     {x}' for x in done.notes), f'verdict  {reason}', f'bag      {bag}',
+            *([] if report is None else [f'report   {report}'])):
+        console.print(line, highlight=False, soft_wrap=True)

@@ -1,0 +1,65 @@
+"""Planner and simulated plant for one run, in slow motion where real time would be too fast."""
+
+from collections.abc import Mapping
+import math
+
+from hmsa_ros.contract.parameters import ACTUATOR
+from hmsa_ros.contract.topics import PLANNER, PLANT
+from hmsa_ros.core.model import natural_frequency
+from hmsa_ros.core.parameters import ActuatorParameters
+from hmsa_ros.runs.parameters import values_of
+from hmsa_ros.session.processes import NodeProcess
+
+# Samples a period of the actuator, and samples that planner, plant and recorder pass on together
+# in a second of ours.
+_SAMPLES_A_PERIOD = 50.0
+_SAMPLES_A_SECOND = 1000.0
+# How far ahead in our time commands are sent: a busy machine may take that long.
+_LEAD_SECONDS = 0.5
+
+
+def simulated_nodes(
+        settings: Mapping[str, object], params_file: str,
+        namespace: str) -> tuple[NodeProcess, NodeProcess]:
+    """
+    Return a paused plant that leads simulated time, and a planner that follows it.
+
+    Parameters
+    ----------
+    settings : mapping of str to object
+        What the parameter file sets, by ``'node.name'``: it goes before what is chosen here.
+    params_file : str
+        For the nodes; empty for none.
+    namespace : str
+        Of both.
+
+    Returns
+    -------
+    tuple of NodeProcess
+        Plant and planner.
+
+    Raises
+    ------
+    BadInputError
+        If the file describes no block.
+
+    """
+    values = values_of(settings, PLANT, ACTUATOR)
+    block = ActuatorParameters(**{
+        name.partition('.')[2]: value for name, value in values.items()})
+    period = 2.0 * math.pi / float(natural_frequency(1.0, block.nondimensional)) * block.time_unit
+    rate = _number(settings, f'{PLANT}.publish_rate', max(1000.0, _SAMPLES_A_PERIOD / period))
+    factor = _number(
+        settings, f'{PLANT}.real_time_factor', min(1.0, _SAMPLES_A_SECOND / rate))
+    lead = _number(settings, f'{PLANNER}.lead_time', _LEAD_SECONDS * (factor or 1.0))
+    return (
+        NodeProcess(PLANT, {
+            'publish_clock': True, 'use_sim_time': False, 'start_paused': True,
+            'publish_rate': rate, 'real_time_factor': factor}, namespace, params_file),
+        NodeProcess(PLANNER, {'use_sim_time': True, 'lead_time': lead}, namespace, params_file))
+
+
+def _number(settings: Mapping[str, object], name: str, default: float) -> float:
+    """Return what the file sets, as the node reads a number."""
+    value = settings.get(name)
+    return float(value) if isinstance(value, (int, float)) else default

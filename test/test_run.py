@@ -1,0 +1,114 @@
+"""A whole experiment with one command: what it measures, what it refuses, and how it ends."""
+
+import json
+import signal
+
+from mcap.reader import make_reader
+import pytest
+
+from hmsa_ros.runs.bags import read_runs
+
+RUN_SECONDS = 120.0
+SETPOINTS = ('1.10:0.1', '1.20:0.1', '1.00:0.1')
+MISMATCHED = """\
+/**:
+  ros__parameters:
+    actuator.shear_modulus: 10000.0
+/**/plant:
+  ros__parameters:
+    mismatch.shear_modulus: 1.1
+"""
+
+pytestmark = pytest.mark.ros
+
+
+def test_a_simulated_experiment_arrives_and_leaves_its_bag_and_a_report(start, tmp_path):
+    out = tmp_path / 'out'
+    run = start.hmsa('run', *SETPOINTS, '--simulate', '--report', '--out', str(out), '--json')
+    assert run.wait(RUN_SECONDS) == 0, run.output
+    result = json.loads(run.stdout)
+    assert result['verdict'] == 'arrived'
+    assert [x['stretch'] for x in result['setpoints']] == [1.1, 1.2, 1.0]
+    for x in result['setpoints']:
+        assert abs(x['offset']) < 1e-6 and x['residual'] < 1e-6
+        assert x['reached'] == pytest.approx(x['stretch'], abs=1e-6)
+    assert result['exits'] == {'plant': 0, 'planner': 0, 'recorder': 0}
+    assert '<html' in (out / 'report.html').read_text()
+    # The bag itself is held against rosbags behind each test.
+    found, = read_runs(out / 'run')
+    assert len(found.commands) == 2 * len(SETPOINTS)
+
+
+def test_a_plant_that_is_not_as_the_planner_thinks_fails_with_the_figures(start, tmp_path):
+    file = tmp_path / 'mismatched.yaml'
+    file.write_text(MISMATCHED)
+    run = start.hmsa('run', '1.10:0.1', '--simulate', '--params-file', str(file),
+                     '--out', str(tmp_path / 'out'))
+    assert run.wait(RUN_SECONDS) == 1, run.output
+    # A block that is a tenth stiffer stays a tenth of the way short.
+    assert 'setpoint 1.1 of actuator is off target by -0.009' in run.stdout
+    again = start.hmsa('run', '1.10:0.1', '--simulate', '--out', str(tmp_path / 'out'))
+    assert again.wait(RUN_SECONDS) == 2
+    assert 'earlier run' in again.stderr
+
+
+def test_an_interrupted_experiment_brings_the_running_actuator_to_rest(start, ros, tmp_path):
+    from hmsa_ros.nodes import interface
+
+    statuses = ros.collect(interface.STATUS.type, 'planner/status', interface.STATUS.qos)
+    nodes = [start.hmsa('plant'), start.hmsa('planner')]
+
+    def now(key: str) -> str:
+        return {x.key: x.value for x in statuses[-1].values}.get(key, '') if statuses else ''
+
+    run = start.hmsa('run', '1.2:30', '1.0:30', '--out', str(tmp_path / 'out'))
+    ros.spin_until(lambda: now('state') == 'holding' or not run.alive(), 'the first setpoint')
+    assert run.stop(signal.SIGINT) == 130, run.output
+    assert 'Traceback' not in run.output
+    ros.spin_until(lambda: now('setpoints') != '2', 'the stop')
+    assert now('state') in ('at_rest', 'settling')
+    assert all(x.alive() for x in nodes)
+    with next((tmp_path / 'out' / 'run').glob('*.mcap')).open('rb') as file:
+        assert make_reader(file).get_summary() is not None
+    # What came of the stop is in the bag too.
+    found, = read_runs(tmp_path / 'out' / 'run')
+    assert abs(found.rate[-1]) < 1e-6
+    assert len(found.plans) >= 2
+
+
+@pytest.mark.parametrize('moment', ['plant.log', 'recorder.log', 'run/*.mcap'])
+def test_an_experiment_can_be_interrupted_at_any_moment(start, tmp_path, wait_until, moment):
+    out = tmp_path / 'out'
+    run = start.hmsa('run', '1.1:1', '1.2:1', '--simulate', '--out', str(out))
+    wait_until(lambda: list(out.glob(moment)), moment, RUN_SECONDS)
+    assert run.stop(signal.SIGINT, RUN_SECONDS) == 130, run.output
+    assert 'Traceback' not in run.output
+    for file in out.glob('run/*.mcap'):
+        with file.open('rb') as opened:
+            assert make_reader(opened).get_summary() is not None
+
+
+def test_commands_that_nobody_takes_fail_before_anything_is_sent(start, tmp_path):
+    start.hmsa('planner')
+    run = start.hmsa('run', '1.1:0.1', '--out', str(tmp_path / 'out'))
+    assert run.wait(RUN_SECONDS) == 1
+    assert 'nobody takes the commands' in run.stderr
+    assert not (tmp_path / 'out' / 'run').exists()
+
+
+def test_nodes_with_other_parameters_than_the_file_are_refused(start, tmp_path):
+    file = tmp_path / 'other.yaml'
+    file.write_text('/**:\n  ros__parameters:\n    actuator.shear_modulus: 66000.0\n')
+    start.hmsa('planner')
+    start.hmsa('plant')
+    run = start.hmsa(
+        'run', '1.1:0.1', '--out', str(tmp_path / 'out'), '--params-file', str(file))
+    assert run.wait(RUN_SECONDS) == 2
+    assert 'planner.actuator.shear_modulus is 10000.0 and not 66000.0' in run.stderr
+    assert len(run.stderr.strip().splitlines()) == 1
+
+
+def test_feedback_other_than_off_is_refused(start, tmp_path):
+    run = start.hmsa('run', '1.1:0.1', '--feedback', 'adapt', '--out', str(tmp_path / 'out'))
+    assert run.wait(RUN_SECONDS) == 2
+    assert "feedback 'adapt' is not available: expected off" in run.stderr
