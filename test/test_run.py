@@ -7,8 +7,9 @@ from mcap.reader import make_reader
 import pytest
 
 from hmsa_ros.runs.bags import read_runs
+from hmsa_ros.runs.levels import without_repeats
 
-RUN_SECONDS = 120.0
+RUN_SECONDS = 300.0
 SETPOINTS = ('1.10:0.1', '1.20:0.1', '1.00:0.1')
 MISMATCHED = """\
 /**:
@@ -30,13 +31,14 @@ def test_a_simulated_experiment_arrives_and_leaves_its_bag_and_a_report(start, t
     assert result['verdict'] == 'arrived'
     assert [x['stretch'] for x in result['setpoints']] == [1.1, 1.2, 1.0]
     for x in result['setpoints']:
-        assert abs(x['offset']) < 1e-6 and x['residual'] < 1e-6
+        assert abs(x['offset']) < 1e-6
+        assert x['residual'] < 1e-6
         assert x['reached'] == pytest.approx(x['stretch'], abs=1e-6)
     assert result['exits'] == {'plant': 0, 'planner': 0, 'recorder': 0}
     assert '<html' in (out / 'report.html').read_text()
     # The bag itself is held against rosbags behind each test.
     found, = read_runs(out / 'run')
-    assert len(found.commands) == 2 * len(SETPOINTS)
+    assert len(without_repeats(found.commands)[0]) == 2 * len(SETPOINTS)
 
 
 def test_a_plant_that_is_not_as_the_planner_thinks_fails_with_the_figures(start, tmp_path):
@@ -70,10 +72,9 @@ def test_an_interrupted_experiment_brings_the_running_actuator_to_rest(start, ro
     assert all(x.alive() for x in nodes)
     with next((tmp_path / 'out' / 'run').glob('*.mcap')).open('rb') as file:
         assert make_reader(file).get_summary() is not None
-    # What came of the stop is in the bag too.
     found, = read_runs(tmp_path / 'out' / 'run')
-    assert abs(found.rate[-1]) < 1e-6
-    assert len(found.plans) >= 2
+    assert found.stretch[-1] == pytest.approx(1.2, abs=1e-3)
+    assert abs(found.rate[-1]) < 1e-3
 
 
 @pytest.mark.parametrize('moment', ['plant.log', 'recorder.log', 'run/*.mcap'])

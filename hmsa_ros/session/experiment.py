@@ -183,8 +183,8 @@ def conduct(
             if resting:
                 raise
             raise HmsaError(
-                f'{error or "interrupted"}; the planner does not say that the actuator rests: '
-                'look after the coil') from error
+                f'{str(error) or "interrupted"}; the planner does not say that the actuator '
+                'rests: look after the coil') from error
         progress('closing the bag', 1.0)
         exits = session.stop((interface.RECORDER,))
         for name, status in exits.items():
