@@ -91,11 +91,7 @@ def time_unit(parts: Sequence[Part]) -> TimeUnit:
 
 
 def decimate(x: Array, y: Array, buckets: int = BUCKETS) -> tuple[Array, Array]:
-    """
-    Thin out a curve, keeping the ends and the extremes of intervals of equally many points.
-
-    Points that are not finite are left out; a curve of few points is otherwise unchanged.
-    """
+    """Thin out a curve, keeping its ends and the extremes of intervals of many points."""
     finite = np.isfinite(y)
     if not finite.all():
         x, y = x[finite], y[finite]
@@ -266,11 +262,8 @@ def _size(usual: int, results: Sequence[MoveResult]) -> int:
 
 
 def phase(parts: Sequence[Part]) -> tuple[Figure, float]:
-    """
-    Return the phase plane with the equilibria, and the smallest share of a run in it.
-
-    What moves on and on fills the plane, so that a part of it is enough.
-    """
+    """Return the phase plane with the equilibria, and the smallest share of a run in it."""
+    # What moves on and on fills the plane, so that a part of it is enough.
     data, shown = [], 1.0
     for part in parts:
         run, found = part.run, part.evaluation
