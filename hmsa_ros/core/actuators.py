@@ -100,6 +100,44 @@ class Setup:
             law.elastic_force(stretch, self.actuator.nondimensional.packed)
             * self.actuator.flux_density_unit)
 
+    @property
+    def load_per_newton(self) -> float:
+        """Load of a force of 1 N: work over both faces against G times the volume."""
+        block = self.actuator
+        return 1.0 / (4.0 * block.half_length ** 2 * block.shear_modulus)
+
+    def check_level(self, flux_density: float) -> None:
+        """
+        Refuse a level in T that nobody could follow.
+
+        Raises
+        ------
+        BadInputError
+            If the value is not finite or too large.
+
+        """
+        unit = self.actuator.flux_density_unit
+        if not abs(flux_density / unit) < _LARGEST_LOAD:
+            raise BadInputError(
+                f'flux density is {flux_density:g} T: expected a finite value below '
+                f'{_LARGEST_LOAD * unit:g} T')
+
+    def check_force(self, force: float) -> None:
+        """
+        Refuse a disturbing force in N that nobody could follow.
+
+        Raises
+        ------
+        BadInputError
+            If the value is not finite or too large.
+
+        """
+        unit = self.load_per_newton
+        if not abs(force * unit) < _LARGEST_LOAD:
+            raise BadInputError(
+                f'disturbing force is {force:g} N: expected a finite value below '
+                f'{_LARGEST_LOAD / unit:g} N')
+
 
 class Actuators:
     """
@@ -134,9 +172,7 @@ class Actuators:
         count = len(blocks)
         self._time_units = np.array([x.time_unit for x in blocks])
         self._units = np.array([x.flux_density_unit for x in blocks])
-        # From a force to a load: F/(4 L^2 G), work over both faces against G times the volume.
-        self._per_newton = [
-            1.0 / (4.0 * x.half_length ** 2 * x.shear_modulus) for x in blocks]
+        self._per_newton = [x.load_per_newton for x in self.setups]
         self._lags = np.array([
             x.coil_time_constant / x.actuator.time_unit for x in self.setups])
         self._slews = [0.0] * count
@@ -183,24 +219,7 @@ class Actuators:
         return field
 
     def reset(self, i: int, stretch: float | None = None, rate: float = 0.0) -> None:
-        """
-        Put one back to its initial or another state; nothing is ahead; time goes on.
-
-        Parameters
-        ----------
-        i : int
-            Which.
-        stretch : float, optional
-            Default the initial one. It is held by its flux density.
-        rate : float
-            In 1/s.
-
-        Raises
-        ------
-        BadInputError
-            If the stretch is outside the limits.
-
-        """
+        """Have one go on at its initial or another stretch, held by its flux density."""
         setup = self.setups[i]
         stretch = setup.stretch if stretch is None else stretch
         self.set_state(i, stretch, rate, setup.holding(stretch))
@@ -213,14 +232,10 @@ class Actuators:
 
         Parameters
         ----------
-        i : int
-            Which.
-        stretch, rate : float
-            State; the rate in 1/s.
-        flux_density : float
-            In force, in T.
+        i, stretch, rate, flux_density : int, float, float, float
+            Which; its state, with the rate in 1/s; the field in force in T.
         level : float, optional
-            That the amplifier is on its way to; default the flux density.
+            In T, that the amplifier is on its way to; default the flux density.
 
         Raises
         ------
@@ -260,13 +275,9 @@ class Actuators:
 
         Parameters
         ----------
-        i : int
-            For which.
-        stamp : int
-            Time in ns from which the value applies; it supersedes all commands stamped at or
-            after it.
-        flux_density : float
-            Signed flux density in T.
+        i, stamp, flux_density : int, int, float
+            For which; time in ns from which the signed value in T applies, superseding all
+            commands stamped at or after it.
 
         Returns
         -------
@@ -280,33 +291,10 @@ class Actuators:
             If the value is not finite or nobody could follow it.
 
         """
-        self.check_level(i, flux_density)
+        self.setups[i].check_level(flux_density)
         changed = self.schedules[i].insert(max(stamp, self.time), flux_density)
         self._plan(i)
         return max(self.time - stamp, 0) if changed else 0
-
-    def check_level(self, i: int, flux_density: float) -> None:
-        """
-        Refuse a level that nobody could follow.
-
-        Parameters
-        ----------
-        i : int
-            For which.
-        flux_density : float
-            In T.
-
-        Raises
-        ------
-        BadInputError
-            If the value is not finite or too large.
-
-        """
-        unit = self._units[i]
-        if not abs(flux_density / unit) < _LARGEST_LOAD:
-            raise BadInputError(
-                f'flux density is {flux_density:g} T: expected a finite value below '
-                f'{_LARGEST_LOAD * unit:g} T')
 
     def force(self, i: int, stamp: int, force: float) -> None:
         """
@@ -314,12 +302,9 @@ class Actuators:
 
         Parameters
         ----------
-        i : int
-            On which.
-        stamp : int
-            Time in ns; a force supersedes those stamped at or after it.
-        force : float
-            Along the field in N, pulling where positive.
+        i, stamp, force : int, int, float
+            On which; time in ns, superseding those stamped at or after it; in N along the
+            field, pulling where positive.
 
         Raises
         ------
@@ -327,35 +312,26 @@ class Actuators:
             If the value is not finite or nobody could follow it.
 
         """
-        if not abs(force * self._per_newton[i]) < _LARGEST_LOAD:
-            raise BadInputError(
-                f'disturbing force is {force:g} N: expected a finite value below '
-                f'{_LARGEST_LOAD / self._per_newton[i]:g} N')
+        self.setups[i].check_force(force)
         self.forces[i].insert(max(stamp, self.time), force)
         self._plan(i)
 
     def limit_slew(self, i: int, slew: float) -> None:
-        """
-        Have one's amplifier ramp no faster than a rate from now on.
-
-        Parameters
-        ----------
-        i : int
-            Whose.
-        slew : float
-            In T/s, greater than 0; its own limit holds beside it.
-
-        """
+        """Have one's amplifier ramp no faster than a rate in T/s, nor than its own limit."""
         setup = self.setups[i]
         self._slews[i] = min(slew, setup.slew_limit) \
             / setup.actuator.flux_density_unit * setup.actuator.time_unit
 
     def _plan(self, i: int) -> None:
         """Note when the next thing happens to one, at once while its amplifier ramps."""
-        ahead = [x for x in (self.schedules[i].next_stamp, self.forces[i].next_stamp)
-                 if x is not None]
         ramping = self._levels[i] != self.schedules[i].current
-        self._events[i] = -1 if ramping else min(ahead, default=_NEVER)
+        self._events[i] = -1 if ramping else self._next(i)
+
+    def _next(self, i: int) -> int:
+        """Return when the next command or force of one takes effect, in ns."""
+        return min((
+            x for x in (self.schedules[i].next_stamp, self.forces[i].next_stamp)
+            if x is not None), default=_NEVER)
 
     def _set_drive(self, i: int, slope: float, level: float | None = None) -> None:
         """Bring the load into line with amplifier, coil and force; the field does not jump."""
@@ -376,12 +352,9 @@ class Actuators:
 
     def advance(self, time: int) -> list[tuple[int, int]]:
         """
-        Integrate to a time, each change applied exactly at its stamp.
+        Integrate to a time in ns, each change applied exactly at its stamp.
 
-        Parameters
-        ----------
-        time : int
-            Time in ns; one that is not ahead changes nothing but applies what is due.
+        A time that is not ahead changes nothing but applies what is due.
 
         Returns
         -------
@@ -412,8 +385,7 @@ class Actuators:
         end = max(end, now)
         schedule, forces = self.schedules[i], self.forces[i]
         while True:
-            ahead = [x for x in (schedule.next_stamp, forces.next_stamp) if x is not None]
-            until = min([*ahead, end])
+            until = min(self._next(i), end)
             if until > now:
                 if not self._integrate(i, until - now):
                     self._plan(i)

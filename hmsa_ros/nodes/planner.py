@@ -21,6 +21,7 @@ from hmsa_ros.nodes.joints import declare_joints
 from hmsa_ros.nodes.managed import AUTOSTART, ManagedNode
 from hmsa_ros.nodes.marker_publisher import TargetMarkers
 from hmsa_ros.nodes.newest_clock import NewestClock
+from hmsa_ros.nodes.parameters import check_names
 from hmsa_ros.nodes.planning import group_from, models_from, OWN, settings_from, SPECS
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.nodes.timekeeping import StepWatch
@@ -61,6 +62,7 @@ class PlannerNode(ManagedNode):
         self._channels: dict[str, JointChannel] = {}
         self._samples: Subscription | None = None
         self._several_clocks = False
+        check_names(self)
         seconds = warm_up(self.get_logger().info)
         if seconds > 1.0:
             self.get_logger().info(f'loaded the numerical kernels in {seconds:.1f} s')
