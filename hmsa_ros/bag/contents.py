@@ -2,47 +2,12 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 
-from hmsa_ros.bag import metadata, qos
-from hmsa_ros.bag.output import OutputFile
-from hmsa_ros.errors import BadInputError, BagError
+from hmsa_ros.bag import metadata
+from hmsa_ros.bag.output import OutputFile, Topic
+from hmsa_ros.errors import BagError
 
 MAX_CHANNELS = 2**16 - 1
-
-
-@dataclass(frozen=True)
-class Topic:
-    """
-    A topic to be written.
-
-    Attributes
-    ----------
-    name, type : str
-        For example ``'/joint_states'`` and ``'sensor_msgs/msg/JointState'``.
-    definition : str
-        Message definition with its dependencies; empty if not known.
-    definition_encoding : str
-        ``'ros2msg'`` or ``'ros2idl'``; empty if not known.
-    profiles : tuple of hmsa_ros.bag.qos.Qos
-        What the publishers offer.
-    type_hash : str
-        RIHS01 hash, empty if not known.
-
-    """
-
-    name: str
-    type: str
-    definition: str = ''
-    definition_encoding: str = 'ros2msg'
-    profiles: tuple[qos.Qos, ...] = ()
-    type_hash: str = ''
-
-    def __post_init__(self) -> None:
-        if not self.name:
-            raise BadInputError('a topic has an empty name: expected a name such as /stretch')
-        if not self.type:
-            raise BadInputError(f'topic {self.name} has an empty type: expected a message type')
 
 
 class Contents:

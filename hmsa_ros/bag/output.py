@@ -5,7 +5,7 @@ A chunk is in the file whole or not at all, and room for the chunk and for the s
 on the disk before, so that a full disk leaves a file that can still be closed.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 import os
 from pathlib import Path
@@ -13,6 +13,7 @@ from pathlib import Path
 from hmsa_ros import __version__
 from hmsa_ros.bag import metadata, qos
 from hmsa_ros.bag.framing import Entries, Framing, MESSAGE_HEAD, Stream
+from hmsa_ros.errors import BadInputError
 
 LIBRARY = f'hmsa_ros {__version__}'
 #: Name of the metadata record with the experiment.
@@ -42,6 +43,40 @@ PRESETS: Mapping[str, Preset] = {
     'zstd_fast': Preset('zstd'),
     'zstd_small': Preset('zstd'),
 }
+
+
+@dataclass(frozen=True)
+class Topic:
+    """
+    A topic to be written.
+
+    Attributes
+    ----------
+    name, type : str
+        For example ``'/joint_states'`` and ``'sensor_msgs/msg/JointState'``.
+    definition : str
+        Message definition with its dependencies; empty if not known.
+    definition_encoding : str
+        ``'ros2msg'`` or ``'ros2idl'``; empty if not known.
+    profiles : tuple of hmsa_ros.bag.qos.Qos
+        What the publishers offer.
+    type_hash : str
+        RIHS01 hash, empty if not known.
+
+    """
+
+    name: str
+    type: str
+    definition: str = ''
+    definition_encoding: str = 'ros2msg'
+    profiles: tuple[qos.Qos, ...] = ()
+    type_hash: str = ''
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise BadInputError('a topic has an empty name: expected a name such as /stretch')
+        if not self.type:
+            raise BadInputError(f'topic {self.name} has an empty type: expected a message type')
 
 
 class OutputFile:
@@ -112,23 +147,23 @@ class OutputFile:
             os.posix_fallocate(self._stream.descriptor, 0, room)
             self._room = room
 
-    def declare(
-            self, name: str, kind: str, encoding: str, definition: str,
-            profiles: Sequence[qos.Qos], type_hash: str) -> None:
+    def declare(self, topic: Topic) -> None:
         """Announce the next topic; it is stored with the next chunk and in the summary."""
-        data = definition.encode()
+        data = topic.definition.encode()
         values = {
-            'offered_qos_profiles': qos.to_yaml(profiles), 'topic_type_hash': type_hash}
-        size = len(name) * 4 + sum(map(len, values.values())) + 100
-        if kind not in self._schemas:
-            size += len(data) + len(kind) * 4
+            'offered_qos_profiles': qos.to_yaml(topic.profiles),
+            'topic_type_hash': topic.type_hash}
+        size = len(topic.name) * 4 + sum(map(len, values.values())) + 100
+        if topic.type not in self._schemas:
+            size += len(data) + len(topic.type) * 4
         # In a chunk, in the summary, and in the metadata.
         self._end_size += 4 * size
         self.reserve(0)
         self.overhead += size
-        if kind not in self._schemas:
-            self._schemas[kind] = self._framing.add_schema(kind, encoding, data)
-        self._framing.add_channel(name, self._schemas[kind], values)
+        if topic.type not in self._schemas:
+            self._schemas[topic.type] = self._framing.add_schema(
+                topic.type, topic.definition_encoding, data)
+        self._framing.add_channel(topic.name, self._schemas[topic.type], values)
 
     def write(self, entries: Entries, size: int) -> None:
         """Store messages with ``size`` bytes of payload as one chunk."""

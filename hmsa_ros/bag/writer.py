@@ -14,14 +14,13 @@ import operator
 import os
 from pathlib import Path
 import re
-from types import TracebackType
 from typing import NamedTuple
 
 from hmsa_ros import __version__
 from hmsa_ros.bag import metadata, qos
-from hmsa_ros.bag.contents import Contents, Topic
+from hmsa_ros.bag.contents import Contents
 from hmsa_ros.bag.framing import MESSAGE_HEAD
-from hmsa_ros.bag.output import OutputFile, PRESETS, RESERVE_STEP
+from hmsa_ros.bag.output import OutputFile, PRESETS, RESERVE_STEP, Topic
 from hmsa_ros.errors import BadInputError
 
 __all__ = ['BagWriter', 'Entry', 'MIN_FILE_SIZE', 'parse_custom_data', 'PRESETS', 'Topic']
@@ -115,10 +114,8 @@ class BagWriter:
     def __enter__(self) -> 'BagWriter':
         return self
 
-    def __exit__(
-            self, kind: type[BaseException] | None, error: BaseException | None,
-            traceback: TracebackType | None) -> None:
-        if error is None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
             self.close()
         else:
             self.abort()
@@ -172,7 +169,7 @@ class BagWriter:
             return number
         contents.check_room()
         if self._file is not None:
-            self._declare(self._file, topic)
+            self._file.declare(topic)
         contents.topics.append(topic)
         return len(contents.topics) - 1
 
@@ -300,7 +297,7 @@ class BagWriter:
         try:
             file.describe(self._contents.serialized(file), self._notes())
             for topic in self._contents.topics:
-                self._declare(file, topic)
+                file.declare(topic)
             self._write_metadata()
         except OSError:
             self._discard(file)
@@ -314,12 +311,6 @@ class BagWriter:
         self._next_number = file.number
         with contextlib.suppress(OSError):
             file.path.unlink()
-
-    @staticmethod
-    def _declare(file: OutputFile, topic: Topic) -> None:
-        """Announce a topic in a file."""
-        file.declare(topic.name, topic.type, topic.definition_encoding, topic.definition,
-                     topic.profiles, topic.type_hash)
 
     def _notes(self) -> dict[str, str]:
         """Return what a file says of the experiment."""
@@ -354,7 +345,6 @@ class BagWriter:
         """Bring ``metadata.yaml`` up to date."""
         self._contents.ended = self._closed
         metadata.write(self.folder, self._contents.describe(self._file))
-
 
 
 def _make(folder: Path) -> None:

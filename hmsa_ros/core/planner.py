@@ -6,10 +6,7 @@ draft (`hmsa_ros.core.drafting`), which changes nothing, and then taken: several
 take all of a request or none of it (`hmsa_ros.core.group`).
 """
 
-from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
-from dataclasses import replace
-import math
 
 from hmsa_ros.core.drafting import (
     check_points,
@@ -24,14 +21,11 @@ from hmsa_ros.core.drafting import (
     Outset,
     Steps,
 )
-from hmsa_ros.core.history import Deviation, History
-from hmsa_ros.core.model import equilibrium_stretch
-from hmsa_ros.core.moves import State
 from hmsa_ros.core.parameters import ActuatorParameters
+from hmsa_ros.core.running import RunningPlan
 from hmsa_ros.core.simulation import check_stretch
 from hmsa_ros.core.status import RefusedError
 from hmsa_ros.core.timeline import (
-    ALWAYS,
     Draft,
     Model,
     Options,
@@ -39,20 +33,11 @@ from hmsa_ros.core.timeline import (
     PlannedLevel,
     PlannedSegment,
 )
-from hmsa_ros.errors import BadInputError
 
 __all__ = ['Options', 'Plan', 'PlannedLevel', 'PlannedSegment', 'Planner']
 
-# Stretch rates of a sample below this share of the natural frequency are rest, where the model
-# would have it move: the model is off then, and not the actuator in motion.
-_SAMPLED_AT_REST = 1e-4
-# How far the model may be off a sample at rest to be believed nevertheless.
-_AGREES = 1e-3
-# Levels that are kept for news of when they took effect.
-_REMEMBERED = 32
 
-
-class Planner:
+class Planner(RunningPlan):
     """
     Keeps one timeline and replaces its future on request.
 
@@ -65,15 +50,6 @@ class Planner:
     stretch : float
         Stretch at rest before the first request.
 
-    Attributes
-    ----------
-    plan : Plan
-        In force.
-    model : Model
-        Under which the next request is planned.
-    revision : int
-        Grows whenever what is going to happen changes: a draft made before is no good then.
-
     Raises
     ------
     BadInputError
@@ -85,12 +61,7 @@ class Planner:
             self, actuator: ActuatorParameters, options: Options, *,
             stretch: float = 1.0) -> None:
         """Start at rest."""
-        self.model = Model(actuator, options)
-        check_stretch(stretch, self.model.material, 'initial stretch')
-        self._initial = stretch
-        self.plan = Plan(0, (), ())
-        self.revision = 0
-        self.restart()
+        super().__init__(Model(actuator, options), stretch)
 
     @property
     def options(self) -> Options:
@@ -118,54 +89,6 @@ class Planner:
         if model is not self.model:
             self.model = model
             self.revision += 1
-
-    def restart(self) -> None:
-        """Drop all plans: at rest where it was before the first request, as the clock begins."""
-        flux_density = self.model.holding(self._initial) * self.model.units.load
-        self._begin_with(PlannedLevel(
-            ALWAYS, flux_density, self._initial, 0.0, flux_density, self.model))
-
-    def _begin_with(self, level: PlannedLevel) -> None:
-        self._history = History((level,))
-        self.plan = Plan(self.plan.number, (level,), ())
-        self.revision += 1
-
-    def take_over(
-            self, stamp: int, stretch: float, rate: float, in_force: float,
-            flux_density: float | None = None) -> None:
-        """
-        Go on from a state that was measured; plans are dropped.
-
-        Parameters
-        ----------
-        stamp : int
-            Time in ns that it belongs to.
-        stretch, rate : float
-            The rate in 1/s.
-        in_force : float
-            Flux density in T.
-        flux_density : float, optional
-            Level in T that a slew limit is still ramping to; default the one in force.
-
-        Raises
-        ------
-        BadInputError
-            If a number is not finite, or the stretch is outside the limits.
-
-        """
-        model = self.model
-        check_stretch(stretch, model.material, 'stretch in force')
-        level = in_force if flux_density is None else flux_density
-        if not math.isfinite(rate + in_force + level):
-            raise BadInputError(
-                f'state in force is rate {rate:g} 1/s, flux density {in_force:g} T: expected '
-                'finite numbers')
-        begin = PlannedLevel(stamp, level, stretch, rate, in_force, model)
-        held = equilibrium_stretch(level / model.units.load, model.material)
-        at_rest = abs(rate) * model.units.time <= _SAMPLED_AT_REST * self.model.frequency(stretch)
-        if at_rest and level == in_force and abs(float(held) - stretch) > _AGREES:
-            begin = replace(begin, stamp=ALWAYS, rate=0.0)
-        self._begin_with(begin)
 
     # -- requests ------------------------------------------------------------------------------
 
@@ -264,190 +187,3 @@ class Planner:
     def _soonest(self, now: int) -> int:
         """Return the first time that a command can still reach in time."""
         return on_grid(now + self.model.options.lead_time, self.model)
-
-    # -- what comes of them --------------------------------------------------------------------
-
-    def take(self, draft: Draft | None, now: int) -> Plan:
-        """
-        Replace everything from the begin of a draft on.
-
-        Parameters
-        ----------
-        draft : Draft or None
-            Made by this planner in its present revision; None changes nothing.
-        now : int
-            Current time in ns, as the draft was made with.
-
-        Returns
-        -------
-        Plan
-            The one in force now.
-
-        """
-        if draft is None:
-            return self.plan
-        old, history, begin = self.plan, self._history, draft.begin
-        kept = bisect_left(old.levels, begin, key=lambda x: x.stamp)
-        begun = bisect_right(old.levels, now, key=lambda x: x.stamp)
-        # What is over and handed out is forgotten, but for the level in force, and for those
-        # that there may still be news of.
-        over = max(min(history.sent, kept, begun) - 1, 0)
-        first = max(min(over, history.known), over - _REMEMBERED)
-        stale = history.stale
-        self._history = History(
-            old.levels[first:kept] + draft.levels, min(history.sent, kept) - first,
-            max(min(history.known, kept - 1) - first, 0),
-            stale - first if stale is not None and stale < kept else None)
-        levels = self._history.levels
-        if draft.resumed is None:
-            segments = _running(old, begin, now)
-            self.plan = Plan(
-                old.number + 1, levels, segments + draft.segments, len(segments))
-        else:
-            before = old.segments[:draft.resumed]
-            self.plan = Plan(
-                old.number, levels, before + draft.segments, min(old.kept, len(before)))
-        self.revision += 1
-        return self.plan
-
-    def due(self, now: int) -> tuple[PlannedLevel, ...]:
-        """Hand out the commands to send now, each once: those stamped up to lead_time ahead."""
-        history, latest = self._history, now + self.model.options.lead_time
-        if not self.pending or history.levels[history.sent].stamp > latest:
-            return ()
-        end = bisect_right(history.levels, latest, history.sent, key=lambda x: x.stamp)
-        self._remember(history.handed_out(end))
-        return self._history.levels[history.sent:end]
-
-    @property
-    def pending(self) -> bool:
-        """Whether commands remain to be handed out."""
-        return self._history.sent < len(self._history.levels)
-
-    @property
-    def next_stamp(self) -> int | None:
-        """Stamp in ns of the next command to be handed out; None if there is none."""
-        return self._history.levels[self._history.sent].stamp if self.pending else None
-
-    @property
-    def last_sent(self) -> PlannedLevel:
-        """Level that was handed out last, or the one in force before the first."""
-        return self._history.levels[self._history.sent - 1]
-
-    def beat_stamp(self, now: int) -> int:
-        """Return the time in ns to stamp the level handed out last with when it is repeated."""
-        return on_grid(
-            max(now + self.model.options.lead_time, self.last_sent.stamp), self.model)
-
-    def drop_missed(self, now: int, tolerance: int) -> int:
-        """
-        Take out of the plan what should have been in force already and was never handed out.
-
-        Parameters
-        ----------
-        now : int
-            Current time in ns.
-        tolerance : int
-            In ns: what is late by less may still be handed out.
-
-        Returns
-        -------
-        int
-            How many levels; the level before them is taken to stay in force.
-
-        """
-        history = self._history
-        end = bisect_left(
-            history.levels, now - tolerance, history.sent, key=lambda x: x.stamp)
-        if end > history.sent:
-            self._remember(history.without(history.sent, end))
-            self.revision += 1
-        return end - history.sent
-
-    def unheard(self, now: int) -> int | None:
-        """
-        Look for changes of level that never took effect, although nobody told.
-
-        Parameters
-        ----------
-        now : int
-            Time in ns up to which everything that took effect has been told.
-
-        Returns
-        -------
-        int or None
-            Stamp of the last of them in ns, for `drop_unheard`.
-
-        """
-        history = self._history
-        count = history.unheard(now)
-        return history.levels[history.known + count].stamp if count else None
-
-    def drop_unheard(self, stamp: int) -> None:
-        """Take out of the plan what `unheard` has found."""
-        first = self._history.known + 1
-        self._remember(self._history.without(first, first + self._history.unheard(stamp)))
-        self.revision += 1
-
-    def applied(self, stamp: int, flux_density: float, tolerance: int) -> Deviation | None:
-        """
-        Take into the timeline a change of level that has taken effect.
-
-        Parameters
-        ----------
-        stamp : int
-            Time in ns at which it did.
-        flux_density : float
-            Level in T from then on.
-        tolerance : int
-            In ns: planned changes this near to it are the same.
-
-        Returns
-        -------
-        Deviation or None
-            All zero if it is as planned; None if it is no news.
-
-        """
-        history, deviation = self._history.with_news(stamp, flux_density, tolerance)
-        self._remember(history)
-        self.revision += bool(
-            deviation and (deviation.foreign or deviation.lost or abs(deviation.late) > tolerance))
-        return deviation
-
-    def _remember(self, history: History) -> None:
-        if history.levels is not self._history.levels:
-            self.plan = replace(self.plan, levels=history.levels)
-        self._history = history
-
-    def state(self, time: int) -> State:
-        """
-        Predict the nondimensional state at a time.
-
-        Parameters
-        ----------
-        time : int
-            In ns, not before the level in force began.
-
-        Returns
-        -------
-        State
-            Under the plan as it is, in the units of the model for the next request.
-
-        """
-        self._remember(self._history.predicted(self.plan.place(time) + 1))
-        level = self.plan.level(time)
-        return self.model.taken_from(level.at(time), level.model)
-
-    def segment(self, now: int) -> tuple[int, PlannedSegment] | None:
-        """Return place and record of the setpoint under way, None before the first begins."""
-        index = self.plan.under_way(now)
-        return None if index < 0 else (index, self.plan.segments[index])
-
-
-def _running(plan: Plan, begin: int, now: int) -> tuple[PlannedSegment, ...]:
-    """Return the setpoints of a plan from the one under way to those a draft replaces."""
-    end = bisect_left(plan.segments, begin, key=lambda x: x.since)
-    running = plan.segments[max(min(plan.under_way(now), end - 1), 0):end]
-    if running and running[-1].arrival is not None and running[-1].arrival > begin:
-        running = (*running[:-1], replace(running[-1], arrival=None))
-    return running
