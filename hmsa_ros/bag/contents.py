@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Iterable, Mapping
 
+from hmsa_ros import __version__
 from hmsa_ros.bag import metadata
 from hmsa_ros.bag.output import OutputFile, Topic
 from hmsa_ros.errors import BagError
@@ -50,6 +51,10 @@ class Contents:
         """Add to the custom data; what UTF-8 cannot hold is written as its codes."""
         for key, value in values.items():
             self.custom_data[_storable(key)] = _storable(value)
+
+    def notes(self) -> dict[str, str]:
+        """Return what a file says of the experiment."""
+        return {'version': __version__, **self.custom_data}
 
     def number_of(self, topic: Topic) -> int | None:
         """Return the number of a topic that is known, None of a new one."""

@@ -16,7 +16,6 @@ from pathlib import Path
 import re
 from typing import NamedTuple
 
-from hmsa_ros import __version__
 from hmsa_ros.bag import metadata, qos
 from hmsa_ros.bag.contents import Contents
 from hmsa_ros.bag.framing import MESSAGE_HEAD
@@ -208,7 +207,7 @@ class BagWriter:
         if file is not None:
             # What changes all the time would be more than the messages are.
             if file.notes_size <= max(_NOTES_SIZE, file.size // 16):
-                file.note(self._notes())
+                file.note(self._contents.notes())
             self._write_metadata()
 
     def flush(self) -> None:
@@ -226,11 +225,7 @@ class BagWriter:
         return self._open()
 
     def reopen(self) -> str:
-        """
-        Give up the file, closing it as well as can be done, and go on in a new one.
-
-        For use after an `OSError`, when writing may be possible again.
-        """
+        """Give up the file after an `OSError`, as `abandon` does, and go on in a new one."""
         self.abandon()
         self.folder.mkdir(parents=True, exist_ok=True)
         _check_room(self.folder, self._waiting_size + 2 * MESSAGE_HEAD * len(self._waiting))
@@ -295,7 +290,7 @@ class BagWriter:
                 file = self._file = OutputFile(self.folder / name, number, self._preset)
                 break
         try:
-            file.describe(self._contents.serialized(file), self._notes())
+            file.describe(self._contents.serialized(file), self._contents.notes())
             for topic in self._contents.topics:
                 file.declare(topic)
             self._write_metadata()
@@ -311,10 +306,6 @@ class BagWriter:
         self._next_number = file.number
         with contextlib.suppress(OSError):
             file.path.unlink()
-
-    def _notes(self) -> dict[str, str]:
-        """Return what a file says of the experiment."""
-        return {'version': __version__, **self.custom_data}
 
     def _write_chunk(self) -> None:
         """Write the messages that wait as one chunk."""
@@ -332,7 +323,7 @@ class BagWriter:
         if file is None:
             return
         file.check_still_there()
-        file.finish(self._contents.serialized(file), self._notes(), fsync=self._fsync)
+        file.finish(self._contents.serialized(file), self._contents.notes(), fsync=self._fsync)
         self._forget_file(file)
         self._write_metadata()
 

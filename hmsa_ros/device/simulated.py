@@ -125,7 +125,7 @@ class SimulatedDevice(Outbox):
 
         """
         if self._transit.delay:
-            self._actuators.check_level(joint, level)
+            self._actuators.setups[joint].check_level(level)
             self._transit.send(self.time, (joint, stamp, level))
         else:
             self._obey(joint, stamp, level)

@@ -11,7 +11,7 @@ As a managed node it opens the bag and offers its topics when it is configured, 
 active, and gives both up when it is cleaned up.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import contextlib
 import os
 import sys
@@ -19,7 +19,7 @@ import threading
 import time
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -36,6 +36,7 @@ from hmsa_ros.bag.transport import Transport
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.audience import Audience
+from hmsa_ros.nodes.conversions import to_clock, to_diagnostics, to_status
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.parameters import declare, ParameterSpec
 from hmsa_ros.nodes.runner import run
@@ -222,12 +223,6 @@ class Player(ManagedNode):
         return tuple(expand_topic_name(name, self.get_name(), self.get_namespace())
                      for name in self._values[parameter])
 
-    def _span(self, parameter: str) -> int:
-        """Return a time span given as seconds and nanoseconds, in nanoseconds."""
-        seconds: int = self._values[f'{parameter}.sec']
-        nanoseconds: int = self._values[f'{parameter}.nsec']
-        return -1 if seconds < 0 else seconds * 10**9 + nanoseconds
-
     def _filter(self) -> Filter:
         """Return which topics are sent."""
         values = self._values
@@ -239,8 +234,8 @@ class Player(ManagedNode):
     def _choose_excerpt(self) -> Excerpt:
         """Return what is played of the bag."""
         first, last = self._reader.start_time or 0, self._reader.end_time
-        start = first + self._span('play.start_offset')
-        length = self._span('play.playback_duration')
+        start = first + _span(self._values, 'play.start_offset')
+        length = _span(self._values, 'play.playback_duration')
         end = (first if last is None else last) if length < 0 else start + length
         return Excerpt(first, start, end, self._values['play.loop'],
                        self._values['play.read_ahead_queue_size'])
@@ -265,9 +260,7 @@ class Player(ManagedNode):
 
     def _send_clock(self, when: int) -> None:
         """Publish a time of the bag."""
-        message = ClockMessage()
-        message.clock.sec, message.clock.nanosec = divmod(when, 10**9)
-        self._clock_publisher.publish(message)
+        self._clock_publisher.publish(to_clock(when))
 
     def _tell_problems(self) -> None:
         """Log what could not be read of the bag, each once."""
@@ -287,7 +280,7 @@ class Player(ManagedNode):
                 os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(priority))
         try:
             self._wait_for_audience(transport)
-            transport.rest(self._span('play.delay') * 1e-9)
+            transport.rest(_span(self._values, 'play.delay') * 1e-9)
             self.get_logger().info(
                 f'playing {len(self._senders)} topics of {self._reader.path}, '
                 f'{max(0, self._excerpt.end - self._excerpt.start) * 1e-9:.3f} s at rate '
@@ -326,7 +319,7 @@ class Player(ManagedNode):
     def _finish(self, transport: Transport) -> None:
         """Wait for reliable subscribers and say what was sent."""
         self._tell_problems()
-        limit = self._span('play.wait_acked_timeout')
+        limit = _span(self._values, 'play.wait_acked_timeout')
         waiting = list(self._senders.values()) if limit >= 0 else []
         end = time.monotonic() + limit * 1e-9
         while waiting and not transport.stopped:
@@ -348,11 +341,16 @@ class Player(ManagedNode):
         def paused(state: Callable[[], bool]) -> Callable[..., Trigger.Response]:
             return lambda _, response: self._change_pause(state(), response)
 
+        def is_paused(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            response.success = self._transport.paused
+            response.message = 'paused' if response.success else 'playing'
+            return response
+
         for service, callback in (
                 (interface.PAUSE, paused(lambda: True)),
                 (interface.RESUME, paused(lambda: False)),
                 (interface.TOGGLE_PAUSED, paused(lambda: not self._transport.paused)),
-                (interface.IS_PAUSED, self._on_is_paused),
+                (interface.IS_PAUSED, is_paused),
                 (interface.PLAY_NEXT, self._on_play_next),
                 (interface.STOP, self._on_stop)):
             self.create_service(Trigger, service.name, callback)
@@ -370,13 +368,6 @@ class Player(ManagedNode):
         self._transport.set_paused(paused)
         response.success = True
         response.message = 'paused' if paused else 'playing'
-        return response
-
-    def _on_is_paused(
-            self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Say by ``success`` whether playback is paused."""
-        response.success = self._transport.paused
-        response.message = 'paused' if response.success else 'playing'
         return response
 
     def _on_play_next(
@@ -433,13 +424,16 @@ class Player(ManagedNode):
             'duration': f'{(excerpt.end - excerpt.first) * 1e-9:.3f}',
             'rate': f'{transport.rate:g}', 'largest_delay': f'{transport.late:.6f}',
         }
-        message = DiagnosticArray()
-        message.header.stamp = self.get_clock().now().to_msg()
-        message.status = [DiagnosticStatus(
-            level=DiagnosticStatus.OK, message=state, hardware_id='',
-            name=f'{self.get_fully_qualified_name().lstrip("/")}: bag',
-            values=[KeyValue(key=key, value=value) for key, value in values.items()])]
-        self._diagnostics.publish(message)
+        self._diagnostics.publish(to_diagnostics(self.get_clock().now().nanoseconds, to_status(
+            f'{self.get_fully_qualified_name().lstrip("/")}: bag', '', DiagnosticStatus.OK, state,
+            values)))
+
+
+def _span(values: Mapping[str, Any], parameter: str) -> int:
+    """Return a duration given as seconds and nanoseconds, in nanoseconds."""
+    seconds: int = values[f'{parameter}.sec']
+    nanoseconds: int = values[f'{parameter}.nsec']
+    return -1 if seconds < 0 else seconds * 10**9 + nanoseconds
 
 
 def _nothing_to_play() -> Transport:

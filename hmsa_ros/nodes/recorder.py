@@ -9,8 +9,7 @@ the bag when it is cleaned up.
 """
 
 from bisect import bisect_left
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import datetime
 import json
 import os
@@ -18,7 +17,6 @@ from pathlib import Path
 import time
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -27,30 +25,26 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Trigger
 
 from hmsa_ros import __version__
-from hmsa_ros.bag.definitions import message_definition, type_hash
 from hmsa_ros.bag.experiment import SetpointLog
-from hmsa_ros.bag.qos import Qos
 from hmsa_ros.bag.reception import figures, judge, RecordedTopic
 from hmsa_ros.bag.recording import Limits, lost_by_topic, Recording, Status
-from hmsa_ros.bag.writer import BagWriter, parse_custom_data, Topic
+from hmsa_ros.bag.writer import BagWriter, parse_custom_data
 from hmsa_ros.errors import BadInputError, BagError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.capture import Capture, decode, RawSubscription, SimulatedTime, Taken
-from hmsa_ros.nodes.conversions import from_time
+from hmsa_ros.nodes.conversions import from_time, to_diagnostics, to_status
 from hmsa_ros.nodes.managed import ManagedNode
-from hmsa_ros.nodes.message_types import interface_class, type_name_of
+from hmsa_ros.nodes.message_types import type_name_of
 from hmsa_ros.nodes.parameters import declare
-from hmsa_ros.nodes.qos import stored, subscription
 from hmsa_ros.nodes.recorder_parameters import PARAMETERS
 from hmsa_ros.nodes.remote_parameters import RemoteParameters
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.nodes.selection import Selection
+from hmsa_ros.nodes.subscribing import Subscriptions
 
 DIAGNOSTICS_SECONDS = 1.0
 # Between being told to end and the last look at what has come.
 _LINGER_SECONDS = 0.1
-# One look in so many asks for the publishers of every topic, changed in number or not.
-_FULL_LOOK = 10
 # Nodes whose parameters are requested.
 _MAX_NODES = 256
 
@@ -90,12 +84,10 @@ class Recorder(ManagedNode):
     def configure(self) -> None:
         """Open the bag and start receiving."""
         values = self._parameters_in
-        self._selection = Selection(
+        selection = Selection(
             tuple(map(self._full_name, values['record.topics'])), values['record.all_topics'],
             values['record.regex'], tuple(map(self._full_name, values['record.exclude_topics'])),
             values['record.exclude_regex'])
-        self._topics: dict[str, RecordedTopic] = {}
-        self._refused: dict[str, str] = {}
         # While inactive it is paused.
         self._paused = True
         self._resumes = not values['record.start_paused']
@@ -103,23 +95,13 @@ class Recorder(ManagedNode):
         self._experiment: dict[str, str] = {'hmsa_ros.version': __version__}
         self._setpoints = SetpointLog()
         self._setpoint_topics: set[str] = set()
-        self._said_ready = False
-        self._polls = 0
-        limits = Limits(
-            values['storage.flush_period'], values['storage.max_bagfile_size'],
-            values['storage.max_bagfile_duration'] * 10**9, values['storage.max_cache_size'],
-            round(values['record.snapshot_duration'] * 1e9)
-            if values['record.snapshot_mode'] else 0)
-        writer = BagWriter(
-            values['storage.uri'] or datetime.datetime.now().strftime(
-                'hmsa_%Y_%m_%d-%H_%M_%S'),
-            preset=values['storage.storage_preset_profile'],
-            custom_data={**self._experiment, **parse_custom_data(
-                values['storage.custom_data'])},
-            ros_distro=os.environ.get('ROS_DISTRO', 'jazzy'), fsync=values['storage.fsync'])
+        limits = _limits(values)
+        writer = _writer(values, self._experiment)
         self.folder: Path = writer.folder
         self._recording = Recording(writer, limits, self._report)
         self._capture = Capture(self, self._deliver)
+        self._recorded = Subscriptions(
+            self, selection, self._recording, self._capture, values['record.queue_depth'])
         self._closed = False
         self._start()
 
@@ -131,10 +113,6 @@ class Recorder(ManagedNode):
         """Pause."""
         self._resumes = not self._paused
         self._paused = True
-
-    def cleanup(self) -> None:
-        """Close the bag."""
-        self.close()
 
     def _start(self) -> None:
         """Create what the node offers and start receiving."""
@@ -149,10 +127,13 @@ class Recorder(ManagedNode):
         self._diagnostics = self.create_publisher(
             interface.DIAGNOSTICS.type, interface.DIAGNOSTICS.name, interface.DIAGNOSTICS.qos)
         for name, callback in (
-                (interface.PAUSE.name, self._on_pause), (interface.RESUME.name, self._on_resume),
+                (interface.PAUSE.name, lambda _, answer: self._set_paused(True, answer)),
+                (interface.RESUME.name, lambda _, answer: self._set_paused(False, answer)),
                 (interface.IS_PAUSED.name, self._on_is_paused),
-                (interface.SPLIT_BAGFILE.name, self._on_split),
-                (interface.SNAPSHOT.name, self._on_snapshot)):
+                (interface.SPLIT_BAGFILE.name,
+                 lambda _, answer: self._answer(answer, self._recording.split)),
+                (interface.SNAPSHOT.name,
+                 lambda _, answer: self._answer(answer, self._recording.snapshot))):
             self.create_service(Trigger, name, callback)
         for topic in _SETPOINTS.values():
             # From the start, so that the first one is not missed; others when they are found.
@@ -179,16 +160,14 @@ class Recorder(ManagedNode):
             self.finished = True
         if self._sim_time is not None and not self._sim_time.started:
             return
-        self._polls += 1
         self._find_nodes()
-        for name, types in self.get_topic_names_and_types():
-            if self._selection.wants(name):
-                self._look_at(name, types)
+        found = self.get_topic_names_and_types()
+        self._recorded.look(found)
+        for name, types in found:
             topic = _SETPOINTS.get(name.rsplit('/', 1)[-1])
             if topic is not None and type_name_of(topic.type) in types and any(
                     name.startswith(f'{node}/') for node in self._followed):
                 self._follow_setpoints(topic, name)
-        self._say_ready()
         for followed in self._followed.values():
             followed.poll(self._note)
 
@@ -213,81 +192,6 @@ class Recorder(ManagedNode):
             self.create_subscription(
                 topic.type, name, lambda message: self._on_setpoint(name, message), topic.qos)
 
-    def _look_at(self, name: str, types: Sequence[str]) -> None:
-        """Subscribe to a topic, or again if its publishers ask for it."""
-        known = self._topics.get(name)
-        # Asking who they are takes five times as long as how many.
-        count = self.count_publishers(name)
-        if known is not None and count == known.publishers and self._polls % _FULL_LOOK:
-            return
-        infos = [info for info in self.get_publishers_info_by_topic(name)
-                 if known is None or info.topic_type == known.type]
-        if known is not None:
-            known.publishers = count
-        if not infos:
-            return
-        offered = tuple(sorted((stored(info.qos_profile) for info in infos), key=repr))
-        if known is not None and not Counter(offered) - Counter(known.offered):
-            return  # nobody is new; who has left does not change what was recorded
-        type_name = known.type if known is not None else infos[0].topic_type
-        if len(types) > 1 and known is None:
-            self._refuse(f'{name}#', f'topic {name} has the types {", ".join(types)}: '
-                                     f'{type_name} is recorded')
-        try:
-            message_type = interface_class(type_name)
-        except BagError as error:
-            self._refuse(name, f'topic {name} is not recorded: {error}')
-            return
-        hashes = {str(info.topic_type_hash) for info in infos
-                  if info.topic_type == type_name}
-        number = self._recording.add_topic(self._describe(name, type_name, offered, hashes))
-        qos = subscription(offered, self._parameters_in['record.queue_depth'])
-        if known is None:
-            recorded = RecordedTopic(name, type_name, number, qos, offered)
-            self._topics[name] = recorded
-            self._capture.add(recorded, RawSubscription(self, message_type, name, qos))
-            self.get_logger().info(f'subscribed to {name} ({type_name})')
-            return
-        known.offered = offered
-        if (qos.reliability, qos.durability) != (known.qos.reliability, known.qos.durability):
-            known.qos = qos
-            self._capture.replace(known, RawSubscription(self, message_type, name, qos))
-            self.get_logger().info(
-                f'subscribed to {name} again, as its publishers offer another quality of service')
-
-    def _describe(
-            self, name: str, type_name: str, offered: tuple[Qos, ...],
-            hashes: Iterable[str]) -> Topic:
-        """Return what the bag stores of a topic."""
-        try:
-            encoding, definition = message_definition(type_name)
-        except BagError as error:
-            self._refuse(f'{name}!', f'topic {name} is recorded without definition: {error}')
-            encoding, definition = '', ''
-        known = {text for text in hashes if text.startswith('RIHS01_')}
-        return Topic(
-            name, type_name, definition, encoding, offered,
-            known.pop() if len(known) == 1 else '' if known else type_hash(type_name))
-
-    def _refuse(self, key: str, sentence: str) -> None:
-        """Warn once."""
-        if key not in self._refused:
-            self._refused[key] = sentence
-            self.get_logger().warning(sentence)
-
-    def _wanted_count(self) -> int:
-        """Return how many topics are waited for, as far as it is known."""
-        missing = [name for name in self._selection.topics if name not in self._topics]
-        return len(self._topics) + len(missing)
-
-    def _say_ready(self) -> None:
-        """Log, once, that every topic requested by name is subscribed to."""
-        if not self._said_ready and self._selection.topics \
-                and self._wanted_count() == len(self._topics):
-            self._said_ready = True
-            self.get_logger().info(
-                f'ready: subscribed to all {len(self._selection.topics)} topics')
-
     def _deliver(self, taken: Sequence[tuple[Any, list[Taken]]]) -> None:
         """Stamp, count and pass on what has been received."""
         clock = self._sim_time
@@ -303,22 +207,13 @@ class Recorder(ManagedNode):
                 before = clock.add(message.received_ns, now, message.publisher)
                 if before is not None:
                     # What came before the jump belongs to the file so far.
-                    taken = self._take_in_until(message.received_ns, taken)
+                    earlier, taken = _parted(taken, message.received_ns)
+                    for key, messages in earlier:
+                        self._take_in(key, messages)
                     self._begin_anew(before, now)
             taken = taken[1:]
         for key, messages in taken:
             self._take_in(key, messages)
-
-    def _take_in_until(
-            self, moment: int,
-            taken: Sequence[tuple[Any, list[Taken]]]) -> list[tuple[Any, list[Taken]]]:
-        """Take in what was received before a moment; return the rest, the clock as it was."""
-        rest = [taken[0]]
-        for key, messages in taken[1:]:
-            count = bisect_left(messages, moment, key=lambda message: message.received_ns)
-            self._take_in(key, messages[:count])
-            rest.append((key, messages[count:]))
-        return rest
 
     def _begin_anew(self, before: int, now: int) -> None:
         """Go on in a new file: a simulation began anew, or a bag is played in a loop."""
@@ -356,16 +251,6 @@ class Recorder(ManagedNode):
                 (parameter.name, parameter.value)
                 for parameter in [*event.new_parameters, *event.changed_parameters]))
 
-    def _on_pause(
-            self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Stop recording for a while."""
-        return self._set_paused(True, response)
-
-    def _on_resume(
-            self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Go on recording."""
-        return self._set_paused(False, response)
-
     def _set_paused(self, paused: bool, response: Trigger.Response) -> Trigger.Response:
         """Pause or go on."""
         if not self.active:
@@ -384,16 +269,6 @@ class Recorder(ManagedNode):
         response.message = 'paused' if self._paused else 'recording'
         return response
 
-    def _on_split(
-            self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Go on in a new file."""
-        return self._answer(response, self._recording.split)
-
-    def _on_snapshot(
-            self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Write what is kept in memory."""
-        return self._answer(response, self._recording.snapshot)
-
     @staticmethod
     def _answer(response: Trigger.Response, action: Callable[[], str]) -> Trigger.Response:
         """Do what was asked for and say how it went."""
@@ -405,54 +280,56 @@ class Recorder(ManagedNode):
 
     def _lost(self, status: Status) -> dict[str, int]:
         """Return the number of lost messages by topic."""
-        missed = {topic.name: topic.missed for topic in list(self._topics.values())}
+        missed = {topic.name: topic.missed for topic in list(self._recorded.topics.values())}
         return lost_by_topic(missed, status.overflowed, status.dropped)
 
-    def _lost_text(self, lost: Mapping[str, int]) -> str:
+    def _lost_note(self, lost: Mapping[str, int]) -> dict[str, str]:
         """Return the number of lost messages of every topic as it is stored."""
-        return json.dumps({**dict.fromkeys(list(self._topics), 0), **lost})
+        return {'lost': json.dumps({
+            **dict.fromkeys(list(self._recorded.topics), 0), **lost})}
 
     def _on_diagnostics(self) -> None:
         """Publish the state."""
         status = self._recording.status()
         lost = self._lost(status)
-        total = sum(lost.values())
         self._note(self._setpoints.news())
         # In the bag at once, so that it is known after a crash too.
-        self._note({'lost': self._lost_text(lost)})
+        self._note(self._lost_note(lost))
         state = ('inactive' if not self.active else 'paused' if self._paused
                  else 'waiting for /clock'
                  if self._sim_time is not None and not self._sim_time.started else 'recording')
         clocks = 0 if self._sim_time is None else self.count_publishers(
             interface.CLOCK_TOPIC.name)
         level, text = judge(
-            status, state, total, flush_period=self._parameters_in['storage.flush_period'],
+            status, state, sum(lost.values()),
+            flush_period=self._parameters_in['storage.flush_period'],
             clocks=clocks, clock_ignored=self._sim_time is not None and bool(
                 self._sim_time.ignored))
         values = {
             'bag': str(self.folder),
             'state': state,
-            'subscribed': f'{len(self._topics)}/{self._wanted_count()}',
-            'received': str(sum(topic.received for topic in self._topics.values())),
+            'subscribed': f'{len(self._recorded.topics)}/{self._recorded.wanted_count}',
+            'received': str(sum(topic.received for topic in self._recorded.topics.values())),
             **figures(status, lost),
             **({} if self._sim_time is None else {
                 'time_jumps': str(self._sim_time.jumps),
                 'clock_ignored': str(self._sim_time.ignored)}),
         }
-        message = DiagnosticArray()
-        message.header.stamp = self.get_clock().now().to_msg()
-        message.status = [DiagnosticStatus(
-            level=bytes((level,)), name=f'{self.get_fully_qualified_name().lstrip("/")}: bag',
-            message=text, hardware_id='',
-            values=[KeyValue(key=key, value=value) for key, value in values.items()])]
-        self._diagnostics.publish(message)
+        self._diagnostics.publish(to_diagnostics(self.get_clock().now().nanoseconds, to_status(
+            f'{self.get_fully_qualified_name().lstrip("/")}: bag', '', bytes((level,)), text,
+            values)))
 
     def _report(self, sentence: str, failure: bool) -> None:
         """Log what happened to the writer."""
+        # On two lines: rclpy lets no line log with two severities.
         if failure:
             self.get_logger().error(sentence)
         else:
             self.get_logger().warning(sentence)
+
+    def cleanup(self) -> None:
+        """Close the bag."""
+        self.close()
 
     def close(self) -> None:
         """Record what has arrived, close the bag and print the counts."""
@@ -463,17 +340,45 @@ class Recorder(ManagedNode):
         time.sleep(_LINGER_SECONDS)
         self._capture.stop()
         self._note(self._setpoints.news())
-        status = self._recording.close(
-            lambda last: {'lost': self._lost_text(self._lost(last))})
+        status = self._recording.close(lambda last: self._lost_note(self._lost(last)))
         lost = self._lost(status)
         written = sum(status.written.values())
-        print(f'hmsa recorder: {written} messages of {len(self._topics)} topics in '
+        print(f'hmsa recorder: {written} messages of {len(self._recorded.topics)} topics in '
               f'{self.folder}, {sum(lost.values())} lost', flush=True)
         for name, count in sorted(lost.items()):
             if count:
                 print(f'hmsa recorder: lost {count} of {name}', flush=True)
         if status.error and self.failure is None:
             self.failure = BagError(status.error)
+
+
+def _parted(
+        taken: Sequence[tuple[Any, list[Taken]]],
+        moment: int) -> tuple[list[tuple[Any, list[Taken]]], list[tuple[Any, list[Taken]]]]:
+    """Part what was received before a moment from the rest, the clock first in the rest."""
+    earlier, rest = [], [taken[0]]
+    for key, messages in taken[1:]:
+        count = bisect_left(messages, moment, key=lambda message: message.received_ns)
+        earlier.append((key, messages[:count]))
+        rest.append((key, messages[count:]))
+    return earlier, rest
+
+
+def _limits(values: Mapping[str, Any]) -> Limits:
+    """Return what the parameters say of flushing, splitting and memory."""
+    return Limits(
+        values['storage.flush_period'], values['storage.max_bagfile_size'],
+        values['storage.max_bagfile_duration'] * 10**9, values['storage.max_cache_size'],
+        round(values['record.snapshot_duration'] * 1e9) if values['record.snapshot_mode'] else 0)
+
+
+def _writer(values: Mapping[str, Any], experiment: Mapping[str, str]) -> BagWriter:
+    """Make the bag."""
+    return BagWriter(
+        values['storage.uri'] or datetime.datetime.now().strftime('hmsa_%Y_%m_%d-%H_%M_%S'),
+        preset=values['storage.storage_preset_profile'],
+        custom_data={**experiment, **parse_custom_data(values['storage.custom_data'])},
+        ros_distro=os.environ.get('ROS_DISTRO', 'jazzy'), fsync=values['storage.fsync'])
 
 
 def main(args: Sequence[str] | None = None) -> int:

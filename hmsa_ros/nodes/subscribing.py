@@ -1,0 +1,142 @@
+"""The recorder's subscriptions: found topics, with the quality of service they ask for."""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+
+from rclpy.node import Node
+
+from hmsa_ros.bag.definitions import message_definition, type_hash
+from hmsa_ros.bag.qos import Qos
+from hmsa_ros.bag.reception import RecordedTopic
+from hmsa_ros.bag.recording import Recording
+from hmsa_ros.bag.writer import Topic
+from hmsa_ros.errors import BagError
+from hmsa_ros.nodes.capture import Capture, RawSubscription
+from hmsa_ros.nodes.message_types import interface_class
+from hmsa_ros.nodes.qos import stored, subscription
+from hmsa_ros.nodes.selection import Selection
+
+# One look in so many asks for the publishers of every topic, changed in number or not.
+_FULL_LOOK = 10
+
+
+class Subscriptions:
+    """
+    Subscribes to the topics that are wanted.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Which subscribes.
+    selection : Selection
+        What is wanted.
+    recording : Recording
+        Learns of the topics.
+    capture : Capture
+        Takes the messages.
+    depth : int
+        Messages of a topic that the middleware keeps.
+
+    Attributes
+    ----------
+    topics : dict of str to RecordedTopic
+        Those subscribed to.
+
+    """
+
+    def __init__(
+            self, node: Node, selection: Selection, recording: Recording, capture: Capture,
+            depth: int) -> None:
+        self.topics: dict[str, RecordedTopic] = {}
+        self._node = node
+        self._selection = selection
+        self._recording = recording
+        self._capture = capture
+        self._depth = depth
+        self._refused: set[str] = set()
+        self._said_ready = False
+        self._looks = 0
+
+    @property
+    def wanted_count(self) -> int:
+        """Return how many topics are waited for, as far as it is known."""
+        missing = [name for name in self._selection.topics if name not in self.topics]
+        return len(self.topics) + len(missing)
+
+    def look(self, found: Iterable[tuple[str, Sequence[str]]]) -> None:
+        """Subscribe to what is new of the topics found, with their types."""
+        self._looks += 1
+        for name, types in found:
+            if self._selection.wants(name):
+                self._look_at(name, types)
+        if not self._said_ready and self._selection.topics \
+                and self.wanted_count == len(self.topics):
+            self._said_ready = True
+            self._node.get_logger().info(
+                f'ready: subscribed to all {len(self._selection.topics)} topics')
+
+    def _look_at(self, name: str, types: Sequence[str]) -> None:
+        """Subscribe to a topic, or again if its publishers ask for it."""
+        known = self.topics.get(name)
+        # Asking who they are takes five times as long as how many.
+        count = self._node.count_publishers(name)
+        if known is not None and count == known.publishers and self._looks % _FULL_LOOK:
+            return
+        infos = [info for info in self._node.get_publishers_info_by_topic(name)
+                 if known is None or info.topic_type == known.type]
+        if known is not None:
+            known.publishers = count
+        if not infos:
+            return
+        offered = tuple(sorted((stored(info.qos_profile) for info in infos), key=repr))
+        if known is not None and not Counter(offered) - Counter(known.offered):
+            return  # nobody is new; who has left does not change what was recorded
+        type_name = known.type if known is not None else infos[0].topic_type
+        if len(types) > 1 and known is None:
+            self._warn(f'topic {name} has the types {", ".join(types)}: {type_name} is recorded')
+        hashes = {str(info.topic_type_hash) for info in infos if info.topic_type == type_name}
+        self._subscribe(known, name, type_name, offered, hashes)
+
+    def _subscribe(
+            self, known: RecordedTopic | None, name: str, type_name: str,
+            offered: tuple[Qos, ...], hashes: Iterable[str]) -> None:
+        try:
+            message_type = interface_class(type_name)
+        except BagError as error:
+            self._warn(f'topic {name} is not recorded: {error}')
+            return
+        number = self._recording.add_topic(self._describe(name, type_name, offered, hashes))
+        qos = subscription(offered, self._depth)
+        logger = self._node.get_logger()
+        if known is None:
+            recorded = RecordedTopic(name, type_name, number, qos, offered)
+            self.topics[name] = recorded
+            self._capture.add(recorded, RawSubscription(self._node, message_type, name, qos))
+            logger.info(f'subscribed to {name} ({type_name})')
+            return
+        known.offered = offered
+        if (qos.reliability, qos.durability) != (known.qos.reliability, known.qos.durability):
+            known.qos = qos
+            self._capture.replace(known, RawSubscription(self._node, message_type, name, qos))
+            logger.info(
+                f'subscribed to {name} again, as its publishers offer another quality of service')
+
+    def _describe(
+            self, name: str, type_name: str, offered: tuple[Qos, ...],
+            hashes: Iterable[str]) -> Topic:
+        """Return what the bag stores of a topic."""
+        try:
+            encoding, definition = message_definition(type_name)
+        except BagError as error:
+            self._warn(f'topic {name} is recorded without definition: {error}')
+            encoding, definition = '', ''
+        known = {text for text in hashes if text.startswith('RIHS01_')}
+        return Topic(
+            name, type_name, definition, encoding, offered,
+            known.pop() if len(known) == 1 else '' if known else type_hash(type_name))
+
+    def _warn(self, sentence: str) -> None:
+        """Warn once."""
+        if sentence not in self._refused:
+            self._refused.add(sentence)
+            self._node.get_logger().warning(sentence)
