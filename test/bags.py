@@ -20,6 +20,9 @@ def hold_against_rosbags(folder):
             continue
         if reader.problems or not reader.complete:
             continue
+        if reader.metadata is not None and reader.metadata.version < 4:
+            # rosbags matches topics by their profiles, which such metadata do not have.
+            continue
         with Reader(path.parent) as other:
             found = Counter(connection.topic for connection, _, _ in other.messages())
         assert found == +expected, f'rosbags reads {found} of {path.parent}'

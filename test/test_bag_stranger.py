@@ -107,7 +107,7 @@ def hostile_files():
         '<QHIIIIQQI', 2**63, 1, 1, 0, 0, 1, 0, 0, 2**32 - 1)), 'statistics record ends early'
     yield 'many channels', b''.join(
         channel(i, 9, f'/{i}') for i in range(2, 2000)
-        ), 'more problems, which are not told'
+        ), 'further problems are not listed'
     yield 'message of many messages', schema(
         1, 'x/msg/Y', nested) + channel(1, 1, '/a') + message(PAYLOAD[:4] + many), (
         'expected at most 8388608')

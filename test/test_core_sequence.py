@@ -119,8 +119,8 @@ def test_whatever_the_spans_the_last_setpoint_is_reached(points, zeta):
 
 def test_a_spell_too_short_is_refused_with_both_times():
     with pytest.raises(RefusedError, match=(
-            r'the move from stretch 1.1 to 1.2 takes 1.353, its span is 1: expected a span of '
-            'at least the move')) as caught:
+            r'the move from stretch 1.1 to 1.2 takes 1.353, its span is 1: expected a span at '
+            'least as long as the move')) as caught:
         plan_sequence(setpoints((1.1, 10), (1.2, 1.0)), PAPER)
     assert caught.value.code is Code.SPELL_TOO_SHORT
 

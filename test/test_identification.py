@@ -280,7 +280,7 @@ def test_ratios_alone_are_not_identifiable_and_said_to_be():
 def test_small_stretches_do_not_hold_the_chain_limit():
     found = identify(recorded((1.02, 1.0)))
     assert found.verdict == 'not_identifiable'
-    assert found.reason.startswith('chain_limit cannot be told')
+    assert found.reason.startswith('chain_limit cannot be identified')
     assert 'larger stretches' in found.reason
 
 

@@ -33,14 +33,14 @@ from hmsa_ros.nodes import interface
 
 LOGGER = logging.getLogger(__name__)
 PACKAGE = Path(errors.__file__).parent
-# Modules without anything to call from outside.
 # Rules of numpydoc that the style of this project does not share: sections that not every
 # function needs (ES01, EX01, SA01), the empty line before the closing quotes (GL02, GL03),
 # parameters of one type described together (PR03), symbols that begin a description (PR08,
 # RT04), results with a name (RT02).
 IGNORED = frozenset({'ES01', 'EX01', 'SA01', 'GL02', 'GL03', 'PR03', 'PR08', 'RT04', 'RT02'})
+# Modules without anything to call from outside; ros_launch is imported by ROS 2's launch alone.
 NOT_PUBLIC = re.compile(
-    r'\.(__main__|cli|compiling|dop853|kernels|law|\w+_kernel|warmup)\b')
+    r'\.(__main__|cli|compiling|dop853|kernels|law|\w+_kernel|ros_launch|warmup)\b')
 
 
 def interface_entries(kind: type) -> list[Any]:

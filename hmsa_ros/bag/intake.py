@@ -75,6 +75,14 @@ class ScannedFile:
 
     Attributes
     ----------
+    path, number, size : Path, int, int
+        The file, its place in the bag, and its length in bytes.
+    schemas, channels : dict
+        Records by their id.
+    blocks : list of Block
+        Its parts with messages, in their order.
+    metadata : dict of str to dict
+        Metadata records by name.
     complete : bool
         Whether it was closed by its writer.
     damaged : bool
@@ -139,6 +147,13 @@ class Intake:
         """
         Refuse what is larger than the memory it may take.
 
+        Parameters
+        ----------
+        size : int
+            In bytes.
+        what : str
+            Its name, for the message.
+
         Raises
         ------
         BagError
@@ -152,6 +167,13 @@ class Intake:
     def take(self, file: ScannedFile, record: McapRecord) -> None:
         """
         Take in a schema, a channel or metadata.
+
+        Parameters
+        ----------
+        file : ScannedFile
+            Where it was found; takes it.
+        record : McapRecord
+            One of these records.
 
         Raises
         ------

@@ -204,6 +204,15 @@ class OutputFile:
         """
         Store the last metadata and the summary in the room taken, and close the file.
 
+        Parameters
+        ----------
+        serialized_metadata : str
+            Text of ``metadata.yaml``.
+        notes : mapping of str to str
+            Custom data that the file does not hold yet.
+        fsync : bool
+            Whether to wait for the disk.
+
         Raises
         ------
         OSError

@@ -52,7 +52,7 @@ class RecordedTopic:
             self, messages: Iterable[tuple[int, int, int, bytes, bytes]],
             at: Callable[[int], int] | None, *, paused: bool) -> tuple[list[Message], int]:
         """
-        Count gaps and return what is to be written, with the length of all payloads.
+        Count gaps among messages and select those to write.
 
         Parameters
         ----------
@@ -62,6 +62,11 @@ class RecordedTopic:
             Returns the log time at a moment of system time; None for that moment itself.
         paused : bool
             Whether nothing is recorded now; what passes meanwhile is not missed.
+
+        Returns
+        -------
+        tuple of list of Message and int
+            What is to be written, and the length of its payloads in bytes.
 
         """
         batch: list[Message] = []

@@ -117,6 +117,11 @@ class Recording:
         topic : hmsa_ros.bag.writer.Topic
             What will be recorded.
 
+        Returns
+        -------
+        int
+            Its number, for the messages.
+
         """
         with self._condition:
             number = next((
@@ -205,6 +210,11 @@ class Recording:
         ----------
         last_words : callable, optional
             Gets the state when everything is written and returns custom data to add.
+
+        Returns
+        -------
+        Status
+            At the end.
 
         """
         with self._condition:

@@ -235,12 +235,24 @@ def decompress(data: bytes, compression: str, size: int) -> bytes:
 
 def checked(content: bytes, crc: int) -> bytes:
     """
-    Return the content of a chunk.
+    Check the content of a chunk.
+
+    Parameters
+    ----------
+    content : bytes
+        Uncompressed.
+    crc : int
+        CRC-32 that it should have; 0 for none.
+
+    Returns
+    -------
+    bytes
+        The content.
 
     Raises
     ------
     BagError
-        If its CRC, unless that is 0, is another.
+        If its CRC is another.
 
     """
     if crc and zlib.crc32(content) != crc:
@@ -284,6 +296,18 @@ def split(content: bytes) -> Iterator[tuple[int, int, int]]:
 def read_exactly(descriptor: int, length: int, offset: int) -> bytes:
     """
     Read from a file.
+
+    Parameters
+    ----------
+    descriptor : int
+        Of the open file.
+    length, offset : int
+        In bytes.
+
+    Returns
+    -------
+    bytes
+        As many as asked for.
 
     Raises
     ------

@@ -82,8 +82,10 @@ class Sink:
 
     Parameters
     ----------
-    writer, limits
-        As for `Recording`.
+    writer : BagWriter
+        Writes the bag.
+    limits : Limits
+        Of files and memory.
     release : callable
         Gives memory back to the queue.
 
@@ -132,6 +134,11 @@ class Sink:
     def snapshot(self) -> str:
         """
         Write the messages kept in memory.
+
+        Returns
+        -------
+        str
+            What was written, in words.
 
         Raises
         ------

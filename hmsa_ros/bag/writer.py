@@ -150,13 +150,18 @@ class BagWriter:
 
     def add_topic(self, topic: Topic) -> int:
         """
-        Announce a topic and return its number.
+        Announce a topic.
 
         Parameters
         ----------
         topic : Topic
             The same topic again keeps its first profiles in every file, since readers match
             files and metadata by them; new ones go into the custom data.
+
+        Returns
+        -------
+        int
+            Its number, for the messages.
 
         """
         contents = self._contents
@@ -201,6 +206,12 @@ class BagWriter:
 
         In the file they come at the end in any case, and at once as long as such records are a
         small part of it. What could not be written is tried again when the file is closed.
+
+        Parameters
+        ----------
+        values : mapping of str to str
+            To add.
+
         """
         self._contents.note(values)
         file = self._file

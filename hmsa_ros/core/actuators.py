@@ -110,6 +110,11 @@ class Setup:
         """
         Refuse a level in T that nobody could follow.
 
+        Parameters
+        ----------
+        flux_density : float
+            In T.
+
         Raises
         ------
         BadInputError
@@ -125,6 +130,11 @@ class Setup:
     def check_force(self, force: float) -> None:
         """
         Refuse a disturbing force in N that nobody could follow.
+
+        Parameters
+        ----------
+        force : float
+            In N.
 
         Raises
         ------
@@ -355,6 +365,11 @@ class Actuators:
         Integrate to a time in ns, each change applied exactly at its stamp.
 
         A time that is not ahead changes nothing but applies what is due.
+
+        Parameters
+        ----------
+        time : int
+            In ns.
 
         Returns
         -------

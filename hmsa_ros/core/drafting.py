@@ -97,6 +97,11 @@ def check_points(points: Sequence[tuple[float, int]]) -> Steps[None]:
     points : sequence of (float, int)
         Stretch, and time in ns from the start of the sequence until which it lasts.
 
+    Yields
+    ------
+    None
+        Wherever it may be continued later.
+
     Raises
     ------
     RefusedError
@@ -123,6 +128,11 @@ def check_points(points: Sequence[tuple[float, int]]) -> Steps[None]:
 def check_target(stretch: float) -> None:
     """
     Check that a number can be a stretch.
+
+    Parameters
+    ----------
+    stretch : float
+        Any number.
 
     Raises
     ------
@@ -152,6 +162,11 @@ def draft_sequence(
         Start in ns.
     now : int
         Current time in ns, for messages.
+
+    Yields
+    ------
+    None
+        Wherever it may be continued later.
 
     Returns
     -------
@@ -214,6 +229,11 @@ def draft_stop(outset: Outset) -> Steps[Draft]:
     outset : Outset
         From where.
 
+    Yields
+    ------
+    None
+        Wherever it may be continued later.
+
     Returns
     -------
     Draft
@@ -266,6 +286,11 @@ def draft_resumption(outset: Outset) -> Steps[Draft | None]:
     ----------
     outset : Outset
         From where.
+
+    Yields
+    ------
+    None
+        Wherever it may be continued later.
 
     Returns
     -------

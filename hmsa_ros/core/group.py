@@ -114,6 +114,11 @@ class PlannerGroup:
         now : int
             Current time in ns.
 
+        Yields
+        ------
+        None
+            Wherever it may be continued later.
+
         Returns
         -------
         dict of str to Draft
@@ -183,6 +188,17 @@ class PlannerGroup:
 
         Where commands come late for ever, so would those of every new plan: a plan that was
         made anew several times with no command in time since is left as it is.
+
+        Parameters
+        ----------
+        name : str
+            Of the joint.
+
+        Returns
+        -------
+        bool
+            False where it should stay.
+
         """
         return self._attempts[name] < _ATTEMPTS
 

@@ -122,6 +122,11 @@ class Planner(RunningPlan):
         now : int
             Current time in ns.
 
+        Yields
+        ------
+        None
+            Wherever it may be continued later.
+
         Returns
         -------
         Draft or None
@@ -156,6 +161,11 @@ class Planner(RunningPlan):
         ----------
         now : int
             Current time in ns.
+
+        Yields
+        ------
+        None
+            Wherever it may be continued later.
 
         Returns
         -------

@@ -136,7 +136,10 @@ def segments(
     """
     Plan a sequence setpoint by setpoint, each when it is requested.
 
-    Arguments and errors are those of `plan_sequence`.
+    Parameters
+    ----------
+    setpoints, material, start, shaper, limits, delivery, order, units, short_spell
+        As for `plan_sequence`.
 
     Yields
     ------
