@@ -48,8 +48,8 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Return two workers a core: tests that run nodes mostly wait."""
-    return 2 * (os.cpu_count() or 1)
+    """Return a worker a core: several nodes of a test share it, and must keep up with real time."""
+    return os.cpu_count() or 1
 
 
 @pytest.hookimpl(tryfirst=True)
