@@ -48,7 +48,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Return a worker a core: several nodes of a test share it, and must keep up with real time."""
+    """Return a worker a core: the nodes of a test must keep up with real time."""
     return os.cpu_count() or 1
 
 
