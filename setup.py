@@ -48,6 +48,7 @@ EXTRAS_REQUIRE = {
         'mypy>=1.9',
         'pyte>=0.8',
         'pytest>=7.4',
+        'pytest-rerunfailures>=12.0',
         'pytest-timeout>=2.2',
         'pytest-xdist>=3.7',
         'rosbags>=0.10',
