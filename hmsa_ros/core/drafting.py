@@ -163,15 +163,15 @@ def draft_sequence(
     now : int
         Current time in ns, for messages.
 
-    Yields
-    ------
-    None
-        Wherever it may be continued later.
-
     Returns
     -------
     Draft or None
         None where the request changes nothing.
+
+    Yields
+    ------
+    None
+        Wherever it may be continued later.
 
     Raises
     ------
@@ -229,15 +229,15 @@ def draft_stop(outset: Outset) -> Steps[Draft]:
     outset : Outset
         From where.
 
-    Yields
-    ------
-    None
-        Wherever it may be continued later.
-
     Returns
     -------
     Draft
         Of one setpoint.
+
+    Yields
+    ------
+    None
+        Wherever it may be continued later.
 
     """
     model, state = outset.model, outset.state
@@ -287,16 +287,16 @@ def draft_resumption(outset: Outset) -> Steps[Draft | None]:
     outset : Outset
         From where.
 
-    Yields
-    ------
-    None
-        Wherever it may be continued later.
-
     Returns
     -------
     Draft or None
         Setpoints end when they did; one that there is no time left for is left out. From where
         the new plan meets the running one it goes on as that. None if nothing is left to do.
+
+    Yields
+    ------
+    None
+        Wherever it may be continued later.
 
     Raises
     ------

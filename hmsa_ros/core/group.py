@@ -114,15 +114,15 @@ class PlannerGroup:
         now : int
             Current time in ns.
 
-        Yields
-        ------
-        None
-            Wherever it may be continued later.
-
         Returns
         -------
         dict of str to Draft
             To be taken; joints for which nothing changes are missing.
+
+        Yields
+        ------
+        None
+            Wherever it may be continued later.
 
         Raises
         ------

@@ -122,15 +122,15 @@ class Planner(RunningPlan):
         now : int
             Current time in ns.
 
-        Yields
-        ------
-        None
-            Wherever it may be continued later.
-
         Returns
         -------
         Draft or None
             For `take`; None where the request changes nothing.
+
+        Yields
+        ------
+        None
+            Wherever it may be continued later.
 
         Raises
         ------
@@ -162,16 +162,16 @@ class Planner(RunningPlan):
         now : int
             Current time in ns.
 
-        Yields
-        ------
-        None
-            Wherever it may be continued later.
-
         Returns
         -------
         Draft or None
             From the first time that a command can reach, or, where there is no way from the
             motion it meets, a part of a period later. None if there is nothing left to do.
+
+        Yields
+        ------
+        None
+            Wherever it may be continued later.
 
         Raises
         ------

@@ -138,8 +138,24 @@ def segments(
 
     Parameters
     ----------
-    setpoints, material, start, shaper, limits, delivery, order, units, short_spell
-        As for `plan_sequence`.
+    setpoints : iterable of Setpoint
+        In their order.
+    material : NondimensionalParameters
+        Of the model.
+    start : State, optional
+        Default at rest at stretch 1.
+    shaper : str
+        Name of a shaper.
+    limits : Limits, optional
+        Admissible loads.
+    delivery : Delivery
+        How commands reach the actuator.
+    order : int
+        Of the shaper robust.
+    units : Units, optional
+        For messages.
+    short_spell : {'refuse', 'continue'}
+        For a span that ends before its move.
 
     Yields
     ------
