@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+import math
 from time import monotonic, sleep
 from uuid import uuid4
 
@@ -23,6 +24,8 @@ _COMPILE_SECONDS = 300.0
 # To come to rest, perhaps in slow motion; and until a planner that does not answer is gone.
 _STOP_SECONDS = 15.0
 _GONE_SECONDS = 3.0
+# How long a recorder is seen before it is taken to hear.
+_SETTLED_SECONDS = 1.0
 
 
 @dataclass(frozen=True)
@@ -210,7 +213,16 @@ class PlannerClient:
             If there is nobody.
 
         """
+        since = math.inf
+
         def recorded() -> bool:
+            # The recorder learns of this publisher a little later than the other way round, and
+            # drops what comes before.
+            nonlocal since
+            since = min(since, monotonic()) if subscribed() else math.inf
+            return monotonic() - since >= _SETTLED_SECONDS
+
+        def subscribed() -> bool:
             # Recorders, rosbag2's too, offer to split the bag.
             recorders = {
                 service.rpartition('/')[0] for service, _ in
