@@ -32,7 +32,7 @@ _HEADS_KILLED = {**_HEADS, Opcode.METADATA: 4}
 @dataclass(frozen=True)
 class Count:
     """
-    What became of the flips.
+    Result of the flips.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ def flip(path: Path, bits: Sequence[int], work: Path) -> Count:
     Returns
     -------
     Count
-        What became of them.
+        Result of the flips.
 
     """
     original = path.read_bytes()
@@ -182,7 +182,7 @@ def samples(count: int, work: Path) -> Iterator[tuple[str, Count]]:
     name : str
         Of the kind of bag.
     result : Count
-        What became of its share.
+        Result of its share.
 
     """
     dice = random.Random(6)

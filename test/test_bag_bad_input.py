@@ -250,7 +250,7 @@ def test_damage_outside_the_chunks_is_got_around_by_the_index(tmp_path):
     path.write_bytes(data)
     reader, got = stamps(path)
     assert got == list(range(400))
-    # It costs nothing, since the index names the chunks; the CRC of the data tells of it.
+    # It costs nothing, since the index names the chunks; the CRC of the data shows it.
     assert reader.counts() == {'/a': 400}
     assert any('the CRC of its data differs' in problem for problem in reader.problems)
 

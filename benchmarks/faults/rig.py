@@ -748,7 +748,7 @@ def settled(
     stamps, values : ndarray, shape (n,) and (n, 3)
         Samples from before the move until long after it, stamped in ns.
     applied : sequence of (int, float)
-        What the plant tells of the changes: stamp in ns and level. Samples do not show one
+        Changes that the plant reported: stamp in ns and level. Samples do not show one
         that is superseded within a sample.
     target : float
         Stretch that was asked for.
