@@ -68,14 +68,16 @@ def pytest_xdist_auto_num_workers() -> int:
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """
     Say what each worker takes at once: a test that runs nodes, or all others of a module.
 
     Long tests begin first.
     """
+    # Where the tests run without it (as colcon may), each is tried once.
+    retries = config.pluginmanager.hasplugin('rerunfailures')
     for item in items:
-        if any(name in item.nodeid for name in TRIED_AGAIN):
+        if retries and any(name in item.nodeid for name in TRIED_AGAIN):
             item.add_marker(pytest.mark.flaky(reruns=1))
         if 'ros_domain_id' in getattr(item, 'fixturenames', ()):
             item.add_marker(pytest.mark.ros)

@@ -358,8 +358,7 @@ def _sampling(actuator: 'ActuatorParameters') -> list[str]:
     digits = 10 ** (math.floor(math.log10(enough)) - 1)
     rate = min(math.ceil(enough / digits) * digits, largest)
     return [
-        '/**/plant:', '  ros__parameters:',
-        '    # Sample rate: at least 20 samples per period of the actuator [Hz].',
+        '    # Sample rate of the plant: at least 20 samples per period of the actuator [Hz].',
         f'    publish_rate: {_number(rate)}']
 
 

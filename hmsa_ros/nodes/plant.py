@@ -99,6 +99,7 @@ class PlantNode(ManagedNode):
         self.add_on_set_parameters_callback(self._on_parameters)
         self._joints: list[PlantJoint] = []
         self._pacer = Pacer(0, 1.0)
+        self._clock_seen = 0
         self.autostart()
 
     def configure(self) -> None:
@@ -217,13 +218,18 @@ class PlantNode(ManagedNode):
         now = int(self.get_clock().now().nanoseconds)
         if now == 0:
             return
+        behind = now - self._clock_seen < 1_000_000_000
+        self._clock_seen = now
         jump = self._device.follow(now, standing=self._standing)
         if jump:
-            self.get_logger().warning(
-                f'the clock jumped {"ahead" if jump > 0 else "back"} by {abs(jump) / 1e9:.3f} s: '
-                'the simulation ' + (
-                    'continues from there in its present state' if jump > 0
-                    else 'starts again from its initial state'), throttle_duration_sec=1.0)
+            if jump < 0:
+                what = (f'the clock jumped back by {-jump / 1e9:.3f} s: the simulation starts '
+                        'again from its initial state')
+            else:
+                cause = (f'the plant fell {jump / 1e9:.3f} s behind the clock (lower publish_rate)'
+                         if behind else f'the clock jumped ahead by {jump / 1e9:.3f} s')
+                what = f'{cause}: the simulation continues from there in its present state'
+            self.get_logger().warning(what, throttle_duration_sec=1.0)
             self._publish_news()
         begin = monotonic_ns()
         while (self._device.next_sample <= now and not self._standing
