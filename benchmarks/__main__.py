@@ -73,6 +73,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument('--picture', type=Path, metavar='FILE',
                         help='soak: PNG of memory over time')
     options = parser.parse_args(arguments)
+    if options.page and not options.page.is_file():
+        parser.error(f'--page: there is no file {options.page}: expected a page with marks')
     names = options.names or NAMES
     for name in names:
         if name not in NAMES + LONG:
