@@ -196,10 +196,11 @@ class Designer:
                 'shorter sequence')
         self.duration, self._rate = duration, rate
         self._reference = dict.fromkeys(self._free, 1.0)
-        self.point = np.zeros(2 * _PATTERN)
+        self.point: Array = np.zeros(2 * _PATTERN)
         count = int(duration * rate)
-        self._times = np.arange(count) / rate
-        self._dense = np.linspace(0.0, duration, max(int(40.0 * duration / self.period), 200))
+        self._times: Array = np.arange(count) / rate
+        self._dense: Array = np.linspace(
+            0.0, duration, max(int(40.0 * duration / self.period), 200), dtype=np.float64)
         lower, upper = model.stretch_limits(self._group)
         if math.isinf(upper):
             upper = 10.0
@@ -219,7 +220,7 @@ class Designer:
     def _recording(self, times: Array, level_times: Array, levels: Array) -> Recording:
         # Only levels and times count.
         return Recording(
-            times, np.linspace(1.0, 1.5, len(times)), level_times, levels,
+            times, np.linspace(1.0, 1.5, len(times), dtype=np.float64), level_times, levels,
             self._bounds.slew_limit)
 
     def judge(self, level_times: Array, levels: Array) -> Program | None:
@@ -257,7 +258,8 @@ class Designer:
         # Ramps have to be over before the last move begins.
         state = respond(
             self._recording(
-                np.linspace(0.0, end, 50), level_times, levels), self._values, (), rtol=1e-9)
+                np.linspace(0.0, end, 50, dtype=np.float64), level_times, levels), self._values,
+            (), rtol=1e-9)
         time, level = self._actuator.time_unit, float(levels[-1])
         slew = self._bounds.slew_limit / self._unit * time
         try:
@@ -351,9 +353,10 @@ class Designer:
         random = np.random.default_rng(seed)
         low, high = self._range
 
-        best, score, point = None, -math.inf, np.zeros(2 * _PATTERN)
+        point: Array = np.zeros(2 * _PATTERN)
+        best, score = None, -math.inf
         for i in range(_FIRST):
-            trial = np.append(
+            trial: Array = np.append(
                 random.uniform(low, high, _PATTERN), random.uniform(0.3, 5.0, _PATTERN))
             if i == 0:
                 # Large steps to both sides, each with the time to ring.

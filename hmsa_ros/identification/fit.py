@@ -180,7 +180,7 @@ class _Search:
     def run(self, values: Mapping[str, float]) -> Fit | None:
         """Descend from start values."""
         values = dict(values)
-        shifts = np.full(len(self._recording.uncertain), self._middle)
+        shifts: Array = np.full(len(self._recording.uncertain), self._middle)
         response = self._respond(values, shifts)
         if response is None:
             return None

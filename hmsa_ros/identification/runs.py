@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hmsa_ros.core.model import Array
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
@@ -74,7 +75,7 @@ def read_bag(
         {'coil_time_constant': run.number('planner.coil_time_constant')})
 
 
-def _last_at_each(stamps: 'np.ndarray[tuple[int], np.dtype[np.float64]]') -> list[int]:
+def _last_at_each(stamps: Array) -> list[int]:
     """Return the places of the last of those at one time."""
     return [i for i in range(len(stamps)) if i + 1 == len(stamps) or stamps[i + 1] > stamps[i]]
 

@@ -114,7 +114,7 @@ def read_table(path: Path, wanted: tuple[str, ...], optional: tuple[str, ...] = 
         raise BadInputError(
             f'{path} has no column {" and no column ".join(missing)}: expected '
             f'{", ".join(wanted)}; its columns are {excerpt(", ".join(cells))}')
-    columns = {name: np.full(len(rows) - 1, np.nan) for name in places}
+    columns: dict[str, Array] = {name: np.full(len(rows) - 1, np.nan) for name in places}
     for i, (line, text) in enumerate(rows[1:]):
         parts = _split(text, separator)
         for name, (place, factor) in places.items():
@@ -257,7 +257,7 @@ def read_csv(
 def _kept(path: Path, table: Table, notes: list[str]) -> NDArray[np.bool_]:
     """Return which rows can be used, and note the others; refuse a file with too many."""
     time, stretch = table.columns['time'], table.columns['stretch']
-    keep = np.isfinite(time) & np.isfinite(stretch)
+    keep: NDArray[np.bool_] = np.isfinite(time) & np.isfinite(stretch)
     lost = int(np.count_nonzero(~keep))
     if lost:
         notes.append(f'{lost} rows without a number were left out')

@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.units import NANOSECONDS
@@ -63,7 +64,7 @@ def levels_of(run: Run) -> dict[str, Array]:
             'flux_density': np.array([x.flux_density for x in run.levels])}
 
 
-def _seconds(run: Run, stamps: 'np.ndarray[tuple[int], np.dtype[np.int64]]') -> Array:
+def _seconds(run: Run, stamps: NDArray[np.int64]) -> Array:
     return np.asarray((stamps - run.time[0]) / NANOSECONDS, dtype=np.float64)
 
 
