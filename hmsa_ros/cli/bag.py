@@ -16,15 +16,7 @@ _LARGEST_CHUNK = 65536
 
 
 def add_parser(subparsers: Any) -> None:
-    """
-    Add the command.
-
-    Parameters
-    ----------
-    subparsers : argparse action
-        Where to add it.
-
-    """
+    """Add the command."""
     parser = subparsers.add_parser(
         'bag', help='inspect, verify and recover bags',
         description='Inspect, verify and recover recordings (MCAP bags as rosbag2 writes them).',
@@ -70,16 +62,6 @@ def add_parser(subparsers: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """
     Carry out one action.
-
-    Parameters
-    ----------
-    arguments : argparse.Namespace
-        With ``action`` and what it needs.
-
-    Returns
-    -------
-    int
-        Exit status.
 
     Raises
     ------

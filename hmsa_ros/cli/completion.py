@@ -75,15 +75,7 @@ class Command:
 
 
 def add_parser(subparsers: Any) -> None:
-    """
-    Add the command.
-
-    Parameters
-    ----------
-    subparsers : argparse action
-        Where to add it.
-
-    """
+    """Add the command."""
     parser = subparsers.add_parser(
         'completion', help='print a shell completion script',
         description='Print a script that lets the shell complete commands, options and files. '
@@ -95,20 +87,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """
-    Print the script.
-
-    Parameters
-    ----------
-    arguments : argparse.Namespace
-        As parsed.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    """
+    """Print the script."""
     from hmsa_ros.cli import build_parser
 
     print(_SCRIPTS[arguments.shell](list(commands_of(build_parser()))), end='')

@@ -15,15 +15,7 @@ if TYPE_CHECKING:
 
 
 def add_parser(subparsers: Any) -> None:
-    """
-    Add the command.
-
-    Parameters
-    ----------
-    subparsers : argparse action
-        Where to add it.
-
-    """
+    """Add the command."""
     parser = subparsers.add_parser(
         'demo', help="run the paper's sequence on real ROS 2 processes",
         description="Start planner, plant and recorder, send the paper's sequence, and print "
@@ -37,25 +29,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """
-    Run the demo.
-
-    Parameters
-    ----------
-    arguments : argparse.Namespace
-        As parsed.
-
-    Returns
-    -------
-    int
-        0 only if every setpoint was reached and held and every process ended cleanly.
-
-    Raises
-    ------
-    HmsaError
-        If a process fails.
-
-    """
+    """Run the demo."""
     from rich.console import Console
 
     from hmsa_ros.session.processes import local_environment

@@ -9,15 +9,7 @@ from hmsa_ros.errors import BadInputError
 
 
 def add_parser(subparsers: Any) -> None:
-    """
-    Add the command.
-
-    Parameters
-    ----------
-    subparsers : argparse action
-        Where to add it.
-
-    """
+    """Add the command."""
     parser = subparsers.add_parser(
         'export', help='write the samples and levels of a run as CSV or Parquet',
         description='Write the samples of a run (time in s from the first sample, stretch, '
@@ -37,16 +29,6 @@ def add_parser(subparsers: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """
     Read and write.
-
-    Parameters
-    ----------
-    arguments : argparse.Namespace
-        As parsed.
-
-    Returns
-    -------
-    int
-        Exit status.
 
     Raises
     ------

@@ -9,15 +9,7 @@ from hmsa_ros.files import make_folder
 
 
 def add_parser(subparsers: Any) -> None:
-    """
-    Add the command.
-
-    Parameters
-    ----------
-    subparsers : argparse action
-        Where to add it.
-
-    """
+    """Add the command."""
     parser = subparsers.add_parser(
         'figures', help="compute and draw the paper's Figures 2 to 10",
         description="Compute the paper's Figures 2 to 10 and write each as PNG and CSV "
@@ -30,27 +22,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """
-    Write the figures and print what was written.
-
-    Parameters
-    ----------
-    arguments : argparse.Namespace
-        With ``out``.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    Raises
-    ------
-    BadInputError
-        If the folder cannot be written to.
-    HmsaError
-        If a computation fails.
-
-    """
+    """Write the figures and print what was written."""
     folder: Path = arguments.out
     # Before the slow imports: a bad folder is reported immediately.
     make_folder(folder)

@@ -14,15 +14,7 @@ if TYPE_CHECKING:
 
 
 def add_parser(subparsers: Any) -> None:
-    """
-    Add the command.
-
-    Parameters
-    ----------
-    subparsers : argparse action
-        Where to add it.
-
-    """
+    """Add the command."""
     parser = subparsers.add_parser(
         'identify', help="identify the actuator's parameters from a recording",
         description="Identify the actuator's parameters from a recording of its motion, with 95 "
@@ -62,25 +54,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """
-    Read, identify and print.
-
-    Parameters
-    ----------
-    arguments : argparse.Namespace
-        As parsed.
-
-    Returns
-    -------
-    int
-        Exit status: 0 only if the parameters are identified.
-
-    Raises
-    ------
-    BadInputError
-        If the recording or a file cannot be used.
-
-    """
+    """Read, identify and print."""
     _check_targets(arguments)
 
     from hmsa_ros.identification.files import file_text, read_belief

@@ -36,15 +36,7 @@ _HARDLY = 0.01
 
 
 def add_parser(subparsers: Any) -> None:
-    """
-    Add the command.
-
-    Parameters
-    ----------
-    subparsers : argparse action
-        Where to add it.
-
-    """
+    """Add the command."""
     parser = subparsers.add_parser(
         'init', help='write a parameter file for your own actuator',
         description='Write a parameter file of your own actuator for planner and plant '
@@ -91,16 +83,6 @@ def _reader(quantity: Quantity) -> Callable[[str], float]:
 def run(arguments: argparse.Namespace) -> int:
     """
     Ask, write and print.
-
-    Parameters
-    ----------
-    arguments : argparse.Namespace
-        As parsed.
-
-    Returns
-    -------
-    int
-        Exit status.
 
     Raises
     ------

@@ -21,15 +21,7 @@ _EXAMPLES = {
 
 
 def add_parser(subparsers: Any) -> None:
-    """
-    Add one command a node.
-
-    Parameters
-    ----------
-    subparsers : argparse action
-        Where to add them.
-
-    """
+    """Add one command a node."""
     for name, summary in NODES.items():
         parser = subparsers.add_parser(
             name, help=f'run the {name} node: {summary}',
@@ -41,20 +33,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """
-    Run the node until it is asked to end.
-
-    Parameters
-    ----------
-    arguments : argparse.Namespace
-        With ``node`` and ``ros_args``.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    """
+    """Run the node until it is asked to end."""
     # Asked to end while ROS is imported, it has nothing to put in order.
     ENDING.leave(0)
     module = import_module(f'hmsa_ros.nodes.{arguments.node}')

@@ -15,15 +15,7 @@ if TYPE_CHECKING:
 
 
 def add_parser(subparsers: Any) -> None:
-    """
-    Add the command.
-
-    Parameters
-    ----------
-    subparsers : argparse action
-        Where to add it.
-
-    """
+    """Add the command."""
     parser = subparsers.add_parser(
         'plan', help='plan a sequence of setpoints without ROS',
         description='Plan a sequence of setpoints, nondimensional as in the paper: each '
@@ -57,25 +49,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """
-    Plan and print.
-
-    Parameters
-    ----------
-    arguments : argparse.Namespace
-        As parsed.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    Raises
-    ------
-    BadInputError
-        If a setpoint cannot be had or a parameter is out of range.
-
-    """
+    """Plan and print."""
     if arguments.params_file is not None:
         return _run_si(arguments)
     from hmsa_ros.core.moves import State

@@ -13,15 +13,7 @@ if TYPE_CHECKING:
 
 
 def add_parser(subparsers: Any) -> None:
-    """
-    Add the command.
-
-    Parameters
-    ----------
-    subparsers : argparse action
-        Where to add it.
-
-    """
+    """Add the command."""
     parser = subparsers.add_parser(
         'report', help='write an HTML report of a run from its bag',
         description='Write a report of a run as one self-contained HTML page: response, '
@@ -48,25 +40,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """
-    Read, evaluate and write.
-
-    Parameters
-    ----------
-    arguments : argparse.Namespace
-        As parsed.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    Raises
-    ------
-    HmsaError
-        If a bag cannot be read or a file cannot be written.
-
-    """
+    """Read, evaluate and write."""
     bags: list[Path] = arguments.bags
     out = arguments.out or Path(f'{bags[0].resolve().stem}_report.html')
     targets = [x for x in (out, arguments.png, arguments.pdf) if x is not None]

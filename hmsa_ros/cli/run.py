@@ -21,15 +21,7 @@ NOT_MEASURED = 'predicted, not measured'
 
 
 def add_parser(subparsers: Any) -> None:
-    """
-    Add the command.
-
-    Parameters
-    ----------
-    subparsers : argparse action
-        Where to add it.
-
-    """
+    """Add the command."""
     parser = subparsers.add_parser(
         'run', help='carry out a whole experiment: check, record, send, measure',
         description='Carry out an experiment with the planner and the plant or driver that run, '
@@ -68,25 +60,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """
-    Carry out the experiment.
-
-    Parameters
-    ----------
-    arguments : argparse.Namespace
-        As parsed.
-
-    Returns
-    -------
-    int
-        0 only if all that was measured arrived and every process ended cleanly.
-
-    Raises
-    ------
-    HmsaError
-        If a check or a process fails.
-
-    """
+    """Carry out the experiment."""
     from rich.console import Console
 
     tolerance = _tolerance(arguments)

@@ -10,15 +10,7 @@ from hmsa_ros.errors import BadInputError
 
 
 def add_parser(subparsers: Any) -> None:
-    """
-    Add the command.
-
-    Parameters
-    ----------
-    subparsers : argparse action
-        Where to add it.
-
-    """
+    """Add the command."""
     parser = subparsers.add_parser(
         'send', help='publish a sequence of setpoints to the running planner',
         description='Publish a sequence of setpoints to the running planner, beginning now, '
@@ -48,16 +40,6 @@ def add_parser(subparsers: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """
     Send and, if asked to, wait.
-
-    Parameters
-    ----------
-    arguments : argparse.Namespace
-        As parsed.
-
-    Returns
-    -------
-    int
-        Exit status.
 
     Raises
     ------

@@ -17,15 +17,7 @@ _AXES = (
 
 
 def add_parser(subparsers: Any) -> None:
-    """
-    Add the command.
-
-    Parameters
-    ----------
-    subparsers : argparse action
-        Where to add it.
-
-    """
+    """Add the command."""
     parser = subparsers.add_parser(
         'sweep', help='plan over grids of parameters or a table of cases',
         description='Plan the two-step command for all combinations of the values given, '
@@ -48,25 +40,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """
-    Plan and write.
-
-    Parameters
-    ----------
-    arguments : argparse.Namespace
-        As parsed.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    Raises
-    ------
-    BadInputError
-        If a grid or the table is malformed or too large, or the file cannot be written.
-
-    """
+    """Plan and write."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,

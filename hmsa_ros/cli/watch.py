@@ -25,15 +25,7 @@ _LOOK_SECONDS = 0.1
 
 
 def add_parser(subparsers: Any) -> None:
-    """
-    Add the command.
-
-    Parameters
-    ----------
-    subparsers : argparse action
-        Where to add it.
-
-    """
+    """Add the command."""
     parser = subparsers.add_parser(
         'watch', help='show the running nodes live in the terminal',
         description='Show stretch against target, command, progress of the plan, the verdict on '
@@ -65,16 +57,6 @@ def add_parser(subparsers: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """
     Watch until told to end.
-
-    Parameters
-    ----------
-    arguments : argparse.Namespace
-        As parsed.
-
-    Returns
-    -------
-    int
-        Exit status.
 
     Raises
     ------
