@@ -197,17 +197,19 @@ def _interpolate(x, h, y, start, new, end, w, c):
 
 @compiled()
 def respond(
-        theta, material, branches, wanted, start, begins, levels, ramps, field, times, rtol,
-        stretch, rate, jacobian):
+        theta, material, branches, wanted, start, begins, levels, ramps, field, field_lag, times,
+        rtol, stretch, rate, jacobian, by_rate):
     """
     Sample the response and its derivatives at increasing times.
 
     Parameters: ``theta`` and ``wanted``, places in it, as the module says; ``material`` as the
     law packs it, whose damping is set; ``start`` derivatives of the initial stretch by the
     wanted parameters; the amplifier's level is ``levels[m] + ramps[m] (t - begins[m])`` from
-    ``begins[m]`` on, the field at ``begins[0]`` is ``field``, a branch has relaxed there.
-    ``stretch``, ``rate`` (n,) and ``jacobian`` (n, wanted) take the samples; before the begin
-    the motion is uniform. Returns whether the motion was followed to its end.
+    ``begins[m]`` on, the field at ``begins[0]`` is ``field``, its derivative by the lag
+    ``field_lag``; a branch has relaxed there. ``stretch``, ``rate`` (n,) and ``jacobian``
+    (n, wanted) take the samples, ``by_rate`` the derivatives of the rate, (n, wanted) or
+    (0, wanted) for none; before the begin the motion is uniform. Returns whether the motion was
+    followed to its end.
     """
     n, count = 2 + branches, wanted.size
     w = 1 + count
@@ -237,10 +239,12 @@ def respond(
         rate[i] = y[w]
         for j in range(count):
             jacobian[i, j] = y[1 + j] + (times[i] - t) * y[w + 1 + j]
+        for j in range(by_rate.shape[0] and count):
+            by_rate[i, j] = y[w + 1 + j]
         i += 1
     drive[0], drive[1] = levels[0], ramps[0]
     drive[2] = field - (levels[0] - ramps[0] * lag)
-    drive[3] = ramps[0]
+    drive[3] = field_lag + ramps[0]
     fresh = True
     unit = _unit_of(theta, branches)
     material[law.DAMPING] = theta[DAMPING] / unit[2]
@@ -257,6 +261,8 @@ def respond(
             rate[i] = y[w]
             for j in range(count):
                 jacobian[i, j] = y[1 + j]
+            for j in range(by_rate.shape[0] and count):
+                by_rate[i, j] = y[w + 1 + j]
             i += 1
         if i == times.size:
             return True
@@ -282,7 +288,9 @@ def respond(
             x = (times[i] - t) / step
             stretch[i], rate[i] = _interpolate(x, step, y, k[0], new, end, w, 0)
             for j in range(count):
-                jacobian[i, j], _ = _interpolate(x, step, y, k[0], new, end, w, 1 + j)
+                jacobian[i, j], slope = _interpolate(x, step, y, k[0], new, end, w, 1 + j)
+                if by_rate.shape[0]:
+                    by_rate[i, j] = slope
             i += 1
         for c in range(size):
             y[c] = new[c]

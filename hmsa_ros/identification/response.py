@@ -115,6 +115,72 @@ def complete(values: Mapping[str, float], free: Sequence[str]) -> dict[str, floa
     return done
 
 
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """
+    What the kernel needs of values, and how its derivatives make those by free parameters.
+
+    Attributes
+    ----------
+    theta : ndarray
+        As the kernel names its places.
+    material : ndarray
+        The packed law.
+    branches : int
+        Of creep.
+    wanted : ndarray, shape (w,)
+        Places in ``theta``, or of constants of the law, by which to differentiate.
+    mixing : ndarray, shape (w, p)
+        Derivatives of these by the coordinates of the free parameters; 0 for those of the sensor.
+
+    """
+
+    theta: Array
+    material: Array
+    branches: int
+    wanted: NDArray[np.int64]
+    mixing: Array
+
+    @classmethod
+    def of(cls, values: Mapping[str, float], free: Sequence[str]) -> 'Setup':
+        """
+        Work it out.
+
+        Parameters
+        ----------
+        values : mapping of str to float
+            Of all quantities, as `complete` returns them.
+        free : sequence of str
+            By which to differentiate.
+
+        Returns
+        -------
+        Setup
+            With arrays of its own.
+
+        """
+        branches = int(values['viscoelastic_ratio'] > 0.0 or 'viscoelastic_ratio' in free)
+        theta, chain = _chain(values, branches)
+        if 'time_unit' in free and 'shear_modulus' in free:
+            extra = values['density'] / values['shear_modulus']
+            modulus = dict(chain['shear_modulus'])
+            for i, x in chain['density'].items():
+                modulus[i] = modulus.get(i, 0.0) + x * extra
+            chain['shear_modulus'] = modulus
+        inner = [x for x in free if x not in _SENSOR]
+        wanted = np.array(sorted({i for x in inner for i in chain[x]}), dtype=np.int64)
+        material = pack(0.0, values['chain_limit'], 2.0 * (
+            values['half_thickness'] / values['half_length']) ** 2)
+        if 'chain_limit' in free:
+            material[KIND] = GENT
+        mixing = np.zeros((len(wanted), len(free)))
+        for j, name in enumerate(free):
+            if name not in _SENSOR:
+                for i, x in chain[name].items():
+                    mixing[np.searchsorted(wanted, i), j] = derivative(name, values[name]) * x
+        return cls(theta, material, branches, wanted, mixing)
+
+
 def respond(
         recording: Recording, values: Mapping[str, float], free: Sequence[str], *,
         at_rest: bool = True, rtol: float = RTOL, shifts: Array | None = None
@@ -146,16 +212,9 @@ def respond(
 
     """
     values = complete(values, free)
-    branches = int(values['viscoelastic_ratio'] > 0.0 or 'viscoelastic_ratio' in free)
-    theta, chain = _chain(values, branches)
-    if 'time_unit' in free and 'shear_modulus' in free:
-        extra = values['density'] / values['shear_modulus']
-        modulus = dict(chain['shear_modulus'])
-        for i, x in chain['density'].items():
-            modulus[i] = modulus.get(i, 0.0) + x * extra
-        chain['shear_modulus'] = modulus
-    inner = [x for x in free if x not in _SENSOR]
-    wanted = np.array(sorted({i for x in inner for i in chain[x]}), dtype=np.int64)
+    setup = Setup.of(values, free)
+    theta, material, wanted = setup.theta, setup.material, setup.wanted
+    branches = setup.branches
     times = recording.time - values['sensor_latency']
     begin = float(recording.time[0])
     if at_rest:
@@ -171,10 +230,6 @@ def respond(
         place = np.searchsorted(begins, level_times[uncertain])
         wanted = np.append(wanted, kernels.SWITCH + place)
     start = np.zeros(len(wanted))
-    material = pack(0.0, values['chain_limit'], 2.0 * (
-        values['half_thickness'] / values['half_length']) ** 2)
-    if 'chain_limit' in free:
-        material[KIND] = GENT
     if at_rest and not _set_rest(theta, material, float(levels[0]), wanted, start):
         return None
     if not at_rest:
@@ -183,21 +238,15 @@ def respond(
     stretch, rate, raw = np.empty(n), np.empty(n), np.empty((n, len(wanted)))
     if not kernels.respond(
             theta, material, branches, wanted, start, begins, levels, slopes, float(levels[0]),
-            times, rtol, stretch, rate, raw):
+            0.0, times, rtol, stretch, rate, raw, np.empty((0, len(wanted)))):
         return None
     gain = values['stretch_gain']
-    mixing = np.zeros((inner_count, len(free)))
-    jacobian = np.zeros((n, len(free)))
+    jacobian = gain * raw[:, :inner_count] @ setup.mixing
     for j, name in enumerate(free):
-        scale = derivative(name, values[name])
         if name in _SENSOR:
-            jacobian[:, j] = scale * (
+            jacobian[:, j] = derivative(name, values[name]) * (
                 1.0 if name == 'stretch_bias' else stretch if name == 'stretch_gain'
                 else -gain * rate)
-            continue
-        for i, x in chain[name].items():
-            mixing[np.searchsorted(wanted[:inner_count], i), j] = gain * scale * x
-    jacobian += raw[:, :inner_count] @ mixing
     return Response(
         gain * stretch + values['stretch_bias'], rate, jacobian, gain * raw[:, inner_count:])
 
