@@ -40,7 +40,8 @@ def modules(package: str) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    'package', ['core', 'device', 'runtime', 'bag', 'studies', 'contract', 'runs', 'report'])
+    'package', ['core', 'device', 'runtime', 'bag', 'studies', 'contract', 'runs', 'report',
+                'estimation'])
 def test_physics_runtime_bags_and_studies_import_without_ros_each_module_by_itself(package):
     result = run(BLOCKED.format(blocked=ROS) + f"""
 import importlib

@@ -230,7 +230,7 @@ def respond(
         place = np.searchsorted(begins, level_times[uncertain])
         wanted = np.append(wanted, kernels.SWITCH + place)
     start = np.zeros(len(wanted))
-    if at_rest and not _set_rest(theta, material, float(levels[0]), wanted, start):
+    if at_rest and not set_rest(theta, material, float(levels[0]), wanted, start):
         return None
     if not at_rest:
         start[wanted == kernels.STRETCH] = 1.0
@@ -251,10 +251,27 @@ def respond(
         gain * stretch + values['stretch_bias'], rate, jacobian, gain * raw[:, inner_count:])
 
 
-def _set_rest(
+def set_rest(
         theta: Array, material: Array, level: float, wanted: NDArray[np.int64], start: Array
 ) -> bool:
-    """Begin at the rest of a level; return whether there is one."""
+    """
+    Begin at the rest of a level.
+
+    Parameters
+    ----------
+    theta, material, wanted : ndarray
+        As `Setup` has them; stretch and rate in ``theta`` are set.
+    level : float
+        Flux density in T.
+    start : ndarray, shape (w,)
+        Takes the derivatives of the stretch by what is wanted.
+
+    Returns
+    -------
+    bool
+        Whether there is one.
+
+    """
     a, k, f = theta[[kernels.STIFFNESS, kernels.DRIVE, kernels.FORCE]]
     rest = equilibrium_stretch((k * level + f) / a, material)
     force, stiffness = elastic_force(rest, material), elastic_stiffness(rest, material)

@@ -1,0 +1,360 @@
+"""What is believed of an actuator: samples in, state and parameters out."""
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+
+from hmsa_ros.core.model import Array
+from hmsa_ros.core.parameters import ActuatorParameters
+from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.estimation.motion import Levels, rest
+from hmsa_ros.estimation.prior import Prior
+from hmsa_ros.estimation.screening import Screening
+from hmsa_ros.estimation.window import coordinates, Solution, Window
+from hmsa_ros.identification.fit import robust_scale
+from hmsa_ros.identification.quantities import actuator_of, derivative, QUANTITIES
+
+# Until the scatter is seen.
+_FIRST_NOISE, _LEAST_NOISE = 1e-3, 2e-6
+_FEWEST_FOR_NOISE = 10
+# How fast the estimate of the noise follows the residuals.
+_NOISE_GAIN = 0.05
+# Deviations of the prior that an estimate may be off it.
+_BOUND = 4.0
+# Deviation of stretch and, in natural frequencies, of rate of a block at rest, and of one whose
+# state is not known.
+_AT_REST, _ANYWHERE = 2e-6, 0.3
+# Window, as a share, that is left when it moves on, its longest span in units of time, and the
+# samples from which on that counts.
+_KEPT, _LONGEST, _FEWEST = 0.5, 200.0, 20
+
+
+@dataclass(frozen=True)
+class Options:
+    """
+    How to estimate.
+
+    Attributes
+    ----------
+    window : int
+        Largest number of samples in the horizon, at least 10.
+    noise : float
+        Standard deviation of a sample of stretch; 0 to estimate it.
+    learn : bool
+        Whether parameters are estimated; else the state alone.
+    gate : float
+        Deviations of the innovation from which a sample is rejected.
+    drift : float
+        Share of the prior deviation that a parameter may wander in a second.
+    slew_limit : float
+        Of the amplifier in T/s; infinite for steps.
+
+    Raises
+    ------
+    BadInputError
+        If a value is out of range.
+
+    """
+
+    window: int = 120
+    noise: float = 0.0
+    learn: bool = True
+    gate: float = 6.0
+    drift: float = 0.003
+    slew_limit: float = math.inf
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for name, least in (('window', 10), ('noise', 0.0), ('gate', 1.0), ('drift', 0.0)):
+            if not least <= getattr(self, name) < math.inf:
+                raise BadInputError(
+                    f'{name} is {getattr(self, name)}: expected at least {least:g}')
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """
+    What is believed at a time.
+
+    Attributes
+    ----------
+    time : int
+        In ns.
+    stretch, rate : float
+        Of the block, the rate in 1/s.
+    values : dict of str to float
+        Of all quantities.
+    free : tuple of str
+        Those that are tracked.
+    deviations : dict of str to float
+        Standard deviations of these, in SI.
+    covariance : ndarray, shape (p + 2, p + 2)
+        Of the coordinates of these, of stretch and of rate.
+    noise : float
+        Standard deviation of a sample.
+    trusted : bool
+        Whether it may be acted upon.
+    trouble : str
+        Why not; empty if it may.
+
+    """
+
+    time: int
+    stretch: float
+    rate: float
+    values: dict[str, float]
+    free: tuple[str, ...]
+    deviations: dict[str, float]
+    covariance: Array
+    noise: float
+    trusted: bool
+    trouble: str
+
+    @property
+    def actuator(self) -> ActuatorParameters:
+        """The block."""
+        return actuator_of(self.values)
+
+
+class Estimator:
+    """
+    Tracks one actuator.
+
+    Parameters
+    ----------
+    prior : Prior
+        What is known before.
+    options : Options, optional
+        How to estimate.
+
+    Attributes
+    ----------
+    prior : Prior
+        As given.
+    options : Options
+        As given.
+    noise : float
+        Standard deviation of a sample, as far as it is known.
+    screening : Screening
+        What was rejected, and why.
+
+    """
+
+    def __init__(self, prior: Prior, options: Options | None = None) -> None:
+        """Begin with no sample and no field."""
+        self.prior = prior
+        self.options = options or Options()
+        self.noise = self.options.noise or _FIRST_NOISE
+        self.screening = Screening(self.options.gate)
+        self._levels: list[tuple[int, float]] = []
+        self._pending: list[tuple[int, float]] = []
+        self._origin = 0
+        self._window: Window | None = None
+        self._solution: Solution | None = None
+
+    # -- in ------------------------------------------------------------------------------------
+
+    def level(self, stamp: int, flux_density: float) -> None:
+        """Take in a level in T from a stamp in ns on; it supersedes what comes at or after it."""
+        place = bisect_left(self._levels, stamp, key=lambda x: x[0])
+        self._levels[place:] = [(stamp, flux_density)]
+
+    def set_levels(self, levels: Sequence[tuple[int, float]]) -> None:
+        """Take in all levels from the begin of the window on: stamps in ns, and T."""
+        self._levels = list(levels)
+
+    def sample(self, stamp: int, stretch: float) -> bool:
+        """
+        Take in a sample; it counts at the next `update`.
+
+        Parameters
+        ----------
+        stamp : int
+            Time in ns at which it was taken.
+        stretch : float
+            Measured.
+
+        Returns
+        -------
+        bool
+            Whether it can count.
+
+        """
+        if not self.screening.readable(stretch):
+            return False
+        if self._window is not None and stamp < self._origin + round(
+                self._window.begin * NANOSECONDS):
+            self.screening.late += 1
+            return False
+        place = bisect_left(self._pending, stamp, key=lambda x: x[0])
+        if stamp in self._stamps() or (
+                place < len(self._pending) and self._pending[place][0] == stamp):
+            self.screening.repeated += 1
+            return False
+        self._pending.insert(place, (stamp, stretch))
+        return True
+
+    def reset(self, prior: Prior | None = None) -> None:
+        """Forget what was learnt, or go on from another prior."""
+        self.prior = prior or self.prior
+        self._window = self._solution = None
+        self._pending.clear()
+        self.screening = Screening(self.options.gate)
+
+    # -- out -----------------------------------------------------------------------------------
+
+    def update(self, time: int) -> Estimate | None:
+        """
+        Take samples into account and predict.
+
+        Parameters
+        ----------
+        time : int
+            In ns: for when the state is wanted; levels until then have been taken in.
+
+        Returns
+        -------
+        Estimate or None
+            None before the first sample.
+
+        """
+        window = self._window or self._begin()
+        if window is None:
+            return None
+        self._window = window
+        self._take(window)
+        until = max(self._seconds(time), window.begin,
+                    float(window.time[-1]) if len(window.time) else 0.0)
+        z = window.mean if self._solution is None else self._solution.z
+        found = window.solve(z, self._as_levels(), self.noise, until)
+        if found is None:
+            self.screening.trouble = 'no motion leads through the samples'
+            return None
+        self._solution = found
+        self._follow_noise(found)
+        estimate = self._estimate(time, found)
+        self._go_along(window, found, until)
+        return estimate
+
+    def _begin(self) -> Window | None:
+        """Return a window at rest under the level in force at the first sample."""
+        if not self._pending:
+            return None
+        stamp = self._pending[0][0]
+        if not self._levels or self._levels[0][0] > stamp:
+            self._levels.insert(0, (stamp, 0.0))
+        self._origin = stamp
+        prior = self.prior
+        mean = coordinates(prior.values, prior.free)
+        size = np.sqrt(np.diag(prior.covariance))
+        bounds = np.stack([mean - _BOUND * size, mean + _BOUND * size], axis=1)
+        for i, name in enumerate(prior.free):
+            if QUANTITIES[name].scale == 'linear':
+                bounds[i, 0] = max(bounds[i, 0], QUANTITIES[name].least)
+            elif QUANTITIES[name].scale == 'inverse':
+                bounds[i, 0] = max(bounds[i, 0], 0.2 * mean[i])
+        known = prior.covariance * (1.0 if self.options.learn else 1e-12)
+        at = rest(prior.values, prior.free, self._in_force(stamp))
+        stretch, frequency, by = at or (
+            self._pending[0][1], 1.0 / prior.values['time_unit'], np.zeros(len(mean)))
+        off = _AT_REST if at is not None else _ANYWHERE
+        covariance = np.zeros((len(mean) + 2, len(mean) + 2))
+        covariance[:-2, :-2] = known
+        covariance[:-2, -2] = covariance[-2, :-2] = known @ by
+        covariance[-2, -2] = by @ known @ by + off ** 2
+        covariance[-1, -1] = (off * frequency) ** 2
+        return Window(
+            dict(prior.values), prior.free, np.append(mean, [stretch, 0.0]), covariance, bounds,
+            0.0, np.zeros(0), np.zeros(0))
+
+    def _take(self, window: Window) -> None:
+        """Take what waits into the window, as far as it fits the motion believed."""
+        if not self._pending:
+            return
+        waiting, self._pending = self._pending, []
+        times = np.array([self._seconds(x) for x, _ in waiting])
+        stretch = np.array([x for _, x in waiting])
+        found = self._solution
+        if found is not None:
+            kept = self.screening.fitting(
+                window, found, self._as_levels(), times, stretch, self.noise)
+            times, stretch = times[kept], stretch[kept]
+        elif not self.options.noise and len(stretch) >= _FEWEST_FOR_NOISE:
+            self.noise = max(robust_scale(np.diff(stretch, 2)) / math.sqrt(6.0), _LEAST_NOISE)
+        order = np.argsort(np.append(window.time, times), kind='stable')
+        window.time = np.append(window.time, times)[order]
+        window.stretch = np.append(window.stretch, stretch)[order]
+
+    def _follow_noise(self, found: Solution) -> None:
+        if self.options.noise or len(found.residual) < _FEWEST_FOR_NOISE:
+            return
+        seen = max(robust_scale(found.residual), _LEAST_NOISE)
+        gain = _NOISE_GAIN if self.noise < 3.0 * seen else 0.5
+        self.noise = math.exp(
+            (1.0 - gain) * math.log(self.noise) + gain * math.log(seen))
+
+    def _estimate(self, time: int, found: Solution) -> Estimate:
+        state, covariance = found.at_end()
+        deviations = {
+            name: abs(derivative(name, found.values[name])) * math.sqrt(covariance[i, i])
+            for i, name in enumerate(self.prior.free)}
+        trouble = self.screening.trouble
+        return Estimate(
+            time, float(state[-2]), float(state[-1]), found.values, self.prior.free, deviations,
+            covariance, self.noise, not trouble, trouble)
+
+    def _go_along(self, window: Window, found: Solution, until: float) -> None:
+        """Let the oldest samples go, or, where none come any more, the time."""
+        span = _LONGEST * found.values['time_unit']
+        count = len(window.time)
+        if count and until - float(window.time[-1]) > span:
+            place = count
+        elif count > self.options.window or (
+                count >= _FEWEST and float(window.time[-1]) - window.begin > span):
+            place = int((1.0 - _KEPT) * count)
+        elif count == 0 and until - window.begin > span:
+            place = 0
+        else:
+            return
+        # After the last sample comes the time asked for.
+        time = float(window.time[place]) if place < count else until
+        drift = np.zeros(len(window.mean))
+        if self.options.learn:
+            drift[:-2] = self.options.drift ** 2 * (time - window.begin) * np.diag(
+                self.prior.covariance)
+        shift = round(time * NANOSECONDS)
+        seconds = shift / NANOSECONDS
+        moved = window.move_on(place, time, found, self.noise, drift)
+        moved.begin -= seconds
+        moved.time = moved.time - seconds
+        self._origin += shift
+        self._window = moved
+        self._solution = replace(found, z=np.append(
+            found.z[:-2], [found.motion.stretch[place], found.motion.rate[place]]),
+            covariance=moved.covariance)
+        first = bisect_right(self._levels, self._origin, key=lambda x: x[0]) - 1
+        # The field of a coil that lags remembers some levels more.
+        del self._levels[:max(first - 8, 0)]
+
+    # -- time ----------------------------------------------------------------------------------
+
+    def _seconds(self, stamp: int) -> float:
+        return (stamp - self._origin) / NANOSECONDS
+
+    def _stamps(self) -> set[int]:
+        if self._window is None:
+            return set()
+        return {self._origin + round(x * NANOSECONDS) for x in self._window.time.tolist()}
+
+    def _in_force(self, stamp: int) -> float:
+        place = bisect_right(self._levels, stamp, key=lambda x: x[0]) - 1
+        return self._levels[max(place, 0)][1]
+
+    def _as_levels(self) -> Levels:
+        return Levels(
+            np.array([self._seconds(x) for x, _ in self._levels]),
+            np.array([x for _, x in self._levels]), self.options.slew_limit)

@@ -1,0 +1,144 @@
+"""What is known of an actuator before the first sample."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from hmsa_ros.core.model import Array
+from hmsa_ros.core.parameters import ActuatorParameters
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification.files import Belief
+from hmsa_ros.identification.quantities import check_free, derivative, values_of
+from hmsa_ros.identification.response import complete
+
+#: Standard deviations where no identification gives any: of the logarithm for parameters that
+#: are sought by it, of the value in SI otherwise. That of the damping and of the chain limit is a
+#: share of the value.
+DEVIATIONS = {
+    'shear_modulus': 0.15, 'density': 0.1, 'remanence': 0.1, 'time_unit': 0.1,
+    'chain_limit': 0.15, 'damping_coefficient': 0.25, 'stretch_bias': 5e-3,
+    'stretch_gain': 0.02, 'sensor_latency': 1e-3, 'coil_time_constant': 5e-4,
+    'constant_force': 0.0, 'viscoelastic_ratio': 0.1, 'viscoelastic_time': 1.0}
+# Where there is none, the deviation is a share of that of a usual block.
+_LEAST_LIMIT, _LEAST_ZETA = 0.02, 0.1
+# A force unknown to this share of the elastic one.
+_FORCE = 0.02
+_NOT_TRACKED = ('initial_stretch', 'initial_rate', 'viscoelastic_ratio', 'viscoelastic_time')
+#: Tracked unless others are named.
+TRACKED = ('shear_modulus', 'damping_coefficient', 'stretch_bias')
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """
+    Values and how far each may be off.
+
+    Attributes
+    ----------
+    values : dict of str to float
+        Of all quantities.
+    free : tuple of str
+        What is tracked.
+    covariance : ndarray, shape (p, p)
+        Of the coordinates of these.
+
+    """
+
+    values: dict[str, float]
+    free: tuple[str, ...]
+    covariance: Array
+
+    @classmethod
+    def nominal(
+            cls, actuator: ActuatorParameters, free: Sequence[str] = TRACKED, *,
+            others: Mapping[str, float] | None = None,
+            deviations: Mapping[str, float] | None = None) -> 'Prior':
+        """
+        Return what is known of a block that was never identified.
+
+        Parameters
+        ----------
+        actuator : ActuatorParameters
+            Nominal.
+        free : sequence of str
+            What is tracked.
+        others : mapping of str to float, optional
+            Of coil and sensor, where they are not the defaults.
+        deviations : mapping of str to float, optional
+            In place of some of `DEVIATIONS`.
+
+        Returns
+        -------
+        Prior
+            Without correlation.
+
+        Raises
+        ------
+        BadInputError
+            If a name is unknown or cannot be tracked.
+
+        """
+        free = check_free(free)
+        wrong = [x for x in free if x in _NOT_TRACKED]
+        if wrong:
+            raise BadInputError(
+                f'{", ".join(wrong)} cannot be tracked: expected some of '
+                + ', '.join(x for x in DEVIATIONS if x not in _NOT_TRACKED))
+        values = complete(values_of(actuator, others), free)
+        if 'chain_limit' in free:
+            values['chain_limit'] = min(values['chain_limit'], 1e9)
+        size = []
+        for name in free:
+            deviation = (deviations or {}).get(name, DEVIATIONS[name])
+            if name == 'constant_force' and not deviation:
+                deviation = _FORCE * 4.0 * actuator.half_length ** 2 * actuator.shear_modulus
+            if name == 'damping_coefficient':
+                deviation *= max(values[name], _damping(actuator))
+            elif name == 'chain_limit':
+                deviation *= max(1.0 / values[name], _LEAST_LIMIT)
+            if not 0.0 < deviation < math.inf:
+                raise BadInputError(
+                    f'the deviation of {name} is {deviation:g}: expected a number above 0')
+            size.append(deviation)
+        return cls(values, free, np.diag(np.square(size)))
+
+    @classmethod
+    def identified(cls, belief: Belief, free: Sequence[str] = TRACKED) -> 'Prior':
+        """
+        Return what a parameter file says.
+
+        Parameters
+        ----------
+        belief : Belief
+            As read; its covariance counts for what was identified.
+        free : sequence of str
+            What is tracked.
+
+        Returns
+        -------
+        Prior
+            Defaults for what was not identified.
+
+        Raises
+        ------
+        BadInputError
+            If a name is unknown or cannot be tracked.
+
+        """
+        found = cls.nominal(belief.actuator, free, others=belief.others)
+        covariance = found.covariance.copy()
+        both = [x for x in found.free if x in belief.names]
+        places = [belief.names.index(x) for x in both]
+        into = [found.free.index(x) for x in both]
+        scale = np.array([derivative(x, found.values[x]) for x in both])
+        covariance[np.ix_(into, into)] = (
+            belief.covariance[np.ix_(places, places)] / np.outer(scale, scale))
+        return cls(found.values, found.free, covariance)
+
+
+def _damping(actuator: ActuatorParameters) -> float:
+    """Return a damping coefficient in N s/m that is small for a block."""
+    return _LEAST_ZETA * 8.0 * actuator.half_length * actuator.half_thickness * math.sqrt(
+        actuator.density * actuator.shear_modulus)

@@ -1,0 +1,118 @@
+"""Samples that cannot be right: no number, a frozen sensor, a jump."""
+
+import math
+
+import numpy as np
+
+from hmsa_ros.core.model import Array
+from hmsa_ros.estimation.motion import follow, Levels
+from hmsa_ros.estimation.window import Solution, Window
+
+# So many rejected samples in a row are no outliers: sensor or actuator is not where it was.
+_LOST = 6
+# So many that fit make up for them.
+_FOUND = 12
+# So many equal values in a row, while motion of so many deviations is expected, come from a
+# sensor that is frozen.
+_EQUAL, _MOTION = 4, 8.0
+# A stretch beyond this is none.
+_LARGEST = 20.0
+
+
+class Screening:
+    """
+    Rejects samples, and says what is wrong with the sensor.
+
+    Parameters
+    ----------
+    gate : float
+        Deviations of the innovation from which a sample is rejected.
+
+    Attributes
+    ----------
+    unreadable, repeated, late, rejected, frozen : int
+        How many were no number, came twice, came after their time was over, did not fit, or
+        repeated a value while the actuator moved.
+    trouble : str
+        Why nothing should be built on samples; empty if nothing speaks against it.
+
+    """
+
+    def __init__(self, gate: float) -> None:
+        """Begin with a sensor that works."""
+        self._gate = gate
+        self.unreadable = self.repeated = self.late = self.rejected = self.frozen = 0
+        self.trouble = ''
+        self._in_a_row = self._fitted = 0
+        self._last: list[tuple[float, float]] = []
+
+    def readable(self, stretch: float) -> bool:
+        """Return whether a value can be a stretch."""
+        if math.isfinite(stretch) and 0.0 < stretch < _LARGEST:
+            return True
+        self.unreadable += 1
+        return False
+
+    def fitting(
+            self, window: Window, found: Solution, levels: Levels, times: Array,
+            stretch: Array, noise: float) -> Array:
+        """
+        Return which samples fit the motion believed.
+
+        Parameters
+        ----------
+        window : Window
+            Without them.
+        found : Solution
+            Of the window.
+        levels : Levels
+            In force.
+        times, stretch : ndarray, shape (n,)
+            The samples, in s by increasing time.
+        noise : float
+            Standard deviation of a sample.
+
+        Returns
+        -------
+        ndarray of bool, shape (n,)
+            True for those that count.
+
+        """
+        kept = np.ones(len(times), dtype=bool)
+        motion = follow(
+            found.values, window.free, (float(found.z[-2]), float(found.z[-1])), levels,
+            window.begin, np.maximum(times - found.values['sensor_latency'], window.begin))
+        if motion is None:
+            return kept
+        shown, by = motion.measured(found.values, window.free)
+        spread = np.sqrt(np.einsum('ij,jk,ik->i', by, found.covariance, by) + noise ** 2)
+        for i, (value, expected) in enumerate(zip(stretch.tolist(), shown.tolist(), strict=True)):
+            kept[i] = self._judge(value, expected, float(spread[i]), noise)
+        return kept
+
+    def _judge(self, value: float, expected: float, spread: float, noise: float) -> bool:
+        self._last = [*self._last, (value, expected)][-_EQUAL:]
+        values, motion = zip(*self._last, strict=True)
+        if len(values) == _EQUAL and len(set(values)) == 1 and (
+                max(motion) - min(motion) > _MOTION * noise):
+            self.frozen += 1
+            self._reject('the sensor repeats the same value while the actuator should move')
+            return False
+        off = value - expected
+        if abs(off) > self._gate * spread:
+            self.rejected += 1
+            self._reject(
+                f'samples lie {off:+.3g} off what is expected: a jump of the sensor, or a '
+                'disturbance')
+            return False
+        self._in_a_row = 0
+        self._fitted += 1
+        if self._fitted >= _FOUND:
+            self.trouble = ''
+        return True
+
+    def _reject(self, why: str) -> None:
+        self._in_a_row += 1
+        self._fitted = 0
+        if self._in_a_row >= _LOST or 'repeats' in why:
+            self.trouble = why

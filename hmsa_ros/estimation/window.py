@@ -1,0 +1,240 @@
+"""
+A moving horizon: the most probable motion through the newest samples, by Gauss and Newton.
+
+Unknown are the coordinates of the free parameters and stretch and rate at the begin of the window,
+in this order. What came before the window is a Gaussian prior of them: when the window moves on,
+the samples that leave it are taken into the prior at the present estimate, and the prior goes
+along with the motion (C. V. Rao, J. B. Rawlings and D. Q. Mayne, IEEE Trans. Autom. Control 48
+(2003) 246).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from hmsa_ros.core.model import Array
+from hmsa_ros.estimation.motion import follow, Levels, Motion
+from hmsa_ros.identification.quantities import from_coordinate, QUANTITIES, to_coordinate
+from hmsa_ros.identification.response import clip, complete
+
+# Residuals from this many deviations on count less and less (Huber).
+_HUBER = 3.0
+# Steps of Gauss and Newton at most, halvings of each, and the step, in deviations, that ends them.
+_PASSES, _HALVINGS, _SMALL = 6, 4, 0.03
+# A coordinate sought by its logarithm goes no further than this in one step.
+_STRIDE = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """
+    The most probable motion.
+
+    Attributes
+    ----------
+    z : ndarray, shape (q,)
+        Coordinates, stretch and rate at the begin.
+    values : dict of str to float
+        Of all quantities.
+    motion : Motion
+        At the samples, and at the time asked for last.
+    residual : ndarray, shape (n,)
+        Measured less simulated.
+    weights : ndarray, shape (n,)
+        How far each counts, 0 to 1.
+    covariance : ndarray, shape (q, q)
+        Of ``z``.
+
+    """
+
+    z: Array
+    values: dict[str, float]
+    motion: Motion
+    residual: Array
+    weights: Array
+    covariance: Array
+
+    def at_end(self) -> tuple[Array, Array]:
+        """Return coordinates, stretch and rate at the time asked for, and their covariance."""
+        change = transport(self.motion, len(self.residual))
+        state = np.append(
+            self.z[:-2], [self.motion.stretch[-1], self.motion.rate[-1]])
+        return state, change @ self.covariance @ change.T
+
+
+def transport(motion: Motion, place: int) -> Array:
+    """Return the derivative of coordinates, stretch and rate at a sample by those at the begin."""
+    size = motion.by.shape[1]
+    change = np.eye(size)
+    change[-2], change[-1] = motion.by[place], motion.rate_by[place]
+    return change
+
+
+@dataclass(eq=False)
+class Window:
+    """
+    Samples, and what is known besides them; times in s from the same instant.
+
+    Attributes
+    ----------
+    values : dict of str to float
+        Of all quantities; those not free stay.
+    free : tuple of str
+        What is sought.
+    mean : ndarray, shape (q,)
+        Prior.
+    covariance : ndarray, shape (q, q)
+        Of the prior.
+    bounds : ndarray, shape (p, 2)
+        Coordinates are kept in them.
+    begin : float
+        Time of the stretch and rate that are sought.
+    time, stretch : ndarray, shape (n,)
+        Samples, from the begin on.
+
+    """
+
+    values: dict[str, float]
+    free: tuple[str, ...]
+    mean: Array
+    covariance: Array
+    bounds: Array
+    begin: float
+    time: Array
+    stretch: Array
+
+    def values_at(self, z: Array) -> dict[str, float]:
+        """Return the values of all quantities for coordinates."""
+        found = dict(self.values)
+        for name, x in zip(self.free, z.tolist(), strict=False):
+            found[name] = clip(name, from_coordinate(name, x))
+        return complete(found, self.free)
+
+    def solve(self, z: Array, levels: Levels, noise: float, until: float) -> Solution | None:
+        """
+        Seek the most probable motion.
+
+        Parameters
+        ----------
+        z : ndarray, shape (q,)
+            Where to begin the search.
+        levels : Levels
+            In force.
+        noise : float
+            Standard deviation of a sample.
+        until : float
+            Time up to which the motion is wanted, not before the last sample.
+
+        Returns
+        -------
+        Solution or None
+            None if no motion can be followed from there.
+
+        """
+        prior: Array = np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
+        times = np.append(self.time, until)
+        here = self._simulate(z, levels, times, noise, prior)
+        if here is None:
+            here = self._simulate(self.mean, levels, times, noise, prior)
+            if here is None:
+                return None
+            z = self.mean
+        for _ in range(_PASSES):
+            values, motion, residual, by, weights, cost = here
+            weighted = weights[:, None] * by / noise ** 2
+            matrix = prior + by.T @ weighted
+            step: Array = np.asarray(np.linalg.solve(
+                matrix, weighted.T @ residual + prior @ (self.mean - z)), dtype=np.float64)
+            size = math.sqrt(max(float(step @ matrix @ step), 0.0))
+            if size < _SMALL:
+                break
+            step *= min([1.0] + [
+                _STRIDE / abs(x) for name, x in zip(self.free, step.tolist(), strict=False)
+                if QUANTITIES[name].scale == 'log' and abs(x) > _STRIDE])
+            for _ in range(_HALVINGS):
+                trial = self._bounded(z + step)
+                there = self._simulate(trial, levels, times, noise, prior)
+                if there is not None and there[-1] <= cost:
+                    break
+                step *= 0.4
+            else:
+                break
+            z, here = trial, there
+        values, motion, residual, by, weights, _ = here
+        matrix = prior + by.T @ (weights[:, None] * by) / noise ** 2
+        covariance = np.linalg.inv(matrix)
+        return Solution(
+            z, values, motion, residual, weights, 0.5 * (covariance + covariance.T))
+
+    def _bounded(self, z: Array) -> Array:
+        kept: Array = z.copy()
+        kept[:-2] = np.clip(z[:-2], self.bounds[:, 0], self.bounds[:, 1])
+        return kept
+
+    def _simulate(
+            self, z: Array, levels: Levels, times: Array, noise: float, prior: Array
+    ) -> tuple[dict[str, float], Motion, Array, Array, Array, float] | None:
+        values = self.values_at(z)
+        motion = follow(
+            values, self.free, (float(z[-2]), float(z[-1])), levels, self.begin,
+            np.maximum(times - values['sensor_latency'], self.begin))
+        if motion is None:
+            return None
+        n = len(self.stretch)
+        shown, by = motion.measured(values, self.free)
+        residual: Array = self.stretch - shown[:n]
+        size = np.abs(residual) / noise
+        weights: Array = _HUBER / np.maximum(size, _HUBER)
+        inner = np.minimum(size, _HUBER)
+        apart = z - self.mean
+        cost = float(np.sum(0.5 * inner ** 2 + _HUBER * (size - inner))
+                     + 0.5 * apart @ prior @ apart)
+        return values, motion, residual, by[:n], weights, cost
+
+    def move_on(
+            self, count: int, begin: float, solution: Solution, noise: float,
+            drift: Array) -> 'Window':
+        """
+        Return the window from a later sample on.
+
+        Parameters
+        ----------
+        count : int
+            Samples that leave it.
+        begin : float
+            Of the new one: time of the next sample, or the time asked for last.
+        solution : Solution
+            Of the whole window.
+        noise : float
+            Standard deviation of a sample.
+        drift : ndarray, shape (q,)
+            Variance that parameters and state gain on the way.
+
+        Returns
+        -------
+        Window
+            With a prior that knows the samples that have left.
+
+        """
+        _, by = solution.motion.measured(solution.values, self.free)
+        by, weights = by[:count], solution.weights[:count, None]
+        prior: Array = np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
+        matrix = prior + by.T @ (weights * by) / noise ** 2
+        gradient = by.T @ (solution.weights[:count] * solution.residual[:count]) / noise ** 2
+        gradient = gradient + prior @ (self.mean - solution.z)
+        covariance = np.linalg.inv(matrix)
+        change = transport(solution.motion, count)
+        here = np.append(
+            solution.z[:-2], [solution.motion.stretch[count], solution.motion.rate[count]])
+        covariance = change @ covariance @ change.T + np.diag(drift)
+        return Window(
+            self.values, self.free, here + change @ np.linalg.solve(matrix, gradient),
+            0.5 * (covariance + covariance.T), self.bounds, begin,
+            self.time[count:], self.stretch[count:])
+
+
+def coordinates(values: Mapping[str, float], free: Sequence[str]) -> Array:
+    """Return the coordinates of the free parameters."""
+    return np.array([to_coordinate(x, values[x]) for x in free], dtype=np.float64)

@@ -1,0 +1,148 @@
+"""The estimator, held against motions that SciPy simulates."""
+
+from dataclasses import replace
+
+import identification_oracle as oracle
+import numpy as np
+import pytest
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.estimation import Estimator, Options, Prior
+from hmsa_ros.identification.files import read_belief
+
+# Rest without field, a push, rest near 1.4, and back to rest near 1.1; in s and T.
+TIMES = np.array([0.0, 0.03, 0.036, 0.09])
+LEVELS = np.array([0.0, 0.06, oracle.level_of(1.4), oracle.level_of(1.1)])
+SAMPLED = np.arange(0.0, 0.15, 1e-3)
+NOISE = 1e-3
+
+
+def ns(seconds):
+    return round(float(seconds) * 1e9)
+
+
+def run(samples, free=None, options=None, prior=None, times=SAMPLED, levels=LEVELS):
+    """Feed samples one by one, each 2 ms late; return the estimator and its last estimate."""
+    prior = prior or Prior.nominal(oracle.BLOCK, free or ('shear_modulus', 'damping_coefficient',
+                                                          'stretch_bias'))
+    estimator = Estimator(prior, options)
+    for time, level in zip(TIMES, levels, strict=True):
+        estimator.level(ns(time), level)
+    estimate = None
+    for time, value in zip(times, samples, strict=True):
+        estimator.sample(ns(time), value)
+        estimate = estimator.update(ns(time) + 2_000_000)
+    return estimator, estimate
+
+
+def measured(block, extras=None, seed=0, noise=NOISE):
+    clean = oracle.simulate(SAMPLED, TIMES, LEVELS, block, extras)
+    return clean + noise * np.random.default_rng(seed).standard_normal(len(SAMPLED))
+
+
+@pytest.mark.parametrize('factor', [0.8, 1.2])
+def test_modulus_damping_bias_and_state_are_found_within_their_deviations(factor):
+    block = replace(oracle.BLOCK, shear_modulus=factor * oracle.BLOCK.shear_modulus)
+    extras = oracle.Extras(bias=4e-3)
+    end = SAMPLED[-1] + 2e-3
+    state = oracle.simulate(
+        np.append(SAMPLED, [end - 1e-5, end, end + 1e-5]), TIMES, LEVELS, block)[-3:]
+    errors = []
+    for seed in range(4):
+        _, found = run(measured(block, extras, seed))
+        assert found.trusted
+        assert 0.8 * NOISE < found.noise < 1.25 * NOISE
+        assert found.deviations['shear_modulus'] < 2e-3 * block.shear_modulus
+        size = np.sqrt(np.diag(found.covariance))
+        errors += [
+            (found.values['shear_modulus'] - block.shear_modulus)
+            / found.deviations['shear_modulus'],
+            (found.values['damping_coefficient'] - block.damping_coefficient)
+            / found.deviations['damping_coefficient'],
+            (found.values['stretch_bias'] - 4e-3) / found.deviations['stretch_bias'],
+            (found.stretch - state[1]) / size[-2],
+            (found.rate - (state[2] - state[0]) / 2e-5) / size[-1]]
+    # Twenty errors, in part of the same cause, in their own deviations.
+    assert 0.4 < np.sqrt(np.mean(np.square(errors))) < 1.8
+    assert np.max(np.abs(errors)) < 4.5
+
+
+def test_remanence_and_coil_lag_are_found_beside_the_modulus():
+    block = replace(oracle.BLOCK, shear_modulus=9e3, remanence=1.05 * oracle.BLOCK.remanence)
+    _, found = run(
+        measured(block, oracle.Extras(coil=5e-4), noise=1e-4),
+        ('shear_modulus', 'damping_coefficient', 'remanence', 'coil_time_constant',
+         'stretch_bias'))
+    for name, value in (('shear_modulus', 9e3), ('remanence', block.remanence),
+                        ('coil_time_constant', 5e-4)):
+        assert found.values[name] == pytest.approx(value, abs=4.5 * found.deviations[name])
+        assert found.deviations[name] < 0.02 * value
+
+
+def test_samples_that_are_late_double_or_no_numbers_change_nothing():
+    samples = measured(oracle.BLOCK)
+    _, wanted = run(samples)
+    order = np.arange(len(samples))
+    order[60:63] = 62, 60, 61
+    times = np.insert(SAMPLED[order], [20, 80], [SAMPLED[15], SAMPLED[79]])
+    values = np.insert(samples[order], [20, 80], [7.0, np.nan])
+    estimator, found = run(values, times=times)
+    assert (estimator.screening.repeated, estimator.screening.unreadable) == (1, 1)
+    assert found.values['shear_modulus'] == pytest.approx(
+        wanted.values['shear_modulus'], abs=wanted.deviations['shear_modulus'])
+
+
+def test_a_few_outliers_are_rejected_and_trust_remains():
+    samples = measured(oracle.BLOCK)
+    samples[[50, 70, 71, 120]] += 0.1
+    estimator, found = run(samples)
+    assert found.trusted
+    assert estimator.screening.rejected == 4
+    assert found.values['shear_modulus'] == pytest.approx(
+        oracle.BLOCK.shear_modulus, abs=4.5 * found.deviations['shear_modulus'])
+
+
+def test_a_sensor_that_jumps_or_freezes_is_not_trusted_and_the_estimate_stays():
+    good = measured(oracle.BLOCK)
+    jumped, frozen = good.copy(), good.copy()
+    jumped[70:] += 0.05
+    frozen[88:] = frozen[88]
+    for samples, word in ((jumped, 'jump'), (frozen, 'repeats')):
+        _, found = run(samples)
+        assert not found.trusted
+        assert word in found.trouble
+        assert found.values['shear_modulus'] == pytest.approx(
+            oracle.BLOCK.shear_modulus, rel=0.01)
+
+
+def test_trust_returns_with_the_sensor():
+    samples = measured(oracle.BLOCK)
+    samples[60:90] += 0.05
+    _, found = run(samples)
+    assert found.trusted
+
+
+def test_parameters_stay_where_they_are_if_they_are_not_to_be_learnt():
+    block = replace(oracle.BLOCK, shear_modulus=1.02e4)
+    _, found = run(measured(block), options=Options(learn=False, gate=100.0))
+    assert found.values['shear_modulus'] == pytest.approx(1e4, rel=1e-4)
+
+
+def test_an_identified_covariance_is_the_prior(tmp_path):
+    path = tmp_path / 'block.yaml'
+    path.write_text(
+        '/**:\n  ros__parameters:\n    actuator.shear_modulus: 12000.0\n'
+        '    identification.names: [shear_modulus, damping_coefficient]\n'
+        '    identification.covariance: [144.0, 0.0, 0.0, 1.0e-4]\n')
+    prior = Prior.identified(read_belief(path))
+    _, found = run(np.ones(3), prior=prior, times=SAMPLED[:3])
+    assert found.values['shear_modulus'] == pytest.approx(12000.0)
+    assert found.deviations['shear_modulus'] == pytest.approx(12.0, rel=1e-3)
+    assert found.deviations['damping_coefficient'] == pytest.approx(1e-2, rel=1e-3)
+
+
+def test_what_cannot_be_tracked_is_refused():
+    with pytest.raises(BadInputError, match='initial_rate cannot be tracked'):
+        Prior.nominal(oracle.BLOCK, ('initial_rate',))
+    with pytest.raises(BadInputError, match='window is 3'):
+        Options(window=3)
