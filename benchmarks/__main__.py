@@ -3,7 +3,8 @@ Measure speed and accuracy.
 
     python -m benchmarks [NAME ...] [--quick] [--runs N] [--json FILE] [--page FILE]
     python -m benchmarks faults [--only KEY ...] [--quick] [--json FILE] [--page FILE]
-    python -m benchmarks soak [--hours H] [--minutes M] [--factor F] [--picture FILE] [--quick]
+    python -m benchmarks soak [--hours H] [--minutes M] [--factor F] [--rate HZ]
+                             [--picture FILE] [--quick]
 
 NAME is planner, plant, preemption, joints, recorder, player or crash; without one all of these
 are run.
@@ -70,6 +71,8 @@ def main(arguments: list[str] | None = None) -> int:
                         help='soak: time on the wall for the part with processes, at most')
     parser.add_argument('--factor', type=float, default=None,
                         help='soak: real-time factor asked for, 0 for as fast as it can')
+    parser.add_argument('--rate', type=float, default=1000.0,
+                        help='soak: sample rate of the plant in Hz (default 1000)')
     parser.add_argument('--picture', type=Path, metavar='FILE',
                         help='soak: PNG of memory over time')
     options = parser.parse_args(arguments)
@@ -148,8 +151,7 @@ def main(arguments: list[str] | None = None) -> int:
 
         record['soak'], texts['soak'], failed = bench_soak.run(
             console, hours=options.hours, minutes=options.minutes, quick=options.quick,
-            factor=bench_soak.FACTOR if options.factor is None else options.factor,
-            picture=options.picture)
+            factor=options.factor, rate=options.rate, picture=options.picture)
         status = status or failed
     if options.json:
         options.json.write_text(

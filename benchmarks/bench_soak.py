@@ -1,14 +1,15 @@
 """
 Soak: hours of operation, compressed in time, with everything that goes wrong in them.
 
-Two parts. Over DDS: plant, planner and recorder as real processes; the plant leads simulated
-time as fast as it can, at 1 kHz. Cycles of two kinds take turns, each with a bag of its own. In
-calm ones there are random setpoints, sequences, stops, garbage on the planner's inputs, and
-kills of planner or recorder; every sample and every command of them is in the bag, and
-integrating the commands anew must give the samples. In rough ones there is garbage on every topic
-and service, the plant is paused, reset and killed too; that nobody raises or ends, and that the
-recorder lost nothing, is what counts there. In process: the planner's and the plant's cores with
-messages between them, for all hours, at 1 kHz.
+Two parts. Over DDS: plant, planner and recorder as real processes; the plant leads simulated time
+as fast as it can, at 1 kHz or another rate. Cycles of two kinds take turns, each with a bag of
+its own. In calm ones there are random setpoints, sequences, stops, garbage on the planner's
+inputs, and kills of planner or recorder; every sample and every command of them is in the bag,
+and integrating the commands anew must give the samples. In rough ones there is garbage on every
+topic and service, the plant is paused, reset and killed too; that nobody raises or ends, and that
+the recorder lost nothing, is what counts there. A second recorder, the witness, lives from the
+first cycle to the last, and the `mcap` package counts what it has written. In process: the
+planner's and the plant's cores with messages between them, for all hours, at 1 kHz.
 
 Memory of each process is sampled all the time; it must not grow. For that to be seen, plant and
 planner are killed in the first third only, and live through the rest.
@@ -39,9 +40,13 @@ from benchmarks.measure import ros_domain
 
 _HOUR = 3600.0
 _STEP_NS = 1_000_000
+#: Of the plant, in Hz.
+RATE = 1000.0
 _NANOSECONDS = 1_000_000_000
-#: Of simulated time, which runs some ten times as fast as that on the wall.
-_LEAD_SECONDS = 5.0
+#: On the wall; in simulated seconds as many times that as simulated time is faster.
+_LEAD_SECONDS = 1.0
+#: Of a file of the witness, in bytes.
+_FILE_SIZE = 100_000_000
 #: Part of a process's life, in simulated h, in which it may still grow: buffers fill.
 _SETTLE_HOURS = 0.25
 #: Part of all hours in which plant and planner are killed; memory is watched in the rest.
@@ -51,7 +56,7 @@ _LOADED_HOURS = 0.005
 _LOOK_SECONDS = 2.0
 #: Simulated s that pass at most between two diagnostics of the plant, 1 s apart on the wall.
 _LARGEST_ROUND = 90.0
-#: Simulated seconds per second: what two cores manage with all three processes, with some room.
+#: Samples a second, by `RATE`: what two cores manage with all processes, with some room.
 #: A recorder that does not get its turn for longer than a second loses samples then, since the
 #: plant keeps the last five thousand of them for those who have not taken them yet.
 FACTOR = 5.0
@@ -59,6 +64,7 @@ _TOPICS = (
     'joint_states', 'flux_density_command', 'flux_density_applied', 'planner/status',
     'planner/plan', 'planner/setpoint', 'planner/joint_trajectory', '/diagnostics')
 _NODES = ('plant', 'planner', 'recorder')
+_WITNESS = 'witness'
 #: Of stretch: a bag's samples against its commands, integrated anew.
 _SAME = 1e-9
 
@@ -103,6 +109,34 @@ class Cycle:
 
 
 @dataclass
+class Witness:
+    """
+    What the recorder that lived through all cycles has written.
+
+    Attributes
+    ----------
+    hours : float
+        Of simulated time that it lived.
+    files : int
+        Of its bag.
+    samples, messages : int
+        Of the plant's stretch, and of all topics, as the `mcap` package reads them.
+    told : int
+        Messages of all topics by the bag's metadata.
+    lost : int
+        Messages, by its own count.
+
+    """
+
+    hours: float
+    files: int
+    samples: int
+    messages: int
+    told: int
+    lost: int
+
+
+@dataclass
 class Result:
     """
     What the soak found.
@@ -119,6 +153,8 @@ class Result:
         In order.
     memory : dict of list
         Samples by node.
+    witness : Witness, optional
+        Of the recorder that lived through all of it.
     trends : dict of Trend
         By node.
     traces : list of str
@@ -139,7 +175,8 @@ class Result:
     calls: int = 0
     cycles: list[Cycle] = field(default_factory=list)
     memory: dict[str, list[Sample]] = field(
-        default_factory=lambda: {x: [] for x in _NODES})
+        default_factory=lambda: {x: [] for x in (*_NODES, _WITNESS)})
+    witness: Witness | None = None
     trends: dict[str, Trend] = field(default_factory=dict)
     traces: list[str] = field(default_factory=list)
     ended: list[str] = field(default_factory=list)
@@ -171,13 +208,17 @@ class Result:
                              f'{one.odd} out of step')
             if one.kind == 'calm' and not one.late and not one.difference < _SAME:
                 found.append(f'{where}: differs by {one.difference:.1e} from its commands')
+        if self.witness is not None and (
+                self.witness.lost or self.witness.messages != self.witness.told):
+            found.append(f'witness: {self.witness.messages} messages of {self.witness.told}, '
+                         f'{self.witness.lost} lost')
         found += [
             f'memory of the {name} grows by {x.slope / 2**20:.2f} MiB an hour'
             for name, x in self.trends.items() if not x.flat]
         return found
 
 
-def check_bag(folder: Path, kind: str, killed: str) -> Cycle:
+def check_bag(folder: Path, kind: str, killed: str, step: int = _STEP_NS) -> Cycle:
     """
     Look for gaps in a bag, integrate its commands anew, and remove it if all is well.
 
@@ -187,6 +228,8 @@ def check_bag(folder: Path, kind: str, killed: str) -> Cycle:
         Of the bag.
     kind, killed : str
         As of `Cycle`.
+    step : int
+        Between two samples, in ns.
 
     Returns
     -------
@@ -219,8 +262,8 @@ def check_bag(folder: Path, kind: str, killed: str) -> Cycle:
             seconds, nanoseconds = struct.unpack_from('<iI', message.data, 4)
             now = seconds * _NANOSECONDS + nanoseconds
             if before:
-                found.missing += (now - before) // _STEP_NS - 1
-                found.odd += (now - before) % _STEP_NS != 0
+                found.missing += (now - before) // step - 1
+                found.odd += (now - before) % step != 0
             before = now
         if kind == 'calm':
             verification, = verify(bag)
@@ -233,6 +276,39 @@ def check_bag(folder: Path, kind: str, killed: str) -> Cycle:
         shutil.rmtree(folder, ignore_errors=True)
         shutil.rmtree(bag, ignore_errors=True)
     return found
+
+
+def read_witness(folder: Path, hours: float) -> Witness:
+    """
+    Count what a long recording holds, by a reader that is not this package's.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the bag.
+    hours : float
+        That the recorder lived.
+
+    Returns
+    -------
+    Witness
+        The counts.
+
+    """
+    from mcap.reader import make_reader
+
+    from hmsa_ros.bag.info import summarize
+
+    samples = messages = 0
+    files = sorted(folder.glob('*.mcap'))
+    for path in files:
+        with open(path, 'rb') as file:
+            for _, channel, _ in make_reader(file, validate_crcs=True).iter_messages(
+                    log_time_order=False):
+                messages += 1
+                samples += channel.topic == '/joint_states'
+    bag = summarize(folder)
+    return Witness(hours, len(files), samples, messages, bag.message_count, bag.lost or 0)
 
 
 class Soak:
@@ -249,6 +325,8 @@ class Soak:
         Of all chance.
     factor : float
         Simulated seconds per second that the plant is asked for; 0 for as fast as it can.
+    rate : float
+        Of the plant, in Hz.
 
     Attributes
     ----------
@@ -259,19 +337,22 @@ class Soak:
 
     """
 
-    def __init__(self, folder: Path, domain: int, seed: int, factor: float) -> None:
-        """Start plant and planner."""
+    def __init__(
+            self, folder: Path, domain: int, seed: int, factor: float, rate: float = RATE) -> None:
+        """Start plant, planner and witness."""
         from benchmarks.faults.rig import Rig
 
         self.result = Result()
         self.seconds = 0.0
         self._dice = random.Random(seed)
         self._factor = factor
+        self._rate = rate
+        self._lead = _LEAD_SECONDS * (factor or FACTOR)
         self._begin = monotonic()
         self.rig = Rig(folder, domain, watch=False)
         self._children: dict[str, Any] = {}
-        self._lives = dict.fromkeys(_NODES, 0)
-        self._born = dict.fromkeys(_NODES, 0.0)
+        self._lives = dict.fromkeys((*_NODES, _WITNESS), 0)
+        self._born = dict.fromkeys((*_NODES, _WITNESS), 0.0)
         self._plant_time = 0.0
         self._looked = 0.0
         self._asked: list[tuple[Any, Any]] = []
@@ -283,8 +364,10 @@ class Soak:
             1, mp_context=multiprocessing.get_context('spawn'), initializer=os.nice,
             initargs=(19,))
         self._checks: list[Future[Cycle]] = []
+        self._witnessed = Path()
         self._start('plant')
         self._start('planner')
+        self._start_witness()
         self.rig.ready('planner')
         self._take_up_time()
         self._topics: list[tuple[Any, Any]] = []
@@ -296,8 +379,11 @@ class Soak:
 
     def __exit__(self, *_: object) -> None:
         """End all processes."""
-        for name in ('planner', 'plant'):
-            self.result.statuses.append(self._children[name].end())
+        for name in ('planner', 'plant', _WITNESS):
+            if name in self._children:
+                self.result.statuses.append(self._children[name].end())
+        self.result.witness = read_witness(
+            self._witnessed, self.seconds / _HOUR - self._born[_WITNESS])
         self.rig.__exit__()
         self.result.traces += self.rig.traces()
         self.result.cycles += [x.result() for x in self._checks]
@@ -310,17 +396,25 @@ class Soak:
 
     # -- processes, time and memory ------------------------------------------------------------
 
-    def _start(self, name: str, **more: object) -> None:
+    def _start(self, name: str, alias: str = '', **more: object) -> None:
         parameters: dict[str, object] = {
-            'plant': {'publish_clock': True, 'real_time_factor': self._factor},
-            'planner': {'use_sim_time': True, 'lead_time': _LEAD_SECONDS,
+            'plant': {'publish_clock': True, 'real_time_factor': self._factor,
+                      'publish_rate': self._rate},
+            'planner': {'use_sim_time': True, 'lead_time': self._lead,
                         'short_spell': 'continue'},
             'recorder': {'use_sim_time': True,
                          'record.topics': '[' + ', '.join(_TOPICS) + ']'},
         }[name] | more
-        self._children[name] = self.rig.start(name, parameters)
-        self._lives[name] += 1
-        self._born[name] = self.seconds / _HOUR
+        alias = alias or name
+        self._children[alias] = self.rig.start(
+            name, parameters, {'__node': alias} if alias != name else None)
+        self._lives[alias] += 1
+        self._born[alias] = self.seconds / _HOUR
+
+    def _start_witness(self) -> None:
+        self._witnessed = self.rig.folder / f'{_WITNESS}{self._lives[_WITNESS]}'
+        self._start('recorder', _WITNESS, **{
+            'storage.uri': self._witnessed, 'storage.max_bagfile_size': _FILE_SIZE})
 
     def _take_up_time(self) -> None:
         """Wait for the time of a plant that has just been started."""
@@ -358,7 +452,7 @@ class Soak:
                 gone.append(name)
         for name in gone:
             del self._children[name]
-            if name != 'recorder':
+            if name in ('plant', 'planner'):
                 self._start(name)
 
     def _pass(self, seconds: float, act: Callable[[], None] | None = None) -> None:
@@ -393,7 +487,7 @@ class Soak:
         self._start('recorder', **{'storage.uri': bag})
         self.rig.spin_until(self._recording, 'the recorder to listen to all topics')
         # What the plant was told before the bag began is over, or the bag would not hold it.
-        self._pass(2.0 * _LEAD_SECONDS)
+        self._pass(2.0 * self._lead)
         act = self._act_calmly if kind == 'calm' else self._act_roughly
         self._pass(0.5 * seconds, act)
         if victim:
@@ -402,13 +496,14 @@ class Soak:
             self._pass(0.5 * seconds, act)
         if kind == 'rough':
             self._put_right()
-        self._pass(2.0 * _LEAD_SECONDS)
+        self._pass(2.0 * self._lead)
         recorder = self._children.pop('recorder', None)
         if recorder is not None:
             self.result.statuses.append(recorder.end())
         for name in [x for x in self.rig.diagnostics if x.startswith('recorder')]:
             del self.rig.diagnostics[name]
-        self._checks.append(self._pool.submit(check_bag, bag, kind, victim))
+        self._checks.append(self._pool.submit(
+            check_bag, bag, kind, victim, round(_NANOSECONDS / self._rate)))
 
     def start_again(self, why: str) -> None:
         """
@@ -427,6 +522,7 @@ class Soak:
         self._children.clear()
         self._start('plant')
         self._start('planner')
+        self._start_witness()
         self._take_up_time()
 
     def _recording(self) -> bool:
@@ -556,14 +652,14 @@ class Soak:
             'planner', use_sim_time=True, flux_density_min=-0.5, flux_density_max=0.5,
             shaper='two_step', short_spell='continue', robust_order=2)
         rig.call(interface.RESET, 'plant')
-        self._pass(2.0 * _LEAD_SECONDS)
+        self._pass(2.0 * self._lead)
         rig.publish_setpoint(1.0)
-        self._pass(2.0 * _LEAD_SECONDS)
+        self._pass(2.0 * self._lead)
 
 
 def run_over_dds(
         folder: Path, domain: int, *, hours: float, minutes: float, length: float,
-        factor: float, seed: int = 1) -> Result:
+        factor: float, rate: float = RATE, seed: int = 1) -> Result:
     """
     Wear out real processes.
 
@@ -581,6 +677,8 @@ def run_over_dds(
         Of a cycle in simulated s.
     factor : float
         Simulated seconds per second that the plant is asked for; 0 for as fast as it can.
+    rate : float
+        Of the plant, in Hz.
     seed : int
         Of all chance.
 
@@ -596,7 +694,7 @@ def run_over_dds(
     from benchmarks.faults.rig import hushed
     from hmsa_ros.errors import HmsaError
 
-    with hushed(folder / 'hushed.log') as told, Soak(folder, domain, seed, factor) as soak:
+    with hushed(folder / 'hushed.log') as told, Soak(folder, domain, seed, factor, rate) as soak:
         end = monotonic() + 60.0 * minutes
         while soak.seconds < hours * _HOUR and monotonic() < end:
             kind, victim = next(kinds)
@@ -785,7 +883,7 @@ def draw(result: Result, file: Path) -> None:
     figure.savefig(file, dpi=120)
 
 
-def report(result: Result, core: Core) -> list[str]:
+def report(result: Result, core: Core, rate: float = RATE) -> list[str]:
     """
     Say what was found.
 
@@ -793,6 +891,8 @@ def report(result: Result, core: Core) -> list[str]:
     ----------
     result, core : Result, Core
         Of both parts.
+    rate : float
+        Of the plant over DDS, in Hz.
 
     Returns
     -------
@@ -803,7 +903,7 @@ def report(result: Result, core: Core) -> list[str]:
     calm = [x for x in result.cycles if x.kind == 'calm']
     checked = [x.difference for x in calm if not x.late and not math.isnan(x.difference)]
     lines = [
-        f'Over DDS, three processes: {result.hours:.2f} h of simulated time at 1 kHz in '
+        f'Over DDS, four processes: {result.hours:.2f} h of simulated time at {rate:g} Hz in '
         f'{60.0 * result.wall:.1f} min, {result.hours / result.wall:.1f} times as fast as real '
         f'time; {result.requests} requests, {result.garbage} messages of garbage, '
         f'{result.calls} calls, {sum(bool(x.killed) for x in result.cycles)} kills.',
@@ -812,9 +912,15 @@ def report(result: Result, core: Core) -> list[str]:
         f'{len(result.cycles)} bags with {sum(x.samples for x in result.cycles)} samples: '
         f'{sum(max(x.lost, 0) for x in result.cycles)} messages lost; {len(calm)} calm ones: '
         f'{sum(x.missing for x in calm)} samples missing, {sum(x.odd for x in calm)} not exactly '
-        '1 ms after the last; largest difference to the commands integrated anew '
+        f'{1e3 / rate:g} ms after the last; largest difference to the commands integrated anew '
         f'{max(checked, default=math.nan):.1e} in {len(checked)} of '
         f'them ({sum(bool(x.late) for x in calm)} with late commands).']
+    if result.witness is not None:
+        seen = result.witness
+        lines.append(
+            f'A recorder lived for {seen.hours:.2f} h of it: {seen.files} files, {seen.samples} '
+            f'samples and {seen.messages} messages as the mcap package counts them, {seen.told} '
+            f'by its own metadata, {seen.lost} lost.')
     lines += [
         f'Memory of the {name}: {_trend_text(x)}.' for name, x in result.trends.items()]
     lines += [
@@ -837,7 +943,7 @@ def _trend_text(found: Trend) -> str:
 
 def run(
         console: Console, *, hours: float = 8.0, minutes: float = math.inf,
-        factor: float = FACTOR, quick: bool = False,
+        factor: float | None = None, rate: float = RATE, quick: bool = False,
         picture: Path | None = None) -> tuple[dict[str, Any], str, int]:
     """
     Run both parts and print what was found.
@@ -850,8 +956,11 @@ def run(
         Of simulated time.
     minutes : float
         On the wall, at most, for the part over DDS.
-    factor : float
+    factor : float, optional
         Simulated seconds per second that the plant is asked for; 0 for as fast as it can.
+        Default `FACTOR`, more for a rate below `RATE`.
+    rate : float
+        Of the plant, in Hz.
     quick : bool
         About a minute of everything.
     picture : Path, optional
@@ -869,14 +978,16 @@ def run(
     """
     domain = ros_domain()
     length = 300.0
+    if factor is None:
+        factor = FACTOR * max(RATE / rate, 1.0)
     if quick:
         hours, minutes, length = 0.05, 0.4, 30.0
     with tempfile.TemporaryDirectory(prefix='hmsa_soak_') as folder:
         result = run_over_dds(
             Path(folder), domain, hours=hours, minutes=minutes, length=length,
-            factor=factor)
+            factor=factor, rate=rate)
     core = run_in_process(hours)
-    lines = report(result, core)
+    lines = report(result, core, rate)
     for line in lines:
         console.print(line)
     if picture is not None:
