@@ -54,15 +54,7 @@ class Ending:
                 signal.signal(number, signal.SIG_IGN)
 
     def check(self) -> None:
-        """
-        Raise KeyboardInterrupt if the end has been asked for.
-
-        Raises
-        ------
-        KeyboardInterrupt
-            At a place that the caller chose.
-
-        """
+        """Raise KeyboardInterrupt if the end has been asked for."""
         if self.asked:
             _raise()
 

@@ -7,20 +7,7 @@ from hmsa_ros.ending import ENDING
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """
-    Run the ``hmsa`` command.
-
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        Arguments without the program's name; default ``sys.argv[1:]``.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    """
+    """Run the ``hmsa`` command; return its exit status."""
     ENDING.leave()
     from hmsa_ros.cli import main as command
     try:

@@ -36,43 +36,14 @@ class BagError(HmsaError):
 
 
 def complain(error: Exception, status: int) -> int:
-    """
-    Print an error as one line on standard error.
-
-    Parameters
-    ----------
-    error : Exception
-        What happened.
-    status : int
-        Exit status to pass on.
-
-    Returns
-    -------
-    int
-        ``status``.
-
-    """
+    """Print an error as one line on standard error and return the exit status given."""
     line = ' '.join(str(error).split())
     print(f'hmsa: error: {printable(line)}', file=sys.stderr)
     return status
 
 
 def printable(text: str) -> str:
-    """
-    Return a text from elsewhere as it may be shown.
-
-    Parameters
-    ----------
-    text : str
-        Any text.
-
-    Returns
-    -------
-    str
-        Control characters, which can take over a terminal, and what is no character at all are
-        written as their codes.
-
-    """
+    """Return a text with control characters, and what is no character, written as codes."""
     if text.isprintable():
         return text
     return ''.join(
@@ -81,19 +52,5 @@ def printable(text: str) -> str:
 
 
 def excerpt(value: object) -> str:
-    """
-    Return a value from elsewhere, shortened for a message.
-
-    Parameters
-    ----------
-    value : object
-        A text, a number, or a list of such.
-
-    Returns
-    -------
-    str
-        Its ``repr``, from which the middle of long texts and the end of long lists are left out:
-        the log keeps what it is told, and shows it on every terminal.
-
-    """
+    """Return a value's ``repr``, its middle left out where it is long, for a message."""
     return _EXCERPT.repr(value)

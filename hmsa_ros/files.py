@@ -53,22 +53,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """
-    Write a text as UTF-8, or leave the file as it was.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    text : str
-        All of it; a name that is no UTF-8 in it is shown with replacement characters.
-
-    Raises
-    ------
-    BadInputError
-        If it cannot be written.
-
-    """
+    """Write a text as UTF-8 (replacement characters for names that are not), or change nothing."""
     with replacing(path) as beside:
         beside.write_bytes(text.encode('utf-8', 'replace'))
 
@@ -76,11 +61,6 @@ def write_text(path: Path, text: str) -> None:
 def make_folder(folder: Path) -> None:
     """
     Make the folder that a command writes to, unless it exists.
-
-    Parameters
-    ----------
-    folder : Path
-        Given by ``--out``.
 
     Raises
     ------
@@ -97,20 +77,7 @@ def make_folder(folder: Path) -> None:
 
 
 def json_text(document: object) -> str:
-    """
-    Return a document as JSON.
-
-    Parameters
-    ----------
-    document : object
-        Of dicts, lists and tuples.
-
-    Returns
-    -------
-    str
-        With null for each number that is not finite, for which JSON has no word.
-
-    """
+    """Return a document as JSON, with null for each number that is not finite."""
     return json.dumps(_known(document), indent=2, allow_nan=False)
 
 

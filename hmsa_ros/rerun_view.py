@@ -44,20 +44,7 @@ def _rerun() -> Any:
 
 
 def views(namespace: str = '') -> dict[str, str]:
-    """
-    Return what the views show.
-
-    Parameters
-    ----------
-    namespace : str
-        Namespace of the nodes.
-
-    Returns
-    -------
-    dict of str to str
-        Entity path by the view's title.
-
-    """
+    """Return the entity path of each view by its title."""
     root = '/' + namespace.strip('/') if namespace.strip('/') else ''
     return {
         'Stretch': f'{root}/{JOINT_STATES}/position',
@@ -167,20 +154,7 @@ def _log_marker(recording: Any, root: str, marker: Any) -> None:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """
-    Show a bag, or save it for the viewer.
-
-    Parameters
-    ----------
-    args : sequence of str, optional
-        Command-line arguments; default ``sys.argv[1:]``.
-
-    Returns
-    -------
-    int
-        Exit status: 0, 1 for a bag that cannot be read, 2 for bad arguments.
-
-    """
+    """Show a bag, or save it; return 0, 1 if it cannot be read, or 2 for bad arguments."""
     parser = argparse.ArgumentParser(
         prog='python -m hmsa_ros.rerun_view', description='Show a bag in the Rerun viewer.',
         epilog='Example: python -m hmsa_ros.rerun_view my_run')

@@ -24,35 +24,14 @@ _SEPARATOR = '\n' + '=' * 80 + '\nMSG: '
 
 
 def share_folders() -> list[Path]:
-    """
-    Return the folders that hold the packages' shared files, in order of precedence.
-
-    Returns
-    -------
-    list of pathlib.Path
-        Those of AMENT_PREFIX_PATH, then of this Python environment, where wheels put them.
-
-    """
+    """Return AMENT_PREFIX_PATH's share folders in order, then that of this Python environment."""
     prefixes = [prefix for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
                 if prefix]
     return [Path(prefix) / 'share' for prefix in [*prefixes, sys.prefix]]
 
 
 def is_interface_package(name: str) -> bool:
-    """
-    Return whether an installed package of the environment has a name.
-
-    Parameters
-    ----------
-    name : str
-        For example ``'sensor_msgs'``.
-
-    Returns
-    -------
-    bool
-        False for what only happens to be a Python module.
-
-    """
+    """Return whether a package is installed as a ROS package, not only as a Python module."""
     return re.fullmatch(r'[A-Za-z]\w*', name) is not None and any(
         (folder / name / 'package.xml').is_file() for folder in share_folders())
 
@@ -93,19 +72,7 @@ def _dependencies(type_name: str, text: str) -> list[str]:
 @cache
 def message_definition(type_name: str) -> tuple[str, str]:
     """
-    Return the encoding and the text of a message type with all it depends on.
-
-    Parameters
-    ----------
-    type_name : str
-        For example ``'sensor_msgs/msg/MagneticField'``.
-
-    Returns
-    -------
-    encoding : str
-        ``'ros2msg'``.
-    text : str
-        The definition, then one section for each dependency, depth first.
+    Return ``'ros2msg'`` and the text of a type like ``'std_msgs/msg/String'`` with all it needs.
 
     Raises
     ------
@@ -137,20 +104,7 @@ def message_definition(type_name: str) -> tuple[str, str]:
 
 @cache
 def type_hash(type_name: str) -> str:
-    """
-    Return the type's RIHS01 hash.
-
-    Parameters
-    ----------
-    type_name : str
-        For example ``'sensor_msgs/msg/MagneticField'``.
-
-    Returns
-    -------
-    str
-        ``'RIHS01_'`` and 64 hexadecimal digits; empty if the environment does not have it.
-
-    """
+    """Return the RIHS01 hash of a type, or an empty text if the environment does not have it."""
     path = _find(type_name, '.json')
     if path is None:
         return ''

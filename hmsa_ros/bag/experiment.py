@@ -18,22 +18,7 @@ _SETPOINTS_LENGTH = 2**18
 
 
 def parameter_key(node: str, name: str) -> str:
-    """
-    Return the key of custom data for a parameter.
-
-    Parameters
-    ----------
-    node : str
-        Full name of the node.
-    name : str
-        Name of the parameter.
-
-    Returns
-    -------
-    str
-        For example ``'/left/plant.actuator.density'``.
-
-    """
+    """Return the key of custom data for a parameter, as ``'/left/plant.actuator.density'``."""
     return f'{node}.{name}'
 
 

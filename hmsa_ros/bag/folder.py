@@ -33,12 +33,7 @@ class Folder:
 
     def find(self) -> list[Path]:
         """
-        Return the files of the bag in order.
-
-        Returns
-        -------
-        list of pathlib.Path
-            At least one.
+        Return the files of the bag in order, at least one.
 
         Raises
         ------

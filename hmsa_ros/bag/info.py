@@ -146,20 +146,7 @@ def summarize(
 
 
 def lost_messages(custom_data: Mapping[str, str]) -> dict[str, int] | None:
-    """
-    Read the counts of lost messages.
-
-    Parameters
-    ----------
-    custom_data : mapping of str to str
-        Of a bag.
-
-    Returns
-    -------
-    dict of str to int or None
-        By topic; None if the bag does not say.
-
-    """
+    """Return the lost messages by topic that a bag's custom data name; None if they name none."""
     try:
         counts = limits.load_json(custom_data['lost'])
     except (KeyError, BagError):
@@ -170,20 +157,7 @@ def lost_messages(custom_data: Mapping[str, str]) -> dict[str, int] | None:
 
 
 def to_json(summary: BagSummary) -> str:
-    """
-    Return a summary as JSON.
-
-    Parameters
-    ----------
-    summary : BagSummary
-        A bag in figures.
-
-    Returns
-    -------
-    str
-        One object.
-
-    """
+    """Return a summary as one JSON object."""
     return json.dumps({
         'path': summary.path,
         'files': [{'name': name, 'size': size} for name, size in summary.files],
@@ -204,20 +178,7 @@ def to_json(summary: BagSummary) -> str:
 
 
 def to_text(summary: BagSummary) -> str:
-    """
-    Return a summary in words.
-
-    Parameters
-    ----------
-    summary : BagSummary
-        A bag in figures.
-
-    Returns
-    -------
-    str
-        Several lines.
-
-    """
+    """Return a summary in words, several lines."""
     return '\n'.join(map(printable, _lines(summary)))
 
 

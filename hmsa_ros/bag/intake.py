@@ -145,14 +145,7 @@ class Intake:
 
     def check_size(self, size: int, what: str) -> None:
         """
-        Refuse what is larger than the memory it may take.
-
-        Parameters
-        ----------
-        size : int
-            In bytes.
-        what : str
-            Its name, for the message.
+        Refuse what is larger (in bytes) than the memory it may take.
 
         Raises
         ------
@@ -166,14 +159,7 @@ class Intake:
 
     def take(self, file: ScannedFile, record: McapRecord) -> None:
         """
-        Take in a schema, a channel or metadata.
-
-        Parameters
-        ----------
-        file : ScannedFile
-            Where it was found; takes it.
-        record : McapRecord
-            One of these records.
+        Take in a schema, a channel or metadata, also for the file where it was found.
 
         Raises
         ------

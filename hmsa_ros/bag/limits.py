@@ -54,17 +54,7 @@ _Loader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 def load_json(text: str) -> Any:
     """
-    Build what a JSON text from a bag says.
-
-    Parameters
-    ----------
-    text : str
-        From a bag.
-
-    Returns
-    -------
-    object
-        Plain lists, maps and scalars; numbers are finite.
+    Return the lists, maps and scalars of a JSON text from a bag; numbers are finite.
 
     Raises
     ------
@@ -87,17 +77,7 @@ def load_json(text: str) -> Any:
 
 def load_yaml(text: str) -> Any:
     """
-    Build what a YAML text says, from plain values only.
-
-    Parameters
-    ----------
-    text : str
-        From a bag.
-
-    Returns
-    -------
-    object
-        Plain lists, maps and scalars.
+    Return the lists, maps and scalars of a YAML text from a bag.
 
     Raises
     ------

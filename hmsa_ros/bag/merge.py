@@ -108,22 +108,7 @@ class Cursor:
 
 
 def merge(cursors: list[Cursor], limit: int) -> Iterator[Message]:
-    """
-    Return the messages of several chunks up to a log time, in order.
-
-    Parameters
-    ----------
-    cursors : list of Cursor
-        Sorted ones.
-    limit : int
-        Only earlier log times.
-
-    Yields
-    ------
-    Message
-        Of equal stamps the one written first comes first.
-
-    """
+    """Yield the messages of sorted chunks before a log time; of equal stamps the first written."""
     heap = [(cursor.time, cursor.key, cursor) for cursor in cursors
             if cursor.left and cursor.time < limit]
     heapq.heapify(heap)

@@ -112,20 +112,7 @@ class BagMetadata:
 
 
 def to_map(metadata: BagMetadata) -> dict[str, Any]:
-    """
-    Return metadata as plain maps, in the order of keys that rosbag2 writes.
-
-    Parameters
-    ----------
-    metadata : BagMetadata
-        What to write.
-
-    Returns
-    -------
-    dict
-        Without the outer key.
-
-    """
+    """Return metadata as plain maps in rosbag2's order of keys, without the outer key."""
     return {
         'version': VERSION,
         'storage_identifier': metadata.storage,
@@ -157,22 +144,7 @@ def to_map(metadata: BagMetadata) -> dict[str, Any]:
 
 
 def to_yaml(metadata: BagMetadata, *, outer_key: bool = True) -> str:
-    """
-    Return metadata as YAML.
-
-    Parameters
-    ----------
-    metadata : BagMetadata
-        What to write.
-    outer_key : bool
-        True for the file, False for the record inside an MCAP file.
-
-    Returns
-    -------
-    str
-        The text.
-
-    """
+    """Return metadata as YAML: with the outer key for the file, without for MCAP's record."""
     content = to_map(metadata)
     text: str = yaml.dump(
         {'rosbag2_bagfile_information': content} if outer_key else content, Dumper=_Dumper,
@@ -181,22 +153,7 @@ def to_yaml(metadata: BagMetadata, *, outer_key: bool = True) -> str:
 
 
 def write(folder: Path, metadata: BagMetadata) -> None:
-    """
-    Replace a bag's metadata file in one step.
-
-    Parameters
-    ----------
-    folder : pathlib.Path
-        The bag's folder.
-    metadata : BagMetadata
-        What to write.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written; the file that was there is then unchanged.
-
-    """
+    """Replace a bag's metadata file in one step; on an OSError the old file is unchanged."""
     path = folder / FILE_NAME
     # Written beside it and renamed: a reader never sees half of it, nor does a crash leave it.
     temporary = folder / f'.{FILE_NAME}.new'
@@ -213,17 +170,7 @@ def write(folder: Path, metadata: BagMetadata) -> None:
 
 def read(path: Path) -> BagMetadata:
     """
-    Read a metadata file of version 1 to 9.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        The file.
-
-    Returns
-    -------
-    BagMetadata
-        What it says; what an older version does not say is left at its default.
+    Read a metadata file of version 1 to 9; what an older one does not say has its default.
 
     Raises
     ------
@@ -253,19 +200,7 @@ def read(path: Path) -> BagMetadata:
 
 def from_map(content: Any, source: str) -> BagMetadata:
     """
-    Read metadata from plain maps.
-
-    Parameters
-    ----------
-    content : object
-        As YAML gives it, without the outer key.
-    source : str
-        Where it comes from, for messages.
-
-    Returns
-    -------
-    BagMetadata
-        What it says.
+    Read metadata from plain maps without the outer key; ``source`` names them in messages.
 
     Raises
     ------

@@ -201,24 +201,7 @@ class OutputFile:
 
     def finish(
             self, serialized_metadata: str, notes: Mapping[str, str], *, fsync: bool) -> None:
-        """
-        Store the last metadata and the summary in the room taken, and close the file.
-
-        Parameters
-        ----------
-        serialized_metadata : str
-            Text of ``metadata.yaml``.
-        notes : mapping of str to str
-            Custom data that the file does not hold yet.
-        fsync : bool
-            Whether to wait for the disk.
-
-        Raises
-        ------
-        OSError
-            If it cannot be written.
-
-        """
+        """Store the metadata and the summary in the room taken, and close the file."""
         self._ending = True
         self.describe(serialized_metadata, notes)
         self._framing.finish()

@@ -87,20 +87,7 @@ def _name(value: Any, known: tuple[str, ...]) -> str:
 
 
 def to_maps(profiles: Iterable[Qos]) -> list[dict[str, Any]]:
-    """
-    Return profiles as plain maps, in the order of keys that rosbag2 writes.
-
-    Parameters
-    ----------
-    profiles : iterable of Qos
-        What was offered.
-
-    Returns
-    -------
-    list of dict
-        One map a profile.
-
-    """
+    """Return profiles as plain maps, in the order of keys that rosbag2 writes."""
     return [{
         'history': profile.history,
         'depth': profile.depth,
@@ -115,20 +102,7 @@ def to_maps(profiles: Iterable[Qos]) -> list[dict[str, Any]]:
 
 
 def to_yaml(profiles: Iterable[Qos]) -> str:
-    """
-    Return profiles as the text that goes into a channel's metadata.
-
-    Parameters
-    ----------
-    profiles : iterable of Qos
-        What was offered.
-
-    Returns
-    -------
-    str
-        A YAML block list; empty for no profile.
-
-    """
+    """Return profiles as the YAML list of a channel's metadata; empty for no profile."""
     maps = to_maps(profiles)
     if not maps:
         return ''
@@ -138,17 +112,7 @@ def to_yaml(profiles: Iterable[Qos]) -> str:
 
 def from_stored(value: Any) -> tuple[Qos, ...]:
     """
-    Read profiles from a YAML text or from the list a newer metadata file holds.
-
-    Parameters
-    ----------
-    value : str, list or None
-        As stored.
-
-    Returns
-    -------
-    tuple of Qos
-        Empty if none was stored.
+    Read profiles from a YAML text or from a newer metadata file's list; empty for None.
 
     Raises
     ------

@@ -208,15 +208,7 @@ class BagReader:
             active = [cursor for cursor in active if cursor.left]
 
     def stored_messages(self) -> Iterator[Message]:
-        """
-        Return all messages in the order they lie in the files.
-
-        Yields
-        ------
-        Message
-            One after the other.
-
-        """
+        """Yield all messages in the order they lie in the files."""
         for file in self._files:
             for block in file.blocks:
                 cursor = self._cursor(block)
@@ -224,15 +216,7 @@ class BagReader:
                     yield from cursor.take(_NEVER)
 
     def counts(self) -> dict[str, int]:
-        """
-        Return the number of messages by topic.
-
-        Returns
-        -------
-        dict of str to int
-            From the files' statistics where their data agree with their CRC, else counted.
-
-        """
+        """Return the messages by topic; counted where statistics and CRC cannot be trusted."""
         result = dict.fromkeys(self.topics, 0)
         for file in self._files:
             check_data(self._intake, file)

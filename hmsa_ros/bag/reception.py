@@ -133,22 +133,7 @@ def judge(
 
 
 def figures(status: Status, lost: Mapping[str, int]) -> dict[str, str]:
-    """
-    Return what the diagnostics of a recorder say of its recording.
-
-    Parameters
-    ----------
-    status : hmsa_ros.bag.recording.Status
-        Of its recording.
-    lost : mapping of str to int
-        Messages lost, by topic.
-
-    Returns
-    -------
-    dict of str to str
-        By key; ``behind`` in seconds.
-
-    """
+    """Return what a recorder's diagnostics say of its recording, by key; ``behind`` in seconds."""
     return {
         'file': status.file,
         'written': str(sum(status.written.values())),

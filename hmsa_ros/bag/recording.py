@@ -109,20 +109,7 @@ class Recording:
     # From any thread -------------------------------------------------------------------------
 
     def add_topic(self, topic: Topic) -> int:
-        """
-        Announce a topic, or new offers of a known one.
-
-        Parameters
-        ----------
-        topic : hmsa_ros.bag.writer.Topic
-            What will be recorded.
-
-        Returns
-        -------
-        int
-            Its number, for the messages.
-
-        """
+        """Announce a topic, or new offers of a known one; return its number for the messages."""
         with self._condition:
             number = next((
                 i for i, known in enumerate(self._topics)
@@ -134,17 +121,7 @@ class Recording:
         return number
 
     def put(self, messages: list[Message], payload_bytes: int) -> None:
-        """
-        Record messages; returns at once.
-
-        Parameters
-        ----------
-        messages : list of tuple
-            Topic number, log time, publish time, sequence and payload of each.
-        payload_bytes : int
-            Length of all payloads.
-
-        """
+        """Record messages of a total payload length in bytes; returns at once."""
         size = payload_bytes + MESSAGE_OVERHEAD * len(messages)
         with self._condition:
             if self._queued + size > self._limits.cache_size:
@@ -158,15 +135,7 @@ class Recording:
                 self._condition.notify()
 
     def note(self, values: Mapping[str, str]) -> None:
-        """
-        Add to the custom data of the bag.
-
-        Parameters
-        ----------
-        values : mapping of str to str
-            Replace those of the same key.
-
-        """
+        """Add to the custom data of the bag; a key that exists gets the new value."""
         with self._condition:
             self._items.append(dict(values))
             self._condition.notify()
@@ -203,20 +172,7 @@ class Recording:
                 self._sink.pace.refused)
 
     def close(self, last_words: Callable[[Status], Mapping[str, str]] | None = None) -> Status:
-        """
-        Write what has been put so far and close the bag.
-
-        Parameters
-        ----------
-        last_words : callable, optional
-            Gets the state when everything is written and returns custom data to add.
-
-        Returns
-        -------
-        Status
-            At the end.
-
-        """
+        """Write what has been put and the custom data of ``last_words``, and close the bag."""
         with self._condition:
             self._closing = True
             self._deadline = time.monotonic() + END_SECONDS
@@ -385,20 +341,7 @@ def _reason(error: OSError) -> str:
 
 
 def lost_by_topic(*counts: Mapping[str, int]) -> dict[str, int]:
-    """
-    Add up losses of several kinds.
-
-    Parameters
-    ----------
-    *counts : mapping of str to int
-        By topic.
-
-    Returns
-    -------
-    dict of str to int
-        Sums by topic.
-
-    """
+    """Return the sums of losses of several kinds by topic."""
     total: dict[str, int] = {}
     for count in counts:
         for topic, number in count.items():

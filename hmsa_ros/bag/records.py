@@ -113,19 +113,7 @@ class _Content(ReadDataStream):
 
 def parse(kind: type[_Record], content: bytes) -> _Record:
     """
-    Read a record by the mcap package's class.
-
-    Parameters
-    ----------
-    kind : type
-        Class of the record.
-    content : bytes
-        All of its content.
-
-    Returns
-    -------
-    mcap.records.McapRecord
-        Bytes that are not UTF-8 are written as their codes.
+    Read a record by the mcap package's class; bytes that are not UTF-8 become their codes.
 
     Raises
     ------
@@ -152,19 +140,7 @@ def parse_any(opcode: int, content: bytes) -> McapRecord | None:
 
 def read_chunk_head(data: bytes, length: int) -> ChunkHead:
     """
-    Return what a chunk says of itself.
-
-    Parameters
-    ----------
-    data : bytes
-        Beginning of the record's content, `CHUNK_HEAD_SIZE` bytes or all of it.
-    length : int
-        Length of the whole content.
-
-    Returns
-    -------
-    ChunkHead
-        Checked against the length.
+    Return the head of a chunk record, checked against the length in bytes of its content.
 
     Raises
     ------
@@ -186,21 +162,7 @@ def read_chunk_head(data: bytes, length: int) -> ChunkHead:
 
 def decompress(data: bytes, compression: str, size: int) -> bytes:
     """
-    Return the content of a chunk.
-
-    Parameters
-    ----------
-    data : bytes
-        As stored.
-    compression : str
-        ``''``, ``'lz4'`` or ``'zstd'``.
-    size : int
-        Length after decompression.
-
-    Returns
-    -------
-    bytes
-        Exactly ``size`` bytes.
+    Return a chunk's content of ``size`` bytes, stored as ``''``, ``'lz4'`` or ``'zstd'``.
 
     Raises
     ------
@@ -235,19 +197,7 @@ def decompress(data: bytes, compression: str, size: int) -> bytes:
 
 def checked(content: bytes, crc: int) -> bytes:
     """
-    Check the content of a chunk.
-
-    Parameters
-    ----------
-    content : bytes
-        Uncompressed.
-    crc : int
-        CRC-32 that it should have; 0 for none.
-
-    Returns
-    -------
-    bytes
-        The content.
+    Return a chunk's uncompressed content if its CRC-32 is as it should be; 0 for none.
 
     Raises
     ------
@@ -262,17 +212,7 @@ def checked(content: bytes, crc: int) -> bytes:
 
 def split(content: bytes) -> Iterator[tuple[int, int, int]]:
     """
-    Go through records that follow each other.
-
-    Parameters
-    ----------
-    content : bytes
-        Of a chunk or a summary.
-
-    Yields
-    ------
-    tuple of int
-        Opcode, and start and end of the content of each record.
+    Yield opcode, start and end of the content of each record in a chunk or summary.
 
     Raises
     ------
@@ -295,19 +235,7 @@ def split(content: bytes) -> Iterator[tuple[int, int, int]]:
 
 def read_exactly(descriptor: int, length: int, offset: int) -> bytes:
     """
-    Read from a file.
-
-    Parameters
-    ----------
-    descriptor : int
-        Of the open file.
-    length, offset : int
-        In bytes.
-
-    Returns
-    -------
-    bytes
-        As many as asked for.
+    Return so many bytes of a file from an offset on.
 
     Raises
     ------

@@ -17,21 +17,7 @@ _CRC_BYTES = 2**20
 
 def scan(intake: Intake, path: Path, number: int) -> ScannedFile:
     """
-    Find out what a file holds.
-
-    Parameters
-    ----------
-    intake : Intake
-        Limits and problems.
-    path : pathlib.Path
-        The file.
-    number : int
-        Of the file in its bag.
-
-    Returns
-    -------
-    ScannedFile
-        With the problems noted.
+    Find out what a file holds; limits and problems are the intake's.
 
     Raises
     ------

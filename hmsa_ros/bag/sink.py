@@ -133,12 +133,7 @@ class Sink:
 
     def snapshot(self) -> str:
         """
-        Write the messages kept in memory.
-
-        Returns
-        -------
-        str
-            What was written, in words.
+        Write the messages kept in memory and return in words what was written.
 
         Raises
         ------

@@ -178,15 +178,7 @@ class BagWriter:
         return len(contents.topics) - 1
 
     def write(self, entries: Iterable[tuple[int, int, int, int, bytes]]) -> None:
-        """
-        Add messages; full chunks go to the file.
-
-        Parameters
-        ----------
-        entries : iterable of tuple
-            As `Entry`, in any order of stamps.
-
-        """
+        """Add messages in any order of stamps; full chunks go to the file."""
         for entry in entries:
             log_time = entry[1]
             if not self._waiting:

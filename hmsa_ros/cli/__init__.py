@@ -42,28 +42,12 @@ class Parser(argparse.ArgumentParser):
         super().__init__(**{'formatter_class': _Help, **settings})
 
     def error(self, message: str) -> NoReturn:
-        """
-        Print one line on standard error and exit with status 2.
-
-        Parameters
-        ----------
-        message : str
-            What was wrong.
-
-        """
+        """Print one line on standard error and exit with status 2."""
         self.exit(2, f'hmsa: error: {message}; see {self.prog} --help\n')
 
 
 def build_parser() -> Parser:
-    """
-    Return the parser of the whole command line.
-
-    Returns
-    -------
-    Parser
-        With one subparser a command.
-
-    """
+    """Return the parser of the whole command line, with one subparser a command."""
     parser = Parser(
         prog='hmsa',
         description='Move hard-magnetic soft actuators to a target stretch, fast and without '
@@ -81,11 +65,6 @@ def build_parser() -> Parser:
 def main(argv: Sequence[str] | None = None) -> int:
     """
     Run the ``hmsa`` command.
-
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        Arguments without the program's name; default ``sys.argv[1:]``.
 
     Returns
     -------
@@ -124,20 +103,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def split_ros_args(words: list[str]) -> list[str]:
-    """
-    Return what comes before ``--ros-args``: argparse does not read the rest.
-
-    Parameters
-    ----------
-    words : list of str
-        Arguments.
-
-    Returns
-    -------
-    list of str
-        Unchanged for a command that is not a node's.
-
-    """
+    """Return what comes before ``--ros-args`` of a node's command: argparse does not read on."""
     if '--ros-args' in words and words[0] in NODES:
         return words[:words.index('--ros-args')]
     return words

@@ -96,22 +96,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def commands_of(parser: argparse.ArgumentParser, path: str = '', text: str = '') \
         -> Iterator[Command]:
-    """
-    Walk a parser and its subparsers.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Where to begin.
-    path, text : str
-        Words of its command, and what it does.
-
-    Yields
-    ------
-    Command
-        One a parser, the outer ones first.
-
-    """
+    """Yield a parser and its subparsers as commands, the outer ones first."""
     options: list[Option] = []
     words: dict[str, str] = {}
     files = False

@@ -233,20 +233,7 @@ def _doubts(given: Mapping[str, float], found: 'Scales') -> list[str]:
 
 
 def table(found: 'Scales') -> list[str]:
-    """
-    Return what follows from the parameters, a line each.
-
-    Parameters
-    ----------
-    found : Scales
-        As worked out.
-
-    Returns
-    -------
-    list of str
-        Aligned.
-
-    """
+    """Return what follows from the parameters, aligned, a line each."""
     rows = [
         ('time unit L sqrt(rho/G)', _time(found.time_unit)),
         ('natural frequency at rest', f'{found.frequency:.5g} Hz'),
@@ -281,28 +268,7 @@ def _time(seconds: float) -> str:
 def file_text(
         path: Path, actuator: 'ActuatorParameters', coil: 'Coil', joints: list[str],
         found: 'Scales') -> str:
-    """
-    Return the parameter file.
-
-    Parameters
-    ----------
-    path : Path
-        Its name, for the comments.
-    actuator : ActuatorParameters
-        The block.
-    coil : Coil
-        Its coil.
-    joints : list of str
-        Names of the joints.
-    found : Scales
-        What follows, for the comments.
-
-    Returns
-    -------
-    str
-        YAML as ROS 2 has it.
-
-    """
+    """Return the parameter file in ROS 2's YAML; its name and the scales go into comments."""
     lines = [
         '# Parameters of an actuator for planner and plant, written by hmsa init:',
         f'#   hmsa plant --ros-args --params-file {path.name}',

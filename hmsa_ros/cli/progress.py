@@ -6,20 +6,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def progress(what: str = 'starting') -> Iterator[Callable[[str, float | None], None]]:
-    """
-    Show how far something has come.
-
-    Parameters
-    ----------
-    what : str
-        What is going on at first.
-
-    Yields
-    ------
-    callable
-        To call with what is going on, and the share that is done, None if that is not known.
-
-    """
+    """Yield what shows progress: called with what is going on, and the share done or None."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 

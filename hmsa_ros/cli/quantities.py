@@ -95,17 +95,7 @@ class Quantity:
 
     def parse(self, text: str) -> float:
         """
-        Read a number, with a unit behind it or in SI units.
-
-        Parameters
-        ----------
-        text : str
-            For example ``'0.01'`` or ``'10 mm'``.
-
-        Returns
-        -------
-        float
-            In SI units.
+        Read a number in SI units, or with a unit behind it as in ``'10 mm'``; return it in SI.
 
         Raises
         ------
@@ -144,20 +134,7 @@ class Quantity:
         return f'{value:g}{self._unit}'
 
     def doubt(self, value: float) -> str | None:
-        """
-        Return what is implausible about a value.
-
-        Parameters
-        ----------
-        value : float
-            In SI units.
-
-        Returns
-        -------
-        str or None
-            A sentence with the usual range and where it is from; None for a usual value.
-
-        """
+        """Return why a value in SI units is implausible, with the usual range and its source."""
         low, high = self.usual
         if low <= value <= high:
             return None
@@ -228,22 +205,7 @@ NEEDED = ('half_length', 'half_thickness', 'shear_modulus', 'density', 'remanenc
 
 
 def default_of(quantity: Quantity, given: Mapping[str, float]) -> float:
-    """
-    Return what is taken for a quantity that is not given.
-
-    Parameters
-    ----------
-    quantity : Quantity
-        Which.
-    given : mapping of str to float
-        Those before it in `QUANTITIES`.
-
-    Returns
-    -------
-    float
-        In SI units: a cube, and a coil that is as strong in either direction, unless told.
-
-    """
+    """Return a default in SI units: a cube, and a coil as strong in either direction."""
     if quantity.default is not None:
         return quantity.default
     return given['half_length'] if quantity.key == 'half_thickness' else -abs(given['flux_max'])
@@ -251,17 +213,7 @@ def default_of(quantity: Quantity, given: Mapping[str, float]) -> float:
 
 def joint_names(text: str) -> list[str]:
     """
-    Read names of joints.
-
-    Parameters
-    ----------
-    text : str
-        With commas or spaces between.
-
-    Returns
-    -------
-    list of str
-        Empty for an empty text.
+    Read names of joints with commas or spaces between; none from an empty text.
 
     Raises
     ------

@@ -8,17 +8,7 @@ from hmsa_ros.errors import BadInputError
 
 def setpoint(text: str) -> tuple[float, float]:
     """
-    Read ``STRETCH:SPAN``.
-
-    Parameters
-    ----------
-    text : str
-        For example ``'1.10:10'``.
-
-    Returns
-    -------
-    tuple of float
-        Stretch and span.
+    Read stretch and hold time from a text as ``'1.10:10'``.
 
     Raises
     ------
@@ -34,19 +24,7 @@ def setpoint(text: str) -> tuple[float, float]:
 
 def setpoint_of_joints(text: str) -> tuple[tuple[float, ...], float]:
     """
-    Read ``STRETCH:SPAN`` or ``STRETCH,STRETCH,...:SPAN``.
-
-    Parameters
-    ----------
-    text : str
-        For example ``'1.10:10'`` or ``'1.10,1.20:10'``.
-
-    Returns
-    -------
-    stretches : tuple of float
-        One, or one a joint.
-    span : float
-        Of all.
+    Read one stretch or one a joint, and the hold time, from ``'1.10:10'`` or ``'1.10,1.20:10'``.
 
     Raises
     ------

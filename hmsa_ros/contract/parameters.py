@@ -50,11 +50,6 @@ class ParameterSpec:
         """
         Refuse a value outside the range or the choices.
 
-        Parameters
-        ----------
-        value : object
-            Value of the parameter's own type.
-
         Raises
         ------
         BadInputError
@@ -75,15 +70,7 @@ class ParameterSpec:
                 f'parameter {self.name} is {value:g}: expected {self.range_text()}')
 
     def range_text(self) -> str:
-        """
-        Return the range in words.
-
-        Returns
-        -------
-        str
-            For example ``'at least 0 s'``.
-
-        """
+        """Return the range in words, for example ``'at least 0 s'``."""
         unit = f' {self.unit}' if self.unit else ''
         if self.minimum is None and self.maximum is None:
             return 'any value'

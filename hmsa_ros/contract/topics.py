@@ -185,45 +185,12 @@ SPLIT_BAGFILE = Service('~/split_bagfile', _TRIGGER, {
 
 
 def of_joint(name: str, joint: str, joints: Sequence[str]) -> str:
-    """
-    Return the name of one joint's topic.
-
-    Parameters
-    ----------
-    name : str
-        As declared here.
-    joint : str
-        Name of the joint.
-    joints : sequence of str
-        All joints of the node.
-
-    Returns
-    -------
-    str
-        With the joint before the last part, as in ``left/flux_density_command`` or
-        ``~/left/setpoint``; unchanged where there is only one joint.
-
-    """
+    """Return a topic's name with the joint before its last part, unchanged for an only joint."""
     if len(joints) == 1:
         return name
     return f'~/{joint}/{name[2:]}' if name.startswith('~/') else f'{joint}/{name}'
 
 
 def from_outside(name: str, node: str) -> str:
-    """
-    Return a private name as another node in the same namespace addresses it.
-
-    Parameters
-    ----------
-    name : str
-        Name as declared here, for example ``'~/stop'``.
-    node : str
-        Name of the node that owns it, for example ``'planner'``.
-
-    Returns
-    -------
-    str
-        For example ``'planner/stop'``; names that are not private are returned unchanged.
-
-    """
+    """Return ``'~/stop'`` of a planner as ``'planner/stop'``; other names unchanged."""
     return f'{node}/{name[2:]}' if name.startswith('~/') else name

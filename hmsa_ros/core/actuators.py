@@ -307,21 +307,7 @@ class Actuators:
         return max(self.time - stamp, 0) if changed else 0
 
     def force(self, i: int, stamp: int, force: float) -> None:
-        """
-        Take a disturbing force that acts from its stamp on.
-
-        Parameters
-        ----------
-        i, stamp, force : int, int, float
-            On which; time in ns, superseding those stamped at or after it; in N along the
-            field, pulling where positive.
-
-        Raises
-        ------
-        BadInputError
-            If the value is not finite or nobody could follow it.
-
-        """
+        """Take a force in N along the field, from a stamp in ns on, superseding later ones."""
         self.setups[i].check_force(force)
         self.forces[i].insert(max(stamp, self.time), force)
         self._plan(i)

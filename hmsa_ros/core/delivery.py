@@ -65,56 +65,17 @@ class Delivery:
         return self.period == 0.0 and math.isinf(self.slew) and self.lag == 0.0
 
     def settling(self, change: float) -> float:
-        """
-        Return after what time nothing is left of a change of level.
-
-        Parameters
-        ----------
-        change : float
-            Of the load, signed.
-
-        Returns
-        -------
-        float
-            The ramp, and what the field lags behind.
-
-        """
+        """Return after what time (ramp and lag) nothing is left of a signed change of the load."""
         return self.ramp(change) + _SETTLED * self.lag
 
     def rounded(self, time: float) -> float:
-        """
-        Return a time as a command can carry it.
-
-        Parameters
-        ----------
-        time : float
-            From the start of a sequence; may be infinite.
-
-        Returns
-        -------
-        float
-            The nearest multiple of the resolution.
-
-        """
+        """Return a time, which may be infinite, as the nearest multiple of the resolution."""
         if self.resolution == 0.0 or math.isinf(time):
             return time
         return round(time / self.resolution) * self.resolution
 
     def ramp(self, change: float) -> float:
-        """
-        Return how long a change of level takes.
-
-        Parameters
-        ----------
-        change : float
-            Of the load, signed.
-
-        Returns
-        -------
-        float
-            0 without a slew limit.
-
-        """
+        """Return how long a signed change of the load takes; 0 without a slew limit."""
         return 0.0 if math.isinf(self.slew) else abs(change) / self.slew
 
 

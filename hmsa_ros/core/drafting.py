@@ -129,11 +129,6 @@ def check_target(stretch: float) -> None:
     """
     Check that a number can be a stretch.
 
-    Parameters
-    ----------
-    stretch : float
-        Any number.
-
     Raises
     ------
     RefusedError

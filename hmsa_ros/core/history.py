@@ -91,20 +91,7 @@ class History:
         return replace(self.predicted(end), sent=end)
 
     def without(self, start: int, end: int) -> 'History':
-        """
-        Take levels out that never were in force, and never will be.
-
-        Parameters
-        ----------
-        start, end : int
-            Places of the first of them and of the first after them.
-
-        Returns
-        -------
-        History
-            In which the level before them stays in force.
-
-        """
+        """Return the history without levels ``start`` to ``end``, which never were in force."""
         sent = self.sent - max(min(self.sent, end) - start, 0)
         return History(
             self.levels[:start] + self.levels[end:], sent, self.known, start).predicted(sent)

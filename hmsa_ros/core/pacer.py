@@ -56,32 +56,12 @@ class Pacer:
         return self._anchor + round((steady - self._steady) * self.factor)
 
     def set_paused(self, paused: bool, time: int) -> None:
-        """
-        Pause or go on.
-
-        Parameters
-        ----------
-        paused : bool
-            What to do.
-        time : int
-            Simulated time in ns that has been reached; goes on from here.
-
-        """
+        """Pause or go on, from a simulated time in ns that has been reached."""
         self._anchor = time
         self._steady = None
         self.paused = paused
 
     def set_factor(self, factor: float, time: int) -> None:
-        """
-        Go on at another speed.
-
-        Parameters
-        ----------
-        factor : float
-            Simulated seconds per second; 0 for as fast as possible.
-        time : int
-            Simulated time in ns that has been reached; goes on from here.
-
-        """
+        """Go on from a simulated time in ns at another speed; 0 for as fast as possible."""
         self.factor = factor
         self.set_paused(self.paused, time)

@@ -207,20 +207,7 @@ class RunningPlan:
         return end - history.sent
 
     def unheard(self, now: int) -> int | None:
-        """
-        Look for changes of level that never took effect, although nobody told.
-
-        Parameters
-        ----------
-        now : int
-            Time in ns up to which everything that took effect has been told.
-
-        Returns
-        -------
-        int or None
-            Stamp of the last of them in ns, for `drop_unheard`.
-
-        """
+        """Return the stamp of the last silently lost change up to ``now``, or None; in ns."""
         history = self._history
         count = history.unheard(now)
         return history.levels[history.known + count].stamp if count else None
@@ -262,20 +249,7 @@ class RunningPlan:
         self._history = history
 
     def state(self, time: int) -> State:
-        """
-        Predict the nondimensional state at a time.
-
-        Parameters
-        ----------
-        time : int
-            In ns, not before the level in force began.
-
-        Returns
-        -------
-        State
-            Under the plan as it is, in the units of the model for the next request.
-
-        """
+        """Predict the nondimensional state at a time in ns, in the units of the next request."""
         self._remember(self._history.predicted(self.plan.place(time) + 1))
         level = self.plan.level(time)
         return self.model.taken_from(level.at(time), level.model)

@@ -14,20 +14,7 @@ T = TypeVar('T')
 
 
 def obeyed(x: float, y: float, z: float) -> bool:
-    """
-    Return whether a field is one that an actuator obeys.
-
-    Parameters
-    ----------
-    x, y, z : float
-        Flux density in T; the actuator moves along z.
-
-    Returns
-    -------
-    bool
-        Whether it is finite, and along z.
-
-    """
+    """Return whether a field in T is one that an actuator obeys: finite, and along z."""
     return math.isfinite(z) and x == 0.0 == y
 
 

@@ -143,24 +143,7 @@ class Model:
         return float(law.natural_frequency(stretch, self.material.packed))
 
     def follow(self, state: State, load: float, duration: float) -> State:
-        """
-        Predict the state after one level has been commanded for a time.
-
-        Parameters
-        ----------
-        state : State
-            At the start; it knows the load in force.
-        load : float
-            Commanded from then on.
-        duration : float
-            Nondimensional.
-
-        Returns
-        -------
-        State
-            At the end.
-
-        """
+        """Predict the state after a load has been commanded for a nondimensional time."""
         return follow((Level(0.0, load),), state, duration, self.material, self.delivery)
 
     def taken_from(self, state: State, other: 'Model') -> State:

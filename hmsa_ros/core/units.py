@@ -26,53 +26,14 @@ class Units:
     load_name: str = ''
 
     def time_text(self, value: float) -> str:
-        """
-        Word a time.
-
-        Parameters
-        ----------
-        value : float
-            Nondimensional time.
-
-        Returns
-        -------
-        str
-            With four significant digits.
-
-        """
+        """Word a nondimensional time with four significant digits."""
         return f'{value * self.time:.4g}{self.time_name}'
 
     def slew_text(self, value: float) -> str:
-        """
-        Word a rate of change of the load.
-
-        Parameters
-        ----------
-        value : float
-            Load beta per unit of nondimensional time.
-
-        Returns
-        -------
-        str
-            With four significant digits, as in ``'20 T/s'``.
-
-        """
+        """Word a slew rate (load per nondimensional time) with four digits, as in ``'20 T/s'``."""
         unit = f'{self.load_name}/{self.time_name.strip()}' if self.time_name else ''
         return f'{value * self.load / self.time:.4g}{unit}'
 
     def load_text(self, value: float) -> str:
-        """
-        Word a load.
-
-        Parameters
-        ----------
-        value : float
-            Nondimensional load beta.
-
-        Returns
-        -------
-        str
-            With four significant digits.
-
-        """
+        """Word a nondimensional load beta with four significant digits."""
         return f'{value * self.load:.4g}{self.load_name}'

@@ -79,15 +79,7 @@ def _run(*, batch: bool) -> None:
 
 
 def main() -> int:
-    """
-    Compile what the package uses and say so.
-
-    Returns
-    -------
-    int
-        Exit status 0.
-
-    """
+    """Compile what the package uses, say so, and return 0."""
     say = partial(print, flush=True)
     print(f'loaded the numerical kernels in {warm_up(say, batch=True):.1f} s')
     return 0

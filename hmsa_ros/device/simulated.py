@@ -131,24 +131,7 @@ class SimulatedDevice(Outbox):
             self._obey(joint, stamp, level)
 
     def push(self, joint: int, stamp: int, force: float) -> None:
-        """
-        Have a force act on a joint.
-
-        Parameters
-        ----------
-        joint : int
-            Its place.
-        stamp : int
-            Time in ns from which it acts, 0 for at once.
-        force : float
-            Along the field in N.
-
-        Raises
-        ------
-        BadInputError
-            If nobody could follow it.
-
-        """
+        """Have a force in N act along the field on a joint from a stamp in ns on, 0 for now."""
         self._actuators.force(joint, stamp or self.time, force)
 
     def _obey(self, joint: int, stamp: int, level: float) -> None:

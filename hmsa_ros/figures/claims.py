@@ -34,15 +34,7 @@ _SETTLED = 0.05
 
 
 def lines() -> Iterator[str]:
-    """
-    Compute every claim.
-
-    Yields
-    ------
-    str
-        One line a number or a group of numbers; those that open a claim end in a colon.
-
-    """
+    """Yield every claim computed, a line a number or group; a claim's title ends in a colon."""
     for section in (
             _limits, _critical, _damping_time, _damping, _mismatch, _inequality, _residuals,
             _settling, _cycles, _near_limit, _extensibility):
@@ -290,15 +282,7 @@ def _power(value: float) -> str:
 
 
 def main() -> int:
-    """
-    Print every claim.
-
-    Returns
-    -------
-    int
-        Exit status 0.
-
-    """
+    """Print every claim and return 0."""
     for line in lines():
         print(line, flush=True)
     return 0

@@ -87,20 +87,7 @@ class Run:
         return np.asarray(self.loads[level])
 
     def turning_points(self, begin: float, end: float) -> int:
-        """
-        Count the changes of direction.
-
-        Parameters
-        ----------
-        begin, end : float
-            Part of the time that counts.
-
-        Returns
-        -------
-        int
-            Two a cycle.
-
-        """
+        """Count the changes of direction between two times; two a cycle."""
         part = self.rate[(self.time > begin) & (self.time < end)]
         return int(np.count_nonzero(np.diff(np.signbit(part))))
 
@@ -199,114 +186,36 @@ def _levels(segments: Sequence[Segment]) -> tuple[Array, Array]:
 
 
 def multi_step(samples: int = SAMPLES) -> tuple[Run, ...]:
-    """
-    Compute Fig. 2: the response to plain steps.
-
-    Parameters
-    ----------
-    samples : int
-        Samples a run.
-
-    Returns
-    -------
-    tuple of Run
-        One.
-
-    """
+    """Compute Fig. 2: the response to plain steps, with so many samples a run."""
     return respond(
         '1.1, 1.2, 1.4', EXPANSION, _PAPER, commands=('unshaped',), samples=samples)
 
 
 def single_move(samples: int = SAMPLES) -> tuple[Run, ...]:
-    """
-    Compute Fig. 3: one move, shaped, unshaped and with b_p alone.
-
-    Parameters
-    ----------
-    samples : int
-        Samples a run.
-
-    Returns
-    -------
-    tuple of Run
-        Shaped, unshaped, b_p alone.
-
-    """
+    """Compute Fig. 3: one move, shaped, unshaped and with b_p alone."""
     return respond(
         '1.1', SINGLE, _PAPER, commands=('shaped', 'unshaped', 'b_p alone'), samples=samples)
 
 
 def shaped_multi_step(samples: int = SAMPLES) -> tuple[Run, ...]:
-    """
-    Compute Fig. 4: three setpoints, shaped and unshaped.
-
-    Parameters
-    ----------
-    samples : int
-        Samples a run.
-
-    Returns
-    -------
-    tuple of Run
-        Shaped, unshaped.
-
-    """
+    """Compute Fig. 4: three setpoints, shaped and unshaped."""
     return respond('1.1, 1.2, 1.4', EXPANSION, _PAPER, samples=samples)
 
 
 def expansion(samples: int = SAMPLES) -> tuple[Run, ...]:
-    """
-    Compute Fig. 5: two sequences in expansion.
-
-    Parameters
-    ----------
-    samples : int
-        Samples a run.
-
-    Returns
-    -------
-    tuple of Run
-        Shaped and unshaped for the first sequence, then for the second.
-
-    """
+    """Compute Fig. 5: two sequences in expansion, each shaped and unshaped."""
     return (*respond('1.1, 1.2, 1.4', EXPANSION, _PAPER, samples=samples),
             *respond('1.15, 1.25, 1.35', SECOND_EXPANSION, _PAPER, samples=samples))
 
 
 def contraction(samples: int = SAMPLES) -> tuple[Run, ...]:
-    """
-    Compute Fig. 6: two sequences in contraction.
-
-    Parameters
-    ----------
-    samples : int
-        Samples a run.
-
-    Returns
-    -------
-    tuple of Run
-        Shaped and unshaped for the first sequence, then for the second.
-
-    """
+    """Compute Fig. 6: two sequences in contraction, each shaped and unshaped."""
     return (*respond('0.9, 0.8, 0.7', CONTRACTION, _PAPER, samples=samples),
             *respond('0.85, 0.7, 0.85', SECOND_CONTRACTION, _PAPER, samples=samples))
 
 
 def damping_cases(samples: int = SAMPLES) -> tuple[Run, ...]:
-    """
-    Compute Fig. 7: three values of zeta in expansion and in contraction.
-
-    Parameters
-    ----------
-    samples : int
-        Samples a run.
-
-    Returns
-    -------
-    tuple of Run
-        Shaped and unshaped for each zeta in expansion, then in contraction.
-
-    """
+    """Compute Fig. 7: three values of zeta in expansion, then contraction, shaped and unshaped."""
     return tuple(
         run for targets in (EXPANSION, DEEP_CONTRACTION) for zeta in ZETAS
         for run in respond(
@@ -315,20 +224,7 @@ def damping_cases(samples: int = SAMPLES) -> tuple[Run, ...]:
 
 
 def damping_sweep(points: int = SWEEP_POINTS) -> Sweep:
-    """
-    Compute Fig. 8: tau_p over zeta for 1 -> 1.1, up to where b_p cannot be told from b_1.
-
-    Parameters
-    ----------
-    points : int
-        Values of zeta; they crowd towards the end, where tau_p grows without bound.
-
-    Returns
-    -------
-    Sweep
-        Over zeta.
-
-    """
+    """Compute Fig. 8: tau_p over zeta for 1 -> 1.1, up to where b_p cannot be told from b_1."""
     start, target = 1.0, EXPANSION[0]
     critical = float(critical_zeta(target, _PAPER))
     near = critical * np.linspace(0.9, 1.1, 4001)
@@ -343,20 +239,7 @@ def damping_sweep(points: int = SWEEP_POINTS) -> Sweep:
 
 
 def chain_limit_cases(samples: int = SAMPLES) -> tuple[Run, ...]:
-    """
-    Compute Fig. 9: three values of J_lim, the last setpoint near the limiting stretch.
-
-    Parameters
-    ----------
-    samples : int
-        Samples a run; the last setpoint is sampled more densely.
-
-    Returns
-    -------
-    tuple of Run
-        Shaped and unshaped for each J_lim.
-
-    """
+    """Compute Fig. 9: three values of J_lim, the last setpoint near the limiting stretch."""
     runs: list[Run] = []
     for j_lim in J_LIMS:
         targets = (1.2, 1.4, NEAR_LIMIT * stretch_limits(j_lim)[1])
@@ -368,20 +251,7 @@ def chain_limit_cases(samples: int = SAMPLES) -> tuple[Run, ...]:
 
 
 def chain_limit_sweep(points: int = SWEEP_POINTS) -> Sweep:
-    """
-    Compute Fig. 10: tau_p and b_p over J_lim for 1 -> 1.2.
-
-    Parameters
-    ----------
-    points : int
-        Evenly spaced values of J_lim; those of Fig. 9 are added.
-
-    Returns
-    -------
-    Sweep
-        Over J_lim.
-
-    """
+    """Compute Fig. 10: tau_p and b_p over J_lim for 1 -> 1.2, those of Fig. 9 among them."""
     j_lim = np.union1d(np.linspace(*J_LIM_RANGE, points), J_LIMS)
     return _sweep(1.0, 1.2, np.full(j_lim.size, _PAPER.zeta), j_lim, float('nan'))
 

@@ -44,24 +44,7 @@ _ORDERS: tuple[dict[str, Any], ...] = (
 
 
 def draw_robustness(path: str | Path, case: Case, results: Sequence[Result]) -> None:
-    """
-    Draw the residuals of one move: over each error alone, and the worst in the box.
-
-    Parameters
-    ----------
-    path : str or Path
-        PNG file to write; an existing file is replaced.
-    case : Case
-        What was studied.
-    results : sequence of Result
-        One a shaper.
-
-    Raises
-    ------
-    BadInputError
-        If the file cannot be written.
-
-    """
+    """Write a PNG of one move's residuals: over each error alone, and the worst in the box."""
     shown = [x for x in results if x.move is not None]
     looks = _looks([x.candidate for x in shown])
     errors = 100.0 * case.errors()
@@ -129,24 +112,7 @@ def _bars(
 
 
 def draw_sampled(path: str | Path, study: SampledStudy, *, period: float = 0.28) -> None:
-    """
-    Draw residuals over the command period, and one period's commands and responses.
-
-    Parameters
-    ----------
-    path : str or Path
-        PNG file to write; an existing file is replaced.
-    study : SampledStudy
-        The residuals.
-    period : float
-        Of the example, as a share of tau_p; there is a command for it.
-
-    Raises
-    ------
-    BadInputError
-        If the file cannot be written.
-
-    """
+    """Write a PNG of residuals over the command period, and a run at one (share of tau_p)."""
     with style.picture(Path(path), 3.9) as figure:
         figure.suptitle(
             rf'Commands every period $T$, $\lambda$ = {study.start:g} to {study.target:g}, '
@@ -219,24 +185,7 @@ def _levels(axes: Axes, move: Move, end: float, look: dict[str, Any]) -> None:
 
 
 def draw_damped(path: str | Path, study: DampedStudy, *, zeta: float = 4.0) -> None:
-    """
-    Draw settling times over zeta, and one zeta's commands and responses.
-
-    Parameters
-    ----------
-    path : str or Path
-        PNG file to write; an existing file is replaced.
-    study : DampedStudy
-        The times.
-    zeta : float
-        Of the example.
-
-    Raises
-    ------
-    BadInputError
-        If the file cannot be written.
-
-    """
+    """Write a PNG of settling times over zeta, and one zeta's commands and responses."""
     material = NondimensionalParameters(zeta)
     holding = float(elastic_force(study.target, material))
     colours = (style.BLUE, style.GREEN)

@@ -104,19 +104,7 @@ def picture(
 
 
 def finish(axes: Axes, x_label: str, y_label: str, letter: str = '') -> None:
-    """
-    Name the axes of a panel.
-
-    Parameters
-    ----------
-    axes : Axes
-        The panel.
-    x_label, y_label : str
-        Quantity with its symbol and unit; an empty one leaves the tick labels off.
-    letter : str
-        Letter of the panel, shown in brackets above it.
-
-    """
+    """Name a panel's axes (none leaves the tick labels off) and write its letter above it."""
     axes.set_xlabel(x_label)
     axes.set_ylabel(y_label)
     if letter:

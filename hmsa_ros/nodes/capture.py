@@ -44,19 +44,7 @@ class Taken(NamedTuple):
 
 def decode(data: bytes, message_type: type[Any]) -> Any:
     """
-    Return the message that a payload holds.
-
-    Parameters
-    ----------
-    data : bytes
-        As received.
-    message_type : type
-        Message class.
-
-    Returns
-    -------
-    object
-        Of that class.
+    Return the message of a class that a payload holds.
 
     Raises
     ------
@@ -173,20 +161,7 @@ class RawSubscription:
         return cls._taker is not None
 
     def take(self, limit: int = _BATCH) -> list[Taken]:
-        """
-        Take what has arrived.
-
-        Parameters
-        ----------
-        limit : int
-            Largest number of messages.
-
-        Returns
-        -------
-        list of Taken
-            In order of arrival; empty if there is nothing.
-
-        """
+        """Take at most ``limit`` messages in order of arrival; none if there are none."""
         try:
             with self.handle:
                 if self.tells_publishers() and self._taker is not None:
@@ -247,36 +222,14 @@ class Capture:
         self._thread.start()
 
     def add(self, key: Any, subscription: RawSubscription) -> None:
-        """
-        Take messages off one more subscription.
-
-        Parameters
-        ----------
-        key : object
-            Passed on with its messages.
-        subscription : RawSubscription
-            From now on read and in the end destroyed by this object.
-
-        """
+        """Take over a subscription: read it, pass its messages on with the key, destroy it."""
         with self._lock:
             self._subscriptions.append((key, subscription))
             self._changed = True
         self._wake()
 
     def replace(self, key: Any, subscription: RawSubscription) -> None:
-        """
-        Take messages off another subscription under the same key.
-
-        What has arrived at the old one is still passed on.
-
-        Parameters
-        ----------
-        key : object
-            As given to `add`.
-        subscription : RawSubscription
-            The new one.
-
-        """
+        """Read another subscription under a known key; what the old one holds is passed on."""
         with self._lock:
             for i, (known, old) in enumerate(self._subscriptions):
                 if known is key:
@@ -403,24 +356,7 @@ class SimulatedTime:
         return bool(self._times)
 
     def add(self, received_ns: int, time_ns: int, publisher: bytes = b'') -> int | None:
-        """
-        Take in a ``/clock`` message.
-
-        Parameters
-        ----------
-        received_ns : int
-            When it was received, in system time.
-        time_ns : int
-            What it says.
-        publisher : bytes
-            Who sent it.
-
-        Returns
-        -------
-        int or None
-            The time before, if time has jumped back with this message.
-
-        """
+        """Take in a ``/clock`` message (ns); return the time before if time jumped back."""
         before = self._times[-1] if self._times else time_ns
         if self._times and publisher != self._publisher \
                 and received_ns - self._received[-1] < _SILENCE_NS:
@@ -437,18 +373,5 @@ class SimulatedTime:
         return None
 
     def at(self, received_ns: int) -> int:
-        """
-        Return the simulated time at a moment.
-
-        Parameters
-        ----------
-        received_ns : int
-            System time.
-
-        Returns
-        -------
-        int
-            Nanoseconds; the first known time for an earlier moment.
-
-        """
+        """Return the simulated time at a system time, in ns; before the first, the first."""
         return self._times[max(0, bisect_right(self._received, received_ns) - 1)]

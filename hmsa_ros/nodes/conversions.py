@@ -41,24 +41,7 @@ def to_clock(nanoseconds: int) -> Clock:
 
 
 def to_command(stamp: int, flux_density: float, frame: str) -> MagneticField:
-    """
-    Return a flux density command.
-
-    Parameters
-    ----------
-    stamp : int
-        Time in ns from which it applies.
-    flux_density : float
-        Along z, in T.
-    frame : str
-        Frame of the coil.
-
-    Returns
-    -------
-    sensor_msgs.msg.MagneticField
-        With x and y zero: these axes are commanded to zero, not unknown.
-
-    """
+    """Return a command from a stamp on (ns), in T along z; x and y are zero, not unknown."""
     message = MagneticField(header=Header(stamp=to_time(stamp), frame_id=frame))
     message.magnetic_field.z = flux_density
     return message
@@ -66,17 +49,7 @@ def to_command(stamp: int, flux_density: float, frame: str) -> MagneticField:
 
 def from_command(message: MagneticField) -> tuple[int, float]:
     """
-    Return stamp in ns and flux density in T of a command.
-
-    Parameters
-    ----------
-    message : sensor_msgs.msg.MagneticField
-        As `to_command` makes them.
-
-    Returns
-    -------
-    tuple of int and float
-        Stamp 0 means immediately.
+    Return stamp in ns (0 for immediately) and flux density in T of a command.
 
     Raises
     ------
@@ -179,24 +152,7 @@ def to_planner_status(status: 'StatusChanged') -> DiagnosticStatus:
 def to_status(
         name: str, joint: str, level: bytes, message: str,
         values: Mapping[str, object]) -> DiagnosticStatus:
-    """
-    Return a diagnostic status.
-
-    Parameters
-    ----------
-    name, joint, message : str
-        What it is about, for which joint, and the sentence.
-    level : bytes
-        One of DiagnosticStatus.OK, WARN, ERROR.
-    values : mapping of str to object
-        Written with `str`.
-
-    Returns
-    -------
-    diagnostic_msgs.msg.DiagnosticStatus
-        Ready to publish.
-
-    """
+    """Return a diagnostic status; ``hardware_id`` is the joint, values become text."""
     return DiagnosticStatus(
         name=name, hardware_id=joint, level=level, message=message,
         values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])

@@ -115,15 +115,7 @@ class CommandInput:
         return int(self._node.count_publishers(self._topic.name))
 
     def publishers(self) -> list[bytes]:
-        """
-        Return the identifiers of all publishers of the topic.
-
-        Returns
-        -------
-        list of bytes
-            As the graph knows them.
-
-        """
+        """Return the identifiers of all publishers of the topic, as the graph knows them."""
         name = self._node.resolve_topic_name(self._topic.name)
         return [bytes(x.endpoint_gid) for x in self._node.get_publishers_info_by_topic(name)]
 

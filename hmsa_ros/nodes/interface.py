@@ -117,23 +117,6 @@ SPLIT_BAGFILE = _service(topics.SPLIT_BAGFILE)
 
 
 def of_joint(topic: Topic, joint: str, joints: Sequence[str]) -> Topic:
-    """
-    Return the topic of one joint.
-
-    Parameters
-    ----------
-    topic : Topic
-        As declared here.
-    joint : str
-        Name of the joint.
-    joints : sequence of str
-        All joints of the node.
-
-    Returns
-    -------
-    Topic
-        Named as `hmsa_ros.contract.topics.of_joint` says.
-
-    """
+    """Return the topic of one joint, named as `hmsa_ros.contract.topics.of_joint` says."""
     name = topics.of_joint(topic.name, joint, joints)
     return topic if name == topic.name else replace(topic, name=name)

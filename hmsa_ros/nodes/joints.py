@@ -38,17 +38,7 @@ _TYPES = {
 
 def joint_names(values: Mapping[str, Any]) -> tuple[str, ...]:
     """
-    Return the joints that declared parameters name.
-
-    Parameters
-    ----------
-    values : mapping of str to object
-        With ``joint`` and ``joints``.
-
-    Returns
-    -------
-    tuple of str
-        At least one, all different.
+    Return the joints that ``joint`` and ``joints`` name: at least one, all different.
 
     Raises
     ------
@@ -100,20 +90,7 @@ class JointParameters:
         return self.values[name]
 
     def of(self, joint: str) -> dict[str, Any]:
-        """
-        Return the values that hold for one joint.
-
-        Parameters
-        ----------
-        joint : str
-            Its name.
-
-        Returns
-        -------
-        dict of str to object
-            By name without the joint, its own values before those for all.
-
-        """
+        """Return the values of one joint by name, its own before those for all."""
         return {
             name: self.values.get(f'{joint}.{name}', self.values[name])
             if name in self.own else self.values[name]
@@ -125,25 +102,7 @@ class JointParameters:
         return joint in self.names and rest in self.own
 
     def changed(self, parameters: Iterable[Parameter]) -> 'JointParameters':
-        """
-        Return what comes of setting parameters, each checked on its own.
-
-        Parameters
-        ----------
-        parameters : iterable of rclpy.parameter.Parameter
-            Those that were not declared here are skipped.
-
-        Returns
-        -------
-        JointParameters
-            A copy.
-
-        Raises
-        ------
-        BadInputError
-            If a value is out of its range.
-
-        """
+        """Return a copy with parameters set and checked; those not declared here are skipped."""
         values = dict(self.values)
         for parameter in parameters:
             if parameter.name in self.specs:

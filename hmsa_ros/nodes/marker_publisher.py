@@ -26,22 +26,7 @@ _LIFETIME_PERIODS = 10.0
 
 
 def scene_from(values: JointParameters, lifetime: float = 0.0) -> Scene:
-    """
-    Return the scene of a node's joints.
-
-    Parameters
-    ----------
-    values : JointParameters
-        Of the node, with ``frame_id`` and ``marker_scale``.
-    lifetime : float
-        In s, 0 for ever.
-
-    Returns
-    -------
-    Scene
-        One block a joint.
-
-    """
+    """Return the scene of a node's joints, one block each; lifetime in s, 0 for ever."""
     return Scene(
         tuple(Block.of(name, actuator_from(values.of(name))) for name in values.names),
         values[MARKER_FRAME.name], values[MARKER_SCALE.name], lifetime)
@@ -108,17 +93,7 @@ class TargetMarkers:
         self._shown: Any = None
 
     def show(self, stamp: int, stretches: Mapping[str, float | None]) -> None:
-        """
-        Show targets, unless they are shown already.
-
-        Parameters
-        ----------
-        stamp : int
-            Time in ns.
-        stretches : mapping of str to float or None
-            By joint; None for none.
-
-        """
+        """Show targets (stamp in ns, stretches by joint, None for none) if they have changed."""
         wanted = tuple(stretches.get(block.joint) for block in self._scene.blocks)
         if wanted != self._shown:
             self._shown = wanted

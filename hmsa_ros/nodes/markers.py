@@ -81,40 +81,12 @@ class Block:
 
     @classmethod
     def of(cls, joint: str, actuator: ActuatorParameters) -> 'Block':
-        """
-        Return the block of a joint's parameters.
-
-        Parameters
-        ----------
-        joint : str
-            Name of the joint.
-        actuator : ActuatorParameters
-            In SI units.
-
-        Returns
-        -------
-        Block
-            Its part that can be seen.
-
-        """
+        """Return the block of a joint's parameters."""
         return cls(
             joint, actuator.half_length, actuator.half_thickness, actuator.remanence)
 
     def size(self, stretch: float) -> tuple[float, float, float]:
-        """
-        Return the block's size at a stretch, which leaves its volume as it is.
-
-        Parameters
-        ----------
-        stretch : float
-            Along z, greater than 0.
-
-        Returns
-        -------
-        tuple of float
-            2 l, 2 l and 2 h in m.
-
-        """
+        """Return 2 l, 2 l and 2 h in m at a stretch along z; the volume stays as it is."""
         side = 2.0 * self.half_length / math.sqrt(stretch)
         return side, side, 2.0 * self.half_thickness * stretch
 
@@ -175,15 +147,7 @@ class Scene:
                 f'lifetime is {self.lifetime!r}: expected a finite number of at least 0 s')
 
     def places(self) -> list[tuple[float, float]]:
-        """
-        Return the middles of the blocks.
-
-        Returns
-        -------
-        list of (float, float)
-            x and y in m, before scaling; the middle of all of them is the origin.
-
-        """
+        """Return x and y of the blocks in m before scaling; their middle is the origin."""
         pitch = PITCH * max((block.half_length for block in self.blocks), default=0.0)
         count = len(self.blocks)
         columns, rows = min(count, ROW), -(-count // ROW)
@@ -193,45 +157,14 @@ class Scene:
             for number in range(count)]
 
     def states(self, stamp: int, states: Sequence[State]) -> MarkerArray:
-        """
-        Return the markers of all joints as they are.
-
-        Parameters
-        ----------
-        stamp : int
-            Time of the states in ns.
-        states : sequence of State
-            One a block.
-
-        Returns
-        -------
-        visualization_msgs.msg.MarkerArray
-            For each joint its block, the arrows of magnetisation and field, and its name with
-            the stretch. Without a field its arrow is deleted.
-
-        """
+        """Return for each joint block, arrows and label; an unknown field's arrow is deleted."""
         markers: list[Marker] = []
         for block, place, state in zip(self.blocks, self.places(), states, strict=True):
             markers += self._state(stamp, block, place, state)
         return MarkerArray(markers=markers)
 
     def targets(self, stamp: int, stretches: Sequence[float | None]) -> MarkerArray:
-        """
-        Return the blocks as they are to become, seen through.
-
-        Parameters
-        ----------
-        stamp : int
-            Time in ns.
-        stretches : sequence of float or None
-            One a block; None deletes its marker.
-
-        Returns
-        -------
-        visualization_msgs.msg.MarkerArray
-            One marker a joint.
-
-        """
+        """Return see-through blocks at their targets; None deletes a joint's marker."""
         markers = []
         for block, place, stretch in zip(self.blocks, self.places(), stretches, strict=True):
             if stretch is None:
@@ -242,15 +175,7 @@ class Scene:
         return MarkerArray(markers=markers)
 
     def nothing(self) -> MarkerArray:
-        """
-        Return the message that removes every marker of its topic.
-
-        Returns
-        -------
-        visualization_msgs.msg.MarkerArray
-            One marker that asks for it.
-
-        """
+        """Return the message that removes every marker of its topic."""
         return MarkerArray(markers=[
             Marker(header=Header(frame_id=self.frame), action=Marker.DELETEALL)])
 

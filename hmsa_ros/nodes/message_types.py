@@ -15,17 +15,7 @@ def type_name_of(message_type: type[Any]) -> str:
 
 def interface_class(type_name: str) -> type[Any]:
     """
-    Return the class of a message, service or action type.
-
-    Parameters
-    ----------
-    type_name : str
-        For example ``'std_msgs/msg/Float64'`` or ``'std_srvs/srv/Trigger'``.
-
-    Returns
-    -------
-    type
-        The class.
+    Return the class of a message, service or action type like ``'std_msgs/msg/Float64'``.
 
     Raises
     ------

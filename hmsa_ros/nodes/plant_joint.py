@@ -188,25 +188,7 @@ class PlantJoint:
 
 
 def joint_from(values: Mapping[str, Any]) -> SimulatedJoint:
-    """
-    Return the simulated joint that parameters describe.
-
-    Parameters
-    ----------
-    values : mapping of str to object
-        Those of `OWN`.
-
-    Returns
-    -------
-    SimulatedJoint
-        With the block as it really is: its parameters times the mismatch.
-
-    Raises
-    ------
-    BadInputError
-        If a value is out of range.
-
-    """
+    """Return the joint that the values of `OWN` describe: the block times the mismatch."""
     actuator = actuator_from(values)
     if values['reset_stretch']:
         check_stretch(

@@ -444,20 +444,7 @@ def _nothing_to_play() -> Transport:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """
-    Run the player.
-
-    Parameters
-    ----------
-    args : sequence of str, optional
-        Command-line arguments; default ``sys.argv[1:]``.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    """
+    """Run the player with the command line's arguments; return the exit status."""
     # Reading ahead must not hold up sending for the usual 5 ms.
     sys.setswitchinterval(0.0005)
     return run(Player, args)

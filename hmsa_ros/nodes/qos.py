@@ -21,20 +21,7 @@ MAX_DEPTH = 100_000
 
 
 def stored(profile: QoSProfile) -> Qos:
-    """
-    Return a discovered profile as a bag stores it.
-
-    Parameters
-    ----------
-    profile : rclpy.qos.QoSProfile
-        As `Node.get_publishers_info_by_topic` gives it.
-
-    Returns
-    -------
-    hmsa_ros.bag.qos.Qos
-        The same.
-
-    """
+    """Return a profile of `Node.get_publishers_info_by_topic` as a bag stores it."""
     return Qos(
         profile.history.name.lower(), profile.depth, profile.reliability.name.lower(),
         profile.durability.name.lower(), profile.deadline.nanoseconds,
@@ -44,22 +31,7 @@ def stored(profile: QoSProfile) -> Qos:
 
 
 def subscription(offered: Iterable[Qos], depth: int) -> QoSProfile:
-    """
-    Return the strongest profile that receives from all of some publishers.
-
-    Parameters
-    ----------
-    offered : iterable of Qos
-        What the publishers offer, at least one.
-    depth : int
-        Depth of the queue.
-
-    Returns
-    -------
-    rclpy.qos.QoSProfile
-        Reliable only if all are, transient local only if all are.
-
-    """
+    """Return the strongest profile that receives from all of one or more publishers."""
     profiles = list(offered)
     reliable = all(profile.reliability == 'reliable' for profile in profiles)
     latched = all(profile.durability == 'transient_local' for profile in profiles)

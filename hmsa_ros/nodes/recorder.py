@@ -382,18 +382,5 @@ def _writer(values: Mapping[str, Any], experiment: Mapping[str, str]) -> BagWrit
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """
-    Run the recorder.
-
-    Parameters
-    ----------
-    args : sequence of str, optional
-        Command-line arguments; default ``sys.argv[1:]``.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    """
+    """Run the recorder with the command line's arguments; return the exit status."""
     return run(Recorder, args)

@@ -39,15 +39,7 @@ class RemoteParameters:
         self._done = False
 
     def poll(self, note: Callable[[dict[str, str]], None]) -> None:
-        """
-        Take the next step towards the node's parameters, if it is there.
-
-        Parameters
-        ----------
-        note : callable
-            Takes the parameters as custom data.
-
-        """
+        """Take the next step towards the node's parameters, for ``note`` as custom data."""
         if self._done:
             # Asked again when it comes back, perhaps with other parameters.
             self._done = bool(self._list.service_is_ready())
@@ -74,19 +66,6 @@ class RemoteParameters:
         self._asked = monotonic()
 
     def texts(self, values: Iterable[tuple[str, Any]]) -> dict[str, str]:
-        """
-        Return parameters as custom data.
-
-        Parameters
-        ----------
-        values : iterable of (str, rcl_interfaces.msg.ParameterValue)
-            Names and values.
-
-        Returns
-        -------
-        dict of str to str
-            Keys as `parameter_key` gives them; the value as JSON.
-
-        """
+        """Return parameters as custom data: keys of `parameter_key`, values as JSON."""
         return {parameter_key(self._name, name): json.dumps(
             parameter_value_to_python(value), default=list) for name, value in values}

@@ -30,17 +30,7 @@ _SLICE_SECONDS = 0.1
 
 
 def spin(node: Node, ending: Callable[[], bool]) -> None:
-    """
-    Serve a node's callbacks until told to end or its context is shut down.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Node to serve.
-    ending : callable
-        Whether to end.
-
-    """
+    """Serve a node's callbacks until ``ending`` says so or its context is shut down."""
     executor = EventsExecutor(context=node.context)
     executor.add_node(node)
     never = Future()

@@ -29,20 +29,7 @@ _LONGEST_NAME = 247
 
 
 def is_full_name(name: str) -> bool:
-    """
-    Return whether ROS takes a name from a file for the very same topic.
-
-    Parameters
-    ----------
-    name : str
-        Anything; rclpy would cut a name at a NUL character, and so publish elsewhere.
-
-    Returns
-    -------
-    bool
-        True for a fully qualified name.
-
-    """
+    """Return whether ROS takes a name for the same topic; rclpy would cut one at a NUL byte."""
     return len(name) <= _LONGEST_NAME and _FULL_NAME.fullmatch(name) is not None
 
 
@@ -88,20 +75,7 @@ class Selection:
         _check_expression('record.exclude_regex', self.exclude_regex)
 
     def wants(self, topic: str) -> bool:
-        """
-        Return whether a topic is to be recorded.
-
-        Parameters
-        ----------
-        topic : str
-            Full name.
-
-        Returns
-        -------
-        bool
-            A topic named in ``topics`` is wanted unless it is excluded.
-
-        """
+        """Return whether to record a topic; one in ``topics`` is, unless it is excluded."""
         if _excluded(topic, self.exclude_topics, self.exclude_regex):
             return False
         if topic in self.topics:
@@ -140,20 +114,7 @@ class Filter:
         _check_expression('play.exclude_regex_to_filter', self.exclude_regex)
 
     def passes(self, topic: str) -> bool:
-        """
-        Return whether a topic is to be sent, commands apart.
-
-        Parameters
-        ----------
-        topic : str
-            Full name.
-
-        Returns
-        -------
-        bool
-            Exclusion comes first.
-
-        """
+        """Return whether to send a topic, commands apart; exclusion comes first."""
         if _excluded(topic, self.exclude_topics, self.exclude_regex):
             return False
         if topic in self.topics or topic in self.allow_commands:
@@ -163,24 +124,7 @@ class Filter:
         return not self.topics
 
     def withholds(self, topic: str, resolved: str, type_name: str) -> bool:
-        """
-        Return whether a topic is left out for being a command not asked for by name.
-
-        Parameters
-        ----------
-        topic : str
-            Full name in the bag.
-        resolved : str
-            Full name under which it would be sent.
-        type_name : str
-            Name of its type.
-
-        Returns
-        -------
-        bool
-            A regular expression does not name it.
-
-        """
+        """Return whether a topic, resolved to be sent, is a command not asked for by name."""
         if topic in self.topics or topic in self.allow_commands:
             return False
         return (_last(topic) in COMMAND_TOPICS or _last(resolved) in COMMAND_TOPICS

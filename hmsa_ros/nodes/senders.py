@@ -21,23 +21,7 @@ _NAMED_AT_MOST = 20
 def create_senders(
         node: Node, reader: BagReader, selection: Filter, *, own_clock: bool) -> dict[str, Any]:
     """
-    Create a publisher for each topic that is sent; the log says what is left out and why.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Node that sends.
-    reader : BagReader
-        The bag.
-    selection : Filter
-        Topics that are wanted.
-    own_clock : bool
-        Whether the node publishes ``/clock`` itself.
-
-    Returns
-    -------
-    dict of str to rclpy.publisher.Publisher
-        By the topic in the bag.
+    Return a publisher for each wanted topic of a bag; the log says what is left out and why.
 
     Raises
     ------

@@ -14,22 +14,7 @@ class StepWatch:
         self._offset: int | None = None
 
     def set_back(self, before: int, now: int, after: int) -> int:
-        """
-        Compare a reading with the last one.
-
-        Parameters
-        ----------
-        before, after : int
-            Steady time in ns just before and just after.
-        now : int
-            The reading in ns.
-
-        Returns
-        -------
-        int
-            By how many ns the clock was set back since; 0 if it was not.
-
-        """
+        """Return by how many ns the clock was set back; all in ns, read between the others."""
         if after - before > _STEP_NS:
             # Interrupted between the readings: they do not belong together.
             return 0

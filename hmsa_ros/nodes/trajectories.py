@@ -89,17 +89,7 @@ class _Cursor:
 
 def read_trajectory(data: bytes) -> Trajectory:
     """
-    Return the request that a serialized trajectory_msgs/JointTrajectory makes.
-
-    Parameters
-    ----------
-    data : bytes
-        As it arrives.
-
-    Returns
-    -------
-    Trajectory
-        Its points are read when they are asked for.
+    Return a serialized JointTrajectory as a request, which reads its points when asked for.
 
     Raises
     ------

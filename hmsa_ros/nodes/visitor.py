@@ -51,14 +51,6 @@ def visit(name: str, namespace: str, **options: Any) -> Node:
 
 
 def leave(node: Node) -> None:
-    """
-    Take a node of `visit` off the graph.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Not used any more.
-
-    """
+    """Take a node of `visit` off the graph."""
     node.destroy_node()
     rclpy.try_shutdown(context=node.context)

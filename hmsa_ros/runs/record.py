@@ -152,20 +152,7 @@ class Run:
                 'at least one sample, and increasing times')
 
     def number(self, name: str) -> float:
-        """
-        Return a parameter that is a number.
-
-        Parameters
-        ----------
-        name : str
-            For example ``'planner.slew_limit'``.
-
-        Returns
-        -------
-        float
-            0 if it is unknown, negative, or not finite.
-
-        """
+        """Return a number like ``'planner.slew_limit'``; 0 if unknown, negative or not finite."""
         value = number_of(of_joint(self.parameters, self.joint, name))
         return value if value is not None and 0.0 <= value < math.inf else 0.0
 

@@ -77,15 +77,7 @@ class DemoResult:
         return all(x.reached for x in self.setpoints) and not any(self.exits.values())
 
     def as_json(self) -> dict[str, object]:
-        """
-        Return the result for JSON.
-
-        Returns
-        -------
-        dict
-            With plain types.
-
-        """
+        """Return the result for JSON."""
         return {
             'succeeded': self.succeeded, 'setpoints': [asdict(x) for x in self.setpoints],
             'exits': self.exits, 'bag': str(self.bag), 'picture': str(self.picture)}

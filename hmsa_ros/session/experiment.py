@@ -109,12 +109,7 @@ class Conducted:
 
 def prepare(folder: Path) -> None:
     """
-    Make the output folder.
-
-    Parameters
-    ----------
-    folder : Path
-        May exist, but not hold an earlier run.
+    Make the output folder, or take one that does not hold an earlier run.
 
     Raises
     ------
@@ -381,12 +376,7 @@ class _Watch:
 
     def look(self, end: float) -> None:
         """
-        Make sure that planner and plant are still there, and that time goes on.
-
-        Parameters
-        ----------
-        end : float
-            Time in s at which the sequence is over.
+        Make sure that the nodes are there and time goes on, to the sequence's end in s.
 
         Raises
         ------

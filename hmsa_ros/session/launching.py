@@ -82,19 +82,7 @@ class LaunchFile:
 
     def evaluate(self, given: Mapping[str, str], share: Path) -> Started:
         """
-        Return what is started with some arguments.
-
-        Parameters
-        ----------
-        given : mapping of str to str
-            Values of arguments by name.
-        share : Path
-            The package's installed folder.
-
-        Returns
-        -------
-        Started
-            With all defaults filled in.
+        Return what some arguments start, defaults filled in; ``share`` is the package's.
 
         Raises
         ------
@@ -219,24 +207,7 @@ REPLAY = LaunchFile((
 
 
 def failure(name: str, status: int, ending: bool) -> str:
-    """
-    Return what to say of a process that has ended, empty if nothing went wrong.
-
-    Parameters
-    ----------
-    name : str
-        Of the node.
-    status : int
-        Exit status; negative for the signal that ended it.
-    ending : bool
-        Whether everything is being ended: signals are no failure then.
-
-    Returns
-    -------
-    str
-        One sentence.
-
-    """
+    """Return why an ended process failed, or nothing; signals are none where all is ending."""
     if not status or (ending and status in _SIGNALS):
         return ''
     return (f'the {name} ended with status {status}: expected 0; the reason is in its output '

@@ -91,15 +91,7 @@ class Session:
         self.stop()
 
     def start(self, node: NodeProcess) -> None:
-        """
-        Start a node.
-
-        Parameters
-        ----------
-        node : NodeProcess
-            Its name is not in use yet.
-
-        """
+        """Start a node whose name is not in use yet."""
         with open(self.log(node.name), 'wb') as log:
             # A session of its own: Ctrl-C in the terminal reaches only us, and we end the
             # nodes in order. Should we be killed, the kernel ends them.
@@ -109,20 +101,7 @@ class Session:
                 preexec_fn=_die_with_parent)  # noqa: PLW1509 - only calls the kernel
 
     def log(self, name: str) -> Path:
-        """
-        Return where a node's output goes.
-
-        Parameters
-        ----------
-        name : str
-            Of the node.
-
-        Returns
-        -------
-        Path
-            In the session's folder.
-
-        """
+        """Return the file of a node's output, in the session's folder."""
         return self._folder / f'{name}.log'
 
     def check(self) -> None:
@@ -142,38 +121,12 @@ class Session:
                     f'{self.last_words(name)}')
 
     def last_words(self, name: str) -> str:
-        """
-        Return the last line of a node's log.
-
-        Parameters
-        ----------
-        name : str
-            Of the node.
-
-        Returns
-        -------
-        str
-            With the place of the log.
-
-        """
+        """Return the last line of a node's log with the log's place."""
         lines = self.log(name).read_text(errors='replace').strip().splitlines()
         return f'{lines[-1] if lines else "it printed nothing"} (log: {self.log(name)})'
 
     def stop(self, order: Sequence[str] = ()) -> dict[str, int]:
-        """
-        End all nodes: SIGINT, and SIGKILL for one that does not answer.
-
-        Parameters
-        ----------
-        order : sequence of str
-            Nodes to end first, one after the other; the rest follows.
-
-        Returns
-        -------
-        dict of str to int
-            Exit status by node; negative for the signal that ended it.
-
-        """
+        """End all nodes, those of ``order`` first one by one; return exit status by node."""
         names = [*(x for x in order if x in self._processes),
                  *(x for x in self._processes if x not in order)]
         for name in names:
@@ -196,18 +149,7 @@ def _die_with_parent() -> None:
 
 
 def local_environment() -> dict[str, str]:
-    """
-    Return an environment in which nodes talk to this host only.
-
-    The ROS domain is the caller's where ROS_DOMAIN_ID is set, and otherwise one that other
-    runs on this host are unlikely to use.
-
-    Returns
-    -------
-    dict of str to str
-        A copy of ours with the two variables set.
-
-    """
+    """Return an environment for this host only, with ROS_DOMAIN_ID or a domain of its own."""
     environment = dict(os.environ)
     environment[RANGE] = 'LOCALHOST'
     # Domains above 101 collide with the ephemeral ports of Linux.

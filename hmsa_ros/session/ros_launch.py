@@ -18,20 +18,7 @@ _PATIENCE = {'sigterm_timeout': '30', 'sigkill_timeout': '30'}
 
 
 def description(file: LaunchFile) -> LaunchDescription:
-    """
-    Return the description of a launch file.
-
-    Parameters
-    ----------
-    file : LaunchFile
-        Which.
-
-    Returns
-    -------
-    launch.LaunchDescription
-        Its arguments and processes. A process that fails ends everything with status 1.
-
-    """
+    """Return a launch file's arguments and processes; one that fails ends all with status 1."""
     def start(context: Any) -> list[Any]:
         share = Path(FindPackageShare('hmsa_ros').perform(context))
         return _actions(file.evaluate(context.launch_configurations, share))

@@ -32,20 +32,7 @@ Table = list[tuple[str, ...]]
 
 
 def robustness_table(start: float, target: float) -> Table:
-    """
-    Return the comparison of all shapers for one move, errors up to 10 %.
-
-    Parameters
-    ----------
-    start, target : float
-        Stretches at rest.
-
-    Returns
-    -------
-    list of tuple of str
-        Header and rows.
-
-    """
+    """Return header and rows comparing all shapers for one move at rest, errors up to 10 %."""
     case = Case(start, target, MATERIAL)
     rows: Table = [(
         'shaper', 'arrival', 'nominal', *(f'{name} ±10 %' for name in PARAMETERS),
@@ -62,15 +49,7 @@ def robustness_table(start: float, target: float) -> Table:
 
 
 def single_error_table() -> Table:
-    """
-    Return residuals at single errors of G and zeta.
-
-    Returns
-    -------
-    list of tuple of str
-        Header and rows.
-
-    """
+    """Return header and rows of residuals at single errors of G and zeta."""
     cases = [(name, error) for name in ('G', 'zeta') for error in (-0.1, -0.05, 0.05, 0.1)]
     rows: Table = [('shaper, move', *(f'{name} {100 * x:+g} %' for name, x in cases))]
     for candidate in (Candidate('two_step'), Candidate('robust')):
@@ -86,15 +65,7 @@ def single_error_table() -> Table:
 
 
 def sampled_table() -> Table:
-    """
-    Return residuals on sampled hardware.
-
-    Returns
-    -------
-    list of tuple of str
-        Header and rows.
-
-    """
+    """Return header and rows of residuals on sampled hardware."""
     rows: Table = [('command, move', *(f'T = {x:g} tau_p' for x in PERIODS))]
     for start, target in MOVES:
         found = sampled_study(start, target, MATERIAL, np.array(PERIODS))
@@ -105,20 +76,7 @@ def sampled_table() -> Table:
 
 
 def damped_table(found: DampedStudy) -> Table:
-    """
-    Return times above critical damping.
-
-    Parameters
-    ----------
-    found : DampedStudy
-        At the values of zeta that the table is to show.
-
-    Returns
-    -------
-    list of tuple of str
-        Header and rows.
-
-    """
+    """Return header and rows of times above critical damping, at the study's values of zeta."""
     rows: Table = [('time to', *(f'zeta = {x:g}' for x in found.zetas))]
     rows.append(('plain step: within 1 %', *(f'{x:.2f}' for x in found.step)))
     for (least, most), settled, arrival in zip(
@@ -130,35 +88,14 @@ def damped_table(found: DampedStudy) -> Table:
 
 
 def tables() -> list[Table]:
-    """
-    Return all tables of the documentation.
-
-    Returns
-    -------
-    list of list of tuple of str
-        In their order there.
-
-    """
+    """Return all tables of the documentation in their order there."""
     return [
         *(robustness_table(*move) for move in MOVES), single_error_table(), sampled_table(),
         damped_table(damped_study(1.0, 1.1, np.array(ZETAS)))]
 
 
 def pictures(folder: Path) -> list[Path]:
-    """
-    Draw all pictures of the documentation.
-
-    Parameters
-    ----------
-    folder : Path
-        Where to; it exists.
-
-    Returns
-    -------
-    list of Path
-        What was written.
-
-    """
+    """Draw all pictures of the documentation into a folder; return their paths."""
     case = Case(1.0, 1.4, MATERIAL)
     written = [folder / 'robustness.png', folder / 'sampled.png', folder / 'damped.png']
     draw_robustness(written[0], case, [study(case, x) for x in candidates()])
@@ -169,20 +106,7 @@ def pictures(folder: Path) -> list[Path]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """
-    Draw the pictures and print the tables.
-
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        Arguments without the program's name; default ``sys.argv[1:]``.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    """
+    """Draw the pictures and print the tables; return the exit status."""
     parser = Parser(
         prog='python -m hmsa_ros.studies',
         description='Draw the pictures of docs/studies.md and print its tables.')

@@ -57,24 +57,7 @@ class DampedStudy:
 
 
 def limits_of(target: float, material: NondimensionalParameters, number: int) -> Limits:
-    """
-    Return load limits.
-
-    Parameters
-    ----------
-    target : float
-        Stretch above 1, whose own load is the unit.
-    material : NondimensionalParameters
-        J_lim.
-    number : int
-        Index into `LIMITS`.
-
-    Returns
-    -------
-    Limits
-        As loads.
-
-    """
+    """Return the entry of `LIMITS` as loads, relative to the load of a stretch above 1."""
     holding = float(elastic_force(target, material))
     least, most = LIMITS[number]
     return Limits(least * holding, most * holding)
@@ -84,20 +67,6 @@ def settling_time(
         move: Move, start: float, target: float, material: NondimensionalParameters) -> float:
     """
     Return the time from which the stretch stays within 1 % of the step about the target.
-
-    Parameters
-    ----------
-    move : Move
-        The command.
-    start, target : float
-        Stretches at rest.
-    material : NondimensionalParameters
-        zeta, J_lim and c1, zeta above 0.
-
-    Returns
-    -------
-    float
-        From the start of the move.
 
     Raises
     ------

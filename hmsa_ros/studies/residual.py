@@ -64,20 +64,7 @@ class Errors:
                     f'{"of at least" if least else "above"} -1')
 
     def actual(self, material: NondimensionalParameters) -> NondimensionalParameters:
-        """
-        Return the group of the actuator, in its own units.
-
-        Parameters
-        ----------
-        material : NondimensionalParameters
-            Of the model.
-
-        Returns
-        -------
-        NondimensionalParameters
-            zeta = c/8 sqrt(1/(L^2 H^2 rho G)) falls as G rises.
-
-        """
+        """Return the model's group for the actuator: zeta = c/8 sqrt(1/(L^2 H^2 rho G))."""
         return replace(
             material,
             zeta=material.zeta * (1.0 + self.zeta) / math.sqrt(1.0 + self.shear_modulus),
@@ -159,24 +146,7 @@ def response(
 
 
 def rest(move: Move, material: NondimensionalParameters, errors: Errors) -> float:
-    """
-    Return the stretch at which the last level of a move really holds the actuator.
-
-    Parameters
-    ----------
-    move : Move
-        The command, in the model's units.
-    material : NondimensionalParameters
-        Of the model.
-    errors : Errors
-        Of the model.
-
-    Returns
-    -------
-    float
-        Stretch.
-
-    """
+    """Return the stretch at which the last level of a move really holds the actuator."""
     load = move.levels[-1].load / (1.0 + errors.shear_modulus)
     return float(equilibrium_stretch(load, errors.actual(material)))
 

@@ -61,19 +61,7 @@ class SampledStudy:
 
 def ideal_move(start: float, target: float, material: NondimensionalParameters) -> Move:
     """
-    Return the two-step command for ideal hardware.
-
-    Parameters
-    ----------
-    start, target : float
-        Stretches at rest.
-    material : NondimensionalParameters
-        zeta, J_lim and c1.
-
-    Returns
-    -------
-    Move
-        Two levels.
+    Return the two-step command for ideal hardware between two stretches at rest.
 
     Raises
     ------
@@ -90,67 +78,20 @@ def ideal_move(start: float, target: float, material: NondimensionalParameters) 
 
 
 def switched_at(move: Move, time: float) -> Move:
-    """
-    Return a two-step command with another time of its switch.
-
-    Parameters
-    ----------
-    move : Move
-        Two levels.
-    time : float
-        When the second begins.
-
-    Returns
-    -------
-    Move
-        Over when it switches.
-
-    """
+    """Return a two-step command with another time of its switch, which is its duration."""
     first, last = move.levels
     return Move(move.code, (first, Level(time, last.load)), time)
 
 
 def rounded_move(move: Move, period: float) -> Move:
-    """
-    Return a two-step command with its switch on the nearest point of a grid.
-
-    Parameters
-    ----------
-    move : Move
-        Two levels.
-    period : float
-        Of the grid.
-
-    Returns
-    -------
-    Move
-        The first level holds for at least one period.
-
-    """
+    """Return a two-step command switched on the nearest point of a grid, at least one on."""
     return switched_at(move, max(1, round(move.duration / period)) * period)
 
 
 def solved_move(
         start: float, target: float, material: NondimensionalParameters,
         period: float) -> Move | None:
-    """
-    Return the command solved for on a grid.
-
-    Parameters
-    ----------
-    start, target : float
-        Stretches at rest.
-    material : NondimensionalParameters
-        zeta, J_lim and c1.
-    period : float
-        Of the grid.
-
-    Returns
-    -------
-    Move or None
-        None if there is none.
-
-    """
+    """Return the command solved for on a grid, None if there is none."""
     try:
         return two_step(Request(State(start), target, material, delivery=Delivery(period)))
     except RefusedError:

@@ -38,20 +38,7 @@ _STATUS = np.array([str(CODES[number]) for number in sorted(CODES)])
 
 
 def too_many(points: int) -> BadInputError:
-    """
-    Return the error for a sweep that is too large.
-
-    Parameters
-    ----------
-    points : int
-        Its size.
-
-    Returns
-    -------
-    BadInputError
-        To raise.
-
-    """
+    """Return the error for a sweep of so many points, which is too large."""
     return BadInputError(
         f'the sweep has {points:,} points: expected at most {MOST_POINTS:,}; take fewer, or '
         'split it')
@@ -59,19 +46,7 @@ def too_many(points: int) -> BadInputError:
 
 def parse_grid(text: str, column: str) -> Array:
     """
-    Read the values of one column.
-
-    Parameters
-    ----------
-    text : str
-        Values and grids with commas between them: ``0.2``, ``0:2:1000``, ``log:0.1:100:50``.
-    column : str
-        One of `DEFAULTS`, for the range and the message.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        In the order given.
+    Read a column's values and grids: ``0.2``, ``0:2:1000``, ``log:0.1:100:50``, with commas.
 
     Raises
     ------
@@ -260,20 +235,7 @@ class Sweep:
             raise too_many(self.size)
 
     def blocks(self, rows: int = BLOCK) -> Iterator[Rows]:
-        """
-        Plan the sweep, block by block.
-
-        Parameters
-        ----------
-        rows : int
-            Of a block, at least 1.
-
-        Yields
-        ------
-        Rows
-            In order.
-
-        """
+        """Plan the sweep and yield its rows in order, in blocks of so many."""
         for begin in range(0, self.size, rows):
             places = np.unravel_index(
                 np.arange(begin, min(begin + rows, self.size)), self._shape)
@@ -308,15 +270,7 @@ class CsvWriter:
         self._writer.writerow(COLUMNS)
 
     def write(self, block: Rows) -> None:
-        """
-        Write a block.
-
-        Parameters
-        ----------
-        block : Rows
-            Rows.
-
-        """
+        """Write a block of rows."""
         self._writer.writerows(zip(
             *(x.tolist() for x in block.inputs.values()), block.status.tolist(),
             *(x.tolist() for x in block.results.values()), strict=True))
@@ -357,15 +311,7 @@ class ParquetWriter:
         self._writer.close()
 
     def write(self, block: Rows) -> None:
-        """
-        Write a block.
-
-        Parameters
-        ----------
-        block : Rows
-            Rows.
-
-        """
+        """Write a block of rows."""
         self._writer.write_table(self._arrow.table(
             {**block.inputs, 'status': block.status.tolist(), **block.results},
             schema=self._schema))

@@ -39,22 +39,7 @@ def dots(braille: bool) -> tuple[int, int]:
 
 
 def limits(*values: Array, least: float) -> tuple[float, float]:
-    """
-    Return the range of an axis.
-
-    Parameters
-    ----------
-    *values : ndarray
-        What is to be seen; NaN where there is nothing.
-    least : float
-        Smallest range.
-
-    Returns
-    -------
-    low, high : float
-        With some room around the values.
-
-    """
+    """Return the ends of an axis of a least range, with some room around the values (or NaN)."""
     known = np.concatenate([x[np.isfinite(x)] for x in values])
     if not len(known):
         return 1.0 - 0.5 * least, 1.0 + 0.5 * least

@@ -132,15 +132,7 @@ class Listener:
         return source
 
     def look(self) -> Scene:
-        """
-        Take what has arrived since the last look.
-
-        Returns
-        -------
-        Scene
-            What is seen now.
-
-        """
+        """Return what is seen now, with what has arrived since the last look."""
         now = monotonic()
         if now - self._graph_at >= _GRAPH_SECONDS:
             self._graph_at = now

@@ -35,17 +35,7 @@ class History:
         self._newest = 0
 
     def put(self, before: float, now: float, values: Array) -> None:
-        """
-        Take in samples that arrived between two looks, evenly as far as is known.
-
-        Parameters
-        ----------
-        before, now : float
-            Times of the looks in s.
-        values : ndarray
-            In order.
-
-        """
+        """Take in samples that arrived between two looks (times in s), evenly spread."""
         self._advance(now)
         count = len(self._low)
         times = before + (now - before) * np.arange(1, len(values) + 1) / max(len(values), 1)
@@ -65,22 +55,7 @@ class History:
         self._newest = max(newest, self._newest)
 
     def ranges(self, now: float, columns: int) -> tuple[Array, Array]:
-        """
-        Return the range of values in each column of a chart.
-
-        Parameters
-        ----------
-        now : float
-            Time of the right edge in s.
-        columns : int
-            At least 1.
-
-        Returns
-        -------
-        low, high : ndarray, shape (columns,)
-            Oldest first; NaN where there was no value.
-
-        """
+        """Return least and largest values by column up to ``now`` in s; NaN for none."""
         self._advance(now)
         count = len(self._low)
         order = np.arange(self._newest - count + 1, self._newest + 1) % count

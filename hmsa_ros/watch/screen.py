@@ -64,22 +64,7 @@ class Screen:
         self._unicode = unicode
 
     def lines(self, scene: Scene, width: int, height: int) -> list[Text]:
-        """
-        Return a frame.
-
-        Parameters
-        ----------
-        scene : Scene
-            What to show.
-        width, height : int
-            Size of the terminal in characters.
-
-        Returns
-        -------
-        list of Text
-            At most ``height`` lines of at most ``width``.
-
-        """
+        """Return a frame of at most ``height`` lines of at most ``width`` characters."""
         foot = self._foot(scene, width, height // _SHARE)
         head = [self._head(scene, width)]
         room = height - len(head) - len(foot)
@@ -238,20 +223,7 @@ def _time(stamp: float) -> str:
 
 
 def line(scene: Scene) -> str:
-    """
-    Return a scene as one line of plain text.
-
-    Parameters
-    ----------
-    scene : Scene
-        What to show.
-
-    Returns
-    -------
-    str
-        Without a line end.
-
-    """
+    """Return a scene as one line of plain text, without a line end."""
     parts = [] if math.isnan(scene.stamp) else [_time(scene.stamp)]
     parts += [
         f'{x.name} {number(x.stretch)} (target {number(x.target)}, '
@@ -271,20 +243,7 @@ def line(scene: Scene) -> str:
 
 
 def as_json(scene: Scene) -> Mapping[str, Any]:
-    """
-    Return a scene for JSON.
-
-    Parameters
-    ----------
-    scene : Scene
-        What to show.
-
-    Returns
-    -------
-    dict
-        With None for what is not known.
-
-    """
+    """Return a scene for JSON, None for what is not known."""
     def known(value: float) -> float | None:
         return float(value) if np.isfinite(value) else None
 

@@ -20,48 +20,12 @@ _EI_TOLERANCE = 0.05
 
 
 def zv(request: Request) -> Move:
-    """
-    Two impulses, half a damped period apart.
-
-    Parameters
-    ----------
-    request : Request
-        The move.
-
-    Returns
-    -------
-    Move
-        Two levels.
-
-    Raises
-    ------
-    RefusedError
-        If the target lies outside the stretch limits or needs a load outside the limits.
-
-    """
+    """Two impulses, half a damped period apart."""
     return _shaped(request, (1.0, 1.0))
 
 
 def zvd(request: Request) -> Move:
-    """
-    Three impulses, a ZV shaper convolved with itself.
-
-    Parameters
-    ----------
-    request : Request
-        The move.
-
-    Returns
-    -------
-    Move
-        Three levels.
-
-    Raises
-    ------
-    RefusedError
-        If the target lies outside the stretch limits or needs a load outside the limits.
-
-    """
+    """Three impulses, a ZV shaper convolved with itself."""
     return _shaped(request, (1.0, 2.0, 1.0))
 
 

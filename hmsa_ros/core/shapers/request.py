@@ -63,20 +63,7 @@ class Request:
         return all(self.limits.minimum <= x.load <= self.limits.maximum for x in levels)
 
     def to(self, target: float) -> 'Request':
-        """
-        Return the same request for another target.
-
-        Parameters
-        ----------
-        target : float
-            Stretch.
-
-        Returns
-        -------
-        Request
-            Otherwise unchanged.
-
-        """
+        """Return the same request for another target stretch."""
         return replace(self, target=target)
 
     def holding_load(self) -> float:
@@ -103,38 +90,10 @@ class Request:
         return load
 
     def check(self, levels: Sequence[Level]) -> None:
-        """
-        Refuse levels outside the load limits.
-
-        Parameters
-        ----------
-        levels : sequence of Level
-            To be checked.
-
-        Raises
-        ------
-        RefusedError
-            With `Code.FLUX_LIMIT` and the value that is needed.
-
-        """
+        """Refuse levels outside the load limits with `Code.FLUX_LIMIT` and the value needed."""
         for level in levels:
             self.limits.check(level.load, self.target, self.units)
 
     def plain(self, code: Code, reason: str) -> Move:
-        """
-        Return the plain step in place of the requested command.
-
-        Parameters
-        ----------
-        code : Code
-            Why.
-        reason : str
-            Why, as a sentence.
-
-        Returns
-        -------
-        Move
-            One level, target approached.
-
-        """
+        """Return the plain step instead, which approaches the target, with code and reason why."""
         return Move(code, (Level(0.0, self.holding_load()),), math.inf, reason)

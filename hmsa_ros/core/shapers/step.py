@@ -6,23 +6,5 @@ from hmsa_ros.core.status import Code
 
 
 def step(request: Request) -> Move:
-    """
-    Apply the target's own load at once and let the motion ring down.
-
-    Parameters
-    ----------
-    request : Request
-        The move.
-
-    Returns
-    -------
-    Move
-        One level; the target is only approached.
-
-    Raises
-    ------
-    RefusedError
-        If the target lies outside the stretch limits or needs a load outside the limits.
-
-    """
+    """Apply the target's own load at once and let the motion ring down."""
     return request.plain(Code.STEP, '')
