@@ -146,6 +146,19 @@ def test_errors_of_many_runs_are_as_large_as_the_deviations_say():
     assert np.mean(np.abs(errors) < 1.96) > 0.85
 
 
+@pytest.mark.parametrize(('noise', 'rate'), [(0.0, 1000), (0.0, 200), (1e-6, 1000), (1e-4, 60)])
+def test_search_ends_where_noise_is_near_the_errors_of_the_simulation(noise, rate):
+    times = np.arange(2 * rate) / rate
+    for seed in range(10, 14):
+        start = replace(
+            BLOCK, shear_modulus=(1.0 + 0.02 * (seed - 9)) * BLOCK.shear_modulus,
+            damping_coefficient=1.1 * BLOCK.damping_coefficient)
+        found = identify(
+            recorded(noise=noise, seed=seed, times=times, repeats=1), actuator=start)
+        assert found.verdict == 'identified', found.reason
+        assert max(map(abs, relative(found).values())) < 4.0
+
+
 def test_nine_parameters_are_found_at_once():
     found = identify(recorded(extras=EXTRAS), free=NINE)
     assert found.verdict == 'identified', found.reason

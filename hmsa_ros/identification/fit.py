@@ -24,7 +24,10 @@ _SMALL = 1e-2
 _MAX_DAMPING = 1e10
 # Largest change of a coordinate's logarithm in one step.
 _STRIDE = 0.7
-_LEAST_SCALE = 1e-15
+# Root mean square error of the simulation, which is no smooth function of the parameters.
+_NUMERICAL = 1e-8
+#: No deviation is below this: a few errors of the simulation.
+LEAST_SCALE = 3.0 * _NUMERICAL
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +88,7 @@ def robust_scale(residual: Array) -> float:
     """Return the standard deviation of residuals of which a few may be outliers."""
     size = np.sort(np.abs(residual))
     one, two = size[int(0.6827 * (len(size) - 1))], 0.5 * size[int(0.9545 * (len(size) - 1))]
-    return max(float(one), float(two), _LEAST_SCALE)
+    return max(float(one), float(two), LEAST_SCALE)
 
 
 def weights_of(residual: Array, scale: float, *, convex: bool = False) -> Array:
@@ -190,7 +193,15 @@ class _Search:
         while self._passes < self._most:
             weights = weights_of(residual, scale, convex=self._convex)
             matrix, gradient, size = self._normal(response, residual, weights, shifts, scale)
+            if _at_bottom(matrix, gradient / size, len(residual), scale):
+                if not self._convex:
+                    converged = True
+                    break
+                self._convex = False
+                continue
             before = self._loss(residual, shifts, scale)
+            allowed = before + _SMALL ** 2 + _NUMERICAL * float(
+                np.linalg.norm(weights * residual)) / scale ** 2
             while self._passes < self._most:
                 scaled: Array = np.asarray(np.linalg.solve(
                     matrix + damping * np.eye(len(size)), gradient / size), dtype=np.float64)
@@ -204,7 +215,7 @@ class _Search:
                 if trial is not None:
                     trial_residual = self._recording.stretch - trial.stretch
                     after = self._loss(trial_residual, trial_shifts, scale)
-                    if after <= before + _SMALL ** 2:
+                    if after <= allowed:
                         break
                 damping = max(10.0 * damping, 1e-6)
                 if damping > _MAX_DAMPING:
@@ -213,8 +224,7 @@ class _Search:
                 break
             if trial is None or damping > _MAX_DAMPING:
                 if not self._convex:
-                    return self._fit(
-                        values, response, residual, scale, _at_bottom(scaled, scale))
+                    break
                 self._convex, damping = False, 1e-4
                 continue
             # Switches at the end of their intervals never come to rest: the loss does.
@@ -277,6 +287,7 @@ def _stride(values: Mapping[str, float], free: Sequence[str], step: Array) -> fl
     return share
 
 
-def _at_bottom(scaled: Array, scale: float) -> bool:
-    """Whether what rounding keeps from being gained is small against the deviations."""
-    return float(scaled @ scaled) <= (10.0 * _SMALL * scale) ** 2
+def _at_bottom(matrix: Array, gradient: Array, count: int, scale: float) -> bool:
+    """Whether the next full step is small against the deviations, or within the errors."""
+    step = np.linalg.solve(matrix + 1e-12 * np.eye(len(gradient)), gradient)
+    return float(gradient @ step) <= (_SMALL * scale) ** 2 + count * _NUMERICAL ** 2

@@ -11,7 +11,7 @@ from hmsa_ros.core.model import Array
 from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification import diagnosis
-from hmsa_ros.identification.fit import Fit, fit, loss, robust_scale
+from hmsa_ros.identification.fit import Fit, fit, LEAST_SCALE, loss, robust_scale
 from hmsa_ros.identification.noise import whiteness, widening
 from hmsa_ros.identification.quantities import (
     check_free,
@@ -197,8 +197,8 @@ def _conclude(
     root = np.sqrt(best.weights)
     weighted = root * best.residual
     counted = float(np.sum(best.weights))
-    deviation = math.sqrt(
-        float(weighted @ weighted) / max(counted - len(best.free), 1.0)) or 1e-15
+    deviation = max(math.sqrt(
+        float(weighted @ weighted) / max(counted - len(best.free), 1.0)), LEAST_SCALE)
     found = whiteness(weighted, len(best.free))
     inverse = _inverse(best.information)
     factors = widening(root[:, None] * best.jacobian, weighted, inverse, found)
