@@ -15,26 +15,8 @@ class Contents:
     """
     What a bag being written holds.
 
-    Parameters
-    ----------
-    custom_data : mapping of str to str
-        What the user notes.
-    ros_distro : str
-        Name of the distribution.
-
-    Attributes
-    ----------
-    topics : list of Topic
-        By number.
-    files : list of hmsa_ros.bag.metadata.FileMetadata
-        Those closed.
-    custom_data : dict of str to str
-        Of the bag.
-    dropped : dict of str to int
-        By topic, messages that are not in the bag after all.
-    ended : bool
-        Whether the recording has ended.
-
+    ``topics`` are by number, ``files`` those closed; ``dropped`` counts messages that are not in
+    the bag after all, by topic; ``ended`` says whether the recording has ended.
     """
 
     def __init__(self, custom_data: Mapping[str, str], ros_distro: str) -> None:

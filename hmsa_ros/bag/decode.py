@@ -45,18 +45,7 @@ class TopicInfo:
 
 def make_decoder(info: TopicInfo) -> Callable[[bytes], Any]:
     """
-    Return the decoder of a topic.
-
-    Parameters
-    ----------
-    info : TopicInfo
-        The topic.
-
-    Returns
-    -------
-    callable
-        Takes a payload, returns an object with the message's fields as attributes. It raises
-        `BagError` for a payload that does not fit the type.
+    Return what decodes a topic's payloads; it raises `BagError` where one does not fit.
 
     Raises
     ------

@@ -23,21 +23,7 @@ def parameter_key(node: str, name: str) -> str:
 
 
 def node_parameters(custom_data: Mapping[str, str]) -> dict[str, dict[str, str]]:
-    """
-    Return the parameters of each node.
-
-    Parameters
-    ----------
-    custom_data : mapping of str to str
-        Of a bag.
-
-    Returns
-    -------
-    dict of str to dict of str to str
-        Values as JSON by parameter, by node: its full name, or in a bag of version 0.1 the last
-        part of it.
-
-    """
+    """Return values as JSON by parameter, by node (full name; in bags of version 0.1 its end)."""
     # Every node has this parameter, and no other custom data end with it.
     nodes = {key.partition('.')[0] for key in custom_data if key.endswith('.use_sim_time')}
     result: dict[str, dict[str, str]] = {}

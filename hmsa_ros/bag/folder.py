@@ -10,20 +10,9 @@ from hmsa_ros.errors import BadInputError, BagError
 
 class Folder:
     """
-    A folder with a bag, or one file.
+    A folder with a bag, or one file; ``problems`` gets what cannot be read or does not agree.
 
-    Parameters
-    ----------
-    path : pathlib.Path
-        Folder of a bag, or one ``.mcap`` file.
-    problems : Problems
-        Gets what cannot be read or does not agree.
-
-    Attributes
-    ----------
-    metadata : hmsa_ros.bag.metadata.BagMetadata or None
-        What ``metadata.yaml`` says, once the files have been found.
-
+    ``metadata`` is what ``metadata.yaml`` says, once the files have been found, or None.
     """
 
     def __init__(self, path: Path, problems: Problems) -> None:

@@ -81,24 +81,8 @@ class Framing:
     """
     Writes records to a stream; `OSError` leaves the file as it was before the call.
 
-    Parameters
-    ----------
-    stream : Stream
-        Empty.
-    library : str
-        What the file says of its writer.
-    compression : str
-        ``''``, ``'lz4'`` or ``'zstd'``.
-    crc : bool
-        Whether with checksums.
-
-    Attributes
-    ----------
-    counts : dict of int to int
-        Messages stored, by channel less one.
-    start, end : int
-        Lowest and highest log time stored.
-
+    ``compression`` is ``''``, ``'lz4'`` or ``'zstd'``. ``counts`` has the messages stored by
+    channel less one; ``start`` and ``end`` are the lowest and highest log time stored.
     """
 
     def __init__(self, stream: Stream, library: str, compression: str, *, crc: bool) -> None:

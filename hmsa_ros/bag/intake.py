@@ -35,14 +35,12 @@ class Problems:
 @dataclass(frozen=True)
 class Block:
     """
-    A chunk, or a run of messages outside chunks.
+    A chunk, or a run of messages outside chunks, in the file of a number.
 
     Attributes
     ----------
-    file : int
-        Number of the file.
-    offset, length : int
-        Of the stored bytes.
+    file, offset, length : int
+        Number of the file, and where the stored bytes lie.
     size, crc : int
         Length and CRC-32 of the content; 0 for no CRC.
     compression : str
@@ -112,17 +110,7 @@ class ScannedFile:
 
 
 class Intake:
-    """
-    Takes in what a file holds, within the limits for a bag.
-
-    Parameters
-    ----------
-    max_chunk_size : int
-        Largest content of a chunk, and largest message, in bytes.
-    problems : Problems
-        Gets what cannot be read or does not agree.
-
-    """
+    """Takes in what a file holds, within a limit in bytes for chunks and for messages."""
 
     def __init__(self, max_chunk_size: int, problems: Problems) -> None:
         self._max_chunk_size = max_chunk_size

@@ -26,23 +26,7 @@ class Cursor:
     A place among the messages of a chunk or run, at first in the order stored.
 
     It keeps places, not messages: a chunk of many small messages would take ten times its size.
-
-    Parameters
-    ----------
-    key : tuple of int
-        Where it was written; of equal stamps the smaller comes first.
-    content : bytes
-        Of the chunk.
-    topic_of : callable
-        Returns the topic of a channel, None if its messages are not wanted.
-    start, end : int
-        Only log times of at least ``start`` and less than ``end``.
-
-    Attributes
-    ----------
-    problem : str
-        What is damaged; empty if nothing is.
-
+    Of equal stamps the smaller ``key`` comes first; ``problem`` says what is damaged.
     """
 
     def __init__(

@@ -81,33 +81,10 @@ class Topic:
 
 class OutputFile:
     """
-    One file.
+    One file of a bag; its methods raise `OSError` if the disk does not take what they write.
 
-    Parameters
-    ----------
-    path : pathlib.Path
-        Must not exist.
-    number : int
-        Of the file in its bag.
-    preset : Preset
-        How chunks are stored.
-
-    Attributes
-    ----------
-    counts : dict of int to int
-        Messages stored, by topic.
-    overhead : int
-        Bytes of what is no message: declarations and metadata records.
-    noted : dict of str to str
-        What the metadata records say of the experiment.
-    notes_size : int
-        Length of these records.
-
-    Raises
-    ------
-    OSError
-        Also by the methods, if the disk does not take it.
-
+    ``counts`` has the messages stored by topic, ``overhead`` the bytes of all else, ``noted`` what
+    the metadata records say of the experiment, and ``notes_size`` their length.
     """
 
     def __init__(self, path: Path, number: int, preset: Preset) -> None:

@@ -14,17 +14,7 @@ READ_AHEAD_BYTES = 64 * 2**20
 
 
 class ReadAhead:
-    """
-    Reads messages in a thread.
-
-    Parameters
-    ----------
-    read : callable
-        Returns the messages; gets a function that says whether nobody wants more of them.
-    size : int
-        How many messages to keep ready.
-
-    """
+    """Reads so many messages ahead in a thread; ``read`` learns whether nobody wants more."""
 
     def __init__(
             self, read: Callable[[Callable[[], bool]], Iterator[Message]], size: int) -> None:

@@ -42,7 +42,6 @@ class Status(NamedTuple):
     overflowed: Mapping[str, int]
     dropped: Mapping[str, int]
     queued_bytes: int
-    peak_bytes: int
     behind: float
     crowded: int
 
@@ -72,16 +71,8 @@ class Recording:
     """
     Writes to a bag in a thread of its own.
 
-    Parameters
-    ----------
-    writer : hmsa_ros.bag.writer.BagWriter
-        From now on used by the thread alone.
-    limits : Limits
-        When to flush and to split, and how much to keep.
-    report : callable
-        Called in the thread with a sentence when writing fails or succeeds again; its second
-        argument says whether it is a failure.
-
+    The thread calls ``report`` with a sentence, and whether it is a failure, when writing fails or
+    succeeds again.
     """
 
     def __init__(
@@ -93,7 +84,6 @@ class Recording:
         self._condition = threading.Condition()
         self._items: deque[_Item] = deque()
         self._queued = 0
-        self._peak = 0
         self._topics: list[Topic] = []
         self._overflowed: dict[int, int] = {}
         self._closing = False
@@ -128,7 +118,6 @@ class Recording:
                 self._lose(messages)
                 return
             self._queued += size
-            self._peak = max(self._peak, self._queued)
             wake = not self._items
             self._items.append(_Batch(messages, size, time.monotonic()))
             if wake:
@@ -167,7 +156,7 @@ class Recording:
                 self._writer.file_name, self._error, self._writer.topic_counts(),
                 {self._topics[number].name: count
                  for number, count in self._overflowed.items()},
-                dict(self._writer.dropped), self._queued, self._peak,
+                dict(self._writer.dropped), self._queued,
                 0.0 if batch is None else time.monotonic() - batch.since,
                 self._sink.pace.refused)
 

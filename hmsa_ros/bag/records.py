@@ -60,10 +60,8 @@ class ChunkHead:
 
     Attributes
     ----------
-    start, end : int
-        Lowest and highest log time in it.
-    size, crc : int
-        Length and CRC-32 of the content before compression; a CRC of 0 was not computed.
+    start, end, size, crc : int
+        Log times, length and CRC-32 of the content before compression; 0 for no CRC.
     compression : str
         ``''``, ``'lz4'`` or ``'zstd'``.
     data_offset, data_length : int

@@ -18,19 +18,7 @@ _SHORTEST_ROUND_SECONDS = 0.1
 
 @dataclass(frozen=True)
 class Excerpt:
-    """
-    What of a bag is played.
-
-    Attributes
-    ----------
-    first, start, end : int
-        First time of the bag, and the first and last that are played, in ns.
-    loop : bool
-        Whether to begin again at the end.
-    read_ahead : int
-        Messages read ahead.
-
-    """
+    """What of a bag is played, in ns: its first time, and the first and last that are played."""
 
     first: int
     start: int
@@ -41,19 +29,7 @@ class Excerpt:
 
 @dataclass(frozen=True)
 class ClockOut:
-    """
-    The clock that goes with the messages.
-
-    Attributes
-    ----------
-    send : callable
-        Takes a time of the bag in ns.
-    frequency : float
-        In Hz of real time, 0 for not.
-    on_publish : bool
-        Whether it precedes each message.
-
-    """
+    """The clock sent at so many Hz of real time (0 for not), or before each message."""
 
     send: Callable[[int], None]
     frequency: float = 0.0
@@ -62,28 +38,10 @@ class ClockOut:
 
 class Sender:
     """
-    Sends a bag once, or in a loop.
+    Sends a bag once, or in a loop, by what a transport says is due.
 
-    Parameters
-    ----------
-    reader : BagReader
-        The bag.
-    out : mapping of str to callable
-        Takes the bytes of a message, by topic.
-    latched : mapping of str to int
-        Of the latched topics, how many messages a late subscriber gets.
-    transport : Transport
-        Says what is due when.
-    excerpt : Excerpt
-        What is played.
-    clock : ClockOut, optional
-        Default none.
-
-    Attributes
-    ----------
-    count : int
-        Messages sent so far.
-
+    ``latched`` says how many messages a late subscriber of a topic gets; ``count`` is the number
+    of messages sent so far.
     """
 
     def __init__(

@@ -77,19 +77,7 @@ class _Pace:
 
 
 class Sink:
-    """
-    Writes messages, splits them into files, or keeps them for a snapshot.
-
-    Parameters
-    ----------
-    writer : BagWriter
-        Writes the bag.
-    limits : Limits
-        Of files and memory.
-    release : callable
-        Gives memory back to the queue.
-
-    """
+    """Writes messages, splits them into files, or keeps them for a snapshot."""
 
     def __init__(
             self, writer: BagWriter, limits: Limits, release: Callable[[int], None]) -> None:

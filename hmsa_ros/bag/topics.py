@@ -13,24 +13,7 @@ from hmsa_ros.errors import BagError
 
 
 class Topics:
-    """
-    Gathers topics.
-
-    Parameters
-    ----------
-    described : iterable of TopicMetadata
-        From ``metadata.yaml``.
-    custom_data : mapping of str to str
-        Of the bag.
-    problems : Problems
-        Gets what cannot be read or does not agree.
-
-    Attributes
-    ----------
-    by_name : dict of str to TopicInfo
-        In order of appearance.
-
-    """
+    """Gathers topics: ``by_name``, in order of appearance."""
 
     def __init__(
             self, described: Iterable[TopicMetadata], custom_data: Mapping[str, str],

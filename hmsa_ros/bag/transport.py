@@ -10,28 +10,10 @@ _FINE_SECONDS = 0.01
 
 class Transport:
     """
-    The schedule of one run: which time of the bag is due when.
+    The schedule of one run, paused at first: which time of the bag (ns) is due when.
 
-    Parameters
-    ----------
-    start : int
-        Time of the bag at which to begin, in ns.
-    rate : float
-        Speed as a multiple of the recorded one, above 0.
-
-    Attributes
-    ----------
-    change : threading.Condition
-        Notified of every change.
-    paused, stopped : bool
-        It begins paused.
-    rate : float
-        As above.
-    position : int
-        Time of the bag reached, in ns.
-    late : float
-        Largest delay of a message so far, in s.
-
+    ``rate`` multiplies the recorded speed, ``position`` is the time of the bag reached and
+    ``late`` the largest delay of a message so far in s. Every change notifies ``change``.
     """
 
     def __init__(self, start: int, rate: float) -> None:

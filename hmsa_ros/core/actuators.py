@@ -28,16 +28,7 @@ _LARGEST_LOAD = 1e9
 
 def check_stretch(stretch: float, material: Material, name: str = 'stretch') -> None:
     """
-    Refuse a stretch outside the limits.
-
-    Parameters
-    ----------
-    stretch : float
-        Value to check.
-    material : NondimensionalParameters or float
-        The group, or the chain limit of a Gent block.
-    name : str
-        What the value is, for the message.
+    Refuse a stretch outside the limits of a group or of the chain limit of a Gent block.
 
     Raises
     ------
@@ -110,11 +101,6 @@ class Setup:
         """
         Refuse a level in T that nobody could follow.
 
-        Parameters
-        ----------
-        flux_density : float
-            In T.
-
         Raises
         ------
         BadInputError
@@ -130,11 +116,6 @@ class Setup:
     def check_force(self, force: float) -> None:
         """
         Refuse a disturbing force in N that nobody could follow.
-
-        Parameters
-        ----------
-        force : float
-            In N.
 
         Raises
         ------

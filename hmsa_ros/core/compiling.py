@@ -64,15 +64,7 @@ def compiled(*, inline: bool = False, parallel: bool = False) -> Callable[..., A
 
 @contextlib.contextmanager
 def announced(say: Callable[[str], object]) -> Iterator[None]:
-    """
-    Call a function with a sentence once, before the first kernel is compiled in this block.
-
-    Parameters
-    ----------
-    say : callable
-        For example the method of a logger.
-
-    """
+    """Call a function with a sentence once, before this block compiles its first kernel."""
     _listeners.append(say)
     try:
         yield

@@ -146,22 +146,7 @@ def late(pieces: Sequence[Piece], end: float, field: float, lag: float) -> float
 def ramps(
         levels: Sequence[Level], load: float, end: float,
         slew: float) -> tuple[list[Piece], float]:
-    """
-    Return what `pieces` returns without arrays, for a few of them.
-
-    Parameters
-    ----------
-    levels, load, end, slew : sequence of Level, float, float, float
-        As for `pieces`.
-
-    Returns
-    -------
-    pieces : list of (float, float, float)
-        Switch, load and slope of each.
-    load : float
-        In force at the end.
-
-    """
+    """Return `pieces` without arrays: switch, load and slope of each; and the last load."""
     rows: list[Piece] = []
     for number, level in enumerate(levels):
         until = levels[number + 1].time if number + 1 < len(levels) else end

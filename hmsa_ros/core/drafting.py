@@ -90,17 +90,7 @@ def on_grid(time: int, model: Model) -> int:
 
 def check_points(points: Sequence[tuple[float, int]]) -> Steps[None]:
     """
-    Check the setpoints of a sequence.
-
-    Parameters
-    ----------
-    points : sequence of (float, int)
-        Stretch, and time in ns from the start of the sequence until which it lasts.
-
-    Yields
-    ------
-    None
-        Wherever it may be continued later.
+    Check stretches and ends (ns from the start) of a sequence; yields where it may pause.
 
     Raises
     ------

@@ -50,17 +50,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class Resumption:
-    """
-    How a joint goes on whose plan reality has left.
-
-    Attributes
-    ----------
-    draft : Draft or None
-        To be taken; None if there is nothing left to do.
-    refusal : str
-        Why it comes to rest instead of going on; empty if it goes on.
-
-    """
+    """A draft or None by which a joint goes on after a deviation, or why it comes to rest."""
 
     draft: Draft | None
     refusal: str = ''
@@ -147,22 +137,7 @@ class PlannerGroup:
             self.planners, lambda name: self.planners[name].draft_stop(now)))
 
     def take(self, drafts: Mapping[str, Draft], now: int) -> bool:
-        """
-        Take drafts of the same request.
-
-        Parameters
-        ----------
-        drafts : mapping of str to Draft
-            As worked out, with no other taken since.
-        now : int
-            Current time in ns, as they were made with.
-
-        Returns
-        -------
-        bool
-            Whether anything changes.
-
-        """
+        """Take drafts of one request, made for the same time in ns; return whether any changes."""
         for name, draft in drafts.items():
             self.planners[name].take(draft, now)
             self._attempts[name] = 0
@@ -183,44 +158,13 @@ class PlannerGroup:
         self.planners[name].take(found.draft, now)
 
     def may_resume(self, name: str) -> bool:
-        """
-        Return whether a joint's plan may be made anew.
-
-        Where commands come late for ever, so would those of every new plan: a plan that was
-        made anew several times with no command in time since is left as it is.
-
-        Parameters
-        ----------
-        name : str
-            Of the joint.
-
-        Returns
-        -------
-        bool
-            False where it should stay.
-
-        """
+        """Return whether a joint may replan; not after several plans without a command in time."""
         return self._attempts[name] < _ATTEMPTS
 
     def applied(
             self, name: str, stamp: int, flux_density: float,
             tolerance: int) -> Deviation | None:
-        """
-        Take in a change of level of a joint that has taken effect.
-
-        Parameters
-        ----------
-        name : str
-            Joint.
-        stamp, flux_density, tolerance : int, float, int
-            As for `Planner.applied`.
-
-        Returns
-        -------
-        Deviation or None
-            What calls for a plan to be made anew; None if it is near enough as planned.
-
-        """
+        """Take in a joint's change of level; return what needs a new plan (`Planner.applied`)."""
         found = self.planners[name].applied(stamp, flux_density, tolerance)
         if found is None:
             return None
@@ -266,21 +210,7 @@ class PlannerGroup:
             planner.restart()
 
     def next_event(self, now: int) -> int | None:
-        """
-        Return when there is something to do or to report next.
-
-        Parameters
-        ----------
-        now : int
-            Current time in ns.
-
-        Returns
-        -------
-        int or None
-            Time in ns at which a command is to be handed out, a setpoint takes over or is
-            arrived at; None if nothing of the kind is ahead.
-
-        """
+        """Return when (ns) a command is due or a setpoint begins or is reached next, or None."""
         times = [
             planner.next_stamp - planner.options.lead_time
             for planner in self.planners.values() if planner.next_stamp is not None]
@@ -289,22 +219,7 @@ class PlannerGroup:
         return min(times, default=None)
 
     def progress(self, now: int) -> tuple[Progress, dict[str, Progress]]:
-        """
-        Return how far all joints have come, and each.
-
-        Parameters
-        ----------
-        now : int
-            Current time in ns.
-
-        Returns
-        -------
-        progress : Progress
-            Of all: the state of the one that has most before it.
-        each : dict of str to Progress
-            By joint.
-
-        """
+        """Return how far all joints have come (as the one with most to do), and each by name."""
         each = {name: _progress(x.plan, now) for name, x in self.planners.items()}
         if len(each) == 1:
             return next(iter(each.values())), each

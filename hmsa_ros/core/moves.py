@@ -109,16 +109,7 @@ class Limits:
 
     def check(self, load: float, target: float, units: Units) -> None:
         """
-        Refuse a load outside the limits.
-
-        Parameters
-        ----------
-        load : float
-            Load that is needed.
-        target : float
-            For which stretch, for the message.
-        units : Units
-            For the message.
+        Refuse a load outside the limits; the message names the target in the units.
 
         Raises
         ------

@@ -36,20 +36,7 @@ class Pacer:
         return self.factor == 0.0
 
     def target(self, steady: int) -> int:
-        """
-        Return the simulated time that is due.
-
-        Parameters
-        ----------
-        steady : int
-            Steady time in ns, not decreasing.
-
-        Returns
-        -------
-        int
-            In ns; the place of the last pause while paused. Without meaning if `unlimited`.
-
-        """
+        """Return the simulated time in ns due at a steady time; no meaning if `unlimited`."""
         if self.paused or self._steady is None:
             self._steady = steady
             return self._anchor

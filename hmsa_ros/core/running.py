@@ -110,22 +110,7 @@ class RunningPlan:
         self._begin_with(begin)
 
     def take(self, draft: Draft | None, now: int) -> Plan:
-        """
-        Replace everything from the begin of a draft on.
-
-        Parameters
-        ----------
-        draft : Draft or None
-            Made by this planner in its present revision; None changes nothing.
-        now : int
-            Current time in ns, as the draft was made with.
-
-        Returns
-        -------
-        Plan
-            The one in force now.
-
-        """
+        """Replace everything from a draft of the present revision on; return the plan in force."""
         if draft is None:
             return self.plan
         old, history, begin = self.plan, self._history, draft.begin
@@ -182,22 +167,7 @@ class RunningPlan:
             max(now + self.model.options.lead_time, self.last_sent.stamp), self.model)
 
     def drop_missed(self, now: int, tolerance: int) -> int:
-        """
-        Take out of the plan what should have been in force already and was never handed out.
-
-        Parameters
-        ----------
-        now : int
-            Current time in ns.
-        tolerance : int
-            In ns: what is late by less may still be handed out.
-
-        Returns
-        -------
-        int
-            How many levels; the level before them is taken to stay in force.
-
-        """
+        """Take out levels never handed out and late by more than a tolerance (ns); count them."""
         history = self._history
         end = bisect_left(
             history.levels, now - tolerance, history.sent, key=lambda x: x.stamp)

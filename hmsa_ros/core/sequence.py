@@ -134,33 +134,7 @@ def segments(
         delivery: Delivery = IDEAL, order: int = 2, units: Units | None = None,
         short_spell: str = 'refuse') -> Generator[Segment, None, None]:
     """
-    Plan a sequence setpoint by setpoint, each when it is requested.
-
-    Parameters
-    ----------
-    setpoints : iterable of Setpoint
-        In their order.
-    material : NondimensionalParameters
-        Of the model.
-    start : State, optional
-        Default at rest at stretch 1.
-    shaper : str
-        Name of a shaper.
-    limits : Limits, optional
-        Admissible loads.
-    delivery : Delivery
-        How commands reach the actuator.
-    order : int
-        Of the shaper robust.
-    units : Units, optional
-        For messages.
-    short_spell : {'refuse', 'continue'}
-        For a span that ends before its move.
-
-    Yields
-    ------
-    Segment
-        Of each setpoint.
+    Plan as `plan_sequence` does, but setpoint by setpoint, each when it is requested.
 
     Raises
     ------

@@ -48,22 +48,7 @@ class Template:
 
     @classmethod
     def of(cls, levels: Sequence[Level], unknowns: Sequence[tuple[str, int]]) -> 'Template':
-        """
-        Make a template of levels.
-
-        Parameters
-        ----------
-        levels : sequence of Level
-            First guess.
-        unknowns : sequence of (str, int)
-            Some of ``('load', i)`` and ``('time', i)``. A time moves all later levels with it.
-
-        Returns
-        -------
-        Template
-            At the first guess.
-
-        """
+        """Return the template of a guess, with unknowns ``('load', i)`` and ``('time', i)``."""
         d_times = np.zeros((len(levels), len(unknowns)))
         d_loads = np.zeros((len(levels), len(unknowns)))
         for column, (kind, index) in enumerate(unknowns):

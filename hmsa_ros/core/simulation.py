@@ -168,22 +168,7 @@ def _vector(values: ArrayLike) -> Array:
 
 
 def longest_motion(load: float, material: NondimensionalParameters) -> float:
-    """
-    Return for how long motion under a constant load is worth following.
-
-    Parameters
-    ----------
-    load : float
-        Load beta.
-    material : NondimensionalParameters
-        zeta, J_lim and c1.
-
-    Returns
-    -------
-    float
-        Time after which it has settled, or, with next to no damping, some thousand periods.
-
-    """
+    """Return the time after which motion under a load beta has settled, or a bound for it."""
     # Scalars by the kernels: each prediction asks for this.
     stretch = law.equilibrium_stretch(float(load), material.packed)
     frequency = float(law.natural_frequency(stretch, material.packed))
@@ -198,19 +183,7 @@ def longest_motion(load: float, material: NondimensionalParameters) -> float:
 
 
 class ActuatorSimulation:
-    """
-    `Actuators` with one actuator, seen as numbers; the parameters are those of `Setup`.
-
-    Parameters
-    ----------
-    actuator : ActuatorParameters
-        The block.
-    time : int
-        Time at the start in ns.
-    stretch, slew_limit, coil_time_constant : float
-        Stretch at the start; of the amplifier in T/s; of the coil in s.
-
-    """
+    """`Actuators` with one actuator, seen as numbers; the parameters are those of `Setup`."""
 
     def __init__(
             self, actuator: ActuatorParameters, *, time: int = 0, stretch: float = 1.0,
@@ -273,12 +246,7 @@ class ActuatorSimulation:
 
     def advance(self, time: int) -> None:
         """
-        Integrate to a time, as `Actuators.advance`.
-
-        Parameters
-        ----------
-        time : int
-            In ns.
+        Integrate to a time in ns, as `Actuators.advance`.
 
         Raises
         ------

@@ -106,27 +106,9 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
 
 
 class RefusedError(BadInputError):
-    """
-    A request that cannot be carried out; whatever ran before runs on.
-
-    Attributes
-    ----------
-    code : Code
-        Why.
-
-    """
+    """A request that cannot be carried out; whatever ran before runs on. `code` says why."""
 
     def __init__(self, code: Code, reason: str) -> None:
-        """
-        Keep the code beside the sentence.
-
-        Parameters
-        ----------
-        code : Code
-            Why.
-        reason : str
-            One sentence: what, got, expected.
-
-        """
+        """Keep the code beside the sentence, which says what, got and expected."""
         super().__init__(reason)
         self.code = code

@@ -98,22 +98,7 @@ def brake(model: Model, work: Array, state: State, share: float = 1.0) -> Brake:
 
 
 def holdable(model: Model, stretch: float) -> float:
-    """
-    Return the nearest stretch that a flux density inside the limits holds.
-
-    Parameters
-    ----------
-    model : Model
-        Of the block and its limits.
-    stretch : float
-        Wanted.
-
-    Returns
-    -------
-    float
-        The same where it can be held.
-
-    """
+    """Return the nearest stretch that a flux density inside the limits holds."""
     load = model.holding(stretch)
     least, most = model.limits.minimum, model.limits.maximum
     if least <= load <= most:

@@ -188,20 +188,7 @@ class PlannedLevel:
     amplifier: float | None = None
 
     def at(self, time: int) -> State:
-        """
-        Predict the state while the level is in force.
-
-        Parameters
-        ----------
-        time : int
-            In ns; before the stamp, the state at the stamp is returned.
-
-        Returns
-        -------
-        State
-            Nondimensional, in the units of the model.
-
-        """
+        """Predict the nondimensional state at a time in ns, not before that at the stamp."""
         model = self.model
         if self.stamp == ALWAYS:
             return State(self.stretch, 0.0, self.in_force / model.units.load)
@@ -224,20 +211,7 @@ class PlannedLevel:
             + longest_motion(end, model.material)
 
     def sample(self, times: Sequence[int]) -> list[tuple[float, float]]:
-        """
-        Predict stretch and rate at several times while the level is in force.
-
-        Parameters
-        ----------
-        times : sequence of int
-            In ns, not decreasing, none before the stamp.
-
-        Returns
-        -------
-        list of (float, float)
-            The rate in 1/s.
-
-        """
+        """Predict stretch and rate (1/s) at times in ns, not decreasing, from the stamp on."""
         if self.stamp == ALWAYS or all(x == self.stamp for x in times):
             return [(self.stretch, self.rate)] * len(times)
         model = self.model

@@ -99,16 +99,7 @@ class HardwareDevice(Outbox):
 
     def receive(self, joint: int, stamp: int, level: float) -> None:
         """
-        Take a level that applies from a stamp on.
-
-        Parameters
-        ----------
-        joint : int
-            Its place.
-        stamp : int
-            Time in ns; a past one, or 0, for at once.
-        level : float
-            In T.
+        Take a level in T that applies from a stamp in ns on; a past one, or 0, at once.
 
         Raises
         ------

@@ -14,18 +14,7 @@ _SAMPLES_A_PERIOD = 10.0
 
 @dataclass(frozen=True)
 class CommandHealth:
-    """
-    The fate of the commands of all joints: late, refused, silent.
-
-    Attributes
-    ----------
-    late, refused, refused_source, failed : int
-        Commands that came late, could not be obeyed, or came from a publisher that is not
-        obeyed; and how often a simulation started again.
-    silent, crowded : sequence of str
-        Joints that nobody, or more than one publisher, commands.
-
-    """
+    """Counts of late, refused and failed commands, and joints nobody or several command."""
 
     late: int
     refused: int

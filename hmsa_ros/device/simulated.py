@@ -107,16 +107,7 @@ class SimulatedDevice(Outbox):
 
     def receive(self, joint: int, stamp: int, level: float) -> None:
         """
-        Have a command take effect once it has passed the transport delay.
-
-        Parameters
-        ----------
-        joint : int
-            Its place.
-        stamp : int
-            Time in ns from which it applies, 0 for at once.
-        level : float
-            In T.
+        Have a command in T take effect from a stamp in ns (0: now) and the transport delay on.
 
         Raises
         ------

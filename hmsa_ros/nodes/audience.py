@@ -17,25 +17,10 @@ _PATIENCE_SECONDS = 1.0
 
 class Audience:
     """
-    Subscribers of what a node sends.
+    Subscribers of what a node sends; the node must be served while ``missing`` is asked.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Node that sends; it must be served while `missing` is asked.
-    senders : mapping of str to rclpy.publisher.Publisher
-        By topic.
-    topics : sequence of str
-        Those that need a subscriber.
-    nodes : sequence of str
-        Full names of managed nodes that must be active; if there are any, one of them must be
-        the subscriber.
-
-    Raises
-    ------
-    BadInputError
-        If one of the topics is not sent.
-
+    Each of ``topics`` needs a subscriber. If ``nodes`` (full names) are given, it must be one of
+    these managed nodes, and active. A topic that is not sent raises `BadInputError`.
     """
 
     def __init__(

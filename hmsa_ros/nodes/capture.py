@@ -122,21 +122,7 @@ class _Taker:
 
 
 class RawSubscription:
-    """
-    A subscription that belongs to no executor and is read by `take`.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Node that subscribes.
-    message_type : type
-        Message class.
-    topic : str
-        Topic name.
-    qos : rclpy.qos.QoSProfile
-        Quality of service.
-
-    """
+    """A subscription that belongs to no executor and is read by ``take``."""
 
     _taker: _Taker | None = None
     _taker_tried = False
@@ -192,14 +178,7 @@ class Capture:
     """
     A thread that takes messages off subscriptions and passes them on in batches.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Node the subscriptions belong to.
-    deliver : callable
-        Called in the thread with a list of (key, messages) of one round, in the order in which
-        the subscriptions were added.
-
+    ``deliver`` gets a list of (key, messages) a round, in the order of the subscriptions.
     """
 
     def __init__(

@@ -14,23 +14,7 @@ from hmsa_ros.runtime.records import Send, Target
 
 
 class JointChannel:
-    """
-    What belongs to one joint on the wire.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        The planner.
-    joint : str
-        Its name.
-    joints : sequence of str
-        All joints of the planner.
-    runtime : PlannerRuntime
-        Takes setpoints and news.
-    serve : callable
-        Called after each.
-
-    """
+    """What belongs to one joint of a planner on the wire; ``serve`` follows each message."""
 
     def __init__(
             self, node: Node, joint: str, joints: Sequence[str], runtime: PlannerRuntime,

@@ -22,13 +22,8 @@ class Allegiance:
     """
     Decides by identifiers which publisher is obeyed.
 
-    Attributes
-    ----------
-    source : bytes or None
-        Whom it obeys; None before the first command.
-    refused : int
-        Commands of others.
-
+    ``source`` is whom it obeys, None before the first command; ``refused`` counts others'
+    commands.
     """
 
     def __init__(self) -> None:
@@ -69,24 +64,9 @@ class Allegiance:
 
 class CommandInput:
     """
-    Commands for one actuator.
+    Commands for one actuator from ``'any'`` or only the ``'first'`` publisher.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Node that receives.
-    topic : Topic
-        Where they come from.
-    take : callable
-        Called with each message that is obeyed.
-    source : {'any', 'first'}
-        Whom to obey.
-
-    Attributes
-    ----------
-    unreadable : int
-        Messages that could not be decoded.
-
+    ``take`` gets each message that is obeyed; ``unreadable`` counts those that cannot be decoded.
     """
 
     def __init__(

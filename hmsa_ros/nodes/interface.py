@@ -21,23 +21,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Topic:
-    """
-    A topic as in `hmsa_ros.contract.topics.Topic`, with rclpy's types.
-
-    Attributes
-    ----------
-    name : str
-        Relative or private.
-    type : type
-        Message class.
-    qos : rclpy.qos.QoSProfile
-        Of publishers and subscribers alike.
-    meaning : str
-        What a message says.
-    publishers, subscribers : tuple of str
-        Nodes of this package that send and take it.
-
-    """
+    """A topic as in `hmsa_ros.contract.topics.Topic`, with rclpy's class and profile."""
 
     name: str
     type: type[Any]
@@ -49,19 +33,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class Service:
-    """
-    A service as in `hmsa_ros.contract.topics.Service`, with its class.
-
-    Attributes
-    ----------
-    name : str
-        Private to the node that serves it.
-    type : type
-        Service class.
-    meaning : mapping of str to str
-        What a call does, by the node that serves it.
-
-    """
+    """A service as in `hmsa_ros.contract.topics.Service`, with rclpy's class."""
 
     name: str
     type: type[Any]

@@ -27,20 +27,8 @@ class ManagedNode(LifecycleNode):
 
     A subclass declares its parameters in ``__init__``, has `configure`, `activate`,
     `deactivate` and `cleanup` do the work, and calls `autostart` last. Each of the four may
-    raise `HmsaError`: the transition is refused and can be tried again.
-
-    Parameters
-    ----------
-    name : str
-        Name of the node.
-
-    Attributes
-    ----------
-    active : bool
-        Whether the node acts.
-    finished : bool
-        Whether it was shut down from outside and the process is to end.
-
+    raise `HmsaError`: the transition is refused and can be tried again. While ``active`` the node
+    acts; with ``finished`` it was shut down from outside and the process is to end.
     """
 
     def __init__(self, name: str) -> None:

@@ -34,20 +34,10 @@ def scene_from(values: JointParameters, lifetime: float = 0.0) -> Scene:
 
 class StateMarkers:
     """
-    Publishes the joints as they are, at a rate, while somebody looks.
+    Publishes the joints as they are, at ``marker_rate``, while somebody looks.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Node to publish from.
-    values : JointParameters
-        Of the node, with ``marker_rate`` and what `scene_from` needs.
-    pace : float
-        Seconds of the node's time in a second, 0 if it has no bound: lifetimes are counted in
-        the node's time.
-    states : callable
-        Returns the time in ns and a `State` a joint.
-
+    ``pace`` is how many seconds of the node's time, in which lifetimes are counted, pass in a
+    second; 0 if it has no bound.
     """
 
     def __init__(
@@ -73,17 +63,7 @@ class StateMarkers:
 
 
 class TargetMarkers:
-    """
-    Publishes where the joints are to go, whenever that changes.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Node to publish from.
-    values : JointParameters
-        Of the node, with what `scene_from` needs.
-
-    """
+    """Publishes where the joints are to go, whenever that changes."""
 
     def __init__(self, node: Node, values: JointParameters) -> None:
         """Create the publisher."""

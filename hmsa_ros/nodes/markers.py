@@ -93,17 +93,7 @@ class Block:
 
 @dataclass(frozen=True)
 class State:
-    """
-    What a joint does at a moment.
-
-    Attributes
-    ----------
-    stretch : float
-        Greater than 0.
-    flux_density : float
-        Applied along z, in T.
-
-    """
+    """Stretch (greater than 0) and flux density along z in T of a joint at a moment."""
 
     stretch: float
     flux_density: float

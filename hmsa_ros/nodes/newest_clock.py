@@ -10,16 +10,10 @@ from hmsa_ros.nodes.capture import decode, RawSubscription
 
 class NewestClock:
     """
-    Sets a node's clock from /clock when it is read.
+    Sets a node's clock from /clock when it is read, instead of its own subscription.
 
     The executor would keep an event for each message, without limit where the node cannot keep
     up with them. A subscription that is read here keeps the newest message alone.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Whose clock it is; its own subscription of /clock is replaced.
-
     """
 
     def __init__(self, node: Node) -> None:

@@ -12,12 +12,6 @@ class CarefulParameterService(ParameterService):
     Those of rclpy raise an error on a value whose type does not exist, and with it end the
     node: anybody in the domain could end it with one message. Make the node with
     ``start_parameter_services=False`` and one of these after that.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Whose parameters they serve.
-
     """
 
     def _set_parameters_callback(

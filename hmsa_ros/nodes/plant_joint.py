@@ -71,33 +71,11 @@ OWN = (
 
 class PlantJoint:
     """
-    A simulated actuator on the wire.
+    A simulated actuator on the wire; it obeys ``commands`` while its node is active.
 
-    Parameters
-    ----------
-    node : ManagedNode
-        Node that it belongs to; commands are obeyed while it is active.
-    device : SimulatedDevice
-        Where its actuator is.
-    number : int
-        Its place among the joints.
-    names : sequence of str
-        Names of all joints of the node.
-    values : mapping of str to object
-        Parameters that hold for this joint.
-    scalars : bool
-        Whether to publish stretch and rate by themselves.
-
-    Attributes
-    ----------
-    name : str
-        Of the joint.
-    commands : CommandInput
-        Where its commands come in.
-    received, refused, late, latest, failed : int
-        Commands that came, were refused or late, the largest lateness in ns; and how often the
-        simulation had to start again.
-
+    ``received``, ``refused``, ``late`` and ``failed`` count commands that came, were refused or
+    late, and how often the simulation had to start again; ``latest`` is the largest lateness in
+    ns.
     """
 
     def __init__(

@@ -16,17 +16,7 @@ _PATIENCE_SECONDS = 2.0
 
 
 class RemoteParameters:
-    """
-    The parameters of a node, requested once it is there and again when it comes back.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Node that asks.
-    name : str
-        Full name of the node that is asked.
-
-    """
+    """The parameters of a node, requested once it is there and again when it comes back."""
 
     def __init__(self, node: Node, name: str) -> None:
         """Create clients; nothing is asked yet."""

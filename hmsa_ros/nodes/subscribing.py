@@ -22,26 +22,9 @@ _FULL_LOOK = 10
 
 class Subscriptions:
     """
-    Subscribes to the topics that are wanted.
+    Subscribes to the topics that are wanted, and keeps them in ``topics``.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Which subscribes.
-    selection : Selection
-        What is wanted.
-    recording : Recording
-        Learns of the topics.
-    capture : Capture
-        Takes the messages.
-    depth : int
-        Messages of a topic that the middleware keeps.
-
-    Attributes
-    ----------
-    topics : dict of str to RecordedTopic
-        Those subscribed to.
-
+    ``depth`` is how many messages of a topic the middleware keeps.
     """
 
     def __init__(

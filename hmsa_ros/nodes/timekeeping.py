@@ -27,17 +27,11 @@ class StepWatch:
 
 class Seldom:
     """
-    Says once in a while that it is time to report something again.
+    Says at most once in so many seconds that it is time to report something again.
 
     A logger's own throttle looks for the place in the code that it is called from before it
     decides, which takes up to a millisecond: too long for what may come a thousand times a
     second.
-
-    Parameters
-    ----------
-    seconds : float
-        Between two times at least, in s.
-
     """
 
     def __init__(self, seconds: float = 1.0) -> None:

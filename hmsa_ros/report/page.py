@@ -40,17 +40,7 @@ _A_DATE = 1e8
 
 @dataclass(frozen=True)
 class Cell:
-    """
-    A cell of a table.
-
-    Attributes
-    ----------
-    shown : str
-        What is read.
-    value : float or None
-        What is copied, in full precision; None for what is shown.
-
-    """
+    """A cell of a table: the text, and the value that is copied in full precision instead."""
 
     shown: str
     value: float | None = None

@@ -40,20 +40,7 @@ class Level:
 
 
 def in_force(messages: Iterable[Sequence[Level]]) -> tuple[Level, ...]:
-    """
-    Return the changes of level that were left when each message had replaced what it replaces.
-
-    Parameters
-    ----------
-    messages : iterable of sequence of Level
-        In the order received; each supersedes all levels stamped at or after its first.
-
-    Returns
-    -------
-    tuple of Level
-        By stamp.
-
-    """
+    """Return the levels left when each message has superseded all at or after its first stamp."""
     levels: Superseding[Level] = Superseding()
     for message in messages:
         for level in sorted(message, key=lambda x: x.stamp):

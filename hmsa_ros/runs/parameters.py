@@ -37,22 +37,7 @@ def of_joint(parameters: Mapping[str, object], joint: str, name: str) -> object:
 
 
 def recorded(custom_data: Mapping[str, str], space: str) -> dict[str, object]:
-    """
-    Return the parameters of planner and plant in a namespace that a recorder stored.
-
-    Parameters
-    ----------
-    custom_data : mapping of str to str
-        Of a bag.
-    space : str
-        Namespace.
-
-    Returns
-    -------
-    dict of str to object
-        By ``'node.name'``; what is no JSON stays a text.
-
-    """
+    """Return the parameters of planner and plant in a namespace by ``'node.name'``."""
     parameters: dict[str, object] = {}
     for node in (PLANNER, PLANT):
         for name, text in parameters_of(custom_data, node, space).items():

@@ -25,17 +25,7 @@ _OF_A_JOINT = (COMMAND, APPLIED, FORCE, SETPOINT)
 
 def topics_by_joint(reader: BagReader) -> dict[str, dict[str, dict[str, str]]]:
     """
-    Return the topics of each actuator.
-
-    Parameters
-    ----------
-    reader : BagReader
-        The bag.
-
-    Returns
-    -------
-    dict of str to dict of str to dict of str to str
-        By namespace, joint (empty for the only one) and role.
+    Return topics by namespace, joint (empty for the only one) and role.
 
     Raises
     ------

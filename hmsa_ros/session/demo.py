@@ -37,34 +37,14 @@ _NODES = (
 
 @dataclass(frozen=True)
 class SetpointResult(MoveResult):
-    """
-    The result of one setpoint, from the bag.
-
-    Attributes
-    ----------
-    reached : bool
-        Whether error and residual are within `LARGEST_RESIDUAL`.
-
-    """
+    """The result of one setpoint from the bag; ``reached`` if within `LARGEST_RESIDUAL`."""
 
     reached: bool
 
 
 @dataclass(frozen=True)
 class DemoResult:
-    """
-    What the demo found.
-
-    Attributes
-    ----------
-    setpoints : tuple of SetpointResult
-        In order.
-    exits : dict of str to int
-        Exit status of each process.
-    bag, picture : Path
-        What was written.
-
-    """
+    """What the demo found: setpoints, exit statuses by process, and the files written."""
 
     setpoints: tuple[SetpointResult, ...]
     exits: dict[str, int]

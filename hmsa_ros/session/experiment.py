@@ -88,19 +88,7 @@ class Experiment:
 
 @dataclass(frozen=True)
 class Conducted:
-    """
-    How an experiment went.
-
-    Attributes
-    ----------
-    exits : dict of str to int
-        Exit status of each process that was started.
-    measured : bool
-        Whether somebody published samples.
-    notes : tuple of str
-        What a reader should know, one sentence each.
-
-    """
+    """Exit statuses by process, whether samples came, and notes for a reader."""
 
     exits: dict[str, int]
     measured: bool

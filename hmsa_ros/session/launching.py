@@ -22,19 +22,7 @@ _RECORDER_NANOSECONDS = 500_000_000
 
 @dataclass(frozen=True)
 class Argument:
-    """
-    An argument of a launch file.
-
-    Attributes
-    ----------
-    name, description : str
-        As ``ros2 launch --show-args`` shows them.
-    default : str or None
-        None if it must be given.
-    choices : tuple of str
-        Empty for anything.
-
-    """
+    """An argument as ``ros2 launch`` shows it; default None if required, no choices for any."""
 
     name: str
     description: str
@@ -44,19 +32,7 @@ class Argument:
 
 @dataclass(frozen=True)
 class Started:
-    """
-    What one launch starts.
-
-    Attributes
-    ----------
-    nodes : tuple of NodeProcess
-        Nodes of this package; one that fails ends everything.
-    rviz : NodeProcess or None
-        RViz, if it is wanted.
-    last : str
-        Node whose clean end ends everything, empty for none.
-
-    """
+    """What a launch starts; a failing node, or the clean end of ``last`` (if any), ends all."""
 
     nodes: tuple[NodeProcess, ...]
     rviz: NodeProcess | None
@@ -65,17 +41,7 @@ class Started:
 
 @dataclass(frozen=True)
 class LaunchFile:
-    """
-    Arguments of a launch file, and what it makes of them.
-
-    Attributes
-    ----------
-    arguments : tuple of Argument
-        All of them.
-    start : callable
-        Takes their values, and the folder with ``config``; returns `Started`.
-
-    """
+    """Arguments of a launch file; ``start`` gets their values and the folder of ``config``."""
 
     arguments: tuple[Argument, ...]
     start: Callable[[Mapping[str, str], Path], Started]

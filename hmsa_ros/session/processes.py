@@ -64,17 +64,7 @@ class NodeProcess:
 
 
 class Session:
-    """
-    Node processes with their logs; a context manager that ends them.
-
-    Parameters
-    ----------
-    folder : Path
-        Existing folder for one ``NAME.log`` a process.
-    environment : mapping of str to str
-        Environment of the processes.
-
-    """
+    """Node processes, each with its log in a folder; a context manager that ends them."""
 
     def __init__(self, folder: Path, environment: Mapping[str, str]) -> None:
         """Start nothing yet."""

@@ -254,15 +254,7 @@ class Sweep:
 
 
 class CsvWriter:
-    """
-    Writes blocks as CSV, numbers in full double precision.
-
-    Parameters
-    ----------
-    file : text file
-        To write to.
-
-    """
+    """Writes blocks as CSV, numbers in full double precision."""
 
     def __init__(self, file: TextIO) -> None:
         """Write the header."""
@@ -277,20 +269,7 @@ class CsvWriter:
 
 
 class ParquetWriter:
-    """
-    Writes blocks as Parquet, a row group each, through pyarrow.
-
-    Parameters
-    ----------
-    path : Path
-        File to write.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written.
-
-    """
+    """Writes blocks as Parquet, a row group each, through pyarrow."""
 
     def __init__(self, path: Path) -> None:
         """Open the file."""

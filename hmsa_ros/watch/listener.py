@@ -71,17 +71,9 @@ class _Source:
 
 class Listener:
     """
-    Looks at planner, plant and the rest of one namespace; a context manager.
+    Looks at the nodes of one namespace; a context manager.
 
-    Parameters
-    ----------
-    namespace : str
-        Where to look.
-    joints : sequence of str
-        Joints to show; empty for all.
-    span : float
-        How far back the charts reach, in s.
-
+    Without ``joints`` it shows all; the charts reach ``span`` seconds back.
     """
 
     def __init__(

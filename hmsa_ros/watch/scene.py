@@ -13,19 +13,7 @@ LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 
 
 class History:
-    """
-    The least and the largest value in each of the last slots of time.
-
-    Nothing between two looks is lost that a chart could show: peaks are kept.
-
-    Parameters
-    ----------
-    span : float
-        How far back it reaches, in s.
-    slots : int
-        How many slots that is.
-
-    """
+    """The least and largest value in each slot of the last ``span`` seconds; peaks are kept."""
 
     def __init__(self, span: float, slots: int = 480) -> None:
         """Begin empty."""

@@ -46,17 +46,7 @@ def _off(joint: Joint) -> str:
 
 
 class Screen:
-    """
-    Shows scenes on a terminal.
-
-    Parameters
-    ----------
-    span : float
-        Of the charts, in s.
-    unicode : bool
-        Whether the terminal shows more than ASCII.
-
-    """
+    """Shows scenes on a terminal; charts of ``span`` seconds, in ASCII unless ``unicode``."""
 
     def __init__(self, span: float, *, unicode: bool = True) -> None:
         """Take the settings."""

@@ -32,17 +32,7 @@ SHAPERS: dict[str, Shaper] = {
 
 def get_shaper(name: str) -> Shaper:
     """
-    Return the shaper of a name.
-
-    Parameters
-    ----------
-    name : str
-        One of `SHAPERS`.
-
-    Returns
-    -------
-    callable
-        The shaper.
+    Return the shaper of a name in `SHAPERS`.
 
     Raises
     ------

@@ -34,22 +34,7 @@ _AT_REST = 1e-9
 
 
 def at_rest(request: Request, holding: float) -> bool:
-    """
-    Return whether stretch, rate and field are those of the target already.
-
-    Parameters
-    ----------
-    request : Request
-        The move.
-    holding : float
-        Load that holds the target.
-
-    Returns
-    -------
-    bool
-        To what a prediction resolves.
-
-    """
+    """Return whether stretch, rate and field are those of the target, which a load holds."""
     packed = request.material.packed
     frequency = law.natural_frequency(request.target, packed)
     stiffness = law.elastic_stiffness(request.target, packed)

@@ -68,12 +68,7 @@ class Request:
 
     def holding_load(self) -> float:
         """
-        Check the target and return the load that holds it, beta_1.
-
-        Returns
-        -------
-        float
-            Signed load.
+        Check the target and return the signed load that holds it, beta_1.
 
         Raises
         ------
