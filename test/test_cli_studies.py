@@ -254,3 +254,28 @@ def test_sweep_ends_quietly_when_its_reader_has_gone():
         process.stdout.close()
         assert process.stderr.read() == ''
     assert process.returncode == 0
+
+
+# --- feedback
+
+
+def test_robustness_with_feedback_compares_open_loop_with_corrections(run, monkeypatch):
+    from hmsa_ros.studies import feedback
+
+    monkeypatch.setattr(feedback, 'ERRORS', ((-0.2, 0.2),))
+    monkeypatch.setattr(feedback.matrix, '__defaults__', (
+        feedback.SCENARIOS[1:2], feedback.STRATEGIES[1::2]))
+    status, out, err = run('robustness', '--feedback', '--seeds', 1, '--json')
+    assert (status, err) == (0, '')
+    rows = json.loads(out)['rows']
+    assert [x['strategy'] for x in rows] == ['chained', 'adapt']
+    chained, adapted = ([y['vibration'] + abs(y['offset']) for y in x['left']] for x in rows)
+    assert min(chained) > 0.05
+    assert max(adapted) < 0.001
+    status, out, err = run('robustness', '--feedback', '--seeds', 1)
+    assert (status, err) == (0, '')
+    assert out.splitlines()[-1].startswith('  20 % adapt')
+
+
+def test_robustness_with_feedback_needs_a_seed(refused):
+    assert '--seeds is 0' in refused('robustness', '--feedback', '--seeds', 0)

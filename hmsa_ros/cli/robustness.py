@@ -56,12 +56,22 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         '--out', type=Path, default=Path('robustness'), metavar='DIR',
         help='output folder, created if missing (default robustness)')
+    parser.add_argument(
+        '--feedback', action='store_true',
+        help='compare open loop with corrections from samples instead: vibration and offset '
+             'after moves with G up to 20 %% off, noise, delay and an unknown bias of the '
+             'sensor; takes minutes, writes no files, and takes only --seeds and --json')
+    parser.add_argument(
+        '--seeds', type=int, default=10, metavar='N',
+        help='runs with different noise for --feedback (default 10)')
     parser.add_argument('--json', action='store_true', help='print JSON in full precision')
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Study, print and write."""
+    if arguments.feedback:
+        return _feedback(arguments.seeds, as_json=arguments.json)
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
@@ -201,3 +211,32 @@ def _print_table(case: 'Case', results: 'list[Result]') -> None:
                      'integrate')
     for note in notes:
         console.print(f'note: {note}', highlight=False, soft_wrap=True)
+
+
+def _feedback(seeds: int, *, as_json: bool) -> int:
+    """Compare open loop with corrections; rows are printed as they are worked out."""
+    from dataclasses import asdict
+
+    from hmsa_ros.errors import BadInputError
+    from hmsa_ros.studies.feedback import matrix
+
+    if seeds < 1:
+        raise BadInputError(f'--seeds is {seeds}: expected at least 1')
+    if as_json:
+        print(json_text({'seeds': seeds, 'rows': [asdict(x) for x in matrix(seeds)]}))
+        return 0
+    print('peak-to-peak vibration (offset) in % of the step, root mean square: after the first '
+          'move\n(1 to 1.4), a cycle and two cycles later, after the next move (to 1.1); what '
+          'would be left\nif nothing was corrected from then on. Worst: vibration after the '
+          'first move.')
+    before = ''
+    for row in matrix(seeds):
+        if row.scenario != before:
+            print(f'\n{row.scenario}\n{"G off":>6} {"strategy":<9} {"after the move":>16} '
+                  f'{"a cycle later":>16} {"two cycles":>16} {"next move":>16} {"worst":>7}')
+            before = row.scenario
+        cells = ' '.join(
+            f'{100.0 * x.vibration:>7.3f} ({100.0 * x.offset:6.3f})' for x in row.left)
+        print(f'{100.0 * row.error:>4g} % {row.strategy:<9} {cells} {100.0 * row.worst[0]:>7.3f}',
+              flush=True)
+    return 0

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 import math
 
 import numpy as np
@@ -115,6 +116,12 @@ def complete(values: Mapping[str, float], free: Sequence[str]) -> dict[str, floa
     return done
 
 
+@lru_cache(maxsize=8)
+def _packed(chain_limit: float, c1: float) -> Array:
+    """Return the packed law without damping; finding its limits takes a while."""
+    return pack(0.0, chain_limit, c1)
+
+
 @dataclass(frozen=True, eq=False)
 class Setup:
     """
@@ -169,8 +176,8 @@ class Setup:
             chain['shear_modulus'] = modulus
         inner = [x for x in free if x not in _SENSOR]
         wanted = np.array(sorted({i for x in inner for i in chain[x]}), dtype=np.int64)
-        material = pack(0.0, values['chain_limit'], 2.0 * (
-            values['half_thickness'] / values['half_length']) ** 2)
+        material = _packed(values['chain_limit'], 2.0 * (
+            values['half_thickness'] / values['half_length']) ** 2).copy()
         if 'chain_limit' in free:
             material[KIND] = GENT
         mixing = np.zeros((len(wanted), len(free)))

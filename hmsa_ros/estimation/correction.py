@@ -1,0 +1,298 @@
+"""
+What a course is expected to leave, and a better one from the estimated state.
+
+A course is expected to leave, squared, what the most probable motion leaves, and what the
+covariance of state and parameters adds to it under this very course: vibration and distance from
+the target together. A course is corrected only where another one is expected to leave less. Early
+in a move, when little is known, a course that forgives errors so wins against one that is exact
+for parameters which are a guess.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+
+from hmsa_ros.core.moves import Level, Move, State
+from hmsa_ros.core.shapers import get_shaper
+from hmsa_ros.core.shapers.request import Request
+from hmsa_ros.core.shooting import solve, Template
+from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.core.timeline import Model, Options
+from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.estimation.estimator import Estimate
+from hmsa_ros.estimation.motion import follow, Levels, rest
+
+# A correction leaves at most this share of what the course in force leaves, in squares, and
+# gains at least this, as a share of the noise of a sample.
+_SHARE, _GAIN = 0.8, 0.02
+# Durations of a correction in half periods: the least with which a move still arrives in time, and
+# those tried where it does not.
+_LEAST, _TRIED = 0.15, (0.5, 1.0, 1.6)
+#: How much longer a move takes that is cautious.
+CAUTIOUS = 3.0
+
+
+@dataclass(frozen=True)
+class Course:
+    """
+    Levels to a target.
+
+    Attributes
+    ----------
+    levels : tuple of (int, float)
+        Stamp in ns and level in T, by time; the last one holds.
+    arrival : int
+        Time in ns of rest at the target.
+    target : float
+        Stretch.
+
+    """
+
+    levels: tuple[tuple[int, float], ...]
+    arrival: int
+    target: float
+
+    @property
+    def holding(self) -> float:
+        """Level in T that is held at the end."""
+        return self.levels[-1][1]
+
+    def follows(self, other: 'Course', begin: int) -> 'Course':
+        """Return this course after what another one does before a time in ns."""
+        return replace(self, levels=(
+            *(x for x in other.levels if x[0] < begin), *self.levels))
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """
+    What is expected to be left at the end of a course.
+
+    Attributes
+    ----------
+    amplitude, offset : float
+        Of the most probable motion: of the vibration, and of the rest from the target.
+    size : float
+        Root of the expected square of both together.
+
+    """
+
+    amplitude: float
+    offset: float
+    size: float
+
+
+def expect(estimate: Estimate, course: Course, slew_limit: float = math.inf) -> Expectation:
+    """
+    Return what a course is expected to leave.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        State and parameters at a time from which on the course may still be changed.
+    course : Course
+        With the level in force then.
+    slew_limit : float
+        Of the amplifier in T/s; infinite for steps.
+
+    Returns
+    -------
+    Expectation
+        Infinite where the motion cannot be followed.
+
+    """
+    nothing = Expectation(math.inf, math.inf, math.inf)
+    begin = estimate.time
+    end = max(course.arrival, begin)
+    motion = follow(
+        estimate.values, estimate.free, (estimate.stretch, estimate.rate),
+        Levels(np.array([(x - begin) / NANOSECONDS for x, _ in course.levels]),
+               np.array([x for _, x in course.levels]), slew_limit),
+        0.0, np.array([(end - begin) / NANOSECONDS]))
+    at = rest(estimate.values, estimate.free, course.holding)
+    if motion is None or at is None:
+        return nothing
+    stretch, frequency, by = at
+    rows = np.zeros((3, len(estimate.covariance)))
+    rows[0] = motion.by[0]
+    rows[0, :-2] -= by
+    rows[1] = motion.rate_by[0] / frequency
+    rows[2, :-2] = by
+    misses = np.array([
+        motion.stretch[0] - stretch, motion.rate[0] / frequency, stretch - course.target])
+    spread = float(np.einsum('ij,jk,ik->', rows, estimate.covariance, rows))
+    return Expectation(
+        math.hypot(misses[0], misses[1]), float(misses[2]),
+        math.sqrt(float(misses @ misses) + max(spread, 0.0)))
+
+
+class Corrector:
+    """
+    Plans courses from estimates.
+
+    Parameters
+    ----------
+    options : Options
+        Limits and properties of coil and amplifier; an estimated lag takes the place of theirs.
+
+    """
+
+    def __init__(self, options: Options) -> None:
+        """Begin with no model."""
+        self.options = options
+
+    def model(self, estimate: Estimate) -> Model:
+        """Return the model of an estimate."""
+        return Model(estimate.actuator, replace(
+            self.options, coil_time_constant=estimate.values['coil_time_constant']))
+
+    def first(
+            self, estimate: Estimate, target: float, in_force: float, *,
+            shaper: str = 'two_step', order: int = 2,
+            tolerance: float = math.inf) -> Course:
+        """
+        Plan a move.
+
+        Where it is expected to leave too much, its levels stay, since their early effect shows
+        what the actuator is, but it gets `CAUTIOUS` times as long for corrections until rest.
+
+        Parameters
+        ----------
+        estimate : Estimate
+            At the begin of the move.
+        target : float
+            Stretch.
+        in_force : float
+            Level in T before.
+        shaper : str
+            Name.
+        order : int
+            Of the robust shaper.
+        tolerance : float
+            Share of the step from which on that is too much.
+
+        Returns
+        -------
+        Course
+            From the begin on.
+
+        Raises
+        ------
+        RefusedError
+            If the target cannot be reached.
+
+        """
+        model = self.model(estimate)
+        move = get_shaper(shaper)(replace(
+            self._request(model, estimate, target, in_force), order=order))
+        found = _placed(move, model, estimate.time, target)
+        step = abs(target - estimate.stretch)
+        if math.isinf(tolerance) or expect(
+                estimate, found, self.options.slew_limit).size <= tolerance * step:
+            return found
+        longer = round((CAUTIOUS - 1.0) * (found.arrival - estimate.time))
+        return replace(found, arrival=found.arrival + longer)
+
+    def correct(self, estimate: Estimate, course: Course) -> Course | None:
+        """
+        Plan what is left of a move anew, where that is expected to leave less.
+
+        Parameters
+        ----------
+        estimate : Estimate
+            At the time from which on levels may be changed.
+        course : Course
+            In force.
+
+        Returns
+        -------
+        Course or None
+            With the levels before; None where the course in force is to be kept.
+
+        """
+        if not estimate.trusted:
+            return None
+        slew = self.options.slew_limit
+        now = expect(estimate, course, slew)
+        best: Course | None = None
+        least = min(
+            math.sqrt(_SHARE) * now.size, now.size - _GAIN * estimate.noise)
+        if not least > 0.0:
+            return None
+        try:
+            model = self.model(estimate)
+        except BadInputError:
+            return None
+        for found in self._candidates(model, estimate, course):
+            whole = found.follows(course, estimate.time)
+            size = expect(estimate, whole, slew).size
+            if size < least:
+                best, least = whole, math.sqrt(_SHARE) * size
+        return best
+
+    def _request(
+            self, model: Model, estimate: Estimate, target: float, in_force: float) -> Request:
+        units = model.units
+        load = in_force / units.load
+        return Request(
+            State(estimate.stretch, estimate.rate * units.time, load,
+                  load if model.delivery.lag > 0.0 else None),
+            target, model.material, model.limits, model.delivery, units=units)
+
+    def _candidates(
+            self, model: Model, estimate: Estimate, course: Course) -> Iterator[Course]:
+        """Yield courses from now on, those that arrive sooner first."""
+        begin = estimate.time
+        levels = [x for x in course.levels if x[0] < begin]
+        in_force = levels[-1][1] if levels else course.levels[0][1]
+        request = self._request(model, estimate, course.target, in_force)
+        if model.delivery.lag > 0.0:
+            lag = model.delivery.lag * model.units.time
+            field = Levels(
+                np.array([(x - begin) / NANOSECONDS for x, _ in course.levels]),
+                np.array([x for _, x in course.levels]), self.options.slew_limit
+            ).field(0.0, lag) / model.units.load
+            request = replace(request, state=replace(request.state, load=field))
+        half = math.pi / model.frequency(course.target)
+        left = model.time(course.arrival - begin)
+        # On the way in the time that is left, and afterwards in times of their own.
+        durations = [left] if left > 0.0 else [x * half for x in _TRIED]
+        for duration in durations:
+            found = _through(request, duration) if duration > _LEAST * half else None
+            if found is not None:
+                yield _placed(found, model, begin, course.target)
+
+
+def _through(request: Request, duration: float) -> Move | None:
+    """Return levels, each as long as the others, that lead to rest in a given time."""
+    try:
+        holding = request.holding_load()
+    except RefusedError:
+        return None
+    delivery = replace(request.delivery, period=0.0)
+    count = 3 if delivery.lag > 0.0 else 2
+    edges = duration / count * np.arange(count + 1)
+    period = request.delivery.period
+    if period > 0.0:
+        edges = period * np.round(edges / period)
+        if np.any(np.diff(edges) <= 0.0):
+            return None
+    guess = [Level(float(x), holding) for x in edges]
+    found = solve(
+        Template.of(guess, [('load', i) for i in range(count)]), request, delivery)
+    if found is None or not request.keeps(found[0]):
+        return None
+    return Move(Code.MINIMUM_TIME, found[0], found[1])
+
+
+def _placed(move: Move, model: Model, begin: int, target: float) -> Course:
+    """Return the course of a move that begins at a time in ns."""
+    unit = model.units.load
+    end = move.duration if math.isfinite(move.duration) else move.levels[-1].time
+    return Course(
+        tuple((begin + model.ns(x.time), x.load * unit) for x in move.levels),
+        begin + model.ns(end), target)
+

@@ -1,0 +1,148 @@
+"""Corrections from samples, carried out by a block that SciPy simulates."""
+
+from dataclasses import replace
+import math
+
+import identification_oracle as oracle
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+from hmsa_ros.core.timeline import Options as PlannerOptions
+from hmsa_ros.estimation import Estimator, Options, Prior
+from hmsa_ros.estimation.correction import Corrector, Course, expect
+from hmsa_ros.studies.feedback import SCENARIOS, Strategy, trial
+
+TARGET, BEGIN, MS = 1.4, 50_000_000, 1_000_000
+
+
+class Block:
+    """A block under levels in ns and T."""
+
+    def __init__(self, block):
+        self.block, self.levels = block, [(0, 0.0)]
+        self._time, self._state = 0, np.array([1.0, 0.0])
+
+    def command(self, begin, levels):
+        self.levels = [x for x in self.levels if x[0] < begin] + [
+            x for x in levels if x[0] >= begin]
+
+    def _slope(self, _, state, level):
+        block = self.block
+        inertia = block.density * block.half_length ** 2
+        damping = block.damping_coefficient * block.half_thickness / (
+            8.0 * block.half_length ** 2)
+        stretch, rate = state
+        total = (block.remanence * level / oracle.mu_0 - block.shear_modulus * oracle.force_of(
+            stretch, block.chain_limit) - damping * rate + 0.25 * inertia * rate ** 2
+            / stretch ** 4)
+        return [rate, total / (inertia * (stretch ** -3 + 2.0) / 6.0)]
+
+    def at(self, time):
+        """Return the stretch at a time in ns, not before the last one."""
+        while self._time < time:
+            level = [x for x in self.levels if x[0] <= self._time][-1][1]
+            until = min([x[0] for x in self.levels if x[0] > self._time] + [time])
+            self._state = solve_ivp(
+                self._slope, (0.0, (until - self._time) * 1e-9), self._state, method='DOP853',
+                rtol=1e-9, atol=1e-11, args=(level,)).y[:, -1]
+            self._time = until
+        return float(self._state[0])
+
+
+def closed_loop(factor, prior, noise=1e-3, seed=0):
+    """Move to the target with samples at 1 kHz, 2 ms late; return the block and the course."""
+    block = Block(replace(oracle.BLOCK, shear_modulus=factor * oracle.BLOCK.shear_modulus))
+    random = np.random.default_rng(seed)
+    estimator = Estimator(prior, Options(noise=noise))
+    estimator.level(0, 0.0)
+    corrector = Corrector(PlannerOptions(flux_density_min=-0.25, flux_density_max=0.25))
+    course = None
+    for time in range(MS, 90 * MS, MS):
+        estimator.sample(time, block.at(time) + 1e-3 + noise * random.standard_normal())
+        act = time + 2 * MS
+        estimate = estimator.update(act)
+        if act == BEGIN:
+            course = corrector.first(estimate, TARGET, 0.0, tolerance=1e-3)
+        elif course is not None:
+            found = corrector.correct(estimate, course)
+            course = found or course
+        if course is not None:
+            for stamp, level in course.levels:
+                if stamp >= act:
+                    estimator.level(stamp, level)
+            block.command(act, course.levels)
+    return block, course
+
+
+def left(block):
+    """Return peak to peak and offset over the next 15 ms, as shares of the step."""
+    seen = np.array([block.at((90 + 0.2 * i) * MS) for i in range(75)])
+    level = block.levels[-1][1] * block.block.remanence / oracle.mu_0 / block.block.shear_modulus
+    rest = brentq(lambda x: oracle.force_of(x, 5.0) - level, 1.01, 2.0)
+    return np.ptp(seen) / 0.4, (rest - TARGET) / 0.4
+
+
+@pytest.mark.parametrize('factor', [0.8, 1.2])
+def test_a_block_that_is_a_fifth_softer_or_stiffer_than_known_comes_to_rest_at_its_target(factor):
+    block, course = closed_loop(factor, Prior.nominal(oracle.BLOCK))
+    vibration, offset = left(block)
+    # Open loop leaves 17 to 26 % of both.
+    assert vibration < 1.5e-3
+    assert abs(offset) < 1.5e-3
+    assert course.target == TARGET
+
+
+def test_a_block_that_is_known_exactly_is_left_alone():
+    prior = Prior.nominal(oracle.BLOCK, deviations={
+        'shear_modulus': 1e-6, 'damping_coefficient': 1e-5, 'stretch_bias': 5e-3})
+    block, course = closed_loop(1.0, prior)
+    assert len(course.levels) == 2
+    vibration, offset = left(block)
+    assert vibration < 1e-5
+    assert abs(offset) < 1e-5
+
+
+def test_what_a_course_is_expected_to_leave_is_what_errors_drawn_from_the_covariance_leave():
+    prior = Prior.nominal(oracle.BLOCK, ('shear_modulus',), deviations={'shear_modulus': 0.01})
+    estimator = Estimator(prior, Options(noise=1e-3))
+    estimator.level(0, 0.0)
+    estimator.sample(0, 1.0)
+    estimate = estimator.update(MS)
+    course = Corrector(PlannerOptions()).first(estimate, TARGET, 0.0)
+    expected = expect(estimate, course)
+    sizes = []
+    for sign in (-1.0, 1.0):
+        block = Block(replace(
+            oracle.BLOCK, shear_modulus=math.exp(sign * 0.01) * oracle.BLOCK.shear_modulus))
+        block.command(MS, course.levels)
+        ends = np.array([block.at(course.arrival + i * MS // 10) for i in range(101)])
+        level = course.holding * oracle.BLOCK.remanence / oracle.mu_0 / block.block.shear_modulus
+        rest = brentq(lambda x, level=level: oracle.force_of(x, 5.0) - level, 1.01, 2.0)
+        sizes.append(math.hypot(np.max(np.abs(ends - rest)), rest - TARGET))
+    assert expected.amplitude < 1e-6
+    assert expected.size == pytest.approx(np.sqrt(np.mean(np.square(sizes))), rel=0.1)
+
+
+def test_a_correction_keeps_what_was_commanded_before_and_the_limits():
+    course = Course(((0, 0.1), (30, 0.2)), 30, TARGET)
+    assert Course(((20, 0.3),), 40, TARGET).follows(course, 20).levels == ((0, 0.1), (20, 0.3))
+    block, _ = closed_loop(0.8, Prior.nominal(oracle.BLOCK), seed=1)
+    assert all(abs(level) <= 0.25 for _, level in block.levels)
+
+
+def test_open_loop_in_the_study_leaves_what_the_study_of_shapers_says():
+    from hmsa_ros.core.moves import State
+    from hmsa_ros.core.parameters import NondimensionalParameters
+    from hmsa_ros.core.shapers import get_shaper
+    from hmsa_ros.core.shapers.request import Request
+    from hmsa_ros.studies.residual import Errors, residual
+
+    material = NondimensionalParameters()
+    move = get_shaper('two_step')(Request(State(1.0), 1.4, material))
+    found = trial(SCENARIOS[0], Strategy('', 'two_step'), 0.2, 0)[0]
+    assert found.vibration == pytest.approx(
+        residual(move, 1.0, 1.4, material, Errors(0.2), move.duration), rel=2e-3)
+    # A cycle is two thirds of a period.
+    assert 0.7 * found.vibration < found.motion < 1.01 * found.vibration
