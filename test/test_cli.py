@@ -98,12 +98,32 @@ def test_bad_input_is_answered_in_one_line_with_status_2(words, said, capsys):
 
 @pytest.mark.ros
 def test_send_reports_until_the_sequence_has_been_carried_out(start):
-    start.hmsa('planner')
-    send = start.hmsa('send', '1.1:0.05', '1.2:0.05', '--wait')
+    # Commands far enough ahead for a busy machine.
+    start.hmsa('planner', '--ros-args', '-p', 'lead_time:=0.5')
+    # Nobody carries it out yet.
+    send = start.hmsa('send', '1.1:0.05', '--wait')
+    assert send.wait(30.0) == 1, send.output
+    assert 'not carried out: nobody subscribes to /flux_density_command' in send.stderr
+    start.hmsa('plant')
+    send = start.hmsa('send', '1.0:0.5', '1.1:0.1', '1.2:0.1', '--wait')
     assert send.wait(30.0) == 0, send.output
     assert 'accepted' in send.stdout
-    assert 'done: at_rest' in send.stdout
-    assert 'setpoint 2 of 2' in send.stderr
+    assert 'done: at_rest, measured' in send.stdout
+    assert 'setpoint 3 of 3' in send.stderr
+
+
+@pytest.mark.ros
+def test_send_fails_where_the_actuator_is_measured_to_miss_the_setpoint(start):
+    start.hmsa('plant', '--ros-args', '-p', 'mismatch.shear_modulus:=1.1')
+    start.hmsa('planner', '--ros-args', '-p', 'lead_time:=0.5')
+    send = start.hmsa('send', '1.0:0.5', '1.4:0.5', '--wait', '--timeout', '30')
+    assert send.wait(60.0) == 1, send.output
+    found = re.search(
+        r'setpoint 2 of 2: rests (\S+) \(\S+ %\) short of 1.4 and rings at (\S+) Hz, '
+        r'(\S+) \(\S+ %\) peak to peak', send.stderr)
+    assert found, send.stderr
+    # As simulated with the true block.
+    assert list(map(float, found.groups())) == pytest.approx([0.0393, 89.9, 0.0366], rel=0.1)
 
 
 @pytest.mark.ros
@@ -111,7 +131,9 @@ def test_send_moves_several_joints_each_to_its_stretch_or_all_to_one(start, ros)
     from hmsa_ros.nodes import interface
 
     plans = ros.collect(interface.PLAN.type, 'planner/plan', interface.PLAN.qos)
-    start.hmsa('planner', '--ros-args', '-p', 'joints:=[left, right]')
+    joints = ['--ros-args', '-p', 'joints:=[left, right]']
+    start.hmsa('plant', *joints)
+    start.hmsa('planner', *joints, '-p', 'lead_time:=0.5')
     send = start.hmsa(
         'send', '1.1,0.9:0.2', '1.2:0.2', '--joint', 'right,left', '--wait')
     assert send.wait(30.0) == 0, send.output

@@ -63,6 +63,8 @@ class Bench:
         self.statuses = self.collect(interface.STATUS)
         self.trajectories = self.publisher(interface.JOINT_TRAJECTORY)
         self.setpoints = self.publisher(interface.SETPOINT)
+        # Who carries commands out reports on them; this one is silent.
+        self.publisher(interface.FLUX_DENSITY_APPLIED)
         self.requests = 0
 
     def name(self, entry: Any) -> str:
@@ -279,8 +281,8 @@ def test_status_tells_the_progress_until_at_rest(bench):
             (END, 'at_rest', 3, '1.4')):
         planner.at(now)
         status = planner.verdict(
-            'accepted', state=state, setpoint=setpoint, setpoints=3, stretch=stretch,
-            request='request 1', plan=1)
+            'unobserved' if state == 'at_rest' else 'accepted', state=state, setpoint=setpoint,
+            setpoints=3, stretch=stretch, request='request 1', plan=1)
         assert status.level == OK
         assert status.hardware_id == 'actuator'
 
@@ -289,7 +291,8 @@ def test_setpoint_is_reached_as_soon_as_possible_and_held(bench):
     planner = bench()
     planner.setpoint(1.25)
     planner.at(START + 1000 * MS)
-    planner.verdict('accepted', state='at_rest', stretch='1.25')
+    status = planner.verdict('unobserved', state='at_rest', stretch='1.25')
+    assert 'predicted, not measured' in status.message
     planner.setpoint(0.9)
     planner.check()
 
@@ -319,7 +322,7 @@ def test_stop_comes_to_rest_without_vibration(bench):
     assert abs(rest.rate) < 1e-12
     assert 1.0 < rest.stretch < 1.1
     planner.run(END)
-    planner.verdict('accepted', state='at_rest')
+    planner.verdict('unobserved', state='at_rest')
     planner.check()
 
 

@@ -147,6 +147,7 @@ class Rig:
 
 def test_sequence_is_sent_in_time_and_ends_at_rest():
     rig = Rig()
+    rig.observable = False
     assert rig.runtime.request(trajectory(*SEQUENCE, name='x')).code == 'accepted'
     rig.run(START + LEAD + 3 * HOLD)
     alone = Planner(paper_actuator(), rig.options)
@@ -336,6 +337,7 @@ def test_preview_of_a_long_plan_comes_in_parts():
 
 def test_heartbeat_repeats_the_last_level_and_changes_nothing():
     rig = Rig(settings=replace(QUIET, heartbeat_period=20 * MS))
+    rig.observable = False
     rig.run(START + 100 * MS)
     # Nothing before the first command.
     assert rig.sent == []
@@ -372,6 +374,7 @@ def test_first_request_waits_for_the_state_in_force():
     assert rig.runtime.wants_samples
     assert rig.codes() == ['none']
     rig.observe()
+    rig.observable = False
     rig.run(START + 150 * MS)
     assert not rig.runtime.wants_samples
     assert rig.status.plan == 2

@@ -6,7 +6,7 @@ from typing import Any
 
 from hmsa_ros.cli.setpoints import setpoint_of_joints
 from hmsa_ros.ending import ENDING
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.errors import BadInputError, HmsaError
 
 
 def add_parser(subparsers: Any) -> None:
@@ -22,8 +22,9 @@ def add_parser(subparsers: Any) -> None:
              'hold); with several joints, one stretch for all or one per joint, as in '
              '1.10,1.20:2')
     parser.add_argument(
-        '--wait', action='store_true', help='report progress until the sequence has been '
-                                            'carried out')
+        '--wait', action='store_true',
+        help='report progress until the sequence has been carried out, and fail if a setpoint was '
+             'measured to be missed')
     parser.add_argument(
         '--recorded', action='store_true', help='wait until a recorder has subscribed, then send')
     parser.add_argument(
@@ -44,7 +45,8 @@ def run(arguments: argparse.Namespace) -> int:
     Raises
     ------
     HmsaError
-        If there is no planner, it refuses, or the sequence is not carried out.
+        If there is no planner, it refuses, the sequence is not carried out, or the stretch was
+        measured to have missed a setpoint.
 
     """
     from hmsa_ros.session.client import PlannerClient
@@ -75,5 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
 
         length = sum(span for _, span in arguments.setpoints)
         verdict = client.follow(verdict, each=report, timeout=length + arguments.timeout)
-        print(f'done: {verdict.state}')
+        if verdict.failure:
+            raise HmsaError(verdict.failure)
+        print(f'done: {verdict.state}, {verdict.basis}')
     return 0

@@ -119,8 +119,8 @@ PLAN = Topic(
     'flux density from then on.', publishers=(PLANNER,))
 STATUS = Topic(
     '~/status', 'diagnostic_msgs/msg/DiagnosticStatus', LATCHED,
-    'The verdict on the last request, with a code and a sentence, and the progress of its '
-    'sequence.', publishers=(PLANNER,))
+    'The verdict on the last request, with a code and a sentence, what was measured at the last '
+    'setpoint, and the progress of its sequence.', publishers=(PLANNER,))
 FLUX_DENSITY_COMMAND = Topic(
     'flux_density_command', _FIELD, COMMAND,
     'The shaped command: from its stamp on, which may be in the future, z is the flux density '

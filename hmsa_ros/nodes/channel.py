@@ -27,12 +27,23 @@ class JointChannel:
         topic = interface.of_joint(interface.SETPOINT, joint, joints)
         node.create_subscription(topic.type, topic.name, self._on_setpoint, topic.qos)
         topic = interface.of_joint(interface.FLUX_DENSITY_APPLIED, joint, joints)
-        node.create_subscription(topic.type, topic.name, self._on_applied, topic.qos)
+        self._applied = node.create_subscription(
+            topic.type, topic.name, self._on_applied, topic.qos).topic_name
 
     def send(self, command: Send, frame: str) -> None:
         """Publish a command in the frame of the coil."""
         self._command.publish(
             conversions.to_command(command.stamp, command.flux_density, frame))
+
+    def unheard(self) -> str:
+        """Return why nobody carries out the commands; empty where somebody does."""
+        if not self._command.get_subscription_count():
+            return f'nobody subscribes to {self._command.topic_name}: start a plant or a driver'
+        if not self._node.count_publishers(self._applied):
+            return (
+                f'nobody reports on {self._applied} which levels took effect: start a plant, or '
+                'a driver that does')
+        return ''
 
     def _on_setpoint(self, message: Float64) -> None:
         self._runtime.request(Target(self._joint, message.data))

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 import re
+from struct import unpack_from
 from typing import TYPE_CHECKING
 
 from builtin_interfaces.msg import Duration, Time
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 
 # Anybody may send a status; Python refuses to read numbers of thousands of digits.
 _WHOLE = re.compile('[0-9]{1,18}')
+# Encapsulation and stamp: bytes at the beginning of a message with a header.
+_STAMPED = 12
 
 
 def to_time(nanoseconds: int) -> Time:
@@ -141,12 +144,21 @@ def to_planner_status(status: 'StatusChanged') -> DiagnosticStatus:
     verdict, progress, each = status.verdict, status.progress, status.each
     values: dict[str, object] = {
         'code': verdict.code, 'request': verdict.request, 'plan': status.plan,
-        **vars(progress), 'late': status.late, 'replanned': status.replanned, **verdict.figures}
-    if len(each) > 1:
-        for name, of_joint in each.items():
-            values |= {f'{name}.{key}': value for key, value in vars(of_joint).items()}
+        **vars(progress), 'late': status.late, 'replanned': status.replanned, **verdict.figures,
+        'watching': status.watching}
+    if status.worst is not None:
+        values |= {'worst': status.worst.code, 'worst_message': status.worst.message}
+    for name, of_joint in each.items():
+        prefix = f'{name}.' if len(each) > 1 else ''
+        found = status.findings.get(name)
+        of_each = {**vars(of_joint), **({} if found is None else found.figures)}
+        values |= {f'{prefix}{key}': value for key, value in of_each.items()}
+    severity, message = int(verdict.severity), verdict.message
+    if status.unheard:
+        values['unheard'] = status.unheard
+        severity, message = max(severity, 1), f'{message}; but {status.unheard}'
     return to_status(
-        'planner: request', ', '.join(each), bytes([verdict.severity]), verdict.message, values)
+        'planner: request', ', '.join(each), bytes([severity]), message, values)
 
 
 def to_status(
@@ -156,6 +168,14 @@ def to_status(
     return DiagnosticStatus(
         name=name, hardware_id=joint, level=level, message=message,
         values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
+
+
+def stamp_of(data: bytes) -> int:
+    """Return the stamp in ns of a serialized message that begins with a header, else 0."""
+    if len(data) < _STAMPED:
+        return 0
+    seconds, nanoseconds = unpack_from('<iI' if data[1] & 1 else '>iI', data, 4)
+    return int(seconds) * NANOSECONDS + int(nanoseconds)
 
 
 def whole(text: str | None) -> int:

@@ -1,6 +1,8 @@
 """Planner node: setpoints in, the shaped stream of stamped flux density commands out."""
 
 from collections.abc import Callable, Sequence
+from itertools import zip_longest
+import math
 from time import monotonic_ns
 
 from rcl_interfaces.msg import SetParametersResult
@@ -8,6 +10,7 @@ from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -43,9 +46,11 @@ PARAMETERS = SPECS
 # simulated time may run at any pace, and is read often.
 _POLL_NS = 2_000_000
 _LONGEST_POLL_NS = 100_000_000
-# Whoever publishes samples, reliably or not, is understood; only the newest counts.
-_NEWEST = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+# Whoever publishes samples, reliably or not, is understood.
+_SAMPLES = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+# How long samples are listened to after they were wanted last: a subscription takes time to match.
+_LINGER_NS = 2 * NANOSECONDS
 
 
 class PlannerNode(ManagedNode):
@@ -61,6 +66,7 @@ class PlannerNode(ManagedNode):
         self._runtime = self._new_runtime()
         self._channels: dict[str, JointChannel] = {}
         self._samples: Subscription | None = None
+        self._listen_until = 0
         self._several_clocks = False
         check_names(self)
         seconds = warm_up(self.get_logger().info)
@@ -72,7 +78,8 @@ class PlannerNode(ManagedNode):
     def _new_runtime(self) -> PlannerRuntime:
         return PlannerRuntime(
             group_from(self._settings), settings_from(self._settings), clock=self._now,
-            observable=lambda: bool(self.count_publishers(interface.JOINT_STATES.name)))
+            observable=lambda: bool(self.count_publishers(interface.JOINT_STATES.name)),
+            unheard=self._unheard)
 
     # -- states --------------------------------------------------------------------------------
 
@@ -139,12 +146,21 @@ class PlannerNode(ManagedNode):
         self._serve()
         return response
 
-    def _on_sample(self, message: JointState) -> None:
+    def _on_sample(self, data: bytes) -> None:
+        # Most of a thousand samples a second are of no use, and reading them takes time.
+        if not self._runtime.looks_at(conversions.stamp_of(data)):
+            return
+        message = deserialize_message(data, JointState)
         stamp = conversions.from_time(message.header.stamp)
-        # A field that is not measured is empty; all three are needed.
-        for name, *values in zip(
-                message.name, message.position, message.velocity, message.effort, strict=False):
-            self._runtime.observed(name, stamp, *map(float, values))
+        # A field that is not measured is empty.
+        for name, *values in zip_longest(
+                message.name, message.position, message.velocity, message.effort,
+                fillvalue=math.nan):
+            self._runtime.observed(str(name), stamp, *values)
+
+    def _unheard(self) -> str:
+        """Return why nobody carries out commands; empty where somebody does."""
+        return next(filter(None, (x.unheard() for x in self._channels.values())), '')
 
     # -- time ----------------------------------------------------------------------------------
 
@@ -182,11 +198,14 @@ class PlannerNode(ManagedNode):
 
     def _listen(self) -> None:
         """Subscribe to samples while they are wanted."""
-        if self._runtime.wants_samples and self._samples is None:
+        wanted = self._runtime.wants_samples
+        if wanted:
+            self._listen_until = monotonic_ns() + _LINGER_NS
+        if wanted and self._samples is None:
             topic = interface.JOINT_STATES
             self._samples = self.create_subscription(
-                topic.type, topic.name, self._on_sample, _NEWEST)
-        elif not self._runtime.wants_samples and self._samples is not None:
+                topic.type, topic.name, self._on_sample, _SAMPLES, raw=True)
+        elif self._samples is not None and monotonic_ns() > self._listen_until:
             self.destroy_subscription(self._samples)
             self._samples = None
 

@@ -28,6 +28,7 @@ from hmsa_ros.nodes.parameters import (
     JOINT,
     ParameterSpec,
 )
+from hmsa_ros.runtime.measured import Tolerances
 from hmsa_ros.runtime.records import Settings
 
 _OPTIONS = Options()
@@ -98,6 +99,18 @@ SPECS = (
         'of a good driver.', 's',
         0.0, 1.0, read_only=False),
     ParameterSpec(
+        'arrival_tolerance', _SETTINGS.tolerances.arrival,
+        'How far from its target, as a share of the step, a measured stretch may rest and '
+        'count as arrived.', '', 0.0, 1e3, read_only=False),
+    ParameterSpec(
+        'vibration_tolerance', _SETTINGS.tolerances.vibration,
+        'How large a measured vibration may be, peak to peak, as a share of the step.', '',
+        0.0, 1e3, read_only=False),
+    ParameterSpec(
+        'stretch_tolerance', _SETTINGS.tolerances.stretch,
+        'Offset and vibration up to this stretch are tolerated however small the step is.', '',
+        0.0, 1e3, read_only=False),
+    ParameterSpec(
         'takeover_timeout', _SETTINGS.takeover_timeout / NANOSECONDS,
         'How long the first request waits for a sample of the current state, if samples are '
         'published; 0 for no wait.', 's', 0.0, 60.0),
@@ -155,7 +168,9 @@ def settings_from(values: JointParameters) -> Settings:
         **{x: nanoseconds(values[x]) for x in (
             'heartbeat_period', 'lateness_tolerance', 'takeover_timeout', 'takeover_max_age')},
         replan_late=bool(values['replan_late']), max_points=int(values['max_points']),
-        allow_partial_joints=bool(values['allow_partial_joints']))
+        allow_partial_joints=bool(values['allow_partial_joints']),
+        tolerances=Tolerances(*(float(values[f'{x}_tolerance']) for x in (
+            'arrival', 'vibration', 'stretch'))))
 
 
 def group_from(parameters: JointParameters) -> PlannerGroup:

@@ -6,41 +6,34 @@ enough, at the latest when `PlannerRuntime.wake` says so, and passes on what tha
 to topics, a loop that has the coil at hand to the coil.
 """
 
-from collections import deque
 from collections.abc import Callable, Mapping
 from time import monotonic_ns
 
-from hmsa_ros.core.group import PlannerGroup, Progress
+from hmsa_ros.core.group import PlannerGroup
 from hmsa_ros.core.status import Code, RefusedError
-from hmsa_ros.core.timeline import Draft, Model
+from hmsa_ros.core.timeline import Model
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.errors import HmsaError
+from hmsa_ros.runtime.bulletin import Bulletin
 from hmsa_ros.runtime.checks import check_joints
 from hmsa_ros.runtime.following import Following
+from hmsa_ros.runtime.planning import Planning, SLICE
 from hmsa_ros.runtime.records import (
-    Note,
     Output,
-    PlanChanged,
     Request,
-    Send,
     Settings,
     Severity,
-    StatusChanged,
     Stop,
     Trajectory,
     Verdict,
 )
-from hmsa_ros.runtime.slices import Clock, Work, work_on
-from hmsa_ros.runtime.takeover import Observations, Sample
+from hmsa_ros.runtime.sending import Sending
+from hmsa_ros.runtime.slices import Clock, work_on
+from hmsa_ros.runtime.takeover import Sample, Takeover
+from hmsa_ros.runtime.watching import Watch
 
-# How long planning goes on before commands and requests are served again, in ns.
-_SLICE = 4_000_000
-# Changes of level in one preview.
-_PREVIEW = 500
 # Clock jumps nearer to each other than this make one verdict.
 _STORM = NANOSECONDS
-# So far ahead that all there is gets sent.
-_FAR = 2**62
 _WAITING = Verdict(
     Severity.OK, 'waiting', 'accepted: starts as soon as the current state is known')
 
@@ -61,44 +54,60 @@ class PlannerRuntime:
         Returns a steady time in ns, by which patience and the length of a slice are measured.
     observable : callable
         Returns whether somebody may give samples: the first request waits for them then.
+    unheard : callable
+        Returns why nobody carries out commands; empty where somebody does.
 
     Attributes
     ----------
     active : bool
         Whether requests are taken.
-    verdict : Verdict
-        On the last request.
     following : Following
         What really happened, and the counters of it.
-    sent, heartbeats, refused, clock_jumps : int
-        Counters.
+    clock_jumps : int
+        Counter.
 
     """
 
     def __init__(
             self, group: PlannerGroup, settings: Settings, *, clock: Clock,
             steady: Clock = monotonic_ns,
-            observable: Callable[[], bool] = lambda: True) -> None:
+            observable: Callable[[], bool] = lambda: True,
+            unheard: Callable[[], str] = str) -> None:
         """Begin at rest, inactive, and report it."""
         self.group = group
         self.settings = settings
         self.active = False
-        self.verdict = Verdict(Severity.OK, 'none', 'no request yet')
         self.following = Following(group)
-        self.sent = self.heartbeats = self.refused = self.clock_jumps = 0
+        self.clock_jumps = 0
         self._clock, self._steady, self._observable = clock, steady, observable
-        self._outputs: list[Output] = []
-        self._queue: deque[Work] = deque()
-        # Whether it is known where the joints are, or until when that is waited for.
-        self._engaged = False
-        self._patience: int | None = None
-        self._samples = Observations(group.planners)
-        self._next_beat = 0
-        # Time from which the next part of a long plan is shown, and the last jump of the clock.
-        self._preview_again: int | None = None
+        self._takeover = Takeover(group, clock, steady, observable)
+        self._watch = Watch(group, steady)
+        self._bulletin = Bulletin(group, self.following, self._watch, clock, steady, unheard)
+        self._sending = Sending(group, self.following, self._bulletin.outputs)
+        self._planning = Planning(
+            group, self.following, self._bulletin, clock, steady,
+            lambda: self._sending.send(clock()))
         self._last_jump: int | None = None
-        self._progress: tuple[Progress, Mapping[str, Progress]] | None = None
-        self._tell()
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict on the last request."""
+        return self._bulletin.verdict
+
+    @property
+    def sent(self) -> int:
+        """Counter of commands."""
+        return self._sending.sent
+
+    @property
+    def heartbeats(self) -> int:
+        """Counter of signs of life."""
+        return self._sending.heartbeats
+
+    @property
+    def refused(self) -> int:
+        """Counter of requests that were refused."""
+        return self._planning.refused
 
     # -- in ------------------------------------------------------------------------------------
 
@@ -124,22 +133,20 @@ class PlannerRuntime:
             self._check(request)
         except RefusedError as error:
             return self.refuse(error, request)
-        work = work_on(request, self.group, self._clock)
-        if self._engaged and work.replaces(self._queue):
-            self._queue.appendleft(work)
-        else:
-            self._queue.append(work)
-        self._begin_to_wait()
+        work = self._planning.add(request, engaged=self._takeover.engaged)
+        self._engage(begin=True)
         self._work_on()
-        while self._engaged and work in self._queue and not isinstance(request, Trajectory):
+        while (self._takeover.engaged and work in self._planning
+               and not isinstance(request, Trajectory)):
             # Short work, which whoever asks wants to be done.
             self._work_on()
-        return _WAITING if work in self._queue else self.verdict
+        return _WAITING if work in self._planning else self.verdict
 
     def applied(self, joint: str, stamp: int, flux_density: float) -> None:
         """Take in that a joint's level in T has really been in force from a stamp in ns on."""
-        if self._engaged:
-            self._outputs += self.following.applied(joint, stamp, flux_density, self.settings)
+        if self._takeover.engaged:
+            self._bulletin.outputs += self.following.applied(
+                joint, stamp, flux_density, self.settings)
         else:
             self.following.newest[joint] = stamp, flux_density
 
@@ -147,20 +154,23 @@ class PlannerRuntime:
             self, joint: str, stamp: int, stretch: float, rate: float,
             flux_density: float) -> None:
         """Take in a sample: stamp in ns, stretch, rate in 1/s and flux density in T."""
-        self._samples.add(joint, Sample(stamp, stretch, rate, flux_density))
+        if self._takeover.waiting or not self._takeover.engaged:
+            self._takeover.samples.add(joint, Sample(stamp, stretch, rate, flux_density))
+        self._watch.add(joint, stamp, stretch, self._clock())
 
     def clock_set_back(self, back: int) -> None:
         """Begin anew where the clock was set back by some ns; the state in force is read again."""
         self.clock_jumps += 1
         self.group.restart()
         self.following.restart()
-        self._queue.clear()
-        self._samples.clear()
-        self._engaged, self._patience = False, None
+        self._planning.clear()
+        self._watch.restart()
+        self._takeover.drop()
+        self._takeover.engaged = False
         last, self._last_jump = self._last_jump, self._steady()
         if last is not None and self._last_jump - last < _STORM:
             return
-        self._give(Verdict(
+        self._bulletin.give(Verdict(
             Severity.WARN, 'clock_jumped',
             f'the clock jumped back by {back / NANOSECONDS:.3f} s: the plan is dropped, and the '
             'actuator is assumed at its initial stretch unless joint_states shows otherwise'),
@@ -169,25 +179,25 @@ class PlannerRuntime:
     def deactivate(self) -> None:
         """Come to rest, for which all commands are sent now, and take no more requests."""
         self.active = False
-        self._patience = None
         # What is seen before the joints have come to rest is not where they are later.
-        self._samples.clear()
-        self._queue.clear()
+        self._takeover.drop()
+        self._planning.clear()
         now = self._clock()
-        if self._engaged and now:
+        if self._takeover.engaged and now:
             work = work_on(Stop(), self.group, self._clock)
-            while not self._advance(work):
+            while not self._planning.advance(work):
                 pass
-            self._send_until(now, _FAR)
-            self._give(Verdict(Severity.OK, 'stopped', 'deactivated: coming to rest'))
-        self._engaged = False
+            self._sending.send(now, everything=True)
+            self._watch.restart()
+            self._bulletin.give(Verdict(Severity.OK, 'stopped', 'deactivated: coming to rest'))
+        self._takeover.engaged = False
 
     def change(
             self, settings: Settings, models: Mapping[str, Model], *,
             simultaneous: bool) -> None:
         """Take other settings now, and other models by joint from the next request on."""
         if settings.heartbeat_period != self.settings.heartbeat_period:
-            self._next_beat = self._clock() + settings.heartbeat_period
+            self._sending.next_beat = self._clock() + settings.heartbeat_period
         self.settings = settings
         for name, model in models.items():
             self.group.planners[name].take_model(model)
@@ -197,20 +207,25 @@ class PlannerRuntime:
 
     @property
     def wants_samples(self) -> bool:
-        """Whether samples are waited for."""
-        return self._patience is not None
+        """Whether samples are waited for now, or will be of use soon."""
+        return self._takeover.waiting or self.active and self._watch.open
+
+    def looks_at(self, stamp: int) -> bool:
+        """Return whether a sample with a stamp in ns is of use; most are not."""
+        return self._takeover.waiting or self._watch.wants(stamp)
 
     @property
     def wake(self) -> int | None:
         """Time in ns at which there is something to do next; None for never, 0 for now."""
-        if self._queue or self._patience is not None or self._outputs:
+        if self._planning or self._takeover.waiting or self._bulletin.outputs:
             return 0
-        if not self._engaged:
+        if not self._takeover.engaged:
             return None
         now = self._clock()
-        times = [self.group.next_event(now), self._preview_again]
+        times = [
+            self.group.next_event(now), self._bulletin.preview_again, self._watch.wake(now)]
         if self.settings.heartbeat_period:
-            times.append(self._next_beat)
+            times.append(self._sending.next_beat)
         if self.following.astray:
             times.append(0)
         return min((x for x in times if x is not None), default=None)
@@ -230,66 +245,49 @@ class PlannerRuntime:
             To be passed on in this order.
 
         """
-        self._wait()
-        if self._engaged and self.active:
+        self._engage()
+        if self._takeover.engaged and self.active:
             if self.settings.replan_late:
-                self._outputs += self.following.drop_missed(
+                self._bulletin.outputs += self.following.drop_missed(
                     now, self.settings.lateness_tolerance)
             if self.following.astray:
                 # Before more of a plan is sent that does not hold.
                 self._work_on()
-            self._send_until(now)
-            self._beat(now)
+            self._sending.send(now)
+            self._sending.beat(now, self.settings)
         self._work_on()
-        if self._preview_again is not None and now >= self._preview_again:
-            self._show()
-        if self.group.progress(self._clock()) != self._progress:
-            self._tell()
-        outputs, self._outputs = self._outputs, []
+        if self._bulletin.preview_again is not None and now >= self._bulletin.preview_again:
+            self._bulletin.show()
+        self._bulletin.tell_progress()
+        if self.active and (self._watch.open or self._bulletin.unheard
+                            or self.group.next_event(now) is not None):
+            self._bulletin.look_for_listeners()
+            self._judge(now)
+        outputs = self._bulletin.outputs.copy()
+        self._bulletin.outputs.clear()
         return outputs
 
     # -- the state in force --------------------------------------------------------------------
 
-    def _begin_to_wait(self) -> None:
-        """Wait for samples of where the joints are, if there is somebody to give them."""
-        if self._engaged or self._patience is not None:
-            return
-        patience = self.settings.takeover_timeout
-        if patience and self._observable():
-            self._patience = self._steady() + patience
-            self._wait()
-        else:
-            self._engage()
-
-    def _wait(self) -> None:
-        """Go on from the samples there are, once there is nothing more to wait for."""
-        if self._patience is None:
-            return
-        samples = self._samples.fresh(self._clock(), self.settings.takeover_max_age)
-        if len(samples) < len(self.group.planners) and self._steady() <= self._patience:
-            return
-        self._patience = None
-        for name, planner in self.group.planners.items():
-            if name not in samples:
-                self._note(
-                    f'no sample of joint {name} on joint_states: it is assumed at rest at its '
-                    'initial stretch')
-                continue
-            x = samples[name]
-            level = self.following.newest.get(name)
-            try:
-                planner.take_over(
-                    x.stamp, x.stretch, x.rate, x.flux_density,
-                    level[1] if level is not None and level[0] <= x.stamp else None)
-            except BadInputError as error:
-                self._note(f'sample of joint {name} ignored: {error}')
-        self._engage()
-
-    def _engage(self) -> None:
-        self._engaged = True
-        self._next_beat = self._clock() + self.settings.heartbeat_period
+    def _engage(self, *, begin: bool = False) -> None:
+        """Go on from where the joints are, as soon as that is known."""
+        engaged = self._takeover.engaged
+        if begin:
+            self._takeover.begin(self.settings)
+        for note in self._takeover.go_on(self.settings, self.following.newest):
+            self._bulletin.note(note)
+        if self._takeover.engaged and not engaged:
+            self._sending.next_beat = self._clock() + self.settings.heartbeat_period
 
     # -- planning ------------------------------------------------------------------------------
+
+    def refuse(self, error: HmsaError, request: Request) -> Verdict:
+        """Answer a request that cannot be read or carried out."""
+        return self._planning.refuse(error, request)
+
+    def _work_on(self) -> None:
+        if self._takeover.engaged:
+            self._planning.work_on()
 
     def _check(self, request: Request) -> None:
         if not self.active:
@@ -303,152 +301,26 @@ class PlannerRuntime:
                 'simulator, or set use_sim_time to false)')
         check_joints(request, tuple(self.group.planners), self.settings)
 
-    def _supersede(self, work: Work) -> None:
-        """Drop what came before and would be replaced as soon as it is planned."""
-        for old in list(self._queue):
-            if old.number < work.number and old.joints <= work.joints and not work.postponed:
-                self._queue.remove(old)
-                if old.request is not None:
-                    self._give(Verdict(
-                        Severity.WARN, 'superseded', 'another request came before this one was '
-                        'planned', old.request.name))
-
-    def _work_on(self) -> None:
-        """Plan what waits, for the length of a slice."""
-        if not self._engaged:
-            return
-        for name in self.following.to_resume():
-            if not any(x.request is None and name in x.joints for x in self._queue):
-                self._queue.appendleft(self.following.resumption(name, self._clock))
-        end = self._steady() + _SLICE
-        while self._queue and self._steady() < end:
-            work = self._queue[0]
-            if self._advance(work) and work in self._queue:
-                self._queue.remove(work)
-        if self.following.given_up:
-            self._give_up()
-
-    def _advance(self, work: Work) -> bool:
-        """Go on with one piece of work; say whether it is done."""
-        try:
-            next(work.steps)
-        except StopIteration as end:
-            drafts, now = end.value
-            if work.request is None:
-                self._resume(work, drafts, now)
-            else:
-                self._supersede(work)
-                self._answer(work.request, drafts, now)
-        except HmsaError as error:
-            if work.request is None:
-                self._give(self.following.abandon(work, error, self.verdict.request), log=True)
-            else:
-                self.refuse(error, work.request)
-        else:
-            return False
-        return True
-
-    def _answer(self, request: Request, drafts: Mapping[str, Draft], now: int) -> None:
-        """Begin to carry out a request."""
-        self.following.astray -= drafts.keys()
-        changed = self.group.take(drafts, now)
-        # First, since reporting takes time.
-        self._send_until(self._clock())
-        warnings = [x.warning for x in drafts.values() if x.warning is not None]
-        if changed:
-            self._show()
-        if warnings:
-            self._give(Verdict(
-                Severity.WARN, str(warnings[0].code), warnings[0].reason, request.name), log=True)
-        elif changed:
-            self._give(Verdict(Severity.OK, 'accepted', 'accepted', request.name))
-        else:
-            self._give(Verdict(
-                Severity.OK, 'unchanged', 'already on the way there: the plan is unchanged',
-                request.name))
-
-    def refuse(self, error: HmsaError, request: Request) -> Verdict:
-        """Answer a request that cannot be read or carried out."""
-        code = Code.BAD_INPUT if isinstance(error, BadInputError) else Code.NOT_CONVERGED
-        if isinstance(error, RefusedError):
-            code = error.code
-        self.refused += 1
-        self._give(Verdict(Severity.ERROR, str(code), str(error), request.name))
-        self._outputs.append(Note(Severity.ERROR, f'request refused ({code}): {error}'))
-        return self.verdict
-
     # -- what comes of it ----------------------------------------------------------------------
 
-    def _resume(self, work: Work, drafts: Mapping[str, Draft], now: int) -> None:
-        """Go on with a plan that was made anew."""
-        verdict = self.following.resume(work, drafts, now, self.verdict.request)
-        self._send_until(self._clock())
-        if verdict is not None:
-            self._show()
-            self._give(verdict, log=self.following.tell_replanned())
-
-    def _give_up(self) -> None:
-        verdict = self.following.give_up(self._lead_time, self.verdict.request)
-        self._give(verdict, log=self.following.tell_replanned())
-
-    @property
-    def _lead_time(self) -> int:
-        return next(iter(self.group.planners.values())).options.lead_time
-
-    def _send_until(self, now: int, until: int | None = None) -> None:
-        for name, planner in self.group.planners.items():
-            for level in planner.due(now if until is None else until):
-                self._outputs.append(Send(name, level.stamp, level.flux_density))
-                self.sent += 1
-                self._outputs += self.following.sent(name, level.stamp, now)
-
-    def _beat(self, now: int) -> None:
-        """Send the level in force again: who listens learns that somebody is there."""
-        period = self.settings.heartbeat_period
-        if not period or now < self._next_beat:
+    def _judge(self, now: int) -> None:
+        """Judge arrivals by what was measured."""
+        if not self._watch.open:
             return
-        self._next_beat = now + period
-        if self.settings.replan_late:
-            self.following.look_for_unheard(now)
-        for name, planner in self.group.planners.items():
-            level = planner.last_sent
-            stamp = planner.beat_stamp(now)
-            following = planner.next_stamp
-            if following is None or stamp < following:
-                self._outputs.append(Send(name, stamp, level.flux_density))
-                self.heartbeats += 1
+        found, end = [], self._steady() + SLICE
+        observable = self._observable()
+        while self._steady() < end:
+            finding = self._watch.judge(now, self.settings.tolerances, observable=observable)
+            if finding is None:
+                break
+            found.append(finding)
+        if found or not self._watch.open:
+            self._bulletin.found(found)
 
     # -- reports -------------------------------------------------------------------------------
 
     def report(self) -> tuple[Severity, str, dict[str, object]]:
         """Return how commands fare: severity, a sentence and counters."""
-        late = self.following.lateness
-        message = 'commands sent in time'
-        if late.count:
-            message = f'{late.count} commands late: {late.advice(self._lead_time)}'
-        return Severity.WARN if late.count else Severity.OK, message, {
-            'sent': self.sent, 'late': late.count, 'refused': self.refused,
-            'replanned': self.following.replanned, 'heartbeats': self.heartbeats,
-            'largest_lateness_ms': f'{late.largest / 1e6:.3f}',
-            'clock_jumps': self.clock_jumps}
-
-    def _give(self, verdict: Verdict, *, log: bool = False) -> None:
-        self.verdict = verdict
-        if log:
-            self._note(verdict.message)
-        self._tell()
-
-    def _note(self, message: str) -> None:
-        self._outputs.append(Note(Severity.WARN, message))
-
-    def _tell(self) -> None:
-        self._progress = self.group.progress(self._clock())
-        self._outputs.append(StatusChanged(
-            self.verdict, *self._progress, self.group.number, self.following.lateness.count,
-            self.following.replanned))
-
-    def _show(self) -> None:
-        """Show what is planned; of a long plan the beginning, and the rest in time."""
-        stamps, samples = self.group.preview(self._clock(), _PREVIEW)
-        self._preview_again = stamps[_PREVIEW // 2] if len(stamps) == _PREVIEW else None
-        self._outputs.append(PlanChanged(tuple(stamps), samples))
+        severity, message, counters = self._sending.report()
+        return severity, message, {
+            **counters, 'refused': self._planning.refused, 'clock_jumps': self.clock_jumps}

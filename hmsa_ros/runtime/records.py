@@ -7,6 +7,7 @@ from enum import IntEnum
 from hmsa_ros.core.group import Progress
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.runtime.measured import Finding, Tolerances
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,8 @@ class Settings:
         Setpoints that one request may have, those of all joints together.
     allow_partial_joints : bool
         Whether a trajectory may be for some of the joints.
+    tolerances : Tolerances
+        What counts as having arrived, where it is measured.
 
     Raises
     ------
@@ -45,6 +48,7 @@ class Settings:
     takeover_max_age: int = NANOSECONDS // 2
     max_points: int = 100_000
     allow_partial_joints: bool = False
+    tolerances: Tolerances = field(default_factory=Tolerances)
 
     def __post_init__(self) -> None:
         """Check the numbers."""
@@ -182,6 +186,14 @@ class StatusChanged:
         Of each.
     plan, late, replanned : int
         Accepted requests, late commands, and plans made anew so far.
+    findings : mapping of str to Finding
+        By joint, what was measured at the newest setpoint that has been judged.
+    worst : Finding or None
+        The worst since the last request.
+    watching : bool
+        Whether setpoints that have begun are still to be judged.
+    unheard : str
+        Why nobody carries out commands; empty where somebody does.
 
     """
 
@@ -191,6 +203,10 @@ class StatusChanged:
     plan: int
     late: int
     replanned: int
+    findings: Mapping[str, Finding] = field(default_factory=dict)
+    worst: Finding | None = None
+    watching: bool = False
+    unheard: str = ''
 
 
 @dataclass(frozen=True)

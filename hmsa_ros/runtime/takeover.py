@@ -1,8 +1,13 @@
 """The state in force, waited for before the first command."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 import math
+
+from hmsa_ros.core.group import PlannerGroup
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.runtime.records import Settings
+from hmsa_ros.runtime.slices import Clock
 
 
 @dataclass(frozen=True)
@@ -49,3 +54,94 @@ class Observations:
         """Return by joint the samples that are not older than an age; times in ns."""
         return {
             joint: x for joint, x in self._newest.items() if abs(now - x.stamp) <= max_age}
+
+
+class Takeover:
+    """
+    Waits for samples of where the joints are before the first request, and goes on from there.
+
+    Parameters
+    ----------
+    group : PlannerGroup
+        The joints.
+    clock, steady : callable
+        Return the present time in ns: that of the stamps, and one that patience is measured by.
+    observable : callable
+        Returns whether somebody may give samples.
+
+    Attributes
+    ----------
+    engaged : bool
+        Whether it is known where the joints are, or they are taken to rest.
+
+    """
+
+    def __init__(
+            self, group: PlannerGroup, clock: Clock, steady: Clock,
+            observable: Callable[[], bool]) -> None:
+        """Begin with nothing known."""
+        self._group, self._clock, self._steady = group, clock, steady
+        self._observable = observable
+        self._until: int | None = None
+        self.engaged = False
+        self.samples = Observations(group.planners)
+
+    @property
+    def waiting(self) -> bool:
+        """Whether samples are waited for."""
+        return self._until is not None
+
+    def begin(self, settings: Settings) -> None:
+        """Wait for samples, if there is somebody to give them."""
+        if self.engaged or self.waiting:
+            return
+        if settings.takeover_timeout and self._observable():
+            self._until = self._steady() + settings.takeover_timeout
+        else:
+            self.engaged = True
+
+    def drop(self) -> None:
+        """Wait for nothing, and forget the samples."""
+        self._until = None
+        self.samples.clear()
+
+    def go_on(
+            self, settings: Settings, newest: Mapping[str, tuple[int, float]]) -> list[str]:
+        """
+        Go on from the samples there are, once there is nothing more to wait for.
+
+        Parameters
+        ----------
+        settings : Settings
+            How old they may be.
+        newest : mapping of str to (int, float)
+            Stamp in ns and level in T of the newest change of each joint.
+
+        Returns
+        -------
+        list of str
+            Why samples do not count, in a sentence each.
+
+        """
+        if self._until is None:
+            return []
+        samples = self.samples.fresh(self._clock(), settings.takeover_max_age)
+        if len(samples) < len(self._group.planners) and self._steady() <= self._until:
+            return []
+        self._until, self.engaged = None, True
+        notes = []
+        for name, planner in self._group.planners.items():
+            if name not in samples:
+                notes.append(
+                    f'no sample of joint {name} on joint_states: it is assumed at rest at its '
+                    'initial stretch')
+                continue
+            x = samples[name]
+            level = newest.get(name)
+            try:
+                planner.take_over(
+                    x.stamp, x.stretch, x.rate, x.flux_density,
+                    level[1] if level is not None and level[0] <= x.stamp else None)
+            except BadInputError as error:
+                notes.append(f'sample of joint {name} ignored: {error}')
+        return notes

@@ -26,6 +26,8 @@ _STOP_SECONDS = 15.0
 _GONE_SECONDS = 3.0
 # How long a recorder is seen before it is taken to hear.
 _SETTLED_SECONDS = 1.0
+# Whoever carries out commands may not have been found yet.
+_UNHEARD_SECONDS = 3.0
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,13 @@ class Verdict:
         Progress: idle, waiting, moving, holding, settling, at_rest.
     setpoint, setpoints : int
         Which one is under way, from 1, and how many there are.
+    watching : bool
+        Whether setpoints that have begun are still to be judged by samples.
+    measured, finding : str
+        The worst that was measured since the request, in a word and in a sentence; empty where
+        nothing has been judged.
+    unheard : str
+        Why nobody carries out commands; empty where somebody does.
 
     """
 
@@ -57,6 +66,22 @@ class Verdict:
     state: str
     setpoint: int
     setpoints: int
+    watching: bool = False
+    measured: str = ''
+    finding: str = ''
+    unheard: str = ''
+
+    @property
+    def failure(self) -> str:
+        """Why what was measured counts as a failure; empty if it does not."""
+        return self.finding if self.measured in ('off_target', 'vibrating') else ''
+
+    @property
+    def basis(self) -> str:
+        """What the state is known from, in words."""
+        if self.measured == 'arrived':
+            return 'measured'
+        return 'predicted, not measured' if self.measured in ('', 'unobserved') else self.finding
 
     @classmethod
     def from_message(cls, message: DiagnosticStatus) -> 'Verdict':
@@ -78,7 +103,9 @@ class Verdict:
         return cls(
             message.level[0], printable(message.message), values.get('code', ''),
             values.get('request', ''), values.get('state', ''),
-            whole(values.get('setpoint')), whole(values.get('setpoints')))
+            whole(values.get('setpoint')), whole(values.get('setpoints')),
+            values.get('watching') == 'True', values.get('worst', ''),
+            values.get('worst_message', ''), values.get('unheard', ''))
 
 
 _SILENCE = Verdict(0, 'no reply from the planner yet', '', '', '', 0, 0)
@@ -291,7 +318,7 @@ class PlannerClient:
             self, verdict: Verdict, *, each: Callable[[Verdict], None] | None = None,
             timeout: float) -> Verdict:
         """
-        Wait until a sequence has been carried out.
+        Wait until a sequence has been carried out, and judged where it is measured.
 
         Parameters
         ----------
@@ -310,16 +337,27 @@ class PlannerClient:
         Raises
         ------
         HmsaError
-            If another request took its place, or it takes too long.
+            If another request took its place, nobody carries out the commands, or it takes too
+            long.
 
         """
+        heard = monotonic()
+
         def done() -> bool:
             now = self._verdict
             if now.request != verdict.request:
                 raise HmsaError(
                     'the sequence was not completed: another request replaced it '
                     f'({now.message})')
-            return now.setpoint == now.setpoints and now.state in ('at_rest', 'settling')
+            nonlocal heard
+            ended = (
+                now.setpoint == now.setpoints and now.state in ('at_rest', 'settling')
+                and not now.watching)
+            if not now.unheard:
+                heard = monotonic()
+            elif ended or monotonic() - heard > _UNHEARD_SECONDS:
+                raise HmsaError(f'the sequence is not carried out: {now.unheard}')
+            return ended
 
         self.spin_until(
             done, 'the sequence has not finished',

@@ -1,0 +1,129 @@
+"""What a runtime tells: verdicts, progress and previews, in the order in which they happen."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+from hmsa_ros.core.group import PlannerGroup, Progress
+from hmsa_ros.runtime.following import Following
+from hmsa_ros.runtime.measured import Finding
+from hmsa_ros.runtime.records import (
+    Note,
+    Output,
+    PlanChanged,
+    Severity,
+    StatusChanged,
+    Verdict,
+)
+from hmsa_ros.runtime.slices import Clock
+from hmsa_ros.runtime.watching import Watch
+
+# Changes of level in one preview.
+_PREVIEW = 500
+# How often it is looked whether somebody listens, in ns.
+_LOOK = 200_000_000
+
+
+class Bulletin:
+    """
+    Outputs that wait to be passed on.
+
+    Parameters
+    ----------
+    group : PlannerGroup
+        The joints.
+    following : Following
+        Counts what comes late.
+    watch : Watch
+        Knows what was measured.
+    clock, steady : callable
+        Return the present time in ns.
+    unheard : callable
+        Returns why nobody carries out commands; empty where somebody does.
+
+    Attributes
+    ----------
+    verdict : Verdict
+        The latest.
+    unheard : str
+        Why nobody carries out commands; empty where somebody does.
+    outputs : list of Output
+        To be passed on in this order.
+    preview_again : int or None
+        Time in ns from which the next part of a long plan is to be shown.
+
+    """
+
+    def __init__(
+            self, group: PlannerGroup, following: Following, watch: Watch, clock: Clock,
+            steady: Clock, unheard: Callable[[], str]) -> None:
+        """Say that there is no request yet."""
+        self._group, self._following, self._watch = group, following, watch
+        self._clock, self._steady, self._look = clock, steady, unheard
+        self._look_again = 0
+        self.unheard = ''
+        self.verdict = Verdict(Severity.OK, 'none', 'no request yet')
+        self.outputs: list[Output] = []
+        self.preview_again: int | None = None
+        self._told: tuple[Progress, Mapping[str, Progress], bool] | None = None
+        self.tell()
+
+    def give(self, verdict: Verdict, *, log: bool = False) -> None:
+        """Give a verdict."""
+        self.verdict = verdict
+        if log:
+            self.note(verdict.message)
+        self.tell()
+
+    def note(self, message: str) -> None:
+        """Have a sentence logged."""
+        self.outputs.append(Note(Severity.WARN, message))
+
+    def tell(self) -> None:
+        """Tell verdict and progress."""
+        self._told = self._state()
+        progress, each, watching = self._told
+        self.outputs.append(StatusChanged(
+            self.verdict, progress, each, self._group.number, self._following.lateness.count,
+            self._following.replanned, self._watch.findings, self._watch.worst, watching,
+            self.unheard))
+
+    def tell_progress(self) -> None:
+        """Tell it, if there is any."""
+        if self._state() != self._told:
+            self.tell()
+
+    def _state(self) -> tuple[Progress, Mapping[str, Progress], bool]:
+        now = self._clock()
+        self._watch.follow(now)
+        return *self._group.progress(now), self._watch.open
+
+    def show(self) -> None:
+        """Show what is planned; of a long plan the beginning, and the rest in time."""
+        stamps, samples = self._group.preview(self._clock(), _PREVIEW)
+        self.preview_again = stamps[_PREVIEW // 2] if len(stamps) == _PREVIEW else None
+        self.outputs.append(PlanChanged(tuple(stamps), samples))
+
+    def found(self, findings: Sequence[Finding]) -> None:
+        """Tell what was measured; the verdict is the worst since the request."""
+        worst, severity = self._watch.worst, self.verdict.severity
+        bad = worst is not None and worst.code not in ('arrived', 'unobserved')
+        if worst is None or severity is Severity.ERROR or not bad and (
+                not self._watch.finished
+                or worst.code == 'unobserved' and severity is Severity.WARN):
+            self.tell()
+            return
+        self.give(
+            Verdict(
+                Severity.WARN if bad else Severity.OK, worst.code, worst.message,
+                self.verdict.request), log=bad and worst in findings)
+
+    def look_for_listeners(self) -> None:
+        """Warn where nobody carries out what is sent, and say when somebody does."""
+        now = self._steady()
+        if now < self._look_again:
+            return
+        self._look_again = now + _LOOK
+        before, self.unheard = self.unheard, self._look()
+        if self.unheard == before:
+            return
+        self.note(self.unheard or 'commands are carried out now')
+        self.tell()

@@ -1,0 +1,174 @@
+"""Requests that wait to be planned, and what comes of planning them."""
+
+from collections import deque
+from collections.abc import Callable, Mapping
+
+from hmsa_ros.core.group import PlannerGroup
+from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.core.timeline import Draft
+from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.runtime.bulletin import Bulletin
+from hmsa_ros.runtime.following import Following
+from hmsa_ros.runtime.records import Note, Request, Severity, Verdict
+from hmsa_ros.runtime.slices import Clock, Work, work_on
+
+#: How long planning goes on before commands and requests are served again, in ns.
+SLICE = 4_000_000
+
+
+class Planning:
+    """
+    Plans what waits in slices, and answers.
+
+    Parameters
+    ----------
+    group : PlannerGroup
+        The joints.
+    following : Following
+        Knows plans that are to be made anew.
+    bulletin : Bulletin
+        Takes the answers.
+    clock, steady : callable
+        Return the present time in ns.
+    send : callable
+        Sends the commands that are due by now.
+
+    Attributes
+    ----------
+    refused : int
+        Requests that were.
+
+    """
+
+    def __init__(
+            self, group: PlannerGroup, following: Following, bulletin: Bulletin, clock: Clock,
+            steady: Clock, send: Callable[[], None]) -> None:
+        """Begin with nothing to do."""
+        self._group, self._following, self._bulletin = group, following, bulletin
+        self._clock, self._steady, self._send = clock, steady, send
+        self._queue: deque[Work] = deque()
+        self.refused = 0
+
+    def __bool__(self) -> bool:
+        """Return whether something waits."""
+        return bool(self._queue)
+
+    def __contains__(self, work: Work) -> bool:
+        """Return whether a piece of work still waits."""
+        return work in self._queue
+
+    def clear(self) -> None:
+        """Drop what waits."""
+        self._queue.clear()
+
+    def add(self, request: Request, *, engaged: bool) -> Work:
+        """
+        Take a request; one that replaces all that waits is planned before it.
+
+        Parameters
+        ----------
+        request : Request
+            Checked.
+        engaged : bool
+            Whether it is known where the joints are.
+
+        Returns
+        -------
+        Work
+            That waits now.
+
+        """
+        work = work_on(request, self._group, self._clock)
+        if engaged and work.replaces(self._queue):
+            self._queue.appendleft(work)
+        else:
+            self._queue.append(work)
+        return work
+
+    def _supersede(self, work: Work) -> None:
+        """Drop what came before and would be replaced as soon as it is planned."""
+        for old in list(self._queue):
+            if old.number < work.number and old.joints <= work.joints and not work.postponed:
+                self._queue.remove(old)
+                if old.request is not None:
+                    self._bulletin.give(Verdict(
+                        Severity.WARN, 'superseded', 'another request came before this one was '
+                        'planned', old.request.name))
+
+    def work_on(self) -> None:
+        """Plan what waits, for the length of a slice."""
+        for name in self._following.to_resume():
+            if not any(x.request is None and name in x.joints for x in self._queue):
+                self._queue.appendleft(self._following.resumption(name, self._clock))
+        end = self._steady() + SLICE
+        while self._queue and self._steady() < end:
+            work = self._queue[0]
+            if self.advance(work) and work in self._queue:
+                self._queue.remove(work)
+        if self._following.given_up:
+            self._give_up()
+
+    def advance(self, work: Work) -> bool:
+        """Go on with one piece of work; say whether it is done."""
+        try:
+            next(work.steps)
+        except StopIteration as end:
+            drafts, now = end.value
+            if work.request is None:
+                self._resume(work, drafts, now)
+            else:
+                self._supersede(work)
+                self._answer(work.request, drafts, now)
+        except HmsaError as error:
+            if work.request is None:
+                self._bulletin.give(
+                    self._following.abandon(work, error, self._bulletin.verdict.request),
+                    log=True)
+            else:
+                self.refuse(error, work.request)
+        else:
+            return False
+        return True
+
+    def _answer(self, request: Request, drafts: Mapping[str, Draft], now: int) -> None:
+        """Begin to carry out a request."""
+        self._following.astray -= drafts.keys()
+        changed = self._group.take(drafts, now)
+        # First, since reporting takes time.
+        self._send()
+        warnings = [x.warning for x in drafts.values() if x.warning is not None]
+        if changed:
+            self._bulletin.show()
+        self._bulletin.look_for_listeners()
+        if warnings:
+            self._bulletin.give(Verdict(
+                Severity.WARN, str(warnings[0].code), warnings[0].reason, request.name), log=True)
+        elif changed:
+            self._bulletin.give(Verdict(Severity.OK, 'accepted', 'accepted', request.name))
+        else:
+            self._bulletin.give(Verdict(
+                Severity.OK, 'unchanged', 'already on the way there: the plan is unchanged',
+                request.name))
+
+    def refuse(self, error: HmsaError, request: Request) -> Verdict:
+        """Answer a request that cannot be read or carried out."""
+        code = Code.BAD_INPUT if isinstance(error, BadInputError) else Code.NOT_CONVERGED
+        if isinstance(error, RefusedError):
+            code = error.code
+        self.refused += 1
+        self._bulletin.give(Verdict(Severity.ERROR, str(code), str(error), request.name))
+        self._bulletin.outputs.append(Note(Severity.ERROR, f'request refused ({code}): {error}'))
+        return self._bulletin.verdict
+
+    def _resume(self, work: Work, drafts: Mapping[str, Draft], now: int) -> None:
+        """Go on with a plan that was made anew."""
+        verdict = self._following.resume(work, drafts, now, self._bulletin.verdict.request)
+        self._send()
+        if verdict is not None:
+            self._bulletin.show()
+            self._bulletin.give(verdict, log=self._following.tell_replanned())
+
+    def _give_up(self) -> None:
+        verdict = self._following.give_up(next(
+            iter(self._group.planners.values())).options.lead_time, self._bulletin.verdict.request)
+        self._bulletin.give(verdict, log=self._following.tell_replanned())
