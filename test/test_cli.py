@@ -97,7 +97,7 @@ def test_bad_input_is_answered_in_one_line_with_status_2(words, said, capsys):
 
 
 @pytest.mark.ros
-def test_send_reports_until_the_sequence_has_been_carried_out(start):
+def test_send_reports_until_the_sequence_has_been_carried_out(start, ros):
     # Commands far enough ahead for a busy machine.
     start.hmsa('planner', '--ros-args', '-p', 'lead_time:=0.5')
     # Nobody carries it out yet.
@@ -105,6 +105,7 @@ def test_send_reports_until_the_sequence_has_been_carried_out(start):
     assert send.wait(30.0) == 1, send.output
     assert 'not carried out: nobody subscribes to /flux_density_command' in send.stderr
     start.hmsa('plant')
+    ros.spin_until(lambda: ros.node.count_publishers('joint_states'), 'the plant')
     send = start.hmsa('send', '1.0:0.5', '1.1:0.1', '1.2:0.1', '--wait')
     assert send.wait(30.0) == 0, send.output
     assert 'accepted' in send.stdout
@@ -113,8 +114,28 @@ def test_send_reports_until_the_sequence_has_been_carried_out(start):
 
 
 @pytest.mark.ros
-def test_send_fails_where_the_actuator_is_measured_to_miss_the_setpoint(start):
+def test_send_trusts_a_driver_that_publishes_samples_alone(start, ros):
+    from hmsa_ros.nodes import interface
+
+    ros.collect(
+        interface.FLUX_DENSITY_COMMAND.type, 'flux_density_command',
+        interface.FLUX_DENSITY_COMMAND.qos)
+    start.hmsa('planner', '--ros-args', '-p', 'lead_time:=0.5')
+    ros.spin_until(lambda: ros.node.count_publishers('flux_density_command'), 'the planner')
+    send = start.hmsa('send', '1.1:0.1', '--wait')
+    assert send.wait(30.0) == 1, send.output
+    assert 'nobody reports levels that take effect' in send.stderr
+    ros.publisher(
+        interface.JOINT_STATES.type, 'joint_states', interface.JOINT_STATES.qos)
+    send = start.hmsa('send', '1.2:0.1', '--wait')
+    assert send.wait(30.0) == 0, send.output
+    assert 'done: at_rest, predicted, not measured' in send.stdout
+
+
+@pytest.mark.ros
+def test_send_fails_where_the_actuator_is_measured_to_miss_the_setpoint(start, ros):
     start.hmsa('plant', '--ros-args', '-p', 'mismatch.shear_modulus:=1.1')
+    ros.spin_until(lambda: ros.node.count_publishers('joint_states'), 'the plant')
     start.hmsa('planner', '--ros-args', '-p', 'lead_time:=0.5')
     send = start.hmsa('send', '1.0:0.5', '1.4:0.5', '--wait', '--timeout', '30')
     assert send.wait(60.0) == 1, send.output
@@ -133,6 +154,7 @@ def test_send_moves_several_joints_each_to_its_stretch_or_all_to_one(start, ros)
     plans = ros.collect(interface.PLAN.type, 'planner/plan', interface.PLAN.qos)
     joints = ['--ros-args', '-p', 'joints:=[left, right]']
     start.hmsa('plant', *joints)
+    ros.spin_until(lambda: ros.node.count_publishers('joint_states'), 'the plant')
     start.hmsa('planner', *joints, '-p', 'lead_time:=0.5')
     send = start.hmsa(
         'send', '1.1,0.9:0.2', '1.2:0.2', '--joint', 'right,left', '--wait')

@@ -134,6 +134,25 @@ def test_samples_that_stay_away_or_are_too_few_are_no_verdict():
     assert loop.status.worst.message.startswith('setpoint 1 of 2: 1.2 is predicted, not measured')
 
 
+def test_a_source_that_lags_seconds_behind_is_waited_for_and_a_frozen_one_is_not():
+    loop = Loop()
+    late = [(START + x * MS, 1.0) for x in range(-1600, 0)]
+
+    def lag(samples):
+        late.extend(samples)
+        return [late.pop(0)]
+
+    loop.spoil = lag
+    loop.run((1.2, HOLD))
+    assert loop.status.watching
+    loop.run((1.2, HOLD))
+    assert loop.status.verdict.code == 'arrived'
+    loop = Loop()
+    loop.spoil = lambda samples: [(START, 1.0)]
+    loop.run((1.2, HOLD))
+    assert loop.status.verdict.code == 'unobserved'
+
+
 def test_bad_samples_change_nothing():
     loop, kept = Loop(noise=1e-4), []
 

@@ -211,12 +211,19 @@ class PlannerGroup:
 
     def next_event(self, now: int) -> int | None:
         """Return when (ns) a command is due or a setpoint begins or is reached next, or None."""
-        times = [
-            planner.next_stamp - planner.options.lead_time
-            for planner in self.planners.values() if planner.next_stamp is not None]
-        for planner in self.planners.values():
-            times += _changes(planner.plan, now)
-        return min(times, default=None)
+        times = (self.next_command(), self.next_change(now))
+        return min((x for x in times if x is not None), default=None)
+
+    def next_command(self) -> int | None:
+        """Return the time in ns at which a command is to be handed out; None for none."""
+        times = ((x.next_stamp, x.options.lead_time) for x in self.planners.values())
+        return min((stamp - lead for stamp, lead in times if stamp is not None), default=None)
+
+    def next_change(self, now: int) -> int | None:
+        """Return the time in ns after now at which progress changes; None for never."""
+        return min((
+            x for planner in self.planners.values() for x in _changes(planner.plan, now)
+        ), default=None)
 
     def progress(self, now: int) -> tuple[Progress, dict[str, Progress]]:
         """Return how far all joints have come (as the one with most to do), and each by name."""

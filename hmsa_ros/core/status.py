@@ -10,7 +10,8 @@ class Code(str, Enum):
     """
     The outcome of a move or a request; the value is what messages and files carry.
 
-    The first eight are plans that can be carried out, the others refusals.
+    The first eight are plans that can be carried out, the next ones refusals, and the last four
+    what was measured.
     """
 
     TWO_STEP = 'two_step'
@@ -35,6 +36,11 @@ class Code(str, Enum):
     TOO_LONG = 'too_long'
     NO_TIME = 'no_time'
     INACTIVE = 'inactive'
+
+    ARRIVED = 'arrived'
+    OFF_TARGET = 'off_target'
+    VIBRATING = 'vibrating'
+    UNOBSERVED = 'unobserved'
 
     def __str__(self) -> str:
         """Return the value."""
@@ -102,6 +108,17 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
     Code.INACTIVE: (
         'The planner is a managed node and is not active.',
         'Activate it: ros2 lifecycle set /planner activate.'),
+    Code.ARRIVED: (
+        'Measured: the stretch rests at the setpoint, within the tolerances.', ''),
+    Code.OFF_TARGET: (
+        'Measured: the stretch rests farther from the setpoint than arrival_tolerance.',
+        "Correct the actuator's parameters, as with hmsa identify, or raise the tolerance."),
+    Code.VIBRATING: (
+        'Measured: the stretch vibrates about the setpoint by more than vibration_tolerance.',
+        "Correct the actuator's parameters, as with hmsa identify, or raise the tolerance."),
+    Code.UNOBSERVED: (
+        'Predicted, not measured: no samples came while the setpoint was held, or too few.',
+        'Publish joint_states to have it measured; or hold the setpoint longer.'),
 }
 
 

@@ -39,10 +39,11 @@ class JointChannel:
         """Return why nobody carries out the commands; empty where somebody does."""
         if not self._command.get_subscription_count():
             return f'nobody subscribes to {self._command.topic_name}: start a plant or a driver'
-        if not self._node.count_publishers(self._applied):
+        if not self._node.count_publishers(self._applied) and not self._node.count_publishers(
+                interface.JOINT_STATES.name):
             return (
-                f'nobody reports on {self._applied} which levels took effect: start a plant, or '
-                'a driver that does')
+                f'nobody reports levels that take effect ({self._applied}) or samples '
+                '(joint_states): start a plant, or a driver that does')
         return ''
 
     def _on_setpoint(self, message: Float64) -> None:

@@ -147,7 +147,7 @@ def to_planner_status(status: 'StatusChanged') -> DiagnosticStatus:
         **vars(progress), 'late': status.late, 'replanned': status.replanned, **verdict.figures,
         'watching': status.watching}
     if status.worst is not None:
-        values |= {'worst': status.worst.code, 'worst_message': status.worst.message}
+        values |= {'worst': str(status.worst.code), 'worst_message': status.worst.message}
     for name, of_joint in each.items():
         prefix = f'{name}.' if len(each) > 1 else ''
         found = status.findings.get(name)

@@ -3,6 +3,8 @@
 from collections.abc import Callable, Mapping, Sequence
 
 from hmsa_ros.core.group import PlannerGroup, Progress
+from hmsa_ros.core.status import Code
+from hmsa_ros.core.timeline import PlannedSegment
 from hmsa_ros.runtime.following import Following
 from hmsa_ros.runtime.measured import Finding
 from hmsa_ros.runtime.records import (
@@ -64,6 +66,9 @@ class Bulletin:
         self.outputs: list[Output] = []
         self.preview_again: int | None = None
         self._told: tuple[Progress, Mapping[str, Progress], bool] | None = None
+        # What progress follows from, and until when it stays as it is.
+        self._segments: list[tuple[PlannedSegment, ...]] = []
+        self._until: int | None = None
         self.tell()
 
     def give(self, verdict: Verdict, *, log: bool = False) -> None:
@@ -88,13 +93,26 @@ class Bulletin:
 
     def tell_progress(self) -> None:
         """Tell it, if there is any."""
-        if self._state() != self._told:
+        if not self._unchanged(self._clock()) and self._state() != self._told:
             self.tell()
+
+    def _unchanged(self, now: int) -> bool:
+        """Return whether all plans are as they were and nothing in them has begun or ended."""
+        planners = self._group.planners.values()
+        return (self._until is None or now < self._until) and all(
+            x.plan.segments is known for x, known in zip(planners, self._segments, strict=True))
 
     def _state(self) -> tuple[Progress, Mapping[str, Progress], bool]:
         now = self._clock()
         self._watch.follow(now)
+        self._segments = [x.plan.segments for x in self._group.planners.values()]
+        self._until = self._group.next_change(now)
         return *self._group.progress(now), self._watch.open
+
+    @property
+    def next_change(self) -> int | None:
+        """Time in ns at which progress changes next; None for never."""
+        return self._until
 
     def show(self) -> None:
         """Show what is planned; of a long plan the beginning, and the rest in time."""
@@ -105,15 +123,15 @@ class Bulletin:
     def found(self, findings: Sequence[Finding]) -> None:
         """Tell what was measured; the verdict is the worst since the request."""
         worst, severity = self._watch.worst, self.verdict.severity
-        bad = worst is not None and worst.code not in ('arrived', 'unobserved')
+        bad = worst is not None and worst.code not in (Code.ARRIVED, Code.UNOBSERVED)
         if worst is None or severity is Severity.ERROR or not bad and (
                 not self._watch.finished
-                or worst.code == 'unobserved' and severity is Severity.WARN):
+                or worst.code == Code.UNOBSERVED and severity is Severity.WARN):
             self.tell()
             return
         self.give(
             Verdict(
-                Severity.WARN if bad else Severity.OK, worst.code, worst.message,
+                Severity.WARN if bad else Severity.OK, str(worst.code), worst.message,
                 self.verdict.request), log=bad and worst in findings)
 
     def look_for_listeners(self) -> None:

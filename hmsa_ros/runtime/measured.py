@@ -6,9 +6,10 @@ import math
 import numpy as np
 
 from hmsa_ros.core.model import Array
+from hmsa_ros.core.status import Code
 
 #: Codes of a finding, the better ones first.
-CODES = ('arrived', 'unobserved', 'vibrating', 'off_target')
+CODES = (Code.ARRIVED, Code.UNOBSERVED, Code.VIBRATING, Code.OFF_TARGET)
 
 # Of a vibration that fades there must be so many samples before so many times its time constant,
 # where the frequency is not seen.
@@ -100,7 +101,7 @@ class Finding:
 
     Attributes
     ----------
-    code : str
+    code : Code
         One of `CODES`.
     message : str
         One sentence.
@@ -119,7 +120,7 @@ class Finding:
 
     """
 
-    code: str
+    code: Code
     message: str
     expected: Expected
     samples: int = 0
@@ -140,7 +141,7 @@ class Finding:
             'vibration_percent': percent(self.vibration), 'vibration_std': self.vibration_std,
             'frequency': self.frequency, 'noise': self.noise}
         return {
-            'measured': self.code, 'measured_setpoint': self.expected.setpoint,
+            'measured': str(self.code), 'measured_setpoint': self.expected.setpoint,
             **{key: f'{x:.6g}' for key, x in values.items() if math.isfinite(x)},
             'samples': self.samples}
 
@@ -148,7 +149,7 @@ class Finding:
 def unobserved(expected: Expected, reason: str = '', samples: int = 0) -> Finding:
     """Return the finding where samples are missing or too few, which a reason says."""
     return Finding(
-        'unobserved',
+        Code.UNOBSERVED,
         f'{_where(expected)}: {expected.target:.6g} is predicted, not measured'
         f'{reason and ": "}{reason}', expected, samples)
 
@@ -194,7 +195,7 @@ def judge(
         tolerances.vibration * expected.step, tolerances.stretch)
     off = abs(fit.offset) - sure * fit.offset_std > max(
         tolerances.arrival * expected.step, tolerances.stretch)
-    code = 'off_target' if off else 'vibrating' if vibrates else 'arrived'
+    code = Code.OFF_TARGET if off else Code.VIBRATING if vibrates else Code.ARRIVED
     frequency = fit.frequency if fit.vibration > sure * fit.vibration_std else math.nan
     message = f'{_where(expected)}: rests {_distance(fit.offset, expected)}'
     if vibrates:

@@ -156,7 +156,7 @@ class PlannerRuntime:
         """Take in a sample: stamp in ns, stretch, rate in 1/s and flux density in T."""
         if self._takeover.waiting or not self._takeover.engaged:
             self._takeover.samples.add(joint, Sample(stamp, stretch, rate, flux_density))
-        self._watch.add(joint, stamp, stretch, self._clock())
+        self._watch.add(joint, stamp, stretch)
 
     def clock_set_back(self, back: int) -> None:
         """Begin anew where the clock was set back by some ns; the state in force is read again."""
@@ -223,7 +223,8 @@ class PlannerRuntime:
             return None
         now = self._clock()
         times = [
-            self.group.next_event(now), self._bulletin.preview_again, self._watch.wake(now)]
+            self.group.next_command(), self._bulletin.next_change, self._bulletin.preview_again,
+            self._watch.wake(now)]
         if self.settings.heartbeat_period:
             times.append(self._sending.next_beat)
         if self.following.astray:
@@ -260,7 +261,7 @@ class PlannerRuntime:
             self._bulletin.show()
         self._bulletin.tell_progress()
         if self.active and (self._watch.open or self._bulletin.unheard
-                            or self.group.next_event(now) is not None):
+                            or self._bulletin.next_change is not None):
             self._bulletin.look_for_listeners()
             self._judge(now)
         outputs = self._bulletin.outputs.copy()

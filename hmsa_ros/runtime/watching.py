@@ -37,17 +37,21 @@ class _Window:
     end: int
     cell: int
     samples: dict[int, tuple[int, float]] = field(default_factory=dict)
+    # Newest sample of the joint by its stamp; of all that were looked at before the end, and when
+    # that was.
     newest: int = 0
+    seen: int = 0
     heard: int = 0
 
-    def lacks(self, stamp: int) -> bool:
-        """Return whether a sample of a time is of use."""
+    def lacks(self, stamp: int, steady: int) -> bool:
+        """Return whether a sample of a time is of use; old ones show that newer ones may come."""
+        if self.seen < stamp <= self.end:
+            self.seen, self.heard = stamp, steady
         return stamp >= self.begin and (
             stamp > self.newest or (stamp - self.begin) // self.cell not in self.samples)
 
-    def add(self, stamp: int, stretch: float, now: int, steady: int) -> None:
+    def add(self, stamp: int, stretch: float, now: int) -> None:
         """Take a sample; the first of each cell counts, and none is from the future."""
-        self.heard = steady
         if stamp < self.begin:
             return
         self.newest = max(self.newest, min(stamp, now))
@@ -96,6 +100,8 @@ class Watch:
         """Begin with nothing to look at."""
         self._group, self._steady = group, steady
         self._joints: dict[str, _Joint] = {}
+        # Reading a clock for each sample of each joint would take longer than all else.
+        self._now = 0
         self.restart()
 
     def restart(self) -> None:
@@ -191,14 +197,17 @@ class Watch:
 
     def wants(self, stamp: int) -> bool:
         """Return whether a sample of a time in ns is of use for one of the joints."""
-        return any(
-            window.lacks(stamp) for joint in self._joints.values() for window in joint.windows)
+        steady, wanted = self._steady(), False
+        for joint in self._joints.values():
+            for window in joint.windows:
+                wanted |= window.lacks(stamp, steady)
+        return wanted
 
-    def add(self, name: str, stamp: int, stretch: float, now: int) -> None:
-        """Take in by now a stretch measured at a stamp; times in ns, samples in any order."""
+    def add(self, name: str, stamp: int, stretch: float) -> None:
+        """Take in a stretch measured at a stamp in ns; samples may come in any order."""
         if name in self._joints:
             for window in self._joints[name].windows:
-                window.add(stamp, stretch, now, self._steady())
+                window.add(stamp, stretch, self._now)
 
     def judge(self, now: int, tolerances: Tolerances, *, observable: bool) -> Finding | None:
         """
@@ -219,6 +228,7 @@ class Watch:
             One that changes what is known.
 
         """
+        self._now = now
         for joint in self._joints.values():
             for window in list(joint.windows):
                 if not self._over(window, now, observable):

@@ -11,6 +11,7 @@ import numpy as np
 from rclpy.experimental.events_executor import EventsExecutor
 from std_srvs.srv import Trigger
 
+from hmsa_ros.core.status import Code
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, HmsaError, printable
@@ -74,14 +75,14 @@ class Verdict:
     @property
     def failure(self) -> str:
         """Why what was measured counts as a failure; empty if it does not."""
-        return self.finding if self.measured in ('off_target', 'vibrating') else ''
+        return self.finding if self.measured in (Code.OFF_TARGET, Code.VIBRATING) else ''
 
     @property
     def basis(self) -> str:
         """What the state is known from, in words."""
-        if self.measured == 'arrived':
+        if self.measured == Code.ARRIVED:
             return 'measured'
-        return 'predicted, not measured' if self.measured in ('', 'unobserved') else self.finding
+        return self.failure or 'predicted, not measured'
 
     @classmethod
     def from_message(cls, message: DiagnosticStatus) -> 'Verdict':
