@@ -35,25 +35,7 @@ def node_parameters(custom_data: Mapping[str, str]) -> dict[str, dict[str, str]]
 
 
 def parameters_of(custom_data: Mapping[str, str], node: str, space: str) -> dict[str, str]:
-    """
-    Return the parameters of the node that belongs to a namespace.
-
-    Parameters
-    ----------
-    custom_data : mapping of str to str
-        Of a bag.
-    node : str
-        Last part of the node's name, for example ``'plant'``.
-    space : str
-        Namespace of the topics in question, for example ``'/left'``; empty for the root.
-
-    Returns
-    -------
-    dict of str to str
-        Values as JSON by parameter: of the node in that namespace, or else of the only node of
-        that name; empty if there is none or it is not clear which.
-
-    """
+    """Return JSON values by parameter of a node in a namespace, else of the only such node."""
     nodes = node_parameters(custom_data)
     exact = nodes.get(f'{space.rstrip("/")}/{node}')
     if exact is not None:

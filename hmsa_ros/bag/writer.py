@@ -149,21 +149,7 @@ class BagWriter:
         return self._contents.counts()
 
     def add_topic(self, topic: Topic) -> int:
-        """
-        Announce a topic.
-
-        Parameters
-        ----------
-        topic : Topic
-            The same topic again keeps its first profiles in every file, since readers match
-            files and metadata by them; new ones go into the custom data.
-
-        Returns
-        -------
-        int
-            Its number, for the messages.
-
-        """
+        """Announce a topic, whose first profiles count, and return its number for messages."""
         contents = self._contents
         number = contents.number_of(topic)
         if number is not None:
@@ -364,17 +350,7 @@ def _check_room(folder: Path, size: int) -> None:
 
 def parse_custom_data(pairs: Iterable[str]) -> dict[str, str]:
     """
-    Read ``key=value`` pairs.
-
-    Parameters
-    ----------
-    pairs : iterable of str
-        For example ``('actuator=A3', 'operator=Kim')``; empty strings are skipped.
-
-    Returns
-    -------
-    dict of str to str
-        In the order given.
+    Read ``key=value`` pairs, such as ``'actuator=A3'``; empty strings are skipped.
 
     Raises
     ------

@@ -83,20 +83,7 @@ class Sensor:
         self._transport.clear()
 
     def measure(self, sample: Sample) -> Iterator[Sample]:
-        """
-        Take a sample of the true state.
-
-        Parameters
-        ----------
-        sample : Sample
-            Later than the one before; its arrays are kept.
-
-        Yields
-        ------
-        Sample
-            Measurements that have arrived by now: each once, its delay later.
-
-        """
+        """Take a newer sample of the truth; yield those that its delay lets through by now."""
         if not self._exact:
             stretch = self._bias + self._gain * sample.stretch
             rate = self._gain * sample.rate

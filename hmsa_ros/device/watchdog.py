@@ -90,24 +90,7 @@ class Watchdog:
         return recovered
 
     def watch(self, now: int, until: int, level: float) -> Iterator[tuple[int, float]]:
-        """
-        Look at the time, and command the safe flux if need be.
-
-        Parameters
-        ----------
-        now : int
-            Time in ns; one that has jumped back begins the silence anew.
-        until : int
-            Time in ns up to which levels are wanted.
-        level : float
-            In force, in T.
-
-        Yields
-        ------
-        (int, float)
-            Stamp in ns and level in T, a ramp in steps of a millisecond.
-
-        """
+        """Look at the time (ns) and yield stamps (ns) and levels (T) of the safe flux if due."""
         if self._trips(now):
             if self._fallback.safe_flux == 'zero':
                 yield now, 0.0

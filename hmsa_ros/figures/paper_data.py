@@ -273,24 +273,7 @@ _SWEEP_COLUMNS = (
 
 
 def write_csv(path: Path, data: Data) -> None:
-    """
-    Write a figure's numbers, one observation a row, units in the header.
-
-    Loads are those in force from the row's time on. Numbers have full double precision.
-
-    Parameters
-    ----------
-    path : Path
-        File to write; an existing file is replaced.
-    data : tuple of Run or Sweep
-        The numbers.
-
-    Raises
-    ------
-    BadInputError
-        If it cannot be written.
-
-    """
+    """Write a figure's numbers in full precision, a row each; loads hold from their time on."""
     with replacing(path) as beside, beside.open('w', newline='', encoding='utf-8') as file:
         writer = csv.writer(file, lineterminator='\n')
         if isinstance(data, Sweep):

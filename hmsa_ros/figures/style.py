@@ -71,29 +71,7 @@ _SETTINGS: dict[str, Any] = {
 def picture(
         path: Path, height: float, *, width: float = WIDTH,
         kind: str = 'png') -> Iterator[Figure]:
-    """
-    Draw a picture and write it.
-
-    Parameters
-    ----------
-    path : Path
-        File to write; an existing file is replaced.
-    height, width : float
-        Size in inches.
-    kind : {'png', 'pdf'}
-        Format.
-
-    Yields
-    ------
-    Figure
-        To draw on; it is written when the block ends without an exception.
-
-    Raises
-    ------
-    BadInputError
-        If the file cannot be written.
-
-    """
+    """Yield a figure of a size in inches; the block's end writes it to a file as PNG or PDF."""
     with style.context(['default', _SETTINGS]):
         figure = Figure(figsize=(width, height), layout='constrained')
         FigureCanvasAgg(figure)

@@ -113,7 +113,7 @@ def to_plan(
         stamps: Sequence[int],
         samples: Mapping[str, Sequence[tuple[float, float, float]]]) -> JointTrajectory:
     """
-    Return a preview: a point at each change of level of any joint.
+    Return a preview, stamped with the first of the changes of level of any joint.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def to_plan(
     Returns
     -------
     trajectory_msgs.msg.JointTrajectory
-        Stamped with the first change; positions, velocities and effort are what the samples say.
+        Positions, velocities and effort are what the samples say.
 
     """
     start = stamps[0] if stamps else 0

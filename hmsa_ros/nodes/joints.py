@@ -115,21 +115,7 @@ def declare_joints(
         node: Node, specs: Sequence[ParameterSpec],
         own: Sequence[ParameterSpec]) -> JointParameters:
     """
-    Declare a node's parameters, and those in which joints may differ once more for each.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Node to declare on.
-    specs : sequence of ParameterSpec
-        All of the node's, ``joint`` and ``joints`` among them.
-    own : sequence of ParameterSpec
-        Those of them that a joint may have a value of its own for.
-
-    Returns
-    -------
-    JointParameters
-        Their values.
+    Declare parameters, those of ``own`` once more for each joint, and return their values.
 
     Raises
     ------

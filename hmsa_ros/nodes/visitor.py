@@ -15,23 +15,7 @@ from hmsa_ros.middleware import prepare_middleware
 
 def visit(name: str, namespace: str, **options: Any) -> Node:
     """
-    Create a node with a context of its own.
-
-    Signals stay Python's: Ctrl-C raises KeyboardInterrupt as anywhere else.
-
-    Parameters
-    ----------
-    name : str
-        Beginning of its name, which nobody else has.
-    namespace : str
-        Absolute or not; empty for the root.
-    **options : object
-        Of `rclpy.create_node`.
-
-    Returns
-    -------
-    rclpy.node.Node
-        For `leave`.
+    Create a node, its name made unique, with a context of its own; Ctrl-C stays Python's.
 
     Raises
     ------

@@ -69,24 +69,7 @@ class Arrival:
 
 
 def arrivals(run: Run, targets: Sequence[float], tolerance: float) -> list[Arrival]:
-    """
-    Measure the setpoints of a run.
-
-    Parameters
-    ----------
-    run : Run
-        As read from a bag.
-    targets : sequence of float
-        Stretches that were asked for, in order; one that was held already is no move.
-    tolerance : float
-        As a share of the step.
-
-    Returns
-    -------
-    list of Arrival
-        One a move.
-
-    """
+    """Measure a run's setpoints: targets in order, one held already is none; share of a step."""
     found = evaluate(run)
     noise = _noise(run)
     results = list(found.results)

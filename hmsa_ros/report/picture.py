@@ -30,24 +30,7 @@ _PANELS = 3
 
 
 def draw(path: Path, parts: Sequence[Part], kind: str) -> None:
-    """
-    Draw command, response, phase plane and the arrivals with the largest residual.
-
-    Parameters
-    ----------
-    path : Path
-        File to write; an existing file is replaced.
-    parts : sequence of Part
-        Runs, evaluated; at least one.
-    kind : {'png', 'pdf'}
-        Format.
-
-    Raises
-    ------
-    BadInputError
-        If the file cannot be written.
-
-    """
+    """Write command, response, phase plane and the arrivals with most residual as PNG or PDF."""
     unit = time_unit(parts)
     shown = worst(parts, _PANELS)
     rows = [['command'] * 3 + ['phase'] * 3, ['response'] * 3 + ['phase'] * 3]

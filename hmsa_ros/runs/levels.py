@@ -49,22 +49,7 @@ def in_force(messages: Iterable[Sequence[Level]]) -> tuple[Level, ...]:
 
 
 def without_repeats(commands: Sequence[Level]) -> tuple[tuple[Level, ...], int]:
-    """
-    Leave out the commands that change nothing, by which a planner shows that it is alive.
-
-    Parameters
-    ----------
-    commands : sequence of Level
-        In the order received.
-
-    Returns
-    -------
-    commands : tuple of Level
-        Those that change the level at their stamp, or replace levels after it.
-    repeats : int
-        How many were left out.
-
-    """
+    """Return the commands that change something, and the number of those that change nothing."""
     schedule = CommandSchedule(math.nan)
     kept = tuple(x for x in commands if schedule.insert(x.stamp, x.flux_density))
     return kept, len(commands) - len(kept)

@@ -123,17 +123,7 @@ _NAMES = tuple(
 
 def read_parameter_file(path: str | Path) -> dict[str, object]:
     """
-    Read a parameter file of the nodes.
-
-    Parameters
-    ----------
-    path : str or Path
-        YAML as ROS 2 has it.
-
-    Returns
-    -------
-    dict of str to object
-        By ``'node.name'`` for planner and plant.
+    Read a YAML parameter file; return values of planner and plant by ``'node.name'``.
 
     Raises
     ------
@@ -160,21 +150,7 @@ def values_of(
         parameters: Mapping[str, object], node: str, specs: Iterable[ParameterSpec]
 ) -> dict[str, Any]:
     """
-    Return the numbers that a node has: what is set, else the default.
-
-    Parameters
-    ----------
-    parameters : mapping of str to object
-        As `read_parameter_file` returns them.
-    node : str
-        Which node.
-    specs : iterable of ParameterSpec
-        Numbers.
-
-    Returns
-    -------
-    dict of str to float
-        By name.
+    Return a node's numbers by name: what is set as ``'node.name'``, else the default.
 
     Raises
     ------

@@ -90,21 +90,7 @@ class SampleReader:
 
     def columns(self, where: str, joint: str, *, required: bool) -> 'Samples':
         """
-        Return the samples of one joint.
-
-        Parameters
-        ----------
-        where : str
-            What is read, for the messages.
-        joint : str
-            Its name; empty if it is not known.
-        required : bool
-            Whether another joint will not do.
-
-        Returns
-        -------
-        Samples
-            In order.
+        Return a joint's samples in order; without ``required``, of another joint if need be.
 
         Raises
         ------

@@ -66,31 +66,7 @@ class DemoResult:
 def run_demo(
         folder: Path, environment: dict[str, str],
         progress: Callable[[str, float], None]) -> DemoResult:
-    """
-    Run the paper's sequence and evaluate the bag.
-
-    Parameters
-    ----------
-    folder : Path
-        Prepared output folder.
-    environment : dict of str to str
-        Environment of the processes; this process must live in the same ROS domain.
-    progress : callable
-        Called with what is going on and the share of the sequence that is done.
-
-    Returns
-    -------
-    DemoResult
-        Read back from the bag.
-
-    Raises
-    ------
-    HmsaError
-        If a process fails or the bag does not hold the run.
-    KeyboardInterrupt
-        If the end was requested; the processes are ended whatever happens.
-
-    """
+    """Run the paper's sequence in a prepared folder and read the result back from the bag."""
     experiment = Experiment(folder, [
         ((stretch,), span * paper_actuator().time_unit) for stretch, span in SEQUENCE], _NODES)
     exits = conduct(experiment, environment, progress).exits

@@ -21,29 +21,7 @@ _LEAD_SECONDS = 0.5
 def simulated_nodes(
         settings: Mapping[str, object], params_file: str,
         namespace: str) -> tuple[NodeProcess, NodeProcess]:
-    """
-    Return a paused plant that leads simulated time, and a planner that follows it.
-
-    Parameters
-    ----------
-    settings : mapping of str to object
-        What the parameter file sets, by ``'node.name'``: it goes before what is chosen here.
-    params_file : str
-        For the nodes; empty for none.
-    namespace : str
-        Of both.
-
-    Returns
-    -------
-    tuple of NodeProcess
-        Plant and planner.
-
-    Raises
-    ------
-    BadInputError
-        If the file describes no block.
-
-    """
+    """Return a paused plant that leads time and its planner; a file's settings go first."""
     values = values_of(settings, PLANT, ACTUATOR)
     block = ActuatorParameters(**{
         name.partition('.')[2]: value for name, value in values.items()})

@@ -94,27 +94,7 @@ def settling_time(
 
 
 def damped_study(start: float, target: float, zetas: Floats) -> DampedStudy:
-    """
-    Compare the plain step with the minimum-time command over zeta.
-
-    Parameters
-    ----------
-    start, target : float
-        Stretches at rest, the target above 1.
-    zetas : ndarray, shape (n,)
-        Damping coefficients, above 0.
-
-    Returns
-    -------
-    DampedStudy
-        Times in L sqrt(rho/G).
-
-    Raises
-    ------
-    HmsaError
-        If a command cannot be had.
-
-    """
+    """Compare plain step and minimum-time command at zetas above 0, from rest to above 1."""
     materials = [NondimensionalParameters(float(zeta)) for zeta in zetas]
     plain = np.array([
         settling_time(step(Request(State(start), target, x)), start, target, x)

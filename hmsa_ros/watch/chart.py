@@ -51,26 +51,7 @@ def limits(*values: Array, least: float) -> tuple[float, float]:
 def strip(
         value: tuple[Array, Array], target: tuple[Array, Array], height: int,
         edges: tuple[float, float], *, braille: bool) -> Strip:
-    """
-    Draw a chart.
-
-    Parameters
-    ----------
-    value, target : tuple of ndarray, shape (columns of dots,)
-        Least and largest value in each column of dots; NaN where there is none.
-    height : int
-        In characters, at least 1.
-    edges : tuple of float
-        Values at the lower and the upper edge.
-    braille : bool
-        Whether Braille can be shown.
-
-    Returns
-    -------
-    Strip
-        Width: as many characters as the columns of dots fill.
-
-    """
+    """Draw least and largest values (NaN for none) by column of dots between two edges."""
     across, down = dots(braille)
     columns = len(value[0])
     lines = height * down
