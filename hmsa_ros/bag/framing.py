@@ -30,16 +30,10 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
-from mcap.writer import MCAP0_MAGIC
 import zstandard
 
-# Opcode, length of what follows it, channel, sequence, log time, publish time.
-_MESSAGE = struct.Struct('<BQHIQQ')
-# What that length counts besides the payload.
-_COUNTED = 22
-#: Bytes of a message besides its payload.
-MESSAGE_HEAD = _MESSAGE.size
-_OPCODE = int(Opcode.MESSAGE)
+from hmsa_ros.bag.records import MAGIC, MESSAGE, MESSAGE_FIXED, MESSAGE_HEAD
+
 _INDEX_HEAD = struct.Struct('<BQHI')
 _COMPRESS: Mapping[str, Any] = {
     '': lambda data: data, 'lz4': lz4.frame.compress, 'zstd': zstandard.compress}
@@ -96,7 +90,7 @@ class Framing:
         self._metadata: list[MetadataIndex] = []
         self.counts: dict[int, int] = {}
         self.start, self.end = 2**64 - 1, 0
-        stream.write(MCAP0_MAGIC + _packed([Header('ros2', library)]))
+        stream.write(MAGIC + _packed([Header('ros2', library)]))
 
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
         """Announce a message type with the next chunk; return its number."""
@@ -176,7 +170,7 @@ class Framing:
         if self._crc:
             # Of the summary and the footer's fields before it.
             footer.summary_crc = zlib.crc32(summary + _packed([footer])[:-4])
-        stream.write(summary + _packed([footer]) + MCAP0_MAGIC)
+        stream.write(summary + _packed([footer]) + MAGIC)
         stream.commit()
 
     def _statistics(self) -> Statistics:
@@ -199,13 +193,13 @@ def _packed(records: Iterable[McapRecord]) -> bytes:
 
 def _messages(entries: Entries, place: int) -> tuple[bytes, dict[int, list[int]]]:
     """Return messages as bytes that begin at a place, and by topic their times and places."""
-    pack, head = _MESSAGE.pack, _MESSAGE.size
+    pack, head = MESSAGE_HEAD.pack, MESSAGE_HEAD.size
     parts: list[bytes] = []
     places: dict[int, list[int]] = {}
     for topic, log_time, publish_time, sequence, data in entries:
         length = len(data)
-        parts += (pack(_OPCODE, length + _COUNTED, topic + 1, sequence & 0xFFFFFFFF, log_time,
-                       publish_time), data)
+        parts += (pack(MESSAGE, length + MESSAGE_FIXED, topic + 1, sequence & 0xFFFFFFFF,
+                       log_time, publish_time), data)
         try:
             places[topic] += (log_time, place)
         except KeyError:

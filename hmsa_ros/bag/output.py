@@ -12,7 +12,8 @@ from pathlib import Path
 
 from hmsa_ros import __version__
 from hmsa_ros.bag import metadata, qos
-from hmsa_ros.bag.framing import Entries, Framing, MESSAGE_HEAD, Stream
+from hmsa_ros.bag.framing import Entries, Framing, Stream
+from hmsa_ros.bag.records import MESSAGE_HEAD
 from hmsa_ros.errors import BadInputError
 
 LIBRARY = f'hmsa_ros {__version__}'
@@ -21,7 +22,7 @@ EXPERIMENT = 'hmsa_ros'
 #: Room is taken in steps of so many bytes.
 RESERVE_STEP = 256 * 1024
 # A message with its index entry; a channel in the indexes of a chunk; a chunk.
-_MESSAGE_BYTES = MESSAGE_HEAD + 16
+_MESSAGE_BYTES = MESSAGE_HEAD.size + 16
 _CHANNEL_BYTES = 25
 _CHUNK_BYTES = 256
 

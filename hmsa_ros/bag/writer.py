@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 from hmsa_ros.bag import metadata, qos
 from hmsa_ros.bag.contents import Contents
-from hmsa_ros.bag.framing import MESSAGE_HEAD
 from hmsa_ros.bag.output import OutputFile, PRESETS, RESERVE_STEP, Topic
+from hmsa_ros.bag.records import MESSAGE_HEAD
 from hmsa_ros.errors import BadInputError
 
 __all__ = ['BagWriter', 'Entry', 'MIN_FILE_SIZE', 'parse_custom_data', 'PRESETS', 'Topic']
@@ -129,7 +129,7 @@ class BagWriter:
         """Return the size of the file's messages with what is not yet flushed, in bytes."""
         if self._file is None:
             return 0
-        waiting = self._waiting_size + MESSAGE_HEAD * len(self._waiting)
+        waiting = self._waiting_size + MESSAGE_HEAD.size * len(self._waiting)
         return max(0, self._file.size - self._file.overhead) + waiting
 
     @property
@@ -175,7 +175,7 @@ class BagWriter:
                 self._end = log_time
             self._waiting.append(entry)
             self._waiting_size += len(entry[4])
-            if self._waiting_size + MESSAGE_HEAD * len(self._waiting) >= self._chunk_size:
+            if self._waiting_size + MESSAGE_HEAD.size * len(self._waiting) >= self._chunk_size:
                 self._write_chunk()
 
     def note(self, values: Mapping[str, str]) -> None:
@@ -217,7 +217,7 @@ class BagWriter:
         """Give up the file after an `OSError`, as `abandon` does, and go on in a new one."""
         self.abandon()
         self.folder.mkdir(parents=True, exist_ok=True)
-        _check_room(self.folder, self._waiting_size + 2 * MESSAGE_HEAD * len(self._waiting))
+        _check_room(self.folder, self._waiting_size + 2 * MESSAGE_HEAD.size * len(self._waiting))
         return self._open()
 
     def drop_pending(self) -> None:

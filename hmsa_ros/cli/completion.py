@@ -135,17 +135,20 @@ def _quote(text: str) -> str:
     return "'" + text.replace("'", '’') + "'"
 
 
+def _valued(commands: list[Command]) -> Iterator[tuple[str, Option]]:
+    """Walk the options that take a value, each with its cases for bash and zsh."""
+    for command in commands:
+        for option in command.options:
+            if option.value:
+                yield ' | '.join(_quote(f'{command.path}:{x}') for x in option.names), option
+
+
 # bash ----------------------------------------------------------------------------------------
 
 def _bash(commands: list[Command]) -> str:
     """Return the script for bash."""
     paths = ' | '.join(_quote(x.path) for x in commands if x.path)
-    values = []
-    for command in commands:
-        for option in command.options:
-            if option.value:
-                keys = ' | '.join(_quote(f'{command.path}:{x}') for x in option.names)
-                values.append(f'    {keys}) {_bash_value(option)}; return ;;')
+    values = [f'    {keys}) {_bash_value(x)}; return ;;' for keys, x in _valued(commands)]
     values += [f"    '--ros-args:{x}') _hmsa_files -f; return ;;" for x in _ROS_FILES]
     values.append("    --ros-args:-[pr] | '--ros-args:--log-level') return ;;")
     words = []
@@ -185,12 +188,7 @@ def _bash_value(option: Option) -> str:
 def _zsh(commands: list[Command]) -> str:
     """Return the script for zsh."""
     paths = ' | '.join(_quote(x.path) for x in commands if x.path)
-    values = []
-    for command in commands:
-        for option in command.options:
-            if option.value:
-                keys = ' | '.join(_quote(f'{command.path}:{x}') for x in option.names)
-                values.append(f'    ({keys}) {_zsh_value(option)}; return ;;')
+    values = [f'    ({keys}) {_zsh_value(x)}; return ;;' for keys, x in _valued(commands)]
     values += [f"    ('--ros-args:{x}') _files; return ;;" for x in _ROS_FILES]
     words = []
     for command in commands:
