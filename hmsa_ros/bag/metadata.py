@@ -50,19 +50,7 @@ class TopicMetadata:
 
 @dataclass(frozen=True)
 class FileMetadata:
-    """
-    One file of a bag.
-
-    Attributes
-    ----------
-    path : str
-        Relative to the bag's folder.
-    start_ns, duration_ns : int
-        First log time and length in nanoseconds; `NO_TIME` and 0 without a message.
-    message_count : int
-        At least 0.
-
-    """
+    """One file of a bag: path in its folder, first log time and length in ns (see `NO_TIME`)."""
 
     path: str
     start_ns: int = NO_TIME

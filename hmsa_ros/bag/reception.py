@@ -51,24 +51,9 @@ class RecordedTopic:
     def take(
             self, messages: Iterable[tuple[int, int, int, bytes, bytes]],
             at: Callable[[int], int] | None, *, paused: bool) -> tuple[list[Message], int]:
-        """
-        Count gaps among messages and select those to write.
-
-        Parameters
-        ----------
-        messages : iterable of tuple
-            Source and reception stamp in nanoseconds, sequence number, publisher, payload.
-        at : callable or None
-            Returns the log time at a moment of system time; None for that moment itself.
-        paused : bool
-            Whether nothing is recorded now; what passes meanwhile is not missed.
-
-        Returns
-        -------
-        tuple of list of Message and int
-            What is to be written, and the length of its payloads in bytes.
-
-        """
+        """Count gaps; return the messages to write, and the length of their payloads in bytes."""
+        # Source and reception stamp in ns, sequence number, publisher, payload of each; at() gives
+        # the log time at a moment of system time. What passes while paused is not missed.
         batch: list[Message] = []
         size = 0
         for source, received, sequence, publisher, data in messages:
@@ -92,30 +77,7 @@ class RecordedTopic:
 def judge(
         status: Status, state: str, lost: int, *, flush_period: float, clocks: int = 0,
         clock_ignored: bool = False) -> tuple[int, str]:
-    """
-    Return the level and the sentence for the diagnostics of a recorder.
-
-    Parameters
-    ----------
-    status : hmsa_ros.bag.recording.Status
-        Of its recording.
-    state : str
-        ``'recording'``, ``'paused'``, ...
-    lost : int
-        Messages lost so far.
-    flush_period : float
-        In seconds, above 0.
-    clocks : int
-        Publishers of ``/clock``.
-    clock_ignored : bool
-        Whether one of them is not followed.
-
-    Returns
-    -------
-    tuple of int and str
-        `OK`, `WARN` or `ERROR`, and why.
-
-    """
+    """Return the level and the sentence of a recorder's diagnostics; ``flush_period`` in s."""
     if status.error:
         return ERROR, status.error
     reasons = []

@@ -12,19 +12,7 @@ from hmsa_ros.errors import BagError
 
 @dataclass(frozen=True)
 class Recovered:
-    """
-    What was recovered.
-
-    Attributes
-    ----------
-    folder : str
-        The new bag.
-    message_count : int
-        Messages in it.
-    problems : tuple of str
-        What could not be read of the old one, one sentence each.
-
-    """
+    """The new bag's folder, its number of messages, and what of the old could not be read."""
 
     folder: str
     message_count: int

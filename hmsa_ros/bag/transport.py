@@ -113,24 +113,9 @@ class Transport:
             return self.change.wait_for(lambda: self.stopped, max(0.0, seconds))
 
     def wait(self, when: int, *, message: bool, patience: float) -> str:
-        """
-        Wait until a time of the bag is due.
-
-        Parameters
-        ----------
-        when : int
-            Time of the bag in ns.
-        message : bool
-            Whether a message is due then, which a step may ask for.
-        patience : float
-            How long to wait at most while paused, in s.
-
-        Returns
-        -------
-        str
-            Empty if it is due, otherwise ``'stop'``, ``'seek'`` or ``'paused'``.
-
-        """
+        """Wait for a time of the bag (ns), paused at most so many seconds; say what ended it."""
+        # Empty if it is due, otherwise 'stop', 'seek' or 'paused'; a message may be what a step
+        # asks for.
         while True:
             with self.change:
                 if self.stopped:

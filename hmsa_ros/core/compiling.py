@@ -34,22 +34,7 @@ _listeners: list[Callable[[str], object]] = []
 
 
 def compiled(*, inline: bool = False, parallel: bool = False) -> Callable[..., Any]:
-    """
-    Return a decorator that has Numba compile a function and caches it.
-
-    Parameters
-    ----------
-    inline : bool
-        Copy the function into its callers before types are known.
-    parallel : bool
-        Run the loops over ``prange`` on all cores.
-
-    Returns
-    -------
-    callable
-        The decorator.
-
-    """
+    """Return Numba's decorator: cached, ``inline`` before types, ``parallel`` over ``prange``."""
     options = {**_OPTIONS, 'parallel': parallel, 'inline': 'always' if inline else 'never'}
 
     def decorate(function: Callable[..., Any]) -> Any:

@@ -116,26 +116,7 @@ def pieces(
 
 
 def late(pieces: Sequence[Piece], end: float, field: float, lag: float) -> float:
-    """
-    Return the load that a field which lags has reached.
-
-    Parameters
-    ----------
-    pieces : sequence of (float, float, float)
-        Of the amplifier, as `ramps` returns them.
-    end : float
-        Time that is meant, not before the last piece.
-    field : float
-        Load at the first piece.
-    lag : float
-        Time constant, greater than 0.
-
-    Returns
-    -------
-    float
-        At the end.
-
-    """
+    """Return the load that a lagging field has reached at a time after the amplifier's pieces."""
     for i, (begin, load, slope) in enumerate(pieces):
         span = (pieces[i + 1][0] if i + 1 < len(pieces) else end) - begin
         line = load - slope * lag

@@ -134,29 +134,7 @@ def draft_sequence(
         outset: Outset, points: Sequence[tuple[float, int]], base: int,
         now: int) -> Steps[Draft | None]:
     """
-    Plan a sequence.
-
-    Parameters
-    ----------
-    outset : Outset
-        From where; it begins at the start of the sequence or, if that is over, as soon as
-        possible.
-    points : sequence of (float, int)
-        Stretch, and time in ns from the start until which it lasts; checked.
-    base : int
-        Start in ns.
-    now : int
-        Current time in ns, for messages.
-
-    Returns
-    -------
-    Draft or None
-        None where the request changes nothing.
-
-    Yields
-    ------
-    None
-        Wherever it may be continued later.
+    Plan checked points (stretch, end in ns) from a start in ns; None if they change nothing.
 
     Raises
     ------
@@ -202,29 +180,10 @@ def draft_target(outset: Outset, stretch: float) -> Steps[Draft | None]:
 
 
 def draft_stop(outset: Outset) -> Steps[Draft]:
-    """
-    Plan how to come to rest as near as the flux density limits allow.
-
-    The load that brakes hardest is held until the first turning point, then the load that
-    holds that stretch: a two-step command whose target is chosen by its beta_p. Where one
-    brake does not do, on a grid, through ramps or at a limit, it is a move to a stretch near by.
-
-    Parameters
-    ----------
-    outset : Outset
-        From where.
-
-    Returns
-    -------
-    Draft
-        Of one setpoint.
-
-    Yields
-    ------
-    None
-        Wherever it may be continued later.
-
-    """
+    """Plan how to come to rest as near as the flux density limits allow."""
+    # The load that brakes hardest is held until the first turning point, then the load that
+    # holds that stretch: a two-step command whose target is chosen by its beta_p. Where one
+    # brake does not do, on a grid, through ramps or at a limit, it is a move to a stretch near by.
     model, state = outset.model, outset.state
     work = work_space()
     found = brake(model, work, state)
@@ -265,23 +224,7 @@ def later_outsets(outset: Outset) -> Iterator[int]:
 
 def draft_resumption(outset: Outset) -> Steps[Draft | None]:
     """
-    Plan what is left of the running plan anew, until it is on its way again.
-
-    Parameters
-    ----------
-    outset : Outset
-        From where.
-
-    Returns
-    -------
-    Draft or None
-        Setpoints end when they did; one that there is no time left for is left out. From where
-        the new plan meets the running one it goes on as that. None if nothing is left to do.
-
-    Yields
-    ------
-    None
-        Wherever it may be continued later.
+    Plan what is left of the running plan anew, until it is on its way again; None if nothing is.
 
     Raises
     ------
@@ -289,6 +232,8 @@ def draft_resumption(outset: Outset) -> Steps[Draft | None]:
         If it cannot be carried out from there.
 
     """
+    # Setpoints end when they did; one that there is no time left for is left out. From where the
+    # new plan meets the running one it goes on as that.
     planned = outset.plan.segments
     first = max(outset.plan.under_way(outset.begin), 0)
     refusal: RefusedError | None = None

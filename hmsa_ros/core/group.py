@@ -91,35 +91,7 @@ class PlannerGroup:
     def draft_request(
             self, points: Mapping[str, Sequence[tuple[float, int]]], stamp: int | None,
             now: int) -> Steps[dict[str, Draft]]:
-        """
-        Work out a setpoint sequence for some joints or all.
-
-        Parameters
-        ----------
-        points : mapping of str to sequence of (float, int)
-            By joint: stretch, and time in ns from the start until which it lasts, the times
-            alike for all.
-        stamp : int or None
-            Start in ns; None for now.
-        now : int
-            Current time in ns.
-
-        Returns
-        -------
-        dict of str to Draft
-            To be taken; joints for which nothing changes are missing.
-
-        Yields
-        ------
-        None
-            Wherever it may be continued later.
-
-        Raises
-        ------
-        RefusedError
-            If it cannot be carried out by one of them; it is named.
-
-        """
+        """Work out a sequence as `Planner.draft_request`, without joints that change nothing."""
         drafts = yield from self._each(
             points, lambda name: self.planners[name].draft_request(points[name], stamp, now))
         if self.simultaneous:
@@ -241,25 +213,7 @@ class PlannerGroup:
     def preview(
             self, begin: int,
             limit: int) -> tuple[list[int], dict[str, list[tuple[float, float, float]]]]:
-        """
-        Sample the plans of all joints wherever the level of one changes.
-
-        Parameters
-        ----------
-        begin : int
-            Time in ns: from the level on that is in force then.
-        limit : int
-            Largest number of changes.
-
-        Returns
-        -------
-        stamps : list of int
-            In ns, increasing.
-        samples : dict of str to list of (float, float, float)
-            By joint, one for each stamp: stretch, rate in 1/s and flux density in T from then
-            on.
-
-        """
+        """Sample all plans at so many changes of any level, from that in force at ``begin`` on."""
         stamps = sorted({
             level.stamp for planner in self.planners.values()
             for level in planner.plan.ahead(begin, limit)})[:limit]

@@ -61,23 +61,9 @@ class History:
     stale: int | None = None
 
     def unheard(self, now: int) -> int:
-        """
-        Count levels that never took effect, although that cannot have been told.
-
-        Only changes are reported. Commands that come so late that they apply all at once make
-        none if the last of them is the level in force: those before it never were.
-
-        Parameters
-        ----------
-        now : int
-            Time in ns up to which everything has been told.
-
-        Returns
-        -------
-        int
-            How many levels after the last one known, up to one that is the same.
-
-        """
+        """Count levels after the last one known that silently never took effect (time in ns)."""
+        # Only changes are reported. Commands that come so late that they apply all at once make
+        # none if the last of them is the level in force: those before it never were.
         levels, first = self.levels, self.known + 1
         for i in reversed(range(first, self.sent)):
             if (levels[i].stamp <= now
@@ -99,29 +85,9 @@ class History:
     def with_news(
             self, stamp: int, flux_density: float,
             tolerance: int) -> tuple['History', Deviation | None]:
-        """
-        Take in that a level has taken effect.
-
-        Changes take effect in the order in which they were sent. So those before the one there
-        is news of have been in force already or never will, and those after it come no earlier.
-
-        Parameters
-        ----------
-        stamp : int
-            Time in ns at which it did.
-        flux_density : float
-            Level in T from then on.
-        tolerance : int
-            In ns: a planned change this near to it is the same.
-
-        Returns
-        -------
-        history : History
-            With predictions under what really happened.
-        deviation : Deviation or None
-            All zero if it is as planned; None if it is no news.
-
-        """
+        """Take in that a level (T) took effect at a stamp, as planned within a tolerance (ns)."""
+        # Changes take effect in the order in which they were sent. So those before the one there
+        # is news of have been in force already or never will, and those after it come no earlier.
         levels, known = self.levels, self.known
         if stamp < levels[known].stamp or stamp == levels[known].stamp and _same(
                 flux_density, levels[known].flux_density):
@@ -151,21 +117,7 @@ class History:
         return History(changed, count, known + 1, known + 1).predicted(count), deviation
 
     def predicted(self, end: int) -> 'History':
-        """
-        Work out anew what is stale.
-
-        Parameters
-        ----------
-        end : int
-            Place up to which predictions are wanted.
-
-        Returns
-        -------
-        History
-            Each level with the state that the one before it leads to; stale no more from where
-            that is what was planned.
-
-        """
+        """Work stale levels out anew up to a place, or until they are what was planned."""
         if self.stale is None or self.stale >= end:
             return self
         anew: list[PlannedLevel] = []

@@ -154,31 +154,9 @@ class Planner(RunningPlan):
         return (yield from draft_stop(self._outset(self._soonest(now))))
 
     def draft_resumption(self, now: int) -> Steps[Draft | None]:
-        """
-        Plan what is left of the running plan anew, from where the actuator really is.
-
-        Parameters
-        ----------
-        now : int
-            Current time in ns.
-
-        Returns
-        -------
-        Draft or None
-            From the first time that a command can reach, or, where there is no way from the
-            motion it meets, a part of a period later. None if there is nothing left to do.
-
-        Yields
-        ------
-        None
-            Wherever it may be continued later.
-
-        Raises
-        ------
-        RefusedError
-            If it cannot be carried out from there.
-
-        """
+        """Plan what is left anew, from where the actuator really is; None if nothing is left."""
+        # From the first time that a command can reach, or, where there is no way from the motion
+        # it meets, a part of a period later.
         begin = self._soonest(now)
         if self.plan.segments:
             begin = max(begin, self.plan.segments[0].since)

@@ -189,24 +189,7 @@ class RunningPlan:
         self.revision += 1
 
     def applied(self, stamp: int, flux_density: float, tolerance: int) -> Deviation | None:
-        """
-        Take into the timeline a change of level that has taken effect.
-
-        Parameters
-        ----------
-        stamp : int
-            Time in ns at which it did.
-        flux_density : float
-            Level in T from then on.
-        tolerance : int
-            In ns: planned changes this near to it are the same.
-
-        Returns
-        -------
-        Deviation or None
-            All zero if it is as planned; None if it is no news.
-
-        """
+        """Take in a change of level as `History.with_news` does; None if it is no news."""
         history, deviation = self._history.with_news(stamp, flux_density, tolerance)
         self._remember(history)
         self.revision += bool(

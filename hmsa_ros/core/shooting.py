@@ -62,25 +62,7 @@ class Template:
 
 
 def solve(template: Template, request: 'Request', delivery: Delivery | None = None) -> Attempt:
-    """
-    Solve a template for rest at the target of a request.
-
-    Parameters
-    ----------
-    template : Template
-        First guess.
-    request : Request
-        The move.
-    delivery : Delivery, optional
-        In place of the request's; its slew limit and lag count.
-
-    Returns
-    -------
-    tuple of (tuple of Level, float), or None
-        The command and the time at which it is at rest, the last ramp included; None if no
-        solution was found from this guess.
-
-    """
+    """Solve a template for rest at the target; returns levels and time of rest, or None."""
     delivery = delivery or request.delivery
     times, loads = template.times.copy(), template.loads.copy()
     state = request.state

@@ -104,28 +104,7 @@ def simulate(
 def follow(
         levels: Sequence[Level], state: State, end: float, material: NondimensionalParameters,
         delivery: Delivery) -> State:
-    """
-    Return where levels lead, without checks: for those who plan.
-
-    Parameters
-    ----------
-    levels : sequence of Level
-        By time, the first at the start.
-    state : State
-        At the start; it knows the load in force.
-    end : float
-        Time of the state that is wanted, not before the last level.
-    material : NondimensionalParameters
-        zeta, J_lim and c1.
-    delivery : Delivery
-        How the levels reach the coil.
-
-    Returns
-    -------
-    State
-        At the end.
-
-    """
+    """Return the state that levels lead to at a time not before the last of them, unchecked."""
     pieces, last = ramps(levels, state.ramps_from, end, delivery.slew)
     if delivery.lag > 0.0:
         return _follow_late(pieces, last, state, end, material, delivery.lag)

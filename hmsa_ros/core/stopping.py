@@ -40,27 +40,9 @@ class Brake:
 
 
 def brake(model: Model, work: Array, state: State, share: float = 1.0) -> Brake:
-    """
-    Return how to stop a motion.
-
-    Parameters
-    ----------
-    model : Model
-        Of the block and its limits.
-    work : ndarray
-        Of `kernels.work_space`.
-    state : State
-        Where the motion is.
-    share : float
-        Of the way from the load that holds the stretch to the limit on the other side, 0 to 1:
-        how hard to brake.
-
-    Returns
-    -------
-    Brake
-        One of no duration where the motion cannot be followed to a turning point.
-
-    """
+    """Return how to stop a motion with a share (0 to 1) of the load that brakes hardest."""
+    # The share is of the way from the load that holds the stretch to the limit on the other side.
+    # A brake of no duration is for a motion that cannot be followed to a turning point.
     holding = model.holding(state.stretch)
     rest = Brake(holding, 0.0, state.stretch)
     frequency = model.frequency(state.stretch)

@@ -336,21 +336,7 @@ class Draft:
     warning: PlannedSegment | None = None
 
     def delayed(self, delays: Sequence[int]) -> 'Draft':
-        """
-        Return the draft with moves that begin later.
-
-        Parameters
-        ----------
-        delays : sequence of int
-            In ns, one for each segment; 0 where it does not begin at rest, or where its setpoint
-            has no room.
-
-        Returns
-        -------
-        Draft
-            The level before a delayed move stays in force until then.
-
-        """
+        """Return the draft with each segment's move begun later by so many ns, 0 for not."""
         begins = [x.begin for x in self.segments]
         levels = tuple(
             replace(x, stamp=x.stamp + delays[bisect_right(begins, x.stamp) - 1])

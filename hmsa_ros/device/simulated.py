@@ -171,26 +171,10 @@ class SimulatedDevice(Outbox):
             self.restart(i)
 
     def follow(self, now: int, *, standing: bool = False) -> int:
-        """
-        Bring the time into line with a clock, as far as it is not to be simulated.
-
-        A device that has not begun, one that is held, and one whose clock jumps goes on from
-        the clock's time; where the clock has jumped back it starts again. Samples stay on
-        the grid from time zero.
-
-        Parameters
-        ----------
-        now : int
-            Of the clock, in ns.
-        standing : bool
-            Whether time is not to run.
-
-        Returns
-        -------
-        int
-            By how many ns the clock jumped, 0 if it did not.
-
-        """
+        """Follow a clock (ns), or hold while ``standing``; return by how many ns it jumped."""
+        # A device that has not begun, one that is held, and one whose clock jumps goes on from the
+        # clock's time; where the clock has jumped back it starts again. Samples stay on the grid
+        # from time zero.
         gap = now - self.time
         if self.time == 0:
             self._go_on_from(now)
@@ -218,24 +202,7 @@ class SimulatedDevice(Outbox):
     # -- beginning anew ------------------------------------------------------------------------
 
     def restart(self, joint: int, stretch: float | None = None, rate: float = 0.0) -> None:
-        """
-        Put a joint back to its initial or another state; nothing is ahead; time goes on.
-
-        Parameters
-        ----------
-        joint : int
-            Its place.
-        stretch : float, optional
-            Default the initial one. It is held by its flux density.
-        rate : float
-            In 1/s.
-
-        Raises
-        ------
-        BadInputError
-            If the stretch is outside the limits.
-
-        """
+        """Put a joint at rest at the initial or another stretch, or in motion; time goes on."""
         self._actuators.reset(joint, stretch, rate)
         # A first command arms it again.
         self._watchdogs[joint].disarm()

@@ -32,22 +32,7 @@ class Allegiance:
         self.refused = 0
 
     def accepts(self, publisher: bytes, present: Callable[[], Sequence[bytes]]) -> bool:
-        """
-        Return whether a command is to be obeyed.
-
-        Parameters
-        ----------
-        publisher : bytes
-            Identifier of who sent it; empty if that is not known.
-        present : callable
-            Returns the identifiers of all publishers there are.
-
-        Returns
-        -------
-        bool
-            A command whose sender is not known is refused while there are several.
-
-        """
+        """Return whether to obey a publisher; one unknown only where a single one is present."""
         if publisher and publisher == self.source:
             return True
         others = [bytes(x) for x in present()]

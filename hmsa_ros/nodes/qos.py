@@ -42,22 +42,10 @@ def subscription(offered: Iterable[Qos], depth: int) -> QoSProfile:
 
 
 def publisher(recorded: Sequence[Qos]) -> QoSProfile:
-    """
-    Return the profile that serves every subscriber that the recorded publishers served.
-
-    Parameters
-    ----------
-    recorded : sequence of Qos
-        What the publishers offered; empty if the bag does not have it.
-
-    Returns
-    -------
-    rclpy.qos.QoSProfile
-        Reliable if any was, transient local if any was. The depth is the recorded one. Where it
-        is unknown a latched topic keeps one message a recorded publisher, so that who comes late
-        gets what it would have got.
-
-    """
+    """Return the profile that serves every subscriber that the recorded publishers served."""
+    # Reliable if any was, transient local if any was. The depth is the recorded one. Where it is
+    # unknown a latched topic keeps one message a recorded publisher, so that who comes late gets
+    # what it would have got.
     latched = any(profile.durability == 'transient_local' for profile in recorded)
     reliable = not recorded or any(
         profile.reliability in ('reliable', 'system_default') for profile in recorded)

@@ -62,33 +62,9 @@ def named_joint(parameters: Mapping[str, object]) -> str:
 def actuators(
         parameters: Mapping[str, object], given: Mapping[str, object], joint: str
 ) -> tuple[ActuatorParameters, ActuatorParameters, bool, list[str]]:
-    """
-    Return the block of the plant and of the planner.
-
-    Parameters
-    ----------
-    parameters : mapping of str to object
-        As `recorded` returns them.
-    given : mapping of str to object
-        From a parameter file: what the block really is. Empty without one.
-    joint : str
-        Whose.
-
-    Returns
-    -------
-    plant, planner : ActuatorParameters
-        The example block where nothing is known.
-    known : bool
-        Whether something is.
-    notes : list of str
-        What a reader should know.
-
-    Raises
-    ------
-    BadInputError
-        If what is given describes no block.
-
-    """
+    """Return the block of the plant and of the planner, whether they are known, and notes."""
+    # What is given in a parameter file is what the block really is. The example block is taken
+    # where nothing is known.
     found: dict[str, ActuatorParameters] = {}
     notes = []
     for node in (PLANT, PLANNER):

@@ -20,21 +20,7 @@ _PATIENCE_SECONDS = 15.0
 
 @dataclass(frozen=True)
 class NodeProcess:
-    """
-    A node to start.
-
-    Attributes
-    ----------
-    name : str
-        One of the ``hmsa`` node commands, or the executable of another package.
-    parameters : mapping of str to object
-        Booleans, numbers, strings and lists of strings.
-    namespace, params_file, log_level : str
-        Empty for none.
-    options : tuple of str
-        What comes before ``--ros-args``.
-
-    """
+    """A ``hmsa`` node command, or an executable of another package; options go before ROS's."""
 
     name: str
     parameters: Mapping[str, object]

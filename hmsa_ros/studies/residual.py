@@ -73,25 +73,9 @@ class Errors:
 
 def arrival_of(
         move: Move, start: float, target: float, material: NondimensionalParameters) -> float:
-    """
-    Return the time from which what still moves counts as residual vibration.
-
-    Parameters
-    ----------
-    move : Move
-        The command.
-    start, target : float
-        Stretches that it was planned for.
-    material : NondimensionalParameters
-        Of the model.
-
-    Returns
-    -------
-    float
-        The end of the command. A plain step, which never arrives, counts from when the
-        two-step command would; where there is none, from half a natural period on.
-
-    """
+    """Return from when (in the model's time) what still moves counts as residual vibration."""
+    # The end of the command. A plain step, which never arrives, counts from when the two-step
+    # command would; where there is none, from half a natural period on.
     if math.isfinite(move.duration):
         return move.duration
     plan = plan_two_step(start, target, material)

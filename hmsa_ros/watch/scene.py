@@ -85,19 +85,7 @@ class Joint:
 
 @dataclass
 class RequestState:
-    """
-    What the planner says of its last request.
-
-    Attributes
-    ----------
-    level : int
-        Index of `LEVELS`.
-    message, code, state : str
-        Sentence, code, and progress (idle, waiting, moving, holding, settling, at_rest).
-    setpoint, setpoints : int
-        Which one is under way, from 1, and how many there are.
-
-    """
+    """What the planner says of its last request, `LEVELS` by index; setpoints count from 1."""
 
     level: int
     message: str
@@ -109,23 +97,7 @@ class RequestState:
 
 @dataclass
 class Report:
-    """
-    What a node says of its health.
-
-    Attributes
-    ----------
-    name : str
-        Who says it.
-    level : int
-        Index of `LEVELS`.
-    message : str
-        Its sentence.
-    counts : dict of str to int
-        Its counters.
-    age : float
-        In s, since it was said.
-
-    """
+    """What a node says of its health, `LEVELS` by index, and how long ago in s."""
 
     name: str
     level: int

@@ -46,22 +46,7 @@ def at_rest(request: Request, holding: float) -> bool:
 
 
 def settle(request: Request, plain: Move) -> Move | None:
-    """
-    Have the field arrive with the stretch, starting from the command for a field without lag.
-
-    Parameters
-    ----------
-    request : Request
-        The move.
-    plain : Move
-        Two levels, for the same request without the lag, and without the grid if there is one.
-
-    Returns
-    -------
-    Move or None
-        With three levels, on a grid up to four; None where none was found within the limits.
-
-    """
+    """Have the field arrive with the stretch, given the two levels without a lag; or None."""
     attempt = _sampled if request.delivery.period > 0.0 else _pushed
     found = attempt(request, plain)
     return None if found is None else Move(plain.code, *found, plain.reason)
@@ -160,20 +145,6 @@ def three_levels(request: Request, code: Code, reason: str) -> Move:
     """
     Come to rest by three levels of free heights: the shortest of those within the limits.
 
-    Parameters
-    ----------
-    request : Request
-        The move, from any state of motion and of the field.
-    code : Code
-        Of the move.
-    reason : str
-        Why it is not another command.
-
-    Returns
-    -------
-    Move
-        Four levels.
-
     Raises
     ------
     RefusedError
@@ -229,24 +200,7 @@ def _limits_text(request: Request, limits: Limits) -> str:
 
 def push_brake_push(
         request: Request, plain: tuple[Level, ...], push: float, brake: float) -> Attempt:
-    """
-    Solve for the times of the fastest command: push, brake and push between two loads.
-
-    Parameters
-    ----------
-    request : Request
-        The move.
-    plain : tuple of Level
-        Command of push and brake for the same request without a lag.
-    push, brake : float
-        Loads to use.
-
-    Returns
-    -------
-    tuple of (tuple of Level, float), or None
-        The command and its duration; None if no such command was found.
-
-    """
+    """Solve for the times of push, brake and push between two loads; None if there are none."""
     delivery = request.delivery
     holding = request.holding_load()
     # The second push ends when the field, at the brake's level before, is at the holding load.
