@@ -37,20 +37,7 @@ LONG = ('faults', 'soak', 'identification')
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """
-    Run benchmarks and print their tables.
-
-    Parameters
-    ----------
-    arguments : list of str, optional
-        Default those of the command line.
-
-    Returns
-    -------
-    int
-        Exit status: 0, or 1 if something did not do what it promises.
-
-    """
+    """Run benchmarks and print their tables."""
     parser = argparse.ArgumentParser(
         prog='python -m benchmarks', description='Measure speed and accuracy.')
     parser.add_argument('names', nargs='*', metavar='NAME',
@@ -166,22 +153,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def renewed(page: str, texts: dict[str, str]) -> str:
-    """
-    Replace what stands between the marks of a page.
-
-    Parameters
-    ----------
-    page : str
-        Markdown.
-    texts : dict of str
-        By the name in the marks; names that the page has not are left out.
-
-    Returns
-    -------
-    str
-        The page, outside the marks unchanged.
-
-    """
+    """Replace what stands between the marks of a page."""
     for name, text in texts.items():
         begin, end = f'<!-- begin {name} -->', f'<!-- end {name} -->'
         head, mark, rest = page.partition(begin)

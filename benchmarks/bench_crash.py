@@ -81,20 +81,7 @@ class Recorder:
 
 
 def compare(*, quick):
-    """
-    Kill, measure, and return the table.
-
-    Parameters
-    ----------
-    quick : bool
-        Whether it is only to show that it runs.
-
-    Returns
-    -------
-    Sheet
-        Passed if no loss is larger than the flush period, and nothing is missing before.
-
-    """
+    """Kill, measure, and return the table; passed if no loss exceeds the flush period."""
     from benchmarks.measure import ros_domain
     from benchmarks.sheet import Sheet
     kills = 2 if quick else 50

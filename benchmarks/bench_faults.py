@@ -21,26 +21,7 @@ from benchmarks.measure import ros_domain
 def run(
         console: Console, *, only: Sequence[str] = (),
         quick: bool = False) -> tuple[list[Outcome], int]:
-    """
-    Inject the faults and print the table.
-
-    Parameters
-    ----------
-    console : Console
-        Where to.
-    only : sequence of str
-        Beginnings of the keys of the faults to inject; default all.
-    quick : bool
-        Only the selection that the tests run.
-
-    Returns
-    -------
-    outcomes : list of Outcome
-        In order.
-    status : int
-        Exit status: 1 if a row is not as expected.
-
-    """
+    """Inject the faults whose keys begin so and print the table; return it and the exit status."""
     from benchmarks.faults.rows import FAULTS, QUICK
 
     faults = [
@@ -70,20 +51,7 @@ def run(
 
 
 def record(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
-    """
-    Return the table for a JSON file.
-
-    Parameters
-    ----------
-    outcomes : sequence of Outcome
-        In order.
-
-    Returns
-    -------
-    list of dict
-        One a row.
-
-    """
+    """Return the table for a JSON file, one dict a row."""
     return [
         {'key': x.fault.key, 'fault': x.fault.name, 'how': x.fault.how,
          'expected': x.fault.expected, 'seen': x.seen.text, 'figure': x.seen.figure,
@@ -91,18 +59,5 @@ def record(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
 
 
 def page_text(outcomes: Sequence[Outcome]) -> str:
-    """
-    Return the table for a page of the documentation.
-
-    Parameters
-    ----------
-    outcomes : sequence of Outcome
-        In order.
-
-    Returns
-    -------
-    str
-        Markdown.
-
-    """
+    """Return the table for a page of the documentation, in Markdown."""
     return markdown(outcomes)

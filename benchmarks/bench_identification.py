@@ -33,22 +33,7 @@ _CHANCE = 1e-4
 
 
 def levels_of(shaped: bool, repeats: int) -> tuple[Array, Array]:
-    """
-    Return times and levels of a sequence.
-
-    Parameters
-    ----------
-    shaped : bool
-        Whether moves are two-step commands; else plain steps.
-    repeats : int
-        Of the sequence 1.1, 1.4, 1.
-
-    Returns
-    -------
-    times, levels : ndarray
-        In s and T.
-
-    """
+    """Return times and levels of a sequence."""
     rows, start, now = [(-0.02, 0.0)], 1.0, 0.0
     for target in SEQUENCE * repeats:
         hold = float(elastic_force(target, BLOCK.nondimensional)) * BLOCK.flux_density_unit
@@ -64,22 +49,7 @@ def levels_of(shaped: bool, repeats: int) -> tuple[Array, Array]:
 
 
 def compare(*, quick: bool = False, runs: int = RUNS) -> Sheet:
-    """
-    Identify many simulated runs.
-
-    Parameters
-    ----------
-    quick : bool
-        Few runs.
-    runs : int
-        Of each kind.
-
-    Returns
-    -------
-    Sheet
-        Ratio of the errors to the bound, and coverage.
-
-    """
+    """Identify many simulated runs."""
     runs = QUICK_RUNS if quick else runs
     # What one in ten thousand rows misses by chance.
     ratio = LARGEST_RATIO * np.sqrt(chi2.ppf(1.0 - _CHANCE, runs) / runs)
@@ -189,20 +159,7 @@ _FAR, _LOST, _CORRELATED, _PIXELS, _JITTER = (
 
 
 def robustness(*, quick: bool = False) -> Sheet:
-    """
-    Identify simulated runs whose samples or start values are bad.
-
-    Parameters
-    ----------
-    quick : bool
-        Few runs.
-
-    Returns
-    -------
-    Sheet
-        Verdicts, errors in deviations, coverage and width of the intervals.
-
-    """
+    """Identify simulated runs whose samples or start values are bad."""
     runs = QUICK_RUNS if quick else ROBUST_RUNS
     levels = levels_of(False, 15)
     times = np.arange(int(1000 * DURATION)) * 1e-3
@@ -247,20 +204,7 @@ def robustness(*, quick: bool = False) -> Sheet:
 
 
 def speed(*, quick: bool = False) -> Sheet:
-    """
-    Time identification beside SciPy's least squares on the same simulation.
-
-    Parameters
-    ----------
-    quick : bool
-        Few runs.
-
-    Returns
-    -------
-    Sheet
-        Least and median times for five and nine parameters.
-
-    """
+    """Time identification beside SciPy's least squares on the same simulation."""
     nine = (*DEFAULT_FREE, 'coil_time_constant', 'constant_force', 'viscoelastic_ratio',
             'viscoelastic_time')
     others = {'coil_time_constant': 5e-4, 'viscoelastic_ratio': 0.1,

@@ -131,20 +131,7 @@ def _sequence(names: Sequence[str], seconds: float):  # type: ignore[no-untyped-
 
 
 def compare(*, quick: bool) -> Sheet:
-    """
-    Measure joints in one pair of nodes, and pairs of nodes side by side.
-
-    Parameters
-    ----------
-    quick : bool
-        Little of everything.
-
-    Returns
-    -------
-    Sheet
-        Passed if 64 joints at 1 kHz keep up with the clock; not judged where ``quick``.
-
-    """
+    """Measure joints in one pair of nodes and pairs side by side; 64 at 1 kHz must keep up."""
     cases = [(joints, rate, 1) for joints, rate in _JOINTS] + [
         (1, 1000.0, spaces) for spaces in _SPACES[1:]]
     if quick:

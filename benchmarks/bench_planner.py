@@ -56,20 +56,7 @@ class Reference:
         self._loads = [two_step(start, target, ACTUATOR)[0] for start, target in MOVES]
 
     def error(self, loads: list[float]) -> float:
-        """
-        Compare loads.
-
-        Parameters
-        ----------
-        loads : list of float
-            beta_p of each move.
-
-        Returns
-        -------
-        float
-            Largest relative error.
-
-        """
+        """Return the largest relative error of beta_p of each move."""
         return max(
             float(abs(type(exact)(load) / exact - 1))
             for load, exact in zip(loads, self._loads, strict=True))
@@ -179,20 +166,7 @@ def _c_programs(
 
 
 def compare(*, quick: bool = False) -> Report:
-    """
-    Measure all that is there.
-
-    Parameters
-    ----------
-    quick : bool
-        Little of everything: shows that it runs, not how fast.
-
-    Returns
-    -------
-    Report
-        Times per plan.
-
-    """
+    """Measure all that is there."""
     rounds = 1 if quick else 15
     reference = Reference()
     rows: list[Row] = []
@@ -240,20 +214,7 @@ def compare(*, quick: bool = False) -> Report:
 
 
 def summary(report: Report) -> list[str]:
-    """
-    Say what the table holds about the batch function.
-
-    Parameters
-    ----------
-    report : Report
-        Of `compare`.
-
-    Returns
-    -------
-    list of str
-        Lines.
-
-    """
+    """Say what the table holds about the batch function."""
     lines = []
     batches = [x for x in report.rows if x.name.startswith('plan_two_step_batch')]
     for one in (x for x in batches if x.name.endswith('1 thread')):
@@ -282,20 +243,7 @@ CHOICES = [
 
 
 def choices(*, quick: bool = False) -> Report:
-    """
-    Measure what guess, derivatives and coarse passes do, in C.
-
-    Parameters
-    ----------
-    quick : bool
-        Little of everything.
-
-    Returns
-    -------
-    Report
-        Times per plan, each at the loosest tolerance that keeps the error.
-
-    """
+    """Measure what guess, derivatives and coarse passes do, in C, at equal error."""
     title = 'What the choices are worth, in the C program; error below 1e-11'
     if contenders.compiler() is None:
         return Report('choices', title, 'time per plan', 'error in beta_p',
@@ -343,20 +291,7 @@ def _process(code: list[str], cache: str | None = None) -> list[float]:
 
 
 def start_up(*, quick: bool = False) -> Report:
-    """
-    Measure the first plan of a new process, with the compiled kernels cached and without.
-
-    Parameters
-    ----------
-    quick : bool
-        Little of everything, and no compilation.
-
-    Returns
-    -------
-    Report
-        Times of a process.
-
-    """
+    """Measure the first plan of a new process, with the compiled kernels cached and without."""
     _process(['-c', _FIRST])
     runs = [_process(['-c', _FIRST]) for _ in range(1 if quick else 9)]
     names = ('new process, first plan, from start to end', 'of that, processor time',

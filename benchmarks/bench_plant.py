@@ -54,21 +54,7 @@ class Sequence:
         return self.span * len(TARGETS)
 
     def pieces(self, follow: Callable[[np.ndarray, float, np.ndarray], np.ndarray]) -> np.ndarray:
-        """
-        Simulate step by step.
-
-        Parameters
-        ----------
-        follow : callable
-            Returns the states (2, n) by state, load and times of the samples from the
-            beginning of the step.
-
-        Returns
-        -------
-        ndarray
-            Stretch.
-
-        """
+        """Simulate step by step; ``follow`` gets times from the beginning of the step."""
         state = np.array([1.0, 0.0])
         stretch = []
         times = self.times[:self.each]
@@ -134,20 +120,7 @@ def _python(sequence: Sequence) -> Callable[[int], np.ndarray]:
 
 
 def compare(*, quick: bool = False) -> Report:
-    """
-    Measure all.
-
-    Parameters
-    ----------
-    quick : bool
-        Little of everything: shows that it runs, not how fast.
-
-    Returns
-    -------
-    Report
-        Times per unit of nondimensional time.
-
-    """
+    """Measure all."""
     sequence = Sequence(1.0, 10) if quick else Sequence(10.0, 10)
     exact = np.array(
         [float(x) for x in response(

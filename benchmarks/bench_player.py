@@ -96,21 +96,7 @@ def play(folder, speed):
 
 
 def compare(*, quick):
-    """
-    Write, play, and return the table.
-
-    Parameters
-    ----------
-    quick : bool
-        Whether it is only to show that it runs.
-
-    Returns
-    -------
-    Sheet
-        Passed if the order held and nothing was skipped, and at rate 1 the 99th percentile is
-        below a millisecond.
-
-    """
+    """Write, play, and return the table; passed if in order, and at rate 1 99 % within 1 ms."""
     from benchmarks.measure import ros_domain
     from benchmarks.sheet import Sheet
     rate, seconds = 1000.0, 2.0 if quick else 30.0

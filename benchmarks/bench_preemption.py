@@ -30,20 +30,7 @@ _TARGETS = np.random.default_rng(1).uniform(0.8, 1.4, 4096)
 
 
 def compare(*, quick: bool = False) -> Report:
-    """
-    Measure all modes.
-
-    Parameters
-    ----------
-    quick : bool
-        Few requests: shows that it runs, not how fast.
-
-    Returns
-    -------
-    Report
-        The column of times is the 99th percentile.
-
-    """
+    """Measure all modes; the column of times is the 99th percentile."""
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     count = 20 if quick else 2000
     rows = [own_time(name, parameters, count) for name, parameters in MODES]
@@ -54,24 +41,7 @@ def compare(*, quick: bool = False) -> Report:
 
 
 def own_time(name: str, parameters: dict[str, str], count: int) -> Row:
-    """
-    Time the node's callback.
-
-    Parameters
-    ----------
-    name : str
-        For the table.
-    parameters : dict of str to str
-        Of the planner.
-    count : int
-        Number of requests.
-
-    Returns
-    -------
-    Row
-        99th percentile, median and largest.
-
-    """
+    """Time the node's callback."""
     import rclpy
     from rosgraph_msgs.msg import Clock
     from std_msgs.msg import Float64
@@ -103,20 +73,7 @@ def own_time(name: str, parameters: dict[str, str], count: int) -> Row:
 
 
 def round_trip(count: int) -> Row:
-    """
-    Time a setpoint's way to the planner process and its command's way back.
-
-    Parameters
-    ----------
-    count : int
-        Number of requests.
-
-    Returns
-    -------
-    Row
-        99th percentile, median and largest.
-
-    """
+    """Time a setpoint's way to the planner process and its command's way back."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
 

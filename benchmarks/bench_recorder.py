@@ -211,15 +211,7 @@ def recorder(rate, seconds, folder):
 
 
 class Search:
-    """
-    The search of the highest rate without loss.
-
-    Parameters
-    ----------
-    seconds : float
-        How long to send at each rate.
-
-    """
+    """The search of the highest rate without loss, some seconds at each rate."""
 
     def __init__(self, seconds):
         self._seconds = seconds
@@ -303,20 +295,7 @@ def runs(name, run):
 
 
 def compare(*, quick):
-    """
-    Search, measure, and return the table.
-
-    Parameters
-    ----------
-    quick : bool
-        Whether it is only to show that it runs.
-
-    Returns
-    -------
-    Sheet
-        Passed if the recorder lost nothing in its last run.
-
-    """
+    """Search, measure, and return the table; passed if the last run lost nothing."""
     from benchmarks.measure import ros_domain
     from benchmarks.sheet import Sheet
     seconds = 2.0 if quick else 60.0

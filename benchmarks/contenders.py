@@ -27,22 +27,7 @@ _PATIENCE = 600.0
 
 
 def holding_load(stretch: float, j_lim: float) -> float:
-    """
-    Return beta_1 of a stretch.
-
-    Parameters
-    ----------
-    stretch : float
-        Inside the limits.
-    j_lim : float
-        Chain limit.
-
-    Returns
-    -------
-    float
-        Signed load.
-
-    """
+    """Return the signed load beta_1 of a stretch inside the limits."""
     return (stretch - stretch ** -2) / (1.0 - (2.0 / stretch + stretch ** 2 - 3.0) / j_lim)
 
 
@@ -270,15 +255,7 @@ class External:
     """
     A program that reads moves, solves them again and again and times itself.
 
-    Parameters
-    ----------
-    command : sequence of str
-        Program and first arguments; tolerance and number of repetitions follow.
-    actuator : Actuator
-        zeta, J_lim and c1.
-    moves : sequence of (float, float)
-        Start and target of each move.
-
+    Tolerance and number of repetitions follow the first arguments of ``command``.
     """
 
     def __init__(
@@ -290,29 +267,7 @@ class External:
             for start, target in moves)
 
     def run(self, tolerance: float, repeats: int) -> tuple[list[float], float, float]:
-        """
-        Solve the moves.
-
-        Parameters
-        ----------
-        tolerance : float
-            Of the integration.
-        repeats : int
-            How often, at least 1.
-
-        Returns
-        -------
-        loads : list of float
-            beta_p of each move.
-        least, median : float
-            Seconds per plan.
-
-        Raises
-        ------
-        subprocess.SubprocessError
-            If the program fails.
-
-        """
+        """Solve the moves; return beta_p of each, and least and median seconds per plan."""
         done = subprocess.run(
             [*self._command, repr(tolerance), str(repeats)], input=self._input, check=True,
             capture_output=True, text=True, timeout=_PATIENCE)
@@ -322,42 +277,12 @@ class External:
 
 
 def compiler() -> str | None:
-    """
-    Find a C compiler.
-
-    Returns
-    -------
-    str or None
-        The one that CC names, else cc.
-
-    """
+    """Return the C compiler that CC names, else cc; None without one."""
     return shutil.which(os.environ.get('CC') or 'cc')
 
 
 def compile_c(directory: Path, name: str, options: Sequence[str]) -> Path:
-    """
-    Compile the C program with -O2.
-
-    Parameters
-    ----------
-    directory : Path
-        Where to.
-    name : str
-        Of the program.
-    options : sequence of str
-        Further options.
-
-    Returns
-    -------
-    Path
-        The program.
-
-    Raises
-    ------
-    subprocess.SubprocessError
-        If it does not compile.
-
-    """
+    """Compile the C program with -O2."""
     program = directory / name
     subprocess.run(
         [compiler() or 'cc', '-O2', *options, '-o', str(program), str(HERE / 'two_step.c'),
@@ -366,13 +291,5 @@ def compile_c(directory: Path, name: str, options: Sequence[str]) -> Path:
 
 
 def octave() -> str | None:
-    """
-    Find GNU Octave.
-
-    Returns
-    -------
-    str or None
-        Its program without windows.
-
-    """
+    """Return GNU Octave's program without windows, None without one."""
     return shutil.which('octave-cli') or shutil.which('octave')

@@ -51,24 +51,7 @@ class Count:
 
 
 def make_bag(folder: Path, *, preset: str = 'none', killed: bool = False) -> Path:
-    """
-    Write a bag of two topics in some chunks.
-
-    Parameters
-    ----------
-    folder : pathlib.Path
-        Must not exist.
-    preset : str
-        Of the writer.
-    killed : bool
-        Whether its writer did not come to its end.
-
-    Returns
-    -------
-    pathlib.Path
-        The bag's file.
-
-    """
+    """Write a bag of two topics in some chunks."""
     writer = BagWriter(folder, preset=preset, chunk_size=1000, custom_data={'actuator': 'A3'})
     numbers = [writer.add_topic(Topic(name, _FLOAT, 'float64 data\n')) for name in ('/a', '/b')]
     writer.write((
@@ -83,22 +66,7 @@ def make_bag(folder: Path, *, preset: str = 'none', killed: bool = False) -> Pat
 
 
 def header_bits(data: bytes, *, killed: bool = False) -> list[int]:
-    """
-    Return the bits of the headers of all records.
-
-    Parameters
-    ----------
-    data : bytes
-        Of an MCAP file.
-    killed : bool
-        Whether its writer did not come to its end.
-
-    Returns
-    -------
-    list of int
-        Eight times the place of the byte, plus the bit.
-
-    """
+    """Return the bits (eight times the byte's place, plus the bit) of all records' headers."""
     bits: list[int] = []
     heads = _HEADS_KILLED if killed else _HEADS
     offset = len(MAGIC)
@@ -113,24 +81,7 @@ def header_bits(data: bytes, *, killed: bool = False) -> list[int]:
 
 
 def flip(path: Path, bits: Sequence[int], work: Path) -> Count:
-    """
-    Read a bag with one wrong bit after the other.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        The bag's file, in its folder.
-    bits : sequence of int
-        As from `header_bits`.
-    work : pathlib.Path
-        Folder for the changed bag.
-
-    Returns
-    -------
-    Count
-        Result of the flips.
-
-    """
+    """Read a bag with one wrong bit after the other."""
     original = path.read_bytes()
     truth = _read(path.parent)
     copy = work / path.parent.name
@@ -167,24 +118,7 @@ def _read(folder: Path) -> tuple[Any, ...]:
 
 
 def samples(count: int, work: Path) -> Iterator[tuple[str, Count]]:
-    """
-    Flip bits of bags of every kind.
-
-    Parameters
-    ----------
-    count : int
-        How many bits altogether.
-    work : pathlib.Path
-        An empty folder.
-
-    Yields
-    ------
-    name : str
-        Of the kind of bag.
-    result : Count
-        Result of its share.
-
-    """
+    """Flip bits of bags of every kind."""
     dice = random.Random(6)
     kinds = [(preset, killed) for preset in ('none', 'zstd_fast', 'lz4')
              for killed in (False, True)]

@@ -105,18 +105,7 @@ def race(contenders: Sequence[Contender], rounds: int) -> list[Row]:
     """
     Time contenders by turns, so that what disturbs the machine meets all of them.
 
-    Parameters
-    ----------
-    contenders : sequence of Contender
-        In the order of the table.
-    rounds : int
-        How many turns each gets, at least 1.
-
-    Returns
-    -------
-    list of Row
-        Least of all turns and median of their medians.
-
+    A row holds the least of all turns and the median of their medians.
     """
     turns: list[list[tuple[float, float]]] = [[] for _ in contenders]
     for _ in range(rounds):
@@ -163,20 +152,7 @@ def loosest(
 
 
 def text_of_time(seconds: float | None) -> str:
-    """
-    Return a time with a unit that suits it.
-
-    Parameters
-    ----------
-    seconds : float or None
-        None for not measured.
-
-    Returns
-    -------
-    str
-        Three digits.
-
-    """
+    """Return a time with a unit that suits it, in three digits."""
     if seconds is None:
         return '-'
     for factor, unit in ((1.0, 's'), (1e3, 'ms'), (1e6, 'us')):
@@ -231,15 +207,7 @@ class Report:
         return [head[i] for i in used], [[cells[i] for i in used] for cells in body]
 
     def show(self, console: Console) -> None:
-        """
-        Print the table.
-
-        Parameters
-        ----------
-        console : Console
-            Where to.
-
-        """
+        """Print the table."""
         head, body = self._cells()
         table = Table(title=self.title, title_justify='left')
         for name in head:
@@ -249,30 +217,14 @@ class Report:
         console.print(table)
 
     def markdown(self) -> str:
-        """
-        Return the table for a page of the documentation.
-
-        Returns
-        -------
-        str
-            Title and table.
-
-        """
+        """Return the table for a page of the documentation."""
         head, body = self._cells()
         rule = ['---' if name in _TEXT else '--:' for name in head]
         lines = ['| ' + ' | '.join(cells) + ' |' for cells in [head, rule, *body]]
         return '\n'.join([f'**{self.title}**', '', *lines, ''])
 
     def record(self) -> dict[str, Any]:
-        """
-        Return the report for a JSON file.
-
-        Returns
-        -------
-        dict
-            Times in seconds.
-
-        """
+        """Return the report for a JSON file."""
         return asdict(self)
 
 
@@ -282,15 +234,7 @@ def ros_domain() -> int:
 
 
 def machine() -> dict[str, Any]:
-    """
-    Say what it was measured on.
-
-    Returns
-    -------
-    dict
-        Processor, cores, versions and the load average at this moment.
-
-    """
+    """Return processor, cores, versions and the load average at this moment."""
     import numba
     import numpy
     import scipy

@@ -38,15 +38,7 @@ class Sheet:
     passed: bool = True
 
     def show(self, console: Console) -> None:
-        """
-        Print the table.
-
-        Parameters
-        ----------
-        console : Console
-            Where to.
-
-        """
+        """Print the table."""
         table = Table(title=self.title, title_justify='left')
         for i, name in enumerate(self.head):
             table.add_column(name, justify='right' if i else 'left')
@@ -55,27 +47,11 @@ class Sheet:
         console.print(table)
 
     def markdown(self) -> str:
-        """
-        Return the table for a page of the documentation.
-
-        Returns
-        -------
-        str
-            Title and table.
-
-        """
+        """Return the table for a page of the documentation."""
         rule = ['---', *['--:'] * (len(self.head) - 1)]
         lines = ['| ' + ' | '.join(cells) + ' |' for cells in (self.head, rule, *self.rows)]
         return '\n'.join([f'**{self.title}**', '', *lines, ''])
 
     def record(self) -> dict[str, Any]:
-        """
-        Return the table for a JSON file.
-
-        Returns
-        -------
-        dict
-            Headings, cells and figures.
-
-        """
+        """Return the table for a JSON file."""
         return asdict(self)

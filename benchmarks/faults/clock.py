@@ -21,20 +21,7 @@ _PERIOD_SECONDS = 0.001
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """
-    Publish until interrupted.
-
-    Parameters
-    ----------
-    arguments : list of str, optional
-        Default those of the command line.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    """
+    """Publish until interrupted."""
     parser = argparse.ArgumentParser(description='Publish simulated time.')
     parser.add_argument('--start', type=float, default=100.0, help='seconds')
     parser.add_argument('--jump', default='0:0', help='AFTER:BY, seconds')

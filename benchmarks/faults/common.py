@@ -49,21 +49,7 @@ def pair(
         rig: Rig, *, plant: Mapping[str, object] | None = None,
         planner: Mapping[str, object] | None = None,
         remap: Mapping[str, str] | None = None, slow: float = 0.0) -> None:
-    """
-    Start a plant and a planner and wait until both are ready.
-
-    Parameters
-    ----------
-    rig : Rig
-        Where.
-    plant, planner : mapping of str to object, optional
-        Parameters.
-    remap : mapping of str to str, optional
-        Names that the planner is to replace.
-    slow : float
-        Real-time factor with the plant as authority on time; 0 for time by the wall.
-
-    """
+    """Start a plant and a planner and wait for both; ``slow`` has the plant lead time."""
     led = {'publish_clock': True, 'real_time_factor': slow} if slow else {}
     # By the wall, so far ahead that stalls of a busy machine are no faults of their own.
     follows: dict[str, object] = {'use_sim_time': True} if slow else {'lead_time': PATIENT_LEAD}
@@ -75,26 +61,7 @@ def pair(
 def move(
         rig: Rig, target: float, *, start: float, pause: float = 0.3,
         patience: float = 60.0) -> tuple[float, float]:
-    """
-    Ask for one stretch and measure what is left of the move.
-
-    Parameters
-    ----------
-    rig : Rig
-        With a plant and a planner.
-    target, start : float
-        Stretch asked for, and the one before, for the step.
-    pause : float
-        Of the plant's time until the end is looked at, in s.
-    patience : float
-        In s on the wall.
-
-    Returns
-    -------
-    residual, error : float
-        As `settled` has them.
-
-    """
+    """Ask for one stretch; return what `settled` says after a pause in s of the plant's time."""
     mark = rig.count()
     rig.setpoint(target)
     await_change(rig, mark, patience)
@@ -103,45 +70,14 @@ def move(
 
 
 def await_change(rig: Rig, mark: int, patience: float = 60.0) -> None:
-    """
-    Wait until the flux density in force changes.
-
-    Parameters
-    ----------
-    rig : Rig
-        With a plant.
-    mark : int
-        Sample from which on a change counts.
-    patience : float
-        In s on the wall.
-
-    """
+    """Wait until the flux density in force changes, from a sample on."""
     rig.spin_until(lambda: jump(rig, mark) > 0.0, 'a command to take effect', patience)
 
 
 def moves(
         rig: Rig, targets: Sequence[float] = TARGETS, *, start: float = 1.0,
         pause: float = 0.3, patience: float = 60.0) -> float:
-    """
-    Ask for several stretches, one after the other.
-
-    Parameters
-    ----------
-    rig : Rig
-        With a plant and a planner.
-    targets : sequence of float
-        Stretches.
-    start : float
-        Stretch before the first.
-    pause, patience : float
-        As of `move`.
-
-    Returns
-    -------
-    float
-        Worst residual or error.
-
-    """
+    """Ask for several stretches, one after the other; return the worst residual or error."""
     worst = 0.0
     for target in targets:
         worst = max(worst, *move(rig, target, start=start, pause=pause, patience=patience))
@@ -150,39 +86,11 @@ def moves(
 
 
 def jump(rig: Rig, first: int, last: int | None = None) -> float:
-    """
-    Return the largest change of the flux density in force between two samples.
-
-    Parameters
-    ----------
-    rig : Rig
-        With a plant.
-    first, last : int
-        Marks between which to look.
-
-    Returns
-    -------
-    float
-        In T.
-
-    """
+    """Return the largest change in T of the flux density in force between two samples."""
     flux = rig.samples(first)[1][:None if last is None else last - first, 2]
     return float(np.max(np.abs(np.diff(flux)), initial=0.0))
 
 
 def share(value: float) -> str:
-    """
-    Return a residual as text.
-
-    Parameters
-    ----------
-    value : float
-        As a share of the step.
-
-    Returns
-    -------
-    str
-        Two digits.
-
-    """
+    """Return a residual, a share of the step, as text."""
     return f'{value:.1e}'

@@ -28,22 +28,7 @@ _LENGTHS = (0, 0, 1, 1, 1, 2, 3, 50)
 
 
 def message(kind: type[Any], dice: random.Random) -> Any:
-    """
-    Return a message of wild values.
-
-    Parameters
-    ----------
-    kind : type
-        Message class, or the request class of a service.
-    dice : random.Random
-        What the values are drawn from.
-
-    Returns
-    -------
-    object
-        One that can be sent.
-
-    """
+    """Return a message, or a request of a service, of wild values."""
     made = kind()
     for name, slot in zip(kind.get_fields_and_field_types(), kind.SLOT_TYPES, strict=True):
         setattr(made, name, _value(slot, dice))
@@ -51,22 +36,7 @@ def message(kind: type[Any], dice: random.Random) -> Any:
 
 
 def encoding(kind: type[Any], dice: random.Random) -> bytes:
-    """
-    Return bytes that are no message, or not one that was meant.
-
-    Parameters
-    ----------
-    kind : type
-        Message class.
-    dice : random.Random
-        What the bytes are drawn from.
-
-    Returns
-    -------
-    bytes
-        Cut off, with wrong bytes, too long, or noise altogether.
-
-    """
+    """Return bytes that are no message, or not one that was meant."""
     whole = bytearray(serialize_message(message(kind, dice)))
     choice = dice.randrange(4)
     if choice == 0:

@@ -19,17 +19,7 @@ _CALLS = 60
 
 
 def input_topics() -> Iterator[tuple[interface.Topic, str]]:
-    """
-    Name every topic that nodes of the package take messages from.
-
-    Yields
-    ------
-    topic : interface.Topic
-        As declared.
-    owner : str
-        Node whose private name it is; empty for others.
-
-    """
+    """Yield every topic that nodes of the package take messages from, and whose private it is."""
     for topic in vars(interface).values():
         if isinstance(topic, interface.Topic) and topic.subscribers:
             yield topic, next(
@@ -116,24 +106,7 @@ def _services(rig: Rig) -> Seen:
 
 
 def wild_request(kind: type[Any], name: str, dice: random.Random) -> Any:
-    """
-    Return a request that nobody means.
-
-    Parameters
-    ----------
-    kind : type
-        Service class.
-    name : str
-        Of the service.
-    dice : random.Random
-        What the values are drawn from.
-
-    Returns
-    -------
-    object
-        Of transitions only such as do not exist: one that does would be obeyed.
-
-    """
+    """Return a request that nobody means; of transitions only such as do not exist."""
     request = garbage.message(kind.Request, dice)
     if name.endswith('/change_state'):
         request.transition.id = dice.randrange(100, 256)
@@ -182,24 +155,7 @@ def _taken(rig: Rig) -> Seen:
 
 
 def atomically(rig: Rig, owner: str, **values: object) -> str:
-    """
-    Set parameters of a node all together or not at all.
-
-    Parameters
-    ----------
-    rig : Rig
-        Where.
-    owner : str
-        Node.
-    **values : object
-        By name.
-
-    Returns
-    -------
-    str
-        Reason of a refusal, empty if they were taken.
-
-    """
+    """Set parameters all together or not at all; return the reason of a refusal."""
     from rcl_interfaces.srv import SetParametersAtomically
     from rclpy.parameter import Parameter
 

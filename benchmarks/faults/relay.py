@@ -29,15 +29,7 @@ _TICK_SECONDS = 0.0005
 
 
 class Relay(Node):
-    """
-    Passes commands on, with a fault.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        As the command line has them.
-
-    """
+    """Passes commands on, with a fault."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         """Listen and pass on."""
@@ -83,20 +75,7 @@ class Relay(Node):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """
-    Relay until interrupted.
-
-    Parameters
-    ----------
-    arguments : list of str, optional
-        Default those of the command line.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    """
+    """Relay until interrupted."""
     parser = argparse.ArgumentParser(description='Relay commands with a fault.')
     parser.add_argument('source')
     parser.add_argument('target')

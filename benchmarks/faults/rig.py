@@ -36,26 +36,7 @@ _TRACE = 'Traceback (most recent call last)'
 
 
 class Child:
-    """
-    A process with its output in a file.
-
-    Parameters
-    ----------
-    command : sequence of str
-        Program and arguments.
-    log : Path
-        Output is appended to it.
-    environment : mapping of str to str
-        Of the process.
-
-    Attributes
-    ----------
-    popen : subprocess.Popen
-        The process.
-    log : Path
-        As given.
-
-    """
+    """A process with its output appended to a file."""
 
     def __init__(
             self, command: Sequence[str], log: Path, environment: Mapping[str, str]) -> None:
@@ -78,34 +59,11 @@ class Child:
         return self.log.read_text(errors='replace')
 
     def send(self, number: int) -> None:
-        """
-        Send a signal.
-
-        Parameters
-        ----------
-        number : int
-            For example SIGSTOP.
-
-        """
+        """Send a signal."""
         self.popen.send_signal(number)
 
     def end(self, number: int = signal.SIGINT, patience: float = PATIENCE) -> int:
-        """
-        Send a signal and wait for the end; kill what does not answer.
-
-        Parameters
-        ----------
-        number : int
-            Signal.
-        patience : float
-            In s.
-
-        Returns
-        -------
-        int
-            Exit status, negative for a signal.
-
-        """
+        """Send a signal, wait for the end and return the status; kill what does not answer."""
         if self.alive:
             self.popen.send_signal(number)
         try:
@@ -214,24 +172,7 @@ class Rig:
     def start(
             self, name: str, parameters: Mapping[str, object] | None = None,
             remap: Mapping[str, str] | None = None) -> Child:
-        """
-        Start a node of the package.
-
-        Parameters
-        ----------
-        name : str
-            For example ``'planner'``.
-        parameters : mapping of str to object, optional
-            Values as ``-p`` takes them.
-        remap : mapping of str to str, optional
-            Names to replace.
-
-        Returns
-        -------
-        Child
-            The process.
-
-        """
+        """Start a node of the package."""
         words = []
         for key, value in (parameters or {}).items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
@@ -241,42 +182,14 @@ class Rig:
         return self.run(name, '-m', 'hmsa_ros', name, '--ros-args', *words)
 
     def run(self, name: str, *words: str) -> Child:
-        """
-        Start this Python with arguments.
-
-        Parameters
-        ----------
-        name : str
-            Of the log.
-        *words : str
-            Arguments.
-
-        Returns
-        -------
-        Child
-            The process.
-
-        """
+        """Start this Python with arguments."""
         child = Child(
             [sys.executable, *words], self.folder / f'{name}.log', self.environment)
         self.children.append(child)
         return child
 
     def relay(self, *options: str) -> dict[str, str]:
-        """
-        Start a relay and return the remapping with which the planner sends through it.
-
-        Parameters
-        ----------
-        *options : str
-            As `benchmarks.faults.relay` takes them.
-
-        Returns
-        -------
-        dict of str to str
-            For `start`.
-
-        """
+        """Start a relay and return the remapping with which the planner sends through it."""
         name = interface.FLUX_DENSITY_COMMAND.name
         self.run('relay', '-m', 'benchmarks.faults.relay', f'{name}_sent', name, *options)
         self.spin_until(
@@ -285,32 +198,11 @@ class Rig:
         return {name: f'{name}_sent'}
 
     def load(self, count: int) -> list[Child]:
-        """
-        Keep processors busy.
-
-        Parameters
-        ----------
-        count : int
-            Number of processes.
-
-        Returns
-        -------
-        list of Child
-            They end with the rig, or when they are told to.
-
-        """
+        """Keep processors busy."""
         return [self.run('load', '-c', 'while True: pass') for _ in range(count)]
 
     def ready(self, *names: str) -> None:
-        """
-        Wait until nodes are there and have found each other.
-
-        Parameters
-        ----------
-        *names : str
-            Nodes that answer on ``/diagnostics``.
-
-        """
+        """Wait until nodes are there and have found each other."""
         if interface.PLANT in names and self._watch:
             self.spin_until(lambda: len(self._stamps) > 0, 'the first sample')
         if interface.PLANNER in names:
@@ -322,15 +214,7 @@ class Rig:
         self._await_diagnostics(names)
 
     def traces(self) -> list[str]:
-        """
-        Find unhandled exceptions in the logs of the package's nodes.
-
-        Returns
-        -------
-        list of str
-            The last line of each traceback.
-
-        """
+        """Return the last line of each traceback in the logs of the package's nodes."""
         found = []
         for log in {x.log for x in self.children}:
             if log.stem.split('_')[0] not in interface.NODES:
@@ -350,22 +234,7 @@ class Rig:
             topic.type, name, lambda x: None if self.deaf else callback(x), topic.qos)
 
     def publisher(self, topic: interface.Topic, owner: str = '') -> Any:
-        """
-        Return a publisher of ours.
-
-        Parameters
-        ----------
-        topic : interface.Topic
-            As the package declares it.
-        owner : str
-            Node that it belongs to, of a private name.
-
-        Returns
-        -------
-        rclpy.publisher.Publisher
-            On that topic.
-
-        """
+        """Return a publisher of ours."""
         return self.node.create_publisher(
             topic.type, interface.from_outside(topic.name, owner), topic.qos)
 
@@ -389,34 +258,11 @@ class Rig:
         return self._seen.get(node, 0)
 
     def count(self) -> int:
-        """
-        Return the number of samples so far, a mark for `samples`.
-
-        Returns
-        -------
-        int
-            Of ``joint_states``.
-
-        """
+        """Return the number of samples so far, a mark for `samples`."""
         return len(self._stamps)
 
     def samples(self, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Return samples of ``joint_states``.
-
-        Parameters
-        ----------
-        first : int
-            Mark from which on.
-
-        Returns
-        -------
-        stamps : ndarray of int, shape (n,)
-            In ns.
-        values : ndarray, shape (n, 3)
-            Stretch, rate in 1/s, flux density in T.
-
-        """
+        """Return stamps in ns and stretch, rate in 1/s, flux density in T from a mark on."""
         return (np.array(self._stamps[first:], np.int64),
                 np.array(self._values[3 * first:]).reshape(-1, 3))
 
@@ -426,55 +272,19 @@ class Rig:
         return self._stamps[-1]
 
     def value(self, node: str, key: str) -> float:
-        """
-        Return a number from the newest diagnostics of a node.
-
-        Parameters
-        ----------
-        node : str
-            Name of the node.
-        key : str
-            Of the value.
-
-        Returns
-        -------
-        float
-            NaN if the node says nothing of it.
-
-        """
+        """Return a number from the newest diagnostics of a node; NaN if there is none."""
         for name, status in self.diagnostics.items():
             if name.startswith(node) and key in status:
                 return float(status[key])
         return float('nan')
 
     def level(self, node: str) -> int:
-        """
-        Return the worst level in the newest diagnostics of a node.
-
-        Parameters
-        ----------
-        node : str
-            Name of the node.
-
-        Returns
-        -------
-        int
-            0 OK, 1 WARN, 2 ERROR, 3 STALE; -1 if it says nothing.
-
-        """
+        """Return the worst level in a node's newest diagnostics; -1 if it says nothing."""
         return max((int(x['level']) for name, x in self.diagnostics.items()
                     if name.startswith(node)), default=-1)
 
     def fresh(self, *nodes: str) -> None:
-        """
-        Wait for diagnostics that are newer than now.
-
-        Parameters
-        ----------
-        *nodes : str
-            Nodes to hear of.
-
-        """
+        """Wait for diagnostics that are newer than now."""
         self._await_diagnostics(nodes)
 
     def _await_diagnostics(self, nodes: Sequence[str]) -> None:
@@ -489,24 +299,7 @@ class Rig:
 
     def spin_until(
             self, condition: Callable[[], Any], what: str, patience: float = PATIENCE) -> None:
-        """
-        Serve callbacks until a condition holds.
-
-        Parameters
-        ----------
-        condition : callable
-            Asked again and again.
-        what : str
-            What is waited for.
-        patience : float
-            In s.
-
-        Raises
-        ------
-        HmsaError
-            If it does not come true in time.
-
-        """
+        """Serve callbacks until a condition holds."""
         end = monotonic() + patience
         while not condition():
             if monotonic() > end:
@@ -514,89 +307,29 @@ class Rig:
             self._executor.spin_once(timeout_sec=_SLICE)
 
     def spin(self, seconds: float) -> None:
-        """
-        Serve callbacks for a time by the clock on the wall.
-
-        Parameters
-        ----------
-        seconds : float
-            How long.
-
-        """
+        """Serve callbacks for a time by the clock on the wall."""
         end = monotonic() + seconds
         self.spin_until(lambda: monotonic() >= end, 'the time to pass', seconds + 1.0)
 
     def let_pass(self, seconds: float, patience: float = PATIENCE) -> None:
-        """
-        Serve callbacks until the plant's samples are so much older.
-
-        Parameters
-        ----------
-        seconds : float
-            Of the plant's time.
-        patience : float
-            In s on the wall.
-
-        """
+        """Serve callbacks until the plant's samples are so much older."""
         end = self.time + round(seconds * NANOSECONDS)
         self.spin_until(lambda: self.time >= end, f'{seconds:g} s of the plant', patience)
 
     def setpoint(self, stretch: float) -> dict[str, str]:
-        """
-        Ask for a stretch and wait for the verdict.
-
-        Parameters
-        ----------
-        stretch : float
-            Target.
-
-        Returns
-        -------
-        dict of str to str
-            The verdict.
-
-        """
+        """Ask for a stretch and wait for the verdict."""
         return self.ask(lambda: self.publish_setpoint(stretch))
 
     def publish_setpoint(self, stretch: float) -> None:
-        """
-        Ask for a stretch and do not wait.
-
-        Parameters
-        ----------
-        stretch : float
-            Target.
-
-        """
+        """Ask for a stretch and do not wait."""
         self._setpoint.publish(interface.SETPOINT.type(data=float(stretch)))
 
     def publish_trajectory(self, message: Any) -> None:
-        """
-        Send a sequence and do not wait.
-
-        Parameters
-        ----------
-        message : trajectory_msgs.msg.JointTrajectory
-            As the planner takes them.
-
-        """
+        """Send a sequence and do not wait."""
         self._trajectory.publish(message)
 
     def sequence(self, setpoints: Sequence[tuple[float, float]]) -> dict[str, str]:
-        """
-        Send a sequence that begins now and wait for the verdict.
-
-        Parameters
-        ----------
-        setpoints : sequence of (float, float)
-            Stretch and span in s.
-
-        Returns
-        -------
-        dict of str to str
-            The verdict.
-
-        """
+        """Send a sequence that begins now and wait for the verdict."""
         ends = np.cumsum([x for _, x in setpoints])
         message = to_trajectory(
             [(x, round(end * NANOSECONDS))
@@ -604,20 +337,7 @@ class Rig:
         return self.ask(lambda: self.publish_trajectory(message))
 
     def ask(self, send: Callable[[], None]) -> dict[str, str]:
-        """
-        Send a request and wait for the planner's next verdict.
-
-        Parameters
-        ----------
-        send : callable
-            Sends it.
-
-        Returns
-        -------
-        dict of str to str
-            The verdict.
-
-        """
+        """Send a request and wait for the planner's next verdict."""
         self.spin_until(self._setpoint.get_subscription_count, 'a planner that listens')
         before = len(self.verdicts)
         send()
@@ -625,46 +345,12 @@ class Rig:
         return self.verdicts[-1]
 
     def call(self, service: interface.Service | type, owner: str, request: Any = None) -> Any:
-        """
-        Call a service of a node.
-
-        Parameters
-        ----------
-        service : interface.Service
-            As the package declares it.
-        owner : str
-            Node that serves it.
-        request : object, optional
-            Default an empty one.
-
-        Returns
-        -------
-        object
-            The response.
-
-        """
+        """Call a service of a node."""
         return self.call_by_name(
             service.type, interface.from_outside(service.name, owner), request)
 
     def call_by_name(self, kind: type[Any], name: str, request: Any = None) -> Any:
-        """
-        Call a service by its name.
-
-        Parameters
-        ----------
-        kind : type
-            Service class.
-        name : str
-            Relative or absolute.
-        request : object, optional
-            Default an empty one.
-
-        Returns
-        -------
-        object
-            The response.
-
-        """
+        """Call a service by its name."""
         client = self._clients.get(name)
         if client is None:
             client = self._clients[name] = self.node.create_client(kind, name)
@@ -677,22 +363,7 @@ class Rig:
         return future.result()
 
     def set_parameters(self, owner: str, **values: object) -> list[str]:
-        """
-        Set parameters of a node, each by itself; dots are written as two underscores.
-
-        Parameters
-        ----------
-        owner : str
-            Node.
-        **values : object
-            By name.
-
-        Returns
-        -------
-        list of str
-            Reasons of the refused ones.
-
-        """
+        """Set parameters each by itself, ``__`` for a dot; return the reasons of refusals."""
         from rcl_interfaces.srv import SetParameters
 
         response = self.call_by_name(SetParameters, f'{owner}/set_parameters', (
@@ -714,17 +385,6 @@ def hushed(log: Path) -> Iterator[TextIO]:
     Have what the middleware writes to standard error go to a file.
 
     It complains there of every broken message that this process sends or receives.
-
-    Parameters
-    ----------
-    log : Path
-        Appended to.
-
-    Yields
-    ------
-    file
-        Standard error as it was.
-
     """
     sys.stderr.flush()
     with open(os.dup(2), 'w', encoding='utf-8') as before, open(log, 'ab') as file:

@@ -77,21 +77,10 @@ class Outcome:
 
 def inject(fault: Fault, domain: int) -> Outcome:
     """
-    Inject one fault into real processes.
+    Inject one fault into real processes of a ROS domain.
 
-    Parameters
-    ----------
-    fault : Fault
-        Which one.
-    domain : int
-        ROS domain that nobody else uses.
-
-    Returns
-    -------
-    Outcome
-        A fault that stops the rig from going on is not survived, and says why. An unhandled
-        exception in the output of any process is never what was expected.
-
+    A fault that stops the rig from going on is not survived, and says why. An unhandled
+    exception in the output of any process is never what was expected.
     """
     with tempfile.TemporaryDirectory(prefix='hmsa_faults_') as folder:
         rig = Rig(Path(folder), domain)
@@ -109,20 +98,7 @@ def inject(fault: Fault, domain: int) -> Outcome:
 
 
 def markdown(outcomes: Sequence[Outcome]) -> str:
-    """
-    Return the table for a page of the documentation.
-
-    Parameters
-    ----------
-    outcomes : sequence of Outcome
-        In order.
-
-    Returns
-    -------
-    str
-        Markdown.
-
-    """
+    """Return the table for a page of the documentation."""
     head = ('fault', 'how it is made', 'expected', 'seen', 'residual or loss', '')
     lines = ['| ' + ' | '.join(head) + ' |', '|' + ' --- |' * len(head)]
     for row in outcomes:
