@@ -1,6 +1,7 @@
 """A client of the planner: sends a sequence, reads the verdict, follows the progress."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 import math
 from time import monotonic, sleep
@@ -16,6 +17,7 @@ from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, HmsaError, printable
 from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.capture import decode, RawSubscription
 from hmsa_ros.nodes.conversions import to_trajectory, whole
 from hmsa_ros.nodes.visitor import leave, visit
 
@@ -161,7 +163,8 @@ class PlannerClient:
 
     def spin_until(
             self, condition: Callable[[], bool], failure: str,
-            each: Callable[[], None] | None = None, timeout: float | None = None) -> None:
+            each: Callable[[], None] | None = None, timeout: float | None = None,
+            time: Callable[[], float] = monotonic) -> None:
         """
         Serve callbacks until a condition holds.
 
@@ -175,6 +178,8 @@ class PlannerClient:
             Called about 20 times a second.
         timeout : float, optional
             Patience in s; default the client's.
+        time : callable
+            Returns the seconds that count for it.
 
         Raises
         ------
@@ -185,9 +190,9 @@ class PlannerClient:
 
         """
         patience = self._timeout if timeout is None else timeout
-        deadline = monotonic() + patience
+        deadline = time() + patience
         while not condition():
-            if monotonic() > deadline:
+            if time() > deadline:
                 raise HmsaError(f'waited {patience:g} s: {failure}')
             ENDING.check()
             self._executor.spin_once(timeout_sec=_SLICE_SECONDS)
@@ -328,7 +333,7 @@ class PlannerClient:
         each : callable, optional
             Called about 20 times a second with the newest verdict.
         timeout : float
-            Patience in s.
+            Patience in s; in simulated ones where that time is published and runs slower.
 
         Returns
         -------
@@ -360,11 +365,39 @@ class PlannerClient:
                 raise HmsaError(f'the sequence is not carried out: {now.unheard}')
             return ended
 
-        self.spin_until(
-            done, 'the sequence has not finished',
-            None if each is None else lambda: each(self._verdict),
-            timeout)
+        with self._slower_time() as time:
+            self.spin_until(
+                done, 'the sequence has not finished',
+                None if each is None else lambda: each(self._verdict), timeout, time)
         return self._verdict
+
+    @contextmanager
+    def _slower_time(self) -> Iterator[Callable[[], float]]:
+        """Give a clock of seconds of simulated time, but none faster than the wall's."""
+        topic = interface.CLOCK_TOPIC
+        if not self.node.count_publishers(topic.name):
+            yield monotonic
+            return
+        clock = RawSubscription(self.node, topic.type, topic.name, topic.qos)
+        passed, heard, before = 0.0, monotonic(), math.nan
+
+        def time() -> float:
+            nonlocal passed, heard, before
+            now = monotonic()
+            for taken in clock.take()[-1:]:
+                with suppress(BadInputError):
+                    stamp = decode(taken.data, topic.type).clock
+                    seconds = stamp.sec + 1e-9 * stamp.nanosec
+                    if seconds > before:
+                        passed += min(seconds - before, now - heard)
+                    heard, before = now, seconds
+            # Where nobody publishes it any more the wall's counts.
+            return passed + max(now - heard - self._timeout, 0.0)
+
+        try:
+            yield time
+        finally:
+            clock.destroy()
 
     def stop(self) -> bool:
         """
