@@ -92,24 +92,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def wait_until(
         condition: Callable[[], Any], what: str = 'the condition',
         seconds: float = WAIT_SECONDS) -> Any:
-    """
-    Wait until a condition holds and return what it gave.
-
-    Parameters
-    ----------
-    condition : callable
-        Asked again and again until its result is true.
-    what : str
-        Name of what is waited for, for the failure's message.
-    seconds : float
-        Limit in seconds.
-
-    Returns
-    -------
-    object
-        The first true result.
-
-    """
+    """Wait until a condition holds and return what it gave."""
     end = time.monotonic() + seconds
     while not (result := condition()):
         if time.monotonic() > end:
@@ -226,62 +209,19 @@ class Process:
         return self.popen.poll() is None
 
     def wait(self, seconds: float = WAIT_SECONDS) -> int:
-        """
-        Wait for its end.
-
-        Parameters
-        ----------
-        seconds : float
-            Limit in seconds.
-
-        Returns
-        -------
-        int
-            Exit status; negative for the signal that ended it.
-
-        """
+        """Wait for its end at most so many seconds; return the status, negative for a signal."""
         try:
             return self.popen.wait(seconds)
         except subprocess.TimeoutExpired:
             pytest.fail(f'{self.popen.args!r} did not end within {seconds:g} s: {self.output}')
 
     def stop(self, number: int = signal.SIGINT, seconds: float = WAIT_SECONDS) -> int:
-        """
-        Send a signal and wait for the end.
-
-        Parameters
-        ----------
-        number : int
-            Signal number.
-        seconds : float
-            Limit in seconds.
-
-        Returns
-        -------
-        int
-            Exit status.
-
-        """
+        """Send a signal and wait for the end."""
         self.popen.send_signal(number)
         return self.wait(seconds)
 
     def wait_for_output(self, text: str, seconds: float = WAIT_SECONDS) -> str:
-        """
-        Wait until the process has printed a text.
-
-        Parameters
-        ----------
-        text : str
-            What to wait for, on either output.
-        seconds : float
-            Limit in seconds.
-
-        Returns
-        -------
-        str
-            Both outputs.
-
-        """
+        """Wait until the process has printed a text on either output; return both."""
         def found() -> bool:
             if text in self.output:
                 return True
@@ -303,22 +243,7 @@ class Starter:
     processes: list[Process] = field(default_factory=list)
 
     def __call__(self, *command: str | os.PathLike[str], **extra_env: str) -> Process:
-        """
-        Start a command.
-
-        Parameters
-        ----------
-        *command : str or path
-            Program and its arguments.
-        **extra_env : str
-            More environment variables.
-
-        Returns
-        -------
-        Process
-            The running process.
-
-        """
+        """Start a command."""
         number = len(self.processes)
         stdout_path = self.folder / f'{number}.out'
         stderr_path = self.folder / f'{number}.err'
@@ -331,41 +256,11 @@ class Starter:
         return process
 
     def python(self, *arguments: str | os.PathLike[str], **extra_env: str) -> Process:
-        """
-        Start this Python.
-
-        Parameters
-        ----------
-        *arguments : str or path
-            Script and arguments, or ``-c`` and code.
-        **extra_env : str
-            More environment variables.
-
-        Returns
-        -------
-        Process
-            The running process.
-
-        """
+        """Start this Python."""
         return self(sys.executable, *arguments, **extra_env)
 
     def hmsa(self, *arguments: str | os.PathLike[str], **extra_env: str) -> Process:
-        """
-        Start ``hmsa`` with arguments.
-
-        Parameters
-        ----------
-        *arguments : str or path
-            For example ``'plant', '--ros-args', '-p', 'rate:=100.0'``.
-        **extra_env : str
-            More environment variables.
-
-        Returns
-        -------
-        Process
-            The running process.
-
-        """
+        """Start ``hmsa`` with arguments."""
         return self.python('-m', 'hmsa_ros', *arguments, **extra_env)
 
     def stop_all(self) -> None:
@@ -423,24 +318,7 @@ class RosSide:
     def spin_until(
             self, condition: Callable[[], Any], what: str = 'the condition',
             seconds: float = WAIT_SECONDS) -> Any:
-        """
-        Serve callbacks until a condition holds and return what it gave.
-
-        Parameters
-        ----------
-        condition : callable
-            Asked after each callback.
-        what : str
-            Name of what is waited for.
-        seconds : float
-            Limit in seconds.
-
-        Returns
-        -------
-        object
-            The first true result.
-
-        """
+        """Serve callbacks until a condition holds and return what it gave."""
         end = time.monotonic() + seconds
         while not (result := condition()):
             if time.monotonic() > end:
@@ -454,21 +332,6 @@ class RosSide:
 
         A node that `Served` runs knows of the subscription then: what it publishes from here on
         arrives, were it a single message.
-
-        Parameters
-        ----------
-        message_type : type
-            Message class.
-        topic : str
-            Topic name.
-        qos : rclpy.qos.QoSProfile or int
-            Quality of service or depth.
-
-        Returns
-        -------
-        list
-            Grows while the node spins.
-
         """
         messages: list[Any] = []
         before = {x: x.get_subscription_count() for x in Served.publishers()}
@@ -482,26 +345,7 @@ class RosSide:
     def publisher(
             self, message_type: type[Any], topic: str, qos: Any = 1000,
             subscribers: int = 1) -> Any:
-        """
-        Return a publisher that already has its subscribers.
-
-        Parameters
-        ----------
-        message_type : type
-            Message class.
-        topic : str
-            Topic name.
-        qos : rclpy.qos.QoSProfile or int
-            Quality of service or depth.
-        subscribers : int
-            How many subscribers to wait for.
-
-        Returns
-        -------
-        rclpy.publisher.Publisher
-            The publisher.
-
-        """
+        """Return a publisher that already has so many subscribers."""
         publisher = self.node.create_publisher(message_type, topic, qos)
         self.spin_until(
             lambda: publisher.get_subscription_count() >= subscribers,
@@ -509,24 +353,7 @@ class RosSide:
         return publisher
 
     def call(self, service_type: type[Any], name: str, request: Any = None) -> Any:
-        """
-        Call a service and return its response.
-
-        Parameters
-        ----------
-        service_type : type
-            Service class.
-        name : str
-            Service name.
-        request : object, optional
-            Default: an empty request.
-
-        Returns
-        -------
-        object
-            The response.
-
-        """
+        """Call a service and return its response."""
         client = self.node.create_client(service_type, name)
         self.spin_until(client.service_is_ready, f'service {name}')
         future = client.call_async(service_type.Request() if request is None else request)
@@ -535,22 +362,7 @@ class RosSide:
         return future.result()
 
     def set_parameters(self, node: str, values: Sequence[Any]) -> Any:
-        """
-        Set parameters of another node.
-
-        Parameters
-        ----------
-        node : str
-            Name of the node.
-        values : sequence of rclpy.parameter.Parameter
-            What to set.
-
-        Returns
-        -------
-        list of rcl_interfaces.msg.SetParametersResult
-            One result a parameter.
-
-        """
+        """Set parameters of another node."""
         from rcl_interfaces.srv import SetParameters
         request = SetParameters.Request(
             parameters=[value.to_parameter_msg() for value in values])
@@ -691,15 +503,7 @@ class SimulatedClock:
             subscribers=len(served.nodes))
 
     def set(self, time_ns: int) -> None:
-        """
-        Set the time and return when all nodes have it.
-
-        Parameters
-        ----------
-        time_ns : int
-            In ns; it may lie before the present.
-
-        """
+        """Set the time in ns, back too, and return when all nodes have it."""
         from builtin_interfaces.msg import Time
         from rosgraph_msgs.msg import Clock
         seconds, nanoseconds = divmod(time_ns, 10**9)

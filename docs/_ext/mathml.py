@@ -25,20 +25,7 @@ def _display(translator: Any, node: Any) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """
-    Register the renderer.
-
-    Parameters
-    ----------
-    app : Sphinx
-        The build.
-
-    Returns
-    -------
-    dict
-        What Sphinx wants to know of an extension.
-
-    """
+    """Register the renderer."""
 
     def leave(function: Any) -> Any:
         def visit(translator: Any, node: Any) -> None:

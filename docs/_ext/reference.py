@@ -44,57 +44,18 @@ NOT_PUBLIC = re.compile(
 
 
 def interface_entries(kind: type) -> list[Any]:
-    """
-    Return what `hmsa_ros.nodes.interface` declares, in its order.
-
-    Parameters
-    ----------
-    kind : type
-        `interface.Topic` or `interface.Service`.
-
-    Returns
-    -------
-    list
-        Of that kind.
-
-    """
+    """Return what `hmsa_ros.nodes.interface` declares of a kind (Topic, Service), in its order."""
     return [x for x in vars(interface).values() if isinstance(x, kind)]
 
 
 def parameters(node: str) -> tuple[Any, ...]:
-    """
-    Return the parameters that a node declares.
-
-    Parameters
-    ----------
-    node : str
-        Its name.
-
-    Returns
-    -------
-    tuple of ParameterSpec
-        In the order of declaration.
-
-    """
+    """Return the parameters that a node declares."""
     found: tuple[Any, ...] = import_module(f'hmsa_ros.nodes.{node}').PARAMETERS
     return found
 
 
 def messages(path: Path) -> Iterator[tuple[str, str, int]]:
-    """
-    Walk the sentences that a module raises errors with.
-
-    Parameters
-    ----------
-    path : Path
-        Source file.
-
-    Yields
-    ------
-    tuple of str, str and int
-        Class of the error, the sentence with ``{...}`` where values come in, and the line.
-
-    """
+    """Yield class, sentence and line of the errors that a module raises."""
     tree = ast.parse(path.read_text(encoding='utf-8'))
     for node in ast.walk(tree):
         # Raised here or returned for a caller to raise.
@@ -107,20 +68,7 @@ def messages(path: Path) -> Iterator[tuple[str, str, int]]:
 
 
 def sentence(expression: ast.expr) -> str:
-    """
-    Return a text with ``{...}`` for each value that is only known later.
-
-    Parameters
-    ----------
-    expression : ast.expr
-        Of the source.
-
-    Returns
-    -------
-    str
-        Just ``{...}`` for anything but a text.
-
-    """
+    """Return a text with ``{...}`` for each value that is only known later, or for all of it."""
     if isinstance(expression, ast.Constant) and isinstance(expression.value, str):
         return expression.value
     if isinstance(expression, ast.JoinedStr):
@@ -133,20 +81,7 @@ def sentence(expression: ast.expr) -> str:
 
 
 def placeholder(part: ast.expr) -> str:
-    """
-    Return what stands in a sentence for a value.
-
-    Parameters
-    ----------
-    part : ast.expr
-        Value in a formatted text.
-
-    Returns
-    -------
-    str
-        The last name of what is shown, in braces; an ellipsis for what has none.
-
-    """
+    """Return what stands in a sentence for a value: its last name in braces, or an ellipsis."""
     value = part.value if isinstance(part, ast.FormattedValue) else part
     if (isinstance(value, ast.Call) and isinstance(value.func, ast.Name)
             and value.func.id == errors.excerpt.__name__):
@@ -158,15 +93,7 @@ def placeholder(part: ast.expr) -> str:
 
 
 def kinds() -> dict[str, type[errors.HmsaError]]:
-    """
-    Return all classes of errors by name.
-
-    Returns
-    -------
-    dict of str to type
-        `HmsaError` and what is derived from it.
-
-    """
+    """Return all classes of errors by name."""
     found: dict[str, type[errors.HmsaError]] = {}
     pending: list[type[errors.HmsaError]] = [errors.HmsaError]
     while pending:
@@ -177,20 +104,7 @@ def kinds() -> dict[str, type[errors.HmsaError]]:
 
 
 def public_modules(package: str) -> list[str]:
-    """
-    Return the public modules of a package.
-
-    Parameters
-    ----------
-    package : str
-        Its dotted name, or that of a module.
-
-    Returns
-    -------
-    list of str
-        Dotted names, the package first.
-
-    """
+    """Return the dotted names of a package's public modules, the package first."""
     module = import_module(package)
     inside = [
         x.name for x in pkgutil.walk_packages(getattr(module, '__path__', []), package + '.')]
@@ -198,20 +112,7 @@ def public_modules(package: str) -> list[str]:
 
 
 def public_members(module: str) -> Iterator[tuple[str, Any]]:
-    """
-    Walk the classes, functions and methods that a module defines for others.
-
-    Parameters
-    ----------
-    module : str
-        Its dotted name.
-
-    Yields
-    ------
-    tuple of str and object
-        Dotted name and the thing itself.
-
-    """
+    """Yield dotted name and thing of the classes, functions and methods of a module for others."""
     for name, thing in vars(import_module(module)).items():
         if name.startswith('_') or getattr(thing, '__module__', None) != module \
                 or not (inspect.isclass(thing) or inspect.isroutine(thing)):
@@ -224,41 +125,13 @@ def public_members(module: str) -> Iterator[tuple[str, Any]]:
 
 
 def described_data(module: str) -> list[str]:
-    """
-    Return the constants of a module that a comment of the form ``#: ...`` describes.
-
-    Parameters
-    ----------
-    module : str
-        Its dotted name.
-
-    Returns
-    -------
-    list of str
-        Names.
-
-    """
+    """Return the constants of a module that a comment of the form ``#: ...`` describes."""
     source = inspect.getsource(import_module(module))
     return re.findall(r'^(?:#: .*\n)+([A-Z][A-Z0-9_]*)\b', source, re.M)
 
 
 def faults(name: str, thing: Any) -> list[str]:
-    """
-    Return what a docstring lacks by numpydoc's rules and those of this project.
-
-    Parameters
-    ----------
-    name : str
-        Dotted name.
-    thing : object
-        Class or function of that name.
-
-    Returns
-    -------
-    list of str
-        One sentence a fault.
-
-    """
+    """Return what a docstring lacks by numpydoc's rules and those of this project."""
     text = inspect.getdoc(thing) or ''
     ignored = IGNORED
     found = []
@@ -280,20 +153,7 @@ def faults(name: str, thing: Any) -> list[str]:
 
 
 def subparsers(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
-    """
-    Return the commands below a command.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-
-    Returns
-    -------
-    dict of str to argparse.ArgumentParser
-        By name, empty for none.
-
-    """
+    """Return the commands below a command by name, empty for none."""
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             return dict(action.choices)
@@ -301,22 +161,7 @@ def subparsers(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentPa
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """
-    Return a table in Markdown.
-
-    Parameters
-    ----------
-    head : iterable of str
-        Titles of the columns.
-    rows : iterable of iterable of str
-        Cells, in Markdown.
-
-    Returns
-    -------
-    str
-        With an empty line before and after.
-
-    """
+    """Return a table in Markdown of titles and cells, with an empty line before and after."""
     head = list(head)
     lines = [head, ['---'] * len(head), *rows]
     return '\n' + '\n'.join(
@@ -325,39 +170,13 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def type_name(kind: type) -> str:
-    """
-    Return a message or service class as ROS writes it.
-
-    Parameters
-    ----------
-    kind : type
-        For example ``sensor_msgs.msg.JointState``.
-
-    Returns
-    -------
-    str
-        For example ``sensor_msgs/msg/JointState``.
-
-    """
+    """Return a message or service class as ROS writes it, as ``sensor_msgs/msg/JointState``."""
     package, group = kind.__module__.split('.')[:2]
     return f'{package}/{group}/{kind.__name__}'
 
 
 def qos_text(qos: Any) -> str:
-    """
-    Return a quality of service in words.
-
-    Parameters
-    ----------
-    qos : rclpy.qos.QoSProfile
-        Of a topic.
-
-    Returns
-    -------
-    str
-        Reliability, durability if it is not volatile, and depth.
-
-    """
+    """Return reliability, durability if it is not volatile, and depth in words."""
     words = [qos.reliability.name.lower().replace('_', ' ')]
     if qos.durability.name != 'VOLATILE':
         words.append(qos.durability.name.lower().replace('_', ' '))
@@ -372,15 +191,7 @@ class Generated(SphinxDirective, ABC):
     option_spec = {'level': directives.positive_int}
 
     def run(self) -> list[nodes.Node]:
-        """
-        Parse the Markdown where the directive stands.
-
-        Returns
-        -------
-        list of docutils.nodes.Node
-            What it says.
-
-        """
+        """Parse the Markdown where the directive stands."""
         # What is documented is the package: any change in it may change this page.
         self.env.note_reread()
         text = self.markdown(self.arguments[0] if self.arguments else '')
@@ -388,31 +199,10 @@ class Generated(SphinxDirective, ABC):
 
     @abstractmethod
     def markdown(self, argument: str) -> str:
-        """
-        Return the content.
-
-        Parameters
-        ----------
-        argument : str
-            Of the directive, empty for none.
-
-        Returns
-        -------
-        str
-            Markdown.
-
-        """
+        """Return the content."""
 
     def missing(self, what: str) -> None:
-        """
-        Warn of a hole in what the package says of itself; warnings fail the build.
-
-        Parameters
-        ----------
-        what : str
-            What is missing.
-
-        """
+        """Warn of a hole in what the package says of itself; warnings fail the build."""
         LOGGER.warning('%s', what, location=self.get_location())
 
 
@@ -578,20 +368,7 @@ DIRECTIVES = {
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """
-    Register the directives.
-
-    Parameters
-    ----------
-    app : Sphinx
-        The build.
-
-    Returns
-    -------
-    dict
-        What Sphinx wants to know of an extension.
-
-    """
+    """Register the directives."""
     for name, directive in DIRECTIVES.items():
         app.add_directive(name, directive)
     return {'parallel_read_safe': True, 'parallel_write_safe': True}
