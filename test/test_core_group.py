@@ -134,7 +134,7 @@ def test_stop_and_setpoint_and_progress():
     assert joints.progress(START)[0] == Progress()
     joints.take(finish(joints.draft_setpoint('left', 1.2, START)), START)
     assert finish(joints.draft_setpoint('left', 1.2, START + LEAD)) == {}
-    assert joints.next_event(START) == START
+    assert joints.next_command() == START
     found, each = joints.progress(START + LEAD)
     assert (found, each['right']) == (Progress('moving', 1, 1, ''), Progress())
     assert each['left'] == Progress('moving', 1, 1, '1.2')
@@ -147,9 +147,11 @@ def test_stop_and_setpoint_and_progress():
         assert abs(planner.state(stop + 10**9).rate) < 1e-8
     end = joints.progress(stop + 10**9)[0]
     assert (end.state, end.setpoint) == ('at_rest', end.setpoints)
-    assert joints.next_event(stop + 10**9) is None
+    assert joints.next_command() is None
+    assert joints.next_change(stop + 10**9) is None
     joints.restart()
-    assert joints.next_event(START) is None
+    assert joints.next_command() is None
+    assert joints.next_change(START) is None
 
 
 @pytest.mark.parametrize('period', [0, MS])

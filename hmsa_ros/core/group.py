@@ -181,11 +181,6 @@ class PlannerGroup:
         for planner in self.planners.values():
             planner.restart()
 
-    def next_event(self, now: int) -> int | None:
-        """Return when (ns) a command is due or a setpoint begins or is reached next, or None."""
-        times = (self.next_command(), self.next_change(now))
-        return min((x for x in times if x is not None), default=None)
-
     def next_command(self) -> int | None:
         """Return the time in ns at which a command is to be handed out; None for none."""
         times = ((x.next_stamp, x.options.lead_time) for x in self.planners.values())

@@ -40,7 +40,8 @@ class Service:
     meaning: Mapping[str, str] = field(default_factory=dict)
 
 
-def _profile(quality: topics.Quality) -> QoSProfile:
+def profile(quality: topics.Quality) -> QoSProfile:
+    """Return a quality of service as rclpy has it."""
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST, depth=quality.depth,
         reliability=ReliabilityPolicy.RELIABLE if quality.reliable
@@ -51,7 +52,7 @@ def _profile(quality: topics.Quality) -> QoSProfile:
 
 def _topic(topic: topics.Topic) -> Topic:
     return Topic(
-        topic.name, interface_class(topic.type), _profile(topic.qos), topic.meaning,
+        topic.name, interface_class(topic.type), profile(topic.qos), topic.meaning,
         topic.publishers, topic.subscribers)
 
 
@@ -59,7 +60,7 @@ def _service(service: topics.Service) -> Service:
     return Service(service.name, interface_class(service.type), service.meaning)
 
 
-LATCHED = _profile(topics.LATCHED)
+LATCHED = profile(topics.LATCHED)
 
 JOINT_TRAJECTORY = _topic(topics.JOINT_TRAJECTORY)
 SETPOINT = _topic(topics.SETPOINT)

@@ -3,15 +3,11 @@
 from collections.abc import Iterable, Sequence
 
 from rclpy.duration import Duration
-from rclpy.qos import (
-    DurabilityPolicy,
-    HistoryPolicy,
-    LivelinessPolicy,
-    QoSProfile,
-    ReliabilityPolicy,
-)
+from rclpy.qos import LivelinessPolicy, QoSProfile
 
 from hmsa_ros.bag.qos import Qos
+from hmsa_ros.contract.topics import Quality
+from hmsa_ros.nodes import interface
 
 # Depth of a republished topic whose recorded depth is unknown, as it is where publishers are
 # discovered over DDS.
@@ -35,10 +31,7 @@ def subscription(offered: Iterable[Qos], depth: int) -> QoSProfile:
     profiles = list(offered)
     reliable = all(profile.reliability == 'reliable' for profile in profiles)
     latched = all(profile.durability == 'transient_local' for profile in profiles)
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST, depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE)
+    return interface.profile(Quality(depth, reliable, latched))
 
 
 def publisher(recorded: Sequence[Qos]) -> QoSProfile:
@@ -50,11 +43,9 @@ def publisher(recorded: Sequence[Qos]) -> QoSProfile:
     reliable = not recorded or any(
         profile.reliability in ('reliable', 'system_default') for profile in recorded)
     depth = min(MAX_DEPTH, max((profile.depth for profile in recorded), default=0))
-    profile = QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=depth or (min(MAX_DEPTH, len(recorded)) if latched else PUBLISHER_DEPTH),
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE)
+    profile = interface.profile(Quality(
+        depth or (min(MAX_DEPTH, len(recorded)) if latched else PUBLISHER_DEPTH),
+        reliable, latched))
     alike = set(recorded)
     if len(alike) == 1:
         # Deadlines and the like only mean something if all publishers agreed on them.

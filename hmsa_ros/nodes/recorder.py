@@ -20,7 +20,6 @@ from typing import Any
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Trigger
 
@@ -29,6 +28,7 @@ from hmsa_ros.bag.experiment import SetpointLog
 from hmsa_ros.bag.reception import figures, judge, RecordedTopic
 from hmsa_ros.bag.recording import Limits, lost_by_topic, Recording, Status
 from hmsa_ros.bag.writer import BagWriter, parse_custom_data
+from hmsa_ros.contract.topics import Quality
 from hmsa_ros.errors import BadInputError, BagError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.capture import Capture, decode, RawSubscription, SimulatedTime, Taken
@@ -120,8 +120,7 @@ class Recorder(ManagedNode):
         if self._sim_time is not None:
             self._clock_subscription = RawSubscription(
                 self, ClockMessage, interface.CLOCK_TOPIC.name,
-                QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1000,
-                           reliability=ReliabilityPolicy.BEST_EFFORT))
+                interface.profile(Quality(1000, reliable=False)))
             self._capture.add(self._sim_time, self._clock_subscription)
         self._capture.start()
         self._diagnostics = self.create_publisher(

@@ -13,9 +13,10 @@ from time import monotonic
 from typing import Any
 
 import numpy as np
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 
+from hmsa_ros.contract.topics import Quality
 from hmsa_ros.core.schedule import CommandSchedule
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError, printable
@@ -27,10 +28,8 @@ from hmsa_ros.watch.scene import History, Joint, Report, RequestState, Scene
 
 # Of the samples since the last look no more than these are kept: all of them at 1 kHz.
 _SAMPLES = 200
-_SAMPLE_QOS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=_SAMPLES, reliability=ReliabilityPolicy.BEST_EFFORT)
-_REPORT_QOS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+_SAMPLE_QOS = interface.profile(Quality(_SAMPLES, reliable=False))
+_REPORT_QOS = interface.profile(Quality(100, reliable=False))
 # Joints times samples that are read at one look: all of them up to ten joints at 1 kHz.
 _MOST_READ = 1000
 # Between two looks at the graph, and how long discovery may take before its result counts.

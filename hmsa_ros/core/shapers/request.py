@@ -1,7 +1,7 @@
 """What a shaper gets, and the checks that all shapers share."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 import math
 
 from hmsa_ros.core import law
@@ -61,10 +61,6 @@ class Request:
     def keeps(self, levels: Sequence[Level]) -> bool:
         """Return whether levels are inside the load limits."""
         return all(self.limits.minimum <= x.load <= self.limits.maximum for x in levels)
-
-    def to(self, target: float) -> 'Request':
-        """Return the same request for another target stretch."""
-        return replace(self, target=target)
 
     def holding_load(self) -> float:
         """
