@@ -101,7 +101,7 @@ def test_a_block_that_fails_is_told_with_what_it_printed(tmp_path):
 
 def test_a_background_process_that_fails_is_told_at_the_end_of_the_page(tmp_path):
     session = Session(tmp_path, {})
-    session.run('bash', '(exit 3) &', 'here')
+    session.run('bash', '(exit 3) &\nwhile [ -n "$(jobs -r)" ]; do :; done', 'here')
     with pytest.raises(Failure, match='ended with status 3'):
         session.close()
 

@@ -180,6 +180,7 @@ def test_a_table_is_copied_in_full_precision(browser, files):
     assert float(rows[1][1]) == 1.1
 
 
+@pytest.mark.timeout(600)
 def test_ten_minutes_at_1_khz_keep_their_peaks_on_a_page_that_opens(browser, bags, tmp_path):
     run, = read_runs(bags[0])
     count = 600_000
