@@ -9,7 +9,7 @@ arrive there too, for which a third number is free. Newton solves them with the 
 come out of the integration.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -74,3 +74,32 @@ def solve(template: Template, request: 'Request', delivery: Delivery | None = No
         return None
     levels = tuple(Level(t, x) for t, x in zip(times.tolist(), loads.tolist(), strict=True))
     return levels, duration
+
+
+def approach(
+        ideal: tuple[Level, ...],
+        closer: Callable[[tuple[Level, ...], float, float], Attempt], shortest: float) -> Attempt:
+    """Follow levels from ideal to real hardware, in strides down to a share of the way."""
+    # closer(levels, share, aim) solves for the hardware at aim of the way, from levels that are
+    # right at share of it.
+    found: Attempt = None
+    levels, share, stride = ideal, 0.0, 1.0
+    while share < 1.0:
+        aim = min(1.0, share + stride)
+        attempt = closer(levels, share, aim)
+        if attempt is not None:
+            found, levels, share = attempt, attempt[0], aim
+        elif stride > shortest:
+            stride *= 0.5
+        else:
+            return None
+    return found
+
+
+def on_time(found: Attempt, heights: int, request: 'Request') -> Attempt:
+    """Solve once more for the first heights, at times that commands can carry if they can."""
+    if found is None or request.delivery.resolution == 0.0:
+        return found
+    rounded = [Level(request.delivery.rounded(x.time), x.load) for x in found[0]]
+    free = [('load', i) for i in range(heights)]
+    return solve(Template.of(rounded, free), request) or found

@@ -15,7 +15,7 @@ from hmsa_ros.core import law
 from hmsa_ros.core.delivery import Delivery
 from hmsa_ros.core.moves import Level, Limits, Move
 from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.core.shooting import Attempt, solve, Template
+from hmsa_ros.core.shooting import approach, Attempt, on_time, solve, Template
 from hmsa_ros.core.status import Code, RefusedError
 
 # Lengths of the settling push to try, in time constants of the lag. The first one passes the
@@ -57,10 +57,9 @@ def _pushed(request: Request, plain: Move) -> Attempt:
     first, last = plain.levels
     delivery = request.delivery
 
-    def slower(length: float) -> Callable[[Attempt, float, float], Attempt]:
-        def closer(found: Attempt, share: float, aim: float) -> Attempt:
+    def slower(length: float) -> Callable[[tuple[Level, ...], float, float], Attempt]:
+        def closer(before: tuple[Level, ...], share: float, aim: float) -> Attempt:
             lag = aim * delivery.lag
-            before = (first, first, last) if found is None else found[0]
             # What the field has not settled of the first level, undone by the push.
             left = math.exp(-length)
             passed = (last.load - before[0].load) * left / (1.0 - left)
@@ -69,7 +68,7 @@ def _pushed(request: Request, plain: Move) -> Attempt:
                     abs(passed), delivery.slew * lag * math.log1p(left)), passed)
             middle = Level(
                 last.time + length * lag * left / (1.0 - left), last.load + passed)
-            if found is not None:
+            if share > 0.0:
                 middle = Level(
                     before[1].time + (aim - share) * delivery.lag * length * left / (1.0 - left),
                     middle.load)
@@ -79,7 +78,7 @@ def _pushed(request: Request, plain: Move) -> Attempt:
         return closer
 
     for length in _PUSHES:
-        found = _follow(slower(length))
+        found = approach((first, first, last), slower(length), _SHORTEST_STRIDE)
         if found is not None and request.keeps(found[0]):
             return found
     return None
@@ -123,22 +122,6 @@ def _sampled(request: Request, plain: Move) -> Attempt:
         if found is not None and request.keeps(found[0]):
             return found
     return None
-
-
-def _follow(closer: Callable[[Attempt, float, float], Attempt]) -> Attempt:
-    """Follow a command from no lag to the real one, in smaller strides where it must be."""
-    found: Attempt = None
-    share, stride = 0.0, 1.0
-    while share < 1.0:
-        aim = min(1.0, share + stride)
-        attempt = closer(found, share, aim)
-        if attempt is not None:
-            found, share = attempt, aim
-        elif stride > _SHORTEST_STRIDE:
-            stride *= 0.5
-        else:
-            return None
-    return found
 
 
 def three_levels(request: Request, code: Code, reason: str) -> Move:
@@ -205,12 +188,10 @@ def push_brake_push(
     holding = request.holding_load()
     # The second push ends when the field, at the brake's level before, is at the holding load.
     length = math.log1p((holding - brake) / (push - holding))
-    def closer(found: Attempt, share: float, aim: float) -> Attempt:
+
+    def closer(levels: tuple[Level, ...], share: float, aim: float) -> Attempt:
         lag = aim * delivery.lag
-        if found is None:
-            second, third = plain[1].time, plain[2].time
-        else:
-            second, third = found[0][1].time, found[0][2].time
+        second, third = levels[1].time, levels[2].time
         up = delivery.ramp(push - brake)
         end = third + up + lag * length + delivery.ramp(push - holding)
         guess = (Level(0.0, push), Level(second, brake), Level(third, push), Level(end, holding))
@@ -218,16 +199,13 @@ def push_brake_push(
             Template.of(guess, [('time', 1), ('time', 2), ('time', 3)]), request,
             replace(delivery, lag=lag))
 
-    found = _follow(closer)
+    found = approach(plain, closer, _SHORTEST_STRIDE)
     if found is None:
         return None
     times = [x.time for x in found[0]]
     if any(late <= early for early, late in zip(times, times[1:], strict=False)):
         return None
-    if delivery.resolution > 0.0:
-        rounded = [Level(delivery.rounded(x.time), x.load) for x in found[0]]
-        return solve(Template.of(rounded, _FREE_LOADS), request) or found
-    return found
+    return on_time(found, 3, request)
 
 
 def fastest_on_grid(request: Request, loads: tuple[float, float]) -> Attempt:

@@ -16,7 +16,7 @@ from hmsa_ros.core.shapers.lagged import (
     three_levels,
 )
 from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.core.shooting import solve, Template
+from hmsa_ros.core.shooting import Attempt, on_time, solve, Template
 from hmsa_ros.core.status import Code, RefusedError
 
 _RTOL = 1e-12
@@ -106,7 +106,7 @@ def _late(request: Request, holding: float, frequency: float, reason: str) -> Mo
 
 def _attempt(
         request: Request, holding: float, least: float,
-        most: float) -> tuple[tuple[Level, ...], float] | None:
+        most: float) -> Attempt:
     """Push and brake with given loads; None if no command comes of it."""
     work = kernels.work_space()
     direction = _direction(work, request, least, most)
@@ -119,16 +119,12 @@ def _attempt(
     down = delivery.ramp(push - brake)
     levels = (Level(0.0, push), Level(max(pushing, up), brake),
               Level(max(pushing, up) + max(braking, down), holding))
-    found = solve(
-        Template.of(levels, [('time', 1), ('time', 2)]), request)
-    if found is not None and delivery.resolution > 0.0:
-        return _on_time(request, found[0]) or found
-    return found
+    return on_time(solve(Template.of(levels, [('time', 1), ('time', 2)]), request), 2, request)
 
 
 def _on_grid(
         request: Request, holding: float, push: tuple[float, float],
-        brake: tuple[float, float]) -> tuple[tuple[Level, ...], float] | None:
+        brake: tuple[float, float]) -> Attempt:
     """Place push and brake, (load, duration) each, on the grid; their heights are free then."""
     period = request.delivery.period
     for more_first, more_second in _MORE_PERIODS:
@@ -144,14 +140,6 @@ def _on_grid(
         if found is not None:
             return found
     return None
-
-
-def _on_time(
-        request: Request, levels: tuple[Level, ...]) -> tuple[tuple[Level, ...], float] | None:
-    """Solve once more for the heights, with the times as commands can carry them."""
-    rounded = [Level(request.delivery.rounded(x.time), x.load) for x in levels]
-    return solve(
-        Template.of(rounded, [('load', 0), ('load', 1)]), request)
 
 
 def _frequency(request: Request) -> float:

@@ -1,6 +1,5 @@
 """The two-step command, on ideal and on real hardware."""
 
-from collections.abc import Callable
 import contextlib
 from dataclasses import replace
 from itertools import product
@@ -13,7 +12,7 @@ from hmsa_ros.core.moves import Level, Limits, Move
 from hmsa_ros.core.shapers.lagged import at_rest, settle, three_levels
 from hmsa_ros.core.shapers.minimum_time import minimum_time
 from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.core.shooting import Attempt, solve, Template
+from hmsa_ros.core.shooting import approach, Attempt, solve, Template
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.two_step import plan_two_step
 
@@ -138,7 +137,7 @@ def _sampled(request: Request, first: Level, last: Level) -> Move:
                 Template.of(guess, [('load', 0), ('load', 1)]), request)
 
         exact = (first, Level((count - 1) * fitting, first.load), last)
-        found = _follow(exact, stretched)
+        found = approach(exact, stretched, _SHORTEST_STRIDE)
         if found is not None and request.keeps(found[0]):
             return Move(Code.TWO_STEP, *found)
     raise RefusedError(
@@ -183,7 +182,7 @@ def _ramped(request: Request, first: Level, last: Level) -> Move:
         if half_periods > 1:
             between = start + change / (1.0 + decay ** half_periods)
         ideal = (Level(0.0, between), Level(half_periods * last.time, last.load))
-        found = _follow(ideal, slower)
+        found = approach(ideal, slower, _SHORTEST_STRIDE)
         if found is not None and request.keeps(found[0]):
             return Move(Code.TWO_STEP, *found)
     if request.state.rate != 0.0:
@@ -240,26 +239,3 @@ def _swings(request: Request, holding: float) -> Attempt:
         if found is not None and request.keeps(found[0]):
             return found
     return None
-
-
-def _follow(
-        levels: tuple[Level, ...],
-        closer: Callable[[tuple[Level, ...], float, float], Attempt]) -> Attempt:
-    """
-    Follow a command from ideal to real hardware, in smaller strides where it must be.
-
-    ``closer(levels, share, aim)`` solves for the hardware at ``aim`` of the way, from levels
-    that are right at ``share`` of it.
-    """
-    found: Attempt = None
-    share, stride = 0.0, 1.0
-    while share < 1.0:
-        aim = min(1.0, share + stride)
-        attempt = closer(levels, share, aim)
-        if attempt is not None:
-            found, levels, share = attempt, attempt[0], aim
-        elif stride > _SHORTEST_STRIDE:
-            stride *= 0.5
-        else:
-            return None
-    return found
