@@ -33,9 +33,15 @@ _HERE = Path(__file__).resolve().parent
 _listeners: list[Callable[[str], object]] = []
 
 
-def compiled(*, inline: bool = False, parallel: bool = False) -> Callable[..., Any]:
+def compiled(
+        *, inline: bool = False, parallel: bool = False, allocates: bool = True
+) -> Callable[..., Any]:
     """Return Numba's decorator: cached, ``inline`` before types, ``parallel`` over ``prange``."""
     options = {**_OPTIONS, 'parallel': parallel, 'inline': 'always' if inline else 'never'}
+    if not allocates:
+        # Neither it nor what it calls makes an array. Counting references to those passed, a
+        # dozen for each array at each call that is copied in, can take most of the time.
+        options['_nrt'] = False
 
     def decorate(function: Callable[..., Any]) -> Any:
         dispatcher = njit(**options)(function)

@@ -210,10 +210,10 @@ def equilibrium_stretch(beta, material):
     return l
 
 
-@compiled()
+@compiled(inline=True)
 def acceleration_slopes(l, v, beta, material, slopes):  # noqa: E741
     """
-    Differentiate the acceleration by what an identification may not know.
+    Differentiate the acceleration by what an identification may not know; return `motion`.
 
     ``slopes`` takes the derivatives by the load, by a factor of the elastic force (the shear
     modulus at a fixed unit of time, load in units of the nominal one), by zeta, by c1 and by
@@ -221,7 +221,7 @@ def acceleration_slopes(l, v, beta, material, slopes):  # noqa: E741
     and with `motion`, s'' = a_l s + a_v s' + slope gives the sensitivity of a trajectory.
     """
     force, _ = _elastic(l, material)
-    a, _, _, i_mass = motion(l, v, beta, material)
+    a, a_l, a_v, i_mass = motion(l, v, beta, material)
     slopes[BY_LOAD] = i_mass
     slopes[BY_MODULUS] = -force * i_mass
     slopes[BY_ZETA] = -0.5 * material[C1] * v * i_mass
@@ -230,6 +230,7 @@ def acceleration_slopes(l, v, beta, material, slopes):  # noqa: E741
         extension = (l - 1.0) * (l - 1.0) * (l + 2.0)
         slopes[BY_CONSTANT] = -force * extension * i_mass / (
             l - extension * material[CONSTANTS])
+    return a, a_l, a_v, i_mass
 
 
 @compiled()

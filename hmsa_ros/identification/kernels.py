@@ -30,7 +30,6 @@ from hmsa_ros.core.law import (
     elastic_force,
     elastic_stiffness,
     mass,
-    motion,
 )
 
 # Places in theta.
@@ -41,18 +40,22 @@ CONSTANT, SWITCH = 500, 1000
 
 # Phase of the fastest motion over which a quintic interpolates to about 1e-8.
 _SMOOTH = 0.45
+# Stages and, in the last row, the solution.
+_TABLEAU = np.vstack([MATRIX, WEIGHTS[None, :]])
+# Columns that are added at once; the state is filled up to a multiple of them.
+_BLOCK = 4
 # What no recording needs and a start value far off may ask for.
 _MAX_STEPS, _STEPS_PER_SAMPLE = 20_000, 20
 
 
-@compiled()
+@compiled(allocates=False)
 def constant_slope(l, i, material, slopes):  # noqa: E741
     """Return the derivative of psi' by constant i of the law; ``slopes`` is for work."""
     acceleration_slopes(l, 0.0, 0.0, material, slopes)
     return -slopes[BY_CONSTANT + i] / slopes[BY_LOAD]
 
 
-@compiled()
+@compiled(allocates=False)
 def _unit_of(theta, branches):
     """Return share, total and root of the stiffness with all branches, and their inverses."""
     share = 1.0
@@ -64,107 +67,122 @@ def _unit_of(theta, branches):
 
 
 @compiled()
-def _slope(y, n, count, field, field_lag, theta, unit, material, wanted, partial, slopes, out):
+def _slots(wanted, branches, size):
+    """
+    Return for each wanted parameter where `_slope` leaves the slope that it adds to the rate.
+
+    The first places are those in theta; the constants of the law follow, then one that stays 0.
+    """
+    slots = np.empty(wanted.size, np.int64)
+    for j in range(wanted.size):
+        place = wanted[j]
+        slots[j] = size - 1
+        if place < STRETCH or (
+                FIRST_BRANCH <= place < CONSTANT and (place - FIRST_BRANCH) % 2 == 0):
+            slots[j] = place
+        elif CONSTANT <= place < SWITCH:
+            slots[j] = FIRST_BRANCH + 2 * branches + place - CONSTANT
+    return slots
+
+
+@compiled(inline=True)
+def _slope(
+        y, n, count, field, field_lag, theta, unit, material, wanted, slots, partial, slopes, k,
+        i):
     """
     Right-hand side of the equations and of their derivatives.
 
     ``y`` holds ``n`` rows (stretch, rate, branches) of ``1 + count`` columns (value and its
-    derivatives by the wanted parameters); ``out`` takes the slopes alike. ``unit`` is what
-    `_unit_of` returns; ``partial`` and ``slopes`` are for work.
+    derivatives by the wanted parameters); row ``i`` of ``k`` takes the slopes alike. ``unit`` is
+    what `_unit_of` returns, ``slots`` what `_slots` does; ``partial`` and ``slopes`` are for work.
     """
     w = 1 + count
     l = y[0]  # noqa: E741
     v = y[w]
-    a, k = theta[STIFFNESS], theta[DRIVE]
+    a, drive = theta[STIFFNESS], theta[DRIVE]
     share, total, speed, per_total, per_speed = unit
     held = 0.0
     for b in range(n - 2):
         held += theta[FIRST_BRANCH + 2 * b] * y[(2 + b) * w]
-    load = (k * field + theta[FORCE] + a * held) * per_total
-    acc, acc_l, acc_v, i_m = motion(l, v * per_speed, load, material)
-    acc *= total
+    load = (drive * field + theta[FORCE] + a * held) * per_total
+    acc, acc_l, acc_v, i_m = acceleration_slopes(l, v * per_speed, load, material, slopes)
     acc_l *= total
     acc_v *= speed
-    for c in range(w):
-        out[c] = y[w + c]
-        out[w + c] = acc_l * y[c] + acc_v * y[w + c]
-    out[w] = acc
-    if n > 2:
-        p1, p2 = elastic_force(l, material), elastic_stiffness(l, material)
-        for b in range(n - 2):
-            row = (2 + b) * w
-            acc_w = a * theta[FIRST_BRANCH + 2 * b] * i_m
-            rate = 1.0 / theta[FIRST_BRANCH + 2 * b + 1]
-            for c in range(1, w):
-                out[w + c] += acc_w * y[row + c]
-                out[row + c] = rate * (p2 * y[c] - y[row + c])
-            out[row] = rate * (p1 - y[row])
-            partial[FIRST_BRANCH + 2 * b] = a * (y[row] - p1) * i_m
-    if count == 0:
-        return
-    acceleration_slopes(l, v * per_speed, load, material, slopes)
     partial[STIFFNESS] = held * i_m + share * slopes[BY_MODULUS]
     partial[DAMPING] = -v * i_m
     partial[DRIVE] = field * i_m
     partial[FORCE] = i_m
-    partial[LAG] = k * field_lag * i_m
+    partial[LAG] = drive * field_lag * i_m
+    first = FIRST_BRANCH + 2 * (n - 2)
+    for c in range(slopes.size - BY_CONSTANT):
+        partial[first + c] = total * slopes[BY_CONSTANT + c]
+    k[i, 0] = v
+    k[i, w] = total * acc
     for j in range(count):
-        place = wanted[j]
-        if place < STRETCH or (
-                FIRST_BRANCH <= place < CONSTANT and (place - FIRST_BRANCH) % 2 == 0):
-            out[w + 1 + j] += partial[place]
-        elif CONSTANT <= place < SWITCH:
-            by = slopes[BY_CONSTANT + place - CONSTANT]
-            out[w + 1 + j] += total * by
-            for b in range(n - 2):
-                out[(2 + b) * w + 1 + j] -= by / (i_m * theta[FIRST_BRANCH + 2 * b + 1])
+        k[i, 1 + j] = y[w + 1 + j]
+        k[i, w + 1 + j] = acc_l * y[1 + j] + acc_v * y[w + 1 + j] + partial[slots[j]]
+    if n > 2:
+        p1, p2 = elastic_force(l, material), elastic_stiffness(l, material)
         for b in range(n - 2):
             row, tau = (2 + b) * w, theta[FIRST_BRANCH + 2 * b + 1]
-            if place == FIRST_BRANCH + 2 * b + 1:
-                out[row + 1 + j] -= (p1 - y[row]) / (tau * tau)
+            acc_w = a * theta[FIRST_BRANCH + 2 * b] * i_m
+            by_ratio = a * (y[row] - p1) * i_m
+            k[i, row] = (p1 - y[row]) / tau
+            for j in range(count):
+                place = wanted[j]
+                k[i, w + 1 + j] += acc_w * y[row + 1 + j]
+                rate = p2 * y[1 + j] - y[row + 1 + j]
+                if place == FIRST_BRANCH + 2 * b:
+                    k[i, w + 1 + j] += by_ratio
+                elif place == FIRST_BRANCH + 2 * b + 1:
+                    rate -= (p1 - y[row]) / tau
+                elif CONSTANT <= place < SWITCH:
+                    rate -= slopes[BY_CONSTANT + place - CONSTANT] / i_m
+                k[i, row + 1 + j] = rate / tau
 
 
-@compiled()
+@compiled(inline=True)
 def _field(dt, level, slope, excess, excess_lag, lag):
     """Return the field and its derivative by the coil's time constant."""
-    field = level + slope * dt
-    if lag <= 0.0:
-        return field, -slope
-    decay = math.exp(-dt / lag)
-    return (field - slope * lag + excess * decay,
-            (excess_lag + excess * dt / (lag * lag)) * decay - slope)
+    field, by_lag = level + slope * dt, -slope
+    if lag > 0.0:
+        decay = math.exp(-dt / lag)
+        field += excess * decay - slope * lag
+        by_lag += (excess_lag + excess * dt / (lag * lag)) * decay
+    return field, by_lag
 
 
-@compiled()
+@compiled(inline=True)
+def _combined(k, y, new, h, matrix, row, count):
+    """Add the slopes in the first rows of ``k``, weighted by a row of a matrix, to ``y``."""
+    for c in range(0, new.size, _BLOCK):
+        d0 = d1 = d2 = d3 = 0.0
+        for j in range(count):
+            weight = matrix[row, j]
+            d0 += weight * k[j, c]
+            d1 += weight * k[j, c + 1]
+            d2 += weight * k[j, c + 2]
+            d3 += weight * k[j, c + 3]
+        new[c] = y[c] + h * d0
+        new[c + 1] = y[c + 1] + h * d1
+        new[c + 2] = y[c + 2] + h * d2
+        new[c + 3] = y[c + 3] + h * d3
+
+
+@compiled(allocates=False)
 def _step(
-        k, y, new, n, count, dt, h, drive, theta, unit, material, wanted, partial, slopes, rtol,
-        fastest):
+        k, y, new, n, count, dt, h, drive, theta, unit, material, wanted, slots, partial, slopes,
+        rtol, fastest):
     """Make one DOP853 step, whose first slope is in ``k[0]``; return the scaled error."""
-    size = n * (1 + count)
     w = 1 + count
     for i in range(1, STAGES):
-        for c in range(size):
-            new[c] = 0.0
-        for j in range(i):
-            weight = MATRIX[i, j]
-            if weight != 0.0:
-                for c in range(size):
-                    new[c] += weight * k[j, c]
-        for c in range(size):
-            new[c] = y[c] + h * new[c]
+        _combined(k, y, new, h, _TABLEAU, i, i)
         field, field_lag = _field(
             dt + h * NODES[i], drive[0], drive[1], drive[2], drive[3], theta[LAG])
-        _slope(new, n, count, field, field_lag, theta, unit, material, wanted,
-            partial, slopes, k[i])
-    for c in range(size):
-        new[c] = 0.0
-    for j in range(STAGES):
-        weight = WEIGHTS[j]
-        if weight != 0.0:
-            for c in range(size):
-                new[c] += weight * k[j, c]
-    for c in range(size):
-        new[c] = y[c] + h * new[c]
+        _slope(
+            new, n, count, field, field_lag, theta, unit, material, wanted, slots, partial,
+            slopes, k, i)
+    _combined(k, y, new, h, _TABLEAU, STAGES, STAGES)
     e5 = e3 = 0.0
     for i in range(2):
         scale = rtol * (1.0 + abs(new[0])) if i == 0 else rtol * (fastest + abs(new[w]))
@@ -179,11 +197,11 @@ def _step(
     return abs(h) * e5 / math.sqrt(2.0 * (e5 + 0.01 * e3))
 
 
-@compiled()
-def _interpolate(x, h, y, start, new, end, w, c):
-    """Return stretch (column ``c``) and rate at the share ``x`` of a step: a quintic."""
-    p0, v0, a0 = y[c], h * y[w + c], h * h * start[w + c]
-    p1, v1, a1 = new[c], h * new[w + c], h * h * end[w + c]
+@compiled(inline=True)
+def _quintic(x, h, y, k, new, w, c):
+    """Return column ``c`` of stretch and rate at the share ``x`` of a step."""
+    p0, v0, a0 = y[c], h * y[w + c], h * h * k[0, w + c]
+    p1, v1, a1 = new[c], h * new[w + c], h * h * k[STAGES, w + c]
     r = p1 - p0 - v0 - 0.5 * a0
     s = v1 - v0 - a0
     u = a1 - a0
@@ -193,6 +211,89 @@ def _interpolate(x, h, y, start, new, end, w, c):
     value = p0 + x * (v0 + x * (0.5 * a0 + x * (c3 + x * (c4 + x * c5))))
     rate = v0 + x * (a0 + x * (3.0 * c3 + x * (4.0 * c4 + x * 5.0 * c5)))
     return value, rate / h
+
+
+@compiled(allocates=False)
+def _follow(
+        y, new, k, n, count, theta, unit, material, wanted, slots, partial, slopes, drive, begins,
+        levels, ramps, times, rtol, stretch, rate, jacobian, by_rate):
+    """Do what `respond` does, from the state ``y`` and the field in ``drive`` on."""
+    w = 1 + count
+    lag = theta[LAG]
+    t, piece, i = begins[0], 0, 0
+    fresh = True
+    material[law.DAMPING] = theta[DAMPING] / unit[2]
+    fastest = math.sqrt(theta[STIFFNESS] / mass(1.0, material))
+    h = 0.2 / fastest
+    for _ in range(_MAX_STEPS + _STEPS_PER_SAMPLE * times.size):
+        if fresh:
+            now, now_lag = _field(
+                t - begins[piece], drive[0], drive[1], drive[2], drive[3], lag)
+            _slope(
+                y, n, count, now, now_lag, theta, unit, material, wanted, slots, partial, slopes,
+                k, 0)
+            fresh = False
+        while i < times.size and times[i] <= t:
+            # Before the begin the motion is uniform.
+            stretch[i] = y[0] + (times[i] - t) * y[w]
+            rate[i] = y[w]
+            for j in range(count):
+                jacobian[i, j] = y[1 + j] + (times[i] - t) * y[w + 1 + j]
+                if by_rate.shape[0]:
+                    by_rate[i, j] = y[w + 1 + j]
+            i += 1
+        if i == times.size:
+            return True
+        limit = begins[piece + 1] if piece + 1 < begins.size else math.inf
+        p2 = elastic_stiffness(y[0], material)
+        smooth = _SMOOTH / math.sqrt(theta[STIFFNESS] * p2 / mass(y[0], material))
+        target = min(limit, times[i] if times[i] - t >= smooth else t + smooth)
+        step = min(h, target - t)
+        error = _step(
+            k, y, new, n, count, t - begins[piece], step, drive, theta, unit, material,
+            wanted, slots, partial, slopes, rtol, fastest)
+        if not error <= 1.0:
+            h = 0.2 * step if not error < math.inf else step * max(
+                0.2, 0.9 * error ** -0.125)
+            if not h > 1e-12 / fastest:
+                return False
+            continue
+        after = target if step == target - t else t + step
+        now, now_lag = _field(
+            after - begins[piece], drive[0], drive[1], drive[2], drive[3], lag)
+        _slope(
+            new, n, count, now, now_lag, theta, unit, material, wanted, slots, partial, slopes,
+            k, STAGES)
+        while i < times.size and times[i] < after:
+            x = (times[i] - t) / step
+            stretch[i], rate[i] = _quintic(x, step, y, k, new, w, 0)
+            for j in range(count):
+                jacobian[i, j], slope = _quintic(x, step, y, k, new, w, 1 + j)
+                if by_rate.shape[0]:
+                    by_rate[i, j] = slope
+            i += 1
+        for c in range(y.size):
+            y[c] = new[c]
+            k[0, c] = k[STAGES, c]
+        t = after
+        if step == h or error > 0.5:
+            h = step * min(6.0, max(0.2, 0.9 * max(error, 1e-12) ** -0.125))
+        while piece + 1 < begins.size and begins[piece + 1] <= t:
+            before, before_lag = _field(
+                begins[piece + 1] - begins[piece], drive[0], drive[1], drive[2], drive[3], lag)
+            piece += 1
+            jump = levels[piece] - before
+            drive[0], drive[1] = levels[piece], ramps[piece]
+            drive[2] = before - (levels[piece] - ramps[piece] * lag)
+            drive[3] = before_lag + ramps[piece]
+            fresh = True
+            if jump != 0.0:
+                # By a lag of 0, or by a later switch: what the step lacks is an impulse.
+                impulse = theta[DRIVE] * jump / mass(y[0], material)
+                for j in range(count):
+                    if wanted[j] == SWITCH + piece or (wanted[j] == LAG and lag <= 0.0):
+                        y[w + 1 + j] -= impulse
+    return False
 
 
 @compiled()
@@ -213,12 +314,13 @@ def respond(
     """
     n, count = 2 + branches, wanted.size
     w = 1 + count
-    size = n * w
-    k = np.zeros((STAGES, size))
-    y, new, end = np.zeros(size), np.zeros(size), np.zeros(size)
-    partial = np.zeros(theta.size)
-    slopes = np.zeros(BY_CONSTANT + material.size - CONSTANTS)
-    drive = np.zeros(4)
+    size = (n * w + _BLOCK - 1) // _BLOCK * _BLOCK
+    k = np.zeros((STAGES + 1, size))
+    y, new = np.zeros(size), np.zeros(size)
+    constants = material.size - CONSTANTS
+    slopes = np.zeros(BY_CONSTANT + constants)
+    partial = np.zeros(FIRST_BRANCH + 2 * branches + constants + 1)
+    slots = _slots(wanted, branches, partial.size)
     y[0], y[w] = theta[STRETCH], theta[RATE]
     p1, p2 = elastic_force(y[0], material), elastic_stiffness(y[0], material)
     for b in range(branches):
@@ -232,85 +334,8 @@ def respond(
             by = constant_slope(y[0], wanted[j] - CONSTANT, material, slopes)
         for b in range(branches):
             y[(2 + b) * w + 1 + j] = p2 * start[j] + by
-    lag = theta[LAG]
-    t, piece, i = begins[0], 0, 0
-    while i < times.size and times[i] < t:
-        stretch[i] = y[0] + (times[i] - t) * y[w]
-        rate[i] = y[w]
-        for j in range(count):
-            jacobian[i, j] = y[1 + j] + (times[i] - t) * y[w + 1 + j]
-        for j in range(by_rate.shape[0] and count):
-            by_rate[i, j] = y[w + 1 + j]
-        i += 1
-    drive[0], drive[1] = levels[0], ramps[0]
-    drive[2] = field - (levels[0] - ramps[0] * lag)
-    drive[3] = field_lag + ramps[0]
-    fresh = True
-    unit = _unit_of(theta, branches)
-    material[law.DAMPING] = theta[DAMPING] / unit[2]
-    fastest = math.sqrt(theta[STIFFNESS] / mass(1.0, material))
-    h = 0.2 / fastest
-    for _ in range(_MAX_STEPS + _STEPS_PER_SAMPLE * times.size):
-        if fresh:
-            now, now_lag = _field(
-                t - begins[piece], drive[0], drive[1], drive[2], drive[3], lag)
-            _slope(y, n, count, now, now_lag, theta, unit, material, wanted, partial, slopes, k[0])
-            fresh = False
-        while i < times.size and times[i] <= t:
-            stretch[i] = y[0]
-            rate[i] = y[w]
-            for j in range(count):
-                jacobian[i, j] = y[1 + j]
-            for j in range(by_rate.shape[0] and count):
-                by_rate[i, j] = y[w + 1 + j]
-            i += 1
-        if i == times.size:
-            return True
-        limit = begins[piece + 1] if piece + 1 < begins.size else math.inf
-        p2 = elastic_stiffness(y[0], material)
-        smooth = _SMOOTH / math.sqrt(theta[STIFFNESS] * p2 / mass(y[0], material))
-        target = min(limit, times[i] if times[i] - t >= smooth else t + smooth)
-        step = min(h, target - t)
-        error = _step(
-            k, y, new, n, count, t - begins[piece], step, drive, theta, unit, material,
-            wanted, partial, slopes, rtol, fastest)
-        if not error <= 1.0:
-            h = 0.2 * step if not error < math.inf else step * max(
-                0.2, 0.9 * error ** -0.125)
-            if not h > 1e-12 / fastest:
-                return False
-            continue
-        after = target if step == target - t else t + step
-        now, now_lag = _field(
-            after - begins[piece], drive[0], drive[1], drive[2], drive[3], lag)
-        _slope(new, n, count, now, now_lag, theta, unit, material, wanted, partial, slopes, end)
-        while i < times.size and times[i] < after:
-            x = (times[i] - t) / step
-            stretch[i], rate[i] = _interpolate(x, step, y, k[0], new, end, w, 0)
-            for j in range(count):
-                jacobian[i, j], slope = _interpolate(x, step, y, k[0], new, end, w, 1 + j)
-                if by_rate.shape[0]:
-                    by_rate[i, j] = slope
-            i += 1
-        for c in range(size):
-            y[c] = new[c]
-            k[0, c] = end[c]
-        t = after
-        if step == h or error > 0.5:
-            h = step * min(6.0, max(0.2, 0.9 * max(error, 1e-12) ** -0.125))
-        while piece + 1 < begins.size and begins[piece + 1] <= t:
-            before, before_lag = _field(
-                begins[piece + 1] - begins[piece], drive[0], drive[1], drive[2], drive[3], lag)
-            piece += 1
-            jump = levels[piece] - before
-            drive[0], drive[1] = levels[piece], ramps[piece]
-            drive[2] = before - (levels[piece] - ramps[piece] * lag)
-            drive[3] = before_lag + ramps[piece]
-            fresh = True
-            if jump != 0.0:
-                # By a lag of 0, or by a later switch: what the step lacks is an impulse.
-                impulse = theta[DRIVE] * jump / mass(y[0], material)
-                for j in range(count):
-                    if wanted[j] == SWITCH + piece or (wanted[j] == LAG and lag <= 0.0):
-                        y[w + 1 + j] -= impulse
-    return False
+    drive = np.array([levels[0], ramps[0], field - (levels[0] - ramps[0] * theta[LAG]),
+                      field_lag + ramps[0]])
+    return _follow(
+        y, new, k, n, count, theta, _unit_of(theta, branches), material, wanted, slots, partial,
+        slopes, drive, begins, levels, ramps, times, rtol, stretch, rate, jacobian, by_rate)
