@@ -10,6 +10,7 @@ from uuid import uuid4
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from hmsa_ros.core.status import Code
@@ -365,39 +366,11 @@ class PlannerClient:
                 raise HmsaError(f'the sequence is not carried out: {now.unheard}')
             return ended
 
-        with self._slower_time() as time:
+        with _slower_time(self.node, self._timeout) as time:
             self.spin_until(
                 done, 'the sequence has not finished',
                 None if each is None else lambda: each(self._verdict), timeout, time)
         return self._verdict
-
-    @contextmanager
-    def _slower_time(self) -> Iterator[Callable[[], float]]:
-        """Give a clock of seconds of simulated time, but none faster than the wall's."""
-        topic = interface.CLOCK_TOPIC
-        if not self.node.count_publishers(topic.name):
-            yield monotonic
-            return
-        clock = RawSubscription(self.node, topic.type, topic.name, topic.qos)
-        passed, heard, before = 0.0, monotonic(), math.nan
-
-        def time() -> float:
-            nonlocal passed, heard, before
-            now = monotonic()
-            for taken in clock.take()[-1:]:
-                with suppress(BadInputError):
-                    stamp = decode(taken.data, topic.type).clock
-                    seconds = stamp.sec + 1e-9 * stamp.nanosec
-                    if seconds > before:
-                        passed += min(seconds - before, now - heard)
-                    heard, before = now, seconds
-            # Where nobody publishes it any more the wall's counts.
-            return passed + max(now - heard - self._timeout, 0.0)
-
-        try:
-            yield time
-        finally:
-            clock.destroy()
 
     def stop(self) -> bool:
         """
@@ -426,3 +399,32 @@ class PlannerClient:
             elif future.done() and self._verdict.state in ('at_rest', 'settling', 'idle'):
                 return bool(future.result().success)
         return False
+
+
+@contextmanager
+def _slower_time(node: Node, patience: float) -> Iterator[Callable[[], float]]:
+    """Give a clock in s of simulated time that is no faster than the wall's; silence counts."""
+    topic = interface.CLOCK_TOPIC
+    if not node.count_publishers(topic.name):
+        yield monotonic
+        return
+    clock = RawSubscription(node, topic.type, topic.name, topic.qos)
+    passed, heard, before = 0.0, monotonic(), math.nan
+
+    def time() -> float:
+        nonlocal passed, heard, before
+        now = monotonic()
+        for taken in clock.take()[-1:]:
+            with suppress(BadInputError):
+                stamp = decode(taken.data, topic.type).clock
+                seconds = stamp.sec + 1e-9 * stamp.nanosec
+                if seconds > before:
+                    passed += min(seconds - before, now - heard)
+                heard, before = now, seconds
+        # Where nobody publishes it any more the wall's counts.
+        return passed + max(now - heard - patience, 0.0)
+
+    try:
+        yield time
+    finally:
+        clock.destroy()
