@@ -35,7 +35,7 @@ def node_parameters(custom_data: Mapping[str, str]) -> dict[str, dict[str, str]]
 
 
 def parameters_of(custom_data: Mapping[str, str], node: str, space: str) -> dict[str, str]:
-    """Return JSON values by parameter of a node in a namespace, else of the only such node."""
+    """Return JSON values by parameter of a namespace's node, else of the only such node."""
     nodes = node_parameters(custom_data)
     exact = nodes.get(f'{space.rstrip("/")}/{node}')
     if exact is not None:

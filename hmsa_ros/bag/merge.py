@@ -92,7 +92,7 @@ class Cursor:
 
 
 def merge(cursors: list[Cursor], limit: int) -> Iterator[Message]:
-    """Yield the messages of sorted chunks before a log time; of equal stamps the first written."""
+    """Yield the messages of sorted chunks before a log time, of equal stamps the oldest first."""
     heap = [(cursor.time, cursor.key, cursor) for cursor in cursors
             if cursor.left and cursor.time < limit]
     heapq.heapify(heap)

@@ -111,7 +111,7 @@ class Recording:
         return number
 
     def put(self, messages: list[Message], payload_bytes: int) -> None:
-        """Record messages of a total payload length in bytes; returns at once."""
+        """Record messages, whose payloads have so many bytes in all; returns at once."""
         size = payload_bytes + MESSAGE_OVERHEAD * len(messages)
         with self._condition:
             if self._queued + size > self._limits.cache_size:
@@ -161,7 +161,7 @@ class Recording:
                 self._sink.pace.refused)
 
     def close(self, last_words: Callable[[Status], Mapping[str, str]] | None = None) -> Status:
-        """Write what has been put and the custom data of ``last_words``, and close the bag."""
+        """Write what has been put, add the custom data of ``last_words``, and close the bag."""
         with self._condition:
             self._closing = True
             self._deadline = time.monotonic() + END_SECONDS

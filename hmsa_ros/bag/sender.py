@@ -18,7 +18,7 @@ _SHORTEST_ROUND_SECONDS = 0.1
 
 @dataclass(frozen=True)
 class Excerpt:
-    """What of a bag is played, in ns: its first time, and the first and last that are played."""
+    """The part of a bag that is played: times in ns, and whether it loops."""
 
     first: int
     start: int

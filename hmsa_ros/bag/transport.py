@@ -113,7 +113,7 @@ class Transport:
             return self.change.wait_for(lambda: self.stopped, max(0.0, seconds))
 
     def wait(self, when: int, *, message: bool, patience: float) -> str:
-        """Wait for a time of the bag (ns), paused at most so many seconds; say what ended it."""
+        """Wait until a time of the bag (ns) is due, while paused at most ``patience`` s."""
         # Empty if it is due, otherwise 'stop', 'seek' or 'paused'; a message may be what a step
         # asks for.
         while True:

@@ -149,7 +149,7 @@ class BagWriter:
         return self._contents.counts()
 
     def add_topic(self, topic: Topic) -> int:
-        """Announce a topic, whose first profiles count, and return its number for messages."""
+        """Announce a topic and return its number; its first profiles hold for every file."""
         contents = self._contents
         number = contents.number_of(topic)
         if number is not None:

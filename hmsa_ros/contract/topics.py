@@ -185,7 +185,7 @@ SPLIT_BAGFILE = Service('~/split_bagfile', _TRIGGER, {
 
 
 def of_joint(name: str, joint: str, joints: Sequence[str]) -> str:
-    """Return a topic's name with the joint before its last part, unchanged for an only joint."""
+    """Return a topic's name for a joint: before its last part, if there are several joints."""
     if len(joints) == 1:
         return name
     return f'~/{joint}/{name[2:]}' if name.startswith('~/') else f'{joint}/{name}'

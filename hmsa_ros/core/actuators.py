@@ -28,7 +28,7 @@ _LARGEST_LOAD = 1e9
 
 def check_stretch(stretch: float, material: Material, name: str = 'stretch') -> None:
     """
-    Refuse a stretch outside the limits of a group or of the chain limit of a Gent block.
+    Refuse a stretch outside the limits of a group, or of a chain limit alone.
 
     Raises
     ------

@@ -50,7 +50,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class Resumption:
-    """A draft or None by which a joint goes on after a deviation, or why it comes to rest."""
+    """How a joint goes on after a deviation: a draft (None if done), or why it comes to rest."""
 
     draft: Draft | None
     refusal: str = ''
@@ -109,7 +109,7 @@ class PlannerGroup:
             self.planners, lambda name: self.planners[name].draft_stop(now)))
 
     def take(self, drafts: Mapping[str, Draft], now: int) -> bool:
-        """Take drafts of one request, made for the same time in ns; return whether any changes."""
+        """Take drafts of one request, made at the same time (ns); return if anything changes."""
         for name, draft in drafts.items():
             self.planners[name].take(draft, now)
             self._attempts[name] = 0
@@ -130,13 +130,13 @@ class PlannerGroup:
         self.planners[name].take(found.draft, now)
 
     def may_resume(self, name: str) -> bool:
-        """Return whether a joint may replan; not after several plans without a command in time."""
+        """Return whether a joint may replan; not where several new plans came too late."""
         return self._attempts[name] < _ATTEMPTS
 
     def applied(
             self, name: str, stamp: int, flux_density: float,
             tolerance: int) -> Deviation | None:
-        """Take in a joint's change of level; return what needs a new plan (`Planner.applied`)."""
+        """Take in a joint's change of level; return the deviation that calls for a new plan."""
         found = self.planners[name].applied(stamp, flux_density, tolerance)
         if found is None:
             return None
@@ -193,7 +193,7 @@ class PlannerGroup:
         ), default=None)
 
     def progress(self, now: int) -> tuple[Progress, dict[str, Progress]]:
-        """Return how far all joints have come (as the one with most to do), and each by name."""
+        """Return the progress of all joints, as of the one with most to do, and of each."""
         each = {name: _progress(x.plan, now) for name, x in self.planners.items()}
         if len(each) == 1:
             return next(iter(each.values())), each
@@ -208,7 +208,8 @@ class PlannerGroup:
     def preview(
             self, begin: int,
             limit: int) -> tuple[list[int], dict[str, list[tuple[float, float, float]]]]:
-        """Sample all plans at so many changes of any level, from that in force at ``begin`` on."""
+        """Return stamps in ns and, by joint, stretch, rate (1/s) and flux density (T) at each."""
+        # From the level in force at begin on, at most limit changes of level of any joint.
         stamps = sorted({
             level.stamp for planner in self.planners.values()
             for level in planner.plan.ahead(begin, limit)})[:limit]

@@ -61,7 +61,7 @@ class History:
     stale: int | None = None
 
     def unheard(self, now: int) -> int:
-        """Count levels after the last one known that silently never took effect (time in ns)."""
+        """Count the levels after the last known one that never took effect (time in ns)."""
         # Only changes are reported. Commands that come so late that they apply all at once make
         # none if the last of them is the level in force: those before it never were.
         levels, first = self.levels, self.known + 1
@@ -85,7 +85,7 @@ class History:
     def with_news(
             self, stamp: int, flux_density: float,
             tolerance: int) -> tuple['History', Deviation | None]:
-        """Take in that a level (T) took effect at a stamp, as planned within a tolerance (ns)."""
+        """Return the history with a level (T) in effect from a stamp (ns), and its deviation."""
         # Changes take effect in the order in which they were sent. So those before the one there
         # is news of have been in force already or never will, and those after it come no earlier.
         levels, known = self.levels, self.known
@@ -117,7 +117,7 @@ class History:
         return History(changed, count, known + 1, known + 1).predicted(count), deviation
 
     def predicted(self, end: int) -> 'History':
-        """Work stale levels out anew up to a place, or until they are what was planned."""
+        """Predict stale levels anew up to a place, or until a prediction is as planned."""
         if self.stale is None or self.stale >= end:
             return self
         anew: list[PlannedLevel] = []

@@ -167,7 +167,7 @@ class RunningPlan:
             max(now + self.model.options.lead_time, self.last_sent.stamp), self.model)
 
     def drop_missed(self, now: int, tolerance: int) -> int:
-        """Take out levels never handed out and late by more than a tolerance (ns); count them."""
+        """Drop levels never sent and late by more than a tolerance (ns); return how many."""
         history = self._history
         end = bisect_left(
             history.levels, now - tolerance, history.sent, key=lambda x: x.stamp)
@@ -177,7 +177,7 @@ class RunningPlan:
         return end - history.sent
 
     def unheard(self, now: int) -> int | None:
-        """Return the stamp of the last silently lost change up to ``now``, or None; in ns."""
+        """Return the stamp in ns of the last level that never took effect; None for none."""
         history = self._history
         count = history.unheard(now)
         return history.levels[history.known + count].stamp if count else None

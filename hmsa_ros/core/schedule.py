@@ -50,7 +50,7 @@ class Superseding(Generic[T]):
 
 
 class CommandSchedule(Superseding[float]):
-    """The level in T in force, NaN for none before the first command, and the commands ahead."""
+    """The level in T in force (NaN before the first command), and the commands ahead."""
 
     def __init__(self, current: float) -> None:
         """Start with one level and nothing ahead."""

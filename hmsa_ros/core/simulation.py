@@ -104,7 +104,7 @@ def simulate(
 def follow(
         levels: Sequence[Level], state: State, end: float, material: NondimensionalParameters,
         delivery: Delivery) -> State:
-    """Return the state that levels lead to at a time not before the last of them, unchecked."""
+    """Return the state that levels lead to at a time after the last of them, without checks."""
     pieces, last = ramps(levels, state.ramps_from, end, delivery.slew)
     if delivery.lag > 0.0:
         return _follow_late(pieces, last, state, end, material, delivery.lag)

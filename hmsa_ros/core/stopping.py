@@ -40,7 +40,7 @@ class Brake:
 
 
 def brake(model: Model, work: Array, state: State, share: float = 1.0) -> Brake:
-    """Return how to stop a motion with a share (0 to 1) of the load that brakes hardest."""
+    """Return the load that stops a motion, and until when; a share of 1 brakes hardest."""
     # The share is of the way from the load that holds the stretch to the limit on the other side.
     # A brake of no duration is for a motion that cannot be followed to a turning point.
     holding = model.holding(state.stretch)

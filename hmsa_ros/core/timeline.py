@@ -188,7 +188,7 @@ class PlannedLevel:
     amplifier: float | None = None
 
     def at(self, time: int) -> State:
-        """Predict the nondimensional state at a time in ns, not before that at the stamp."""
+        """Predict the nondimensional state at a time in ns; before the stamp, as at the stamp."""
         model = self.model
         if self.stamp == ALWAYS:
             return State(self.stretch, 0.0, self.in_force / model.units.load)
@@ -336,7 +336,7 @@ class Draft:
     warning: PlannedSegment | None = None
 
     def delayed(self, delays: Sequence[int]) -> 'Draft':
-        """Return the draft with each segment's move begun later by so many ns, 0 for not."""
+        """Return the draft with the move of each segment delayed by so many ns."""
         begins = [x.begin for x in self.segments]
         levels = tuple(
             replace(x, stamp=x.stamp + delays[bisect_right(begins, x.stamp) - 1])

@@ -83,7 +83,7 @@ class Sensor:
         self._transport.clear()
 
     def measure(self, sample: Sample) -> Iterator[Sample]:
-        """Take a newer sample of the truth; yield those that its delay lets through by now."""
+        """Take a sample of the true state; yield the measurements that have arrived by now."""
         if not self._exact:
             stretch = self._bias + self._gain * sample.stretch
             rate = self._gain * sample.rate

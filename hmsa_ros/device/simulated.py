@@ -107,7 +107,7 @@ class SimulatedDevice(Outbox):
 
     def receive(self, joint: int, stamp: int, level: float) -> None:
         """
-        Have a command in T take effect from a stamp in ns (0: now) and the transport delay on.
+        Have a command in T take effect at its stamp in ns (0 for now), or its delay later.
 
         Raises
         ------
@@ -202,7 +202,7 @@ class SimulatedDevice(Outbox):
     # -- beginning anew ------------------------------------------------------------------------
 
     def restart(self, joint: int, stretch: float | None = None, rate: float = 0.0) -> None:
-        """Put a joint at rest at the initial or another stretch, or in motion; time goes on."""
+        """Put a joint back to its initial or another state (rate in 1/s); time goes on."""
         self._actuators.reset(joint, stretch, rate)
         # A first command arms it again.
         self._watchdogs[joint].disarm()

@@ -90,7 +90,7 @@ class Watchdog:
         return recovered
 
     def watch(self, now: int, until: int, level: float) -> Iterator[tuple[int, float]]:
-        """Look at the time (ns) and yield stamps (ns) and levels (T) of the safe flux if due."""
+        """Yield stamps (ns) and levels (T) of the safe flux once commands have ceased."""
         if self._trips(now):
             if self._fallback.safe_flux == 'zero':
                 yield now, 0.0

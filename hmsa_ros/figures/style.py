@@ -71,7 +71,7 @@ _SETTINGS: dict[str, Any] = {
 def picture(
         path: Path, height: float, *, width: float = WIDTH,
         kind: str = 'png') -> Iterator[Figure]:
-    """Yield a figure of a size in inches; the block's end writes it to a file as PNG or PDF."""
+    """Yield a figure (sizes in inches), which the end of the block writes as PNG or PDF."""
     with style.context(['default', _SETTINGS]):
         figure = Figure(figsize=(width, height), layout='constrained')
         FigureCanvasAgg(figure)
@@ -82,7 +82,7 @@ def picture(
 
 
 def finish(axes: Axes, x_label: str, y_label: str, letter: str = '') -> None:
-    """Name a panel's axes (none leaves the tick labels off) and write its letter above it."""
+    """Name a panel's axes (no name, no tick labels) and write its letter above it."""
     axes.set_xlabel(x_label)
     axes.set_ylabel(y_label)
     if letter:

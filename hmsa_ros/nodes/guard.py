@@ -32,7 +32,7 @@ class Allegiance:
         self.refused = 0
 
     def accepts(self, publisher: bytes, present: Callable[[], Sequence[bytes]]) -> bool:
-        """Return whether to obey a publisher; one unknown only where a single one is present."""
+        """Return whether to obey a publisher; an unknown one only if it is the only one."""
         if publisher and publisher == self.source:
             return True
         others = [bytes(x) for x in present()]

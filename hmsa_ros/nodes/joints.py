@@ -115,7 +115,7 @@ def declare_joints(
         node: Node, specs: Sequence[ParameterSpec],
         own: Sequence[ParameterSpec]) -> JointParameters:
     """
-    Declare parameters, those of ``own`` once more for each joint, and return their values.
+    Declare parameters, those of ``own`` once more for each joint; return their values.
 
     Raises
     ------

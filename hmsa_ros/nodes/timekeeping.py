@@ -14,7 +14,8 @@ class StepWatch:
         self._offset: int | None = None
 
     def set_back(self, before: int, now: int, after: int) -> int:
-        """Return by how many ns the clock was set back; all in ns, read between the others."""
+        """Return by how many ns the clock was set back since the last reading; 0 if it was not."""
+        # Steady time just before and just after the reading, in ns.
         if after - before > _STEP_NS:
             # Interrupted between the readings: they do not belong together.
             return 0

@@ -69,7 +69,7 @@ class Arrival:
 
 
 def arrivals(run: Run, targets: Sequence[float], tolerance: float) -> list[Arrival]:
-    """Measure a run's setpoints: targets in order, one held already is none; share of a step."""
+    """Measure the arrival at each target, one a move; the tolerance is a share of the step."""
     found = evaluate(run)
     noise = _noise(run)
     results = list(found.results)

@@ -90,7 +90,7 @@ class SampleReader:
 
     def columns(self, where: str, joint: str, *, required: bool) -> 'Samples':
         """
-        Return a joint's samples in order; without ``required``, of another joint if need be.
+        Return a joint's samples in order; another joint will do unless ``required``.
 
         Raises
         ------

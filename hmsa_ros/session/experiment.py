@@ -364,7 +364,7 @@ class _Watch:
 
     def look(self, end: float) -> None:
         """
-        Make sure that the nodes are there and time goes on, to the sequence's end in s.
+        Make sure that the nodes are there and time goes on; the sequence is over at ``end`` s.
 
         Raises
         ------

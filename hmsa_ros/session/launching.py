@@ -22,7 +22,7 @@ _RECORDER_NANOSECONDS = 500_000_000
 
 @dataclass(frozen=True)
 class Argument:
-    """An argument as ``ros2 launch`` shows it; default None if required, no choices for any."""
+    """An argument of a launch file; without a default it must be given."""
 
     name: str
     description: str
@@ -32,7 +32,7 @@ class Argument:
 
 @dataclass(frozen=True)
 class Started:
-    """What a launch starts; a failing node, or the clean end of ``last`` (if any), ends all."""
+    """The processes of a launch; if one fails, or ``last`` ends cleanly, all end."""
 
     nodes: tuple[NodeProcess, ...]
     rviz: NodeProcess | None
@@ -48,7 +48,7 @@ class LaunchFile:
 
     def evaluate(self, given: Mapping[str, str], share: Path) -> Started:
         """
-        Return what some arguments start, defaults filled in; ``share`` is the package's.
+        Return what the given arguments start; ``share`` is the package's installed folder.
 
         Raises
         ------
@@ -173,7 +173,7 @@ REPLAY = LaunchFile((
 
 
 def failure(name: str, status: int, ending: bool) -> str:
-    """Return why an ended process failed, or nothing; signals are none where all is ending."""
+    """Return a sentence about a process that failed, else none; signals are fine while all end."""
     if not status or (ending and status in _SIGNALS):
         return ''
     return (f'the {name} ended with status {status}: expected 0; the reason is in its output '

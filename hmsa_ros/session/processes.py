@@ -20,7 +20,7 @@ _PATIENCE_SECONDS = 15.0
 
 @dataclass(frozen=True)
 class NodeProcess:
-    """A ``hmsa`` node command, or an executable of another package; options go before ROS's."""
+    """A node to start: a ``hmsa`` command, or the executable of another package."""
 
     name: str
     parameters: Mapping[str, object]
@@ -125,7 +125,9 @@ def _die_with_parent() -> None:
 
 
 def local_environment() -> dict[str, str]:
-    """Return an environment for this host only, with ROS_DOMAIN_ID or a domain of its own."""
+    """Return a copy of our environment in which nodes talk to this host only."""
+    # The ROS domain is the caller's where ROS_DOMAIN_ID is set, and otherwise one that other runs
+    # on this host are unlikely to use.
     environment = dict(os.environ)
     environment[RANGE] = 'LOCALHOST'
     # Domains above 101 collide with the ephemeral ports of Linux.

@@ -21,7 +21,8 @@ _LEAD_SECONDS = 0.5
 def simulated_nodes(
         settings: Mapping[str, object], params_file: str,
         namespace: str) -> tuple[NodeProcess, NodeProcess]:
-    """Return a paused plant that leads time and its planner; a file's settings go first."""
+    """Return a paused plant that leads simulated time, and a planner that follows it."""
+    # What the parameter file sets goes before what is chosen here.
     values = values_of(settings, PLANT, ACTUATOR)
     block = ActuatorParameters(**{
         name.partition('.')[2]: value for name, value in values.items()})

@@ -94,7 +94,7 @@ def settling_time(
 
 
 def damped_study(start: float, target: float, zetas: Floats) -> DampedStudy:
-    """Compare plain step and minimum-time command at zetas above 0, from rest to above 1."""
+    """Compare the plain step with the minimum-time command over values of zeta above 0."""
     materials = [NondimensionalParameters(float(zeta)) for zeta in zetas]
     plain = np.array([
         settling_time(step(Request(State(start), target, x)), start, target, x)

@@ -84,7 +84,7 @@ def switched_at(move: Move, time: float) -> Move:
 
 
 def rounded_move(move: Move, period: float) -> Move:
-    """Return a two-step command switched on the nearest point of a grid, at least one on."""
+    """Return a two-step command switched at the nearest point of a grid after its start."""
     return switched_at(move, max(1, round(move.duration / period)) * period)
 
 

@@ -39,7 +39,7 @@ def dots(braille: bool) -> tuple[int, int]:
 
 
 def limits(*values: Array, least: float) -> tuple[float, float]:
-    """Return the ends of an axis of a least range, with some room around the values (or NaN)."""
+    """Return the ends of an axis, with some room around the values; NaN values do not count."""
     known = np.concatenate([x[np.isfinite(x)] for x in values])
     if not len(known):
         return 1.0 - 0.5 * least, 1.0 + 0.5 * least
@@ -51,7 +51,7 @@ def limits(*values: Array, least: float) -> tuple[float, float]:
 def strip(
         value: tuple[Array, Array], target: tuple[Array, Array], height: int,
         edges: tuple[float, float], *, braille: bool) -> Strip:
-    """Draw least and largest values (NaN for none) by column of dots between two edges."""
+    """Draw the least and largest value in each column of dots (NaN for none) between two edges."""
     across, down = dots(braille)
     columns = len(value[0])
     lines = height * down

@@ -23,7 +23,7 @@ class History:
         self._newest = 0
 
     def put(self, before: float, now: float, values: Array) -> None:
-        """Take in samples that arrived between two looks (times in s), evenly spread."""
+        """Take in samples that arrived between two looks (times in s), evenly as far as known."""
         self._advance(now)
         count = len(self._low)
         times = before + (now - before) * np.arange(1, len(values) + 1) / max(len(values), 1)
