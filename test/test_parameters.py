@@ -15,12 +15,13 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 import yaml
 
+from hmsa_ros.contract.parameters import ACTUATOR
 from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.errors import BadInputError
 import hmsa_ros.nodes
 from hmsa_ros.nodes.parameters import (
-    ACTUATOR,
     actuator_from,
+    BLOCK,
     check_names,
     declare,
     ParameterSpec,
@@ -38,7 +39,7 @@ DIMENSIONLESS = {
     'marker_scale', 'max_points',
     'actuator.chain_limit', 'initial_stretch', 'real_time_factor', 'robust_order', 'play.rate',
     'play.read_ahead_queue_size', 'play.realtime_priority', 'record.queue_depth',
-    'reset_stretch', 'seed', 'step_count', 'stretch_bias', 'stretch_gain', 'stretch_noise',
+    'reset_stretch', 'seed', 'law.alpha', 'law.lambda_m', 'step_count', 'stretch_bias', 'stretch_gain', 'stretch_noise',
     *(f'mismatch.{x.name.partition(".")[2]}' for x in ACTUATOR)}
 TYPES = {
     bool: ParameterType.PARAMETER_BOOL, int: ParameterType.PARAMETER_INTEGER,
@@ -96,7 +97,8 @@ def test_names_are_in_snake_case_and_each_is_there_once(node):
 def test_each_parameter_is_described_in_a_sentence_and_has_its_unit(node):
     for spec in DECLARED[node]:
         assert re.fullmatch(r'[A-Z].*[^.]\.', spec.description), spec.name
-        assert bool(spec.unit) == (is_number(spec) and spec.name not in DIMENSIONLESS), spec.name
+        number = is_number(spec) or spec.items is float
+        assert bool(spec.unit) == (number and spec.name not in DIMENSIONLESS), spec.name
 
 
 @every_node
@@ -268,7 +270,7 @@ def test_check_takes_the_ends_of_the_range(value):
 
 
 def test_actuator_of_the_defaults_is_that_of_the_paper():
-    assert actuator_from({x.name: x.default for x in ACTUATOR}) == paper_actuator()
+    assert actuator_from({x.name: x.default for x in BLOCK}) == paper_actuator()
 
 
 def test_actuator_has_each_parameter_where_it_belongs():
@@ -277,14 +279,14 @@ def test_actuator_has_each_parameter_where_it_belongs():
         shear_modulus=1.0, density=2.0, half_length=3.0, half_thickness=4.0, remanence=5.0,
         chain_limit=6.0, damping_coefficient=7.0)
     assert [x.name for x in ACTUATOR] == [
-        f'actuator.{x}' for x in ActuatorParameters.__dataclass_fields__]
+        f'actuator.{x}' for x in paper_actuator().numbers]
 
 
 def test_planner_and_plant_describe_the_same_block():
     planner, plant = (
         {x.name: replace(x, read_only=True) for x in DECLARED[node]}
         for node in ('planner', 'plant'))
-    common = {*(x.name for x in ACTUATOR), 'joint', 'initial_stretch', 'slew_limit',
+    common = {*(x.name for x in BLOCK), 'joint', 'initial_stretch', 'slew_limit',
               'coil_time_constant'}
     assert common <= planner.keys() & plant.keys()
     assert all(planner[x] == plant[x] for x in common)

@@ -208,7 +208,7 @@ def _records(given: Mapping[str, float]) -> 'tuple[ActuatorParameters, Coil]':
     block = {x.parameter.partition('.')[2]: given[x.key] for x in QUANTITIES
              if x.parameter.startswith('actuator.')}
     return (
-        ActuatorParameters(**block, damping_coefficient=damping),
+        ActuatorParameters(damping_coefficient=damping, law=None, **block),
         Coil(given['flux_min'], given['flux_max'], given['slew_limit']))
 
 
@@ -313,7 +313,7 @@ def _sampling(actuator: 'ActuatorParameters') -> list[str]:
 def _parameters(actuator: 'ActuatorParameters', coil: 'Coil') -> dict[str, float]:
     """Return the nodes' parameters by name."""
     return {
-        **{f'actuator.{name}': value for name, value in asdict(actuator).items()},
+        **{f'actuator.{name}': value for name, value in actuator.numbers.items()},
         **asdict(coil)}
 
 

@@ -76,7 +76,7 @@ def _run_si(arguments: argparse.Namespace) -> int:
     """Plan in seconds and tesla for the actuator of a parameter file."""
     from hmsa_ros.contract.actuator import actuator_from
     from hmsa_ros.contract.parameters import (
-        ACTUATOR,
+        BLOCK,
         COIL_TIME_CONSTANT,
         FLUX_DENSITY_MAX,
         FLUX_DENSITY_MIN,
@@ -96,7 +96,7 @@ def _run_si(arguments: argparse.Namespace) -> int:
             'since the file sets these values')
     values = values_of(
         read_parameter_file(arguments.params_file), PLANNER,
-        (*ACTUATOR, FLUX_DENSITY_MIN, FLUX_DENSITY_MAX, SLEW_LIMIT, COIL_TIME_CONSTANT))
+        (*BLOCK, FLUX_DENSITY_MIN, FLUX_DENSITY_MAX, SLEW_LIMIT, COIL_TIME_CONSTANT))
     actuator = actuator_from(values)
     model = Model(actuator, Options(
         flux_density_min=values['flux_density_min'], flux_density_max=values['flux_density_max'],

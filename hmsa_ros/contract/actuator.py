@@ -1,14 +1,40 @@
 """The actuator that a set of parameters describes."""
 
 from collections.abc import Mapping
+import math
 from typing import Any
 
-from hmsa_ros.contract.parameters import ACTUATOR_FIELDS
+from hmsa_ros.contract.parameters import ACTUATOR_FIELDS, LAW
+from hmsa_ros.core.laws import LAWS
 from hmsa_ros.core.parameters import ActuatorParameters
 
 
 def actuator_from(values: Mapping[str, Any]) -> ActuatorParameters:
-    """Return the block of ``actuator.*`` in SI units, times the factors ``mismatch.*`` if any."""
-    return ActuatorParameters(**{
-        name: values[f'actuator.{name}'] * values.get(f'mismatch.{name}', 1.0)
-        for name in ACTUATOR_FIELDS})
+    """Return the block of ``actuator.*``, ``mismatch.*`` if any, and its law unless Gent."""
+    numbers = {name: values[f'actuator.{name}'] for name in ACTUATOR_FIELDS}
+    law, elastic = LAWS[values.get('law', 'gent')], None
+    if law.endless:
+        numbers['chain_limit'] = math.inf
+    if law.scaled is not None:
+        numbers['shear_modulus'], elastic = law.scaled(
+            {**{x.name: x.default for x in LAW}, **values})
+    return ActuatorParameters(law=elastic, **{
+        name: value * values.get(f'mismatch.{name}', 1.0) for name, value in numbers.items()})
+
+
+def parameters_of(actuator: ActuatorParameters) -> dict[str, Any]:
+    """Return the parameters that describe a block, the inverse of `actuator_from`."""
+    values: dict[str, Any] = {
+        f'actuator.{name}': value for name, value in actuator.numbers.items()}
+    if actuator.law is None:
+        return values
+    units = {x.name: x.unit for x in LAWS[actuator.law.law].constants}
+
+    def in_si(name: str, value: Any) -> Any:
+        factor = actuator.shear_modulus if units[name] == 'Pa' else 1.0
+        if isinstance(value, tuple):
+            return [factor * x for x in value]
+        return value if isinstance(value, str) else factor * value
+
+    return values | {'law': actuator.law.law} | {
+        name: in_si(name, value) for name, value in actuator.law.given}

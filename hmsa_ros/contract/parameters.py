@@ -4,13 +4,15 @@ Parameters that nodes, files and reports share: name, default, unit, range and d
 `ParameterSpec` is one entry. What only one node has is declared with that node.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 from typing import Any
 
+from hmsa_ros.core.laws import LAWS
 from hmsa_ros.errors import BadInputError, excerpt
 
-Value = bool | int | float | str | list[str]
+Value = bool | int | float | str | list[str] | list[float]
 
 
 @dataclass(frozen=True)
@@ -22,18 +24,20 @@ class ParameterSpec:
     ----------
     name : str
         Snake case, groups separated by dots.
-    default : bool, int, float, str or list of str
+    default : bool, int, float, str or list
         Its type is the parameter's type.
     description : str
         One sentence without the unit.
     unit : str
         Unit in plain text, empty for a dimensionless value.
     minimum, maximum : float, optional
-        Closed range of a number.
+        Closed range of a number, or of each in a list.
     choices : tuple of str
         Admissible values of a string, empty for any.
     read_only : bool
         Whether the value is fixed at the start.
+    items : type
+        ``str`` or ``float``: what a list holds.
 
     """
 
@@ -45,6 +49,52 @@ class ParameterSpec:
     maximum: float | None = None
     choices: tuple[str, ...] = ()
     read_only: bool = True
+    items: type = str
+
+    def taken(self, value: Any) -> Any:
+        """
+        Return a value as the nodes use it, checked.
+
+        Parameters
+        ----------
+        value : object
+            As ROS or a file gives it; one item is a list of one, None is an empty list.
+
+        Returns
+        -------
+        object
+            Of the default's type.
+
+        Raises
+        ------
+        BadInputError
+            If it is of another type, outside the range or not one of the choices.
+
+        """
+        if isinstance(self.default, list):
+            value = self._as_list(value)
+            for item in value:
+                self.check(item)
+            return value
+        if isinstance(self.default, str) and not isinstance(value, str):
+            raise BadInputError(
+                f'parameter {self.name} is {excerpt(value)}: expected a text')
+        self.check(value)
+        return value
+
+    def _as_list(self, value: Any) -> list[Any]:
+        """Return the items of a list."""
+        if value is None:
+            return []
+        several = not isinstance(value, str) and (
+            isinstance(value, Sequence) or hasattr(value, 'typecode'))
+        values = list(value) if several else [value]
+        kinds = (int, float) if self.items is float else (str,)
+        if not all(isinstance(x, kinds) and not isinstance(x, bool) for x in values):
+            of = 'numbers' if self.items is float else 'strings'
+            raise BadInputError(
+                f'parameter {self.name} is {excerpt(value)}: expected a list of {of}')
+        return [self.items(x) for x in values]
 
     def check(self, value: Any) -> None:
         """
@@ -107,6 +157,36 @@ ACTUATOR = (
         'actuator.damping_coefficient', 8.0 * ZETA * 0.01 * 0.01 * math.sqrt(1900.0 * 1e4),
         'Damping coefficient c; zeta = c/(8 L H sqrt(rho G)).', 'N s/m', 0.0, 1e12),
 )
+
+
+
+def _of_laws() -> tuple[ParameterSpec, ...]:
+    """Return the constants of all laws; a name that two laws have is one parameter."""
+    texts: dict[str, list[str]] = {}
+    found: dict[str, ParameterSpec] = {}
+    for law in LAWS.values():
+        for x in law.constants:
+            texts.setdefault(x.name, []).append(f'{law.name}: {x.symbol}')
+            number = x.kind is not str
+            found[x.name] = ParameterSpec(
+                x.name, 0.0 if x.kind is float else x.kind(),
+                f'Constant of law {"; ".join(texts[x.name])}.', x.unit,
+                x.minimum if number else None, x.maximum if number else None,
+                items=float if x.kind is list else str)
+    return tuple(found.values())
+
+
+#: The elastic law of the block and its constants.
+LAW = (
+    ParameterSpec(
+        'law', next(iter(LAWS)),
+        'Elastic law of the block. All but gent and neo_hookean have constants law.*, from which '
+        'the shear modulus follows.', choices=tuple(LAWS)),
+    *_of_laws(),
+)
+
+#: All that describes a block.
+BLOCK = (*ACTUATOR, *LAW)
 
 JOINT = ParameterSpec(
     'joint', 'actuator', 'Name of the joint in trajectories and joint states.')

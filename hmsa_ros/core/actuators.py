@@ -14,7 +14,7 @@ import numpy as np
 
 from hmsa_ros.core import kernels, law
 from hmsa_ros.core.model import Array, Material, stretch_limits
-from hmsa_ros.core.parameters import ActuatorParameters
+from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.core.schedule import CommandSchedule
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
@@ -38,9 +38,38 @@ def check_stretch(stretch: float, material: Material, name: str = 'stretch') -> 
     """
     lower, upper = stretch_limits(material)
     if not lower < stretch < upper:
+        elastic = getattr(material, 'law', None)
+        whose = f'J_lim {getattr(material, "j_lim", material):g}' if elastic is None \
+            else f'law {elastic.law}'
         raise BadInputError(
             f'{name} is {stretch:g}: expected a stretch between the limits {lower:.4f} and '
-            f'{upper:.4f} of J_lim {getattr(material, "j_lim", material):g}')
+            f'{upper:.4f} of {whose}')
+
+
+def unheld(material: NondimensionalParameters) -> str:
+    """
+    Return which stretches cannot be held because the force falls there.
+
+    Parameters
+    ----------
+    material : NondimensionalParameters
+        The group.
+
+    Returns
+    -------
+    str
+        A sentence without a full stop; empty where the force rises everywhere.
+
+    """
+    if material.law is None:
+        return ''
+    sides = [
+        f'{words} {limit:.4f}' for words, limit, end in zip(
+            ('below', 'above'), stretch_limits(material), material.law.limits, strict=True)
+        if limit != end]
+    return sides and (
+        f'no field holds stretches {" and ".join(sides)}, where law {material.law.law} has a '
+        'falling force') or ''
 
 
 @dataclass(frozen=True)
@@ -169,7 +198,7 @@ class Actuators:
         self._slews = [0.0] * count
         for i in range(count):
             self.limit_slew(i, math.inf)
-        self._material = np.array([x.nondimensional.packed for x in blocks])
+        self._material = law.stack([x.nondimensional.packed for x in blocks])
         self._state = np.zeros((count, 3))
         self._drive = np.zeros((count, 4))
         self._levels = np.zeros(count)  # of the amplifiers, in T

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from hmsa_ros.core.compiling import compiled
 from hmsa_ros.core.dop853 import ERROR_3, ERROR_5, MATRIX, NODES, STAGES, WEIGHTS
-from hmsa_ros.core.law import acceleration, motion, natural_frequency, ZETA
+from hmsa_ros.core.law import acceleration, KIND, motion, natural_frequency, ZETA
+from hmsa_ros.core.laws.record import ANY, GENT, NEO_HOOKEAN, OGDEN, POLYNOMIAL, TABLE
 
 # Status codes of the integration.
 DONE = 0
@@ -42,13 +43,13 @@ def work_space() -> NDArray[np.float64]:
 
 
 @compiled(inline=True)
-def _derivative(l, v, s, r, beta, p, material):  # noqa: E741
+def _derivative(l, v, s, r, beta, p, material, family):  # noqa: E741
     """
     Right-hand side of Eq. 11 and of its variational equation.
 
     ``p`` is the derivative of the load with respect to the parameter.
     """
-    a, a_l, a_v, a_beta = motion(l, v, beta, material)
+    a, a_l, a_v, a_beta = motion(l, v, beta, material, family)
     return v, a, r, a_l * s + a_v * r + a_beta * p
 
 
@@ -73,6 +74,25 @@ def step(k, l, v, s, r, beta, slope, p, q, h, material, rtol):  # noqa: E741
     The load is ``beta + slope t`` and its parameter derivative ``p + q t`` from the start of
     the step. Returns the new state and the error in units of the tolerance.
     """
+    if material[KIND] <= NEO_HOOKEAN:
+        return _step(k, l, v, s, r, beta, slope, p, q, h, material, rtol, GENT)
+    return _family_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol)
+
+
+@compiled()
+def _family_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol):  # noqa: E741
+    """Make a step for a law beside Gent."""
+    family = material[KIND]
+    if family == POLYNOMIAL:
+        return _step(k, l, v, s, r, beta, slope, p, q, h, material, rtol, POLYNOMIAL)
+    if family == OGDEN:
+        return _step(k, l, v, s, r, beta, slope, p, q, h, material, rtol, OGDEN)
+    return _step(k, l, v, s, r, beta, slope, p, q, h, material, rtol, TABLE)
+
+
+@compiled(inline=True)
+def _step(k, l, v, s, r, beta, slope, p, q, h, material, rtol, family):  # noqa: E741
+    """Make a step, compiled for a family of laws."""
     for i in range(STAGES):
         d0 = d1 = d2 = d3 = 0.0
         for j in range(i):
@@ -84,7 +104,7 @@ def step(k, l, v, s, r, beta, slope, p, q, h, material, rtol):  # noqa: E741
         t = h * NODES[i]
         k[i, 0], k[i, 1], k[i, 2], k[i, 3] = _derivative(
             l + h * d0, v + h * d1, s + h * d2, r + h * d3,
-            beta + slope * t, p + q * t, material)
+            beta + slope * t, p + q * t, material, family)
     d0 = d1 = d2 = d3 = 0.0
     e5_l = e5_v = e3_l = e3_v = 0.0
     for j in range(STAGES):
@@ -106,7 +126,8 @@ def step(k, l, v, s, r, beta, slope, p, q, h, material, rtol):  # noqa: E741
 def first_step(l, v, beta, material, rtol):  # noqa: E741
     """Return a first step length: a fixed phase of the local oscillation."""
     rate = natural_frequency(l, material)
-    return 4.0 * rtol ** 0.125 / (rate + 3.0 * material[ZETA])
+    # Where the force turns, the frequency vanishes.
+    return 4.0 * rtol ** 0.125 / (rate + 3.0 * material[ZETA] + 1e-9)
 
 
 @compiled(inline=True)
@@ -228,7 +249,7 @@ def _land(k, l, v, s, r, t, direction, beta, h, end_v, material, rtol):  # noqa:
             dt = 0.5 * (before + after)
         new_l, new_v, new_s, new_r, _ = step(
             k, l, v, s, r, beta, 0.0, 1.0, 0.0, dt, material, rtol)
-        _, a, _, _ = _derivative(new_l, new_v, new_s, new_r, beta, 1.0, material)
+        _, a, _, _ = _derivative(new_l, new_v, new_s, new_r, beta, 1.0, material, ANY)
         if abs(new_v) <= 1e-6 * size and direction * a < 0.0:
             break
         if direction * new_v > 0.0:
@@ -240,7 +261,7 @@ def _land(k, l, v, s, r, t, direction, beta, h, end_v, material, rtol):  # noqa:
     left = -new_v / a
     new_l += 0.5 * new_v * left
     new_s += new_r * left
-    _, a, _, slope = _derivative(new_l, 0.0, new_s, new_r, beta, 1.0, material)
+    _, a, _, slope = _derivative(new_l, 0.0, new_s, new_r, beta, 1.0, material, ANY)
     new_r += slope * left
     return DONE, t + dt + left, new_l, new_s, -new_r / a
 
@@ -306,7 +327,7 @@ def respond(
             if status != DONE:
                 return status, end_l, end_v
             _, a, _, _ = _derivative(
-                end_l, end_v, 0.0, 0.0, loads[m] + slopes[m] * durations[m], 0.0, material)
+                end_l, end_v, 0.0, 0.0, loads[m] + slopes[m] * durations[m], 0.0, material, ANY)
             s += end_v * d_durations[m, j]
             r += a * d_durations[m, j]
         jacobian[0, j] = s
@@ -325,6 +346,20 @@ def _plain_step(k, l, v, beta, slope, excess, decay, h, material, rtol):  # noqa
     The load is ``beta + slope t + excess exp(-decay t)`` from the start of the step. Returns
     the new state and the error in units of the tolerance.
     """
+    if material[KIND] <= NEO_HOOKEAN:
+        return _bare_step(k, l, v, beta, slope, excess, decay, h, material, rtol, GENT)
+    return _bare_family_step(k, l, v, beta, slope, excess, decay, h, material, rtol)
+
+
+@compiled()
+def _bare_family_step(k, l, v, beta, slope, excess, decay, h, material, rtol):  # noqa: E741
+    """Make a step without sensitivities for a law beside Gent."""
+    return _bare_step(k, l, v, beta, slope, excess, decay, h, material, rtol, ANY)
+
+
+@compiled(inline=True)
+def _bare_step(k, l, v, beta, slope, excess, decay, h, material, rtol, family):  # noqa: E741
+    """Make a step without sensitivities, as `_step` does."""
     for i in range(STAGES):
         d0 = d1 = 0.0
         for j in range(i):
@@ -337,7 +372,7 @@ def _plain_step(k, l, v, beta, slope, excess, decay, h, material, rtol):  # noqa
             load += excess * math.exp(-decay * t)
         new_v = v + h * d1
         k[i, 0] = new_v
-        k[i, 1] = acceleration(l + h * d0, new_v, load, material)
+        k[i, 1] = acceleration(l + h * d0, new_v, load, material, family)
     d0 = d1 = 0.0
     e5_l = e5_v = e3_l = e3_v = 0.0
     for j in range(STAGES):

@@ -23,6 +23,7 @@ from hmsa_ros.core.kernels import (
     STUCK,
 )
 from hmsa_ros.core.law import motion, natural_frequency
+from hmsa_ros.core.laws.record import ANY
 
 # Columns of the state: stretch, rate, and their derivatives by three parameters.
 _WIDTH = 8
@@ -49,7 +50,7 @@ def _step(k, x, new, line, line_slope, rest, decay, d_line, d_rest, h, material,
         t = h * NODES[i]
         left = math.exp(-decay * t)
         a, a_l, a_v, a_beta = motion(
-            here[0], here[1], line + line_slope * t + rest * left, material)
+            here[0], here[1], line + line_slope * t + rest * left, material, ANY)
         k[i, 0] = here[1]
         k[i, 1] = a
         for c in range(3):
@@ -127,7 +128,7 @@ def respond_late(
         left = math.exp(-decay * span)
         field = line + slope * span + rest * left
         change = slope - rest * decay * left
-        a, _, _, _ = motion(x[0], x[1], field, material)
+        a, _, _, _ = motion(x[0], x[1], field, material, ANY)
         for c in range(3):
             x[2 + 2 * c] += x[1] * d_durations[m, c]
             x[3 + 2 * c] += a * d_durations[m, c]

@@ -6,14 +6,16 @@ In nondimensional energy form every actuator of this package obeys
     m(l) l'' + m'(l) l'^2 / 2 + d l' + psi'(l) = beta
 
 with stretch ``l``, time in units of ``L sqrt(rho/G)`` and the signed load
-``beta = Br B/(mu0 G)``. This module has the parts: everything else takes them from here, and a
-further law is one more branch in `_elastic`, `elastic_energy` and `pack`.
+``beta = Br B/(mu0 G)``. This module has the parts: everything else takes them from here. Gent
+and its limit are inlined; the other laws are families in `hmsa_ros.core.laws.kernels`.
 
 The compiled functions take one array ``material``, as `pack` makes it: a header (`KIND` to
 `UPPER`), then the constants of the law from `CONSTANTS` on, as many as it has, tables included.
-Nothing here checks its arguments; outside the limits the results are NaN.
+Nothing here checks its arguments. Where there is no energy the results are NaN. Between `LOWER`
+and `UPPER` the force rises, so that each stretch can be held.
 """
 
+from functools import lru_cache
 import math
 from typing import Any
 
@@ -21,6 +23,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmsa_ros.core.compiling import compiled
+from hmsa_ros.core.laws import kernels as families
+from hmsa_ros.core.laws.record import (
+    ANY,
+    CONSTANTS,
+    Elastic,
+    GENT,
+    NEO_HOOKEAN,
+    OGDEN,
+    POLYNOMIAL,
+)
 
 # Places in the packed material.
 KIND = 0  # which law
@@ -29,11 +41,10 @@ C1 = 2  # shape of the block, 2 H^2/L^2
 DAMPING = 3  # d
 LOWER = 4  # limiting stretches; 0 and infinity where there are none
 UPPER = 5
-CONSTANTS = 6
 
-# Laws, with their constants.
-GENT = 0.0  # 1/J_lim
-NEO_HOOKEAN = 1.0  # none
+# Points and halvings of the search for where a force falls.
+_LOOK = 4000
+_HALVINGS = 60
 
 #: Columns of `acceleration_slopes` before the constants of the law.
 BY_LOAD, BY_MODULUS, BY_ZETA, BY_C1, BY_CONSTANT = 0, 1, 2, 3, 4
@@ -63,13 +74,18 @@ def gent_limits(i_j: Any) -> tuple[Any, Any]:
     return np.where(endless, 0.0, lower), np.where(endless, math.inf, upper)
 
 
-def pack(zeta: Any, j_lim: Any, c1: Any) -> Array:
+def pack(zeta: Any, j_lim: Any, c1: Any, elastic: Elastic | None = None) -> Array:
     """
-    Return the packed material of a Gent block; neo-Hookean where J_lim is infinite.
+    Return the packed material of a Gent block, or of one with another law.
 
-    Arrays (n,) give n rows.
+    Neo-Hookean where J_lim is infinite. Arrays (n,) give n rows.
     """
     zeta, j_lim, c1 = (np.asarray(x, dtype=np.float64) for x in (zeta, j_lim, c1))
+    if elastic is not None:
+        columns = np.broadcast_arrays(
+            elastic.family, zeta, c1, 0.5 * zeta * c1, *held(elastic), *elastic.constants)
+        made: Array = np.stack(columns, axis=-1)
+        return made
     with np.errstate(divide='ignore', over='ignore'):
         i_j = 1.0 / j_lim
     kind = np.where(i_j == 0.0, NEO_HOOKEAN, GENT)
@@ -77,11 +93,58 @@ def pack(zeta: Any, j_lim: Any, c1: Any) -> Array:
         [kind, zeta, c1, 0.5 * zeta * c1, *gent_limits(i_j), i_j], axis=-1)
 
 
+@lru_cache(maxsize=256)
+def held(elastic: Elastic) -> tuple[float, float]:
+    """Return the stretches around 1 between which the force of a law rises."""
+    material = np.array([elastic.family, 0.0, 1.0, 0.0, *elastic.limits, *elastic.constants])
+
+    def boundary(end: float) -> float:
+        path: Array = np.geomspace(1.0, end, _LOOK)
+        path[-1] = end
+        stiffness = np.empty(_LOOK)
+        evaluate(STIFFNESS, path, material, stiffness)
+        falls = np.flatnonzero(~(stiffness > 0.0))
+        if not len(falls):
+            return end
+        outside = float(path[falls[0]])
+        inside = float(path[max(falls[0] - 1, 0)])
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (inside + outside)
+            if elastic_stiffness(middle, material) > 0.0:
+                inside = middle
+            else:
+                outside = middle
+        return inside
+
+    return boundary(elastic.limits[0]), boundary(elastic.limits[1])
+
+
+def stack(materials: Any) -> Array:
+    """Return packed materials as rows, though their laws have different numbers of constants."""
+    rows = np.zeros((len(materials), max((len(x) for x in materials), default=0)))
+    for row, material in zip(rows, materials, strict=True):
+        row[:len(material)] = material
+    return rows
+
+
 @compiled(inline=True)
-def _elastic(l, material):  # noqa: E741
-    """Return psi' and psi'' by the law; NaN outside its limits."""
+def _elastic(l, material, family):  # noqa: E741
+    """
+    Return psi' and psi'' by the law of a family; NaN outside its limits.
+
+    The family is a constant, `GENT` also for neo-Hookean, or `ANY`. Where it is known, a step
+    of the integration is compiled without calls in it and takes half of the time.
+    """
     force = stiffness = math.nan
-    if material[KIND] == GENT:
+    if family == POLYNOMIAL:
+        if 0.0 < l < math.inf:
+            force, stiffness = families.polynomial(l, material)
+    elif family == OGDEN:
+        if 0.0 < l < math.inf:
+            force, stiffness = families.ogden(l, material)
+    elif family == ANY and material[KIND] > NEO_HOOKEAN:
+        force, stiffness = families.elastic(l, material[KIND], material)
+    elif material[KIND] == GENT:
         # psi = -(J/2) ln g, A. N. Gent, Rubber Chem. Technol. 69, 59 (1996), and Eq. 4.
         # lg = l g, free of cancellation near l = 1.
         i_j = material[CONSTANTS]
@@ -101,13 +164,14 @@ def _elastic(l, material):  # noqa: E741
 
 
 @compiled(inline=True)
-def motion(l, v, beta, material):  # noqa: E741
+def motion(l, v, beta, material, family):  # noqa: E741
     """
     Return the acceleration and its derivatives by stretch, rate and load, Eq. 11.
 
-    Outside the limits they are NaN, which makes a step control reject its step.
+    Outside the limits they are NaN, which makes a step control reject its step. ``family`` is as
+    for `_elastic`.
     """
-    force, stiffness = _elastic(l, material)
+    force, stiffness = _elastic(l, material, family)
     i_l = 1.0 / l
     l3 = l * l * l
     # 1/m, with -m'/2 = l^-4/4 and -m''/2 = -l^-5.
@@ -120,26 +184,28 @@ def motion(l, v, beta, material):  # noqa: E741
 
 
 @compiled(inline=True)
-def acceleration(l, v, beta, material):  # noqa: E741
+def acceleration(l, v, beta, material, family):  # noqa: E741
     """Return the acceleration alone; NaN outside the limits."""
-    return motion(l, v, beta, material)[0]
+    return motion(l, v, beta, material, family)[0]
 
 
 @compiled()
 def elastic_force(l, material):  # noqa: E741
     """Return the load that balances the stretch at rest, psi'(l)."""
-    return _elastic(l, material)[0]
+    return _elastic(l, material, ANY)[0]
 
 
 @compiled()
 def elastic_stiffness(l, material):  # noqa: E741
     """Return psi''(l)."""
-    return _elastic(l, material)[1]
+    return _elastic(l, material, ANY)[1]
 
 
 @compiled()
 def elastic_energy(l, material):  # noqa: E741
     """Return psi(l), zero at l = 1."""
+    if material[KIND] > NEO_HOOKEAN:
+        return families.energy(l, material[KIND], material)
     if not material[LOWER] < l < material[UPPER]:
         return math.nan
     # (I1 - 3), free of cancellation near l = 1.
@@ -158,8 +224,12 @@ def mass(l, material):  # noqa: E741
 
 @compiled()
 def natural_frequency(l, material):  # noqa: E741
-    """Return the frequency of small undamped motion about a stretch."""
-    return math.sqrt(elastic_stiffness(l, material) / mass(l, material))
+    """
+    Return the frequency of small undamped motion about a stretch.
+
+    Where the force falls nothing oscillates; it is then the rate at which motion grows.
+    """
+    return math.sqrt(abs(elastic_stiffness(l, material)) / mass(l, material))
 
 
 @compiled()
@@ -170,7 +240,11 @@ def critical_zeta(l, material):  # noqa: E741
 
 @compiled()
 def equilibrium_stretch(beta, material):
-    """Return the stretch at which a constant load is in balance; psi' is monotone."""
+    """
+    Return the stretch at which a constant load is in balance; psi' is monotone.
+
+    A load beyond what can be held gives the limit on its side.
+    """
     lower, upper = material[LOWER], material[UPPER]
     if beta > 0.0:
         lower = 1.0
@@ -184,7 +258,7 @@ def equilibrium_stretch(beta, material):
         return 1.0
     l = 0.5 * (lower + upper)  # noqa: E741
     for _ in range(200):
-        force, stiffness = _elastic(l, material)
+        force, stiffness = _elastic(l, material, ANY)
         value = force - beta
         if math.isnan(value):
             # Rounded onto a limit.
@@ -220,8 +294,8 @@ def acceleration_slopes(l, v, beta, material, slopes):  # noqa: E741
     each constant of the law, 1/J_lim for Gent, in the order of the packed material. With them
     and with `motion`, s'' = a_l s + a_v s' + slope gives the sensitivity of a trajectory.
     """
-    force, _ = _elastic(l, material)
-    a, a_l, a_v, i_mass = motion(l, v, beta, material)
+    force, _ = _elastic(l, material, ANY)
+    a, a_l, a_v, i_mass = motion(l, v, beta, material, ANY)
     slopes[BY_LOAD] = i_mass
     slopes[BY_MODULUS] = -force * i_mass
     slopes[BY_ZETA] = -0.5 * material[C1] * v * i_mass
@@ -258,4 +332,4 @@ def evaluate(what, values, material, out):
 def accelerations(stretch, rate, load, material, out):
     """Compute the acceleration for arrays of states and loads."""
     for i in range(stretch.size):
-        out[i] = acceleration(stretch[i], rate[i], load[i], material)
+        out[i] = acceleration(stretch[i], rate[i], load[i], material, ANY)

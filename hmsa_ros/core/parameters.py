@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import mu_0
 
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.core.laws.record import Elastic
+from hmsa_ros.errors import BadInputError, excerpt
 
 _ZERO_ALLOWED = ('zeta', 'damping_coefficient')
 # Infinite for neo-Hookean.
@@ -22,6 +23,11 @@ def _check(record: object) -> None:
     """Refuse a record with a field that is out of range."""
     for field in fields(record):  # type: ignore[arg-type]
         value = getattr(record, field.name)
+        if field.name == 'law':
+            if value is not None and not isinstance(value, Elastic):
+                raise BadInputError(
+                    f'law is {excerpt(value)}: expected an elastic law, or none for Gent')
+            continue
         if not isinstance(value, (int, float)) or isinstance(value, bool):
             raise BadInputError(f'{field.name} is {value!r}: expected a number')
         zero_allowed = field.name in _ZERO_ALLOWED
@@ -51,6 +57,8 @@ class NondimensionalParameters:
     c1 : float
         Shape 2 H^2/L^2, greater than 0. The paper does not state it; the damping that it calls
         critical implies 2 (H = L).
+    law : Elastic, optional
+        Elastic energy in units of G, in place of the Gent model: J_lim is then without effect.
 
     Raises
     ------
@@ -62,6 +70,7 @@ class NondimensionalParameters:
     zeta: float = 0.2
     j_lim: float = 5.0
     c1: float = 2.0
+    law: Elastic | None = None
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -72,7 +81,7 @@ class NondimensionalParameters:
         """The one argument of the compiled law, see `hmsa_ros.core.law`."""
         from hmsa_ros.core import law  # imports Numba, which not all who have parameters need
 
-        return law.pack(self.zeta, self.j_lim, self.c1)
+        return law.pack(self.zeta, self.j_lim, self.c1, self.law)
 
 
 @dataclass(frozen=True)
@@ -96,6 +105,9 @@ class ActuatorParameters:
         J_lim, dimensionless, greater than 0; infinite for neo-Hookean.
     damping_coefficient : float
         c of Eq. 9 in N s/m, at least 0.
+    law : Elastic, optional
+        Elastic energy in units of G, in place of the Gent model: the chain limit is then without
+        effect.
 
     Raises
     ------
@@ -111,6 +123,7 @@ class ActuatorParameters:
     remanence: float
     chain_limit: float
     damping_coefficient: float
+    law: Elastic | None = None
 
     def __post_init__(self) -> None:
         """Check the values, and that the equations can be scaled by them."""
@@ -135,7 +148,7 @@ class ActuatorParameters:
         Parameters
         ----------
         material : NondimensionalParameters
-            zeta, J_lim and c1.
+            zeta, J_lim and c1, and the law.
         shear_modulus, density, half_length, remanence : float
             The scale, in Pa, kg/m^3, m and T.
 
@@ -157,7 +170,12 @@ class ActuatorParameters:
         damping = (8.0 * material.zeta * unfinished.half_length * half_thickness
                    * math.sqrt(density * shear_modulus))
         return cls(shear_modulus, density, half_length, half_thickness, remanence,
-                   material.j_lim, damping)
+                   material.j_lim, damping, material.law)
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """All that is a number, by name."""
+        return {x.name: getattr(self, x.name) for x in fields(self) if x.name != 'law'}
 
     @property
     def time_unit(self) -> float:
@@ -177,7 +195,8 @@ class ActuatorParameters:
             zeta=self.damping_coefficient / 8.0
             / (area * math.sqrt(self.density * self.shear_modulus)),
             j_lim=self.chain_limit,
-            c1=2.0 * (self.half_thickness / self.half_length) ** 2)
+            c1=2.0 * (self.half_thickness / self.half_length) ** 2,
+            law=self.law)
 
 
 def paper_actuator(material: NondimensionalParameters | None = None) -> ActuatorParameters:

@@ -145,7 +145,7 @@ def scales(actuator: ActuatorParameters, coil: Coil) -> Scales:
         targets = 1.0 + (end - 1.0) * np.linspace(0.0, 1.0, _LOOK + 1)[1:] ** 2
         plans = plan_two_step_batch(
             1.0, targets, zeta=material.zeta, j_lim=material.j_lim, c1=material.c1,
-            load_limits=loads)
+            load_limits=loads, elastic=material.law)
         both = np.stack([plans.beta_p, plans.beta_1])
         good = np.array([CODES[x] is Code.TWO_STEP for x in plans.status.tolist()]) & np.all(
             (both >= loads[0]) & (both <= loads[1]), axis=0)

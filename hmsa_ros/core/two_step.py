@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hmsa_ros.core import kernels, law
 from hmsa_ros.core import two_step_kernel as kernel
+from hmsa_ros.core.laws.record import Elastic
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.status import Code
 from hmsa_ros.errors import BadInputError
@@ -136,7 +137,7 @@ def plan_two_step_batch(
         start: ArrayLike, target: ArrayLike, *, zeta: ArrayLike = 0.2,
         j_lim: ArrayLike = 5.0, c1: ArrayLike = 2.0, rate: ArrayLike = 0.0,
         load_limits: tuple[float, float] = (-math.inf, math.inf),
-        rtol: float = RTOL) -> TwoStepBatch:
+        rtol: float = RTOL, elastic: Elastic | None = None) -> TwoStepBatch:
     """
     Plan many moves at once, over all cores.
 
@@ -148,6 +149,8 @@ def plan_two_step_batch(
         Admissible loads.
     rtol : float
         Relative tolerance, 1e-14 to 1e-4.
+    elastic : Elastic, optional
+        The law of all rows, in place of ``j_lim``.
 
     Returns
     -------
@@ -170,7 +173,7 @@ def plan_two_step_batch(
     shape = arrays[0].shape
     # Copies: NumPy warns of a broadcast array that Numba asks whether it may write to.
     columns = [np.array(a).ravel() for a in arrays]
-    materials = law.pack(*columns[3:])
+    materials = law.pack(columns[3], columns[4], columns[5], elastic)
     status = np.empty(columns[0].size, dtype=np.int64)
     results = [np.empty(status.size) for _ in range(3)]
     kernel.two_step_batch(

@@ -80,7 +80,7 @@ class Prior:
             If a name is unknown or cannot be tracked.
 
         """
-        free = check_free(free)
+        free = check_free(free, actuator.law)
         wrong = [x for x in free if x in _NOT_TRACKED]
         if wrong:
             raise BadInputError(

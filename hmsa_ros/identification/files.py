@@ -7,7 +7,7 @@ no node declares, and that nodes leave alone: ``identification.names``, and
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import datetime
 import math
 from pathlib import Path
@@ -16,13 +16,14 @@ from typing import Any
 import numpy as np
 import yaml
 
+from hmsa_ros.contract.actuator import actuator_from, parameters_of
+from hmsa_ros.contract.parameters import LAW
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.quantities import actuator_of, check_free, QUANTITIES
 from hmsa_ros.identification.result import Identification
 
-_BLOCK = tuple(ActuatorParameters.__dataclass_fields__)
 # What coil and sensor have, by the name in parameter files.
 _OTHERS = {
     'coil_time_constant': 'coil_time_constant', 'stretch_bias': 'stretch_bias',
@@ -96,9 +97,11 @@ def read_belief(path: Path | None) -> Belief:
         if not settings:
             raise BadInputError(
                 f'{path} has no ros__parameters: expected a parameter file as hmsa init writes it')
-    default = asdict(paper_actuator())
-    numbers = {x: _number(path, f'actuator.{x}', settings.get(f'actuator.{x}', default[x]))
-               for x in _BLOCK}
+    default = paper_actuator().numbers
+    values: dict[str, Any] = {
+        f'actuator.{x}': _number(path, f'actuator.{x}', settings.get(f'actuator.{x}', default[x]))
+        for x in default}
+    values |= {x.name: x.taken(settings[x.name]) for x in LAW if x.name in settings}
     others = {name: _number(path, key, settings[key])
               for name, key in _OTHERS.items() if key in settings}
     for name, key in _LISTS.items():
@@ -112,7 +115,7 @@ def read_belief(path: Path | None) -> Belief:
     if others.get('viscoelastic_ratio') == 0.0:
         others.pop('viscoelastic_time', None)
     names, covariance = _covariance(path, settings)
-    return Belief(ActuatorParameters(**numbers), others, settings, names, covariance)
+    return Belief(actuator_from(values), others, settings, names, covariance)
 
 
 def _collect(value: object, name: str, found: dict[str, Any]) -> None:
@@ -174,10 +177,15 @@ def file_text(found: Identification, belief: Belief, run: str, now: datetime) ->
         *(f'# Note: {x}.' for x in found.warnings),
         '/**:', '  ros__parameters:']
     written: dict[str, Any] = {}
-    for name, value in asdict(actuator_of(found.values)).items():
+    actuator = actuator_of(found.values)
+    for name, value in actuator.numbers.items():
         source = 'time_unit' if name == 'density' and 'time_unit' in found.names else name
         lines.append(_line(f'actuator.{name}', value, found, source))
         written[f'actuator.{name}'] = value
+    for key, value in parameters_of(actuator).items():
+        if key not in written:
+            lines.append(f'    {key}: {_yaml(value)}')
+            written[key] = value
     for name, key in {**_OTHERS, **_LISTS}.items():
         if name in found.names:
             value = found.values[name]

@@ -65,7 +65,7 @@ def identify(
     free : sequence of str
         What is sought, names of `hmsa_ros.identification.quantities.QUANTITIES`.
     actuator : ActuatorParameters, optional
-        The block as far as it is known; default the paper's.
+        The block as far as it is known, its law included; default the paper's.
     known : mapping of str to float, optional
         Of coil and sensor, where they are not the defaults.
     slew_limit : float
@@ -89,7 +89,7 @@ def identify(
             raise BadInputError(
                 'stretch, level_times or levels is missing: expected all three beside time')
         recording = as_recording(time, stretch, level_times, levels, slew_limit)
-    free = check_free(free)
+    free = check_free(free, actuator.law if actuator else None)
     values = complete(values_of(actuator or paper_actuator(), known), ())
     if 'chain_limit' in free:
         # Endless chains are no start: the derivative by their inverse is taken of the limit.

@@ -26,11 +26,11 @@ from hmsa_ros.core.law import (
     BY_CONSTANT,
     BY_LOAD,
     BY_MODULUS,
-    CONSTANTS,
     elastic_force,
     elastic_stiffness,
     mass,
 )
+from hmsa_ros.core.laws.record import CONSTANTS
 
 # Places in theta.
 STIFFNESS, DAMPING, DRIVE, FORCE, LAG, STRETCH, RATE, FIRST_BRANCH = range(8)

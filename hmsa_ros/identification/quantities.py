@@ -1,10 +1,12 @@
 """What can be estimated: names, units, ranges, and the coordinate in which each is sought."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 import math
+from typing import Any
 
-from hmsa_ros.core.parameters import ActuatorParameters
+from hmsa_ros.core.laws.record import Elastic
+from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.errors import BadInputError
 
 
@@ -76,7 +78,7 @@ DEFAULT_FREE = (
 GEOMETRY = ('half_length', 'half_thickness')
 
 
-def check_free(names: Iterable[str]) -> tuple[str, ...]:
+def check_free(names: Iterable[str], law: Elastic | None = None) -> tuple[str, ...]:
     """
     Return the names of free parameters, checked.
 
@@ -84,6 +86,8 @@ def check_free(names: Iterable[str]) -> tuple[str, ...]:
     ----------
     names : iterable of str
         As asked for; ``actuator.`` before a name is dropped.
+    law : Elastic, optional
+        In place of Gent: the chain limit is then not sought.
 
     Returns
     -------
@@ -102,6 +106,12 @@ def check_free(names: Iterable[str]) -> tuple[str, ...]:
         raise BadInputError(
             f'free parameter {", ".join(map(repr, unknown)) or "missing"}: expected some of '
             f'{", ".join(QUANTITIES)}')
+    if law is not None and 'chain_limit' in free:
+        if free != DEFAULT_FREE:
+            raise BadInputError(
+                f'chain_limit is free: expected none for law {law.law}, whose constants keep '
+                'their ratios while shear_modulus is sought')
+        free = tuple(x for x in free if x != 'chain_limit')
     if 'time_unit' in free and 'density' in free:
         raise BadInputError(
             'both time_unit and density are free: expected one of them, since one follows from '
@@ -111,9 +121,9 @@ def check_free(names: Iterable[str]) -> tuple[str, ...]:
 
 def values_of(
         actuator: ActuatorParameters, others: Mapping[str, float] | None = None
-) -> dict[str, float]:
+) -> dict[str, Any]:
     """
-    Return values of all quantities.
+    Return values of all quantities, and the law under the name ``law``.
 
     Parameters
     ----------
@@ -133,8 +143,8 @@ def values_of(
         If a name is unknown or a value out of range.
 
     """
-    values = {name: x.default for name, x in QUANTITIES.items()}
-    values |= asdict(actuator) | {'time_unit': actuator.time_unit}
+    values: dict[str, Any] = {name: x.default for name, x in QUANTITIES.items()}
+    values |= actuator.numbers | {'time_unit': actuator.time_unit, 'law': actuator.law}
     for name, value in (others or {}).items():
         quantity = QUANTITIES.get(name)
         if quantity is None:
@@ -147,7 +157,7 @@ def values_of(
     return values
 
 
-def actuator_of(values: Mapping[str, float]) -> ActuatorParameters:
+def actuator_of(values: Mapping[str, Any]) -> ActuatorParameters:
     """
     Return the block of some values.
 
@@ -166,7 +176,31 @@ def actuator_of(values: Mapping[str, float]) -> ActuatorParameters:
         shear_modulus=values['shear_modulus'], density=values['density'],
         half_length=values['half_length'], half_thickness=values['half_thickness'],
         remanence=values['remanence'], chain_limit=values['chain_limit'],
-        damping_coefficient=values['damping_coefficient'])
+        damping_coefficient=values['damping_coefficient'], law=values.get('law'))
+
+
+def group_of(
+        values: Mapping[str, Any], *, zeta: float = 0.0, j_lim: float | None = None
+) -> NondimensionalParameters:
+    """
+    Return the nondimensional group of some values.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        As `values_of` returns them.
+    zeta, j_lim : float, optional
+        In place of those of the values; zeta is 0 unless given.
+
+    Returns
+    -------
+    NondimensionalParameters
+        With the law.
+
+    """
+    return NondimensionalParameters(
+        zeta, values['chain_limit'] if j_lim is None else j_lim,
+        2.0 * (values['half_thickness'] / values['half_length']) ** 2, values.get('law'))
 
 
 def to_coordinate(name: str, value: float) -> float:

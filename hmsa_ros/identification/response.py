@@ -11,17 +11,16 @@ from scipy.constants import mu_0
 
 from hmsa_ros.core.law import (
     BY_CONSTANT,
-    CONSTANTS,
     elastic_force,
     elastic_stiffness,
     equilibrium_stretch,
-    GENT,
     KIND,
-    pack,
 )
+from hmsa_ros.core.laws.record import CONSTANTS, GENT
 from hmsa_ros.core.model import Array
+from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.identification import kernels
-from hmsa_ros.identification.quantities import derivative, QUANTITIES
+from hmsa_ros.identification.quantities import derivative, group_of, QUANTITIES
 from hmsa_ros.identification.recording import pieces, Recording
 
 #: Relative tolerance of the integration: far below the noise of any sensor.
@@ -117,9 +116,9 @@ def complete(values: Mapping[str, float], free: Sequence[str]) -> dict[str, floa
 
 
 @lru_cache(maxsize=8)
-def _packed(chain_limit: float, c1: float) -> Array:
-    """Return the packed law without damping; finding its limits takes a while."""
-    return pack(0.0, chain_limit, c1)
+def _packed(group: NondimensionalParameters) -> Array:
+    """Return the packed law; finding its limits takes a while."""
+    return group.packed
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,8 +175,7 @@ class Setup:
             chain['shear_modulus'] = modulus
         inner = [x for x in free if x not in _SENSOR]
         wanted = np.array(sorted({i for x in inner for i in chain[x]}), dtype=np.int64)
-        material = _packed(values['chain_limit'], 2.0 * (
-            values['half_thickness'] / values['half_length']) ** 2).copy()
+        material = _packed(group_of(values)).copy()
         if 'chain_limit' in free:
             material[KIND] = GENT
         mixing = np.zeros((len(wanted), len(free)))

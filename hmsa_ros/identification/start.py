@@ -16,7 +16,7 @@ from scipy.constants import mu_0
 
 from hmsa_ros.core import model
 from hmsa_ros.core.model import Array
-from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.identification.quantities import group_of
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.response import respond
 
@@ -68,8 +68,11 @@ def segments(
     return found
 
 
-def static(recording: Recording, chain_limit: float | None = None) -> Static:
-    """Return what the levels at rest say; a chain limit that is known is kept."""
+def static(
+        recording: Recording, values: Mapping[str, float], free: Sequence[str]) -> Static:
+    """Return what the levels at rest say; law and chain limit, unless that is free, are kept."""
+    limits = _CHAIN_LIMITS if 'chain_limit' in free else (values['chain_limit'],)
+    usual = 5.0 if 'chain_limit' in free else values['chain_limit']
     rests = []
     for begin, end, when, level in segments(recording, 1):
         tail = recording.stretch[begin + (end - begin) * 2 // 3:end]
@@ -77,18 +80,19 @@ def static(recording: Recording, chain_limit: float | None = None) -> Static:
     # Each level once: short ones have not come to rest, but ring about it.
     fields = np.unique([x[1] for x in rests])
     if len(fields) < 2:
-        return Static(math.nan, chain_limit or 5.0, tuple(rests))
+        return Static(math.nan, usual, tuple(rests))
     stretch = np.array([np.median([x[2] for x in rests if x[1] == y]) for y in fields])
     low, high = float(np.min(recording.stretch)), float(np.max(recording.stretch))
-    best = (math.inf, math.nan, chain_limit or 5.0)
-    for limit in (chain_limit,) if chain_limit else _CHAIN_LIMITS:
-        lower, upper = model.stretch_limits(limit)
+    best = (math.inf, math.nan, usual)
+    for limit in limits:
+        group = group_of(values, j_lim=limit)
+        lower, upper = model.stretch_limits(group)
         if not lower * 1.002 < low <= high < upper * 0.998:
             continue
-        force = np.asarray(model.elastic_force(stretch, limit))
+        force = np.asarray(model.elastic_force(stretch, group))
         slope = float(fields @ force) / float(fields @ fields)
         if slope > 0.0:
-            held = np.asarray(model.equilibrium_stretch(slope * fields, limit))
+            held = np.asarray(model.equilibrium_stretch(slope * fields, group))
             miss = float(np.sum((held - stretch) ** 2))
             if miss < 0.98 * best[0]:
                 best = miss, slope, limit
@@ -167,15 +171,13 @@ def starts(
     given = dict(values)
     if 'stretch_gain' in free:
         given['stretch_gain'] = 1.0
-    known = None if 'chain_limit' in free else given['chain_limit']
-    found = static(recording, known)
-    c1 = 2.0 * (given['half_thickness'] / given['half_length']) ** 2
+    found = static(recording, given, free)
+    material = group_of(given, zeta=0.2, j_lim=found.chain_limit)
+    lower, upper = model.stretch_limits(material)
     candidates: list[dict[str, float]] = []
     for frequency, decay, mean in ringing(recording, found.rests):
-        lower, upper = model.stretch_limits(found.chain_limit)
         if not lower < mean < upper:
             continue
-        material = NondimensionalParameters(0.2, found.chain_limit, c1)
         natural = math.hypot(frequency, decay)
         unit = float(model.natural_frequency(mean, material)) / natural
         candidate = _candidate(given, free, unit, found)
@@ -215,7 +217,7 @@ def scan(
         The best few.
 
     """
-    found = static(recording, None if 'chain_limit' in free else values['chain_limit'])
+    found = static(recording, values, free)
     first = _SCAN_SAMPLES
     changes = np.searchsorted(recording.time, recording.level_times)
     begin = int(np.min(changes[changes > 0], initial=len(recording.time)))

@@ -106,8 +106,7 @@ class JointParameters:
         values = dict(self.values)
         for parameter in parameters:
             if parameter.name in self.specs:
-                self.specs[parameter.name].check(parameter.value)
-                values[parameter.name] = parameter.value
+                values[parameter.name] = self.specs[parameter.name].taken(parameter.value)
         return replace(self, values=values)
 
 
@@ -131,12 +130,12 @@ def declare_joints(
             spec = replace(general, name=f'{joint}.{general.name}')
             declared[spec.name] = spec
             try:
+                # A list, whose type is dynamic, is declared by the lack of a value.
                 value = node.declare_parameter(
-                    spec.name, _TYPES[type(spec.default)], descriptor(spec)).value
+                    spec.name, _TYPES.get(type(spec.default)), descriptor(spec)).value
             except ParameterException as error:
                 raise refusal(node, spec) from error
             if value is not None:
-                spec.check(value)
-                values[spec.name] = value
+                values[spec.name] = spec.taken(value)
     return JointParameters(
         names, declared, values, frozenset(spec.name for spec in own))

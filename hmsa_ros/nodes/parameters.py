@@ -4,7 +4,7 @@ Declaration of ROS parameters on a node, each from its `ParameterSpec`.
 The files under ``config/`` are held against them by a test.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 import difflib
 from importlib import import_module
 import math
@@ -16,11 +16,11 @@ from rclpy.node import Node
 
 from hmsa_ros.contract import topics
 from hmsa_ros.contract.actuator import actuator_from
-from hmsa_ros.contract.parameters import ACTUATOR, INITIAL_STRETCH, JOINT, ParameterSpec
-from hmsa_ros.errors import BadInputError, excerpt
+from hmsa_ros.contract.parameters import BLOCK, INITIAL_STRETCH, JOINT, ParameterSpec
+from hmsa_ros.errors import BadInputError
 
 __all__ = [
-    'ACTUATOR', 'actuator_from', 'check_names', 'declare', 'descriptor', 'INITIAL_STRETCH',
+    'actuator_from', 'BLOCK', 'check_names', 'declare', 'descriptor', 'INITIAL_STRETCH',
     'JOINT', 'ParameterSpec', 'refusal']
 
 
@@ -42,11 +42,11 @@ def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
     text = f'{spec.description} [{spec.unit}]' if spec.unit else spec.description
     descriptor = ParameterDescriptor(description=text, read_only=spec.read_only)
     # An empty list says nothing of its type: rclpy would take it for one of bytes and
-    # refuse every list of strings. `declare` checks instead.
+    # refuse every other. `declare` checks instead.
     descriptor.dynamic_typing = isinstance(spec.default, list)
     if spec.choices:
         descriptor.additional_constraints = 'one of: ' + ', '.join(spec.choices)
-    if spec.minimum is None and spec.maximum is None:
+    if descriptor.dynamic_typing or (spec.minimum is None and spec.maximum is None):
         return descriptor
     if isinstance(spec.default, int):
         descriptor.integer_range = [IntegerRange(
@@ -88,12 +88,9 @@ def declare(node: Node, specs: Iterable[ParameterSpec]) -> Mapping[str, Any]:
             # does not.
             value = node.declare_parameter(
                 spec.name, spec.default, descriptor(spec)).value
-            if isinstance(spec.default, list):
-                value = _as_list(spec.name, value)
         except ParameterException as error:
             raise refusal(node, spec) from error
-        spec.check(value)
-        values[spec.name] = value
+        values[spec.name] = spec.taken(value)
     return values
 
 
@@ -155,14 +152,3 @@ def refusal(node: Node, spec: ParameterSpec) -> BadInputError:
     if spec.minimum is not None or spec.maximum is not None:
         expected += f', {spec.range_text()}'
     return BadInputError(f'parameter {spec.name} is {got}: expected {expected}')
-
-
-def _as_list(name: str, value: Any) -> list[str]:
-    """Return a list of strings; one string is a list of one, an unset value is empty."""
-    if value is None:
-        return []
-    values = list(value) if isinstance(value, Sequence) and not isinstance(value, str) \
-        else [value]
-    if not all(isinstance(item, str) for item in values):
-        raise BadInputError(f'parameter {name} is {excerpt(value)}: expected a list of strings')
-    return values

@@ -15,6 +15,7 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
+from hmsa_ros.core.actuators import unheld
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.core.warmup import warm_up
 from hmsa_ros.errors import BadInputError
@@ -24,7 +25,7 @@ from hmsa_ros.nodes.joints import declare_joints
 from hmsa_ros.nodes.managed import AUTOSTART, ManagedNode
 from hmsa_ros.nodes.marker_publisher import TargetMarkers
 from hmsa_ros.nodes.newest_clock import NewestClock
-from hmsa_ros.nodes.parameters import check_names
+from hmsa_ros.nodes.parameters import actuator_from, check_names
 from hmsa_ros.nodes.planning import group_from, models_from, OWN, settings_from, SPECS
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.nodes.timekeeping import StepWatch
@@ -87,6 +88,9 @@ class PlannerNode(ManagedNode):
         """Create topics, services and timers."""
         self._runtime = self._new_runtime()
         names = self._settings.names
+        for name in names:
+            if lost := unheld(actuator_from(self._settings.of(name)).nondimensional):
+                self.get_logger().warning(f'joint {name}: {lost}')
         self._channels = {
             x: JointChannel(self, x, names, self._runtime, self._serve) for x in names}
         self._plan, self._status, self._diagnostics = (

@@ -22,8 +22,8 @@ from hmsa_ros.nodes.joints import JointParameters, JOINTS
 from hmsa_ros.nodes.managed import AUTOSTART
 from hmsa_ros.nodes.marker_publisher import MARKER_SCALE
 from hmsa_ros.nodes.parameters import (
-    ACTUATOR,
     actuator_from,
+    BLOCK,
     INITIAL_STRETCH,
     JOINT,
     ParameterSpec,
@@ -36,7 +36,7 @@ _SETTINGS = Settings()
 
 #: Parameters that a joint may have a value of its own for.
 OWN = (
-    *(replace(x, read_only=False) for x in ACTUATOR),
+    *(replace(x, read_only=False) for x in BLOCK),
     INITIAL_STRETCH,
     ParameterSpec(
         'shaper', 'two_step', 'Shaper that plans each move.', choices=tuple(SHAPERS),

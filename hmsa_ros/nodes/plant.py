@@ -11,6 +11,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
 from hmsa_ros.contract.parameters import PUBLISH_RATE
+from hmsa_ros.core.actuators import unheld
 from hmsa_ros.core.pacer import Pacer
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.core.warmup import warm_up
@@ -156,6 +157,8 @@ class PlantNode(ManagedNode):
         for name, joint in zip(values.names, joints, strict=True):
             if few := too_few_samples(joint.setup.actuator, values['publish_rate']):
                 self.get_logger().warning(f'joint {name}: {few}')
+            if lost := unheld(joint.setup.actuator.nondimensional):
+                self.get_logger().warning(f'joint {name}: {lost}')
         return SimulatedDevice(
             joints, period=max(round(NANOSECONDS / values['publish_rate']), 1), time=start,
             command_delay=round(values['command_delay'] * NANOSECONDS),

@@ -10,7 +10,7 @@ from std_msgs.msg import Float64
 
 from hmsa_ros.contract.actuator import actuator_from
 from hmsa_ros.contract.parameters import (
-    ACTUATOR,
+    BLOCK,
     COIL_TIME_CONSTANT,
     INITIAL_STRETCH,
     MISMATCH,
@@ -30,7 +30,7 @@ from hmsa_ros.nodes.timekeeping import Seldom
 
 #: Parameters that each joint may have values of its own for.
 OWN = (
-    *ACTUATOR,
+    *BLOCK,
     INITIAL_STRETCH,
     *MISMATCH,
     SLEW_LIMIT,

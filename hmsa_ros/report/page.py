@@ -15,7 +15,8 @@ import numpy as np
 
 from hmsa_ros import __version__
 from hmsa_ros.bag.info import BagSummary
-from hmsa_ros.contract.parameters import ACTUATOR, ACTUATOR_FIELDS
+from hmsa_ros.contract.actuator import parameters_of
+from hmsa_ros.contract.parameters import ACTUATOR, ACTUATOR_FIELDS, LAW
 from hmsa_ros.core.model import critical_zeta, stretch_limits
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.units import NANOSECONDS
@@ -426,6 +427,13 @@ def _losses(parts: Sequence[Part]) -> str:
         ['bag', 'topic', 'type', 'messages', 'a second', 'lost'], rows)
 
 
+def _given(value: object) -> Cell | str:
+    """Return a constant of a law as a cell shows it; Gent has none."""
+    if isinstance(value, list):
+        return ', '.join(f'{x:.6g}' for x in value)
+    return cell(value) if isinstance(value, float) else str(value or '-')
+
+
 def _parameters(parts: Sequence[Part]) -> str:
     """Return the table of parameters."""
     header = ['parameter', 'unit']
@@ -444,6 +452,10 @@ def _parameters(parts: Sequence[Part]) -> str:
         [name.replace('_', ' '), (spec.unit or '1').replace('^3', '³'),
          *(cell(getattr(x, name)) for x in columns)]
         for name, spec in zip(ACTUATOR_FIELDS, ACTUATOR, strict=True)]
+    laws = [parameters_of(x) for x in columns]
+    rows += [
+        [spec.name, spec.unit or '1', *(_given(x.get(spec.name)) for x in laws)]
+        for spec in LAW if any(spec.name in x for x in laws)]
     groups = [x.nondimensional for x in columns]
     limits = [stretch_limits(x.nondimensional) for x in columns]
     rows += [

@@ -8,7 +8,7 @@ from typing import Any
 
 from hmsa_ros.bag.experiment import parameters_of
 from hmsa_ros.contract.actuator import actuator_from
-from hmsa_ros.contract.parameters import ACTUATOR, JOINT, ParameterSpec
+from hmsa_ros.contract.parameters import ACTUATOR, BLOCK, JOINT, LAW, ParameterSpec
 from hmsa_ros.contract.topics import PLANNER, PLANT
 from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.errors import BadInputError, excerpt
@@ -71,14 +71,14 @@ def actuators(
         values = {x: number_of(of_joint(parameters, joint, f'{node}.{x}')) for x in _NAMES}
         if all(values[x.name] is not None for x in ACTUATOR):
             try:
-                found[node] = actuator_from({k: v for k, v in values.items() if v is not None})
+                found[node] = actuator_from(
+                    {k: v for k, v in values.items() if v is not None}
+                    | _own(parameters, joint, node, LAW))
             except BadInputError as error:
                 notes.append(f'The parameters of the {node} in the bag cannot be used: {error}.')
     if given:
-        own = {f'{PLANT}.{x.name}': of_joint(given, joint, f'{PLANT}.{x.name}')
-               for x in ACTUATOR}
-        found[PLANT] = actuator_from(values_of(
-            {name: value for name, value in own.items() if value is not None}, PLANT, ACTUATOR))
+        found[PLANT] = actuator_from(
+            values_of({}, PLANT, ACTUATOR) | _own(given, joint, PLANT, BLOCK))
     if not found:
         notes.append(
             "The recording does not contain the actuator's parameters: those of the example "
@@ -91,6 +91,16 @@ def actuators(
             'The planner and the plant had different parameters of the actuator: see the table '
             'of parameters.')
     return plant, planner, bool(found), notes
+
+
+def _own(
+        parameters: Mapping[str, object], joint: str, node: str, specs: Iterable[ParameterSpec]
+) -> dict[str, Any]:
+    """Return what is set of some parameters, for a joint or for all."""
+    found = {x.name: of_joint(parameters, joint, f'{node}.{x.name}') for x in specs}
+    return values_of(
+        {f'{node}.{name}': value for name, value in found.items()}, node,
+        [x for x in specs if found[x.name] is not None])
 
 
 _NAMES = tuple(
@@ -115,7 +125,7 @@ def read_parameter_file(path: str | Path) -> dict[str, object]:
             found |= {f'{node}.{name}': value for key, name, value in entries
                       if (key.rpartition('/')[2] == node) == own
                       and (own or key.rpartition('/')[2] in ('', '*', '**'))}
-    if not any(name.partition('.')[2].endswith(x.name) for name in found for x in ACTUATOR):
+    if not any(name.partition('.')[2].endswith(x.name) for name in found for x in BLOCK):
         raise BadInputError(
             f'{path} sets no parameter of the actuator: expected some of '
             + ', '.join(x.name for x in ACTUATOR))
@@ -126,17 +136,20 @@ def values_of(
         parameters: Mapping[str, object], node: str, specs: Iterable[ParameterSpec]
 ) -> dict[str, Any]:
     """
-    Return a node's numbers by name: what is set as ``'node.name'``, else the default.
+    Return a node's values by name: what is set as ``'node.name'``, else the default.
 
     Raises
     ------
     BadInputError
-        If a value is no number or out of range.
+        If a value is of another type or out of range.
 
     """
     values = {}
     for spec in specs:
         value = parameters.get(f'{node}.{spec.name}', spec.default)
+        if isinstance(spec.default, (str, list)):
+            values[spec.name] = spec.taken(value)
+            continue
         number = number_of(value)
         if number is None:
             raise BadInputError(

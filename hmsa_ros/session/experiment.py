@@ -16,7 +16,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 
-from hmsa_ros.contract.parameters import ACTUATOR
+from hmsa_ros.contract.parameters import BLOCK
 from hmsa_ros.contract.topics import of_joint
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.ending import ENDING
@@ -327,7 +327,7 @@ class _Watch:
             raise BadInputError(
                 f'the nodes run with other parameters than the file has ({"; ".join(wrong[:3])}'
                 '): expected the same; start them with --params-file and that file')
-        for spec in ACTUATOR:
+        for spec in BLOCK:
             own, other = (self.parameter(f'{x}.{spec.name}')
                           for x in (interface.PLANT, interface.PLANNER))
             if own is not None and not _same(own, other):

@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 import math
 
-from hmsa_ros.contract.parameters import ACTUATOR
+from hmsa_ros.contract.actuator import actuator_from
+from hmsa_ros.contract.parameters import BLOCK
 from hmsa_ros.contract.topics import PLANNER, PLANT
 from hmsa_ros.core.model import natural_frequency
-from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.runs.parameters import values_of
 from hmsa_ros.session.processes import NodeProcess
 
@@ -23,9 +23,7 @@ def simulated_nodes(
         namespace: str) -> tuple[NodeProcess, NodeProcess]:
     """Return a paused plant that leads simulated time, and a planner that follows it."""
     # What the parameter file sets goes before what is chosen here.
-    values = values_of(settings, PLANT, ACTUATOR)
-    block = ActuatorParameters(**{
-        name.partition('.')[2]: value for name, value in values.items()})
+    block = actuator_from(values_of(settings, PLANT, BLOCK))
     period = 2.0 * math.pi / float(natural_frequency(1.0, block.nondimensional)) * block.time_unit
     rate = _number(settings, f'{PLANT}.publish_rate', max(1000.0, _SAMPLES_A_PERIOD / period))
     factor = _number(

@@ -1,0 +1,91 @@
+"""
+Compiled force, stiffness and energy of the families of laws beside Gent.
+
+Each takes a stretch and a packed material, whose numbers from `CONSTANTS` on are those of the
+law, and works in units of the shear modulus at small strain. The stretch is above 0.
+"""
+
+import math
+
+from hmsa_ros.core.compiling import compiled
+from hmsa_ros.core.laws.record import CONSTANTS, OGDEN, POLYNOMIAL
+
+
+@compiled(inline=True)
+def polynomial(l, material):  # noqa: E741
+    """Return psi' and psi'' of b (I2 - 3) + sum a_k (I1 - 3)^k."""
+    b = material[CONSTANTS]
+    a1, a2, a3 = material[CONSTANTS + 1], material[CONSTANTS + 2], material[CONSTANTS + 3]
+    a4, a5 = material[CONSTANTS + 4], material[CONSTANTS + 5]
+    i_l = 1.0 / l
+    # I1 - 3, half its first and all of its second derivative, free of cancellation near l = 1.
+    x = (l - 1.0) * (l - 1.0) * (l + 2.0) * i_l
+    half = (l - 1.0) * (l * l + l + 1.0) * i_l * i_l
+    second = 2.0 + 4.0 * i_l * i_l * i_l
+    p1 = a1 + x * (2.0 * a2 + x * (3.0 * a3 + x * (4.0 * a4 + x * 5.0 * a5)))
+    p2 = 2.0 * a2 + x * (6.0 * a3 + x * (12.0 * a4 + x * 20.0 * a5))
+    force = 2.0 * half * (p1 + b * i_l)
+    stiffness = second * p1 + 4.0 * half * half * p2 + 6.0 * b * (i_l * i_l) * (i_l * i_l)
+    return force, stiffness
+
+
+@compiled()
+def _polynomial_energy(l, material):  # noqa: E741
+    """Return b (I2 - 3) + sum a_k (I1 - 3)^k."""
+    x = (l - 1.0) * (l - 1.0) * (l + 2.0) / l
+    total = 0.0
+    for k in range(5, 0, -1):
+        total = x * (material[CONSTANTS + k] + total)
+    return total + material[CONSTANTS] * (l - 1.0) * (l - 1.0) * (2.0 * l + 1.0) / (l * l)
+
+
+@compiled(inline=True)
+def ogden(l, material):  # noqa: E741
+    """Return psi' and psi'' of sum mu/a (l^a + 2 l^(-a/2) - 3)."""
+    logarithm = math.log(l)
+    force = stiffness = 0.0
+    for i in range(int(material[CONSTANTS])):
+        mu = material[CONSTANTS + 1 + 2 * i]
+        a = material[CONSTANTS + 2 + 2 * i]
+        low = math.exp(-0.5 * a * logarithm)
+        high = 1.0 / (low * low)
+        force += mu * (high - low)
+        stiffness += mu * ((a - 1.0) * high + (0.5 * a + 1.0) * low)
+    i_l = 1.0 / l
+    return force * i_l, stiffness * i_l * i_l
+
+
+@compiled()
+def _ogden_energy(l, material):  # noqa: E741
+    """Return sum mu/a (l^a + 2 l^(-a/2) - 3)."""
+    logarithm = math.log(l)
+    total = 0.0
+    for i in range(int(material[CONSTANTS])):
+        a = material[CONSTANTS + 2 + 2 * i]
+        total += material[CONSTANTS + 1 + 2 * i] / a * (
+            math.expm1(a * logarithm) + 2.0 * math.expm1(-0.5 * a * logarithm))
+    return total
+
+
+@compiled()
+def elastic(l, family, material):  # noqa: E741
+    """Return psi' and psi''; NaN at a stretch that there is not."""
+    if not 0.0 < l < math.inf:
+        return math.nan, math.nan
+    if family == POLYNOMIAL:
+        return polynomial(l, material)
+    if family == OGDEN:
+        return ogden(l, material)
+    return math.nan, math.nan
+
+
+@compiled()
+def energy(l, family, material):  # noqa: E741
+    """Return psi, zero at l = 1; NaN at a stretch that there is not."""
+    if not 0.0 < l < math.inf:
+        return math.nan
+    if family == POLYNOMIAL:
+        return _polynomial_energy(l, material)
+    if family == OGDEN:
+        return _ogden_energy(l, material)
+    return math.nan

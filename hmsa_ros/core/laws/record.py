@@ -1,0 +1,187 @@
+"""What a law of elasticity is: its constants, and what is left of it without its scale."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from hmsa_ros.errors import BadInputError, excerpt
+
+# Families of laws, as the kernels know them: the first number of a packed material.
+ANY = -1.0  # one of them
+GENT = 0.0  # 1/J_lim
+NEO_HOOKEAN = 1.0  # none
+POLYNOMIAL = 2.0  # b, a_1 to a_5 of b (I2 - 3) + sum a_k (I1 - 3)^k
+OGDEN = 3.0  # number of terms, then mu and alpha of each
+TABLE = 4.0  # first stretch, width and number of intervals, then five numbers of each
+
+#: Place of the constants in a packed material.
+CONSTANTS = 6
+#: Powers of I1 - 3 that the polynomial family has.
+POWERS = 5
+
+
+@dataclass(frozen=True)
+class Constant:
+    """
+    One constant of a law.
+
+    Attributes
+    ----------
+    name : str
+        Of the parameter, as in ``'law.c10'``.
+    symbol : str
+        What it is in the energy.
+    unit : str
+        ``'Pa'`` for what scales with the shear modulus; empty for a number or a file.
+    kind : type
+        ``float``, ``list`` or ``str``.
+    minimum, maximum : float
+        Closed range of the number, or of each in a list.
+
+    """
+
+    name: str
+    symbol: str
+    unit: str = 'Pa'
+    kind: type = float
+    minimum: float = -1e12
+    maximum: float = 1e12
+
+
+@dataclass(frozen=True)
+class Elastic:
+    """
+    An elastic energy in units of its shear modulus at small strain.
+
+    Attributes
+    ----------
+    law : str
+        Name of the law.
+    family : float
+        Which of the kernels has it.
+    constants : tuple of float
+        Those of the family.
+    given : tuple of (str, object)
+        Parameters that gave it, those in Pa in units of the shear modulus.
+    limits : tuple of float
+        Stretches beyond which nothing is known; those that can be held are in
+        `hmsa_ros.core.model.stretch_limits`.
+
+    """
+
+    law: str
+    family: float
+    constants: tuple[float, ...]
+    given: tuple[tuple[str, Any], ...]
+    limits: tuple[float, float] = (1e-3, 1e3)
+
+
+@dataclass(frozen=True)
+class Law:
+    """
+    A law that may be chosen.
+
+    Attributes
+    ----------
+    name : str
+        Value of the parameter ``law``.
+    energy : str
+        W per reference volume.
+    source : str
+        Where it was published.
+    constants : tuple of Constant
+        What it takes besides those of the actuator.
+    scaled : callable, optional
+        From the values of the constants, and of the actuator, to the shear modulus at small
+        strain and what is left of the law in units of it. None for Gent and its limit, which
+        shear modulus and chain limit describe.
+    endless : bool
+        Whether the chain limit is infinite, whatever the parameter says.
+
+    """
+
+    name: str
+    energy: str
+    source: str
+    constants: tuple[Constant, ...] = ()
+    scaled: Callable[[Mapping[str, Any]], tuple[float, Elastic]] | None = None
+    endless: bool = False
+
+
+def positive_modulus(law: str, modulus: float, words: str, values: Sequence[Any]) -> float:
+    """
+    Return a shear modulus at small strain, checked.
+
+    Parameters
+    ----------
+    law : str
+        Name of the law.
+    modulus : float
+        In Pa.
+    words : str
+        How it follows from the constants.
+    values : sequence
+        The constants.
+
+    Returns
+    -------
+    float
+        The same.
+
+    Raises
+    ------
+    BadInputError
+        If it is not positive: at rest such a block would not be stable.
+
+    """
+    if not 1e-3 <= modulus <= 1e12:
+        raise BadInputError(
+            f'the constants of law {law} are {", ".join(map(excerpt, values))}: expected a shear '
+            f'modulus {words} of 0.001 to 1e+12 Pa, got {modulus:g} Pa')
+    return modulus
+
+
+def polynomial(
+        law: Law, values: Mapping[str, Any], modulus: float, powers: Sequence[float],
+        second: float = 0.0) -> Elastic:
+    """
+    Return a law that is a polynomial of I1 - 3, and linear in I2 - 3.
+
+    Parameters
+    ----------
+    law : Law
+        Which.
+    values : mapping of str to object
+        Of its constants.
+    modulus : float
+        Shear modulus at small strain in Pa.
+    powers : sequence of float
+        Factors of the powers 1, 2, ... of I1 - 3 in Pa, at most `POWERS`.
+    second : float
+        Factor of I2 - 3 in Pa.
+
+    Returns
+    -------
+    Elastic
+        In units of the modulus.
+
+    """
+    filled = (*powers, *(0.0,) * (POWERS - len(powers)))
+    return Elastic(
+        law.name, POLYNOMIAL, tuple(x / modulus for x in (second, *filled)),
+        given(law, values, modulus))
+
+
+def given(
+        law: Law, values: Mapping[str, Any], modulus: float) -> tuple[tuple[str, Any], ...]:
+    """Return the constants of a law, those in Pa in units of the shear modulus."""
+    def scaled(constant: Constant) -> Any:
+        value = values[constant.name]
+        if constant.kind is list:
+            value = tuple(value)
+        if constant.unit != 'Pa':
+            return value
+        return tuple(x / modulus for x in value) if constant.kind is list else value / modulus
+
+    return tuple((x.name, scaled(x)) for x in law.constants)
+

@@ -1,0 +1,240 @@
+"""Elastic laws: each against SymPy, finite differences and plans of 40 digits."""
+
+from dataclasses import replace
+import math
+
+import mpmath
+import numpy as np
+import pytest
+import sympy
+
+from hmsa_ros.contract.actuator import actuator_from, parameters_of
+from hmsa_ros.contract.parameters import BLOCK
+from hmsa_ros.core import law
+from hmsa_ros.core.actuators import check_stretch, unheld
+from hmsa_ros.core.laws import LAWS
+from hmsa_ros.core.model import (
+    acceleration,
+    elastic_energy,
+    elastic_force,
+    elastic_stiffness,
+    equilibrium_stretch,
+    stretch_limits,
+)
+from hmsa_ros.core.parameters import paper_actuator
+from hmsa_ros.core.simulation import simulate
+from hmsa_ros.core.status import Code
+from hmsa_ros.core.two_step import plan_two_step, plan_two_step_batch
+from hmsa_ros.errors import BadInputError
+
+L = sympy.Symbol('l', positive=True)
+I1, I2 = L ** 2 + 2 / L, 2 * L + L ** -2
+# Constants and energy of each law, typed from the literature.
+CASES = {
+    'neo_hookean': ({'actuator.shear_modulus': 9e3}, sympy.Integer(4500) * (I1 - 3)),
+    'mooney_rivlin': (
+        {'law.c10': 3e3, 'law.c01': 2e3}, 3000 * (I1 - 3) + 2000 * (I2 - 3)),
+    'yeoh': (
+        {'law.c10': 5e3, 'law.c20': -200.0, 'law.c30': 40.0},
+        5000 * (I1 - 3) - 200 * (I1 - 3) ** 2 + 40 * (I1 - 3) ** 3),
+    'ogden': (
+        {'law.mu': [6e3, -1500.0, 10.0], 'law.alpha': [1.5, -3.0, 8.0]},
+        sum(sympy.Integer(m) / a * (L ** a + 2 * L ** (-a / 2) - 3) for m, a in (
+            (6000, sympy.Rational(3, 2)), (-1500, sympy.Integer(-3)), (10, sympy.Integer(8))))),
+    'arruda_boyce': (
+        {'law.mu': [9e3], 'law.lambda_m': 2.0},
+        9000 * sum(c / sympy.Integer(2) ** (2 * i - 2) * (I1 ** i - 3 ** i) for i, c in enumerate(
+            (sympy.Rational(1, 2), sympy.Rational(1, 20), sympy.Rational(11, 1050),
+             sympy.Rational(19, 7000), sympy.Rational(519, 673750)), 1))),
+}
+STRETCHES = (0.3, 0.7, 0.999, 1.0, 1.0001, 1.4, 2.5)
+# The pieces of a move, and the extrapolations of each: the end is converged to 1e-17.
+PIECES, COLUMNS = 12, 10
+every_law = pytest.mark.parametrize('name', CASES)
+
+
+def block(name, constants=None):
+    """Return the block of a law."""
+    return actuator_from({x.name: x.default for x in BLOCK} | {'law': name} | (
+        CASES[name][0] if constants is None else constants))
+
+
+def in_units_of_the_modulus(name):
+    """Return the energy of a law in units of its small-strain shear modulus."""
+    energy = CASES[name][1]
+    modulus = sympy.simplify(sympy.diff(energy, L, 2).subs(L, 1) / 3)
+    return modulus, energy / modulus
+
+
+def test_each_law_of_the_table_is_tested():
+    assert CASES.keys() | {'gent'} == LAWS.keys()
+
+
+@every_law
+def test_force_and_stiffness_are_derivatives_of_the_energy(name):
+    actuator = block(name)
+    modulus, energy = in_units_of_the_modulus(name)
+    assert actuator.shear_modulus == pytest.approx(float(modulus), rel=1e-14)
+    found = actuator.nondimensional
+    for quantity, order, least in (
+            (elastic_energy, 0, 1e-15), (elastic_force, 1, 1e-14), (elastic_stiffness, 2, 0.0)):
+        exact = [float(sympy.diff(energy, L, order).subs(L, sympy.Float(x, 40)).evalf(30))
+                 for x in STRETCHES]
+        assert quantity(STRETCHES, found) == pytest.approx(exact, rel=1e-12, abs=least)
+
+
+@every_law
+def test_derivatives_of_the_motion_are_those_of_finite_differences(name):
+    group = block(name).nondimensional
+    for state in ((1.3, 0.4, 0.2), (0.7, -0.8, -1.0), (2.1, 1.5, 3.0)):
+        found = law.motion(*state, group.packed, law.ANY)
+        for column in range(3):
+            ends = []
+            for step in (1e-6, -1e-6):
+                moved = list(state)
+                moved[column] += step
+                ends.append(float(acceleration(*moved, group)))
+            assert found[1 + column] == pytest.approx(
+                (ends[0] - ends[1]) / 2e-6, rel=1e-7, abs=1e-7)
+
+
+@every_law
+def test_equilibrium_is_the_inverse_of_the_force(name):
+    group = block(name).nondimensional
+    assert equilibrium_stretch(elastic_force(STRETCHES, group), group) == pytest.approx(
+        STRETCHES, rel=1e-12)
+
+
+def end_of(force, start, zeta, c1, beta, tau):
+    """Return stretch and rate after a load, by extrapolated midpoint steps with 40 digits."""
+    def slope(x, v):
+        inertia = (x ** -3 + c1) / 6
+        return v, (beta - force(x) - zeta * c1 / 2 * v + v * v * x ** -4 / 4) / inertia
+
+    def midpoint(state, n):
+        h = tau / PIECES / n
+        before, now = state, [x + h * d for x, d in zip(state, slope(*state), strict=True)]
+        for _ in range(n - 1):
+            before, now = now, [
+                x + 2 * h * d for x, d in zip(before, slope(*now), strict=True)]
+        return [(x + y + h * d) / 2 for x, y, d in zip(before, now, slope(*now), strict=True)]
+
+    state = [mpmath.mpf(start), mpmath.mpf(0)]
+    for _ in range(PIECES):
+        table = []
+        for k in range(1, COLUMNS + 1):
+            row = [midpoint(state, 2 * k)]
+            for j, old in enumerate(table, 1):
+                share = mpmath.mpf(k) ** 2 / (k - j) ** 2 - 1
+                row.append([x + (x - y) / share for x, y in zip(row[-1], old, strict=True)])
+            table = row
+        state = table[-1]
+    return state
+
+
+@every_law
+@pytest.mark.parametrize(('start', 'target'), [(1.0, 1.1), (1.2, 1.6), (1.0, 0.8)])
+def test_a_plan_is_that_of_a_solution_with_40_digits(name, start, target):
+    group = block(name).nondimensional
+    plan = plan_two_step(start, target, group)
+    assert plan.code is Code.TWO_STEP
+    with mpmath.workdps(40):
+        force = sympy.lambdify(L, sympy.diff(in_units_of_the_modulus(name)[1], L), 'mpmath')
+        zeta, c1 = mpmath.mpf(group.zeta), mpmath.mpf(group.c1)
+        beta, tau = mpmath.mpf(plan.beta_p), mpmath.mpf(plan.tau_p)
+        small = mpmath.mpf(10) ** -15
+        x, v = end_of(force, start, zeta, c1, beta, tau)
+        other = end_of(force, start, zeta, c1, beta + small, tau)
+        a = (beta - force(x)) * 6 / (x ** -3 + c1)
+        # Newton on load and time: what is left of its error is that of the plan squared.
+        by_load, by_time = ((other[0] - x) / small, (other[1] - v) / small), (v, a)
+        off = (target - x, -v)
+        scale = by_load[0] * by_time[1] - by_load[1] * by_time[0]
+        d_beta = (off[0] * by_time[1] - off[1] * by_time[0]) / scale
+        d_tau = (by_load[0] * off[1] - by_load[1] * off[0]) / scale
+    assert abs(d_beta) < 1e-11
+    assert abs(d_tau) < 1e-10
+    assert plan.beta_1 == pytest.approx(float(force(mpmath.mpf(target))), rel=1e-12)
+    stretch, rate = simulate(
+        [0.0, plan.tau_p], [plan.beta_p, plan.beta_1], np.linspace(0.0, plan.tau_p + 20.0, 50),
+        group, stretch=start)
+    assert abs(stretch[-1] - target) < 1e-9 * abs(target - start)
+    assert abs(rate[-1]) < 1e-9 * abs(target - start)
+
+
+def test_a_batch_plans_a_law_as_single_plans_do():
+    group = block('ogden').nondimensional
+    targets = np.array([0.7, 1.1, 1.5])
+    batch = plan_two_step_batch(
+        1.0, targets, zeta=group.zeta, c1=group.c1, elastic=group.law)
+    assert batch.beta_p.tolist() == [plan_two_step(1.0, x, group).beta_p for x in targets]
+
+
+# Constants of a force that falls, on which side.
+FALLING = {
+    'mooney_rivlin': ({'law.c10': 9e3, 'law.c01': -3e3}, 0),
+    'yeoh': ({'law.c10': 5e3, 'law.c20': -900.0, 'law.c30': 0.0}, 1),
+    'ogden': ({'law.mu': [-2e4], 'law.alpha': [-1.0]}, 1)}
+
+
+@pytest.mark.parametrize('name', FALLING)
+def test_what_cannot_be_held_is_refused_where_the_force_falls(name):
+    constants, side = FALLING[name]
+    group = block(name, constants).nondimensional
+    limits = stretch_limits(group)
+    edge = limits[side]
+    assert edge not in (1e-3, 1e3)
+    assert elastic_stiffness(edge, group) == pytest.approx(0.0, abs=1e-9)
+    beyond = edge + (edge - 1.0) * 1e-3
+    assert elastic_stiffness(beyond, group) < 0.0
+    inside = edge - 0.2 * (edge - 1.0)
+    assert plan_two_step(1.0, inside, group).code is Code.TWO_STEP
+    with pytest.raises(BadInputError, match=f'between the limits .* of law {name}'):
+        check_stretch(beyond, group)
+    assert f'{edge:.4f}, where law {name} has a falling force' in unheld(group)
+    # A motion may pass there, and a load that no stretch balances gives the limit.
+    push = 1.5 * float(elastic_force(edge, group))
+    stretch, _ = simulate(
+        [0.0, 3.0], [push, -push], np.linspace(0.0, 5.0, 50), group, stretch=inside)
+    assert np.all(np.isfinite(stretch))
+    assert np.any((stretch - edge) * (edge - 1.0) > 0.0)
+    assert equilibrium_stretch(10.0 * elastic_force(edge, group), group) == pytest.approx(edge)
+
+
+@pytest.mark.parametrize(('name', 'constants', 'message'), [
+    ('yeoh', {}, r'2 c10 of 0.001 to 1e\+12 Pa, got 0 Pa'),
+    ('mooney_rivlin', {'law.c10': 1e3, 'law.c01': -2e3}, 'got -2000 Pa'),
+    ('ogden', {'law.mu': [1e3], 'law.alpha': [1.0, 2.0]}, 'has 1 values and law.alpha 2'),
+    ('ogden', {'law.mu': [1.0] * 4, 'law.alpha': [1.0] * 4}, 'expected 1 to 3 of both'),
+    ('ogden', {'law.mu': [1e3], 'law.alpha': [0.0]}, 'expected no 0'),
+    ('arruda_boyce', {'law.mu': [], 'law.lambda_m': 2.0}, 'law.mu has 0 values: expected one'),
+    ('arruda_boyce', {'law.mu': [1e3]}, 'law.lambda_m is 0: expected more than 1'),
+])
+def test_constants_of_no_solid_are_refused_in_a_sentence(name, constants, message):
+    with pytest.raises(BadInputError, match=message):
+        block(name, constants)
+
+
+@every_law
+def test_parameters_of_a_block_give_the_same_block(name):
+    actuator = block(name)
+    again = actuator_from({x.name: x.default for x in BLOCK} | parameters_of(actuator))
+    stretch = np.array(STRETCHES)
+    assert again.shear_modulus == pytest.approx(actuator.shear_modulus, rel=1e-15)
+    assert elastic_force(stretch, again.nondimensional) == pytest.approx(
+        elastic_force(stretch, actuator.nondimensional), rel=1e-13)
+    # Another modulus scales the law.
+    stiffer = replace(actuator, shear_modulus=2.0 * actuator.shear_modulus)
+    if actuator.law is not None:
+        given = parameters_of(stiffer)
+        for constant in LAWS[name].constants:
+            value, factor = CASES[name][0][constant.name], 2.0 if constant.unit == 'Pa' else 1.0
+            assert given[constant.name] == pytest.approx(
+                [factor * x for x in value] if isinstance(value, list) else factor * value)
+
+
+def test_gent_has_no_constants_of_a_law():
+    assert paper_actuator().law is None
+    assert set(parameters_of(paper_actuator())) == {
+        x.name for x in BLOCK if x.name.startswith('actuator.')}
+    assert block('neo_hookean').chain_limit == math.inf
