@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import sympy
 
+from hmsa_ros.cli import main
 from hmsa_ros.contract.actuator import actuator_from, parameters_of
 from hmsa_ros.contract.parameters import BLOCK
 from hmsa_ros.core import law
@@ -26,6 +27,8 @@ from hmsa_ros.core.simulation import simulate
 from hmsa_ros.core.status import Code
 from hmsa_ros.core.two_step import plan_two_step, plan_two_step_batch
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification import identify
+from hmsa_ros.identification.files import read_belief
 
 L = sympy.Symbol('l', positive=True)
 I1, I2 = L ** 2 + 2 / L, 2 * L + L ** -2
@@ -193,11 +196,11 @@ def test_what_cannot_be_held_is_refused_where_the_force_falls(name):
         check_stretch(beyond, group)
     assert f'{edge:.4f}, where law {name} has a falling force' in unheld(group)
     # A motion may pass there, and a load that no stretch balances gives the limit.
-    push = 1.5 * float(elastic_force(edge, group))
     stretch, _ = simulate(
-        [0.0, 3.0], [push, -push], np.linspace(0.0, 5.0, 50), group, stretch=inside)
-    assert np.all(np.isfinite(stretch))
+        [0.0], [0.0], np.linspace(0.0, 40.0, 400), group, rate=math.copysign(0.3, edge - 1.0),
+        stretch=edge - (edge - 1.0) * 1e-3)
     assert np.any((stretch - edge) * (edge - 1.0) > 0.0)
+    assert stretch[-1] == pytest.approx(1.0, abs=0.05)
     assert equilibrium_stretch(10.0 * elastic_force(edge, group), group) == pytest.approx(edge)
 
 
@@ -238,3 +241,29 @@ def test_gent_has_no_constants_of_a_law():
     assert set(parameters_of(paper_actuator())) == {
         x.name for x in BLOCK if x.name.startswith('actuator.')}
     assert block('neo_hookean').chain_limit == math.inf
+
+
+def test_identification_scales_a_law_and_keeps_the_ratios_of_its_constants(tmp_path):
+    true = block('ogden')
+    unit, group = true.flux_density_unit, true.nondimensional
+    begins = np.array([0.0, *(0.02 + 0.05 * np.arange(9))])
+    levels = np.array([0.0, *(float(elastic_force(x, group)) * unit for x in (1.1, 1.4, 1.0) * 3)])
+    times = np.arange(500) * 1e-3
+    stretch, _ = simulate(
+        begins / true.time_unit, levels / unit, times / true.time_unit, group)
+    noisy = stretch + 1e-4 * np.random.default_rng(2).standard_normal(len(times))
+    data, known, made = tmp_path / 'data.csv', tmp_path / 'known.yaml', tmp_path / 'found.yaml'
+    level = levels[np.searchsorted(begins, times, 'right') - 1]
+    data.write_text('time,stretch,flux_density\n' + ''.join(
+        f'{t!r},{x!r},{b!r}\n' for t, x, b in zip(
+            times.tolist(), noisy.tolist(), level.tolist(), strict=True)))
+    known.write_text(
+        '/**:\n  ros__parameters:\n    law: ogden\n    law.mu: [7200.0, -1800.0, 12.0]\n'
+        '    law.alpha: [1.5, -3.0, 8.0]\n')
+    assert main([
+        'identify', str(data), '--params-file', str(known), '--out', str(made)]) == 0
+    found = read_belief(made).actuator
+    assert found.shear_modulus == pytest.approx(true.shear_modulus, rel=2e-3)
+    assert parameters_of(found)['law.mu'] == pytest.approx([6e3, -1500.0, 10.0], rel=2e-3)
+    with pytest.raises(BadInputError, match='chain_limit is free: expected none for law ogden'):
+        identify(times, noisy, begins, levels, free=('chain_limit',), actuator=true)
