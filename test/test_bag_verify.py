@@ -1,6 +1,6 @@
 """A recorded run: integrated again from the bag, and played to a second plant."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 import json
 import math
 import re
@@ -16,7 +16,7 @@ from std_srvs.srv import Trigger
 from hmsa_ros.bag.definitions import message_definition
 from hmsa_ros.bag.reader import read_messages
 from hmsa_ros.bag.writer import BagWriter, Topic
-from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
+from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.simulation import ActuatorSimulation
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes.conversions import to_command
@@ -121,8 +121,8 @@ def write_joints(folder, densities, *, told=None, space='', lost=None, strange=(
                  for joint, density in densities.items()}
     told = told or densities
     custom_data = {f'{space}/plant.use_sim_time': 'false', f'{space}/plant.slew_limit': '0.0'} | {
-        f'{space}/plant.actuator.{field.name}': json.dumps(getattr(paper_actuator(), field.name))
-        for field in fields(ActuatorParameters) if field.init} | {
+        f'{space}/plant.actuator.{name}': json.dumps(value)
+        for name, value in paper_actuator().numbers.items()} | {
         f'{space}/plant.{joint}.actuator.density': json.dumps(density)
         for joint, density in told.items()} | {f'{space}/plant.one.slew_limit': 'null'} | (
         {'lost': json.dumps(lost)} if lost else {})

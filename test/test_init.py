@@ -266,7 +266,7 @@ def test_usual_numbers_are_not_warned_of():
 
 
 def test_numbers_are_taken_in_the_range_that_the_nodes_take():
-    specs = pytest.importorskip('hmsa_ros.nodes.parameters').ACTUATOR
+    specs = pytest.importorskip('hmsa_ros.contract.parameters').ACTUATOR
     from hmsa_ros.nodes.planning import SPECS
     declared = {x.name: x for x in (*specs, *SPECS)}
     for quantity in (*QUANTITIES, DAMPING):
