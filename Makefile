@@ -96,7 +96,7 @@ $(VENV)/.installed: setup.py setup.cfg pyproject.toml package.xml constraints.tx
 	@touch $@
 
 $(VENV)/.tools: $(VENV)/.installed
-	$(INSTALL) -e '.[test,studies,docs]'
+	$(INSTALL) -e '.[test,studies,cluster,docs]'
 	@touch $@
 
 $(VENV)/.bench: $(VENV)/.installed

@@ -60,6 +60,11 @@ EXTRAS_REQUIRE = {
     'studies': [
         'pyarrow>=14.0',
     ],
+    # Studies on a Dask cluster.
+    'cluster': [
+        'distributed>=2024.1',
+        'pyarrow>=14.0',
+    ],
     'bench': [
         'casadi>=3.6',
     ],

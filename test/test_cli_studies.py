@@ -136,15 +136,17 @@ def test_a_table_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_sweep_that_is_ended_leaves_nothing_and_one_into_a_full_device_says_so(tmp_path):
+def test_a_sweep_that_is_ended_leaves_its_chunks_and_one_into_a_full_device_says_so(tmp_path):
     words = [
         sys.executable, '-m', 'hmsa_ros', 'sweep', '--zeta', '0:2:3000', '--j-lim', '1:9:3000']
     process = subprocess.Popen([*words, '--out', 'sweep.csv'], cwd=tmp_path)
-    while not list(tmp_path.glob('.*.part')):
+    while not list(tmp_path.glob('sweep.csv.chunks/.run-*')):
         assert process.poll() is None
     process.terminate()
     assert process.wait() == 128 + signal.SIGTERM
-    assert not list(tmp_path.iterdir())
+    assert [x.name for x in tmp_path.iterdir()] == ['sweep.csv.chunks']
+    assert sorted(x.name for x in (tmp_path / 'sweep.csv.chunks').iterdir()) == [
+        'chunks', 'study.json']
     with Path('/dev/full').open('w') as full:
         ended = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert (ended.returncode, ended.stderr.count('\n')) == (1, 1)
@@ -216,7 +218,7 @@ def test_sweep_says_how_to_get_parquet_where_it_is_missing(refused, tmp_path, mo
     (['--zeta', '0:nan:3'], 'finite ends'),
     (['--target', '0'], 'greater than 0'),
     (['--j-lim', 'log:0:1:3'], 'logarithmic'),
-    (['--zeta', '0:1:4000', '--j-lim', '1:2:4000'], '16,000,000 points'),
+    (['--zeta', '0:1:8000000,0:1:8000000'], 'zeta has 16,000,000 points'),
     (['--zeta', '0:1:99999999999'], '99,999,999,999 points'),
     (['--cases', 'none.csv'], 'cannot read none.csv: No such file'),
     (['--cases', '.'], 'cannot read .: Is a directory'),

@@ -31,7 +31,7 @@ WITHOUT_KEY = {'plotly', 'pyte', 'ruff', 'types-PyYAML'}
 # Requirements whose module has another name.
 MODULES = {'PyYAML': 'yaml', 'mcap-ros2-support': 'mcap_ros2'}
 # What only a part of the package needs.
-OPTIONAL = {'pyarrow'}
+OPTIONAL = {'distributed', 'pyarrow'}
 # What the package asks for in one line where it is missing: a viewer is the user's choice.
 BESIDE = {'rerun'}
 # Needed to install, or to be launched, not to be imported.
@@ -138,7 +138,9 @@ def test_everything_imported_is_required_and_everything_required_is_imported(set
     python = {MODULES.get(name, name.lower()) for name in names(setup['install_requires'])}
     ros = {key for key in texts(manifest, 'exec_depend')
            if not key.startswith('python3-') and key not in KEYS.values()}
-    assert names(setup['extras_require']['studies']) == OPTIONAL
+    extras = setup['extras_require']
+    assert names(extras['studies']) == {'pyarrow'}
+    assert names(extras['cluster']) == OPTIONAL
     assert imported() == (python | ros | OPTIONAL | BESIDE) - NOT_IMPORTED
 
 

@@ -2,10 +2,25 @@
 
 import argparse
 from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
+import shutil
 import sys
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
+from hmsa_ros.errors import BadInputError
+
+if TYPE_CHECKING:
+    from hmsa_ros.studies.chunks import Chunks
+    from hmsa_ros.studies.engine import Outcome, Start
+    from hmsa_ros.studies.sweep import Sweep
+
+#: Fewer points are planned at once, without chunks.
+_SMALL = 500_000
+#: From so many on, what a sweep takes is said before.
+_LARGE = 1_000_000
 # Column, option, and what it is.
 _AXES = (
     ('start', '--start', 'initial stretch, at rest (default 1)'),
@@ -24,7 +39,8 @@ def add_parser(subparsers: Any) -> None:
                     'nondimensional as in the paper. GRID is a value, FIRST:LAST:POINTS or '
                     'log:FIRST:LAST:POINTS, or several of these separated by commas. A case '
                     'that cannot be planned gives the reason in its status; the others are '
-                    'still planned.',
+                    'still planned. The table is the same, to the byte, however many workers '
+                    'or shards compute it.',
         epilog='example: hmsa sweep --zeta 0:2:1000 --j-lim log:0.1:100:50 --out sweep.csv')
     for _, option, text in _AXES:
         parser.add_argument(option, metavar='GRID', help=text)
@@ -33,42 +49,207 @@ def add_parser(subparsers: Any) -> None:
         help='CSV with some of the columns start, target, zeta, j_lim, c1; each row is combined '
              'with the grids of the other columns')
     parser.add_argument(
-        '--out', type=Path, metavar='FILE',
-        help='file to write, ending in .csv or .parquet; an existing file is replaced (default: '
-             'CSV on standard output)')
+        '--out', type=Path, metavar='FILE|DIR',
+        help='file to write, ending in .csv or .parquet; an existing file is replaced. Or a '
+             'folder, which keeps the chunks and gets table.parquet once all are there '
+             '(default: CSV on standard output)')
+    parser.add_argument(
+        '--workers', type=int, metavar='N',
+        help='processes; 1 computes in this one (default: one a core for large sweeps)')
+    parser.add_argument(
+        '--shard', metavar='I/N',
+        help='compute part I of N only, as a job of an array does; I from 0 to N-1 or from 1 to '
+             'N; needs --out')
+    parser.add_argument(
+        '--dask', metavar='ADDRESS',
+        help='compute on a Dask cluster: its address, its scheduler file (.json), or "local"; '
+             'all workers must see the folder of --out')
+    parser.add_argument(
+        '--resume', action='store_true',
+        help='keep the chunks of an earlier run that are there and whole')
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Plan and write."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-
-    from hmsa_ros.studies.sweep import open_writer, parse_grid, read_cases, Sweep
+    from hmsa_ros.studies.sweep import parse_grid, read_cases, Sweep
 
     grids = {
         column: parse_grid(getattr(arguments, column), column)
         for column, _, _ in _AXES if getattr(arguments, column) is not None}
     cases = None if arguments.cases is None else read_cases(arguments.cases)
     sweep = Sweep(grids, cases)
+    return _plan_in_chunks(sweep, arguments) if _in_chunks(sweep, arguments) \
+        else _plan_at_once(sweep, arguments.out)
+
+
+def _in_chunks(sweep: 'Sweep', arguments: argparse.Namespace) -> bool:
+    """Return whether chunks are kept; refuse options that do not fit."""
+    if arguments.workers is not None and arguments.workers < 1:
+        raise BadInputError(f'--workers is {arguments.workers}: expected at least 1')
+    if arguments.dask is not None and arguments.workers is not None and arguments.dask != 'local':
+        raise BadInputError('--workers and --dask ADDRESS: expected one of them')
+    asked = [f'--{x}' for x in ('workers', 'shard', 'dask', 'resume') if getattr(arguments, x)]
+    out: Path | None = arguments.out
+    if out is None:
+        if asked:
+            raise BadInputError(
+                f'{asked[0]} without --out: expected --out with a file or a folder')
+        return False
+    if _is_folder(out) or asked:
+        return True
+    # What could not be written in the end is refused at the beginning, without a chunk.
+    return sweep.size > _SMALL and out.suffix.lower() in {'.csv', '.parquet'} and \
+        not out.is_dir() and out.parent.is_dir() and (
+            out.suffix.lower() == '.parquet' or _has_arrow())
+
+
+def _is_folder(out: Path) -> bool:
+    return not out.suffix or (out.is_dir() and out.suffix.lower() not in {'.csv', '.parquet'})
+
+
+def _has_arrow() -> bool:
+    from importlib.util import find_spec
+
+    return find_spec('pyarrow') is not None
+
+
+def _plan_at_once(sweep: 'Sweep', out: Path | None) -> int:
+    from hmsa_ros.studies.chunks import Chunks
+    from hmsa_ros.studies.sweep import COLUMNS
+    from hmsa_ros.studies.tables import open_writer
+
     counts: Counter[str] = Counter()
-    console = Console(stderr=True)
-    with open_writer(arguments.out) as write, Progress(
-            TextColumn('planning'), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-            console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task('', total=sweep.size)
-        for block in sweep.blocks():
+    with open_writer(out, COLUMNS) as write, _progress(sweep.size) as advance:
+        for block in sweep.blocks(Chunks.of(sweep, Path()).rows):
             write(block)
             counts.update(block.status.tolist())
-            progress.advance(task, block.status.size)
-    words = ', '.join(f'{count:,} {status}' for status, count in counts.most_common())
-    print(f'{sweep.size:,} plans: {words}', file=sys.stderr)
-    if arguments.out is not None:
-        print(arguments.out)
+            advance(block.status.size)
+    _report(sweep.size, counts)
+    if out is not None:
+        print(out)
     return 0
+
+
+def _plan_in_chunks(sweep: 'Sweep', arguments: argparse.Namespace) -> int:
+    from hmsa_ros.studies.chunks import Chunks
+    from hmsa_ros.studies.engine import compute, parse_shard
+    from hmsa_ros.studies.tables import require_arrow
+
+    require_arrow()
+    shard = (0, 1) if arguments.shard is None else parse_shard(arguments.shard)
+    table, folder = _places(arguments.out)
+    start, cores = _engine(arguments)
+    chunks = Chunks.of(sweep, folder)
+    _estimate(sweep, chunks, cores, shard)
+    try:
+        with _progress(-(-sweep.size // shard[1])) as advance:
+            outcome = compute(
+                sweep, folder, start, shard=shard, resume=arguments.resume, say=_say,
+                advance=advance)
+        if len(chunks.found()) < chunks.count:
+            return _part(outcome, chunks, folder)
+        _report(sweep.size, chunks.merge(table))
+    except KeyboardInterrupt:
+        _say(f'{len(chunks.found()):,} of {chunks.count:,} chunks are in {folder}: go on with '
+             '--resume')
+        raise
+    if table.parent.resolve() != chunks.folder and arguments.shard is None:
+        shutil.rmtree(folder, ignore_errors=True)
+    print(table)
+    return 0
+
+
+def _places(out: Path) -> tuple[Path, Path]:
+    """Return where the table goes and where the chunks."""
+    if _is_folder(out):
+        return out / 'table.parquet', out
+    if out.suffix.lower() not in {'.csv', '.parquet'}:
+        raise BadInputError(
+            f'the format of {out} is unknown: expected a name that ends in .csv or .parquet, or a '
+            'folder')
+    if out.is_dir():
+        raise BadInputError(f'{out} is a folder: expected the name of a file')
+    if not out.parent.is_dir():
+        raise BadInputError(f'cannot write {out}: No such file or directory; expected a folder')
+    return out, out.with_name(f'{out.name}.chunks')
+
+
+def _engine(arguments: argparse.Namespace) -> tuple['Start', int]:
+    """Return what computes, and on how many cores as far as that is known."""
+    from hmsa_ros.studies.executors import cores, dask, here, local_processes
+
+    if arguments.dask is not None:
+        return (partial(dask, arguments.dask, arguments.workers),
+                arguments.workers or (cores() if arguments.dask == 'local' else 1))
+    workers = arguments.workers or cores()
+    return (here if workers == 1 else partial(local_processes, workers)), workers
+
+
+def _estimate(sweep: 'Sweep', chunks: 'Chunks', cores: int, shard: tuple[int, int]) -> None:
+    """Say what a large sweep takes, and refuse one that the disk has no room for."""
+    from hmsa_ros.studies.sweep import RATE, ROW_BYTES
+
+    if sweep.size < _LARGE:
+        return
+    size = sweep.size * ROW_BYTES
+    seconds = sweep.size / shard[1] / (RATE * cores)
+    time = f'{seconds / 3600:,.1f} h' if seconds > 3600 else f'{seconds / 60:.1f} min'
+    _say(f'{sweep.size:,} plans in {chunks.count:,} chunks of {chunks.rows:,}: about '
+         f'{size / 1e9:.3g} GB, the table as much again'
+         f'{f"; part {shard[0] + 1} of {shard[1]}" if shard[1] > 1 else ""}; about {time} on '
+         f'{cores} core{"s" if cores > 1 else ""}')
+    place = chunks.folder
+    while not place.exists():
+        place = place.parent
+    free = shutil.disk_usage(place).free
+    if free < size / shard[1]:
+        raise BadInputError(
+            f'{place} has {free / 1e9:.3g} GB of free space: expected some '
+            f'{size / shard[1] / 1e9:.3g} GB for the chunks; take fewer points or another disk')
+
+
+def _part(outcome: 'Outcome', chunks: 'Chunks', folder: Path) -> int:
+    """Report a part of a study whose other parts are missing."""
+    _say(f'{outcome.computed:,} chunks computed, {outcome.kept:,} kept; '
+         f'{len(chunks.found()):,} of {chunks.count:,} are there, and the table is written when '
+         'all are')
+    print(folder)
+    return 0
+
+
+def _report(size: int, counts: Mapping[str, int]) -> None:
+    words = ', '.join(
+        f'{count:,} {status}' for status, count in Counter(counts).most_common())
+    _say(f'{size:,} plans: {words}')
+
+
+def _say(sentence: str) -> None:
+    print(sentence, file=sys.stderr)
+
+
+@contextmanager
+def _progress(total: int) -> Iterator[Callable[[int], None]]:
+    """Show rows done, rate and time left, on a terminal only."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        Task,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+    from rich.text import Text
+
+    class Rate(TextColumn):
+        def render(self, task: Task) -> Text:
+            return Text(f'{task.speed:,.0f}/s' if task.speed else '')
+
+    console = Console(stderr=True)
+    with Progress(
+            TextColumn('planning'), BarColumn(), MofNCompleteColumn(), Rate(''),
+            TimeRemainingColumn(), console=console, transient=True,
+            disable=not console.is_terminal) as progress:
+        task = progress.add_task('', total=total)
+        yield lambda rows: progress.advance(task, rows)

@@ -1,47 +1,45 @@
 """
-Sweeps: two-step plans over grids of parameters or a table of cases, to CSV or Parquet.
+Sweeps: two-step plans over grids of parameters or a table of cases.
 
 A sweep is a product of axes. It is planned in blocks, so that its size is bounded by the disk
 and not by the memory, and a row that cannot be planned says why in its status.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
 import csv
 from dataclasses import dataclass
+from functools import cached_property
+import hashlib
 import math
 from pathlib import Path
-import sys
-from types import TracebackType
-from typing import Any, TextIO
+from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from hmsa_ros.core.model import Array, signed_root
 from hmsa_ros.core.two_step import CODES, plan_two_step_batch
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import replacing
+from hmsa_ros.studies.tables import require_arrow
 
 #: What can be swept, with the value of what is not.
 DEFAULTS = {'start': 1.0, 'target': 1.1, 'zeta': 0.2, 'j_lim': 5.0, 'c1': 2.0}
 #: Columns of the numbers that a plan consists of, after the inputs and the status.
 RESULTS = ('beta_p', 'b_p', 'tau_p', 'beta_1', 'b_1')
 COLUMNS = (*DEFAULTS, 'status', *RESULTS)
-#: More are refused: a slip of the keyboard, most likely.
-MOST_POINTS = 10_000_000
-#: Rows planned at a time.
-BLOCK = 10_000
+#: More values of one column, or cases, are refused: a sweep has no limit, but they are in memory.
+MOST_VALUES = 10_000_000
+#: Plans a second and core, on a desktop of 2023; bytes of a row as Parquet, on average.
+RATE, ROW_BYTES = 150_000.0, 50
 
 _GRID = 'VALUE, FIRST:LAST:POINTS, log:FIRST:LAST:POINTS, or several separated by commas'
 _STATUS = np.array([str(CODES[number]) for number in sorted(CODES)])
 
 
-def too_many(points: int) -> BadInputError:
-    """Return the error for a sweep of so many points, which is too large."""
+def _too_many(column: str, points: int) -> BadInputError:
     return BadInputError(
-        f'the sweep has {points:,} points: expected at most {MOST_POINTS:,}; take fewer, or '
-        'split it')
+        f'{column} has {points:,} points: expected at most {MOST_VALUES:,} of one column')
 
 
 def parse_grid(text: str, column: str) -> Array:
@@ -55,8 +53,8 @@ def parse_grid(text: str, column: str) -> Array:
 
     """
     parts = [_part(part.strip(), text, column) for part in text.split(',')]
-    if sum(x.size for x in parts) > MOST_POINTS:
-        raise too_many(sum(x.size for x in parts))
+    if sum(x.size for x in parts) > MOST_VALUES:
+        raise _too_many(column, sum(x.size for x in parts))
     values = np.concatenate(parts)
     least = 'at least 0' if column == 'zeta' else 'greater than 0'
     wrong = ~np.isfinite(values) | ((values < 0.0) if column == 'zeta' else (values <= 0.0))
@@ -83,8 +81,8 @@ def _part(part: str, text: str, column: str) -> Array:
         raise BadInputError(f'{column} is {text!r}: expected {_GRID}') from None
     if points < 2:
         raise BadInputError(f'{column} of {text!r} has {points} points: expected at least 2')
-    if points > MOST_POINTS:
-        raise too_many(points)
+    if points > MOST_VALUES:
+        raise _too_many(column, points)
     if not math.isfinite(first) or not math.isfinite(last):
         raise BadInputError(f'{column} is {text!r}: expected finite ends of the grid')
     if words[0] == 'log' and not (first > 0.0 and last > 0.0):
@@ -134,9 +132,9 @@ def read_cases(path: Path) -> dict[str, Array]:
             for cells in reader:
                 if cells:
                     rows.append(_case(cells, names, f'{path}, line {reader.line_num}'))
-                if len(rows) > MOST_POINTS:
+                if len(rows) > MOST_VALUES:
                     raise BadInputError(
-                        f'{path} has more than {MOST_POINTS:,} cases: expected at most that '
+                        f'{path} has more than {MOST_VALUES:,} cases: expected at most that '
                         'many; split it')
     except OSError as error:
         raise BadInputError(
@@ -171,16 +169,33 @@ class Rows:
     ----------
     inputs : dict of str to ndarray, shape (n,)
         Columns of `DEFAULTS`, in that order.
-    status : ndarray of str, shape (n,)
-        Code of each row.
+    codes : ndarray of int64, shape (n,)
+        Keys of `CODES`.
     results : dict of str to ndarray, shape (n,)
         Columns of `RESULTS`, in that order; NaN where there is no such number.
 
     """
 
     inputs: dict[str, Array]
-    status: NDArray[np.str_]
+    codes: NDArray[np.int64]
     results: dict[str, Array]
+
+    @property
+    def status(self) -> NDArray[np.str_]:
+        """Return the code of each row."""
+        return _STATUS[self.codes]
+
+    def lists(self) -> list[list[Any]]:
+        """Return the columns as lists."""
+        return [*(x.tolist() for x in self.inputs.values()), self.status.tolist(),
+                *(x.tolist() for x in self.results.values())]
+
+    def arrow(self) -> Any:
+        """Return the columns as a table of pyarrow."""
+        arrow, _ = require_arrow()
+        status = arrow.DictionaryArray.from_arrays(self.codes, _STATUS.tolist())
+        return arrow.table(
+            {**self.inputs, 'status': status.cast(arrow.string()), **self.results})
 
 
 class Sweep:
@@ -202,8 +217,7 @@ class Sweep:
     Raises
     ------
     BadInputError
-        If a column is unknown, empty or in both, the cases differ in length, or there are too
-        many points.
+        If a column is unknown, empty or in both, or the cases differ in length.
 
     """
 
@@ -231,120 +245,43 @@ class Sweep:
         self.size = math.prod(self._shape)
         if self.size == 0:
             raise BadInputError('a column of the sweep is empty: expected at least one value')
-        if self.size > MOST_POINTS:
-            raise too_many(self.size)
 
-    def blocks(self, rows: int = BLOCK) -> Iterator[Rows]:
+    @cached_property
+    def digest(self) -> str:
+        """Return a hash of all inputs."""
+        made = hashlib.sha256(b'sweep of two-step plans, ' + ','.join(COLUMNS).encode())
+        for axis in self._axes:
+            for name, values in axis.items():
+                made.update(f'{name} {values.size} {len(axis)} '.encode())
+                made.update(np.ascontiguousarray(values, dtype='<f8').tobytes())
+        return made.hexdigest()
+
+    def rows(self, begin: int, end: int) -> Rows:
+        """Plan rows from one number up to another, on the threads that Numba has."""
+        places = np.unravel_index(np.arange(begin, end), self._shape)
+        values = {
+            name: column[place]
+            for axis, place in zip(self._axes, places, strict=True)
+            for name, column in axis.items()}
+        inputs = {name: values[name] for name in DEFAULTS}
+        plans = plan_two_step_batch(
+            inputs['start'], inputs['target'], zeta=inputs['zeta'], j_lim=inputs['j_lim'],
+            c1=inputs['c1'])
+        return Rows(inputs, plans.status, {
+            'beta_p': plans.beta_p, 'b_p': signed_root(plans.beta_p),
+            'tau_p': plans.tau_p, 'beta_1': plans.beta_1,
+            'b_1': signed_root(plans.beta_1)})
+
+    def table(self, begin: int, end: int) -> Any:
+        """Plan rows from one number up to another on one core; return a table of pyarrow."""
+        threads = numba.get_num_threads()
+        numba.set_num_threads(1)
+        try:
+            return self.rows(begin, end).arrow()
+        finally:
+            numba.set_num_threads(threads)
+
+    def blocks(self, rows: int) -> Iterator[Rows]:
         """Plan the sweep and yield its rows in order, in blocks of so many."""
         for begin in range(0, self.size, rows):
-            places = np.unravel_index(
-                np.arange(begin, min(begin + rows, self.size)), self._shape)
-            values = {
-                name: column[place]
-                for axis, place in zip(self._axes, places, strict=True)
-                for name, column in axis.items()}
-            inputs = {name: values[name] for name in DEFAULTS}
-            plans = plan_two_step_batch(
-                inputs['start'], inputs['target'], zeta=inputs['zeta'], j_lim=inputs['j_lim'],
-                c1=inputs['c1'])
-            yield Rows(inputs, _STATUS[plans.status], {
-                'beta_p': plans.beta_p, 'b_p': signed_root(plans.beta_p),
-                'tau_p': plans.tau_p, 'beta_1': plans.beta_1,
-                'b_1': signed_root(plans.beta_1)})
-
-
-class CsvWriter:
-    """Writes blocks as CSV, numbers in full double precision."""
-
-    def __init__(self, file: TextIO) -> None:
-        """Write the header."""
-        self._writer = csv.writer(file, lineterminator='\n')
-        self._writer.writerow(COLUMNS)
-
-    def write(self, block: Rows) -> None:
-        """Write a block of rows."""
-        self._writer.writerows(zip(
-            *(x.tolist() for x in block.inputs.values()), block.status.tolist(),
-            *(x.tolist() for x in block.results.values()), strict=True))
-
-
-class ParquetWriter:
-    """Writes blocks as Parquet, a row group each, through pyarrow."""
-
-    def __init__(self, path: Path) -> None:
-        """Open the file."""
-        self._arrow, parquet = _arrow()
-        self._schema = self._arrow.schema([
-            (name, self._arrow.string() if name == 'status' else self._arrow.float64())
-            for name in COLUMNS])
-        self._writer = parquet.ParquetWriter(path, self._schema)
-
-    def __enter__(self) -> 'ParquetWriter':
-        """Return the writer."""
-        return self
-
-    def __exit__(
-            self, kind: type[BaseException] | None, error: BaseException | None,
-            trace: TracebackType | None) -> None:
-        """Write the footer."""
-        self._writer.close()
-
-    def write(self, block: Rows) -> None:
-        """Write a block of rows."""
-        self._writer.write_table(self._arrow.table(
-            {**block.inputs, 'status': block.status.tolist(), **block.results},
-            schema=self._schema))
-
-
-def _arrow() -> tuple[Any, Any]:
-    try:
-        import pyarrow
-        from pyarrow import parquet
-    except ImportError as error:
-        raise BadInputError(
-            'pyarrow, which writes Parquet, is not installed: install it (pip install '
-            '"hmsa_ros[studies]") or write to a file that ends in .csv') from error
-    return pyarrow, parquet
-
-
-@contextmanager
-def open_writer(path: Path | None) -> Iterator[Callable[[Rows], None]]:
-    """
-    Open what the blocks of a sweep are written to.
-
-    Parameters
-    ----------
-    path : Path or None
-        A file that ends in .csv or .parquet, None for standard output. A file of that name is
-        replaced when all is written, and left alone otherwise.
-
-    Yields
-    ------
-    callable
-        Writes a `Rows`.
-
-    Raises
-    ------
-    BadInputError
-        If the name ends otherwise, pyarrow is missing, or the file cannot be written.
-
-    """
-    if path is None:
-        yield CsvWriter(sys.stdout).write
-        sys.stdout.flush()
-        return
-    kind = path.suffix.lower()
-    if kind not in {'.csv', '.parquet'}:
-        raise BadInputError(
-            f'the format of {path} is unknown: expected a name that ends in .csv or .parquet')
-    if path.is_dir():
-        raise BadInputError(f'{path} is a folder: expected the name of a file')
-    if kind == '.parquet':
-        _arrow()
-    with replacing(path) as beside:
-        if kind == '.csv':
-            with beside.open('w', newline='', encoding='utf-8') as file:
-                yield CsvWriter(file).write
-        else:
-            with ParquetWriter(beside) as writer:
-                yield writer.write
+            yield self.rows(begin, min(begin + rows, self.size))

@@ -1,0 +1,224 @@
+"""
+Chunks of a study: a file each, in one folder that any number of processes may share.
+
+The name of a file holds the number of its chunk, a hash of the input and of the package's
+version, and a checksum of the content. So a folder says which chunks there are and whether they
+are whole, and nobody has to keep a list.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import hashlib
+import io
+from itertools import chain
+import json
+import os
+from pathlib import Path
+import re
+from typing import Any, Protocol
+import uuid
+import zlib
+
+from hmsa_ros import __version__
+from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.files import make_folder, write_text
+from hmsa_ros.studies.tables import ArrowBlock, open_writer, repeating, require_arrow
+
+#: Rows of a chunk: a thousandth of the study, at least 0.1 s and at most some 100 MB of work.
+SHARE, LEAST_ROWS, MOST_ROWS = 1000, 20_000, 500_000
+
+_NAME = re.compile(r'(\d{7,})-([0-9a-f]{16})-([0-9a-f]{8})\.parquet')
+
+
+class Study(Protocol):
+    """A table whose rows can be computed in any order and anywhere."""
+
+    @property
+    def size(self) -> int:
+        """Number of rows."""
+
+    @property
+    def digest(self) -> str:
+        """A hash of everything that the rows depend on, but the package's version."""
+
+    def table(self, begin: int, end: int) -> Any:
+        """Return rows as a `pyarrow.Table`, with the same columns in every block."""
+
+
+@dataclass(frozen=True)
+class Chunks:
+    """
+    The chunks of a study, and the folder that they are in.
+
+    Attributes
+    ----------
+    folder : Path
+        Absolute.
+    digest : str
+        Of the study and the package's version.
+    size : int
+        Rows of the study, at least 1.
+
+    """
+
+    folder: Path
+    digest: str
+    size: int
+
+    @classmethod
+    def of(cls, study: Study, folder: Path) -> 'Chunks':
+        """Return the chunks of a study; nothing is written."""
+        made = hashlib.sha256(f'{__version__} {study.digest} {study.size}'.encode())
+        return cls(Path(folder).resolve(), made.hexdigest(), study.size)
+
+    @property
+    def rows(self) -> int:
+        """Return the rows of a chunk; the last one may have fewer."""
+        return min(max(-(-self.size // SHARE), LEAST_ROWS), MOST_ROWS)
+
+    @property
+    def count(self) -> int:
+        """Return the number of chunks."""
+        return -(-self.size // self.rows)
+
+    def span(self, index: int) -> tuple[int, int]:
+        """Return the first row of a chunk, and the first after it."""
+        return index * self.rows, min((index + 1) * self.rows, self.size)
+
+    def prepare(self) -> None:
+        """
+        Make the folder, or find out that it is that of the same study.
+
+        Raises
+        ------
+        BadInputError
+            If it belongs to something else, or cannot be made.
+
+        """
+        described = self.folder / 'study.json'
+        if described.exists():
+            try:
+                found = json.loads(described.read_text(encoding='utf-8'))['digest']
+            except (OSError, ValueError, KeyError, TypeError):
+                found = None
+            if found != self.digest:
+                raise BadInputError(
+                    f'{self.folder} holds another study, or the same of another version of this '
+                    'package: expected an empty folder or that of this study; name another with '
+                    '--out, or remove it')
+        elif any((self.folder / x).exists() for x in ('chunks', 'table.parquet')):
+            raise BadInputError(
+                f'{self.folder} has chunks or a table but no study.json: expected an empty '
+                'folder or that of this study; name another with --out')
+        make_folder(self.folder / 'chunks')
+        if not described.exists():
+            write_text(described, json.dumps({
+                'digest': self.digest, 'version': __version__, 'rows': self.size,
+                'chunks': self.count, 'rows_of_a_chunk': self.rows}, indent=2) + '\n')
+
+    def found(self) -> dict[int, list[Path]]:
+        """Return the files of this study's chunks by number; their content is not looked at."""
+        files: dict[int, list[Path]] = {}
+        for path in sorted((self.folder / 'chunks').iterdir()):
+            name = _NAME.fullmatch(path.name)
+            if name and int(name[1]) < self.count and name[2] == self._hash(int(name[1])):
+                files.setdefault(int(name[1]), []).append(path)
+        return files
+
+    def sound(self, paths: list[Path]) -> bool:
+        """Return whether one file of a chunk is as it was written; damaged ones are removed."""
+        good = False
+        for path in paths:
+            if self._content(path) is None:
+                path.unlink(missing_ok=True)
+            else:
+                good = True
+        return good
+
+    def write(self, index: int, table: Any, beside: Path) -> None:
+        """
+        Write a chunk, by way of another folder of the same file system.
+
+        Raises
+        ------
+        HmsaError
+            If it cannot be written.
+
+        """
+        _, parquet = require_arrow()
+        made = io.BytesIO()
+        parquet.write_table(
+            table, made, row_group_size=max(1, table.num_rows), write_statistics=False,
+            use_dictionary=repeating(table))
+        content = made.getbuffer()
+        name = f'{index:07d}-{self._hash(index)}-{zlib.crc32(content):08x}.parquet'
+        part = beside / f'{name}.{uuid.uuid4().hex}.part'
+        try:
+            part.write_bytes(content)
+            os.replace(part, self.folder / 'chunks' / name)
+        except OSError as error:
+            raise HmsaError(
+                f'cannot write chunk {index} to {self.folder}: {error.strerror or error}; '
+                'expected a folder with room that all workers can write to') from error
+
+    def tables(self) -> Iterator[Any]:
+        """
+        Yield the tables of all chunks, in order.
+
+        Raises
+        ------
+        HmsaError
+            If a chunk is missing or damaged.
+
+        """
+        _, parquet = require_arrow()
+        files = self.found()
+        for index in range(self.count):
+            for path in files.get(index, []):
+                content = self._content(path)
+                if content is not None:
+                    yield parquet.read_table(io.BytesIO(content), use_threads=False)
+                    break
+            else:
+                raise HmsaError(
+                    f'chunk {index} of {self.folder} is missing or damaged: run the study again '
+                    'with --resume, which computes it')
+
+    def merge(self, path: Path) -> dict[str, int]:
+        """
+        Write the whole table, in the order of its rows; return how often each status occurs.
+
+        Raises
+        ------
+        HmsaError
+            If a chunk is missing or damaged, or the table cannot be written.
+
+        """
+        counts: dict[str, int] = {}
+        tables = self.tables()
+        first = next(tables)
+        with open_writer(path, first.column_names) as write:
+            for table in chain([first], tables):
+                write(ArrowBlock(table))
+                add_counts(counts, table)
+        return counts
+
+    def _hash(self, index: int) -> str:
+        return hashlib.sha256(f'{self.digest} {self.span(index)}'.encode()).hexdigest()[:16]
+
+    @staticmethod
+    def _content(path: Path) -> bytes | None:
+        """Return what is in a file, None if that is not what its name says."""
+        try:
+            content = path.read_bytes()
+        except OSError:
+            return None
+        name = _NAME.fullmatch(path.name)
+        return content if name and zlib.crc32(content) == int(name[3], 16) else None
+
+
+def add_counts(counts: dict[str, int], table: Any) -> None:
+    """Add how often each status occurs in a table of pyarrow, if it has that column."""
+    if 'status' in table.column_names:
+        for entry in table['status'].value_counts().to_pylist():
+            counts[entry['values']] = counts.get(entry['values'], 0) + entry['counts']

@@ -1,0 +1,141 @@
+"""Where the chunks of a study are computed: here, in local processes, or on a Dask cluster."""
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from contextlib import contextmanager, ExitStack
+import logging
+import multiprocessing
+from multiprocessing.connection import wait
+import os
+from pathlib import Path
+import signal
+import threading
+from typing import Any
+
+from hmsa_ros.errors import BadInputError, HmsaError
+
+#: Seconds that a Dask scheduler has for its first answer.
+PATIENCE = 15
+#: Chunks that wait at a Dask cluster: they are small there, and it grows by what waits.
+AHEAD = 1000
+
+
+class Here(Executor):
+    """Computes in this process, as soon as something is submitted."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> 'Future[Any]':
+        """Call the function."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+@contextmanager
+def here() -> Iterator[tuple[Executor, int]]:
+    """Yield an executor of this process, and how many chunks to submit ahead."""
+    yield Here(), 1
+
+
+@contextmanager
+def local_processes(workers: int) -> Iterator[tuple[Executor, int]]:
+    """Yield a pool of fresh processes, and how many chunks to submit ahead; left, none lives."""
+    pool = ProcessPoolExecutor(
+        workers, mp_context=multiprocessing.get_context('spawn'), initializer=_end_with_parent)
+    try:
+        yield pool, 4 * workers
+        pool.shutdown()
+    finally:
+        for process in list((pool._processes or {}).values()):
+            process.kill()
+        pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def dask(address: str, workers: int | None = None) -> Iterator[tuple[Executor, int]]:
+    """
+    Yield an executor of a Dask cluster, and how many chunks to submit ahead.
+
+    Parameters
+    ----------
+    address : str
+        ``local`` for a cluster on this machine, a scheduler's address as in
+        ``tcp://node:8786``, or its scheduler file, ending in .json.
+    workers : int, optional
+        Processes of a local cluster; default: one a core.
+
+    Raises
+    ------
+    BadInputError
+        If dask.distributed is not installed, or no scheduler answers.
+
+    """
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise BadInputError(
+            'dask.distributed is not installed: install it (pip install "hmsa_ros[cluster]") or '
+            'take --workers or --shard') from error
+    with ExitStack() as stack:
+        if address == 'local':
+            with held_signals():
+                target = stack.enter_context(LocalCluster(
+                    n_workers=workers or cores(), threads_per_worker=1, dashboard_address=None,
+                    silence_logs=logging.CRITICAL))
+        else:
+            target = None if address.endswith('.json') else address
+        try:
+            if target is None:
+                # Dask waits for ever for the file.
+                Path(address).read_bytes()
+            client = stack.enter_context(Client(
+                target, timeout=PATIENCE, scheduler_file=address if target is None else None))
+        except (OSError, ValueError, TypeError) as error:
+            raise BadInputError(
+                f'no Dask scheduler answers at {address!r} ({type(error).__name__}): expected '
+                'local, an address as in tcp://node:8786, or a scheduler file that ends in '
+                '.json') from error
+        yield client.get_executor(), AHEAD
+
+
+@contextmanager
+def given(executor: Executor) -> Iterator[tuple[Executor, int]]:
+    """Yield an executor that belongs to the caller, and how many chunks to submit ahead."""
+    yield executor, AHEAD
+
+
+def cores() -> int:
+    """Return how many cores this process may use."""
+    if hasattr(os, 'sched_getaffinity'):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@contextmanager
+def held_signals() -> Iterator[None]:
+    """
+    Let SIGINT wait.
+
+    A process that starts meanwhile never gets it: Ctrl-C goes to all processes of a terminal, but
+    it is for the one that starts the others to end them.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _end_with_parent() -> None:
+    """Have this worker end when the process that started it is gone, even by kill -9."""
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        raise HmsaError('not a worker: expected a process started by another')
+
+    def watch(sentinel: int) -> None:
+        wait([sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, args=(parent.sentinel,), daemon=True).start()

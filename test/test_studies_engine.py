@@ -1,0 +1,253 @@
+"""Studies in chunks: the same table whatever computes them, and nothing lost on the way."""
+
+from concurrent.futures import ThreadPoolExecutor
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+
+import pytest
+
+pytest.importorskip('pyarrow')
+
+from hmsa_ros.cli import main
+from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.studies import executors
+from hmsa_ros.studies.chunks import Chunks, LEAST_ROWS
+from hmsa_ros.studies.engine import compute, parse_shard
+from hmsa_ros.studies.sweep import COLUMNS, parse_grid, Sweep
+from hmsa_ros.studies.tables import open_writer
+
+#: Three chunks, the last one not full; some rows without a plan.
+AXES = {'zeta': '0:2:400', 'target': '1.1,1.2,3.0', 'j_lim': '4:9:40'}
+WORDS = [f'--{name.replace("_", "-")}={text}' for name, text in AXES.items()]
+CHUNKS = 3
+
+
+@pytest.fixture(scope='module')
+def sweep():
+    """Return a small sweep."""
+    return Sweep({name: parse_grid(text, name) for name, text in AXES.items()})
+
+
+@pytest.fixture(scope='module')
+def expected(sweep, tmp_path_factory):
+    """Return its table as Parquet and as CSV, planned without chunks on disk."""
+    folder = tmp_path_factory.mktemp('expected')
+    for name in ('t.parquet', 't.csv'):
+        with open_writer(folder / name, COLUMNS) as write:
+            for block in sweep.blocks(LEAST_ROWS):
+                write(block)
+    return (folder / 't.parquet').read_bytes(), (folder / 't.csv').read_bytes()
+
+
+@pytest.fixture
+def run(capsys, tmp_path, monkeypatch):
+    """Return a runner of the sweep in an empty folder: status, standard output and error."""
+    monkeypatch.chdir(tmp_path)
+
+    def run_words(*words):
+        try:
+            status = main(['sweep', *WORDS, *words])
+        except SystemExit as end:
+            status = end.code
+        return status, *capsys.readouterr()
+
+    return run_words
+
+
+def chunk_files(folder):
+    """Return the files of the chunks, in order."""
+    return sorted((folder / 'chunks').iterdir())
+
+
+def test_two_workers_write_the_table_of_one_to_the_byte(run, tmp_path, expected):
+    assert run('--workers=1', '--out=a')[:2] == (0, 'a/table.parquet\n')
+    assert (tmp_path / 'a' / 'table.parquet').read_bytes() == expected[0]
+    status, out, err = run('--workers=2', '--out=b.csv')
+    assert (status, out) == (0, 'b.csv\n')
+    assert err.startswith('48,000 plans: 39,347 two_step, 8,400 out_of_range')
+    assert (tmp_path / 'b.csv').read_bytes() == expected[1]
+    assert sorted(x.name for x in tmp_path.iterdir()) == ['a', 'b.csv']
+    assert sorted(x.name for x in (tmp_path / 'a').iterdir()) == [
+        'chunks', 'study.json', 'table.parquet']
+
+
+def test_shards_of_two_machines_merge_into_the_same_table(run, tmp_path, expected):
+    # From 1 on one of them and in two folders, brought together afterwards.
+    status, out, err = run('--workers=1', '--shard=1/2', '--out=one')
+    assert (status, out) == (0, 'one\n')
+    assert '1 of 3 are there' in err
+    assert run('--workers=1', '--shard=2/2', '--out=two')[0] == 0
+    for path in chunk_files(tmp_path / 'two'):
+        path.rename(tmp_path / 'one' / 'chunks' / path.name)
+    before = [x.stat().st_mtime_ns for x in chunk_files(tmp_path / 'one')]
+    assert run('--workers=1', '--resume', '--out=one')[0] == 0
+    assert (tmp_path / 'one' / 'table.parquet').read_bytes() == expected[0]
+    assert [x.stat().st_mtime_ns for x in chunk_files(tmp_path / 'one')] == before
+    # In one folder, the last shard writes the table.
+    assert run('--workers=1', '--shard=0/2', '--out=both.parquet')[0] == 0
+    assert not (tmp_path / 'both.parquet').exists()
+    assert run('--workers=1', '--shard=1/2', '--out=both.parquet')[1] == 'both.parquet\n'
+    assert (tmp_path / 'both.parquet').read_bytes() == expected[0]
+
+
+def test_resume_computes_what_is_missing_or_damaged_and_nothing_else(run, tmp_path, expected):
+    run('--workers=1', '--out=a')
+    missing, damaged, kept = chunk_files(tmp_path / 'a')
+    missing.unlink()
+    content = bytearray(damaged.read_bytes())
+    content[len(content) // 2] ^= 1
+    damaged.write_bytes(content)
+    (tmp_path / 'a' / 'table.parquet').unlink()
+    before = kept.stat().st_mtime_ns
+    assert run('--workers=1', '--shard=0/3', '--out=a')[0] == 1
+    assert run('--workers=1', '--resume', '--out=a')[0] == 0
+    assert (tmp_path / 'a' / 'table.parquet').read_bytes() == expected[0]
+    assert chunk_files(tmp_path / 'a') == [missing, damaged, kept]
+    assert kept.stat().st_mtime_ns == before
+
+
+class Deadly:
+    """A study whose worker is killed in one chunk, the first time."""
+
+    size = 6 * LEAST_ROWS
+    digest = 'deadly'
+
+    def __init__(self, log):
+        self.log = log
+
+    def table(self, begin, end):
+        import pyarrow
+
+        log = self.log / f'{begin:06d}-{os.getpid()}'
+        first = not list(self.log.glob(f'{begin:06d}-*'))
+        log.touch()
+        if begin == 2 * LEAST_ROWS and first:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return pyarrow.table({'row': list(range(begin, end))})
+
+
+@pytest.mark.parametrize('workers', [1, 2])
+def test_a_killed_worker_costs_its_chunk_and_nothing_that_was_done(tmp_path, workers):
+    said = []
+    (tmp_path / 'log').mkdir()
+    outcome = compute(
+        Deadly(tmp_path / 'log'), tmp_path / 'study',
+        lambda: executors.local_processes(workers), say=said.append)
+    chunks = Chunks.of(Deadly(tmp_path / 'log'), tmp_path / 'study')
+    assert len(said) == 1
+    assert 'a worker died' in said[0]
+    assert outcome.computed == chunks.count == 6
+    assert [x for table in chunks.tables() for x in table['row'].to_pylist()] == list(
+        range(Deadly.size))
+    # Only what was in the workers' hands was begun twice.
+    assert 1 <= len(list((tmp_path / 'log').iterdir())) - 6 <= workers
+    assert sorted(x.name for x in (tmp_path / 'study').iterdir()) == ['chunks', 'study.json']
+
+
+def test_interrupt_leaves_whole_chunks_and_nothing_else(tmp_path):
+    # A session of its own, so that the signal goes to all workers too, as on a terminal.
+    process = subprocess.Popen(
+        ['env', '--default-signal=INT', sys.executable, '-m', 'hmsa_ros', 'sweep',
+         '--zeta=0:2:1000', '--j-lim=1:9:2000', '--workers=2', '--out=a'], cwd=tmp_path,
+        stderr=subprocess.PIPE, text=True, start_new_session=True)
+    while not list(tmp_path.glob('a/chunks/*.parquet')):
+        assert process.poll() is None
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate()
+    assert process.returncode == 128 + signal.SIGINT
+    said, ended = err.splitlines()
+    assert said.startswith('2,000,000 plans in 100 chunks of 20,000: about 0.1 GB')
+    assert ended.endswith('of 100 chunks are in a: go on with --resume')
+    assert sorted(x.name for x in (tmp_path / 'a').iterdir()) == ['chunks', 'study.json']
+    sweep = Sweep({'zeta': parse_grid('0:2:1000', 'zeta'), 'j_lim': parse_grid('1:9:2000', 'j')})
+    chunks = Chunks.of(sweep, tmp_path / 'a')
+    found = chunks.found()
+    assert len(found) == len(chunk_files(tmp_path / 'a'))
+    assert all(chunks.sound(x) for x in found.values())
+
+
+def test_any_executor_computes_a_study(sweep, tmp_path, expected):
+    with ThreadPoolExecutor(2) as executor:
+        assert compute(sweep, tmp_path / 'study', executor).computed == CHUNKS
+    Chunks.of(sweep, tmp_path / 'study').merge(tmp_path / 'table.parquet')
+    assert (tmp_path / 'table.parquet').read_bytes() == expected[0]
+
+
+def test_a_dask_cluster_writes_the_same_table(run, tmp_path, expected):
+    pytest.importorskip('distributed')
+    assert run('--dask=local', '--workers=1', '--out=a.parquet')[:2] == (0, 'a.parquet\n')
+    assert (tmp_path / 'a.parquet').read_bytes() == expected[0]
+
+
+@pytest.mark.parametrize(('text', 'part'), [
+    ('0/4', (0, 4)), ('3/4', (3, 4)), ('4/4', (0, 4)), ('1/1', (0, 1))])
+def test_shards_are_numbered_from_0_or_from_1(text, part):
+    assert parse_shard(text) == part
+
+
+@pytest.mark.parametrize('text', ['5/4', '-1/4', '1/0', '0/0', '2', '1/', 'a/b', '1/2/3', '1.0/2'])
+def test_shards_that_do_not_exist_are_refused(text):
+    with pytest.raises(BadInputError, match='expected I/N'):
+        parse_shard(text)
+
+
+@pytest.mark.parametrize(('words', 'message'), [
+    (['--workers=0', '--out=a'], '--workers is 0'),
+    (['--workers=2'], '--workers without --out'),
+    (['--shard=0/2'], '--shard without --out'),
+    (['--shard=7/2', '--out=a'], "'7/2'"),
+    (['--dask=tcp://x:1', '--workers=2', '--out=a'], 'one of them'),
+    (['--workers=1', '--out=a.txt'], '.csv or .parquet'),
+    (['--workers=1', '--out=none/a.csv'], 'cannot write none/a.csv'),
+])
+def test_options_that_do_not_fit_are_refused_in_one_line(run, tmp_path, words, message):
+    status, out, err = run(*words)
+    assert (status, out, err.count('\n')) == (2, '', 1)
+    assert message in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_address_without_a_scheduler_is_refused(run, tmp_path, monkeypatch):
+    pytest.importorskip('distributed')
+    monkeypatch.setattr(executors, 'PATIENCE', 0.5)
+    for address in ('tcp://127.0.0.1:9', 'nonsense://x', 'none.json'):
+        status, out, err = run(f'--dask={address}', '--out=a')
+        assert (status, out, err.count('\n')) == (2, '', 1)
+        assert f'no Dask scheduler answers at {address!r}' in err
+
+
+def test_a_missing_dask_is_said_with_how_to_get_it(run, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'distributed', None)
+    status, _, err = run('--dask=local', '--out=a')
+    assert (status, err.count('\n')) == (2, 1)
+    assert 'hmsa_ros[cluster]' in err
+
+
+def test_the_folder_of_another_study_is_refused_and_kept(run, tmp_path):
+    assert run('--workers=1', '--shard=0/3', '--out=a')[0] == 0
+    before = chunk_files(tmp_path / 'a')
+    status, _, err = run('--c1=3', '--workers=1', '--resume', '--out=a')
+    assert (status, err.count('\n')) == (2, 1)
+    assert 'a holds another study' in err
+    assert chunk_files(tmp_path / 'a') == before
+    (tmp_path / 'a' / 'study.json').unlink()
+    assert 'no study.json' in run('--workers=1', '--out=a')[2]
+
+
+class Failing:
+    """A study that cannot be computed."""
+
+    size = 1
+    digest = 'failing'
+
+    def table(self, begin, end):
+        raise MemoryError(f'{begin} to {end}')
+
+
+def test_a_chunk_that_fails_is_named(tmp_path):
+    with pytest.raises(HmsaError, match=r'chunk 0 failed \(MemoryError: 0 to 1\)'):
+        compute(Failing(), tmp_path)
+    assert not list(Path(tmp_path).glob('.run-*'))
