@@ -63,7 +63,7 @@ graph: tools ## draw docs/images/graph.svg anew, when a topic has changed
 	$(BIN)/python scripts/draw_graph.py
 
 .PHONY: theory
-theory: tools ## draw the figures of docs/theory.md anew
+theory: tools ## draw the figures of docs/theory.md and docs/laws.md anew
 	$(BIN)/python scripts/draw_theory.py
 
 .PHONY: constraints

@@ -1,5 +1,5 @@
 """
-Draw the figures of docs/theory.md into docs/images, from the package itself.
+Draw the figures of docs/theory.md and docs/laws.md into docs/images, from the package itself.
 
 Used by ``make theory``.
 """
@@ -13,6 +13,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from hmsa_ros.core.delivery import Delivery, pieces  # noqa: E402
+from hmsa_ros.core.laws import LAWS  # noqa: E402
 from hmsa_ros.core.model import elastic_force, stretch_limits  # noqa: E402
 from hmsa_ros.core.moves import State  # noqa: E402
 from hmsa_ros.core.parameters import NondimensionalParameters  # noqa: E402
@@ -126,12 +127,39 @@ def deliveries(path: Path) -> None:
             style.finish(rows[1, i], r'time $\tau$', '' if i else r'stretch $\lambda$')
 
 
+def laws(path: Path) -> None:
+    """Draw the load that holds a stretch by each law, all with the same modulus."""
+    cases = {
+        'mooney_rivlin': {'law.c10': 3e3, 'law.c01': 2e3},
+        'yeoh': {'law.c10': 5e3, 'law.c20': -200.0, 'law.c30': 40.0},
+        'ogden': {'law.mu': [2e4], 'law.alpha': [1.0]},
+        'arruda_boyce': {'law.mu': [8.354e3], 'law.lambda_m': 2.0}}
+    groups = {'gent, J 5': MATERIAL, 'neo_hookean': NondimensionalParameters(j_lim=np.inf)} | {
+        name: NondimensionalParameters(law=LAWS[name].scaled(values)[1])
+        for name, values in cases.items()}
+    looks = zip(
+        (style.BLUE, style.GREY, style.GREEN, style.VERMILION, style.PURPLE, style.ORANGE),
+        ('-', '-', '--', '-.', ':', '-'), strict=True)
+    with style.picture(path, 3.2, width=5.0) as figure:
+        axes = figure.add_subplot()
+        stretch = np.linspace(0.5, 2.6, 1001)
+        for (name, group), (colour, line) in zip(groups.items(), looks, strict=True):
+            axes.plot(stretch, elastic_force(stretch, group), color=colour, linestyle=line,
+                      label=name)
+        axes.axhline(0.0, color=style.GREY, linewidth=0.6)
+        axes.plot([1.0], [0.0], **style.EQUILIBRIUM)
+        axes.set_ylim(-4.0, 6.0)
+        axes.legend(loc='upper left')
+        style.finish(axes, r'stretch $\lambda$', r"load that holds it, $\beta_1 = \psi'$")
+
+
 def main() -> int:
     """Draw all of them."""
     force(FOLDER / 'theory_force.png')
     two_steps(FOLDER / 'theory_two_steps.png')
     energy(FOLDER / 'theory_paths.png')
     deliveries(FOLDER / 'theory_deliveries.png')
+    laws(FOLDER / 'laws.png')
     return 0
 
 

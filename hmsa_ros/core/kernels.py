@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from hmsa_ros.core.compiling import compiled
 from hmsa_ros.core.dop853 import ERROR_3, ERROR_5, MATRIX, NODES, STAGES, WEIGHTS
 from hmsa_ros.core.law import acceleration, KIND, motion, natural_frequency, ZETA
-from hmsa_ros.core.laws.record import ANY, GENT, NEO_HOOKEAN, OGDEN, POLYNOMIAL, TABLE
+from hmsa_ros.core.laws.record import ANY, GENT, NEO_HOOKEAN, OGDEN, POLYNOMIAL
 
 # Status codes of the integration.
 DONE = 0
@@ -76,18 +76,21 @@ def step(k, l, v, s, r, beta, slope, p, q, h, material, rtol):  # noqa: E741
     """
     if material[KIND] <= NEO_HOOKEAN:
         return _step(k, l, v, s, r, beta, slope, p, q, h, material, rtol, GENT)
-    return _family_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol)
+    if material[KIND] == POLYNOMIAL:
+        return _polynomial_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol)
+    return _ogden_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol)
 
 
 @compiled()
-def _family_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol):  # noqa: E741
-    """Make a step for a law beside Gent."""
-    family = material[KIND]
-    if family == POLYNOMIAL:
-        return _step(k, l, v, s, r, beta, slope, p, q, h, material, rtol, POLYNOMIAL)
-    if family == OGDEN:
-        return _step(k, l, v, s, r, beta, slope, p, q, h, material, rtol, OGDEN)
-    return _step(k, l, v, s, r, beta, slope, p, q, h, material, rtol, TABLE)
+def _polynomial_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol):  # noqa: E741
+    """Make a step, compiled by itself to keep the one for Gent short."""
+    return _step(k, l, v, s, r, beta, slope, p, q, h, material, rtol, POLYNOMIAL)
+
+
+@compiled()
+def _ogden_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol):  # noqa: E741
+    """Make a step, compiled by itself to keep the one for Gent short."""
+    return _step(k, l, v, s, r, beta, slope, p, q, h, material, rtol, OGDEN)
 
 
 @compiled(inline=True)

@@ -12,7 +12,6 @@ GENT = 0.0  # 1/J_lim
 NEO_HOOKEAN = 1.0  # none
 POLYNOMIAL = 2.0  # b, a_1 to a_5 of b (I2 - 3) + sum a_k (I1 - 3)^k
 OGDEN = 3.0  # number of terms, then mu and alpha of each
-TABLE = 4.0  # first stretch, width and number of intervals, then five numbers of each
 
 #: Place of the constants in a packed material.
 CONSTANTS = 6
