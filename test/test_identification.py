@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from benchmarks.bench_identification import levels_of
 from hmsa_ros.core.two_step import plan_two_step
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification import identify, profile, Recording
@@ -175,6 +176,20 @@ def test_shaped_moves_alone_are_identified_with_a_warning():
     assert found.verdict == 'identified', found.reason
     assert max(map(abs, relative(found).values())) < 4.0
     assert any('sixth of the information' in x for x in found.warnings)
+
+
+def test_search_among_slow_samples_of_shaped_moves_does_not_end_far_off():
+    times = np.arange(400) / 200.0
+    recording = Recording(times, 1.0 + 0.1 * np.sin(70.0 * times), *levels_of(True, 15))
+    clean = respond(recording, values_of(BLOCK), (), rtol=1e-10).stretch
+    noise = 1e-4 * np.random.default_rng(1002).standard_normal(len(times))
+    # Here differences from one sample to the next are as large as what a wrong fit leaves.
+    start = replace(
+        BLOCK, shear_modulus=2058.774275913783, remanence=0.1015426981741141,
+        chain_limit=6.465398485581865, damping_coefficient=4.7000366100194295)
+    found = identify(replace(recording, stretch=clean + noise), actuator=start)
+    assert found.verdict == 'identified', found.reason
+    assert max(map(abs, relative(found).values())) < 4.0
 
 
 def test_time_unit_serves_where_geometry_is_unknown():

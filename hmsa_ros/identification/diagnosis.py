@@ -5,13 +5,14 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+from scipy.stats import binom
 
 from hmsa_ros.core.model import Array
 from hmsa_ros.identification.fit import Fit
 from hmsa_ros.identification.noise import autocorrelation, inflation, Whiteness, whiteness
 from hmsa_ros.identification.quantities import QUANTITIES
 from hmsa_ros.identification.recording import Recording
-from hmsa_ros.identification.response import respond
+from hmsa_ros.identification.response import complete, respond
 from hmsa_ros.identification.result import Signature
 
 # Deviation, in the coordinates, from which on a number is none: of positive values a quarter.
@@ -26,7 +27,7 @@ _FEWEST_PARTS = 8
 _OUT = 0.5  # weight below which a sample does not count
 _SOON = 10  # samples after a change of level
 _NUMERICAL = 1e-6  # residuals below this are those of the integration
-_DISTANT = 0.1  # residual over motion from which on nothing was fitted
+DISTANT = 0.1  # residual over motion from which on nothing was fitted
 
 
 def allowed(fit: Fit) -> Array:
@@ -178,10 +179,10 @@ class _Columns:
 
     def _by(self, names: Sequence[str], values: dict[str, float]) -> Array:
         response = respond(
-            self.recording, values, (*self.fit.free, *names), at_rest=self.at_rest)
+            self.recording, complete(values, self.fit.free), names, at_rest=self.at_rest)
         if response is None:
             return np.zeros((len(self.recording.time), len(names)))
-        return response.jacobian[:, len(self.fit.free):]
+        return response.jacobian
 
 
 _WORDS = {
@@ -306,11 +307,12 @@ def in_motion(recording: Recording, fit: Fit) -> float:
     return float(fast / slow) if slow > 0.0 else 1.0
 
 
-def mistaken(recording: Recording, fit: Fit) -> bool:
+def mistaken(recording: Recording, fit: Fit, chance: float = 0.02) -> bool:
     """
     Whether what did not count is motion: it lies right after the changes of level.
 
-    A fit to the levels at rest alone may take the few samples in motion for outliers.
+    A fit to the levels at rest alone may take the few samples in motion for outliers. Outliers
+    of the sensor lie there with the probability given at most.
     """
     out = fit.weights < _OUT
     changes = recording.level_times[1:][np.diff(recording.levels) != 0.0]
@@ -318,14 +320,17 @@ def mistaken(recording: Recording, fit: Fit) -> bool:
         return False
     place = np.searchsorted(recording.time, changes)
     last = np.searchsorted(changes, recording.time, side='right') - 1
-    after = (last >= 0) & (np.arange(len(out)) - place[last] < _SOON)
+    # Of slow samples only a third of those on a level.
+    soon = min(_SOON, max(len(out) // (3 * len(changes)), 1))
+    after = (last >= 0) & (np.arange(len(out)) - place[last] < soon)
     usual = float(np.mean(after))
-    return float(np.mean(after[out])) > usual + 0.4 * (1.0 - usual)
+    return float(np.mean(after[out])) > usual + 0.4 * (1.0 - usual) and bool(binom.sf(
+        np.count_nonzero(after & out) - 1, np.count_nonzero(out), usual) < chance)
 
 
 def distant(recording: Recording, fit: Fit, found: Whiteness) -> bool:
     """Whether nothing of the motion was fitted."""
-    return not found.white and fit.scale > _DISTANT * float(np.std(recording.stretch)) and abs(
+    return not found.white and fit.scale > DISTANT * float(np.std(recording.stretch)) and abs(
         float(found.autocorrelation[1])) > 0.2
 
 

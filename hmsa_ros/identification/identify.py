@@ -33,10 +33,13 @@ _95 = 1.959963984540054
 _NEAR_WHITE = 1.5
 # Neighbours that are both outliers, as a share of all, from which on they may be motion.
 _ADJACENT = 0.002
-# Simulations for each of the starts; the best one goes on.
-_FIRST_PASSES = 25
+# Simulations for each of the starts; the best one goes on. Once there is a fit, the others get
+# fewer, and the rest only if the loss is within this factor of the best.
+_FIRST_PASSES, _FEW_PASSES, _PROMISING = 25, 8, 4.0
 # A time unit seen in the data is tried before the others up to this factor from the given one.
 _FAR = 4.0
+# Outliers so unlikely to lie in motion by chance make a fit one to go on from.
+_DOUBT = 0.05
 # As many fits at one optimum end the search.
 _ENOUGH = 2
 # Fits within this share of the deviations, or of the scale, are one optimum.
@@ -130,8 +133,10 @@ def _good(recording: Recording, found: Fit) -> bool:
     return bool(
         found.converged
         and found.scale < _NEAR_WHITE * robust_scale(differences) / math.sqrt(2.0)
+        # Of few samples a level even what is far off differs from one to the next.
+        and found.scale < diagnosis.DISTANT * float(np.std(recording.stretch))
         and np.count_nonzero(out[1:] & out[:-1]) <= _ADJACENT * len(out)
-        and not diagnosis.mistaken(recording, found))
+        and not diagnosis.mistaken(recording, found, _DOUBT))
 
 
 def _search(
@@ -142,7 +147,11 @@ def _search(
 
     def tried(candidates: Sequence[Mapping[str, float]]) -> bool:
         for candidate in candidates:
-            one = fit(recording, candidate, free, at_rest=at_rest, most=_FIRST_PASSES)
+            few = any(x.converged for x in found)
+            one = fit(recording, candidate, free, at_rest=at_rest,
+                      most=_FEW_PASSES if few else _FIRST_PASSES)
+            if few and one is not None and not one.converged and _promising(found, one):
+                one = fit(recording, one.values, free, at_rest=at_rest, most=_FIRST_PASSES)
             if one is not None:
                 found.append(one)
                 if _good(recording, one) or _settled(recording, found):
@@ -177,10 +186,20 @@ def _best(found: Sequence[Fit]) -> tuple[Fit, int]:
     return found[int(np.argmin(losses))], agreed
 
 
+def _promising(found: Sequence[Fit], one: Fit) -> bool:
+    """Whether a fit that has not ended may still become the likeliest."""
+    best, _ = _best([x for x in found if x.converged])
+    return loss(one.residual, best.scale, convex=True) < _PROMISING * loss(
+        best.residual, best.scale, convex=True)
+
+
 def _settled(recording: Recording, found: Sequence[Fit]) -> bool:
     """Whether several starts ended at the likeliest fit, though it leaves more than noise."""
     best, agreed = _best(found)
-    return agreed >= _ENOUGH and best.converged and not diagnosis.mistaken(recording, best)
+    return (
+        agreed >= _ENOUGH and best.converged
+        and best.scale < diagnosis.DISTANT * float(np.std(recording.stretch))
+        and not diagnosis.mistaken(recording, best, _DOUBT))
 
 
 def _miss(recording: Recording, candidate: Mapping[str, float], at_rest: bool) -> float:

@@ -27,8 +27,9 @@ _CHAIN_LIMITS = (1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 15.0, 40.0, 1000.0)
 _FREQUENCIES = 160
 _DECAYS = (0.02, 0.1, 0.3)
 # Of the scan over the time unit: from one on over the other, and samples that count.
-_SCAN_RANGE, _SCAN_POINTS, _SCAN_DECAYS, _SCAN_SAMPLES = 12.0, 64, (0.05, 0.4), 300
-_BEST = 3  # of the scan
+_SCAN_RANGE, _SCAN_POINTS, _SCAN_DECAYS, _SCAN_SAMPLES = 12.0, 192, (0.05, 0.4), 300
+# Best ones of the scan that are taken, and the least factor between their time units.
+_BEST, _APART = 5, 1.06
 _SHORTEST = 0.02  # time unit in intervals of the samples
 
 
@@ -226,7 +227,7 @@ def scan(
     part = replace(recording, time=recording.time[:first], stretch=recording.stretch[:first]) \
         if first < len(recording.time) else recording
     shortest = _SHORTEST * float(np.median(np.diff(recording.time)))
-    tried: list[tuple[float, int, dict[str, float]]] = []
+    tried: list[tuple[float, dict[str, float]]] = []
     timed = {'shear_modulus', 'density', 'time_unit'}.intersection(free)
     factors = np.geomspace(1.0 / _SCAN_RANGE, _SCAN_RANGE, _SCAN_POINTS) if timed else (1.0,)
     c1 = 2.0 * (values['half_thickness'] / values['half_length']) ** 2
@@ -243,9 +244,14 @@ def scan(
             response = respond(part, candidate, (), at_rest=at_rest, rtol=1e-5)
             if response is not None:
                 miss = float(np.mean(np.abs(part.stretch - response.stretch)))
-                tried.append((miss, len(tried), candidate))
-    tried.sort()
-    return [x[2] for x in tried[:_BEST]]
+                tried.append((miss, candidate))
+    best: list[dict[str, float]] = []
+    for _, candidate in sorted(tried, key=lambda x: x[0]):
+        if len(best) < _BEST and (not timed or all(
+                abs(math.log(candidate['time_unit'] / x['time_unit'])) > math.log(_APART)
+                for x in best)):
+            best.append(candidate)
+    return best
 
 
 def _candidate(
