@@ -64,6 +64,11 @@ def parse_shard(text: str) -> tuple[int, int]:
     """
     Read ``I/N``, a part of an array job: I from 0 to N - 1, or from 1 to N; N is the same as 0.
 
+    Parameters
+    ----------
+    text : str
+        What to read.
+
     Returns
     -------
     tuple of int

@@ -66,6 +66,11 @@ def dask(address: str, workers: int | None = None) -> Iterator[tuple[Executor, i
     workers : int, optional
         Processes of a local cluster; default: one a core.
 
+    Yields
+    ------
+    tuple of Executor and int
+        The executor, and how many chunks to submit ahead.
+
     Raises
     ------
     BadInputError
@@ -115,12 +120,8 @@ def cores() -> int:
 
 @contextmanager
 def held_signals() -> Iterator[None]:
-    """
-    Let SIGINT wait.
-
-    A process that starts meanwhile never gets it: Ctrl-C goes to all processes of a terminal, but
-    it is for the one that starts the others to end them.
-    """
+    """Let SIGINT wait; processes that start meanwhile never get it."""
+    # Ctrl-C goes to all processes of a terminal; the one that started the others ends them.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
