@@ -148,3 +148,14 @@ def test_rows_without_numbers_and_gaps_are_said(folder, capsys):
     notes = json.loads(out)['warnings']
     assert any('4 rows without a number' in x for x in notes)
     assert any('gap of 0.052 s' in x for x in notes)
+
+
+def test_seconds_of_an_epoch_are_as_good_as_those_of_the_run(folder, capsys):
+    epoch = 1.7e9
+    for name, head, rows in (('camera.csv', 'time,stretch', zip(TIMES, STRETCH, strict=True)),
+                             ('levels.csv', 'time,flux_density', zip(*LEVELS, strict=True))):
+        with open(name, 'w', encoding='utf-8') as file:
+            file.write('\n'.join([head, *(f'{epoch + t:.6f},{y:.9f}' for t, y in rows)]) + '\n')
+    status, out, err = identify(capsys, 'camera.csv', '--commands', 'levels.csv')
+    assert (status, err) == (0, '')
+    assert 'identified' in out

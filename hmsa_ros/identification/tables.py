@@ -246,12 +246,14 @@ def read_csv(
             # As a coil is before anybody commands it.
             times, levels = np.append(time[0], times), np.append(0.0, levels)
             notes.append(f'before the first level at {times[1]:.6g} s the field is taken to be 0')
+        earlier = 0.0
     else:
         times, levels, earlier = _sampled_levels(
             path, time, table.columns['flux_density'][keep], notes)
-        return Recording(
-            time, stretch, times, levels, slew_limit, earlier, str(path), tuple(notes))
-    return Recording(time, stretch, times, levels, slew_limit, 0.0, str(path), tuple(notes))
+    # From the first sample on: seconds of an epoch leave no digits for what happens between.
+    return Recording(
+        time - time[:1], stretch, times - time[:1], levels, slew_limit, earlier, str(path),
+        tuple(notes))
 
 
 def _kept(path: Path, table: Table, notes: list[str]) -> NDArray[np.bool_]:
