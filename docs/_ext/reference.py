@@ -263,7 +263,8 @@ class Parameters(Generated):
             else:
                 shown = str(default).lower()
             details = [
-                type(default).__name__ if not isinstance(default, list) else 'list of str',
+                type(default).__name__ if not isinstance(default, list)
+                else f'list of {spec.items.__name__}',
                 *([] if limits == 'any value' else [limits]),
                 *([] if spec.read_only else ['can be set while running'])]
             rows.append((
