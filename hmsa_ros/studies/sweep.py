@@ -30,7 +30,7 @@ RESULTS = ('beta_p', 'b_p', 'tau_p', 'beta_1', 'b_1')
 COLUMNS = (*DEFAULTS, 'status', *RESULTS)
 #: More values of one column, or cases, are refused: a sweep has no limit, but they are in memory.
 MOST_VALUES = 10_000_000
-#: Plans a second and core of an idle machine, roughly; bytes of a row as Parquet, at most some.
+#: Roughly: plans a second and core of an idle machine, and bytes of a row as Parquet.
 RATE, ROW_BYTES = 150_000.0, 50
 
 _GRID = 'VALUE, FIRST:LAST:POINTS, log:FIRST:LAST:POINTS, or several separated by commas'
