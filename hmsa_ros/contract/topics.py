@@ -121,6 +121,12 @@ STATUS = Topic(
     '~/status', 'diagnostic_msgs/msg/DiagnosticStatus', LATCHED,
     'The verdict on the last request, with a code and a sentence, what was measured at the last '
     'setpoint, and the progress of its sequence.', publishers=(PLANNER,))
+ESTIMATE = Topic(
+    '~/estimate', 'diagnostic_msgs/msg/DiagnosticArray', RELIABLE,
+    'With the parameter `feedback`: a status of each joint with what samples say of it in a '
+    'sentence, the parameters believed with their standard deviations (`NAME.std`) and the given '
+    'values (`NAME.nominal`), whether plans use them, and how many samples were rejected.',
+    publishers=(PLANNER,))
 FLUX_DENSITY_COMMAND = Topic(
     'flux_density_command', _FIELD, COMMAND,
     'The shaped command: from its stamp on, which may be in the future, z is the flux density '

@@ -6,7 +6,8 @@ draft (`hmsa_ros.core.drafting`), which changes nothing, and then taken: several
 take all of a request or none of it (`hmsa_ros.core.group`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from hmsa_ros.core.drafting import (
     check_points,
@@ -62,6 +63,9 @@ class Planner(RunningPlan):
             stretch: float = 1.0) -> None:
         """Start at rest."""
         super().__init__(Model(actuator, options), stretch)
+        #: Returns stretch and rate in 1/s believed of a time in ns where samples show them; None
+        #: for what is predicted.
+        self.believed: Callable[[int], tuple[float, float] | None] = lambda time: None
 
     @property
     def options(self) -> Options:
@@ -139,7 +143,7 @@ class Planner(RunningPlan):
 
         """
         yield from check_points(points)
-        soonest = self._soonest(now)
+        soonest = self.soonest(now)
         base = soonest if stamp is None else stamp
         outset = self._outset(on_grid(max(base, soonest), self.model))
         return (yield from draft_sequence(outset, points, base, now))
@@ -147,17 +151,17 @@ class Planner(RunningPlan):
     def draft_setpoint(self, stretch: float, now: int) -> Steps[Draft | None]:
         """Work out a move to one stretch; None where it changes nothing."""
         check_target(stretch)
-        return (yield from draft_target(self._outset(self._soonest(now)), stretch))
+        return (yield from draft_target(self._outset(self.soonest(now)), stretch))
 
     def draft_stop(self, now: int) -> Steps[Draft]:
         """Work out how to come to rest."""
-        return (yield from draft_stop(self._outset(self._soonest(now))))
+        return (yield from draft_stop(self._outset(self.soonest(now))))
 
     def draft_resumption(self, now: int) -> Steps[Draft | None]:
         """Plan what is left anew, from where the actuator really is; None if nothing is left."""
         # From the first time that a command can reach, or, where there is no way from the motion
         # it meets, a part of a period later.
-        begin = self._soonest(now)
+        begin = self.soonest(now)
         if self.plan.segments:
             begin = max(begin, self.plan.segments[0].since)
         outset = self._outset(begin)
@@ -170,8 +174,13 @@ class Planner(RunningPlan):
         return (yield from draft_resumption(outset))
 
     def _outset(self, begin: int) -> Outset:
-        return Outset(self.plan, self.model, begin, self.state(begin), self._history.stale)
+        state = self.state(begin)
+        believed = self.believed(begin)
+        if believed is not None:
+            state = replace(
+                state, stretch=believed[0], rate=believed[1] * self.model.units.time)
+        return Outset(self.plan, self.model, begin, state, self._history.stale)
 
-    def _soonest(self, now: int) -> int:
+    def soonest(self, now: int) -> int:
         """Return the first time that a command can still reach in time."""
         return on_grid(now + self.model.options.lead_time, self.model)

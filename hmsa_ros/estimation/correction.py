@@ -85,7 +85,9 @@ class Expectation:
     size: float
 
 
-def expect(estimate: Estimate, course: Course, slew_limit: float = math.inf) -> Expectation:
+def expect(
+        estimate: Estimate, course: Course, slew_limit: float = math.inf,
+        until: int = 0) -> Expectation:
     """
     Return what a course is expected to leave.
 
@@ -97,6 +99,8 @@ def expect(estimate: Estimate, course: Course, slew_limit: float = math.inf) -> 
         With the level in force then.
     slew_limit : float
         Of the amplifier in T/s; infinite for steps.
+    until : int
+        Time in ns at which it counts, if the course ends sooner: vibration decays meanwhile.
 
     Returns
     -------
@@ -106,7 +110,7 @@ def expect(estimate: Estimate, course: Course, slew_limit: float = math.inf) -> 
     """
     nothing = Expectation(math.inf, math.inf, math.inf)
     begin = estimate.time
-    end = max(course.arrival, begin)
+    end = max(course.arrival, begin, until)
     motion = follow(
         estimate.values, estimate.free, (estimate.stretch, estimate.rate),
         Levels(np.array([(x - begin) / NANOSECONDS for x, _ in course.levels]),
@@ -216,12 +220,8 @@ class Corrector:
         if not estimate.trusted:
             return None
         slew = self.options.slew_limit
-        now = expect(estimate, course, slew)
         best: Course | None = None
-        least = min(
-            math.sqrt(_SHARE) * now.size, now.size - _GAIN * estimate.noise)
-        if not least > 0.0:
-            return None
+        least = math.inf
         try:
             model = self.model(estimate)
         except BadInputError:
@@ -229,7 +229,8 @@ class Corrector:
         for found in self._candidates(model, estimate, course):
             whole = found.follows(course, estimate.time)
             size = expect(estimate, whole, slew).size
-            if size < least:
+            now = expect(estimate, course, slew, whole.arrival).size
+            if size < min(least, math.sqrt(_SHARE) * now, now - _GAIN * estimate.noise):
                 best, least = whole, math.sqrt(_SHARE) * size
         return best
 

@@ -3,15 +3,16 @@
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 import math
 
 import numpy as np
 
 from hmsa_ros.core.model import Array
-from hmsa_ros.core.parameters import ActuatorParameters
+from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.estimation.motion import Levels, rest
+from hmsa_ros.estimation.motion import follow, Levels, rest
 from hmsa_ros.estimation.prior import Prior
 from hmsa_ros.estimation.screening import Screening
 from hmsa_ros.estimation.window import coordinates, Solution, Window
@@ -164,8 +165,9 @@ class Estimator:
         self._levels[place:] = [(stamp, flux_density)]
 
     def set_levels(self, levels: Sequence[tuple[int, float]]) -> None:
-        """Take in all levels from the begin of the window on: stamps in ns, and T."""
-        self._levels = list(levels)
+        """Take in all levels from a time on, by stamps in ns and in T; earlier ones stay."""
+        first = levels[0][0]
+        self._levels = [x for x in self._levels if x[0] < first] + list(levels)
 
     def sample(self, stamp: int, stretch: float) -> bool:
         """
@@ -239,6 +241,32 @@ class Estimator:
         estimate = self._estimate(time, found)
         self._go_along(window, found, until)
         return estimate
+
+    def predict(self, time: int) -> Estimate | None:
+        """
+        Return what is believed of a time ahead, without taking in anything.
+
+        Parameters
+        ----------
+        time : int
+            In ns, not before that of the last `update`; levels until then have been taken in.
+
+        Returns
+        -------
+        Estimate or None
+            None before the first update, or if the motion cannot be followed.
+
+        """
+        window, found = self._window, self._solution
+        if window is None or found is None:
+            return None
+        motion = follow(
+            found.values, self.prior.free, (float(found.z[-2]), float(found.z[-1])),
+            self._as_levels(), window.begin,
+            np.array([max(self._seconds(time), window.begin)]))
+        if motion is None:
+            return None
+        return self._estimate(time, replace(found, motion=motion, residual=np.zeros(0)))
 
     def _begin(self) -> Window | None:
         """Return a window at rest under the level in force at the first sample."""
@@ -358,3 +386,13 @@ class Estimator:
         return Levels(
             np.array([self._seconds(x) for x, _ in self._levels]),
             np.array([x for _, x in self._levels]), self.options.slew_limit)
+
+
+@cache
+def warm_up() -> None:
+    """Load the compiled kernels, once a process: where they must be compiled that takes long."""
+    estimator = Estimator(Prior.nominal(paper_actuator()))
+    estimator.level(0, 0.01)
+    estimator.sample(0, 1.0)
+    estimator.update(1_000_000)
+    estimator.predict(2_000_000)

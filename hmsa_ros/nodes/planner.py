@@ -32,6 +32,7 @@ from hmsa_ros.nodes.timekeeping import StepWatch
 from hmsa_ros.nodes.trajectories import read_trajectory
 from hmsa_ros.runtime.planner import PlannerRuntime
 from hmsa_ros.runtime.records import (
+    EstimateChanged,
     Note,
     PlanChanged,
     Send,
@@ -93,13 +94,15 @@ class PlannerNode(ManagedNode):
                 self.get_logger().warning(f'joint {name}: {lost}')
         self._channels = {
             x: JointChannel(self, x, names, self._runtime, self._serve) for x in names}
-        self._plan, self._status, self._diagnostics = (
+        self._plan, self._status, self._estimate, self._diagnostics = (
             self.create_publisher(x.type, x.name, x.qos)
-            for x in (interface.PLAN, interface.STATUS, interface.DIAGNOSTICS))
+            for x in (
+                interface.PLAN, interface.STATUS, interface.ESTIMATE, interface.DIAGNOSTICS))
         self._targets = TargetMarkers(self, self._settings)
         self._publish: dict[type, Callable[..., None]] = {
             Send: self._publish_command, PlanChanged: self._publish_plan,
-            StatusChanged: self._publish_status, Note: self._log}
+            StatusChanged: self._publish_status, EstimateChanged: self._publish_estimate,
+            Note: self._log}
         topic = interface.JOINT_TRAJECTORY
         self.create_subscription(
             topic.type, topic.name, self._on_trajectory, topic.qos, raw=True)
@@ -225,6 +228,12 @@ class PlannerNode(ManagedNode):
         self._status.publish(conversions.to_planner_status(status))
         self._targets.show(self._now(), {
             name: float(x.stretch) if x.stretch else None for name, x in status.each.items()})
+
+    def _publish_estimate(self, estimate: EstimateChanged) -> None:
+        self._estimate.publish(conversions.to_diagnostics(
+            estimate.time, conversions.to_status(
+                f'{self.get_name()}: estimate', estimate.joint, bytes([estimate.severity]),
+                estimate.message, estimate.values)))
 
     def _log(self, note: Note) -> None:
         if note.severity is Severity.ERROR:

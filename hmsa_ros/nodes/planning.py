@@ -18,6 +18,7 @@ from hmsa_ros.core.shapers import SHAPERS
 from hmsa_ros.core.timeline import Model
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification.quantities import check_free
 from hmsa_ros.nodes.joints import JointParameters, JOINTS
 from hmsa_ros.nodes.managed import AUTOSTART
 from hmsa_ros.nodes.marker_publisher import MARKER_SCALE
@@ -28,6 +29,7 @@ from hmsa_ros.nodes.parameters import (
     JOINT,
     ParameterSpec,
 )
+from hmsa_ros.runtime.feedback import MODES
 from hmsa_ros.runtime.measured import Tolerances
 from hmsa_ros.runtime.records import Settings
 
@@ -111,6 +113,15 @@ SPECS = (
         'Offset and vibration up to this stretch are tolerated however small the step is.', '',
         0.0, 1e3, read_only=False),
     ParameterSpec(
+        'feedback', _SETTINGS.feedback,
+        'What samples on joint_states are used for: off; observe estimates parameters and reports '
+        'them on ~/estimate; adapt also corrects plans and plans with what was learnt.',
+        choices=MODES, read_only=False),
+    ParameterSpec(
+        'feedback_parameters', list(_SETTINGS.feedback_parameters),
+        'What feedback estimates besides the state: shear_modulus, damping_coefficient, '
+        'stretch_bias, remanence, chain_limit, coil_time_constant and others of hmsa identify.'),
+    ParameterSpec(
         'takeover_timeout', _SETTINGS.takeover_timeout / NANOSECONDS,
         'How long the first request waits for a sample of the current state, if samples are '
         'published; 0 for no wait.', 's', 0.0, 60.0),
@@ -169,6 +180,8 @@ def settings_from(values: JointParameters) -> Settings:
             'heartbeat_period', 'lateness_tolerance', 'takeover_timeout', 'takeover_max_age')},
         replan_late=bool(values['replan_late']), max_points=int(values['max_points']),
         allow_partial_joints=bool(values['allow_partial_joints']),
+        feedback=str(values['feedback']),
+        feedback_parameters=check_free(values['feedback_parameters']),
         tolerances=Tolerances(*(float(values[f'{x}_tolerance']) for x in (
             'arrival', 'vibration', 'stretch'))))
 

@@ -1,6 +1,6 @@
 """What a runtime tells: verdicts, progress and previews, in the order in which they happen."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from hmsa_ros.core.group import PlannerGroup, Progress
 from hmsa_ros.core.status import Code
@@ -133,6 +133,11 @@ class Bulletin:
             Verdict(
                 Severity.WARN if bad else Severity.OK, str(worst.code), worst.message,
                 self.verdict.request), log=bad and worst in findings)
+
+    def judge_again(self, names: Iterable[str]) -> None:
+        """Have the setpoints of joints judged anew."""
+        for name in names:
+            self._watch.again(name)
 
     def look_for_listeners(self) -> None:
         """Warn where nobody carries out what is sent, and say when somebody does."""

@@ -8,6 +8,7 @@ from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.timeline import Draft
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.runtime.bulletin import Bulletin
+from hmsa_ros.runtime.feedback import Feedback
 from hmsa_ros.runtime.following import Following
 from hmsa_ros.runtime.records import Note, Request, Severity, Verdict
 from hmsa_ros.runtime.slices import Clock, Work, work_on
@@ -26,6 +27,8 @@ class Planning:
         The joints.
     following : Following
         Knows plans that are to be made anew.
+    feedback : Feedback
+        Knows plans that may be worth correcting.
     bulletin : Bulletin
         Takes the answers.
     clock, steady : callable
@@ -41,10 +44,11 @@ class Planning:
     """
 
     def __init__(
-            self, group: PlannerGroup, following: Following, bulletin: Bulletin, clock: Clock,
-            steady: Clock, send: Callable[[], None]) -> None:
+            self, group: PlannerGroup, following: Following, feedback: Feedback,
+            bulletin: Bulletin, clock: Clock, steady: Clock, send: Callable[[], None]) -> None:
         """Begin with nothing to do."""
         self._group, self._following, self._bulletin = group, following, bulletin
+        self._feedback = feedback
         self._clock, self._steady, self._send = clock, steady, send
         self._queue: deque[Work] = deque()
         self.refused = 0
@@ -100,6 +104,8 @@ class Planning:
         for name in self._following.to_resume():
             if not any(x.request is None and name in x.joints for x in self._queue):
                 self._queue.appendleft(self._following.resumption(name, self._clock))
+        if not self._queue:
+            self._queue += self._feedback.corrections_due(self._clock())
         end = self._steady() + SLICE
         while self._queue and self._steady() < end:
             work = self._queue[0]
@@ -114,13 +120,17 @@ class Planning:
             next(work.steps)
         except StopIteration as end:
             drafts, now = end.value
-            if work.request is None:
+            if work.corrects:
+                self._correct(drafts, now)
+            elif work.request is None:
                 self._resume(work, drafts, now)
             else:
                 self._supersede(work)
                 self._answer(work.request, drafts, now)
         except HmsaError as error:
-            if work.request is None:
+            if work.corrects:
+                self._bulletin.note(f'plan not corrected: {error}')
+            elif work.request is None:
                 self._bulletin.give(
                     self._following.abandon(work, error, self._bulletin.verdict.request),
                     log=True)
@@ -167,6 +177,15 @@ class Planning:
         if verdict is not None:
             self._bulletin.show()
             self._bulletin.give(verdict, log=self._following.tell_replanned())
+
+    def _correct(self, drafts: Mapping[str, Draft], now: int) -> None:
+        """Go on with a plan that was corrected from samples."""
+        verdict = self._feedback.take(drafts, now, self._bulletin.verdict.request)
+        self._send()
+        if verdict is not None:
+            self._bulletin.judge_again(drafts)
+            self._bulletin.show()
+            self._bulletin.give(verdict)
 
     def _give_up(self) -> None:
         verdict = self._following.give_up(next(

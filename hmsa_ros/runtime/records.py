@@ -7,6 +7,7 @@ from enum import IntEnum
 from hmsa_ros.core.group import Progress
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.estimation.prior import TRACKED
 from hmsa_ros.runtime.measured import Finding, Tolerances
 
 
@@ -33,6 +34,10 @@ class Settings:
         Whether a trajectory may be for some of the joints.
     tolerances : Tolerances
         What counts as having arrived, where it is measured.
+    feedback : str
+        ``off``; ``observe`` to estimate from samples; ``adapt`` to correct plans too.
+    feedback_parameters : tuple of str
+        What is estimated besides the state.
 
     Raises
     ------
@@ -49,6 +54,8 @@ class Settings:
     max_points: int = 100_000
     allow_partial_joints: bool = False
     tolerances: Tolerances = field(default_factory=Tolerances)
+    feedback: str = 'off'
+    feedback_parameters: tuple[str, ...] = TRACKED
 
     def __post_init__(self) -> None:
         """Check the numbers."""
@@ -217,4 +224,31 @@ class Note:
     message: str
 
 
-Output = Send | PlanChanged | StatusChanged | Note
+@dataclass(frozen=True)
+class EstimateChanged:
+    """
+    What samples say of a joint.
+
+    Attributes
+    ----------
+    time : int
+        In ns.
+    joint : str
+        Whose it is.
+    severity : Severity
+        WARN where parameters differ from those given, or samples are not trusted.
+    message : str
+        One sentence for people.
+    values : mapping of str to object
+        Parameters in SI, with standard deviations and given values, and counters.
+
+    """
+
+    time: int
+    joint: str
+    severity: Severity
+    message: str
+    values: Mapping[str, object]
+
+
+Output = Send | PlanChanged | StatusChanged | Note | EstimateChanged

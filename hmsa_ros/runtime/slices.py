@@ -32,6 +32,8 @@ class Work:
         None for a plan that is made anew.
     number : int
         Grows from one to the next.
+    corrects : bool
+        Whether it is a correction from samples.
 
     """
 
@@ -39,6 +41,7 @@ class Work:
     steps: Steps[tuple[Mapping[str, Draft], int]]
     request: Request | None = None
     number: int = field(default_factory=count().__next__)
+    corrects: bool = False
 
     @property
     def postponed(self) -> bool:

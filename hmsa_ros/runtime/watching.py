@@ -133,6 +133,17 @@ class Watch:
         found = [x.worst for x in self._joints.values() if x.worst is not None]
         return max(found, key=_rank, default=None)
 
+    def again(self, name: str) -> None:
+        """Judge the setpoint of a joint that is under way anew, since its plan was corrected."""
+        joint = self._joints[name]
+        newest = joint.newest
+        if newest is None or joint.plan is None or newest.expected.setpoint != (
+                joint.place - joint.plan.kept):
+            return
+        joint.newest = None
+        if joint.worst is newest:
+            joint.worst = None
+
     def wake(self, now: int) -> int | None:
         """Return when to judge next, a time in ns; None for never, 0 for now."""
         times = [

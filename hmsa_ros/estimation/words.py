@@ -1,0 +1,104 @@
+"""What an estimate means, in a sentence."""
+
+from collections.abc import Iterator, Mapping
+import math
+
+from hmsa_ros.estimation.estimator import Estimate
+from hmsa_ros.estimation.motion import rest
+
+# A parameter is another one than the nominal from so many deviations and so large a share on.
+_SURE, _MATTERS = 3.0, 0.01
+# Offset and vibration that are worth a word, as shares of the step.
+_OFFSET, _RINGING = 0.01, 0.01
+# Smaller steps have no percentage.
+_STEP = 0.01
+_NAMES = {
+    'shear_modulus': 'G', 'damping_coefficient': 'damping', 'remanence': 'Br',
+    'chain_limit': 'J_lim', 'density': 'density', 'stretch_gain': 'gain of the sensor',
+    'time_unit': 'time unit'}
+_ABSOLUTE = {
+    'coil_time_constant': ('coil lag', 'ms', 1e3), 'constant_force': ('constant force', 'N', 1.0),
+    'sensor_latency': ('latency of the sensor', 'ms', 1e3),
+    'stretch_bias': ('bias of the sensor', '', 1.0)}
+
+
+def differences(estimate: Estimate, nominal: Mapping[str, float]) -> list[str]:
+    """
+    Return which parameters differ from what was known of them.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        What is believed.
+    nominal : mapping of str to float
+        Values of all quantities before.
+
+    Returns
+    -------
+    list of str
+        Such as ``G about +20 %``.
+
+    """
+    return list(_differences(estimate, nominal))
+
+
+def _differences(estimate: Estimate, nominal: Mapping[str, float]) -> Iterator[str]:
+    for name in estimate.free:
+        value, before = estimate.values[name], nominal[name]
+        change = value - before
+        if abs(change) < _SURE * estimate.deviations[name]:
+            continue
+        if name in _ABSOLUTE:
+            label, unit, factor = _ABSOLUTE[name]
+            if name != 'stretch_bias' or abs(change) > _MATTERS:
+                yield f'{label} about {factor * value:.2g} {unit}'.rstrip()
+        elif before and abs(change / before) > _MATTERS:
+            yield f'{_NAMES[name]} about {100.0 * change / before:+.0f} %'
+
+
+def sentence(
+        estimate: Estimate, nominal: Mapping[str, float], holding: float, target: float,
+        start: float, amplitude: float, *, adapting: bool) -> str:
+    """
+    Return what is wrong, and what mends it.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        What is believed.
+    nominal : mapping of str to float
+        Values of all quantities before.
+    holding : float
+        Level in T that holds the target, as planned.
+    target, start : float
+        Stretch to rest at, and the one before.
+    amplitude : float
+        Of the vibration about the rest.
+    adapting : bool
+        Whether plans use the estimate.
+
+    Returns
+    -------
+    str
+        One sentence without its stop.
+
+    """
+    if not estimate.trusted:
+        return f'{estimate.trouble}: open loop until samples fit again'
+    wrong = []
+    at = rest(estimate.values, (), holding)
+    step = target - start
+    if at is not None and abs(step) > _STEP:
+        offset = (at[0] - target) / step
+        if abs(offset) > _OFFSET:
+            wrong.append(f'rests {100.0 * abs(offset):.0f} % {"short" if offset < 0.0 else "far"}')
+        if 2.0 * amplitude > _RINGING * abs(step):
+            wrong.append(f'rings at {at[1] / (2.0 * math.pi):.0f} Hz')
+    found = ', '.join(differences(estimate, nominal))
+    if not wrong and not found:
+        return 'as known'
+    words = ' and '.join(wrong)
+    words += f'{": " if words and found else ""}{found}'
+    if adapting:
+        return f'{words}; plans use it' if found else words
+    return f'{words}; `hmsa identify` or feedback: adapt mends it'

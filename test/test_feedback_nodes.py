@@ -1,0 +1,51 @@
+"""Planner and plant as processes, the plant with a G that is a fifth higher."""
+
+import pytest
+
+from hmsa_ros.nodes import interface
+
+pytestmark = pytest.mark.ros
+# Where the kernels must be compiled first that takes a while.
+RUN_SECONDS = 300.0
+PLANT = ('--ros-args', '-p', 'mismatch.shear_modulus:=1.2', '-p', 'stretch_noise:=0.001')
+
+
+def begin(start, ros, mode):
+    """Start both and wait for them; return a function of the newest sentence and its values."""
+    statuses = ros.collect(interface.STATUS.type, 'planner/status', interface.STATUS.qos)
+    samples = ros.collect(interface.JOINT_STATES.type, 'joint_states', interface.JOINT_STATES.qos)
+    start.hmsa('plant', *PLANT)
+    start.hmsa('planner', '--ros-args', '-p', f'feedback:={mode}')
+    ros.spin_until(lambda: statuses and samples, 'planner and plant', RUN_SECONDS)
+    found = ros.collect(interface.ESTIMATE.type, 'planner/estimate', interface.ESTIMATE.qos)
+
+    def read():
+        if not found:
+            return '', {}
+        status, = found[-1].status
+        return status.message, {x.key: x.value for x in status.values}
+    return read
+
+
+def test_a_planner_that_observes_says_what_is_wrong_with_the_actuator(start, ros):
+    estimate = begin(start, ros, 'observe')
+    send = start.hmsa('send', '1.4:0.5', '--wait')
+    assert send.wait(RUN_SECONDS) == 1, send.output
+    assert '%) short of 1.4 and rings at' in send.output
+    ros.spin_until(lambda: 'G about +20 %' in estimate()[0], 'the estimate')
+    message, values = estimate()
+    assert 'rests 18 % short' in message
+    assert 'feedback: adapt mends it' in message
+    assert float(values['shear_modulus']) == pytest.approx(1.2e4, rel=0.01)
+    assert float(values['shear_modulus.nominal']) == 1e4
+    assert (values['used_by_plans'], values['corrections']) == ('False', '0')
+
+
+def test_a_planner_that_adapts_arrives_with_the_second_move(start, ros):
+    estimate = begin(start, ros, 'adapt')
+    assert start.hmsa('send', '1.4:0.5', '--wait').wait(RUN_SECONDS) in (0, 1)
+    ros.spin_until(lambda: 'plans use it' in estimate()[0], 'the estimate')
+    assert int(estimate()[1]['corrections']) > 0
+    second = start.hmsa('send', '1.1:0.5', '--wait')
+    assert second.wait(RUN_SECONDS) == 0, second.output
+    assert 'measured' in second.output
