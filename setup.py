@@ -80,7 +80,7 @@ EXTRAS_REQUIRE = {
     ],
 }
 
-NODES = ('planner', 'plant', 'recorder', 'player')
+NODES = ('planner', 'plant', 'recorder', 'player', 'controller')
 
 setup(
     name=PACKAGE,

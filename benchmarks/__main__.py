@@ -6,8 +6,8 @@ Measure speed and accuracy.
     python -m benchmarks soak [--hours H] [--minutes M] [--factor F] [--rate HZ]
                              [--picture FILE] [--quick]
 
-NAME is planner, plant, preemption, joints, recorder, player or crash; without one all of these
-are run.
+NAME is planner, plant, preemption, joints, controller, recorder, player or crash; without one all
+of these are run.
 Those of recorder, player and crash take some seven minutes together. faults injects faults into
 running nodes and fails if one is not answered as it should be; soak runs for hours;
 identification fits thousands of simulated runs.
@@ -31,7 +31,8 @@ from benchmarks.sheet import Sheet
 # Of a table that goes to a file.
 _WIDTH = 120
 
-NAMES = ('planner', 'plant', 'preemption', 'joints', 'recorder', 'player', 'crash')
+NAMES = ('planner', 'plant', 'preemption', 'joints', 'controller', 'recorder', 'player',
+         'crash')
 #: Not run unless asked for: they take long and need the machine for themselves.
 LONG = ('faults', 'soak', 'identification')
 
@@ -117,7 +118,7 @@ def main(arguments: list[str] | None = None) -> int:
         if not reports[-1].passed:
             console.print('identification: not what is promised')
             status = 1
-    for name in ('joints', 'recorder', 'player', 'crash'):
+    for name in ('joints', 'controller', 'recorder', 'player', 'crash'):
         if name in names and _has_ros(name):
             sheet = importlib.import_module(f'benchmarks.bench_{name}').compare(
                 quick=options.quick)

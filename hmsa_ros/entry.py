@@ -32,6 +32,11 @@ def recorder() -> int:
     return main(['recorder', *sys.argv[1:]])
 
 
+def controller() -> int:
+    """Run ``hmsa controller``."""
+    return main(['controller', *sys.argv[1:]])
+
+
 def player() -> int:
     """Run ``hmsa player``."""
     return main(['player', *sys.argv[1:]])

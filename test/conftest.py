@@ -436,7 +436,7 @@ class Served:
     def _run(self, node: Any) -> None:
         from hmsa_ros.nodes.runner import spin
         try:
-            spin(node, lambda: self._ending)
+            spin((node,), lambda: self._ending)
         except BaseException as error:  # whatever it is, it would have ended the process
             self._failures.append(error)
 

@@ -1,4 +1,4 @@
-"""``hmsa planner``, ``hmsa plant``, ``hmsa recorder`` and ``hmsa player``: run a node."""
+"""``hmsa planner`` and its like: run a node, or planner and plant in one process."""
 
 import argparse
 from importlib import import_module
@@ -11,12 +11,14 @@ NODES = {
     'plant': 'simulate the actuator',
     'recorder': 'record topics to a bag',
     'player': 'replay a bag',
+    'controller': 'planner and plant in one process and one loop',
 }
 _EXAMPLES = {
     'planner': '-r __ns:=/left',
     'plant': '-p publish_rate:=500.0',
     'recorder': '-p storage.uri:=my_run -p record.all_topics:=true',
     'player': '-p storage.uri:=my_run',
+    'controller': '--params-file actuator.yaml -p lead_time:=0.003',
 }
 
 

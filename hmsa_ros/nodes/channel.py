@@ -18,17 +18,19 @@ class JointChannel:
 
     def __init__(
             self, node: Node, joint: str, joints: Sequence[str], runtime: PlannerRuntime,
-            serve: Callable[[], None]) -> None:
-        """Create publisher and subscriptions."""
+            serve: Callable[[], None], *, linked: bool = False) -> None:
+        """Create publisher and subscriptions; who is linked gives news of commands itself."""
         self._node, self._joint, self._runtime, self._serve = node, joint, runtime, serve
         self._tell_ignored = Seldom()
         topic = interface.of_joint(interface.FLUX_DENSITY_COMMAND, joint, joints)
         self._command = node.create_publisher(topic.type, topic.name, topic.qos)
         topic = interface.of_joint(interface.SETPOINT, joint, joints)
         node.create_subscription(topic.type, topic.name, self._on_setpoint, topic.qos)
-        topic = interface.of_joint(interface.FLUX_DENSITY_APPLIED, joint, joints)
-        self._applied = node.create_subscription(
-            topic.type, topic.name, self._on_applied, topic.qos).topic_name
+        self._applied = ''
+        if not linked:
+            topic = interface.of_joint(interface.FLUX_DENSITY_APPLIED, joint, joints)
+            self._applied = node.create_subscription(
+                topic.type, topic.name, self._on_applied, topic.qos).topic_name
 
     def send(self, command: Send, frame: str) -> None:
         """Publish a command in the frame of the coil."""
@@ -37,6 +39,8 @@ class JointChannel:
 
     def unheard(self) -> str:
         """Return why nobody carries out the commands; empty where somebody does."""
+        if not self._applied:
+            return ''
         if not self._command.get_subscription_count():
             return f'nobody subscribes to {self._command.topic_name}: start a plant or a driver'
         if not self._node.count_publishers(self._applied) and not self._node.count_publishers(

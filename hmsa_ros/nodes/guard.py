@@ -52,12 +52,16 @@ class CommandInput:
     Commands for one actuator from ``'any'`` or only the ``'first'`` publisher.
 
     ``take`` gets each message that is obeyed; ``unreadable`` counts those that cannot be decoded.
+    What a ``companion`` publishes, a node of that name in the same namespace, is passed over:
+    its commands come directly, and first.
     """
 
     def __init__(
             self, node: Node, topic: interface.Topic, take: Callable[[MagneticField], None],
-            source: str) -> None:
+            source: str, companion: str = '') -> None:
         """Subscribe."""
+        self._companion = companion
+        self._companions: dict[bytes, bool] = {}
         self.unreadable = 0
         self._node = node
         self._topic = topic
@@ -66,6 +70,7 @@ class CommandInput:
         self._raw: RawSubscription | None = None
         if source == 'first':
             self._allegiance = Allegiance()
+        if source == 'first' or companion:
             self._raw = RawSubscription(node, topic.type, topic.name, topic.qos)
         else:
             node.create_subscription(topic.type, topic.name, take, topic.qos)
@@ -86,16 +91,35 @@ class CommandInput:
 
     def poll(self) -> None:
         """Take what has arrived, where the node's executor does not."""
-        if self._raw is None or self._allegiance is None:
+        if self._raw is None:
             return
         for taken in self._raw.take():
-            if self._allegiance.accepts(taken.publisher, self.publishers):
+            if self._companion and self._is_companion(taken.publisher):
+                continue
+            if self._allegiance is None or self._allegiance.accepts(
+                    taken.publisher, self.publishers):
                 self._obey(taken.data)
             else:
                 self._node.get_logger().warning(
                     f'command on {self._topic.name} refused: it comes from a publisher other '
                     'than the one obeyed; stop one of them, or set command_source to any',
                     throttle_duration_sec=60.0)
+
+    def _is_companion(self, publisher: bytes) -> bool:
+        """Return whether a publisher is the companion; looked up in the graph once."""
+        if publisher not in self._companions:
+            own = self._companion, self._node.get_namespace()
+            name = self._node.resolve_topic_name(self._topic.name)
+            found = {
+                bytes(x.endpoint_gid): (x.node_name, x.node_namespace) == own
+                for x in self._node.get_publishers_info_by_topic(name)}
+            if self._allegiance is not None:
+                self._allegiance.source = next((x for x in found if found[x]), None)
+            # Where the sender of a message is not known, it is the companion's if all are.
+            found[b''] = all(found.values())
+            self._companions = found
+            return found.get(publisher, False)
+        return self._companions[publisher]
 
     def _obey(self, data: bytes) -> None:
         try:

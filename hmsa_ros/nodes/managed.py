@@ -163,6 +163,10 @@ class ManagedNode(LifecycleNode):
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
 
+    def keep(self, *entities: object) -> None:
+        """Keep what was created when the node is cleaned up."""
+        self._kept |= {*entities}
+
     def _entities(self) -> set[object]:
         """Return all that this node has created."""
         return {*self.publishers, *self.subscriptions, *self.services, *self.clients,

@@ -58,6 +58,9 @@ _LINGER_NS = 2 * NANOSECONDS
 class PlannerNode(ManagedNode):
     """Connects `hmsa_ros.runtime.planner.PlannerRuntime` to topics, services and the clock."""
 
+    #: Whether the device is in the same process: whoever links them serves the runtime.
+    linked = False
+
     def __init__(self) -> None:
         """Declare the parameters, and start if told to."""
         super().__init__(interface.PLANNER)
@@ -80,8 +83,7 @@ class PlannerNode(ManagedNode):
     def _new_runtime(self) -> PlannerRuntime:
         return PlannerRuntime(
             group_from(self._settings), settings_from(self._settings), clock=self._now,
-            observable=lambda: bool(self.count_publishers(interface.JOINT_STATES.name)),
-            unheard=self._unheard)
+            observable=self._observable, unheard=self._unheard)
 
     # -- states --------------------------------------------------------------------------------
 
@@ -92,8 +94,8 @@ class PlannerNode(ManagedNode):
         for name in names:
             if lost := unheld(actuator_from(self._settings.of(name)).nondimensional):
                 self.get_logger().warning(f'joint {name}: {lost}')
-        self._channels = {
-            x: JointChannel(self, x, names, self._runtime, self._serve) for x in names}
+        self._channels = {x: JointChannel(
+            self, x, names, self._runtime, self._serve, linked=self.linked) for x in names}
         self._plan, self._status, self._estimate, self._diagnostics = (
             self.create_publisher(x.type, x.name, x.qos)
             for x in (
@@ -111,6 +113,8 @@ class PlannerNode(ManagedNode):
         # what is due is decided by the node's clock anyhow.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._poll = self.create_timer(_POLL_NS / NANOSECONDS, self._serve, clock=steady)
+        if self.linked:
+            self._poll.cancel()
         self.create_timer(1.0, self._on_diagnostics, clock=steady)
         self._jump = self.get_clock().create_jump_callback(
             JumpThreshold(
@@ -165,6 +169,10 @@ class PlannerNode(ManagedNode):
                 fillvalue=math.nan):
             self._runtime.observed(str(name), stamp, *values)
 
+    def _observable(self) -> bool:
+        """Return whether somebody may give samples."""
+        return bool(self.count_publishers(interface.JOINT_STATES.name))
+
     def _unheard(self) -> str:
         """Return why nobody carries out commands; empty where somebody does."""
         return next(filter(None, (x.unheard() for x in self._channels.values())), '')
@@ -191,7 +199,12 @@ class PlannerNode(ManagedNode):
             return
         for output in self._runtime.tick(self._now()):
             self._publish[type(output)](output)
-        self._listen()
+        if not self.linked:
+            self._listen()
+            self._pace()
+
+    def _pace(self) -> None:
+        """Have the runtime served again when there is something to do next."""
         wake = self._runtime.wake
         if wake is None and not self._clock_reader.simulated:
             self._poll.cancel()

@@ -2,7 +2,7 @@
 
 from array import array
 from collections.abc import Callable, Sequence
-from time import monotonic_ns
+from time import monotonic_ns, time_ns
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
@@ -19,7 +19,7 @@ from hmsa_ros.device.health import (
     CommandHealth,
     too_few_samples,
 )
-from hmsa_ros.device.protocol import Sample
+from hmsa_ros.device.protocol import Change, Sample
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import conversions, interface
@@ -83,7 +83,8 @@ PARAMETERS = (
     MARKER_SCALE,
 )
 
-_TICK_SECONDS = 0.001
+#: How often the time is looked at.
+TICK_SECONDS = 0.001
 # Of each tick, the share that samples may take; commands and services get the rest.
 _BUDGET_NS = 800_000
 _PAUSED_CLOCK_NS = 100_000_000
@@ -91,6 +92,10 @@ _PAUSED_CLOCK_NS = 100_000_000
 
 class PlantNode(ManagedNode):
     """Advances a `SimulatedDevice` along a clock and publishes what comes of it."""
+
+    #: Name of a planner in the same process, which gives its commands directly; whoever links
+    #: them lets time run.
+    companion = ''
 
     def __init__(self) -> None:
         """Declare the parameters, and start if told to."""
@@ -137,7 +142,8 @@ class PlantNode(ManagedNode):
         self._scalars = scalars == 'always' or (
             scalars == 'auto' and len(values.names) == 1)
         self._joints = [
-            PlantJoint(self, self._device, i, values.names, values.of(x), self._scalars)
+            PlantJoint(
+                self, self._device, i, values.names, values.of(x), self._scalars, self.companion)
             for i, x in enumerate(values.names)]
         self._publish_news()
         StateMarkers(self, values, factor, self._states)
@@ -148,7 +154,8 @@ class PlantNode(ManagedNode):
         # Steady time: what to simulate is decided by the pacer or the node's clock, and the
         # tick only looks at it.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(_TICK_SECONDS, self._on_tick, clock=steady)
+        if not self.companion:
+            self.create_timer(TICK_SECONDS, self._on_tick, clock=steady)
         self.create_timer(1.0, self._on_diagnostics, clock=steady)
 
     def _make_device(self, start: int) -> SimulatedDevice:
@@ -218,7 +225,9 @@ class PlantNode(ManagedNode):
 
     def _follow(self) -> None:
         """Advance to the node's clock: the wall clock, or somebody else's /clock."""
-        now = int(self.get_clock().now().nanoseconds)
+        # The wall clock is what rclpy's reads then, without its objects.
+        now = int(self.get_clock().now().nanoseconds) if (
+            self._time_source.ros_time_is_active) else time_ns()
         if now == 0:
             return
         behind = now - self._clock_seen < 1_000_000_000
@@ -253,9 +262,12 @@ class PlantNode(ManagedNode):
         for notice in self._device.notices():
             self._joints[notice.joint].log(notice)
         for change in self._device.changes():
-            self._joints[change.joint].publish_applied(change)
+            self._publish_change(change)
         for sample in self._device.samples():
             self._publish_sample(sample)
+
+    def _publish_change(self, change: Change) -> None:
+        self._joints[change.joint].publish_applied(change)
 
     def _publish_sample(self, sample: Sample) -> None:
         message = self._message

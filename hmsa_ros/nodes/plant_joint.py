@@ -1,6 +1,6 @@
 """One joint of the plant on the wire: commands and forces in, changes of level out."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import math
 from typing import Any
 
@@ -80,7 +80,8 @@ class PlantJoint:
 
     def __init__(
             self, node: ManagedNode, device: SimulatedDevice, number: int,
-            names: Sequence[str], values: Mapping[str, Any], scalars: bool) -> None:
+            names: Sequence[str], values: Mapping[str, Any], scalars: bool,
+            companion: str = '') -> None:
         """Create its topics."""
         self.name = names[number]
         self._node = node
@@ -100,7 +101,7 @@ class PlantJoint:
             if scalars else ()
         self.commands = CommandInput(
             node, interface.of_joint(interface.FLUX_DENSITY_COMMAND, self.name, names),
-            self._on_command, values['command_source'])
+            self._on_command, values['command_source'], companion)
         force = interface.of_joint(interface.DISTURBANCE_FORCE, self.name, names)
         node.create_subscription(force.type, force.name, self._on_force, force.qos)
 
@@ -134,11 +135,18 @@ class PlantJoint:
     # -- in ------------------------------------------------------------------------------------
 
     def _on_command(self, message: MagneticField) -> None:
+        self._obey(lambda: conversions.from_command(message))
+
+    def command(self, stamp: int, level: float) -> None:
+        """Obey a level in T from a stamp in ns on, from a planner in the same process."""
+        self._obey(lambda: (stamp, level))
+
+    def _obey(self, read: Callable[[], tuple[int, float]]) -> None:
         if not self._node.active:
             return
         self.received += 1
         try:
-            self._device.receive(self._number, *conversions.from_command(message))
+            self._device.receive(self._number, *read())
         except BadInputError as error:
             self.refused += 1
             if self._tell_refused():

@@ -29,13 +29,15 @@ from hmsa_ros.middleware import prepare_middleware
 _SLICE_SECONDS = 0.1
 
 
-def spin(node: Node, ending: Callable[[], bool]) -> None:
-    """Serve a node's callbacks until ``ending`` says so or its context is shut down."""
-    executor = EventsExecutor(context=node.context)
-    executor.add_node(node)
+def spin(nodes: Sequence[Node], ending: Callable[[], bool]) -> None:
+    """Serve the callbacks of nodes until ``ending`` says so or their context is shut down."""
+    context = nodes[0].context
+    executor = EventsExecutor(context=context)
+    for node in nodes:
+        executor.add_node(node)
     never = Future()
     try:
-        while node.context.ok() and not ending():
+        while context.ok() and not ending():
             executor.spin_until_future_complete(never, _SLICE_SECONDS)
     except ExternalShutdownException:
         pass
@@ -43,14 +45,15 @@ def spin(node: Node, ending: Callable[[], bool]) -> None:
         executor.shutdown()
 
 
-def run(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
+def run(
+        factory: Callable[[], Node | Sequence[Node]], args: Sequence[str] | None = None) -> int:
     """
-    Run one node as a process: initialise, spin until told to end, clean up.
+    Run one node, or several, as a process: initialise, spin until told to end, clean up.
 
     Parameters
     ----------
     factory : callable
-        Makes the node; may raise `HmsaError` or an rclpy parameter error, which refuse the
+        Makes the nodes; may raise `HmsaError` or an rclpy parameter error, which refuse the
         start. A node with a ``close`` method has it called before the node is destroyed; an
         error in its attribute ``failure`` makes the run a failed one, and a true attribute
         ``finished`` ends it.
@@ -70,12 +73,13 @@ def run(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
     except BadInputError as error:
         rclpy.try_shutdown()
         return complain(error, 2)
-    node: Node | None = None
+    nodes: Sequence[Node] = ()
     status = 0
     try:
-        node = factory()
+        made = factory()
+        nodes = (made,) if isinstance(made, Node) else made
         _avoid_pauses()
-        spin(node, lambda: ENDING.asked or getattr(node, 'finished', False))
+        spin(nodes, lambda: ENDING.asked or any(getattr(x, 'finished', False) for x in nodes))
     except (BadInputError, ParameterException) as error:
         status = complain(error, 2)
     except HmsaError as error:
@@ -83,14 +87,16 @@ def run(factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
-        if node is not None:
-            close = getattr(node, 'close', None)
-            if close is not None:
-                close()
+        for node in nodes:
+            getattr(node, 'close', _nothing)()
             node.destroy_node()
         rclpy.try_shutdown()
-    failure = getattr(node, 'failure', None)
+    failure = next(filter(None, (getattr(x, 'failure', None) for x in nodes)), None)
     return complain(failure, 1) if failure is not None and not status else status
+
+
+def _nothing() -> None:
+    """Have nothing to close."""
 
 
 def _avoid_pauses() -> None:

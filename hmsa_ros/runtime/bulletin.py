@@ -91,9 +91,9 @@ class Bulletin:
             self._following.replanned, self._watch.findings, self._watch.worst, watching,
             self.unheard))
 
-    def tell_progress(self) -> None:
-        """Tell it, if there is any."""
-        if not self._unchanged(self._clock()) and self._state() != self._told:
+    def tell_progress(self, now: int) -> None:
+        """Tell it, if there is any by a time in ns."""
+        if not self._unchanged(now) and self._state() != self._told:
             self.tell()
 
     def _unchanged(self, now: int) -> bool:

@@ -266,7 +266,7 @@ class PlannerRuntime:
         self._work_on()
         if self._bulletin.preview_again is not None and now >= self._bulletin.preview_again:
             self._bulletin.show()
-        self._bulletin.tell_progress()
+        self._bulletin.tell_progress(now)
         if self.active and (self._watch.open or self._bulletin.unheard
                             or self._bulletin.next_change is not None):
             self._bulletin.look_for_listeners()

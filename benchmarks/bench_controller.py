@@ -1,0 +1,63 @@
+"""What a cycle of planner and plant in one process costs, and how the loop keeps time."""
+
+from pathlib import Path
+import tempfile
+
+from benchmarks.faults.rig import Rig
+from benchmarks.measure import ros_domain
+from benchmarks.sheet import Sheet
+from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.conversions import to_trajectory
+
+#: Work of a cycle that 99 of 100 are promised to stay below, in us.
+LARGEST = 300.0
+_LOOP = 'controller: loop'
+_SECONDS = 20.0
+#: Between two moves, in s.
+_HOLD = 0.5
+_LEAD = 0.005
+
+
+def _run(seconds: float, *, moves: bool, readers: bool, folder: Path) -> dict[str, float]:
+    """Return the newest figures of the loop, with the lateness of these seconds alone."""
+    with Rig(folder, ros_domain(), watch=readers) as rig:
+        rig.start('controller', {'lead_time': _LEAD})
+        rig.ready(interface.PLANNER)
+        rig.spin_until(lambda: _LOOP in rig.diagnostics, 'diagnostics of the loop')
+        # The start is forgotten: more cycles than the loop remembers.
+        rig.spin(5.0)
+        before = dict(rig.diagnostics[_LOOP])
+        if moves:
+            rig.publish_trajectory(to_trajectory(
+                [(1.1 if k % 2 else 1.2, round((k + 1) * _HOLD * NANOSECONDS))
+                 for k in range(int(seconds / _HOLD))], ['actuator']))
+        rig.spin(seconds)
+        after = rig.diagnostics[_LOOP]
+        cycles = int(after['cycles']) - int(before['cycles'])
+        return {
+            'cycles_per_second': cycles / seconds,
+            'late': (int(after['late']) - int(before['late'])) / max(cycles, 1),
+            **{x: float(after[f'work_{x}_us']) for x in ('p50', 'p99', 'largest')},
+            'commands_late': rig.value('planner: commands', 'late')}
+
+
+def compare(*, quick: bool) -> Sheet:
+    """Measure at rest, in motion, and in motion while somebody reads all samples."""
+    cases = {
+        'at rest': {'moves': False, 'readers': False},
+        'moved twice a second': {'moves': True, 'readers': False},
+        'moved, and another process reads all': {'moves': True, 'readers': True}}
+    if quick:
+        cases = {'moved twice a second': cases['moved twice a second']}
+    figures = {}
+    for name, case in cases.items():
+        with tempfile.TemporaryDirectory() as folder:
+            figures[name] = _run(2.0 if quick else _SECONDS, folder=Path(folder), **case)
+    return Sheet(
+        'controller', 'One cycle of the controller, 1 joint at 1 kHz: processor time',
+        ('', 'cycles/s', 'median', '99 %', 'largest', 'cycles late', 'late commands'),
+        [[name, f'{x["cycles_per_second"]:.0f}', f'{x["p50"]:.0f} us', f'{x["p99"]:.0f} us',
+          f'{x["largest"]:.0f} us', f'{100.0 * x["late"]:.2f} %', f'{x["commands_late"]:.0f}']
+         for name, x in figures.items()], {'cases': figures},
+        quick or all(x['p99'] < LARGEST for x in figures.values()))

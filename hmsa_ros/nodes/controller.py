@@ -1,0 +1,149 @@
+"""
+Planner and plant in one process, with one loop and no middleware between them.
+
+Both nodes are there with their names, topics, services and parameters. Commands go to the device,
+and samples to the planner, within the cycle in which they are made; they are published as well.
+"""
+
+from collections.abc import Sequence
+import gc
+
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+
+from hmsa_ros.device.protocol import Change, Sample
+from hmsa_ros.nodes import conversions, interface
+from hmsa_ros.nodes.planner import PlannerNode
+from hmsa_ros.nodes.plant import PlantNode, TICK_SECONDS
+from hmsa_ros.nodes.runner import run
+from hmsa_ros.runtime.cycles import Cycles
+from hmsa_ros.runtime.records import Send
+
+
+class LinkedPlanner(PlannerNode):
+    """A planner whose runtime a plant in the same process serves."""
+
+    linked = True
+
+    def __init__(self) -> None:
+        """Begin without a plant."""
+        self.plant: LinkedPlant | None = None
+        self._last = 0
+        super().__init__()
+
+    def serve(self) -> None:
+        """Do what is due."""
+        self._serve()
+
+    def serve_if_due(self) -> None:
+        """Do what is due, if there is anything."""
+        wake = self._runtime.wake
+        if wake is not None and wake <= self._now():
+            self._serve()
+
+    def take_change(self, joint: str, change: Change) -> None:
+        """Take in that a level has taken effect."""
+        self._runtime.applied(joint, change.stamp, change.level)
+
+    def take_sample(self, joints: Sequence[str], sample: Sample) -> None:
+        """Take in what was measured of all joints."""
+        if not self._runtime.looks_at(sample.time):
+            return
+        for name, *values in zip(
+                joints, sample.stretch.tolist(), sample.rate.tolist(),
+                sample.flux_density.tolist(), strict=True):
+            self._runtime.observed(name, sample.time, *values)
+
+    def _now(self) -> int:
+        time = None if self.plant is None or not self._clock_reader.simulated else \
+            self.plant.leading_time
+        if time is None:
+            return super()._now()
+        last, self._last = self._last, time
+        if time < last:
+            self._runtime.clock_set_back(last - time)
+        return time
+
+    def _observable(self) -> bool:
+        return self.plant is not None and self.plant.active
+
+    def _unheard(self) -> str:
+        if self.plant is not None and self.plant.active:
+            return ''
+        return 'the plant of this process is not active: activate it'
+
+    def _publish_command(self, command: Send) -> None:
+        if self.plant is not None:
+            self.plant.command(command)
+        super()._publish_command(command)
+
+
+class LinkedPlant(PlantNode):
+    """A plant that a planner in the same process commands."""
+
+    def __init__(self, planner: LinkedPlanner) -> None:
+        """Take a planner."""
+        self._planner = planner
+        self.companion = planner.get_name()
+        self.cycles = Cycles(round(TICK_SECONDS * 1e9))
+        super().__init__()
+        planner.plant = self
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        topic = interface.DIAGNOSTICS
+        self._of_loop = self.create_publisher(topic.type, topic.name, topic.qos)
+        self.keep(
+            self.create_timer(TICK_SECONDS, self._cycle, clock=steady),
+            self.create_timer(1.0, self._report, clock=steady), self._of_loop)
+
+    @property
+    def leading_time(self) -> int | None:
+        """Simulated time in ns, if this plant is the authority on it."""
+        return self._device.time if self._joints and self._authority else None
+
+    def command(self, command: Send) -> None:
+        """Obey a command of the planner."""
+        for joint in self._joints:
+            if joint.name == command.joint:
+                joint.command(command.stamp, command.flux_density)
+
+    def _cycle(self) -> None:
+        """Let time run, and serve the planner."""
+        with self.cycles:
+            if self._joints:
+                self._on_tick()
+            self._planner.serve()
+
+    def _sample(self) -> None:
+        super()._sample()
+        if self._authority:
+            # Simulated time may run far in one cycle.
+            self._planner.serve_if_due()
+
+    def _publish_change(self, change: Change) -> None:
+        self._planner.take_change(self._joints[change.joint].name, change)
+        super()._publish_change(change)
+
+    def _publish_sample(self, sample: Sample) -> None:
+        self._planner.take_sample(self._values.names, sample)
+        super()._publish_sample(sample)
+
+    def _report(self) -> None:
+        """Publish how the loop keeps time; garbage is collected now, between two cycles."""
+        gc.collect()
+        severity, message, values = self.cycles.report()
+        self._of_loop.publish(conversions.to_diagnostics(
+            int(self.get_clock().now().nanoseconds), conversions.to_status(
+                'controller: loop', '', bytes([severity]), message, values)))
+
+
+def make() -> Sequence[Node]:
+    """Make the two nodes; from now on garbage is collected by the loop alone."""
+    planner = LinkedPlanner()
+    plant = LinkedPlant(planner)
+    gc.disable()
+    return plant, planner
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run planner and plant in one process; return the exit status."""
+    return run(make, args)

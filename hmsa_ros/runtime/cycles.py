@@ -1,0 +1,76 @@
+"""How a loop keeps time: its own work a cycle, and cycles that begin late."""
+
+from time import monotonic_ns, thread_time_ns
+
+import numpy as np
+
+from hmsa_ros.runtime.records import Severity
+from hmsa_ros.runtime.slices import Clock
+
+# Cycles whose work is remembered.
+_REMEMBERED = 4096
+
+
+class Cycles:
+    """
+    Measures the cycles of a loop; a context manager around each.
+
+    Parameters
+    ----------
+    period : int
+        Between two cycles, in ns.
+    steady, cpu : callable
+        Return a steady time, and the processor time of the loop's thread, in ns.
+
+    Attributes
+    ----------
+    count, late : int
+        Cycles, and those that began later than a period after their time.
+    largest : int
+        Largest lateness in ns.
+
+    """
+
+    def __init__(
+            self, period: int, *, steady: Clock = monotonic_ns,
+            cpu: Clock = thread_time_ns) -> None:
+        """Begin with none."""
+        self.count = self.late = self.largest = 0
+        self._period, self._steady, self._cpu = period, steady, cpu
+        self._work = np.zeros(_REMEMBERED, dtype=np.int64)
+        self._due = self._begun = 0
+        self._reported = 0, 0
+
+    def __enter__(self) -> None:
+        """Begin a cycle."""
+        now = self._steady()
+        lateness = now - self._due if self.count else 0
+        if lateness > self._period:
+            self.late += 1
+            self.largest = max(self.largest, lateness)
+        # The grid is that of the earliest cycles; those that were missed are left out.
+        self._due = now + self._period - (
+            lateness if 0 < lateness <= self._period else 0)
+        self._begun = self._cpu()
+
+    def __exit__(self, *_: object) -> None:
+        """End it."""
+        self._work[self.count % _REMEMBERED] = self._cpu() - self._begun
+        self.count += 1
+
+    def work(self, share: float) -> float:
+        """Return the work in us that a share of the last cycles do not exceed."""
+        if not self.count:
+            return 0.0
+        return float(np.quantile(self._work[:self.count], share)) / 1e3
+
+    def report(self) -> tuple[Severity, str, dict[str, object]]:
+        """Return how the loop fares: severity, a sentence and counters; since the last time."""
+        count, late = self.count - self._reported[0], self.late - self._reported[1]
+        self._reported = self.count, self.late
+        message = f'{late} of {count} cycles late' if late else 'cycles in time'
+        return Severity.WARN if late else Severity.OK, message, {
+            'cycles': self.count, 'late': self.late,
+            'largest_lateness_ms': f'{self.largest / 1e6:.3f}',
+            **{f'work_p{round(100 * x)}_us': f'{self.work(x):.1f}' for x in (0.5, 0.99)},
+            'work_largest_us': f'{self.work(1.0):.1f}'}
