@@ -109,7 +109,18 @@ def test_nodes_with_other_parameters_than_the_file_are_refused(start, tmp_path):
     assert len(run.stderr.strip().splitlines()) == 1
 
 
-def test_feedback_other_than_off_is_refused(start, tmp_path):
-    run = start.hmsa('run', '1.1:0.1', '--feedback', 'adapt', '--out', str(tmp_path / 'out'))
+def test_feedback_that_there_is_not_is_refused(start, tmp_path):
+    run = start.hmsa('run', '1.1:0.1', '--feedback', 'guess', '--out', str(tmp_path / 'out'))
     assert run.wait(RUN_SECONDS) == 2
-    assert "feedback 'adapt' is not available: expected off" in run.stderr
+    assert "invalid choice: 'guess'" in run.stderr
+
+
+@pytest.mark.ros
+def test_a_simulated_experiment_with_feedback_records_what_is_believed(start, tmp_path):
+    run = start.hmsa(
+        'run', '1.1:0.2', '--simulate', '--feedback', 'observe', '--out', str(tmp_path / 'out'))
+    assert run.wait(RUN_SECONDS) == 0, run.output
+    file, = (tmp_path / 'out').rglob('*.mcap')
+    with open(file, 'rb') as stream:
+        topics = {channel.topic for _, channel, _ in make_reader(stream).iter_messages()}
+    assert '/planner/estimate' in topics

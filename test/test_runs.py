@@ -17,7 +17,7 @@ from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text, replacing, write_text
 from hmsa_ros.runs import bags
-from hmsa_ros.runs.levels import Level
+from hmsa_ros.runs.levels import lateness_of, Level
 from hmsa_ros.runs.parameters import number_of, read_parameter_file, recorded, values_of
 from hmsa_ros.runs.record import Run
 from hmsa_ros.runs.tables import levels_of, samples_of, write_table
@@ -54,6 +54,15 @@ def test_a_command_that_nobody_applied_is_said_though_the_motion_fits():
     found = verify_run(moved())
     assert (found.unapplied_count, found.note) == (0, '')
     assert found.largest_difference < 1e-12
+
+
+def test_a_level_that_was_in_force_already_is_no_command_without_effect():
+    earlier = Level(BEGIN - 2 * STEP, 0.02, BEGIN), Level(BEGIN - STEP, 0.01, BEGIN)
+    commands = Level(BEGIN, 0.01, BEGIN), Level(BEGIN + STEP, 0.03, BEGIN)
+    lateness, unapplied = lateness_of(
+        commands, (*earlier, Level(BEGIN + STEP, 0.03, BEGIN)), BEGIN + 9 * STEP)
+    assert unapplied == 0
+    assert lateness[1] == 0.0
 
 
 def test_a_table_has_the_samples_in_full_precision_and_the_levels_at_their_times(tmp_path):

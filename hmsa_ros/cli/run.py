@@ -41,7 +41,9 @@ def add_parser(subparsers: Any) -> None:
         '--params-file', type=Path, metavar='YAML', dest='params_file',
         help='parameter file: of the nodes to start, or to hold those that run against')
     parser.add_argument(
-        '--feedback', default='off', metavar='MODE', help='off (default): open loop')
+        '--feedback', choices=('off', 'observe', 'adapt'), metavar='MODE',
+        help='off, observe or adapt: what the planner does with the samples; a planner that runs '
+             'already must be set to it (default as it is; off)')
     parser.add_argument(
         '--tolerance', type=float, metavar='X',
         help='offset and residual vibration of a setpoint that counts as reached, as a share of '
@@ -103,10 +105,6 @@ def _tolerance(arguments: argparse.Namespace) -> float:
     """Return the tolerance; refuse what cannot be used."""
     from hmsa_ros.report.outcome import TOLERANCE
 
-    if arguments.feedback != 'off':
-        raise BadInputError(
-            f'feedback {arguments.feedback!r} is not available: expected off, which carries out '
-            'the plan in open loop')
     tolerance = TOLERANCE if arguments.tolerance is None else arguments.tolerance
     if not 0.0 < tolerance < math.inf:
         raise BadInputError(f'tolerance is {tolerance:g}: expected a share above 0')
@@ -118,8 +116,10 @@ def _experiment(arguments: argparse.Namespace, folder: Path) -> 'Experiment':
     from hmsa_ros.session.experiment import Experiment
     from hmsa_ros.session.simulated import simulated_nodes
 
-    expected = {} if arguments.params_file is None else read_parameter_file(
-        arguments.params_file)
+    expected = {} if arguments.params_file is None else dict(read_parameter_file(
+        arguments.params_file))
+    if arguments.feedback is not None:
+        expected['planner.feedback'] = arguments.feedback
     nodes = simulated_nodes(
         expected, str(arguments.params_file or ''), arguments.namespace
     ) if arguments.simulate else ()

@@ -84,7 +84,11 @@ def lateness_of(
     # What was replaced before its time never took effect.
     standing = in_force((x,) for x in commands)
     places = {x: i for i, x in enumerate(commands)}
-    before: Level | None = min(applied, key=lambda x: x.stamp)
+    # What was in force when the first command was due; applied levels may be older than that.
+    begin = standing[0].stamp if standing else 0
+    before: Level | None = max(
+        (x for x in applied if x.stamp <= begin), key=lambda x: x.stamp,
+        default=min(applied, key=lambda x: x.stamp))
     for i, command in enumerate(standing):
         until = next(
             (x.stamp for x in standing[i + 1:] if _same_level(x, command)), math.inf)

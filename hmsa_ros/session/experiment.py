@@ -79,7 +79,8 @@ class Experiment:
             for topic in (interface.FLUX_DENSITY_COMMAND, interface.FLUX_DENSITY_APPLIED)]
         own += [interface.JOINT_STATES.name, *(
             interface.from_outside(x.name, interface.PLANNER)
-            for x in (interface.JOINT_TRAJECTORY, interface.PLAN, interface.STATUS))]
+            for x in (interface.JOINT_TRAJECTORY, interface.PLAN, interface.STATUS,
+                      interface.ESTIMATE))]
         if self.nodes:
             own += [interface.STRETCH.name, interface.STRETCH_RATE.name]
         space = self.namespace.strip('/')

@@ -33,7 +33,9 @@ def simulated_nodes(
         NodeProcess(PLANT, {
             'publish_clock': True, 'use_sim_time': False, 'start_paused': True,
             'publish_rate': rate, 'real_time_factor': factor}, namespace, params_file),
-        NodeProcess(PLANNER, {'use_sim_time': True, 'lead_time': lead}, namespace, params_file))
+        NodeProcess(PLANNER, {
+            'use_sim_time': True, 'lead_time': lead,
+            'feedback': settings.get(f'{PLANNER}.feedback', 'off')}, namespace, params_file))
 
 
 def _number(settings: Mapping[str, object], name: str, default: float) -> float:
