@@ -114,10 +114,11 @@ def test_send_reports_until_the_sequence_has_been_carried_out(start, ros):
 
 
 @pytest.mark.ros
-def test_send_is_patient_in_simulated_time_that_is_slower_than_the_wall(start):
+def test_send_is_patient_in_simulated_time_that_is_slower_than_the_wall(start, ros):
     start.hmsa(
         'plant', '--ros-args', '-p', 'publish_clock:=true', '-p', 'real_time_factor:=0.1')
     start.hmsa('planner', '--ros-args', '-p', 'use_sim_time:=true')
+    ros.spin_until(lambda: ros.node.count_publishers('flux_density_command'), 'the planner')
     # Ten times that on the wall: more than the sequence and the patience together.
     send = start.hmsa('send', '1.1:0.7', '--wait', '--timeout', '5')
     assert send.wait(60.0) == 0, send.output
