@@ -99,7 +99,7 @@ def held(elastic: Elastic) -> tuple[float, float]:
     material = np.array([elastic.family, 0.0, 1.0, 0.0, *elastic.limits, *elastic.constants])
 
     def boundary(end: float) -> float:
-        path: Array = np.geomspace(1.0, end, _LOOK)
+        path: Array = np.geomspace(1.0, end, _LOOK).astype(np.float64)
         path[-1] = end
         stiffness = np.empty(_LOOK)
         evaluate(STIFFNESS, path, material, stiffness)

@@ -257,13 +257,13 @@ def _fit(time: Array, rest: Array, expected: Expected) -> _Fit | None:
         high = min(high, 0.9 * math.pi / interval)
     decay = expected.decay
     count = max(int((high - low) * span * _TRIED / (2 * math.pi)), _REFINED)
-    tried = np.linspace(low, high, count)
+    tried: Array = np.linspace(low, high, count).astype(np.float64)
     best = _best(time, rest, decay, tried)
     for _ in range(2):
         if best is None:
             return None
         width = tried[1] - tried[0]
-        tried = np.linspace(best - width, best + width, _REFINED)
+        tried = np.linspace(best - width, best + width, _REFINED).astype(np.float64)
         best = _best(time, rest, decay, tried)
     if best is None:
         return None
