@@ -15,7 +15,9 @@ def begin(start, ros, mode):
     statuses = ros.collect(interface.STATUS.type, 'planner/status', interface.STATUS.qos)
     samples = ros.collect(interface.JOINT_STATES.type, 'joint_states', interface.JOINT_STATES.qos)
     start.hmsa('plant', *PLANT)
-    start.hmsa('planner', '--ros-args', '-p', f'feedback:={mode}')
+    # Commands far enough ahead for a busy machine.
+    start.hmsa(
+        'planner', '--ros-args', '-p', f'feedback:={mode}', '-p', 'lead_time:=0.3')
     ros.spin_until(lambda: statuses and samples, 'planner and plant', RUN_SECONDS)
     found = ros.collect(interface.ESTIMATE.type, 'planner/estimate', interface.ESTIMATE.qos)
 
@@ -29,7 +31,7 @@ def begin(start, ros, mode):
 
 def test_a_planner_that_observes_says_what_is_wrong_with_the_actuator(start, ros):
     estimate = begin(start, ros, 'observe')
-    send = start.hmsa('send', '1.4:0.5', '--wait')
+    send = start.hmsa('send', '1.4:2', '--wait')
     assert send.wait(RUN_SECONDS) == 1, send.output
     assert '%) short of 1.4 and rings at' in send.output
     ros.spin_until(lambda: 'G about +20 %' in estimate()[0], 'the estimate')
@@ -43,9 +45,9 @@ def test_a_planner_that_observes_says_what_is_wrong_with_the_actuator(start, ros
 
 def test_a_planner_that_adapts_arrives_with_the_second_move(start, ros):
     estimate = begin(start, ros, 'adapt')
-    assert start.hmsa('send', '1.4:0.5', '--wait').wait(RUN_SECONDS) in (0, 1)
+    assert start.hmsa('send', '1.4:2', '--wait').wait(RUN_SECONDS) in (0, 1)
     ros.spin_until(lambda: 'plans use it' in estimate()[0], 'the estimate')
     assert int(estimate()[1]['corrections']) > 0
-    second = start.hmsa('send', '1.1:0.5', '--wait')
+    second = start.hmsa('send', '1.1:2', '--wait')
     assert second.wait(RUN_SECONDS) == 0, second.output
     assert 'measured' in second.output

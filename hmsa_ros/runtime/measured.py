@@ -35,8 +35,8 @@ _FITTED = 5
 # uncertain themselves, as Student's distribution has it.
 _SURE = 5.0
 _UNSURE = 12.0
-# Smaller steps have no percentage.
-_NO_STEP = 1e-9
+# Smaller steps have no percentage, as those of a plan that was made anew on the way.
+_NO_STEP = 1e-4
 
 
 @dataclass(frozen=True)
