@@ -5,10 +5,11 @@ import re
 import pytest
 from rclpy.parameter import Parameter
 
+from hmsa_ros.contract.parameters import ACTUATOR
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.joints import declare_joints, joint_names, JOINTS
-from hmsa_ros.nodes.parameters import ACTUATOR, INITIAL_STRETCH, JOINT, ParameterSpec
+from hmsa_ros.nodes.parameters import INITIAL_STRETCH, JOINT, ParameterSpec
 
 OWN = (*ACTUATOR, INITIAL_STRETCH)
 SPECS = (*OWN, JOINT, JOINTS, ParameterSpec('other', 1, 'Not for one joint.', '', 0, 9))
