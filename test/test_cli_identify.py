@@ -159,3 +159,12 @@ def test_seconds_of_an_epoch_are_as_good_as_those_of_the_run(folder, capsys):
     status, out, err = identify(capsys, 'camera.csv', '--commands', 'levels.csv')
     assert (status, err) == (0, '')
     assert 'identified' in out
+
+
+def test_a_modulus_of_no_elastomer_is_not_passed_over(folder, capsys):
+    # Both in ms, and nothing says so.
+    write('camera.csv', 'time,stretch', zip(1e3 * TIMES, STRETCH, strict=True))
+    write('levels.csv', 'time,flux_density', zip(1e3 * LEVELS[0], LEVELS[1], strict=True))
+    _, out, err = identify(capsys, 'camera.csv', '--commands', 'levels.csv')
+    assert 'that of no elastomer' in out + err
+    assert 'check that times are in s' in out + err
