@@ -20,8 +20,9 @@ def prepare_middleware() -> None:
     the network to command. Who wants several machines sets
     ``ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET``.
 
-    What a subscriber has missed is sent to it again within 0.03 s, where no other profiles are
-    given to Fast DDS. By its own default it may take 3 s, long after a command was to apply.
+    Where no other profiles are given to Fast DDS, what a subscriber has missed is sent to it again
+    within 0.03 s, and a newcomer is found within 0.5 s. By default either may take 3 s, long
+    after a command was to apply.
     """
     if not any(os.environ.get(name) for name in _DECIDED):
         os.environ[RANGE] = 'LOCALHOST'

@@ -136,7 +136,7 @@ def test_send_trusts_a_driver_that_publishes_samples_alone(start, ros):
     send = start.hmsa('send', '1.1:0.1', '--wait')
     assert send.wait(30.0) == 1, send.output
     assert 'nobody reports levels that take effect' in send.stderr
-    ros.publisher(
+    ros.node.create_publisher(
         interface.JOINT_STATES.type, 'joint_states', interface.JOINT_STATES.qos)
     send = start.hmsa('send', '1.2:0.1', '--wait')
     assert send.wait(30.0) == 0, send.output

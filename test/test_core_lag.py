@@ -12,7 +12,8 @@ from hmsa_ros.core.model import elastic_force
 from hmsa_ros.core.moves import Limits, State
 from hmsa_ros.core.parameters import NondimensionalParameters, paper_actuator
 from hmsa_ros.core.planner import Options, Planner
-from hmsa_ros.core.sequence import plan_sequence, Setpoint
+from hmsa_ros.core.sequence import plan_sequence
+from hmsa_ros.core.setpoint import Setpoint
 from hmsa_ros.core.shapers import get_shaper
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.simulation import ActuatorSimulation, simulate

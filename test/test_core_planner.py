@@ -11,7 +11,8 @@ import pytest
 from hmsa_ros.core.model import elastic_force, natural_frequency
 from hmsa_ros.core.parameters import NondimensionalParameters, paper_actuator
 from hmsa_ros.core.planner import Options, Planner
-from hmsa_ros.core.sequence import plan_sequence, Setpoint
+from hmsa_ros.core.sequence import plan_sequence
+from hmsa_ros.core.setpoint import Setpoint
 from hmsa_ros.core.simulation import ActuatorSimulation
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.errors import BadInputError

@@ -13,7 +13,8 @@ from hmsa_ros.core.delivery import Delivery
 from hmsa_ros.core.model import critical_zeta, natural_frequency, stretch_limits
 from hmsa_ros.core.moves import Limits, State
 from hmsa_ros.core.parameters import NondimensionalParameters
-from hmsa_ros.core.sequence import plan_sequence, Setpoint
+from hmsa_ros.core.sequence import plan_sequence
+from hmsa_ros.core.setpoint import Setpoint
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.two_step import plan_two_step
 from hmsa_ros.core.units import Units

@@ -19,7 +19,8 @@ from hmsa_ros.core.model import (
 from hmsa_ros.core.moves import Limits, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters, paper_actuator
 from hmsa_ros.core.planner import Options, Planner
-from hmsa_ros.core.sequence import plan_sequence, Setpoint
+from hmsa_ros.core.sequence import plan_sequence
+from hmsa_ros.core.setpoint import Setpoint
 from hmsa_ros.core.shapers import get_shaper, SHAPERS
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.simulation import ActuatorSimulation, follow

@@ -12,7 +12,8 @@ from scipy.integrate import solve_ivp, trapezoid
 from hmsa_ros.core.model import damping, elastic_force, energy, equilibrium_stretch, mass
 from hmsa_ros.core.parameters import NondimensionalParameters, paper_actuator
 from hmsa_ros.core.schedule import CommandSchedule
-from hmsa_ros.core.sequence import plan_sequence, Setpoint
+from hmsa_ros.core.sequence import plan_sequence
+from hmsa_ros.core.setpoint import Setpoint
 from hmsa_ros.core.simulation import ActuatorSimulation, longest_motion, simulate, unshaped
 from hmsa_ros.errors import BadInputError, HmsaError
 

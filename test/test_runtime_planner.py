@@ -50,11 +50,12 @@ class Rig:
         # What each look at a clock takes.
         self.effort = 0
         self.observable = True
+        self.unheard = ''
         self.group = PlannerGroup({
             x: Planner(block, self.options) for x, block in self.blocks.items()})
         self.runtime = PlannerRuntime(
             self.group, settings, clock=self.clock, steady=self.look,
-            observable=lambda: self.observable)
+            observable=lambda: self.observable, unheard=lambda: self.unheard)
         self.runtime.active = True
         self.plants = {
             x: ActuatorSimulation(block, time=START) for x, block in self.blocks.items()}
@@ -396,6 +397,31 @@ def test_nobody_is_waited_for_where_nobody_gives_samples():
     rig = Rig(settings=PATIENT)
     rig.observable = False
     assert rig.runtime.request(Target('a', 1.1)).code == 'accepted'
+
+
+def test_first_request_waits_until_a_plant_is_found():
+    rig = Rig(settings=PATIENT)
+    rig.observable, rig.unheard = False, 'nobody subscribes'
+    assert rig.runtime.request(Target('a', 1.1)).code == 'waiting'
+    rig.tick()
+    rig.observable = True
+    rig.observe()
+    rig.tick()
+    assert rig.codes() == ['none']
+    rig.unheard = ''
+    rig.tick()
+    assert rig.status.verdict.code == 'accepted'
+    assert not rig.notes()
+
+
+def test_patience_with_a_plant_that_does_not_come_has_an_end():
+    rig = Rig(settings=PATIENT)
+    rig.observable, rig.unheard = False, 'nobody subscribes'
+    rig.runtime.request(Target('a', 1.1))
+    rig.steady += 501 * MS
+    rig.tick()
+    assert rig.status.verdict.code == 'accepted'
+    assert rig.notes() == ['nobody subscribes']
 
 
 def test_impossible_sample_is_ignored_with_a_note():

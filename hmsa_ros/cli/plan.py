@@ -54,7 +54,8 @@ def run(arguments: argparse.Namespace) -> int:
         return _run_si(arguments)
     from hmsa_ros.core.moves import State
     from hmsa_ros.core.parameters import NondimensionalParameters
-    from hmsa_ros.core.sequence import plan_sequence, Setpoint
+    from hmsa_ros.core.sequence import plan_sequence
+    from hmsa_ros.core.setpoint import Setpoint
 
     given = {name: value for name in ('zeta', 'j_lim', 'c1')
              if (value := getattr(arguments, name)) is not None}
@@ -84,7 +85,8 @@ def _run_si(arguments: argparse.Namespace) -> int:
     )
     from hmsa_ros.contract.topics import PLANNER
     from hmsa_ros.core.moves import State
-    from hmsa_ros.core.sequence import plan_sequence, Setpoint
+    from hmsa_ros.core.sequence import plan_sequence
+    from hmsa_ros.core.setpoint import Setpoint
     from hmsa_ros.core.timeline import Model, Options
     from hmsa_ros.runs.parameters import read_parameter_file, values_of
 

@@ -61,6 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
         client.find_planner()
         if arguments.recorded:
             client.find_recorder()
+        client.find_plant()
         # A planner that has just started may not have heard the time yet.
         verdict = client.send(arguments.setpoints, time_begins=True)
         print(verdict.message)

@@ -3,6 +3,7 @@
 import argparse
 import math
 
+from hmsa_ros.core.setpoint import Setpoint
 from hmsa_ros.errors import BadInputError
 
 
@@ -32,9 +33,6 @@ def setpoint_of_joints(text: str) -> tuple[tuple[float, ...], float]:
         If it is not numbers in range.
 
     """
-    # Not imported above: Numba comes along, which ``hmsa --help`` has no use for.
-    from hmsa_ros.core.sequence import Setpoint
-
     stretches, colon, span = text.partition(':')
     try:
         if not colon:

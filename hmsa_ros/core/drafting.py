@@ -13,7 +13,8 @@ from typing import TypeVar
 from hmsa_ros.core.history import agree
 from hmsa_ros.core.kernels import work_space
 from hmsa_ros.core.moves import Level, Move, State
-from hmsa_ros.core.sequence import Segment, segments, Setpoint
+from hmsa_ros.core.sequence import Segment, segments
+from hmsa_ros.core.setpoint import Setpoint
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.stopping import brake, holdable
 from hmsa_ros.core.timeline import Draft, Model, Plan, PlannedLevel, PlannedSegment, scaled

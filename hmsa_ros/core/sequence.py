@@ -8,6 +8,7 @@ from hmsa_ros.core.delivery import Delivery, IDEAL, ramps
 from hmsa_ros.core.model import elastic_force
 from hmsa_ros.core.moves import Level, Limits, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.core.setpoint import Setpoint
 from hmsa_ros.core.shapers import get_shaper
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.simulation import check_stretch, follow, longest_motion
@@ -17,38 +18,6 @@ from hmsa_ros.errors import BadInputError
 
 #: What to do with a setpoint that ends before the move to it does.
 SHORT_SPELL = ('refuse', 'continue')
-
-
-@dataclass(frozen=True)
-class Setpoint:
-    """
-    A stretch and how long it lasts, the paper's (lambda_d, span).
-
-    Attributes
-    ----------
-    stretch : float
-        Target, greater than 0.
-    span : float
-        Time from leaving the previous setpoint to leaving this one, greater than 0; infinite
-        for the last one of a sequence that is held.
-
-    Raises
-    ------
-    BadInputError
-        If a value is not in range.
-
-    """
-
-    stretch: float
-    span: float
-
-    def __post_init__(self) -> None:
-        """Check both numbers."""
-        if not (math.isfinite(self.stretch) and self.stretch > 0.0):
-            raise BadInputError(
-                f'stretch is {self.stretch:g}: expected a finite number greater than 0')
-        if not self.span > 0.0:
-            raise BadInputError(f'span is {self.span:g}: expected a number greater than 0')
 
 
 @dataclass(frozen=True)

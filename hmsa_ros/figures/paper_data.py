@@ -14,7 +14,8 @@ import numpy as np
 
 from hmsa_ros.core.model import Array, critical_zeta, signed_root, stretch_limits
 from hmsa_ros.core.parameters import NondimensionalParameters
-from hmsa_ros.core.sequence import plan_sequence, Segment, Setpoint
+from hmsa_ros.core.sequence import plan_sequence, Segment
+from hmsa_ros.core.setpoint import Setpoint
 from hmsa_ros.core.simulation import simulate
 from hmsa_ros.core.status import Code
 from hmsa_ros.core.two_step import CODES, plan_two_step_batch

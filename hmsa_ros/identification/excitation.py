@@ -18,7 +18,8 @@ from hmsa_ros.core.delivery import Delivery
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.moves import Limits, State
 from hmsa_ros.core.parameters import ActuatorParameters
-from hmsa_ros.core.sequence import plan_sequence, Setpoint
+from hmsa_ros.core.sequence import plan_sequence
+from hmsa_ros.core.setpoint import Setpoint
 from hmsa_ros.core.status import RefusedError
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.quantities import check_free, DEFAULT_FREE, derivative, values_of

@@ -123,8 +123,8 @@ SPECS = (
         'stretch_bias, remanence, chain_limit, coil_time_constant and others of hmsa identify.'),
     ParameterSpec(
         'takeover_timeout', _SETTINGS.takeover_timeout / NANOSECONDS,
-        'How long the first request waits for a sample of the current state, if samples are '
-        'published; 0 for no wait.', 's', 0.0, 60.0),
+        'How long the first request waits for a plant or a driver, and for a sample of the '
+        'current state if samples are published; 0 for no wait.', 's', 0.0, 60.0),
     ParameterSpec(
         'takeover_max_age', _SETTINGS.takeover_max_age / NANOSECONDS,
         'Largest age of a sample that is used for this.', 's', 0.0, 1e6),

@@ -56,7 +56,8 @@ class PlannerRuntime:
     observable : callable
         Returns whether somebody may give samples: the first request waits for them then.
     unheard : callable
-        Returns why nobody carries out commands; empty where somebody does.
+        Returns why nobody carries out commands; empty where somebody does. The first request
+        waits for that.
 
     Attributes
     ----------
@@ -81,7 +82,7 @@ class PlannerRuntime:
         self.following = Following(group)
         self.clock_jumps = 0
         self._clock, self._steady, self._observable = clock, steady, observable
-        self._takeover = Takeover(group, clock, steady, observable)
+        self._takeover = Takeover(group, clock, steady, observable, unheard)
         self._watch = Watch(group, steady)
         self._bulletin = Bulletin(group, self.following, self._watch, clock, steady, unheard)
         self._sending = Sending(group, self.following, self._bulletin.outputs)

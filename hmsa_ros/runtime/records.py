@@ -25,7 +25,8 @@ class Settings:
     lateness_tolerance : int
         How late a command may take effect without a new plan.
     takeover_timeout : int
-        How long the first request waits for a sample of the state in force; 0 for not at all.
+        How long the first request waits for a plant and a sample of the state in force; 0 for
+        not at all.
     takeover_max_age : int
         Age up to which such a sample counts.
     max_points : int

@@ -1,4 +1,4 @@
-"""The state in force, waited for before the first command."""
+"""The plant and the state in force, waited for before the first command."""
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
@@ -68,6 +68,8 @@ class Takeover:
         Return the present time in ns: that of the stamps, and one that patience is measured by.
     observable : callable
         Returns whether somebody may give samples.
+    unheard : callable
+        Returns why nobody carries out commands; empty where somebody does.
 
     Attributes
     ----------
@@ -78,10 +80,10 @@ class Takeover:
 
     def __init__(
             self, group: PlannerGroup, clock: Clock, steady: Clock,
-            observable: Callable[[], bool]) -> None:
+            observable: Callable[[], bool], unheard: Callable[[], str]) -> None:
         """Begin with nothing known."""
         self._group, self._clock, self._steady = group, clock, steady
-        self._observable = observable
+        self._observable, self._unheard = observable, unheard
         self._until: int | None = None
         self.engaged = False
         self.samples = Observations(group.planners)
@@ -92,10 +94,10 @@ class Takeover:
         return self._until is not None
 
     def begin(self, settings: Settings) -> None:
-        """Wait for samples, if there is somebody to give them."""
+        """Wait for samples, if there is somebody to give them or nobody is found yet at all."""
         if self.engaged or self.waiting:
             return
-        if settings.takeover_timeout and self._observable():
+        if settings.takeover_timeout and (self._observable() or self._unheard()):
             self._until = self._steady() + settings.takeover_timeout
         else:
             self.engaged = True
@@ -126,15 +128,18 @@ class Takeover:
         if self._until is None:
             return []
         samples = self.samples.fresh(self._clock(), settings.takeover_max_age)
-        if len(samples) < len(self._group.planners) and self._steady() <= self._until:
+        if self._steady() <= self._until and (
+                len(samples) < len(self._group.planners) or self._unheard()):
             return []
         self._until, self.engaged = None, True
+        observable = self._observable()
         notes = []
         for name, planner in self._group.planners.items():
             if name not in samples:
-                notes.append(
-                    f'no sample of joint {name} on joint_states: it is assumed at rest at its '
-                    'initial stretch')
+                if observable:
+                    notes.append(
+                        f'no sample of joint {name} on joint_states: it is assumed at rest at '
+                        'its initial stretch')
                 continue
             x = samples[name]
             level = newest.get(name)

@@ -11,6 +11,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_srvs.srv import Trigger
 
 from hmsa_ros.core.status import Code
@@ -20,6 +21,7 @@ from hmsa_ros.errors import BadInputError, HmsaError, printable
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.capture import decode, RawSubscription
 from hmsa_ros.nodes.conversions import to_trajectory, whole
+from hmsa_ros.nodes.message_types import type_name_of
 from hmsa_ros.nodes.visitor import leave, visit
 
 _SLICE_SECONDS = 0.05
@@ -257,17 +259,51 @@ class PlannerClient:
             return monotonic() - since >= _SETTLED_SECONDS
 
         def subscribed() -> bool:
-            # Recorders, rosbag2's too, offer to split the bag.
-            recorders = {
-                service.rpartition('/')[0] for service, _ in
-                self.node.get_service_names_and_types() if service.endswith('/split_bagfile')}
-            heard = self.node.get_subscriptions_info_by_topic(self._publisher.topic_name)
-            return any(
-                f'{x.node_namespace.rstrip("/")}/{x.node_name}' in recorders for x in heard
-            ) and self._publisher.get_subscription_count() >= len(heard)
+            recorders, heard = self._recorders(), self._subscribers(self._publisher.topic_name)
+            return any(x in recorders for x in heard) and (
+                self._publisher.get_subscription_count() >= len(heard))
 
         self.spin_until(
             recorded, f'no recorder of {self._publisher.topic_name}; start one with hmsa recorder')
+
+    def find_plant(self) -> None:
+        """Wait until the commands reach somebody, with little patience: the planner reports it."""
+        with suppress(HmsaError):
+            self.spin_until(lambda: not self.unheard(), 'no plant', timeout=_UNHEARD_SECONDS)
+
+    def unheard(self) -> list[str]:
+        """
+        Look who takes the commands.
+
+        Returns
+        -------
+        list of str
+            Topics of commands that nobody but recorders subscribes to.
+
+        """
+        recorders = self._recorders()
+        return [
+            x for x in self._commands() if recorders.issuperset(self._subscribers(x))]
+
+    def _commands(self) -> list[str]:
+        """Return the topics on which the planner commands our joints, whatever they are called."""
+        planner = f'{self._namespace.strip("/")}/{interface.PLANNER}'.lstrip('/')
+        name = type_name_of(interface.FLUX_DENSITY_COMMAND.type)
+        topics = [
+            topic for topic, types in self.node.get_topic_names_and_types() if name in types
+            and f'/{planner}' in _full_names(self.node.get_publishers_info_by_topic(topic))]
+        return [x for x in topics if x.split('/')[-2] in self._joints] or topics or [
+            self.node.resolve_topic_name(interface.of_joint(
+                interface.FLUX_DENSITY_COMMAND, x, self._joints).name) for x in self._joints]
+
+    def _subscribers(self, topic: str) -> list[str]:
+        return _full_names(self.node.get_subscriptions_info_by_topic(topic))
+
+    def _recorders(self) -> set[str]:
+        """Return the full names of recorders: rosbag2's too offer to split the bag."""
+        return {
+            service.rpartition('/')[0] for service, _ in
+            self.node.get_service_names_and_types() if service.endswith('/split_bagfile')}
 
     def send(
             self, setpoints: Sequence[tuple[float | Sequence[float], float]], *,
@@ -362,9 +398,9 @@ class PlannerClient:
                 and not now.watching)
             if not now.unheard:
                 heard = monotonic()
-            elif ended or monotonic() - heard > _UNHEARD_SECONDS:
+            elif monotonic() - heard > _UNHEARD_SECONDS:
                 raise HmsaError(f'the sequence is not carried out: {now.unheard}')
-            return ended
+            return ended and not now.unheard
 
         with _slower_time(self.node, self._timeout) as time:
             self.spin_until(
@@ -399,6 +435,11 @@ class PlannerClient:
             elif future.done() and self._verdict.state in ('at_rest', 'settling', 'idle'):
                 return bool(future.result().success)
         return False
+
+
+def _full_names(ends: Sequence[TopicEndpointInfo]) -> list[str]:
+    """Return the full names of the nodes that publishers or subscriptions belong to."""
+    return [f'{x.node_namespace.rstrip("/")}/{x.node_name}' for x in ends]
 
 
 @contextmanager

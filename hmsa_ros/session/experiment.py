@@ -335,33 +335,18 @@ class _Watch:
                 self.notes.append(
                     f'{spec.name} is {other} for the planner and {own} for the plant')
         self.client.spin_until(
-            lambda: not self._unheard(),
-            f'nobody takes the commands on {", ".join(self._unheard()) or "their topics"}: '
+            lambda: not self.client.unheard(),
+            f'nobody takes the commands on {", ".join(self.client.unheard()) or "their topics"}: '
             'expected a plant or a driver of the coil (hmsa plant)')
-        if not self.client.node.count_publishers(self._topic(interface.FLUX_DENSITY_APPLIED.name)):
+        joints = self._experiment.joints
+        if not self.client.node.count_publishers(
+                of_joint(interface.FLUX_DENSITY_APPLIED.name, joints[0], joints)):
             self.notes.append(
                 'nobody reports the levels that take effect (flux_density_applied)')
             if not self.measured:
                 raise HmsaError(
                     'nobody reports levels that take effect (flux_density_applied) or samples '
                     '(joint_states): expected a plant or a driver that does')
-
-    def _topic(self, name: str, joint: str = '') -> str:
-        joints = self._experiment.joints
-        return of_joint(name, joint or joints[0], joints)
-
-    def _unheard(self) -> list[str]:
-        """Return topics of commands that nobody but recorders subscribes to."""
-        node = self.client.node
-        recorders = {
-            x.rpartition('/')[0] for x, _ in node.get_service_names_and_types()
-            if x.endswith('/split_bagfile')}
-        topics = [self._topic(interface.FLUX_DENSITY_COMMAND.name, x)
-                  for x in self._experiment.joints]
-        return [topic for topic in topics if all(
-            f'{x.node_namespace.rstrip("/")}/{x.node_name}' in recorders
-            for x in node.get_subscriptions_info_by_topic(
-                node.resolve_topic_name(topic)))]
 
     def look(self, end: float) -> None:
         """
@@ -384,7 +369,7 @@ class _Watch:
         if not self.client.node.count_publishers(
                 interface.from_outside(interface.STATUS.name, interface.PLANNER)):
             raise HmsaError('the planner has gone: expected it to run until the end')
-        if unheard := self._unheard():
+        if unheard := self.client.unheard():
             raise HmsaError(
                 f'nobody takes the commands on {", ".join(unheard)} any more: expected plant or '
                 'driver to run until the end')

@@ -1,0 +1,38 @@
+"""What is asked of an actuator: a stretch, and how long it lasts."""
+
+from dataclasses import dataclass
+import math
+
+from hmsa_ros.errors import BadInputError
+
+
+@dataclass(frozen=True)
+class Setpoint:
+    """
+    A stretch and how long it lasts, the paper's (lambda_d, span).
+
+    Attributes
+    ----------
+    stretch : float
+        Target, greater than 0.
+    span : float
+        Time from leaving the previous setpoint to leaving this one, greater than 0; infinite
+        for the last one of a sequence that is held.
+
+    Raises
+    ------
+    BadInputError
+        If a value is not in range.
+
+    """
+
+    stretch: float
+    span: float
+
+    def __post_init__(self) -> None:
+        """Check both numbers."""
+        if not (math.isfinite(self.stretch) and self.stretch > 0.0):
+            raise BadInputError(
+                f'stretch is {self.stretch:g}: expected a finite number greater than 0')
+        if not self.span > 0.0:
+            raise BadInputError(f'span is {self.span:g}: expected a number greater than 0')
