@@ -7,9 +7,9 @@ import sys
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.constants import mu_0
 
 from hmsa_ros.core.laws.record import Elastic
+from hmsa_ros.core.units import MU_0
 from hmsa_ros.errors import BadInputError, excerpt
 
 _ZERO_ALLOWED = ('zeta', 'damping_coefficient')
@@ -185,7 +185,7 @@ class ActuatorParameters:
     @property
     def flux_density_unit(self) -> float:
         """Flux density in T of the load beta = 1, mu0 G/Br."""
-        return float(mu_0) * self.shear_modulus / self.remanence
+        return MU_0 * self.shear_modulus / self.remanence
 
     @cached_property
     def nondimensional(self) -> NondimensionalParameters:

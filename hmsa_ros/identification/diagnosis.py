@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from scipy.stats import binom
 
 from hmsa_ros.core.model import Array
 from hmsa_ros.identification.fit import Fit
@@ -314,6 +313,9 @@ def mistaken(recording: Recording, fit: Fit, chance: float = 0.02) -> bool:
     A fit to the levels at rest alone may take the few samples in motion for outliers. Outliers
     of the sensor lie there with the probability given at most.
     """
+    # Slow to load, and no use to a planner that estimates.
+    from scipy.special import bdtrc
+
     out = fit.weights < _OUT
     changes = recording.level_times[1:][np.diff(recording.levels) != 0.0]
     if not np.any(out) or not len(changes):
@@ -324,7 +326,7 @@ def mistaken(recording: Recording, fit: Fit, chance: float = 0.02) -> bool:
     soon = min(_SOON, max(len(out) // (3 * len(changes)), 1))
     after = (last >= 0) & (np.arange(len(out)) - place[last] < soon)
     usual = float(np.mean(after))
-    return float(np.mean(after[out])) > usual + 0.4 * (1.0 - usual) and bool(binom.sf(
+    return float(np.mean(after[out])) > usual + 0.4 * (1.0 - usual) and bool(bdtrc(
         np.count_nonzero(after & out) - 1, np.count_nonzero(out), usual) < chance)
 
 

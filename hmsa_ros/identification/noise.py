@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from scipy.stats import chi2
 
 from hmsa_ros.core.model import Array
 
@@ -76,12 +75,15 @@ def whiteness(residual: Array, free: int) -> Whiteness:
         With the lags that matter.
 
     """
+    # Slow to load, and no use to a planner that estimates.
+    from scipy.special import chdtrc
+
     n = len(residual)
     rho = autocorrelation(residual)
     lags = max(1, min(_LAGS, n // 5))
     k = np.arange(1, lags + 1)
     q = n * (n + 2.0) * float(np.sum(rho[1:lags + 1] ** 2 / (n - k)))
-    p_value = float(chi2.sf(q, max(lags - min(free, lags // 2), 1)))
+    p_value = float(chdtrc(max(lags - min(free, lags // 2), 1), q))
     if p_value > _WHITE:
         return Whiteness(rho, p_value, 0)
     window, time = n // 4, 0.5

@@ -7,7 +7,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.constants import mu_0
 
 from hmsa_ros.core.law import (
     BY_CONSTANT,
@@ -19,6 +18,7 @@ from hmsa_ros.core.law import (
 from hmsa_ros.core.laws.record import CONSTANTS, GENT
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.core.units import MU_0
 from hmsa_ros.identification import kernels
 from hmsa_ros.identification.quantities import derivative, group_of, QUANTITIES
 from hmsa_ros.identification.recording import pieces, Recording
@@ -58,7 +58,7 @@ def _chain(
     a = values['shear_modulus'] / inertia
     per_damping = thickness / (8.0 * length ** 2) / inertia
     d = per_damping * values['damping_coefficient']
-    k = values['remanence'] / (mu_0 * inertia)
+    k = values['remanence'] / (MU_0 * inertia)
     per_force = 1.0 / (4.0 * length ** 2 * inertia)
     f = per_force * values['constant_force']
     theta = np.zeros(kernels.FIRST_BRANCH + 2 * branches)

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from scipy.constants import mu_0
 
 from hmsa_ros.core import model
 from hmsa_ros.core.model import Array
+from hmsa_ros.core.units import MU_0
 from hmsa_ros.identification.quantities import group_of
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.response import respond
@@ -269,8 +269,8 @@ def _candidate(
     values['time_unit'] = unit
     if math.isfinite(found.per_tesla):
         if 'remanence' in free:
-            values['remanence'] = found.per_tesla * mu_0 * values['shear_modulus']
+            values['remanence'] = found.per_tesla * MU_0 * values['shear_modulus']
         elif 'shear_modulus' in free and 'time_unit' in free:
-            values['shear_modulus'] = values['remanence'] / (mu_0 * found.per_tesla)
+            values['shear_modulus'] = values['remanence'] / (MU_0 * found.per_tesla)
             values['density'] = values['shear_modulus'] * (unit / length) ** 2
     return values

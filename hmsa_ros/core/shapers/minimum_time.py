@@ -1,10 +1,9 @@
 """The fastest command within the load limits: full push, full brake, hold."""
 
+from collections.abc import Callable
 import contextlib
 from dataclasses import replace
 import math
-
-from scipy.optimize import brentq
 
 from hmsa_ros.core import kernels, law
 from hmsa_ros.core.model import Array
@@ -28,6 +27,8 @@ _MORE_PERIODS = ((0, 0), (1, 0), (0, 1), (1, 1), (2, 2), (3, 3))
 # Heights to try, as shares of what the limits allow.
 _SHARES = (1.0, 0.5, 0.25, 0.1, 0.05)
 _MOST_STEPS = 20_000
+# Of the time of the switch, as a share.
+_ZERO_TOLERANCE = 1e-13
 
 
 def minimum_time(request: Request, reason: str = '') -> Move:
@@ -237,5 +238,27 @@ def _durations(
         low = high = 0.0
     elif excess(low) > 0.0:
         low = 0.0
-    pushing = high if low == high else float(brentq(excess, low, high, xtol=1e-14, rtol=1e-13))
+    pushing = high if low == high else _zero(excess, low, high)
     return begin + pushing, turn(follow(here, pushing))[0]
+
+
+def _zero(function: Callable[[float], float], low: float, high: float) -> float:
+    """
+    Return where a function changes its sign (Anderson and Bjorck, BIT 13, 1973).
+
+    SciPy's solvers are as fast, but loading them takes half of the time in which a planner starts.
+    """
+    other, value = function(low), function(high)
+    for _ in range(_MOST_STEPS):
+        step = value * (high - low) / (other - value)
+        if abs(step) <= _ZERO_TOLERANCE * max(abs(high), 0.1):
+            break
+        new = function(high + step)
+        if (new > 0.0) == (value > 0.0):
+            # The same end moves again: the other one has less weight from now on.
+            share = 1.0 - new / value
+            other *= share if share > 0.0 else 0.5
+        else:
+            low, other = high, value
+        high, value = high + step, new
+    return high
