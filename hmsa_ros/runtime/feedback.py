@@ -1,24 +1,22 @@
-"""Feedback: what samples say of the actuators, and plans that are corrected accordingly."""
+"""Feedback: what samples say of the actuators, and models that are learnt from them."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 import math
 
-from hmsa_ros.core.drafting import Steps
 from hmsa_ros.core.group import PlannerGroup
 from hmsa_ros.core.planner import Planner
 from hmsa_ros.core.simulation import check_stretch
-from hmsa_ros.core.timeline import Draft, Model, Plan, PlannedLevel
+from hmsa_ros.core.timeline import Model, Plan
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.estimation import Estimate, Estimator, Options, Prior
-from hmsa_ros.estimation.correction import Course, expect
 from hmsa_ros.estimation.estimator import warm_up
 from hmsa_ros.estimation.motion import rest
 from hmsa_ros.estimation.words import differences, sentence
-from hmsa_ros.runtime.records import EstimateChanged, Output, Settings, Severity, Verdict
-from hmsa_ros.runtime.slices import Clock, in_time, Work
+from hmsa_ros.runtime.records import EstimateChanged, Output, Settings, Severity
+from hmsa_ros.runtime.slices import Clock
 
 #: What the parameter `feedback` can be.
 MODES = ('off', 'observe', 'adapt')
@@ -29,11 +27,6 @@ _UPDATE, _RESTING, _TELL = 20_000_000, 200_000_000, 200_000_000
 _DENSE, _SPARSE = 40, 10
 # Periods after the last change of level from which on a joint rests.
 _QUIET = 12.0
-# A correction leaves at most this share of what the plan leaves, in squares, and gains this share
-# of the step.
-_SHARE, _GAIN = 0.5, 5e-4
-# A step that is smaller counts as this one.
-_LEAST_STEP = 0.1
 # A model is another one from this share of a parameter, and this many of its deviations, on.
 _NEWS, _SURE = 1e-3, 2.0
 # States further ahead than so many units of time are those of rest.
@@ -60,7 +53,7 @@ class _Joint:
 
 class Feedback:
     """
-    Estimates from samples, tells what is wrong, and corrects plans.
+    Estimates from samples, reports what is wrong, and learns what to plan with.
 
     Parameters
     ----------
@@ -109,7 +102,7 @@ class Feedback:
             if name in self._nominal:
                 planner.take_model(self._nominal[name])
             self._nominal[name] = planner.model
-            planner.believed = self._believed(name)
+            planner.believed = partial(self._believed, name)
         self._joints = {}
         if self.on:
             warm_up()
@@ -293,10 +286,15 @@ class Feedback:
             found, joint.estimator.prior.values, plan.level(now).flux_density, target, joint.start,
             joint.amplitude, adapting=self.mode == 'adapt')
 
-    # -- corrections ---------------------------------------------------------------------------
+    # -- for plans -----------------------------------------------------------------------------
 
-    def _believed(self, name: str) -> 'Believed':
-        return Believed(self, name)
+    def _believed(self, name: str, time: int) -> tuple[float, float] | None:
+        """Return stretch and rate in 1/s at a time in ns; None for what is predicted."""
+        try:
+            found = self.state(name, time)
+        except HmsaError:
+            return None
+        return None if found is None else (found.stretch, found.rate)
 
     def state(self, name: str, time: int) -> Estimate | None:
         """
@@ -324,37 +322,26 @@ class Feedback:
             return None
         return joint.estimator.predict(time)
 
-    def corrections_due(self, now: int) -> Iterator[Work]:
+    def news(self) -> Iterator[tuple[str, Planner]]:
         """
-        Yield what may be worth correcting.
-
-        Parameters
-        ----------
-        now : int
-            Time in ns, with nothing else waiting to be planned.
+        Learn from the latest estimates.
 
         Yields
         ------
-        Work
-            Its result is for `take`.
+        str
+            Joint whose estimate is trusted, and has not been held against the plan yet.
+        Planner
+            Of that joint; it plans with what was learnt from now on.
 
         """
         if self.mode != 'adapt':
             return
         for name, joint in self._joints.items():
-            planner = self._group.planners[name]
-            if not joint.news or joint.latest is None or not joint.latest.trusted:
-                continue
-            joint.news = False
-            self._learn(name, joint.latest, planner)
-            if not planner.plan.segments:
-                continue
-            estimate = self.state(name, planner.soonest(now))
-            if estimate is None or not self._worthwhile(estimate, planner):
-                continue
-            joints = frozenset([name])
-            yield Work(joints, in_time(
-                partial(self._correct, name), self._group, joints, self._clock), corrects=True)
+            if joint.news and joint.latest is not None and joint.latest.trusted:
+                joint.news = False
+                planner = self._group.planners[name]
+                self._learn(name, joint.latest, planner)
+                yield name, planner
 
     def _learn(self, name: str, estimate: Estimate, planner: Planner) -> None:
         """Plan with another model where it is known to be another."""
@@ -366,86 +353,3 @@ class Feedback:
             if abs(value - known) > max(_NEWS * abs(value), _SURE * estimate.deviations[key]):
                 planner.take_model(self._learnt(name, planner.model))
                 return
-
-    def _worthwhile(self, estimate: Estimate, planner: Planner) -> bool:
-        """Return whether a plan is expected to leave more than it must."""
-        course, step = _course(planner.plan, estimate.time, planner.plan.levels)
-        size = expect(estimate, course, planner.options.slew_limit).size
-        return size > _GAIN * step
-
-    def _correct(self, name: str, now: int) -> Steps[Mapping[str, Draft]]:
-        """Plan the rest anew, if that is expected to leave less."""
-        planner = self._group.planners[name]
-        draft = yield from planner.draft_resumption(now)
-        estimate = None if draft is None else self.state(name, draft.begin)
-        if draft is None or estimate is None:
-            return {}
-        slew = planner.options.slew_limit
-        course, step = _course(planner.plan, draft.begin, planner.plan.levels)
-        segment = draft.segments[0]
-        before = expect(estimate, course, slew, segment.arrival or 0).size
-        end = draft.segments[1].begin if len(draft.segments) > 1 else None
-        after = expect(estimate, Course(
-            tuple((x.stamp, x.flux_density) for x in draft.levels
-                  if end is None or x.stamp < end),
-            segment.arrival or draft.begin, segment.stretch), slew).size
-        if after < min(math.sqrt(_SHARE) * before, before - _GAIN * step):
-            return {name: draft}
-        return {}
-
-    def take(self, drafts: Mapping[str, Draft], now: int, request: str) -> Verdict | None:
-        """
-        Take a correction.
-
-        Parameters
-        ----------
-        drafts : mapping of str to Draft
-            As worked out; empty where the plan is to be kept.
-        now : int
-            Time in ns that they are made for.
-        request : str
-            Name of the request that is carried out.
-
-        Returns
-        -------
-        Verdict or None
-            None if nothing changes.
-
-        """
-        for name, draft in drafts.items():
-            words = self.words(name, self._clock())
-            self._group.planners[name].take(draft, now)
-            self.corrections += 1
-            return Verdict(
-                Severity.OK, 'corrected', f'corrected from samples: {words}', request)
-        return None
-
-
-class Believed:
-    """State of a joint for its planner."""
-
-    def __init__(self, feedback: Feedback, name: str) -> None:
-        """Remember whom to ask."""
-        self._feedback, self._name = feedback, name
-
-    def __call__(self, time: int) -> tuple[float, float] | None:
-        """Return stretch and rate in 1/s at a time in ns; None for what is predicted."""
-        try:
-            found = self._feedback.state(self._name, time)
-        except HmsaError:
-            return None
-        return None if found is None else (found.stretch, found.rate)
-
-
-def _course(plan: Plan, begin: int, levels: tuple[PlannedLevel, ...]) -> tuple[Course, float]:
-    """Return what is planned from a time in ns to the end of the setpoint then, and its step."""
-    place = max(plan.under_way(begin), 0)
-    segment = plan.segments[place]
-    end = plan.segments[place + 1].begin if place + 1 < len(plan.segments) else None
-    first = plan.place(begin)
-    kept = [x for x in levels[first:] if end is None or x.stamp < end or x is levels[first]]
-    start = plan.segments[place - 1].stretch if place else levels[0].stretch
-    return Course(
-        tuple((x.stamp, x.flux_density) for x in kept),
-        segment.arrival or kept[-1].stamp, segment.stretch), max(
-            abs(segment.stretch - start), _LEAST_STEP)

@@ -16,6 +16,7 @@ from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.runtime.bulletin import Bulletin
 from hmsa_ros.runtime.checks import check_joints
+from hmsa_ros.runtime.corrections import Corrections
 from hmsa_ros.runtime.feedback import Feedback
 from hmsa_ros.runtime.following import Following
 from hmsa_ros.runtime.planning import Planning, SLICE
@@ -88,7 +89,8 @@ class PlannerRuntime:
         self._sending = Sending(group, self.following, self._bulletin.outputs)
         self._feedback = Feedback(group, settings, self._bulletin.outputs, clock)
         self._planning = Planning(
-            group, self.following, self._feedback, self._bulletin, clock, steady,
+            group, self.following, Corrections(group, self._feedback, clock), self._bulletin,
+            clock, steady,
             lambda: self._sending.send(clock()))
         self._last_jump: int | None = None
 

@@ -8,7 +8,7 @@ from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.timeline import Draft
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.runtime.bulletin import Bulletin
-from hmsa_ros.runtime.feedback import Feedback
+from hmsa_ros.runtime.corrections import Corrections
 from hmsa_ros.runtime.following import Following
 from hmsa_ros.runtime.records import Note, Request, Severity, Verdict
 from hmsa_ros.runtime.slices import Clock, Work, work_on
@@ -27,7 +27,7 @@ class Planning:
         The joints.
     following : Following
         Knows plans that are to be made anew.
-    feedback : Feedback
+    corrections : Corrections
         Knows plans that may be worth correcting.
     bulletin : Bulletin
         Takes the answers.
@@ -44,11 +44,11 @@ class Planning:
     """
 
     def __init__(
-            self, group: PlannerGroup, following: Following, feedback: Feedback,
+            self, group: PlannerGroup, following: Following, corrections: Corrections,
             bulletin: Bulletin, clock: Clock, steady: Clock, send: Callable[[], None]) -> None:
         """Begin with nothing to do."""
         self._group, self._following, self._bulletin = group, following, bulletin
-        self._feedback = feedback
+        self._corrections = corrections
         self._clock, self._steady, self._send = clock, steady, send
         self._queue: deque[Work] = deque()
         self.refused = 0
@@ -105,7 +105,7 @@ class Planning:
             if not any(x.request is None and name in x.joints for x in self._queue):
                 self._queue.appendleft(self._following.resumption(name, self._clock))
         if not self._queue:
-            self._queue += self._feedback.corrections_due(self._clock())
+            self._queue += self._corrections.due(self._clock())
         end = self._steady() + SLICE
         while self._queue and self._steady() < end:
             work = self._queue[0]
@@ -180,7 +180,7 @@ class Planning:
 
     def _correct(self, drafts: Mapping[str, Draft], now: int) -> None:
         """Go on with a plan that was corrected from samples."""
-        verdict = self._feedback.take(drafts, now, self._bulletin.verdict.request)
+        verdict = self._corrections.take(drafts, now, self._bulletin.verdict.request)
         self._send()
         if verdict is not None:
             self._bulletin.judge_again(drafts)

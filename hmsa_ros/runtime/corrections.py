@@ -1,0 +1,133 @@
+"""Plans that are corrected from what feedback has seen."""
+
+from collections.abc import Iterator, Mapping
+from functools import partial
+import math
+
+from hmsa_ros.core.drafting import Steps
+from hmsa_ros.core.group import PlannerGroup
+from hmsa_ros.core.planner import Planner
+from hmsa_ros.core.timeline import Draft, Plan
+from hmsa_ros.estimation import Estimate
+from hmsa_ros.estimation.correction import Course, expect
+from hmsa_ros.runtime.feedback import Feedback
+from hmsa_ros.runtime.records import Severity, Verdict
+from hmsa_ros.runtime.slices import Clock, in_time, Work
+
+# A correction leaves at most this share of what the plan leaves, in squares, and gains this share
+# of the step.
+_SHARE, _GAIN = 0.5, 5e-4
+# A step that is smaller counts as this one.
+_LEAST_STEP = 0.1
+
+
+class Corrections:
+    """
+    Corrects plans where that is expected to leave less.
+
+    Parameters
+    ----------
+    group : PlannerGroup
+        The joints.
+    feedback : Feedback
+        Knows the joints' states.
+    clock : callable
+        Returns the present time in ns.
+
+    """
+
+    def __init__(self, group: PlannerGroup, feedback: Feedback, clock: Clock) -> None:
+        """Begin with nothing corrected."""
+        self._group, self._feedback, self._clock = group, feedback, clock
+
+    def due(self, now: int) -> Iterator[Work]:
+        """
+        Yield what may be worth correcting.
+
+        Parameters
+        ----------
+        now : int
+            Time in ns, with nothing else waiting to be planned.
+
+        Yields
+        ------
+        Work
+            Its result is for `take`.
+
+        """
+        for name, planner in self._feedback.news():
+            if not planner.plan.segments:
+                continue
+            estimate = self._feedback.state(name, planner.soonest(now))
+            if estimate is None or not self._worthwhile(estimate, planner):
+                continue
+            yield Work(frozenset([name]), in_time(
+                partial(self._correct, name), self._group, frozenset([name]), self._clock),
+                corrects=True)
+
+    def _worthwhile(self, estimate: Estimate, planner: Planner) -> bool:
+        """Return whether a plan is expected to leave more than it must."""
+        course, step = _course(planner.plan, estimate.time)
+        size = expect(estimate, course, planner.options.slew_limit).size
+        return size > _GAIN * step
+
+    def _correct(self, name: str, now: int) -> Steps[Mapping[str, Draft]]:
+        """Plan the rest anew, if that is expected to leave less."""
+        planner = self._group.planners[name]
+        draft = yield from planner.draft_resumption(now)
+        estimate = None if draft is None else self._feedback.state(name, draft.begin)
+        if draft is None or estimate is None:
+            return {}
+        slew = planner.options.slew_limit
+        course, step = _course(planner.plan, draft.begin)
+        segment = draft.segments[0]
+        before = expect(estimate, course, slew, segment.arrival or 0).size
+        end = draft.segments[1].begin if len(draft.segments) > 1 else None
+        after = expect(estimate, Course(
+            tuple((x.stamp, x.flux_density) for x in draft.levels
+                  if end is None or x.stamp < end),
+            segment.arrival or draft.begin, segment.stretch), slew).size
+        if after < min(math.sqrt(_SHARE) * before, before - _GAIN * step):
+            return {name: draft}
+        return {}
+
+    def take(self, drafts: Mapping[str, Draft], now: int, request: str) -> Verdict | None:
+        """
+        Take a correction.
+
+        Parameters
+        ----------
+        drafts : mapping of str to Draft
+            As worked out; empty where the plan is to be kept.
+        now : int
+            Time in ns that they are made for.
+        request : str
+            Name of the request that is carried out.
+
+        Returns
+        -------
+        Verdict or None
+            None if nothing changes.
+
+        """
+        for name, draft in drafts.items():
+            words = self._feedback.words(name, self._clock())
+            self._group.planners[name].take(draft, now)
+            self._feedback.corrections += 1
+            return Verdict(
+                Severity.OK, 'corrected', f'corrected from samples: {words}', request)
+        return None
+
+
+def _course(plan: Plan, begin: int) -> tuple[Course, float]:
+    """Return what is planned from a time in ns to the end of the setpoint then, and its step."""
+    levels, place = plan.levels, max(plan.under_way(begin), 0)
+    segment = plan.segments[place]
+    end = plan.segments[place + 1].begin if place + 1 < len(plan.segments) else None
+    first = plan.place(begin)
+    kept = [x for x in levels[first:] if end is None or x.stamp < end or x is levels[first]]
+    start = plan.segments[place - 1].stretch if place else levels[0].stretch
+    return Course(
+        tuple((x.stamp, x.flux_density) for x in kept),
+        segment.arrival or kept[-1].stamp, segment.stretch), max(
+            abs(segment.stretch - start), _LEAST_STEP)
