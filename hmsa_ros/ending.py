@@ -9,10 +9,13 @@ has something to put in order only notes them, and looks where it is safe to end
 """
 
 from collections.abc import Callable
+import ctypes
 import os
 import signal
 
 _NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+# How long a process may take to end when all is done, in s.
+_LAST_SECONDS = 10
 
 
 class Ending:
@@ -53,6 +56,10 @@ class Ending:
             for number in _NUMBERS:
                 signal.signal(number, signal.SIG_IGN)
 
+    def finish(self, status: int) -> None:
+        """Have the process end with a status, soon, even if a library hangs in its clean-up."""
+        _exit_after(_LAST_SECONDS, status)
+
     def check(self) -> None:
         """Raise KeyboardInterrupt if the end has been asked for."""
         if self.asked:
@@ -80,6 +87,33 @@ class Ending:
 
 def _raise() -> None:
     raise KeyboardInterrupt
+
+
+class _Event(ctypes.Structure):
+    """``struct sigevent`` of Linux that has a function called in a thread (man 7 sigevent)."""
+
+    _fields_ = (
+        ('value', ctypes.c_void_p), ('number', ctypes.c_int), ('notify', ctypes.c_int),
+        ('function', ctypes.c_void_p), ('rest', ctypes.c_byte * 40))
+
+
+def _exit_after(seconds: int, status: int) -> None:
+    """
+    Call ``_exit`` with a status after some seconds, from a thread that needs no Python.
+
+    Fast DDS 2.14 may never come back from the end of a participant: it waits, without letting
+    go, for a thread that has just received the end of another one.
+    """
+    libc = ctypes.CDLL(None)
+    if not hasattr(libc, 'timer_create'):
+        return
+    in_thread, monotonic = 2, 1
+    event = _Event(
+        value=status, notify=in_thread, function=ctypes.cast(libc._exit, ctypes.c_void_p).value)
+    timer = ctypes.c_void_p()
+    if libc.timer_create(monotonic, ctypes.byref(event), ctypes.byref(timer)) == 0:
+        # struct itimerspec: interval and time to go, each in seconds and nanoseconds.
+        libc.timer_settime(timer, 0, ctypes.byref((ctypes.c_long * 4)(0, 0, seconds, 0)), None)
 
 
 #: Of this process.

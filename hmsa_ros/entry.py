@@ -11,10 +11,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     ENDING.leave()
     from hmsa_ros.cli import main as command
     try:
-        return command(argv)
+        status = command(argv)
     finally:
         # Python's own end takes a while, in which it would answer signals by dying.
         ENDING.ignore()
+    ENDING.finish(status)
+    return status
 
 
 def planner() -> int:

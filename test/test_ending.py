@@ -41,9 +41,30 @@ sys.exit(main(['send', '1.1:1', '--timeout', '1000']))
 """
 
 
+# Ends in native code that holds the interpreter for ever.
+IN_NATIVE_CODE = """
+import atexit, ctypes, sys
+from hmsa_ros import ending, entry
+ending._LAST_SECONDS = 1
+atexit.register(ctypes.PyDLL(None).pause)
+sys.exit(entry.main({arguments!r}))
+"""
+
+
+@pytest.mark.parametrize(('arguments', 'status'), [
+    (['plan', '1.1:10'], 0), (['plan', '1.1:10', '--zeta', '-1'], 2)])
+def test_a_process_ends_even_where_a_library_does_not(arguments, status):
+    done = subprocess.run(
+        [sys.executable, '-c', IN_NATIVE_CODE.format(arguments=arguments)],
+        capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == status
+    assert ('error' in done.stderr) == bool(status)
+    assert ('1.1' in done.stdout) == (not status)
+
+
 @pytest.mark.parametrize(('node', 'module', 'number'), [
     (node, module, NUMBERS[i % 3]) for i, (node, module) in enumerate([
-        *((x, 'rclpy') for x in NODES), ('planner', 'numba'), ('plant', 'scipy')])])
+        *((x, 'rclpy') for x in NODES), ('planner', 'numba'), ('plant', 'numpy')])])
 def test_a_node_that_is_told_to_end_while_it_is_imported_ends_without_a_word(
         ros_env, node, module, number):
     done = subprocess.run(

@@ -234,14 +234,8 @@ class PlantNode(ManagedNode):
         self._clock_seen = now
         jump = self._device.follow(now, standing=self._standing)
         if jump:
-            if jump < 0:
-                what = (f'the clock jumped back by {-jump / 1e9:.3f} s: the simulation starts '
-                        'again from its initial state')
-            else:
-                cause = (f'the plant fell {jump / 1e9:.3f} s behind the clock (lower publish_rate)'
-                         if behind else f'the clock jumped ahead by {jump / 1e9:.3f} s')
-                what = f'{cause}: the simulation continues from there in its present state'
-            self.get_logger().warning(what, throttle_duration_sec=1.0)
+            self.get_logger().warning(
+                _jump_in_words(jump, behind=behind), throttle_duration_sec=1.0)
             self._publish_news()
         begin = monotonic_ns()
         while (self._device.next_sample <= now and not self._standing
@@ -430,6 +424,17 @@ def joints_from(values: JointParameters) -> list[SimulatedJoint]:
                 raise
             raise BadInputError(f'joint {name}: {error}') from error
     return found
+
+
+def _jump_in_words(jump: int, *, behind: bool) -> str:
+    """Describe a jump of the clock by some ns, which may be the plant's own fault."""
+    seconds = abs(jump) / 1e9
+    if jump < 0:
+        return (f'the clock jumped back by {seconds:.3f} s: the simulation starts again from its '
+                'initial state')
+    cause = (f'the plant fell {seconds:.3f} s behind the clock (lower publish_rate)'
+             if behind else f'the clock jumped ahead by {seconds:.3f} s')
+    return f'{cause}: the simulation continues from there in its present state'
 
 
 def main(args: Sequence[str] | None = None) -> int:
