@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 import os
 from pathlib import Path
-import struct
 import tempfile
 from time import monotonic, sleep
 
@@ -18,7 +17,7 @@ from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.capture import Capture, RawSubscription, Taken
-from hmsa_ros.nodes.conversions import to_trajectory
+from hmsa_ros.nodes.conversions import stamp_of, to_trajectory
 
 #: Joints of one plant and planner, by the rate of samples in Hz.
 _JOINTS = ((1, 1000.0), (16, 1000.0), (64, 1000.0), (128, 1000.0), (64, 4000.0))
@@ -63,10 +62,8 @@ class _Watch:
     def _take(self, taken: Sequence[tuple[None, list[Taken]]]) -> None:
         for _, messages in taken:
             for message in messages:
-                # Behind the four bytes that say how it is encoded: the stamp of the header.
-                seconds, nanoseconds = struct.unpack_from('<iI', message.data, 4)
                 self.behind.append(
-                    (message.received_ns - nanoseconds) / NANOSECONDS - seconds)
+                    (message.received_ns - stamp_of(message.data)) / NANOSECONDS)
 
     def _judge(self, message: DiagnosticStatus) -> None:
         self.late = next(int(x.value) for x in message.values if x.key == 'late')

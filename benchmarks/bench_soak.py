@@ -28,7 +28,6 @@ from pathlib import Path
 import random
 import shutil
 import signal
-import struct
 import tempfile
 from time import monotonic
 from typing import Any
@@ -241,6 +240,7 @@ def check_bag(folder: Path, kind: str, killed: str, step: int = _STEP_NS) -> Cyc
     from hmsa_ros.bag.reader import BagReader
     from hmsa_ros.bag.recover import recover
     from hmsa_ros.errors import HmsaError
+    from hmsa_ros.nodes.conversions import stamp_of
     from hmsa_ros.runs.verify import verify
 
     found = Cycle(kind, killed)
@@ -258,9 +258,7 @@ def check_bag(folder: Path, kind: str, killed: str, step: int = _STEP_NS) -> Cyc
             if kind == 'rough':
                 # Time jumps, and there is garbage among them.
                 continue
-            # Behind the four bytes that say how it is encoded: the stamp of the header.
-            seconds, nanoseconds = struct.unpack_from('<iI', message.data, 4)
-            now = seconds * _NANOSECONDS + nanoseconds
+            now = stamp_of(message.data)
             if before:
                 found.missing += (now - before) // step - 1
                 found.odd += (now - before) % step != 0

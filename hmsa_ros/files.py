@@ -7,6 +7,7 @@ import math
 import os
 from pathlib import Path
 import stat
+from typing import Any
 
 from hmsa_ros.errors import BadInputError
 
@@ -87,3 +88,23 @@ def _known(value: object) -> object:
     if isinstance(value, dict):
         return {key: _known(x) for key, x in value.items()}
     return [_known(x) for x in value] if isinstance(value, (list, tuple)) else value
+
+
+def require_arrow() -> tuple[Any, Any]:
+    """
+    Return the modules ``pyarrow`` and ``pyarrow.parquet``.
+
+    Raises
+    ------
+    BadInputError
+        If pyarrow is not installed.
+
+    """
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError as error:
+        raise BadInputError(
+            'pyarrow, which writes Parquet, is not installed: install it (pip install '
+            '"hmsa_ros[studies]") or write to a file that ends in .csv') from error
+    return pyarrow, parquet

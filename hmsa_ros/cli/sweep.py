@@ -132,9 +132,9 @@ def _plan_at_once(sweep: 'Sweep', out: Path | None) -> int:
 
 
 def _plan_in_chunks(sweep: 'Sweep', arguments: argparse.Namespace) -> int:
+    from hmsa_ros.files import require_arrow
     from hmsa_ros.studies.chunks import Chunks
     from hmsa_ros.studies.engine import compute, parse_shard
-    from hmsa_ros.studies.tables import require_arrow
 
     require_arrow()
     shard = (0, 1) if arguments.shard is None else parse_shard(arguments.shard)

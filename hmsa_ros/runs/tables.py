@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import replacing
+from hmsa_ros.files import replacing, require_arrow
 from hmsa_ros.runs.record import Run
 
 SUFFIXES = ('.csv', '.parquet')
@@ -91,7 +91,9 @@ def write_table(path: Path, columns: Mapping[str, Array]) -> None:
             f'the format of {path} is unknown: expected a name that ends in '
             + ' or '.join(SUFFIXES))
     if kind == '.parquet':
-        _write_parquet(path, columns)
+        arrow, parquet = require_arrow()
+        with replacing(path) as beside:
+            parquet.write_table(arrow.table(dict(columns)), beside)
         return
     with replacing(path) as beside, beside.open('w', newline='', encoding='utf-8') as file:
         writer = csv.writer(file)
@@ -99,15 +101,3 @@ def write_table(path: Path, columns: Mapping[str, Array]) -> None:
         writer.writerows(
             ['' if math.isnan(value) else repr(value) for value in row]
             for row in zip(*(x.tolist() for x in columns.values()), strict=True))
-
-
-def _write_parquet(path: Path, columns: Mapping[str, Array]) -> None:
-    try:
-        import pyarrow  # type: ignore[import-not-found,import-untyped,unused-ignore]
-        import pyarrow.parquet  # type: ignore[import-not-found,import-untyped,unused-ignore]
-    except ImportError as error:
-        raise BadInputError(
-            f'Parquet cannot be written without pyarrow ({error}): install it with "pip install '
-            'pyarrow", or write CSV') from error
-    with replacing(path) as beside:
-        pyarrow.parquet.write_table(pyarrow.table(dict(columns)), beside)

@@ -21,8 +21,8 @@ import zlib
 
 from hmsa_ros import __version__
 from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.files import make_folder, write_text
-from hmsa_ros.studies.tables import ArrowBlock, open_writer, repeating, require_arrow
+from hmsa_ros.files import make_folder, require_arrow, write_text
+from hmsa_ros.studies.tables import ArrowBlock, open_writer, repeating
 
 #: Rows of a chunk: a thousandth of the study, at least 0.1 s and at most some 100 MB of work.
 SHARE, LEAST_ROWS, MOST_ROWS = 1000, 20_000, 500_000

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from hmsa_ros.core.model import Array, signed_root
 from hmsa_ros.core.two_step import CODES, plan_two_step_batch
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.studies.tables import require_arrow
+from hmsa_ros.files import require_arrow
 
 #: What can be swept, with the value of what is not.
 DEFAULTS = {'start': 1.0, 'target': 1.1, 'zeta': 0.2, 'j_lim': 5.0, 'c1': 2.0}

@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import Any, Protocol, TextIO
 
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import replacing
+from hmsa_ros.files import replacing, require_arrow
 
 
 class Block(Protocol):
@@ -83,26 +83,6 @@ def repeating(table: Any) -> list[str]:
     head = table.slice(0, 1000)
     return [name for name in head.column_names
             if len(head[name].unique()) <= max(1, head.num_rows // 2)]
-
-
-def require_arrow() -> tuple[Any, Any]:
-    """
-    Return the modules ``pyarrow`` and ``pyarrow.parquet``.
-
-    Raises
-    ------
-    BadInputError
-        If pyarrow is not installed.
-
-    """
-    try:
-        import pyarrow
-        from pyarrow import parquet
-    except ImportError as error:
-        raise BadInputError(
-            'pyarrow, which writes Parquet, is not installed: install it (pip install '
-            '"hmsa_ros[studies]") or write to a file that ends in .csv') from error
-    return pyarrow, parquet
 
 
 @contextmanager
