@@ -193,7 +193,7 @@ class Estimator:
             self.screening.late += 1
             return False
         place = bisect_left(self._pending, stamp, key=lambda x: x[0])
-        if stamp in self._stamps() or (
+        if self._taken(stamp) or (
                 place < len(self._pending) and self._pending[place][0] == stamp):
             self.screening.repeated += 1
             return False
@@ -373,10 +373,13 @@ class Estimator:
     def _seconds(self, stamp: int) -> float:
         return (stamp - self._origin) / NANOSECONDS
 
-    def _stamps(self) -> set[int]:
+    def _taken(self, stamp: int) -> bool:
+        """Return whether the window has a sample of this stamp; its times are rounded."""
         if self._window is None:
-            return set()
-        return {self._origin + round(x * NANOSECONDS) for x in self._window.time.tolist()}
+            return False
+        times, time = self._window.time, self._seconds(stamp)
+        place = int(np.searchsorted(times, time - 0.5 / NANOSECONDS))
+        return place < len(times) and float(times[place]) < time + 0.5 / NANOSECONDS
 
     def _in_force(self, stamp: int) -> float:
         place = bisect_right(self._levels, stamp, key=lambda x: x[0]) - 1
