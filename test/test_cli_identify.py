@@ -113,9 +113,13 @@ def test_levels_sampled_beside_the_stretch_serve_with_semicolons_and_units(folde
     ('time,stretch\n', 'has a header and no row'),
     ('0.0,1.0\n0.1,1.1\n', 'begins with numbers .*expected a header'),
     ('time,length\n0,1\n', 'has no column stretch'),
+    ('time,strain\n0,0\n', 'has no column stretch: .*stretch is strain plus 1'),
+    ('time,stretch [%]\n0,100\n', 'gives stretch in %: .*percent by 100'),
+    ('time,stretch\n0,1\n0,1,1,02\n', 'line 3 has 4 cells in 2 columns .*need semicolons'),
+    ('time,stretch\n"0,1","1,02"\n', "line 2 has '0,1' in column time: .*need semicolons"),
     ('time,stretch [mm]\n0,1\n', 'gives stretch in mm: expected no unit: divide'),
     ('time,stretch\n0,1\n0.1,abc\n', "line 3 has 'abc' in column stretch"),
-    ('time,stretch\n0,1\n0.1,1\n0.05,1\n', 'line 4 jumps back in time from 0.1 to 0.05 s'),
+    ('time,stretch\n0,1\n0.1,1\n0.05,1\n', 'line 4 jumps back in time from 0.1 to 0.05 s.*sort'),
     ('time,stretch\n0,1\n0,1\n0,1\n0.1,1\n', '2 of 4 rows .* stamp of its own'),
     ('time,stretch\n0,1\n0.1,1\n0.2,1\n0.3,1\n0.4,1\n', 'has 5 samples: expected 12 or more')])
 def test_bad_samples_end_with_2_and_a_sentence(folder, capsys, text, message):
@@ -123,6 +127,43 @@ def test_bad_samples_end_with_2_and_a_sentence(folder, capsys, text, message):
     status, out, err = identify(capsys, 'camera.csv', '--commands', 'levels.csv')
     assert (status, out, err.count('\n')) == (2, '', 1)
     assert re.search(message, err)
+
+
+@pytest.mark.parametrize(('factor', 'offset', 'first', 'message'), [
+    (100.0, 0.0, 0.0, '99.99 without field: .* if it is percent, divide it by 100'),
+    (1.0, -1.0, 0.0, 'if it is strain, add 1'),
+    (100.0, -100.0, 0.0, 'if it is strain in percent, divide it by 100 and add 1'),
+    (10.0, 0.0, 0.0, 'if it is ten times the stretch, divide it by 10'),
+    (10.0, 0.0, 0.05, 'if it is ten times the stretch, divide it by 10'),
+    (3.0, 0.0, 0.0, 'if it is a length, in mm perhaps, divide it by the length at rest')])
+def test_what_is_no_stretch_is_refused_with_what_it_looks_like(
+        folder, capsys, factor, offset, first, message):
+    rows = [(t, factor * y + offset) for t, y in zip(TIMES, STRETCH, strict=True) if t >= first]
+    write('camera.csv', 'time,stretch', rows)
+    status, out, err = identify(capsys, 'camera.csv', '--commands', 'levels.csv')
+    assert (status, out, err.count('\n')) == (2, '', 1)
+    assert re.search(message, err)
+
+
+@pytest.mark.parametrize(('samples', 'levels', 'wrong'), [
+    (1e3, 1.0, 'camera.csv were in ms'), (1.0, 1e3, 'levels.csv were in ms'),
+    (1e6, 1.0, 'camera.csv were in us')])
+def test_times_in_two_units_are_refused_with_which_is_which(
+        folder, capsys, samples, levels, wrong):
+    write('camera.csv', 'time,stretch', zip(samples * TIMES, STRETCH, strict=True))
+    write('levels.csv', 'time,flux_density', zip(levels * LEVELS[0], LEVELS[1], strict=True))
+    status, out, err = identify(capsys, 'camera.csv', '--commands', 'levels.csv')
+    assert (status, out, err.count('\n')) == (2, '', 1)
+    assert wrong in err
+
+
+def test_a_few_samples_of_nothing_are_no_other_unit(folder, capsys):
+    stretch = np.where(np.arange(500) % 100 == 7, 0.0, STRETCH)
+    write('camera.csv', 'time,stretch', zip(TIMES, stretch, strict=True))
+    status, out, _ = identify(capsys, 'camera.csv', '--commands', 'levels.csv', '--json')
+    x = json.loads(out)['parameters']['shear_modulus']
+    assert status == 0
+    assert abs(x['value'] - BLOCK.shear_modulus) < 4.0 * x['std']
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [

@@ -357,7 +357,7 @@ def test_sixty_uneven_points_of_a_figure_are_enough():
     ({'stretch': 1.0 + 1e-3 * np.random.default_rng(0).standard_normal(1200)},
      'expected a motion'),
     ({'stretch': np.clip(recorded().stretch, 0.0, 1.35)}, 'cut off .* times at .*1.35'),
-    ({'stretch': 10.0 * recorded().stretch}, None),
+    ({'stretch': 10.0 * recorded().stretch}, 'ten times the stretch'),
     ({'stretch': 25.0 * recorded().stretch}, 'in mm'),
     ({'levels': 1000.0 * steps(SEQUENCE, SPAN, 9)[1]}, 'in mT'),
     ({'time': TIMES[::-1]}, 'expected increasing times'),
@@ -365,8 +365,5 @@ def test_sixty_uneven_points_of_a_figure_are_enough():
     ({'stretch': np.where(TIMES == 0.5, np.nan, 1.1)}, '1 that are not finite')])
 def test_arrays_that_hold_no_motion_are_refused_with_a_reason(change, message):
     recording = recorded()
-    if message is None:
-        assert identify(replace(recording, **change)).verdict != 'identified'
-        return
     with pytest.raises(BadInputError, match=message):
         replace(recording, **change)

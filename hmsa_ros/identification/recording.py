@@ -18,6 +18,9 @@ _TIMES_SCATTER = 6.0
 # this share of the whole range.
 _CLIPPED_SLOPE = 0.01
 _CLIPPED_SAMPLES = 3
+# What a stretch may be without field, and ever; the share of the samples on either side that may
+# be no stretch; and the largest flux density of a coil in T.
+_RESTS, _STRETCHES, _FEW, _STRONGEST = (0.6, 1.6), (0.15, 5.0), 0.02, 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,15 +102,11 @@ class Recording:
                 'each parameter')
         if not len(self.levels):
             raise BadInputError(f'{self.label} has no level: expected the flux density in T')
-        if np.min(self.stretch) <= 0.0 or np.max(self.stretch) > 20.0:
-            raise BadInputError(
-                f'{self.label} has stretches from {np.min(self.stretch):.6g} to '
-                f'{np.max(self.stretch):.6g}: expected the length over the length at rest, '
-                'around 1; is it a length in mm?')
-        if np.max(np.abs(self.levels)) > 20.0:
+        self._check_scale()
+        if np.max(np.abs(self.levels)) > _STRONGEST:
             raise BadInputError(
                 f'{self.label} has flux densities up to {np.max(np.abs(self.levels)):.6g} T: '
-                'expected tesla; is it in mT?')
+                f'expected at most {_STRONGEST:g} T; is it in mT?')
         spread = float(np.quantile(self.stretch, 0.99) - np.quantile(self.stretch, 0.01))
         # White noise spreads by 4.65 of its deviation, and so much from one sample to the next.
         jitter = float(np.median(np.abs(np.diff(self.stretch)))) / 0.954
@@ -128,6 +127,29 @@ class Recording:
                 f'the stretch of {self.label} is cut off {clipped} times at '
                 f'{np.min(self.stretch):.6g} or {np.max(self.stretch):.6g}: expected a sensor '
                 'within its range; the crests are lost, and a fit would be wrong without a sign')
+
+    def _check_scale(self) -> None:
+        """Refuse what cannot be a stretch."""
+        # A few samples may have lost the actuator.
+        low, middle, high = np.quantile(self.stretch, (_FEW, 0.5, 1.0 - _FEW)).tolist()
+        place = np.searchsorted(self.level_times, self.time, side='right').clip(1) - 1
+        without = self.stretch[self.levels[place] == 0.0]
+        seen = len(without) >= _CLIPPED_SAMPLES
+        rest = float(np.median(without)) if seen else middle
+        least, most = _RESTS if seen else _STRETCHES
+        if least <= rest <= most and _STRETCHES[0] <= low and high <= _STRETCHES[1]:
+            return
+        strain = abs(rest) < 0.4 if seen else low < _STRETCHES[0]
+        looks = (
+            'strain in percent, divide it by 100 and add 1' if strain and high > _STRETCHES[1]
+            else 'strain, add 1' if strain
+            else 'ten times the stretch, divide it by 10' if 6.0 < rest < 16.0
+            else 'percent, divide it by 100' if 60.0 < rest < 160.0
+            else 'a length, in mm perhaps, divide it by the length at rest')
+        raise BadInputError(
+            f'{self.label} has stretches from {low:.4g} to {high:.4g}'
+            + (f', {rest:.4g} without field' if seen else '')
+            + ': expected the length over the length at rest, around 1; if it is ' + looks)
 
     def _unmoved(self, jitter: float) -> bool:
         """Whether nothing differs between the levels, nor from sample to sample but noise."""

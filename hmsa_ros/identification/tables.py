@@ -17,7 +17,8 @@ from hmsa_ros.identification.recording import Recording
 _SEPARATORS = (';', '\t', ',', '|')
 _LARGEST_FILE = 512 * 1024 * 1024
 _UNITS = {
-    'time': {'s': 1.0, 'sec': 1.0, 'seconds': 1.0, 'ms': 1e-3, 'us': 1e-6, 'µs': 1e-6},
+    'time': {'s': 1.0, 'sec': 1.0, 'seconds': 1.0, 'ms': 1e-3, 'us': 1e-6, 'µs': 1e-6,
+             'ns': 1e-9},
     'stretch': {'1': 1.0, '-': 1.0, '': 1.0},
     'flux_density': {'t': 1.0, 'tesla': 1.0, 'mt': 1e-3, 'g': 1e-4, 'gauss': 1e-4},
 }
@@ -35,6 +36,9 @@ _MEASURED_FIELD = 0.3
 _FEW_LEVELS = 8
 # More unknown times of switches than this take too long.
 _MOST_SWITCHES = 300
+# Levels whose times fit the motion so much better in another unit are in that unit.
+_OTHER_UNITS = {1e3: 'ms', 1e6: 'us', 1e9: 'ns'}
+_BETTER = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,10 +117,16 @@ def read_table(path: Path, wanted: tuple[str, ...], optional: tuple[str, ...] = 
     if missing:
         raise BadInputError(
             f'{path} has no column {" and no column ".join(missing)}: expected '
-            f'{", ".join(wanted)}; its columns are {excerpt(", ".join(cells))}')
+            f'{", ".join(wanted)}; its columns are {excerpt(", ".join(cells))}'
+            + ('; stretch is strain plus 1' if 'stretch' in missing
+               and any('strain' in x.lower() for x in cells) else ''))
     columns: dict[str, Array] = {name: np.full(len(rows) - 1, np.nan) for name in places}
     for i, (line, text) in enumerate(rows[1:]):
         parts = _split(text, separator)
+        if any(parts[len(cells):]):
+            raise BadInputError(
+                f'{path} line {line} has {len(parts)} cells in {len(cells)} columns '
+                f'({excerpt(text)}): expected a number a column{_decimal_commas(separator)}')
         for name, (place, factor) in places.items():
             if place >= len(parts):
                 continue
@@ -124,11 +134,14 @@ def read_table(path: Path, wanted: tuple[str, ...], optional: tuple[str, ...] = 
             if value is None:
                 raise BadInputError(
                     f'{path} line {line} has {excerpt(parts[place])} in column {name}: expected '
-                    'a number' + (
-                        '; decimal commas need semicolons between the columns'
-                        if len(parts) > len(cells) else ''))
+                    f'a number{_decimal_commas(separator) if "," in parts[place] else ""}')
             columns[name][i] = value * factor
     return Table(columns, np.array([x[0] for x in rows[1:]]), tuple(notes))
+
+
+def _decimal_commas(separator: str | None) -> str:
+    return ('; numbers with decimal commas need semicolons between the columns'
+            if separator == ',' else '')
 
 
 def _split(text: str, separator: str | None) -> list[str]:
@@ -171,8 +184,8 @@ def _places(
         if (unit or default) not in known:
             raise BadInputError(
                 f'{path} gives {name} in {unit}: expected '
-                + ('no unit: divide the length by the length at rest' if name == 'stretch'
-                   else ', '.join(known)))
+                + ('no unit: divide a length by the length at rest, percent by 100'
+                   if name == 'stretch' else ', '.join(known)))
         factor = known[unit or default]
         if factor != 1.0:
             notes.append(f'{name} was converted from {unit} as the header says')
@@ -238,6 +251,7 @@ def read_csv(
         if not len(level_table.lines):
             raise BadInputError(f'{commands} has a header and no row: expected levels')
         times, levels = _levels(commands, level_table)
+        _check_units(path, time, stretch, commands, times, levels)
         if times[0] > time[-1]:
             raise BadInputError(
                 f'{commands} begins at {times[0]:.9g} s, after the last sample of {path} at '
@@ -270,7 +284,8 @@ def _kept(path: Path, table: Table, notes: list[str]) -> NDArray[np.bool_]:
         i, j = places[back[0]], places[back[0] + 1]
         raise BadInputError(
             f'{path} line {table.lines[j]} jumps back in time from {time[i]:.9g} to '
-            f'{time[j]:.9g} s, {len(back)} times in all: expected increasing times of one clock')
+            f'{time[j]:.9g} s, {len(back)} times in all: expected increasing times of one clock; '
+            'sort the rows by time, or cut the file where the clock was set')
     double = places[1:][steps == 0.0]
     if len(double):
         keep[double] = False
@@ -286,6 +301,28 @@ def _kept(path: Path, table: Table, notes: list[str]) -> NDArray[np.bool_]:
             f'the stamps have a gap of {np.max(steps):.3g} s, where the others are '
             f'{np.median(steps):.3g} s apart')
     return keep
+
+
+def _check_units(
+        path: Path, time: Array, stretch: Array, commands: Path, times: Array, levels: Array
+) -> None:
+    """Refuse times of samples and of levels that are in different units."""
+    def unexplained(factor: float) -> float:
+        # How much of the motion is left when each level has a mean of its own.
+        place = np.searchsorted(factor * times, time, side='right') - 1
+        _, group = np.unique(np.where(place < 0, 0.0, levels[place]), return_inverse=True)
+        mean = np.bincount(group, stretch) / np.bincount(group)
+        return float(np.sum((stretch - mean[group]) ** 2))
+
+    least = _BETTER * unexplained(1.0)
+    for factor, unit in _OTHER_UNITS.items():
+        for finer, wrong in ((factor, path), (1.0 / factor, commands)):
+            if unexplained(finer) < least:
+                raise BadInputError(
+                    f'{path} has samples from {time[0]:.6g} to {time[-1]:.6g} s and {commands} '
+                    f'levels from {times[0]:.6g} to {times[-1]:.6g} s: expected both in s, but '
+                    f'the motion follows the levels as if the times of {wrong} were in {unit}; '
+                    f'if they are, write "time [{unit}]" in its header')
 
 
 def _sampled_levels(
