@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.files import write_text
 
 if TYPE_CHECKING:
     from hmsa_ros.identification.excitation import Excitation, Program
@@ -75,12 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         rows = zip(found.best.level_times, found.best.levels, strict=True)
         lines = ['time,flux_density', *(f'{x:.9f},{y:.9g}' for x, y in rows)]
-        try:
-            arguments.out.write_text('\n'.join(lines) + '\n', encoding='utf-8')
-        except OSError as error:
-            raise BadInputError(
-                f'cannot write {arguments.out}: {error.strerror or error}; expected a folder '
-                'with write permission') from error
+        write_text(arguments.out, '\n'.join(lines) + '\n')
     if arguments.json:
         print(json.dumps({
             'duration': found.duration, **_record(found.best), 'improvement': _finite(

@@ -7,6 +7,7 @@ import sys
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.files import write_text
 
 if TYPE_CHECKING:
     from hmsa_ros.identification import Identification, Recording
@@ -72,12 +73,12 @@ def run(arguments: argparse.Namespace) -> int:
         from datetime import datetime
 
         now = datetime.now().astimezone()
-        _write(arguments.out, file_text(found, belief, str(arguments.recording), now))
+        write_text(arguments.out, file_text(found, belief, str(arguments.recording), now))
         written.append(arguments.out)
     if arguments.report is not None:
         from hmsa_ros.identification.page import page
 
-        _write(arguments.report, page(found))
+        write_text(arguments.report, page(found))
         written.append(arguments.report)
     if arguments.json:
         record = found.record()
@@ -131,15 +132,6 @@ def _read(
 
     slew = belief.number('slew_limit', 0.0) or math.inf
     return read_csv(path, arguments.commands, slew_limit=slew), belief
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding='utf-8')
-    except OSError as error:
-        raise BadInputError(
-            f'cannot write {path}: {error.strerror or error}; expected a folder with write '
-            'permission') from error
 
 
 def table(found: 'Identification') -> list[str]:

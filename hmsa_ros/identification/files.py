@@ -14,15 +14,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from hmsa_ros.contract.actuator import actuator_from, parameters_of
-from hmsa_ros.contract.parameters import LAW
+from hmsa_ros.contract.parameters import BLOCK
+from hmsa_ros.contract.topics import PLANNER, PLANT
 from hmsa_ros.core.model import Array
-from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
+from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.quantities import actuator_of, check_free, QUANTITIES
 from hmsa_ros.identification.result import Identification
+from hmsa_ros.runs.parameters import entries_of, number_of, values_of
 
 # What coil and sensor have, by the name in parameter files.
 _OTHERS = {
@@ -31,6 +32,7 @@ _OTHERS = {
 _LISTS = {
     'viscoelastic_ratio': 'viscoelastic.ratio', 'viscoelastic_time': 'viscoelastic.time'}
 _PREFIX = 'identification.'
+_RANKS = {'': 1, PLANT: 2, PLANNER: 3}
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +63,8 @@ class Belief:
 
     def number(self, name: str, default: float) -> float:
         """Return a setting that is a number."""
-        value = self.settings.get(name)
-        return float(value) if isinstance(value, (int, float)) else default
+        value = number_of(self.settings.get(name))
+        return default if value is None else value
 
 
 def read_belief(path: Path | None) -> Belief:
@@ -85,23 +87,10 @@ def read_belief(path: Path | None) -> Belief:
         If the file cannot be read or a value is none.
 
     """
-    settings: dict[str, Any] = {}
-    if path is not None:
-        try:
-            document = yaml.safe_load(path.read_text(encoding='utf-8'))
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            reason = getattr(error, 'strerror', None) or ' '.join(str(error).split())
-            raise BadInputError(
-                f'{path} cannot be read ({reason}): expected a parameter file (YAML)') from error
-        _collect(document, '', settings)
-        if not settings:
-            raise BadInputError(
-                f'{path} has no ros__parameters: expected a parameter file as hmsa init writes it')
-    default = paper_actuator().numbers
-    values: dict[str, Any] = {
-        f'actuator.{x}': _number(path, f'actuator.{x}', settings.get(f'actuator.{x}', default[x]))
-        for x in default}
-    values |= {x.name: x.taken(settings[x.name]) for x in LAW if x.name in settings}
+    # A node's own goes before what is meant for all, and the planner's before the plant's.
+    entries = [] if path is None else sorted(entries_of(path), key=lambda x: _RANKS.get(x[0], 0))
+    settings: dict[str, Any] = {name: value for _, name, value in entries}
+    values = values_of({f'{PLANNER}.{x}': y for x, y in settings.items()}, PLANNER, BLOCK)
     others = {name: _number(path, key, settings[key])
               for name, key in _OTHERS.items() if key in settings}
     for name, key in _LISTS.items():
@@ -118,20 +107,11 @@ def read_belief(path: Path | None) -> Belief:
     return Belief(actuator_from(values), others, settings, names, covariance)
 
 
-def _collect(value: object, name: str, found: dict[str, Any]) -> None:
-    """Collect what is below ``ros__parameters``, by dotted name."""
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            whole = '' if key == 'ros__parameters' else f'{name}.{key}' if name else str(key)
-            _collect(inner, whole, found)
-    elif name and not name.startswith('/'):
-        found[name] = value
-
-
 def _number(path: Path | None, name: str, value: object) -> float:
-    if not isinstance(value, (int, float)) or isinstance(value, bool):
+    number = number_of(value)
+    if number is None:
         raise BadInputError(f'{path} gives {name} as {value!r}: expected a number')
-    return float(value)
+    return number
 
 
 def _covariance(path: Path | None, settings: Mapping[str, Any]) -> tuple[tuple[str, ...], Array]:

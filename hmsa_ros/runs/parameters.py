@@ -117,14 +117,13 @@ def read_parameter_file(path: str | Path) -> dict[str, object]:
         If the file cannot be read or sets no parameter of the actuator.
 
     """
-    entries = list(_entries(Path(path)))
+    entries = entries_of(Path(path))
     found: dict[str, object] = {}
     for node in (PLANNER, PLANT):
         # What is meant for all nodes comes first, so that a node's own goes before it.
         for own in (False, True):
             found |= {f'{node}.{name}': value for key, name, value in entries
-                      if (key.rpartition('/')[2] == node) == own
-                      and (own or key.rpartition('/')[2] in ('', '*', '**'))}
+                      if key == (node if own else '')}
     if not any(name.partition('.')[2].endswith(x.name) for name in found for x in BLOCK):
         raise BadInputError(
             f'{path} sets no parameter of the actuator: expected some of '
@@ -160,8 +159,16 @@ def values_of(
     return values
 
 
-def _entries(path: Path) -> 'list[tuple[str, str, object]]':
-    """Return node, dotted name and value of each parameter in a file; no node if it has none."""
+def entries_of(path: Path) -> list[tuple[str, str, object]]:
+    """
+    Return node, dotted name and value of each parameter in a file; no node if all are meant.
+
+    Raises
+    ------
+    BadInputError
+        If the file cannot be read.
+
+    """
     try:
         if path.stat().st_size > _LARGEST_FILE:
             raise BadInputError(
@@ -174,12 +181,16 @@ def _entries(path: Path) -> 'list[tuple[str, str, object]]':
         reason = getattr(error, 'strerror', None) or ' '.join(str(error).split())
         raise BadInputError(
             f'{path} cannot be read ({reason}): expected a parameter file (YAML)') from error
+    if not isinstance(document, dict):
+        raise BadInputError(
+            f'{path} has no ros__parameters: expected a parameter file as hmsa init writes it')
     flat: dict[str, object] = {}
     _flatten(document, '', flat, 0, path)
     entries = []
     for name, value in flat.items():
-        node, found, parameter = name.rpartition('ros__parameters.')
-        entries.append((node.rstrip('.'), parameter, value) if found else ('', name, value))
+        whole, _, parameter = name.rpartition('ros__parameters.')
+        node = whole.rstrip('.').rpartition('/')[2]
+        entries.append(('' if node in ('*', '**') else node, parameter, value))
     return entries
 
 
