@@ -58,6 +58,8 @@ TRIED_AGAIN = {
     'test_launch.py::test_a_demonstration_is_recorded_and_its_replay_is_the_same': _REAL_TIME,
     'test_bag_verify.py::test_a_second_plant_moves_the_same_when_the_bag_is_played': _REAL_TIME,
     'test_cli.py::test_send_reports_until': _REAL_TIME,
+    'test_cli.py::test_send_moves_several_joints': _REAL_TIME,
+    'test_cli.py::test_send_fails_where_the_actuator_is_measured': _REAL_TIME,
     'test_init.py::test_planner_and_plant_take_the_file_and_arrive_when_it_says': _REAL_TIME,
     'test_feedback_nodes.py::test_a_planner_that_observes_says_what_is_wrong': _REAL_TIME,
     'test_feedback_nodes.py::test_a_planner_that_adapts_arrives': _REAL_TIME,

@@ -357,6 +357,20 @@ def test_heartbeat_repeats_the_last_level_and_changes_nothing():
     assert rig.runtime.wake is None
 
 
+def test_a_long_plan_that_was_replaced_is_freed_bit_by_bit():
+    rig = Rig()
+    rig.runtime.request(trajectory(*((1.1 + 0.1 * (i % 2), i * HOLD) for i in range(1, 3001))))
+    while rig.runtime.wake == 0:
+        rig.tick()
+    rig.runtime.request(Stop())
+    ticks = 0
+    while rig.runtime.wake == 0:
+        rig.tick()
+        ticks += 1
+    # 6,000 levels and 3,000 setpoints.
+    assert 3 <= ticks <= 9
+
+
 # -- taking over --------------------------------------------------------------------------------
 
 PATIENT = replace(QUIET, takeover_timeout=500 * MS)

@@ -194,6 +194,7 @@ class PlannerRuntime:
             work = work_on(Stop(), self.group, self._clock)
             while not self._planning.advance(work):
                 pass
+            self._planning.clear()
             self._sending.send(now, everything=True)
             self._watch.restart()
             self._bulletin.give(Verdict(Severity.OK, 'stopped', 'deactivated: coming to rest'))

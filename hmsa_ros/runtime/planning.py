@@ -15,6 +15,8 @@ from hmsa_ros.runtime.slices import Clock, Work, work_on
 
 #: How long planning goes on before commands and requests are served again, in ns.
 SLICE = 4_000_000
+# Levels and setpoints of replaced plans that are freed at a time.
+_FREED = 2_000
 
 
 class Planning:
@@ -51,11 +53,13 @@ class Planning:
         self._corrections = corrections
         self._clock, self._steady, self._send = clock, steady, send
         self._queue: deque[Work] = deque()
+        # What plans that were replaced consist of: to free it all at once takes tens of ms.
+        self._leftovers: list[object] = []
         self.refused = 0
 
     def __bool__(self) -> bool:
-        """Return whether something waits."""
-        return bool(self._queue)
+        """Return whether there is something to do."""
+        return bool(self._queue or self._leftovers)
 
     def __contains__(self, work: Work) -> bool:
         """Return whether a piece of work still waits."""
@@ -64,6 +68,7 @@ class Planning:
     def clear(self) -> None:
         """Drop what waits."""
         self._queue.clear()
+        self._leftovers.clear()
 
     def add(self, request: Request, *, engaged: bool) -> Work:
         """
@@ -106,6 +111,7 @@ class Planning:
                 self._queue.appendleft(self._following.resumption(name, self._clock))
         if not self._queue:
             self._queue += self._corrections.due(self._clock())
+        del self._leftovers[-_FREED:]
         end = self._steady() + SLICE
         while self._queue and self._steady() < end:
             work = self._queue[0]
@@ -116,6 +122,8 @@ class Planning:
 
     def advance(self, work: Work) -> bool:
         """Go on with one piece of work; say whether it is done."""
+        planners = [self._group.planners[x] for x in work.joints]
+        plans = [x.plan for x in planners]
         try:
             next(work.steps)
         except StopIteration as end:
@@ -138,6 +146,10 @@ class Planning:
                 self.refuse(error, work.request)
         else:
             return False
+        for planner, plan in zip(planners, plans, strict=True):
+            if planner.plan is not plan:
+                self._leftovers += plan.levels
+                self._leftovers += plan.segments
         return True
 
     def _answer(self, request: Request, drafts: Mapping[str, Draft], now: int) -> None:
