@@ -245,10 +245,11 @@ def test_a_bag_without_a_run_is_refused(tmp_path):
 
 
 @pytest.mark.ros
-def test_late_commands_a_slow_coil_and_the_watchdog_come_out_again(start, ros, tmp_path):
+def test_late_commands_a_slow_coil_creep_and_the_watchdog_come_out_again(start, ros, tmp_path):
     bag = tmp_path / 'run'
     start.hmsa(
         'plant', '--ros-args', '-p', 'mismatch.density:=1.1', '-p', 'coil_time_constant:=0.002',
+        '-p', 'viscoelastic.ratio:=[0.1, 0.2]', '-p', 'viscoelastic.time:=[0.005, 0.05]',
         '-p', 'slew_limit:=20.0', '-p', 'command_timeout:=0.1', '-p', 'safe_flux:=ramp', '-p',
         'safe_ramp_rate:=0.1')
     recorder = start.hmsa(

@@ -6,7 +6,8 @@ import sys
 
 PROGRAM = """
 import json
-from hmsa_ros.core import kernels, lag_kernel, law, shooting_kernel, two_step_kernel
+from hmsa_ros.core import creep_kernel, kernels, lag_kernel, law, shooting_kernel, two_step_kernel
+from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.simulation import ActuatorSimulation
@@ -15,11 +16,11 @@ from hmsa_ros.core.warmup import warm_up
 def signatures():
     return {
         name: len(kernel.signatures)
-        for module in (law, kernels, lag_kernel, shooting_kernel, two_step_kernel)
+        for module in (law, creep_kernel, kernels, lag_kernel, shooting_kernel, two_step_kernel)
         for name, kernel in vars(module).items()
         if hasattr(kernel, 'signatures')}
 
-warm_up()
+warm_up(creep=True)
 before = signatures()
 millisecond = 1_000_000
 for options in (
@@ -30,7 +31,8 @@ for options in (
     planner = Planner(paper_actuator(), Options(
         flux_density_min=-0.5, flux_density_max=0.5, lead_time=0, **options))
     plant = ActuatorSimulation(
-        paper_actuator(), slew_limit=options.get('slew_limit', float('inf')))
+        paper_actuator(), slew_limit=options.get('slew_limit', float('inf')),
+        creep=Creep((0.1,), (0.1,)) if 'shaper' in options else None)
     planner.request([(1.1, 44 * millisecond), (0.9, 88 * millisecond)], None, 0)
     for now in range(0, 120 * millisecond, millisecond):
         if now == 3 * millisecond:

@@ -40,7 +40,7 @@ DIMENSIONLESS = {
     'actuator.chain_limit', 'initial_stretch', 'real_time_factor', 'robust_order', 'play.rate',
     'play.read_ahead_queue_size', 'play.realtime_priority', 'record.queue_depth',
     'reset_stretch', 'seed', 'law.alpha', 'law.lambda_m', 'step_count',
-    'stretch_bias', 'stretch_gain', 'stretch_noise',
+    'stretch_bias', 'stretch_gain', 'stretch_noise', 'viscoelastic.ratio',
     'arrival_tolerance', 'stretch_tolerance', 'vibration_tolerance',
     *(f'mismatch.{x.name.partition(".")[2]}' for x in ACTUATOR)}
 TYPES = {

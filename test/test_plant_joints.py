@@ -61,7 +61,9 @@ def test_each_joint_has_topics_parameters_and_a_motion_of_its_own(ros, serve):
 @pytest.mark.parametrize(('arguments', 'sentence'), [
     (('-p', 'joints:=[a, a]'), "names 'a' 2 times"),
     (('-p', 'joints:=[a, b]', '-p', 'b.initial_stretch:=9.0'), 'joint b: initial stretch is 9'),
-    (('-p', 'joints:=[a, b]', '-p', 'b.reset_stretch:=9.0'), 'joint b: reset_stretch is 9')])
+    (('-p', 'joints:=[a, b]', '-p', 'b.reset_stretch:=9.0'), 'joint b: reset_stretch is 9'),
+    (('-p', 'joints:=[a, b]', '-p', 'b.viscoelastic.ratio:=[0.1]'),
+     'joint b: viscoelastic.ratio has 1 values and viscoelastic.time 0')])
 def test_a_joint_that_cannot_be_is_refused(serve, arguments, sentence):
     with pytest.raises(BadInputError, match=sentence):
         serve(PlantNode, *arguments)

@@ -11,6 +11,7 @@ import pytest
 
 from hmsa_ros.bag.info import BagSummary
 from hmsa_ros.cli import main
+from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.simulation import ActuatorSimulation
 from hmsa_ros.core.units import NANOSECONDS
@@ -28,9 +29,9 @@ BEGIN = NANOSECONDS
 STEP = 1_000_000
 
 
-def moved(*, applied=True, commands=((10, 0.01),)):
+def moved(*, applied=True, commands=((10, 0.01),), creep=None, told=None):
     """Return a run of 100 samples in which commands, (sample, T), were obeyed or not."""
-    simulation = ActuatorSimulation(paper_actuator(), time=BEGIN)
+    simulation = ActuatorSimulation(paper_actuator(), time=BEGIN, creep=creep)
     levels = [Level(BEGIN + at * STEP, flux, BEGIN) for at, flux in commands]
     rows = []
     for level in levels if applied else ():
@@ -44,6 +45,7 @@ def moved(*, applied=True, commands=((10, 0.01),)):
     return Run(
         'run', 'actuator', Path('run'), time, time, stretch, rate, field,
         commands=tuple(levels), applied=tuple(in_force), parameters_known=True,
+        parameters=told or {},
         topics={COMMAND: '/flux_density_command', APPLIED: '/flux_density_applied'})
 
 
@@ -54,6 +56,28 @@ def test_a_command_that_nobody_applied_is_said_though_the_motion_fits():
     found = verify_run(moved())
     assert (found.unapplied_count, found.note) == (0, '')
     assert found.largest_difference < 1e-12
+
+
+CREEP = Creep((0.1, 0.2), (0.005, 0.05))
+TOLD = {'plant.viscoelastic.ratio': [0.1, 0.2], 'plant.viscoelastic.time': [0.005, 0.05]}
+
+
+def test_a_plant_that_creeps_comes_out_again_if_its_branches_are_known():
+    found = verify_run(moved(creep=CREEP, told=TOLD))
+    assert found.largest_difference < 1e-12
+    assert found.note == ''
+    assert verify_run(moved(creep=CREEP)).largest_difference > 1e-4
+
+
+def test_a_creeping_plant_recorded_from_the_middle_of_a_motion_on_is_said_to_be():
+    run = moved(creep=CREEP, told=TOLD)
+    late = replace(run, **{x: getattr(run, x)[40:] for x in (
+        'time', 'logged', 'stretch', 'rate', 'flux_density')})
+    found = verify_run(late)
+    assert found.largest_difference > 1e-4
+    assert 'the first sample is not one of rest' in found.note
+    with pytest.raises(BadInputError, match='ratio has 1 values and viscoelastic.time 2'):
+        verify_run(moved(told={**TOLD, 'plant.viscoelastic.ratio': 0.1}))
 
 
 def test_a_level_that_was_in_force_already_is_no_command_without_effect():

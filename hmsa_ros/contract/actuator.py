@@ -4,7 +4,8 @@ from collections.abc import Mapping
 import math
 from typing import Any
 
-from hmsa_ros.contract.parameters import ACTUATOR_FIELDS, LAW
+from hmsa_ros.contract.parameters import ACTUATOR_FIELDS, LAW, VISCOELASTIC
+from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.laws import LAWS
 from hmsa_ros.core.parameters import ActuatorParameters
 
@@ -20,6 +21,11 @@ def actuator_from(values: Mapping[str, Any]) -> ActuatorParameters:
             {**{x.name: x.default for x in LAW}, **values})
     return ActuatorParameters(law=elastic, **{
         name: value * values.get(f'mismatch.{name}', 1.0) for name, value in numbers.items()})
+
+
+def creep_from(values: Mapping[str, Any]) -> Creep:
+    """Return the Maxwell branches of ``viscoelastic.*``; none where there is no such value."""
+    return Creep(*(tuple(values.get(x.name, ())) for x in VISCOELASTIC))
 
 
 def parameters_of(actuator: ActuatorParameters) -> dict[str, Any]:

@@ -210,6 +210,18 @@ COIL_TIME_CONSTANT = ParameterSpec(
     'coil_time_constant', 0.0, 'Time constant of the first-order coil lag; 0 for none.', 's',
     0.0, 1e3)
 
+#: Maxwell branches beside the elastic law.
+VISCOELASTIC = (
+    ParameterSpec(
+        'viscoelastic.ratio', [],
+        'Creep: stiffness of up to three Maxwell branches in units of that of the elastic law, '
+        'which is what the elastomer holds in the end; empty for none.', '', 0.0, 1e3,
+        items=float),
+    ParameterSpec(
+        'viscoelastic.time', [], 'Creep: relaxation time of each Maxwell branch.', 's',
+        1e-9, 1e9, items=float),
+)
+
 PUBLISH_RATE = ParameterSpec(
     'publish_rate', 1000.0, "Sample rate, in the plant's own time.", 'Hz', 1e-3, 1e6)
 

@@ -6,13 +6,15 @@ its own, from change to change of what drives it: what happens to one leaves no 
 numbers of another, and one alone moves bit for bit as it does among others.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 import math
 
 import numpy as np
 
 from hmsa_ros.core import kernels, law
+from hmsa_ros.core.branches import Branches
+from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.model import Array, Material, stretch_limits
 from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.core.schedule import CommandSchedule
@@ -90,6 +92,8 @@ class Setup:
         Largest change of the amplifier's level in T/s, greater than 0; infinite for steps.
     coil_time_constant : float
         Of the lag in s, at least 0; 0 for none.
+    creep : Creep
+        What the elastomer adds to its law; it has relaxed at the start.
 
     Raises
     ------
@@ -102,6 +106,7 @@ class Setup:
     stretch: float = 1.0
     slew_limit: float = math.inf
     coil_time_constant: float = 0.0
+    creep: Creep = field(default_factory=Creep)
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -113,6 +118,7 @@ class Setup:
             raise BadInputError(
                 f'time constant of the coil is {self.coil_time_constant:g} s: expected a '
                 'finite number of at least 0')
+        self.creep.check(self.actuator.time_unit)
 
     def holding(self, stretch: float) -> float:
         """Return the flux density in T that holds a stretch."""
@@ -207,6 +213,11 @@ class Actuators:
         self._status = np.zeros(count, np.int64)
         self._all = np.ones(count, bool)
         self._work = kernels.work_space()
+        self._kernel: Callable[..., int] = kernels.follow
+        self._branches = None
+        if any(x.creep for x in self.setups):
+            self._branches = Branches([x.creep for x in self.setups], self._time_units)
+            self._kernel = self._branches.follow
         self.schedules = [CommandSchedule(0.0) for _ in blocks]
         self.forces = [CommandSchedule(0.0) for _ in blocks]
         self.changes: list[tuple[int, int, float]] = []
@@ -248,7 +259,7 @@ class Actuators:
             self, i: int, stretch: float, rate: float, flux_density: float,
             level: float | None = None) -> None:
         """
-        Have one go on from another state, with nothing ahead and no force.
+        Have one go on from another state, relaxed, with nothing ahead and no force.
 
         Parameters
         ----------
@@ -268,6 +279,8 @@ class Actuators:
             raise BadInputError(f'stretch rate is {rate:g} 1/s: expected a finite number')
         level = flux_density if level is None else level
         self._state[i] = stretch, rate * self._time_units[i], 0.0
+        if self._branches is not None:
+            self._branches.relax(i, law.elastic_force(stretch, self._material[i]))
         # A coil that lags is behind an amplifier that has arrived, another is not.
         behind = self._lags[i] > 0.0
         self._levels[i] = level if behind and math.isinf(self._slews[i]) else flux_density
@@ -382,7 +395,7 @@ class Actuators:
                     failed.append((int(i), reached))
         if time > self.time:
             np.divide((time - self.time) / NANOSECONDS, self._time_units, self._durations)
-            if kernels.follow(
+            if self._kernel(
                     self._work, 0, len(self.setups), ~due, self._state, self._drive,
                     self._material, self._durations, RTOL, self._status):
                 failed += [(int(i), self.time) for i in np.flatnonzero(
@@ -446,6 +459,6 @@ class Actuators:
 
     def _follow(self, i: int, duration: float) -> bool:
         self._durations[i] = duration
-        return not kernels.follow(
+        return not self._kernel(
             self._work, i, i + 1, self._all, self._state, self._drive, self._material,
             self._durations, RTOL, self._status)

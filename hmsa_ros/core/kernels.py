@@ -34,7 +34,7 @@ MAX_STEPS = 200_000
 # One swing takes tens of steps, a creep into an equilibrium thousands.
 _MAX_TURN_STEPS = 20_000
 # Closer to a limiting stretch than rounding lets this tolerance be kept, motion is not resolved.
-_RESOLVED = 1e-8
+RESOLVED = 1e-8
 
 
 def work_space() -> NDArray[np.float64]:
@@ -171,7 +171,7 @@ def advance(k, l, v, s, r, beta, slope, p, q, duration, material, rtol, h):  # n
             return DONE, l, v, s, r, h
         span = min(h, left)
         rate = natural_frequency(l, material)
-        if attainable(0.0, l, v, rate) > _RESOLVED and v * (l - 1.0) > 0.0:
+        if attainable(0.0, l, v, rate) > RESOLVED and v * (l - 1.0) > 0.0:
             v, s, r = -v, -s, -r
         new_l, new_v, new_s, new_r, error = step(
             k, l, v, s, r, beta + slope * done, slope, p + q * done, q, span, material,
@@ -220,7 +220,7 @@ def turning_point(k, l, v, direction, beta, move, material, rtol):  # noqa: E741
         h = resize(h, error)
         armed = direction * v > 0.0
         rate = natural_frequency(l, material)
-        if attainable(0.0, l, v, rate) > _RESOLVED:
+        if attainable(0.0, l, v, rate) > RESOLVED:
             return TOO_CLOSE, t, l, s, 0.0
         fast = rate + 3.0 * material[ZETA]
         if (abs(v) < _AT_REST * move * fast and abs(a) < _AT_REST * move * fast * fast):
@@ -402,7 +402,7 @@ def follow_one(k, l, v, h, beta, slope, excess, decay, duration, material, rtol)
             return DONE, l, v, h
         span = min(h, left)
         rate = natural_frequency(l, material)
-        if attainable(0.0, l, v, rate) > _RESOLVED and v * (l - 1.0) > 0.0:
+        if attainable(0.0, l, v, rate) > RESOLVED and v * (l - 1.0) > 0.0:
             v = -v
         rest = excess
         if excess != 0.0:
@@ -418,6 +418,16 @@ def follow_one(k, l, v, h, beta, slope, excess, decay, duration, material, rtol)
         else:
             h = resize(span, error)
     return STUCK, l, v, h
+
+
+@compiled()
+def faded(beta, excess, decay, duration):
+    """Return what is left of an excess after a duration: nothing that a sum would not show."""
+    if excess != 0.0:
+        excess *= math.exp(-decay * duration)
+        if not abs(excess) > 1e-17 * (1e-3 + abs(beta)):
+            excess = 0.0
+    return excess
 
 
 @compiled()
@@ -446,8 +456,5 @@ def follow(k, first, last, wanted, state, drive, material, durations, rtol, stat
         state[i, 1] = v
         state[i, 2] = h
         drive[i, 0] = beta + slope * duration
-        if excess != 0.0:
-            excess *= math.exp(-decay * duration)
-            # Nothing that a sum of loads could still show.
-            drive[i, 2] = excess if abs(excess) > 1e-17 * (1e-3 + abs(beta)) else 0.0
+        drive[i, 2] = faded(beta, excess, decay, duration)
     return failed

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from hmsa_ros.core import kernels, lag_kernel, law
 from hmsa_ros.core.actuators import Actuators, check_stretch, RTOL, Setup
+from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.delivery import Delivery, Piece, ramps
 from hmsa_ros.core.model import Array, damping
 from hmsa_ros.core.moves import Level, State
@@ -166,11 +167,13 @@ class ActuatorSimulation:
 
     def __init__(
             self, actuator: ActuatorParameters, *, time: int = 0, stretch: float = 1.0,
-            slew_limit: float = math.inf, coil_time_constant: float = 0.0) -> None:
+            slew_limit: float = math.inf, coil_time_constant: float = 0.0,
+            creep: Creep | None = None) -> None:
         """Start at rest."""
         self.actuator = actuator
         self._all = Actuators(
-            [Setup(actuator, stretch, slew_limit, coil_time_constant)], time=time)
+            [Setup(actuator, stretch, slew_limit, coil_time_constant, creep or Creep())],
+            time=time)
 
     @property
     def time(self) -> int:

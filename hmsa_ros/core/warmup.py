@@ -15,6 +15,7 @@ from time import perf_counter
 import numpy as np
 
 from hmsa_ros.core.compiling import announced
+from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.simulation import ActuatorSimulation
@@ -32,7 +33,9 @@ _DELIVERIES = (
 )
 
 
-def warm_up(say: Callable[[str], object] = lambda _: None, *, batch: bool = False) -> float:
+def warm_up(
+        say: Callable[[str], object] = lambda _: None, *, batch: bool = False,
+        creep: bool = False) -> float:
     """
     Run every kernel once.
 
@@ -42,6 +45,8 @@ def warm_up(say: Callable[[str], object] = lambda _: None, *, batch: bool = Fals
         Gets a sentence before the first kernel is compiled, if one must be.
     batch : bool
         Also the parallel one, which no node uses.
+    creep : bool
+        Also the one of a plant whose elastomer creeps.
 
     Returns
     -------
@@ -57,6 +62,8 @@ def warm_up(say: Callable[[str], object] = lambda _: None, *, batch: bool = Fals
     begin = perf_counter()
     with announced(say):
         _run(batch=batch)
+        if creep:
+            ActuatorSimulation(paper_actuator(), creep=Creep((0.1,), (0.1,))).advance(_MILLISECOND)
     return perf_counter() - begin
 
 
@@ -81,7 +88,7 @@ def _run(*, batch: bool) -> None:
 def main() -> int:
     """Compile what the package uses, say so, and return 0."""
     say = partial(print, flush=True)
-    print(f'loaded the numerical kernels in {warm_up(say, batch=True):.1f} s')
+    print(f'loaded the numerical kernels in {warm_up(say, batch=True, creep=True):.1f} s')
     return 0
 
 

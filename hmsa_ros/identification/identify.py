@@ -230,7 +230,9 @@ def _conclude(
     verdict: Verdict = 'model_rejected'
     distant = diagnosis.distant(recording, best, found)
     if weak is not None and not distant:
-        verdict, reason = 'not_identifiable', weak.words
+        # What the model lacks widens all intervals, and may be why nothing is held.
+        verdict = 'not_identifiable'
+        reason = f'{weak.words}; besides, {reason}' if reason else weak.words
     elif not reason and not best.converged:
         reason = (
             f'the search did not come to an end from {tried} starts: the best leaves residuals '

@@ -127,7 +127,6 @@ class PlantNode(ManagedNode):
         start = round(values['start_time'] * NANOSECONDS) if self._authority else 0
         factor = values['real_time_factor'] if self._authority else 1.0
         self._device = self._make_device(start)
-        warm_up(self.get_logger().info)
         self._pacer = Pacer(start, factor, paused=values['start_paused'])
         self._clock_published = 0
         self._measured = (start, monotonic_ns())
@@ -166,6 +165,7 @@ class PlantNode(ManagedNode):
                 self.get_logger().warning(f'joint {name}: {few}')
             if lost := unheld(joint.setup.actuator.nondimensional):
                 self.get_logger().warning(f'joint {name}: {lost}')
+        warm_up(self.get_logger().info, creep=any(x.setup.creep for x in joints))
         return SimulatedDevice(
             joints, period=max(round(NANOSECONDS / values['publish_rate']), 1), time=start,
             command_delay=round(values['command_delay'] * NANOSECONDS),

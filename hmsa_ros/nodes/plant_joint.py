@@ -8,7 +8,7 @@ from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import MagneticField
 from std_msgs.msg import Float64
 
-from hmsa_ros.contract.actuator import actuator_from
+from hmsa_ros.contract.actuator import actuator_from, creep_from
 from hmsa_ros.contract.parameters import (
     BLOCK,
     COIL_TIME_CONSTANT,
@@ -16,6 +16,7 @@ from hmsa_ros.contract.parameters import (
     MISMATCH,
     ParameterSpec,
     SLEW_LIMIT,
+    VISCOELASTIC,
 )
 from hmsa_ros.core.actuators import check_stretch, Setup
 from hmsa_ros.device.protocol import Change, Kind, Notice
@@ -33,6 +34,7 @@ OWN = (
     *BLOCK,
     INITIAL_STRETCH,
     *MISMATCH,
+    *VISCOELASTIC,
     SLEW_LIMIT,
     COIL_TIME_CONSTANT,
     ParameterSpec(
@@ -182,7 +184,7 @@ def joint_from(values: Mapping[str, Any]) -> SimulatedJoint:
     return SimulatedJoint(
         Setup(
             actuator, values['initial_stretch'], values['slew_limit'] or math.inf,
-            values['coil_time_constant']),
+            values['coil_time_constant'], creep_from(values)),
         Fallback(values['command_timeout'], values['safe_flux'], values['safe_ramp_rate']),
         SensorErrors(
             values['stretch_noise'], values['rate_noise'], values['stretch_bias'],

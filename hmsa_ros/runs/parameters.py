@@ -7,9 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from hmsa_ros.bag.experiment import parameters_of
-from hmsa_ros.contract.actuator import actuator_from
-from hmsa_ros.contract.parameters import ACTUATOR, BLOCK, JOINT, LAW, ParameterSpec
+from hmsa_ros.contract.actuator import actuator_from, creep_from
+from hmsa_ros.contract.parameters import (
+    ACTUATOR,
+    BLOCK,
+    JOINT,
+    LAW,
+    ParameterSpec,
+    VISCOELASTIC,
+)
 from hmsa_ros.contract.topics import PLANNER, PLANT
+from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.errors import BadInputError, excerpt
 
@@ -91,6 +99,19 @@ def actuators(
             'The planner and the plant had different parameters of the actuator: see the table '
             'of parameters.')
     return plant, planner, bool(found), notes
+
+
+def creep_of(parameters: Mapping[str, object], joint: str) -> Creep:
+    """
+    Return the Maxwell branches of the plant of a run.
+
+    Raises
+    ------
+    BadInputError
+        If these are none that an elastomer can have.
+
+    """
+    return creep_from(_own(parameters, joint, PLANT, VISCOELASTIC))
 
 
 def _own(
