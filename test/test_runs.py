@@ -19,7 +19,13 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text, replacing, write_text
 from hmsa_ros.runs import bags
 from hmsa_ros.runs.levels import lateness_of, Level
-from hmsa_ros.runs.parameters import number_of, read_parameter_file, recorded, values_of
+from hmsa_ros.runs.parameters import (
+    actuators,
+    number_of,
+    read_parameter_file,
+    recorded,
+    values_of,
+)
 from hmsa_ros.runs.record import Run
 from hmsa_ros.runs.tables import levels_of, samples_of, write_table
 from hmsa_ros.runs.topics import APPLIED, COMMAND
@@ -78,6 +84,17 @@ def test_a_creeping_plant_recorded_from_the_middle_of_a_motion_on_is_said_to_be(
     assert 'the first sample is not one of rest' in found.note
     with pytest.raises(BadInputError, match='ratio has 1 values and viscoelastic.time 2'):
         verify_run(moved(told={**TOLD, 'plant.viscoelastic.ratio': 0.1}))
+
+
+def test_notes_say_that_a_plant_creeps_or_that_nobody_could_creep_so():
+    def notes(told):
+        return ' '.join(actuators(told, {}, 'one')[3])
+
+    assert 'creeps' not in notes({'plant.viscoelastic.ratio': []})
+    assert 'The elastomer of the plant creeps' in notes({
+        'plant.one.viscoelastic.ratio': [0.1], 'plant.one.viscoelastic.time': [0.05]})
+    assert 'creep cannot be used: viscoelastic.ratio has 2 values' in notes({
+        **TOLD, 'plant.viscoelastic.time': 0.05})
 
 
 def test_a_level_that_was_in_force_already_is_no_command_without_effect():

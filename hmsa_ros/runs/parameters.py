@@ -98,6 +98,13 @@ def actuators(
         notes.append(
             'The planner and the plant had different parameters of the actuator: see the table '
             'of parameters.')
+    try:
+        if creep_of({**parameters, **given}, joint):
+            notes.append(
+                'The elastomer of the plant creeps (viscoelastic.*), which the planner does not '
+                'know; plain steps are simulated without it.')
+    except BadInputError as error:
+        notes.append(f'What the plant says of creep cannot be used: {error}.')
     return plant, planner, bool(found), notes
 
 
