@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.progress import progress
-from hmsa_ros.cli.setpoints import setpoint_of_joints
+from hmsa_ros.cli.setpoints import add_sequence, levels_of
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError
 
@@ -30,10 +30,7 @@ def add_parser(subparsers: Any) -> None:
                     'measure whether each setpoint was reached. Ctrl-C brings the actuator to '
                     'rest and closes the bag.',
         epilog='example: hmsa run 1.10:0.2 1.20:0.2 1.00:0.2 --simulate')
-    parser.add_argument(
-        'setpoints', nargs='+', type=setpoint_of_joints, metavar='STRETCH:SECONDS',
-        help='stretch to come to rest at, and how long this setpoint lasts in s (move plus '
-             'hold); with several joints one stretch for all, or one a joint')
+    add_sequence(parser)
     parser.add_argument(
         '--simulate', action='store_true',
         help='start a planner and a simulated plant for this run, which lead simulated time')
@@ -82,7 +79,8 @@ def run(arguments: argparse.Namespace) -> int:
             done = conduct(experiment, dict(os.environ), update)
             ENDING.check()
             update('evaluating the bag', None)
-            measured = _measure(experiment, tolerance) if done.measured else []
+            measured = _measure(experiment, tolerance) if (
+                done.measured and not experiment.levels) else []
             report = _report(experiment.bag, folder / 'report.html') if (
                 arguments.report and done.measured) else None
     except KeyboardInterrupt:
@@ -90,7 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
             f'interrupted; the bag so far: {experiment.bag}' if experiment.bag.exists()
             else 'interrupted', highlight=False, soft_wrap=True)
         return ENDING.status
-    verdict, reason = _verdict(measured, done)
+    verdict, reason = _verdict(measured, done, levels=bool(experiment.levels))
     if arguments.json:
         print(json.dumps({
             'verdict': verdict, 'reason': reason, 'setpoints': [_record(x) for x in measured],
@@ -125,7 +123,7 @@ def _experiment(arguments: argparse.Namespace, folder: Path) -> 'Experiment':
     ) if arguments.simulate else ()
     return Experiment(
         folder, tuple(arguments.setpoints), nodes, arguments.namespace,
-        tuple(arguments.joint.split(',')), expected)
+        tuple(arguments.joint.split(',')), expected, levels_of(arguments))
 
 
 def _measure(experiment: 'Experiment', tolerance: float) -> 'list[Arrival]':
@@ -154,10 +152,14 @@ def _report(bag: Path, path: Path) -> Path:
     return path
 
 
-def _verdict(measured: 'list[Arrival]', done: 'Conducted') -> tuple[str, str]:
-    """Return the verdict on all setpoints, and a sentence with the figures."""
+def _verdict(
+        measured: 'list[Arrival]', done: 'Conducted', *, levels: bool) -> tuple[str, str]:
+    """Return the verdict on all setpoints, or on the end of levels, and why."""
     if not done.measured:
         return NOT_MEASURED, f'{NOT_MEASURED}: nobody publishes joint_states'
+    if levels:
+        return done.verdict.measured or NOT_MEASURED, (
+            done.verdict.finding or 'predicted, not measured: the levels end at rest')
     missed = [x for x in measured if x.verdict != 'arrived']
     if not missed:
         return 'arrived', f'all {len(measured)} moves arrived and stayed within tolerance'

@@ -4,7 +4,7 @@ import argparse
 import sys
 from typing import Any
 
-from hmsa_ros.cli.setpoints import setpoint_of_joints
+from hmsa_ros.cli.setpoints import add_sequence, levels_of
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, HmsaError
 
@@ -13,14 +13,10 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     parser = subparsers.add_parser(
         'send', help='publish a sequence of setpoints to the running planner',
-        description='Publish a sequence of setpoints to the running planner, beginning now, '
-                    'and print its verdict.',
+        description='Publish a sequence of setpoints, or of levels, to the running planner, '
+                    'beginning now, and print its verdict.',
         epilog='example: hmsa send 1.10:2 1.20:2 --wait')
-    parser.add_argument(
-        'setpoints', nargs='+', type=setpoint_of_joints, metavar='STRETCH:SECONDS',
-        help='stretch to come to rest at, and how long this setpoint lasts in s (move plus '
-             'hold); with several joints, one stretch for all or one per joint, as in '
-             '1.10,1.20:2')
+    add_sequence(parser)
     parser.add_argument(
         '--wait', action='store_true',
         help='report progress until the sequence has been carried out, and fail if a setpoint was '
@@ -54,6 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.timeout > 0.0:
         raise BadInputError(
             f'timeout is {arguments.timeout:g}: expected a number of seconds above 0')
+    levels = levels_of(arguments)
     ENDING.note()
     with PlannerClient(
             namespace=arguments.namespace, joints=arguments.joint.split(','),
@@ -63,7 +60,8 @@ def run(arguments: argparse.Namespace) -> int:
             client.find_recorder()
         client.find_plant()
         # A planner that has just started may not have heard the time yet.
-        verdict = client.send(arguments.setpoints, time_begins=True)
+        verdict = (client.send_levels(levels, time_begins=True) if levels
+                   else client.send(arguments.setpoints, time_begins=True))
         print(verdict.message)
         if not arguments.wait:
             return 0
@@ -76,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
                 seen = line
                 print(line, file=sys.stderr, flush=True)
 
-        length = sum(span for _, span in arguments.setpoints)
+        length = levels[-1][0] if levels else sum(span for _, span in arguments.setpoints)
         verdict = client.follow(verdict, each=report, timeout=length + arguments.timeout)
         if verdict.failure:
             raise HmsaError(verdict.failure)

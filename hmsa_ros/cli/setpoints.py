@@ -2,9 +2,46 @@
 
 import argparse
 import math
+from pathlib import Path
 
 from hmsa_ros.core.setpoint import Setpoint
 from hmsa_ros.errors import BadInputError
+
+
+def add_sequence(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that say what to send: setpoints, or a file of levels."""
+    parser.add_argument(
+        'setpoints', nargs='*', type=setpoint_of_joints, metavar='STRETCH:SECONDS',
+        help='stretch to come to rest at, and how long this setpoint lasts in s (move plus '
+             'hold); with several joints, one stretch for all or one per joint, as in '
+             '1.10,1.20:2')
+    parser.add_argument(
+        '--levels', type=Path, metavar='CSV',
+        help='in place of setpoints: CSV of time, flux_density, as hmsa excite writes it. The '
+             'levels are sent as they are, if they keep the limits of coil and block; a shaped '
+             'move to rest ends those that do not end at rest')
+
+
+def levels_of(arguments: argparse.Namespace) -> list[tuple[float, float]]:
+    """
+    Return times in s and flux densities in T of the file of levels; none where it is setpoints.
+
+    Raises
+    ------
+    BadInputError
+        If neither or both are given, or the file cannot be used.
+
+    """
+    if bool(arguments.setpoints) == (arguments.levels is not None):
+        raise BadInputError(
+            f'{"both" if arguments.setpoints else "neither"} setpoints and --levels are given: '
+            'expected STRETCH:SECONDS ... or --levels CSV')
+    if arguments.levels is None:
+        return []
+    from hmsa_ros.identification.tables import read_levels
+
+    times, levels, _ = read_levels(arguments.levels)
+    return list(zip((times - times[0]).tolist(), levels.tolist(), strict=True))
 
 
 def setpoint(text: str) -> tuple[float, float]:

@@ -107,7 +107,8 @@ JOINT_TRAJECTORY = Topic(
     'A sequence of setpoints. Each point says: be at rest at `positions` by `time_from_start`, '
     "having left the previous point at that point's `time_from_start`. Stamp 0 starts now; a "
     'future stamp keeps the running plan until then; a sequence that began in the past is '
-    'joined in the middle.',
+    'joined in the middle. Points without `positions` and with `effort` are raw levels: the flux '
+    'density in tesla from `time_from_start` on; the planner checks them, and ends at rest.',
     subscribers=(PLANNER, RECORDER))
 SETPOINT = Topic(
     '~/setpoint', _FLOAT, RELIABLE,

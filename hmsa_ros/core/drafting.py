@@ -170,14 +170,14 @@ def draft_sequence(
             yield
     if len(setpoints) == 1 and outset.is_target(setpoints[0].stretch):
         return None
-    return (yield from _draft(outset, setpoints))
+    return (yield from draft_moves(outset, setpoints))
 
 
 def draft_target(outset: Outset, stretch: float) -> Steps[Draft | None]:
     """Plan a move to one stretch that is held then; None where it changes nothing."""
     if outset.is_target(stretch):
         return None
-    return (yield from _draft(outset, [Setpoint(stretch, math.inf)]))
+    return (yield from draft_moves(outset, [Setpoint(stretch, math.inf)]))
 
 
 def draft_stop(outset: Outset) -> Steps[Draft]:
@@ -201,11 +201,11 @@ def draft_stop(outset: Outset) -> Steps[Draft]:
     for share in _BRAKE_SHARES:
         stretch = holdable(model, brake(model, work, state, share).stretch)
         try:
-            return (yield from _draft(outset, [Setpoint(stretch, math.inf)], 'two_step'))
+            return (yield from draft_moves(outset, [Setpoint(stretch, math.inf)], 'two_step'))
         except RefusedError:
             yield
     # Nothing stops it at once: let it settle.
-    return (yield from _draft(
+    return (yield from draft_moves(
         outset, [Setpoint(holdable(model, state.stretch), math.inf)], 'step'))
 
 
@@ -302,9 +302,9 @@ def _meeting(outset: Outset, state: State, following: int) -> int | None:
     return place if agree(here, level) else None
 
 
-def _draft(
+def draft_moves(
         outset: Outset, setpoints: Iterable[Setpoint], shaper: str = '') -> Steps[Draft]:
-    """Plan setpoints and place them on the timeline."""
+    """Plan setpoints and place them on the timeline; the shaper is that of the options."""
     levels: list[PlannedLevel] = []
     placed: list[PlannedSegment] = []
     warning: PlannedSegment | None = None

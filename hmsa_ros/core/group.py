@@ -90,8 +90,12 @@ class PlannerGroup:
 
     def draft_request(
             self, points: Mapping[str, Sequence[tuple[float, int]]], stamp: int | None,
-            now: int) -> Steps[dict[str, Draft]]:
-        """Work out a sequence as `Planner.draft_request`, without joints that change nothing."""
+            now: int, *, raw: bool = False) -> Steps[dict[str, Draft]]:
+        """Work out a sequence, or levels if raw, without joints that change nothing."""
+        if raw:
+            return (yield from self._each(
+                points, lambda name: self.planners[name].draft_levels(
+                    points[name], stamp, now)))
         drafts = yield from self._each(
             points, lambda name: self.planners[name].draft_request(points[name], stamp, now))
         if self.simultaneous:

@@ -23,9 +23,10 @@ from hmsa_ros.core.drafting import (
     Steps,
 )
 from hmsa_ros.core.parameters import ActuatorParameters
+from hmsa_ros.core.raw import check_levels, draft_levels
 from hmsa_ros.core.running import RunningPlan
 from hmsa_ros.core.simulation import check_stretch
-from hmsa_ros.core.status import RefusedError
+from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.timeline import (
     Draft,
     Model,
@@ -34,6 +35,7 @@ from hmsa_ros.core.timeline import (
     PlannedLevel,
     PlannedSegment,
 )
+from hmsa_ros.core.units import NANOSECONDS
 
 __all__ = ['Options', 'Plan', 'PlannedLevel', 'PlannedSegment', 'Planner']
 
@@ -147,6 +149,27 @@ class Planner(RunningPlan):
         base = soonest if stamp is None else stamp
         outset = self._outset(on_grid(max(base, soonest), self.model))
         return (yield from draft_sequence(outset, points, base, now))
+
+    def draft_levels(
+            self, points: Sequence[tuple[float, int]], stamp: int | None,
+            now: int) -> Steps[Draft]:
+        """
+        Work out levels in T, in force from times in ns on that count from a stamp, or from now.
+
+        Raises
+        ------
+        RefusedError
+            If they cannot be carried out.
+
+        """
+        check_levels(points, self.model)
+        soonest = self.soonest(now)
+        begin = on_grid((soonest if stamp is None else stamp) + points[0][1], self.model)
+        if begin < soonest:
+            raise RefusedError(
+                Code.IN_THE_PAST, f'the first level applies {(now - begin) / NANOSECONDS:.3f} s '
+                'ago: expected levels more than lead_time ahead')
+        return (yield from draft_levels(self._outset(begin), points))
 
     def draft_setpoint(self, stretch: float, now: int) -> Steps[Draft | None]:
         """Work out a move to one stretch; None where it changes nothing."""

@@ -10,7 +10,7 @@ class Code(str, Enum):
     """
     The outcome of a move or a request; the value is what messages and files carry.
 
-    The first eight are plans that can be carried out, the next ones refusals, and the last four
+    The first nine are plans that can be carried out, the next ones refusals, and the last four
     what was measured.
     """
 
@@ -22,6 +22,7 @@ class Code(str, Enum):
     LINEAR = 'linear'
     TOO_DAMPED = 'too_damped'
     INDISTINGUISHABLE = 'indistinguishable'
+    LEVELS = 'levels'
 
     OUT_OF_RANGE = 'out_of_range'
     FLUX_LIMIT = 'flux_limit'
@@ -63,6 +64,7 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'So close to critical damping, beta_p and beta_1 agree to double precision; a plain '
         'step is used instead.',
         'No action needed; the shaper minimum_time arrives sooner.'),
+    Code.LEVELS: ('Levels of the field as they were sent, up to rest at the end.', ''),
     Code.OUT_OF_RANGE: (
         'The stretch is at or beyond the limiting extension of the polymer chains (J_lim).',
         'Choose a stretch inside the interval that the message names, or correct '

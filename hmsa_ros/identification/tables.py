@@ -193,8 +193,31 @@ def _places(
     return places, notes
 
 
-def _levels(path: Path, table: Table) -> tuple[Array, Array]:
-    """Return times and levels of a file of commands."""
+def read_levels(path: Path) -> tuple[Array, Array, tuple[str, ...]]:
+    """
+    Read the levels of the field from CSV.
+
+    Parameters
+    ----------
+    path : Path
+        With the columns ``time`` (s) and ``flux_density`` (T).
+
+    Returns
+    -------
+    times, levels : ndarray, shape (m,)
+        Flux density in T from each time in s on, increasing.
+    notes : tuple of str
+        What was converted.
+
+    Raises
+    ------
+    BadInputError
+        If it cannot be used.
+
+    """
+    table = read_table(path, ('time', 'flux_density'))
+    if not len(table.lines):
+        raise BadInputError(f'{path} has a header and no row: expected levels')
     times, levels = table.columns['time'], table.columns['flux_density']
     bad = ~(np.isfinite(times) & np.isfinite(levels))
     if np.any(bad):
@@ -209,7 +232,7 @@ def _levels(path: Path, table: Table) -> tuple[Array, Array]:
             f'{times[back[0]]:.9g} to {times[back[0] + 1]:.9g} s: expected increasing times')
     # Of levels at one time the last one holds.
     keep = np.append(np.diff(times) > 0.0, True)
-    return times[keep], levels[keep]
+    return times[keep], levels[keep], table.notes
 
 
 def read_csv(
@@ -246,11 +269,8 @@ def read_csv(
     keep = _kept(path, table, notes)
     time, stretch = table.columns['time'][keep], table.columns['stretch'][keep]
     if commands is not None:
-        level_table = read_table(commands, ('time', 'flux_density'))
-        notes += level_table.notes
-        if not len(level_table.lines):
-            raise BadInputError(f'{commands} has a header and no row: expected levels')
-        times, levels = _levels(commands, level_table)
+        times, levels, more = read_levels(commands)
+        notes += more
         _check_units(path, time, stretch, commands, times, levels)
         if times[0] > time[-1]:
             raise BadInputError(

@@ -73,25 +73,28 @@ def from_command(message: MagneticField) -> tuple[int, float]:
 
 def to_trajectory(
         setpoints: Iterable[tuple[float | Sequence[float], int]], joints: str | Sequence[str], *,
-        stamp: int = 0, frame: str = '') -> JointTrajectory:
+        stamp: int = 0, frame: str = '', raw: bool = False) -> JointTrajectory:
     """
-    Return setpoints as a trajectory message.
+    Return setpoints, or raw levels, as a trajectory message.
 
     Parameters
     ----------
     setpoints : iterable of (float or sequence of float, int)
-        Stretch, of all joints or one a joint, and time from the start in ns until which it lasts.
+        Stretch, of all joints or one a joint, and time from the start in ns until which it lasts;
+        if raw, flux density in T and time from which it applies.
     joints : str or sequence of str
         Name or names.
     stamp : int
         Start in ns; 0 for now.
     frame : str
         Identifies the request: the planner's verdict repeats it.
+    raw : bool
+        Whether they are levels.
 
     Returns
     -------
     trajectory_msgs.msg.JointTrajectory
-        One point a setpoint.
+        One point each.
 
     """
     names = [joints] if isinstance(joints, str) else list(joints)
@@ -99,8 +102,9 @@ def to_trajectory(
         header=Header(stamp=to_time(stamp), frame_id=frame), joint_names=names,
         points=[
             JointTrajectoryPoint(
-                positions=np.broadcast_to(stretch, len(names)).tolist(),
-                time_from_start=_to_duration(time))
+                time_from_start=_to_duration(time),
+                **{'effort' if raw else 'positions': np.broadcast_to(
+                    stretch, len(names)).tolist()})
             for stretch, time in setpoints])
 
 

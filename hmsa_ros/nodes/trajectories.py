@@ -22,6 +22,7 @@ _BIG = b'\x00\x00'
 _LEAST_POINT = 24
 # More joints than any planner has.
 _MOST_JOINTS = 1000
+_FIELDS = ('positions', 'velocities', 'accelerations', 'effort')
 _TOO_SHORT = 'the trajectory cannot be decoded: it ends too early'
 
 
@@ -33,12 +34,12 @@ class _Cursor:
             raise BadInputError('the trajectory cannot be decoded: expected plain CDR')
         self._data = memoryview(data)[_PREAMBLE:]
         self._order = '<' if data[:2] == _LITTLE else '>'
-        self._place = 0
+        self.place = 0
 
     @property
     def left(self) -> int:
         """Bytes that are left."""
-        return len(self._data) - self._place
+        return len(self._data) - self.place
 
     def take(self, kind: str, count: int = 1) -> tuple[float, ...]:
         """
@@ -53,10 +54,10 @@ class _Cursor:
         if not count:
             return ()
         size = struct.calcsize(f'<{kind}')
-        place = -(-self._place // size) * size
+        place = -(-self.place // size) * size
         if place + count * size > len(self._data):
             raise BadInputError(_TOO_SHORT)
-        self._place = place + count * size
+        self.place = place + count * size
         return struct.unpack_from(f'{self._order}{count}{kind}', self._data, place)
 
     def count(self) -> int:
@@ -82,8 +83,8 @@ class _Cursor:
         length = self.count()
         if length > self.left:
             raise BadInputError(_TOO_SHORT)
-        self._place += length
-        text = bytes(self._data[self._place - length:self._place])
+        self.place += length
+        text = bytes(self._data[self.place - length:self.place])
         return text.rstrip(b'\0').decode('utf-8', 'replace')
 
 
@@ -107,27 +108,44 @@ def read_trajectory(data: bytes) -> Trajectory:
     count = cursor.count()
     if _LEAST_POINT * count > cursor.left + 4:
         raise BadInputError(_TOO_SHORT)
-    return Trajectory(names, _points(cursor, names, count), count, stamp or None, name)
+    raw = bool(count) and _raw(cursor, names)
+    return Trajectory(
+        names, _points(cursor, names, count, 'effort' if raw else 'positions'), count,
+        stamp or None, name, raw)
+
+
+def _raw(cursor: _Cursor, names: Sequence[str]) -> bool:
+    """Whether the next point has efforts and no positions."""
+    place = cursor.place
+    try:
+        sizes = [len(cursor.take('d', cursor.count())) for _ in _FIELDS]
+    except BadInputError:
+        return False
+    finally:
+        cursor.place = place
+    return bool(names) and sizes == [0, sizes[1], sizes[2], len(names)]
 
 
 def _points(
-        cursor: _Cursor, names: Sequence[str],
-        count: int) -> Iterator[tuple[Sequence[float], int]]:
-    """Yield stretches and time from the start in ns of each point."""
+        cursor: _Cursor, names: Sequence[str], count: int,
+        wanted: str) -> Iterator[tuple[Sequence[float], int]]:
+    """Yield stretches, or levels in T, and time from the start in ns of each point."""
     rest = (0.0,) * len(names)
     for number in range(count):
-        positions = cursor.take('d', cursor.count())
-        if len(positions) != len(names):
-            raise RefusedError(
-                Code.BAD_INPUT,
-                f'point {number} has {len(positions)} positions: expected {len(names)}, '
-                'one for each of joint_names')
-        for field in ('velocities', 'accelerations', 'effort'):
+        for field in _FIELDS:
             values = cursor.take('d', cursor.count())
-            if values not in ((), rest):
+            if field == wanted:
+                found = values
+                if len(found) != len(names):
+                    raise RefusedError(
+                        Code.BAD_INPUT,
+                        f'point {number} has {len(found)} {wanted}: expected {len(names)}, '
+                        'one for each of joint_names')
+            elif values not in ((), rest):
                 raise RefusedError(
                     Code.BAD_INPUT,
-                    f'point {number} has {field} {excerpt(list(values))}: expected none, the '
-                    'actuator comes to rest at each setpoint')
-        yield positions, cursor.time()
+                    f'point {number} has {field} {excerpt(list(values))}: expected none, '
+                    + ('the actuator comes to rest at each setpoint' if wanted == 'positions'
+                       else 'the levels of the field are all there is'))
+        yield found, cursor.time()
 

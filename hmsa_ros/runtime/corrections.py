@@ -7,6 +7,7 @@ import math
 from hmsa_ros.core.drafting import Steps
 from hmsa_ros.core.group import PlannerGroup
 from hmsa_ros.core.planner import Planner
+from hmsa_ros.core.status import Code
 from hmsa_ros.core.timeline import Draft, Plan
 from hmsa_ros.estimation import Estimate
 from hmsa_ros.estimation.correction import Course, expect
@@ -56,7 +57,7 @@ class Corrections:
 
         """
         for name, planner in self._feedback.news():
-            if not planner.plan.segments:
+            if not planner.plan.segments or _as_sent(planner, now):
                 continue
             estimate = self._feedback.state(name, planner.soonest(now))
             if estimate is None or not self._worthwhile(estimate, planner):
@@ -117,6 +118,12 @@ class Corrections:
             return Verdict(
                 Severity.OK, 'corrected', f'corrected from samples: {words}', request)
         return None
+
+
+def _as_sent(planner: Planner, now: int) -> bool:
+    """Whether levels are being carried out that are not to be changed."""
+    return any(x.code is Code.LEVELS and (x.arrival is None or now < x.arrival)
+               for _, x in filter(None, [planner.segment(planner.soonest(now))]))
 
 
 def _course(plan: Plan, begin: int) -> tuple[Course, float]:

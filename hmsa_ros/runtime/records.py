@@ -79,13 +79,16 @@ class Trajectory:
         Whose setpoints they are.
     points : iterable of (tuple of float, int)
         Stretch of each joint, and time in ns from the start until which they last. It is read
-        bit by bit, and may raise `RefusedError` where it cannot be read.
+        bit by bit, and may raise `RefusedError` where it cannot be read. If raw: flux density in
+        T of each joint, and time from which they apply.
     count : int
         How many points there are.
     stamp : int or None
         Start in ns; None for now.
     name : str
         Repeated in the verdict.
+    raw : bool
+        Whether the points are levels.
 
     """
 
@@ -94,6 +97,7 @@ class Trajectory:
     count: int
     stamp: int | None = None
     name: str = ''
+    raw: bool = False
 
 
 @dataclass(frozen=True)

@@ -97,7 +97,7 @@ def _trajectory(
         if number % _READ == _READ - 1:
             yield
     return (yield from in_time(
-        lambda now: group.draft_request(points, request.stamp, now), group,
+        lambda now: group.draft_request(points, request.stamp, now, raw=request.raw), group,
         frozenset(request.joints), clock, request.count * len(request.joints)))
 
 

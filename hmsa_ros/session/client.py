@@ -343,10 +343,22 @@ class PlannerClient:
             if end >= 2**31:
                 raise BadInputError(f'the sequence lasts {end:g} s: expected less than 2^31 s')
             points.append((stretch, round(end * NANOSECONDS)))
+        return self._ask(points, raw=False, time_begins=time_begins)
+
+    def send_levels(
+            self, levels: Sequence[tuple[float, float]], *, time_begins: bool = False) -> Verdict:
+        """Send levels (time in s from now, flux density in T of all joints), as `send` does."""
+        return self._ask(
+            [(y, round(x * NANOSECONDS)) for x, y in levels], raw=True, time_begins=time_begins)
+
+    def _ask(
+            self, points: Sequence[tuple[float | Sequence[float], int]], *, raw: bool,
+            time_begins: bool) -> Verdict:
         deadline = monotonic() + self._timeout
         while True:
             request = self._requested = uuid4().hex
-            self._publisher.publish(to_trajectory(points, self._joints, frame=request))
+            self._publisher.publish(to_trajectory(
+                points, self._joints, frame=request, raw=raw))
             self.spin_until(
                 lambda request=request: self._verdict.request == request,  # type: ignore[misc]
                 'the planner did not reply with a verdict')

@@ -24,7 +24,7 @@ from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import from_time, whole
 from hmsa_ros.nodes.remote_parameters import RemoteParameters
-from hmsa_ros.session.client import PlannerClient
+from hmsa_ros.session.client import PlannerClient, Verdict
 from hmsa_ros.session.processes import NodeProcess, Session
 
 Setpoints = Sequence[tuple[Sequence[float], float]]
@@ -47,7 +47,7 @@ class Experiment:
     folder : Path
         Existing folder for the bag ``run`` and the logs.
     setpoints : sequence of (sequence of float, float)
-        Stretch of all joints, or one a joint, and span in s.
+        Stretch of all joints, or one a joint, and span in s; empty where there are levels.
     nodes : tuple of NodeProcess
         To start besides the recorder, among them a paused plant that leads time; empty for
         nodes that run already.
@@ -57,6 +57,8 @@ class Experiment:
         Of the planner.
     expected : mapping of str to object
         Parameters of running nodes by ``'node.name'``, from a parameter file.
+    levels : sequence of (float, float)
+        Time in s, and flux density in T from then on.
 
     """
 
@@ -66,6 +68,12 @@ class Experiment:
     namespace: str = ''
     joints: tuple[str, ...] = ('actuator',)
     expected: Mapping[str, object] = field(default_factory=dict)
+    levels: Sequence[tuple[float, float]] = ()
+
+    @property
+    def duration(self) -> float:
+        """Length in s of the sequence."""
+        return sum(x for _, x in self.setpoints) + (self.levels[-1][0] if self.levels else 0.0)
 
     @property
     def bag(self) -> Path:
@@ -89,11 +97,12 @@ class Experiment:
 
 @dataclass(frozen=True)
 class Conducted:
-    """Exit statuses by process, whether samples came, and notes for a reader."""
+    """Exit statuses by process, whether samples came, notes, and what the planner said last."""
 
     exits: dict[str, int]
     measured: bool
     notes: tuple[str, ...]
+    verdict: Verdict
 
 
 def prepare(folder: Path) -> None:
@@ -156,7 +165,7 @@ def conduct(
         try:
             progress('starting the nodes' if experiment.nodes else 'looking for the nodes', 0.0)
             _begin(experiment, session, watch)
-            _carry_out(experiment, session, watch, progress)
+            verdict = _carry_out(experiment, session, watch, progress)
             measured = watch.measured
         except BaseException as error:
             resting = True
@@ -175,7 +184,7 @@ def conduct(
             if status:
                 raise HmsaError(
                     f'the {name} ended with status {status}: {session.last_words(name)}')
-    return Conducted(exits, measured, tuple(watch.notes))
+    return Conducted(exits, measured, tuple(watch.notes), verdict)
 
 
 def _begin(experiment: Experiment, session: Session, watch: '_Watch') -> None:
@@ -204,13 +213,15 @@ def _recorder(experiment: Experiment, simulated: bool) -> NodeProcess:
 
 
 def _carry_out(
-        experiment: Experiment, session: Session, watch: '_Watch', progress: Tell) -> None:
+        experiment: Experiment, session: Session, watch: '_Watch', progress: Tell) -> Verdict:
     """Send the sequence, and wait until the last setpoint has been watched for its span."""
     watch.sent = True
-    verdict = watch.client.send(experiment.setpoints, time_begins=True)
+    verdict = (
+        watch.client.send_levels(experiment.levels, time_begins=True) if experiment.levels
+        else watch.client.send(experiment.setpoints, time_begins=True))
     begin = watch.now
     lead = watch.parameter('planner.lead_time')
-    total = sum(x for _, x in experiment.setpoints) + (
+    total = experiment.duration + (
         float(lead) if isinstance(lead, (int, float)) else 0.0)
 
     def report() -> None:
@@ -218,9 +229,10 @@ def _carry_out(
         watch.look(begin + total)
         progress('running the sequence', min((watch.now - begin) / total, 1.0))
 
-    watch.client.follow(verdict, each=lambda _: report(), timeout=float('inf'))
+    verdict = watch.client.follow(verdict, each=lambda _: report(), timeout=float('inf'))
     watch.client.spin_until(
         lambda: watch.now - begin > total, 'time does not advance', report, float('inf'))
+    return verdict
 
 
 class _Watch:

@@ -1,0 +1,136 @@
+"""Levels sent as they are: checked against limits, carried out to the letter, ended at rest."""
+
+import csv
+import json
+import math
+
+from identification_oracle import BLOCK, level_of, simulate
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+import numpy as np
+import pytest
+
+from hmsa_ros.cli import main
+from hmsa_ros.core.planner import Options, Planner
+from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.identification.excitation import Bounds, excite
+from hmsa_ros.identification.tables import read_levels
+
+SECOND = 1_000_000_000
+RUN_SECONDS = 300.0
+
+
+def planned(levels, **options):
+    """Return the plan of levels (s, T) sent at 1 s, and the planner."""
+    planner = Planner(BLOCK, Options(**{'flux_density_min': -0.5, 'flux_density_max': 0.5,
+                                        **options}))
+    points = [(y, round(x * SECOND)) for x, y in levels]
+    from hmsa_ros.core.drafting import finish
+    return planner.take(finish(planner.draft_levels(points, None, SECOND)), SECOND)
+
+
+def followed(plan, end=0.3):
+    """Return the stretch from the first level on, as SciPy has it."""
+    levels = [x for x in plan.levels if x.stamp > 0]
+    times = (np.array([x.stamp for x in levels]) - levels[0].stamp) / SECOND
+    fields = np.array([x.flux_density for x in levels])
+    samples = np.linspace(0.0, times[-1] + end, 4000)
+    # A while without field before the first.
+    return samples - times[-1] - 0.02, simulate(
+        samples, np.append(0.0, times + 0.02), np.append(0.0, fields))
+
+
+def test_what_excite_designs_is_carried_out_to_the_letter():
+    best = excite(BLOCK, Bounds(-0.1, 0.2), duration=0.5).best
+    plan = planned(zip(best.level_times, best.levels, strict=True), flux_density_max=0.2)
+    sent = [x for x in plan.levels if x.stamp > 0]
+    assert [x.flux_density for x in sent] == best.levels.tolist()
+    assert [x.stamp - sent[0].stamp for x in sent] == [
+        round(x * SECOND) for x in best.level_times]
+    segment, = plan.segments
+    assert segment.arrival == sent[-1].stamp
+    after, stretch = followed(plan)
+    assert stretch[after > 0.0] == pytest.approx(1.0, abs=5e-4)
+
+
+def test_levels_that_ring_get_a_move_to_rest_in_place_of_the_last():
+    levels = [(0.0, 0.0), (0.01, level_of(1.3)), (0.02, level_of(1.1))]
+    plan = planned(levels)
+    sent = [x for x in plan.levels if x.stamp > 0]
+    assert [x.flux_density for x in sent[:2]] == [y for _, y in levels[:2]]
+    after, stretch = followed(plan)
+    arrival = (plan.segments[0].arrival - sent[-1].stamp) / SECOND
+    assert stretch[after > arrival + 1e-6] == pytest.approx(1.1, abs=1e-5)
+
+
+def test_ramps_of_the_amplifier_are_part_of_the_prediction():
+    plan = planned([(0.0, 0.0), (0.01, level_of(1.3)), (0.02, 0.0)], slew_limit=5.0)
+    times = np.array([x.stamp for x in plan.levels if x.stamp > 0]) / SECOND
+    assert np.all(np.diff(times) > 0.0)
+    assert plan.levels[-1].at(plan.segments[0].arrival + SECOND // 10).stretch == pytest.approx(
+        1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(('levels', 'options', 'code', 'words'), [
+    ([(0.0, 0.3)], {'flux_density_max': 0.2}, Code.FLUX_LIMIT, 'level 0 is 0.3 T'),
+    ([(0.0, -0.6)], {}, Code.FLUX_LIMIT, 'expected -0.5 to 0.5 T'),
+    ([(0.0, math.nan)], {}, Code.BAD_INPUT, 'level 0 is nan T'),
+    ([(0.0, 0.0), (0.0, 0.1)], {}, Code.NOT_INCREASING, 'time_from_start of level 1'),
+    ([(0.001, 0.0), (0.002, 0.1), (0.003, 0.0)], {'period': SECOND // 100}, Code.NOT_INCREASING,
+     'within one command period'),
+    ([(0.0, 50.0)], {'flux_density_max': 100.0}, Code.OUT_OF_RANGE, 'takes the stretch to'),
+    ([], {}, Code.BAD_INPUT, 'no points')])
+def test_levels_that_break_a_limit_are_refused(levels, options, code, words):
+    with pytest.raises(RefusedError, match=words) as raised:
+        planned(levels, **options)
+    assert raised.value.code is code
+
+
+@pytest.mark.parametrize(('arguments', 'message'), [
+    ([], 'neither setpoints and --levels'), (['1.1:1', '--levels', 'x.csv'], 'both setpoints'),
+    (['--levels', 'x.csv'], 'x.csv cannot be read')])
+@pytest.mark.parametrize('command', ['send', 'run'])
+def test_bad_arguments_end_with_2_and_a_sentence(
+        tmp_path, monkeypatch, capsys, command, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    assert main([command, *arguments]) == 2
+    out, err = capsys.readouterr()
+    assert (out, err.count('\n')) == ('', 1)
+    assert message in err
+
+
+@pytest.mark.ros
+def test_a_run_of_levels_has_them_in_force_and_ends_at_rest(start, tmp_path):
+    file, out = tmp_path / 'levels.csv', tmp_path / 'out'
+    designed = excite(BLOCK, duration=0.5).best
+    with file.open('w', newline='', encoding='utf-8') as text:
+        writer = csv.writer(text)
+        writer.writerow(['time', 'flux_density'])
+        writer.writerows(zip(designed.level_times, designed.levels, strict=True))
+    run = start.hmsa('run', '--levels', str(file), '--simulate', '--report', '--out', str(out),
+                     '--json')
+    assert run.wait(RUN_SECONDS) == 0, run.output
+    assert json.loads(run.stdout)['verdict'] == 'arrived'
+    assert '<html' in (out / 'report.html').read_text()
+    applied, samples = [], []
+    with next((out / 'run').glob('*.mcap')).open('rb') as bag:
+        reader = make_reader(bag, decoder_factories=[DecoderFactory()])
+        for _, channel, _, message in reader.iter_decoded_messages():
+            if not channel.topic.endswith(('flux_density_applied', 'joint_states')):
+                continue
+            stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+            if channel.topic.endswith('applied'):
+                applied.append((stamp, message.magnetic_field.z))
+            else:
+                samples.append((stamp, message.position[0]))
+    times, levels, _ = read_levels(file)
+    changes = np.array(sorted(set(applied)))[-(len(levels) - 1):]
+    # The first level is the one in force before: no change.
+    assert levels[0] == 0.0
+    assert changes[:, 1] == pytest.approx(levels[1:], abs=0.0)
+    assert changes[:, 0] - changes[0, 0] == pytest.approx(times[1:] - times[1], abs=2e-9)
+    stamps, stretch = np.array(samples).T
+    assert np.max(stretch) > 1.3
+    held = stretch[stamps > changes[-1, 0]]
+    assert len(held) > 100
+    assert held == pytest.approx(1.0, abs=1e-3)
