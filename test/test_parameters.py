@@ -39,7 +39,7 @@ DIMENSIONLESS = {
     'marker_scale', 'max_points',
     'actuator.chain_limit', 'initial_stretch', 'real_time_factor', 'robust_order', 'play.rate',
     'play.read_ahead_queue_size', 'play.realtime_priority', 'record.queue_depth',
-    'reset_stretch', 'seed', 'law.alpha', 'law.lambda_m', 'step_count',
+    'reset_stretch', 'seed', 'law.alpha', 'law.lambda_m', 'law.stretch', 'step_count',
     'stretch_bias', 'stretch_gain', 'stretch_noise', 'viscoelastic.ratio',
     'arrival_tolerance', 'stretch_tolerance', 'vibration_tolerance',
     *(f'mismatch.{x.name.partition(".")[2]}' for x in ACTUATOR)}

@@ -10,6 +10,21 @@ from hmsa_ros.core.laws import LAWS
 from hmsa_ros.core.parameters import ActuatorParameters
 
 
+def completed(values: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Return the constants of a law that are in a file which the parameters name.
+
+    Raises
+    ------
+    BadInputError
+        If the file cannot be used.
+
+    """
+    values = {**{x.name: x.default for x in LAW}, **values}
+    law = LAWS[values['law']]
+    return law.completed(values) if law.completed is not None else {}
+
+
 def actuator_from(values: Mapping[str, Any]) -> ActuatorParameters:
     """Return the block of ``actuator.*``, ``mismatch.*`` if any, and its law unless Gent."""
     numbers = {name: values[f'actuator.{name}'] for name in ACTUATOR_FIELDS}
@@ -35,9 +50,10 @@ def parameters_of(actuator: ActuatorParameters) -> dict[str, Any]:
     if actuator.law is None:
         return values
     units = {x.name: x.unit for x in LAWS[actuator.law.law].constants}
+    scales = {'Pa': actuator.shear_modulus, 'T': actuator.flux_density_unit}
 
     def in_si(name: str, value: Any) -> Any:
-        factor = actuator.shear_modulus if units[name] == 'Pa' else 1.0
+        factor = scales.get(units[name], 1.0)
         if isinstance(value, tuple):
             return [factor * x for x in value]
         return value if isinstance(value, str) else factor * value

@@ -185,6 +185,9 @@ LAW = (
     *_of_laws(),
 )
 
+#: Constants of laws that are read once, when a node starts.
+FIXED = frozenset(x.name for law in LAWS.values() for x in law.constants if x.fixed)
+
 #: All that describes a block.
 BLOCK = (*ACTUATOR, *LAW)
 

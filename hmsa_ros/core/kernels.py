@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from hmsa_ros.core.compiling import compiled
 from hmsa_ros.core.dop853 import ERROR_3, ERROR_5, MATRIX, NODES, STAGES, WEIGHTS
 from hmsa_ros.core.law import acceleration, KIND, motion, natural_frequency, ZETA
-from hmsa_ros.core.laws.record import ANY, GENT, NEO_HOOKEAN, OGDEN, POLYNOMIAL
+from hmsa_ros.core.laws.record import ANY, GENT, NEO_HOOKEAN, OGDEN, POLYNOMIAL, TABLE
 
 # Status codes of the integration.
 DONE = 0
@@ -78,7 +78,9 @@ def step(k, l, v, s, r, beta, slope, p, q, h, material, rtol):  # noqa: E741
         return _step(k, l, v, s, r, beta, slope, p, q, h, material, rtol, GENT)
     if material[KIND] == POLYNOMIAL:
         return _polynomial_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol)
-    return _ogden_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol)
+    if material[KIND] == OGDEN:
+        return _ogden_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol)
+    return _table_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol)
 
 
 @compiled()
@@ -91,6 +93,12 @@ def _polynomial_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol):  # no
 def _ogden_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol):  # noqa: E741
     """Make a step, compiled by itself to keep the one for Gent short."""
     return _step(k, l, v, s, r, beta, slope, p, q, h, material, rtol, OGDEN)
+
+
+@compiled()
+def _table_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol):  # noqa: E741
+    """Make a step, compiled by itself to keep the one for Gent short."""
+    return _step(k, l, v, s, r, beta, slope, p, q, h, material, rtol, TABLE)
 
 
 @compiled(inline=True)

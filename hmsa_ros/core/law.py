@@ -32,6 +32,7 @@ from hmsa_ros.core.laws.record import (
     NEO_HOOKEAN,
     OGDEN,
     POLYNOMIAL,
+    TABLE,
 )
 
 # Places in the packed material.
@@ -82,9 +83,11 @@ def pack(zeta: Any, j_lim: Any, c1: Any, elastic: Elastic | None = None) -> Arra
     """
     zeta, j_lim, c1 = (np.asarray(x, dtype=np.float64) for x in (zeta, j_lim, c1))
     if elastic is not None:
-        columns = np.broadcast_arrays(
-            elastic.family, zeta, c1, 0.5 * zeta * c1, *held(elastic), *elastic.constants)
-        made: Array = np.stack(columns, axis=-1)
+        head = np.stack(np.broadcast_arrays(
+            elastic.family, zeta, c1, 0.5 * zeta * c1, *held(elastic)), axis=-1)
+        constants = np.broadcast_to(
+            np.array(elastic.constants), (*head.shape[:-1], len(elastic.constants)))
+        made: Array = np.concatenate([head, constants], axis=-1).astype(np.float64)
         return made
     with np.errstate(divide='ignore', over='ignore'):
         i_j = 1.0 / j_lim
@@ -142,6 +145,8 @@ def _elastic(l, material, family):  # noqa: E741
     elif family == OGDEN:
         if 0.0 < l < math.inf:
             force, stiffness = families.ogden(l, material)
+    elif family == TABLE:
+        force, stiffness = families.table(l, material)
     elif family == ANY and material[KIND] > NEO_HOOKEAN:
         force, stiffness = families.elastic(l, material[KIND], material)
     elif material[KIND] == GENT:

@@ -4,20 +4,25 @@ from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, replace
 import math
 
-from hmsa_ros.core.delivery import Delivery, IDEAL, ramps
-from hmsa_ros.core.model import elastic_force
+import numpy as np
+
+from hmsa_ros.core.delivery import Delivery, IDEAL, Piece, ramps
+from hmsa_ros.core.laws.record import ENDLESS
+from hmsa_ros.core.model import elastic_force, natural_frequency
 from hmsa_ros.core.moves import Level, Limits, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.setpoint import Setpoint
 from hmsa_ros.core.shapers import get_shaper
 from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.core.simulation import check_stretch, follow, longest_motion
+from hmsa_ros.core.simulation import check_stretch, follow, longest_motion, simulate
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.units import Units
 from hmsa_ros.errors import BadInputError
 
 #: What to do with a setpoint that ends before the move to it does.
 SHORT_SPELL = ('refuse', 'continue')
+# Samples of a motion, and their tolerance, where it must keep inside the limits of its law.
+_LOOK, _LOOK_RTOL = 300, 1e-7
 
 
 @dataclass(frozen=True)
@@ -140,7 +145,7 @@ def segments(
                     f'{units.time_text(setpoint.span)}: expected a span at least as long as the '
                     'move')
             move = _cut(move, setpoint, units, last=following is None)
-        end = _follow(state, move, setpoint.span, material, delivery)
+        end = _follow(state, move, setpoint, material, delivery)
         yield Segment(setpoint, begin, state, end, move)
         begin += setpoint.span
         state = end
@@ -164,15 +169,40 @@ def _rounded(move: Move, delivery: Delivery) -> Move:
 
 
 def _follow(
-        state: State, move: Move, span: float, material: NondimensionalParameters,
+        state: State, move: Move, setpoint: Setpoint, material: NondimensionalParameters,
         delivery: Delivery) -> State:
     """Return the state at the end of the span, or where the last ramp ends."""
     end = move.levels[-1].time if math.isinf(move.duration) else move.duration
-    if math.isfinite(span):
-        end = max(end, span)
+    if math.isfinite(setpoint.span):
+        end = max(end, setpoint.span)
     if math.isnan(state.load):
         state = replace(state, load=float(elastic_force(state.stretch, material)))
     parts, last = ramps(move.levels, state.ramps_from, end, delivery.slew)
     settled = longest_motion(last, material) + delivery.settling(0.0)
     end = min(end, max(parts[-1][0], 0.0) + settled)
+    _check_known(state, parts, end, setpoint.stretch, material, delivery.lag)
     return follow(move.levels, state, end, material, delivery)
+
+
+def _check_known(
+        state: State, parts: Sequence[Piece], end: float, target: float,
+        material: NondimensionalParameters, lag: float) -> None:
+    """Refuse a move that swings to where nothing is known of the elastic force."""
+    elastic = material.law
+    if elastic is None or elastic.limits == ENDLESS:
+        return
+    # The first swing about the last level is the widest.
+    swing = 2.0 * math.pi / float(natural_frequency(target, material))
+    times = np.linspace(parts[0][0], min(end, max(parts[-1][0], 0.0) + swing), _LOOK)
+    switches, loads, slopes = np.array(parts).T
+    stretch, _ = simulate(
+        switches, loads, times, material, rtol=_LOOK_RTOL, stretch=state.stretch,
+        rate=state.rate, slopes=slopes, lag=lag, field=state.load)
+    for widest, beyond in ((np.min(stretch), -1.0), (np.max(stretch), 1.0)):
+        limit = elastic.limits[beyond > 0.0]
+        if beyond * (widest - limit) > 0.0:
+            raise RefusedError(
+                Code.OUT_OF_RANGE,
+                f'the move from stretch {state.stretch:.6g} to {target:g} swings to '
+                f'{widest:.4f}: expected a motion between the limits {elastic.limits[0]:.4f} and '
+                f'{elastic.limits[1]:.4f} of law {elastic.law}, beyond which nothing is known')

@@ -66,7 +66,8 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'No action needed; the shaper minimum_time arrives sooner.'),
     Code.LEVELS: ('Levels of the field as they were sent, up to rest at the end.', ''),
     Code.OUT_OF_RANGE: (
-        'The stretch is at or beyond the limiting extension of the polymer chains (J_lim).',
+        'The stretch is at or beyond a limit of the elastic law: the full extension of the '
+        'polymer chains (J_lim), where the force falls, or the end of a table.',
         'Choose a stretch inside the interval that the message names, or correct '
         'actuator.chain_limit.'),
     Code.FLUX_LIMIT: (

@@ -30,7 +30,6 @@ from hmsa_ros.core.law import (
     elastic_stiffness,
     mass,
 )
-from hmsa_ros.core.laws.record import CONSTANTS
 
 # Places in theta.
 STIFFNESS, DAMPING, DRIVE, FORCE, LAG, STRETCH, RATE, FIRST_BRANCH = range(8)
@@ -317,7 +316,11 @@ def respond(
     size = (n * w + _BLOCK - 1) // _BLOCK * _BLOCK
     k = np.zeros((STAGES + 1, size))
     y, new = np.zeros(size), np.zeros(size)
-    constants = material.size - CONSTANTS
+    # A table has hundreds of constants, of which none is sought; Gent's is always differentiated.
+    constants = 1
+    for j in range(count):
+        if CONSTANT <= wanted[j] < SWITCH:
+            constants = max(constants, wanted[j] - CONSTANT + 1)
     slopes = np.zeros(BY_CONSTANT + constants)
     partial = np.zeros(FIRST_BRANCH + 2 * branches + constants + 1)
     slots = _slots(wanted, branches, partial.size)

@@ -1,32 +1,16 @@
 """Recordings out of CSV files, with what is wrong in them said."""
 
-import csv
-from dataclasses import dataclass
-import io
 import math
 from pathlib import Path
-import re
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hmsa_ros.columns import read_table, Table
 from hmsa_ros.core.model import Array
-from hmsa_ros.errors import BadInputError, excerpt
+from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.recording import Recording
 
-_SEPARATORS = (';', '\t', ',', '|')
-_LARGEST_FILE = 512 * 1024 * 1024
-_UNITS = {
-    'time': {'s': 1.0, 'sec': 1.0, 'seconds': 1.0, 'ms': 1e-3, 'us': 1e-6, 'µs': 1e-6,
-             'ns': 1e-9},
-    'stretch': {'1': 1.0, '-': 1.0, '': 1.0},
-    'flux_density': {'t': 1.0, 'tesla': 1.0, 'mt': 1e-3, 'g': 1e-4, 'gauss': 1e-4},
-}
-_ALIASES = {
-    't': 'time', 'stamp': 'time', 'timestamp': 'time', 'lambda': 'stretch',
-    'position': 'stretch', 'b': 'flux_density', 'flux': 'flux_density', 'field': 'flux_density',
-    'effort': 'flux_density'}
-_HEADER = re.compile(r'\s*([A-Za-z_µ ]+?)\s*(?:[\[(/]\s*([^\])]*?)\s*[\])]?)?\s*')
 # Of what is left out: more than this is not a few bad rows.
 _MOST_LEFT_OUT = 0.2
 # A jump of the stamps this many intervals long is said; a level for nearly every sample is a
@@ -39,158 +23,6 @@ _MOST_SWITCHES = 300
 # Levels whose times fit the motion so much better in another unit are in that unit.
 _OTHER_UNITS = {1e3: 'ms', 1e6: 'us', 1e9: 'ns'}
 _BETTER = 0.5
-
-
-@dataclass(frozen=True, eq=False)
-class Table:
-    """
-    Columns of a CSV file.
-
-    Attributes
-    ----------
-    columns : dict of str to ndarray
-        By name, in SI; NaN where a cell was empty or no number.
-    lines : ndarray
-        Number of each row's line.
-    notes : tuple of str
-        What was converted.
-
-    """
-
-    columns: dict[str, Array]
-    lines: Array
-    notes: tuple[str, ...]
-
-
-def _text(path: Path) -> str:
-    try:
-        if path.stat().st_size > _LARGEST_FILE:
-            raise BadInputError(
-                f'{path} has {path.stat().st_size} bytes: expected a CSV of at most '
-                f'{_LARGEST_FILE}')
-        return path.read_text(encoding='utf-8-sig')
-    except UnicodeDecodeError as error:
-        raise BadInputError(f'{path} is no text: expected a CSV or the folder of a bag') from error
-    except OSError as error:
-        raise BadInputError(
-            f'{path} cannot be read ({error.strerror or error}): expected a CSV or the folder of '
-            'a bag') from error
-
-
-def read_table(path: Path, wanted: tuple[str, ...], optional: tuple[str, ...] = ()) -> Table:
-    """
-    Read columns of a CSV file.
-
-    Separators are found out; so are units behind a name, as in ``flux_density [mT]``.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    wanted, optional : tuple of str
-        Names of columns.
-
-    Returns
-    -------
-    Table
-        In SI.
-
-    Raises
-    ------
-    BadInputError
-        If the file cannot be read, has no header, or a column is missing.
-
-    """
-    rows = [(i, x) for i, x in enumerate(_text(path).splitlines(), 1)
-            if x.strip() and not x.lstrip().startswith('#')]
-    if not rows:
-        raise BadInputError(f'{path} is empty: expected a header and rows of numbers')
-    head = rows[0][1]
-    separator = next((x for x in _SEPARATORS if x in head), None)
-    cells = _split(head, separator)
-    if all(_number(x, separator) is not None for x in cells):
-        raise BadInputError(
-            f'{path} begins with numbers ({excerpt(head)}): expected a header with the columns '
-            f'{", ".join(wanted)} in line {rows[0][0]}')
-    places, notes = _places(path, cells, (*wanted, *optional))
-    missing = [x for x in wanted if x not in places]
-    if missing:
-        raise BadInputError(
-            f'{path} has no column {" and no column ".join(missing)}: expected '
-            f'{", ".join(wanted)}; its columns are {excerpt(", ".join(cells))}'
-            + ('; stretch is strain plus 1' if 'stretch' in missing
-               and any('strain' in x.lower() for x in cells) else ''))
-    columns: dict[str, Array] = {name: np.full(len(rows) - 1, np.nan) for name in places}
-    for i, (line, text) in enumerate(rows[1:]):
-        parts = _split(text, separator)
-        if any(parts[len(cells):]):
-            raise BadInputError(
-                f'{path} line {line} has {len(parts)} cells in {len(cells)} columns '
-                f'({excerpt(text)}): expected a number a column{_decimal_commas(separator)}')
-        for name, (place, factor) in places.items():
-            if place >= len(parts):
-                continue
-            value = _number(parts[place], separator)
-            if value is None:
-                raise BadInputError(
-                    f'{path} line {line} has {excerpt(parts[place])} in column {name}: expected '
-                    f'a number{_decimal_commas(separator) if "," in parts[place] else ""}')
-            columns[name][i] = value * factor
-    return Table(columns, np.array([x[0] for x in rows[1:]]), tuple(notes))
-
-
-def _decimal_commas(separator: str | None) -> str:
-    return ('; numbers with decimal commas need semicolons between the columns'
-            if separator == ',' else '')
-
-
-def _split(text: str, separator: str | None) -> list[str]:
-    if separator is None:
-        return text.split()
-    return [x.strip() for x in next(csv.reader(io.StringIO(text), delimiter=separator))]
-
-
-def _number(text: str, separator: str | None) -> float | None:
-    """Return the number in a cell, NaN for an empty one; None for what is none."""
-    if text.lower() in ('', 'nan', 'na', 'n/a', 'null', 'none'):
-        return math.nan
-    try:
-        return float(text.replace(',', '.') if separator != ',' else text)
-    except ValueError:
-        return None
-
-
-def _places(
-        path: Path, cells: list[str], names: tuple[str, ...]
-) -> tuple[dict[str, tuple[int, float]], list[str]]:
-    """Return place and factor of each column that is known, and notes."""
-    places: dict[str, tuple[int, float]] = {}
-    notes = []
-    for place, cell in enumerate(cells):
-        match = _HEADER.fullmatch(cell)
-        if match is None:
-            continue
-        name = '_'.join(match[1].lower().split())
-        unit = (match[2] or '').strip().lower()
-        for suffix in ('ms', 'us', 'mt', 'mm', 's', 't'):
-            stem = name.removesuffix(f'_{suffix}')
-            if not unit and stem != name and _ALIASES.get(stem, stem) in names:
-                name, unit = stem, suffix
-        name = _ALIASES.get(name, name)
-        if name not in names or name in places:
-            continue
-        known = _UNITS[name]
-        default = {'time': 's', 'stretch': '', 'flux_density': 't'}[name]
-        if (unit or default) not in known:
-            raise BadInputError(
-                f'{path} gives {name} in {unit}: expected '
-                + ('no unit: divide a length by the length at rest, percent by 100'
-                   if name == 'stretch' else ', '.join(known)))
-        factor = known[unit or default]
-        if factor != 1.0:
-            notes.append(f'{name} was converted from {unit} as the header says')
-        places[name] = place, factor
-    return places, notes
 
 
 def read_levels(path: Path) -> tuple[Array, Array, tuple[str, ...]]:
@@ -262,7 +94,7 @@ def read_csv(
 
     """
     own = () if commands is not None else ('flux_density',)
-    table = read_table(path, ('time', 'stretch', *own))
+    table = read_table(path, ('time', 'stretch', *own), kind='a CSV or the folder of a bag')
     notes = list(table.notes)
     if not len(table.lines):
         raise BadInputError(f'{path} has a header and no row: expected samples')

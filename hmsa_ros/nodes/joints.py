@@ -19,6 +19,7 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes.parameters import (
     declare,
     descriptor,
+    from_files,
     JOINT,
     ParameterSpec,
     refusal,
@@ -126,13 +127,15 @@ def declare_joints(
     names = joint_names(values)
     declared = {spec.name: spec for spec in specs}
     for joint in names if values[JOINTS.name] else ():
+        filled = from_files(node, values, joint)
         for general in own:
             spec = replace(general, name=f'{joint}.{general.name}')
             declared[spec.name] = spec
             try:
                 # A list, whose type is dynamic, is declared by the lack of a value.
                 value = node.declare_parameter(
-                    spec.name, _TYPES.get(type(spec.default)), descriptor(spec)).value
+                    spec.name, filled.get(general.name, _TYPES.get(type(spec.default))),
+                    descriptor(spec)).value
             except ParameterException as error:
                 raise refusal(node, spec) from error
             if value is not None:

@@ -15,13 +15,20 @@ from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 
 from hmsa_ros.contract import topics
-from hmsa_ros.contract.actuator import actuator_from
-from hmsa_ros.contract.parameters import BLOCK, INITIAL_STRETCH, JOINT, ParameterSpec
+from hmsa_ros.contract.actuator import actuator_from, completed
+from hmsa_ros.contract.parameters import (
+    BLOCK,
+    FIXED,
+    INITIAL_STRETCH,
+    JOINT,
+    LAW,
+    ParameterSpec,
+)
 from hmsa_ros.errors import BadInputError
 
 __all__ = [
-    'actuator_from', 'BLOCK', 'check_names', 'declare', 'descriptor', 'INITIAL_STRETCH',
-    'JOINT', 'ParameterSpec', 'refusal']
+    'actuator_from', 'BLOCK', 'check_names', 'declare', 'descriptor', 'from_files',
+    'INITIAL_STRETCH', 'JOINT', 'ParameterSpec', 'refusal']
 
 
 def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
@@ -82,16 +89,55 @@ def declare(node: Node, specs: Iterable[ParameterSpec]) -> Mapping[str, Any]:
 
     """
     values: dict[str, Any] = {}
+    filled: Mapping[str, Any] | None = None
     for spec in specs:
+        if filled is None and spec.name in FIXED:
+            filled = from_files(node, values)
         try:
             # The range is checked by `check`, whose message names what was expected; rclpy's
             # does not.
             value = node.declare_parameter(
-                spec.name, spec.default, descriptor(spec)).value
+                spec.name, (filled or {}).get(spec.name, spec.default),
+                descriptor(spec)).value
         except ParameterException as error:
             raise refusal(node, spec) from error
         values[spec.name] = spec.taken(value)
     return values
+
+
+def from_files(node: Node, values: Mapping[str, Any], joint: str = '') -> Mapping[str, Any]:
+    """
+    Return constants of the law out of a file which the start values name.
+
+    As parameters they are recorded with the rest: a bag can be verified without the file.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Whose start values count.
+    values : mapping of str to object
+        Declared so far.
+    joint : str
+        Whose own values go before those for all; nothing is read where it has none.
+
+    Returns
+    -------
+    mapping of str to object
+        By name, without the joint.
+
+    Raises
+    ------
+    BadInputError
+        If the file cannot be used.
+
+    """
+    given = {spec.name: found.value for spec in LAW if (found := node._parameter_overrides.get(
+        f'{joint}.{spec.name}' if joint else spec.name)) is not None}
+    if joint and not given:
+        return {}
+    lists = {x.name for x in LAW if isinstance(x.default, list)}
+    return completed({
+        name: value for name, value in values.items() if not joint or name not in lists} | given)
 
 
 def check_names(node: Node) -> None:

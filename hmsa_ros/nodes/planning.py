@@ -7,6 +7,7 @@ from typing import Any
 
 from hmsa_ros.contract.parameters import (
     COIL_TIME_CONSTANT,
+    FIXED,
     FLUX_DENSITY_MAX,
     FLUX_DENSITY_MIN,
     SLEW_LIMIT,
@@ -38,7 +39,7 @@ _SETTINGS = Settings()
 
 #: Parameters that a joint may have a value of its own for.
 OWN = (
-    *(replace(x, read_only=False) for x in BLOCK),
+    *(replace(x, read_only=x.name in FIXED) for x in BLOCK),
     INITIAL_STRETCH,
     ParameterSpec(
         'shaper', 'two_step', 'Shaper that plans each move.', choices=tuple(SHAPERS),

@@ -429,6 +429,8 @@ def _losses(parts: Sequence[Part]) -> str:
 
 def _given(value: object) -> Cell | str:
     """Return a constant of a law as a cell shows it; Gent has none."""
+    if isinstance(value, list) and len(value) > 6:
+        return f'{len(value)} values, {min(value):.6g} to {max(value):.6g}'
     if isinstance(value, list):
         return ', '.join(f'{x:.6g}' for x in value)
     return cell(value) if isinstance(value, float) else str(value or '-')

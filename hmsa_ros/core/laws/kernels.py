@@ -8,7 +8,7 @@ law, and works in units of the shear modulus at small strain. The stretch is abo
 import math
 
 from hmsa_ros.core.compiling import compiled
-from hmsa_ros.core.laws.record import CONSTANTS, OGDEN, POLYNOMIAL
+from hmsa_ros.core.laws.record import CONSTANTS, OGDEN, POLYNOMIAL, TABLE
 
 
 @compiled(inline=True)
@@ -68,6 +68,75 @@ def _ogden_energy(l, material):  # noqa: E741
 
 
 @compiled()
+def _piece(l, material):  # noqa: E741
+    """Return the place of the piece of a table that a stretch is in."""
+    low, high = 0, int(material[CONSTANTS])
+    while high - low > 1:
+        middle = (low + high) // 2
+        if l < material[CONSTANTS + 3 + 8 * middle]:
+            high = middle
+        else:
+            low = middle
+    return CONSTANTS + 3 + 8 * low
+
+
+@compiled()
+def _beyond(l, material):  # noqa: E741
+    """
+    Return the way beyond an end of a table, 0 inside it, and the depth of the stop there.
+
+    Then force, stiffness and energy at the end.
+    """
+    first = CONSTANTS + 3
+    last = first + 8 * int(material[CONSTANTS])
+    if l < material[first]:
+        return (l - material[first], material[CONSTANTS + 1], material[first + 2],
+                material[first + 3], material[first + 1])
+    if l > material[last]:
+        return (l - material[last], material[CONSTANTS + 2], material[last + 2],
+                material[last + 3], material[last + 1])
+    return 0.0, 1.0, 0.0, 0.0, 0.0
+
+
+@compiled()
+def table(l, material):  # noqa: E741
+    """
+    Return psi' and psi'' of a table.
+
+    Beyond its ends the force goes on with the slope there and rises without bound at a stop.
+    """
+    way, depth, force, stiffness, _ = _beyond(l, material)
+    if way != 0.0:
+        room = 1.0 - way / depth
+        if not room > 0.0:
+            return math.nan, math.nan
+        return force + stiffness * way / room, stiffness / (room * room)
+    i = _piece(l, material)
+    u = l - material[i]
+    c1, c2, c3 = material[i + 3], material[i + 4], material[i + 5]
+    c4, c5 = material[i + 6], material[i + 7]
+    force = material[i + 2] + u * (c1 + u * (c2 + u * (c3 + u * (c4 + u * c5))))
+    stiffness = c1 + u * (2.0 * c2 + u * (3.0 * c3 + u * (4.0 * c4 + u * 5.0 * c5)))
+    return force, stiffness
+
+
+@compiled()
+def _table_energy(l, material):  # noqa: E741
+    """Return the integral of a table's force from stretch 1."""
+    way, depth, force, stiffness, total = _beyond(l, material)
+    if way != 0.0:
+        share = way / depth
+        if not share < 1.0:
+            return math.nan
+        return total + force * way - stiffness * depth * depth * (math.log1p(-share) + share)
+    i = _piece(l, material)
+    u = l - material[i]
+    for k in range(6, 0, -1):
+        total = u * (material[i + 1 + k] / k + total)
+    return material[i + 1] + total
+
+
+@compiled()
 def elastic(l, family, material):  # noqa: E741
     """Return psi' and psi''; NaN at a stretch that there is not."""
     if not 0.0 < l < math.inf:
@@ -76,6 +145,8 @@ def elastic(l, family, material):  # noqa: E741
         return polynomial(l, material)
     if family == OGDEN:
         return ogden(l, material)
+    if family == TABLE:
+        return table(l, material)
     return math.nan, math.nan
 
 
@@ -88,4 +159,6 @@ def energy(l, family, material):  # noqa: E741
         return _polynomial_energy(l, material)
     if family == OGDEN:
         return _ogden_energy(l, material)
+    if family == TABLE:
+        return _table_energy(l, material)
     return math.nan

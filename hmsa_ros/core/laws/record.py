@@ -12,11 +12,14 @@ GENT = 0.0  # 1/J_lim
 NEO_HOOKEAN = 1.0  # none
 POLYNOMIAL = 2.0  # b, a_1 to a_5 of b (I2 - 3) + sum a_k (I1 - 3)^k
 OGDEN = 3.0  # number of terms, then mu and alpha of each
+TABLE = 4.0  # number of pieces, then what `hmsa_ros.core.laws.curve.Curve.packed` returns
 
 #: Place of the constants in a packed material.
 CONSTANTS = 6
 #: Powers of I1 - 3 that the polynomial family has.
 POWERS = 5
+#: Of a law that is a formula: no block reaches these stretches.
+ENDLESS = (1e-3, 1e3)
 
 
 @dataclass(frozen=True)
@@ -31,11 +34,14 @@ class Constant:
     symbol : str
         What it is in the energy.
     unit : str
-        ``'Pa'`` for what scales with the shear modulus; empty for a number or a file.
+        ``'Pa'`` for what scales with the shear modulus, ``'T'`` for what scales with the flux
+        density of load 1; empty for a number or a file.
     kind : type
         ``float``, ``list`` or ``str``.
     minimum, maximum : float
         Closed range of the number, or of each in a list.
+    fixed : bool
+        Whether it is read once, when a node starts.
 
     """
 
@@ -45,6 +51,7 @@ class Constant:
     kind: type = float
     minimum: float = -1e12
     maximum: float = 1e12
+    fixed: bool = False
 
 
 @dataclass(frozen=True)
@@ -61,7 +68,7 @@ class Elastic:
     constants : tuple of float
         Those of the family.
     given : tuple of (str, object)
-        Parameters that gave it, those in Pa in units of the shear modulus.
+        Parameters that gave it, those in Pa and in T in units of the block.
     limits : tuple of float
         Stretches beyond which nothing is known; those that can be held are in
         `hmsa_ros.core.model.stretch_limits`.
@@ -72,7 +79,7 @@ class Elastic:
     family: float
     constants: tuple[float, ...]
     given: tuple[tuple[str, Any], ...]
-    limits: tuple[float, float] = (1e-3, 1e3)
+    limits: tuple[float, float] = ENDLESS
 
 
 @dataclass(frozen=True)
@@ -96,6 +103,8 @@ class Law:
         shear modulus and chain limit describe.
     endless : bool
         Whether the chain limit is infinite, whatever the parameter says.
+    completed : callable, optional
+        From the values of the constants to those that are in a file which they name.
 
     """
 
@@ -105,6 +114,7 @@ class Law:
     constants: tuple[Constant, ...] = ()
     scaled: Callable[[Mapping[str, Any]], tuple[float, Elastic]] | None = None
     endless: bool = False
+    completed: Callable[[Mapping[str, Any]], dict[str, Any]] | None = None
 
 
 def positive_modulus(law: str, modulus: float, words: str, values: Sequence[Any]) -> float:
