@@ -35,7 +35,7 @@ _DELIVERIES = (
 
 def warm_up(
         say: Callable[[str], object] = lambda _: None, *, batch: bool = False,
-        creep: bool = False) -> float:
+        creep: bool = False, planning: bool = True) -> float:
     """
     Run every kernel once.
 
@@ -47,6 +47,8 @@ def warm_up(
         Also the parallel one, which no node uses.
     creep : bool
         Also the one of a plant whose elastomer creeps.
+    planning : bool
+        Also those that plan, which no plant uses.
 
     Returns
     -------
@@ -61,9 +63,12 @@ def warm_up(
     """
     begin = perf_counter()
     with announced(say):
-        _run(batch=batch)
-        if creep:
-            ActuatorSimulation(paper_actuator(), creep=Creep((0.1,), (0.1,))).advance(_MILLISECOND)
+        if planning:
+            _run(batch=batch)
+        for branches in (None, Creep((0.1,), (0.1,)))[:2 if creep else 1]:
+            plant = ActuatorSimulation(paper_actuator(), creep=branches)
+            plant.command(0, 0.01)
+            plant.advance(_MILLISECOND)
     return perf_counter() - begin
 
 

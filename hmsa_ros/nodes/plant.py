@@ -7,6 +7,7 @@ from time import monotonic_ns, time_ns
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
+from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
@@ -126,7 +127,7 @@ class PlantNode(ManagedNode):
                 'leads simulated time or follows it')
         start = round(values['start_time'] * NANOSECONDS) if self._authority else 0
         factor = values['real_time_factor'] if self._authority else 1.0
-        self._device = self._make_device(start)
+        self._device = _make_device(values, start, self.get_logger())
         self._pacer = Pacer(start, factor, paused=values['start_paused'])
         self._clock_published = 0
         self._measured = (start, monotonic_ns())
@@ -156,21 +157,6 @@ class PlantNode(ManagedNode):
         if not self.companion:
             self.create_timer(TICK_SECONDS, self._on_tick, clock=steady)
         self.create_timer(1.0, self._on_diagnostics, clock=steady)
-
-    def _make_device(self, start: int) -> SimulatedDevice:
-        values = self._values
-        joints = joints_from(values)
-        for name, joint in zip(values.names, joints, strict=True):
-            if few := too_few_samples(joint.setup.actuator, values['publish_rate']):
-                self.get_logger().warning(f'joint {name}: {few}')
-            if lost := unheld(joint.setup.actuator.nondimensional):
-                self.get_logger().warning(f'joint {name}: {lost}')
-        warm_up(self.get_logger().info, creep=any(x.setup.creep for x in joints))
-        return SimulatedDevice(
-            joints, period=max(round(NANOSECONDS / values['publish_rate']), 1), time=start,
-            command_delay=round(values['command_delay'] * NANOSECONDS),
-            measurement_delay=round(values['measurement_delay'] * NANOSECONDS),
-            seed=values['seed'])
 
     def activate(self) -> None:
         """Let time run, from where it is."""
@@ -424,6 +410,22 @@ def joints_from(values: JointParameters) -> list[SimulatedJoint]:
                 raise
             raise BadInputError(f'joint {name}: {error}') from error
     return found
+
+
+def _make_device(values: JointParameters, start: int, logger: RcutilsLogger) -> SimulatedDevice:
+    """Return the device at a start time in ns; what is odd is warned of."""
+    joints = joints_from(values)
+    for name, joint in zip(values.names, joints, strict=True):
+        if few := too_few_samples(joint.setup.actuator, values['publish_rate']):
+            logger.warning(f'joint {name}: {few}')
+        if lost := unheld(joint.setup.actuator.nondimensional):
+            logger.warning(f'joint {name}: {lost}')
+    warm_up(logger.info, creep=any(x.setup.creep for x in joints), planning=False)
+    return SimulatedDevice(
+        joints, period=max(round(NANOSECONDS / values['publish_rate']), 1), time=start,
+        command_delay=round(values['command_delay'] * NANOSECONDS),
+        measurement_delay=round(values['measurement_delay'] * NANOSECONDS),
+        seed=values['seed'])
 
 
 def _jump_in_words(jump: int, *, behind: bool) -> str:

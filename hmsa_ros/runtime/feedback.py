@@ -260,22 +260,7 @@ class Feedback:
                 found.stretch - at[0], found.rate / at[1]))
 
     def words(self, name: str, now: int) -> str:
-        """
-        Say what is wrong with a joint.
-
-        Parameters
-        ----------
-        name : str
-            Of the joint.
-        now : int
-            Time in ns.
-
-        Returns
-        -------
-        str
-            One sentence without its stop.
-
-        """
+        """Say in a sentence without its stop what is wrong with a joint at a time in ns."""
         joint, planner = self._joints[name], self._group.planners[name]
         found = joint.latest
         if found is None:

@@ -11,7 +11,6 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
-from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_srvs.srv import Trigger
 
 from hmsa_ros.core.status import Code
@@ -21,8 +20,8 @@ from hmsa_ros.errors import BadInputError, HmsaError, printable
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.capture import decode, RawSubscription
 from hmsa_ros.nodes.conversions import to_trajectory, whole
-from hmsa_ros.nodes.message_types import type_name_of
 from hmsa_ros.nodes.visitor import leave, visit
+from hmsa_ros.session import graph
 
 _SLICE_SECONDS = 0.05
 # The first start after an installation compiles the kernels.
@@ -259,8 +258,8 @@ class PlannerClient:
             return monotonic() - since >= _SETTLED_SECONDS
 
         def subscribed() -> bool:
-            recorders, heard = self._recorders(), self._subscribers(self._publisher.topic_name)
-            return any(x in recorders for x in heard) and (
+            heard = graph.subscribers(self.node, self._publisher.topic_name)
+            return not graph.recorders(self.node).isdisjoint(heard) and (
                 self._publisher.get_subscription_count() >= len(heard))
 
         self.spin_until(
@@ -281,29 +280,7 @@ class PlannerClient:
             Topics of commands that nobody but recorders subscribes to.
 
         """
-        recorders = self._recorders()
-        return [
-            x for x in self._commands() if recorders.issuperset(self._subscribers(x))]
-
-    def _commands(self) -> list[str]:
-        """Return the topics on which the planner commands our joints, whatever they are called."""
-        planner = f'{self._namespace.strip("/")}/{interface.PLANNER}'.lstrip('/')
-        name = type_name_of(interface.FLUX_DENSITY_COMMAND.type)
-        topics = [
-            topic for topic, types in self.node.get_topic_names_and_types() if name in types
-            and f'/{planner}' in _full_names(self.node.get_publishers_info_by_topic(topic))]
-        return [x for x in topics if x.split('/')[-2] in self._joints] or topics or [
-            self.node.resolve_topic_name(interface.of_joint(
-                interface.FLUX_DENSITY_COMMAND, x, self._joints).name) for x in self._joints]
-
-    def _subscribers(self, topic: str) -> list[str]:
-        return _full_names(self.node.get_subscriptions_info_by_topic(topic))
-
-    def _recorders(self) -> set[str]:
-        """Return the full names of recorders: rosbag2's too offer to split the bag."""
-        return {
-            service.rpartition('/')[0] for service, _ in
-            self.node.get_service_names_and_types() if service.endswith('/split_bagfile')}
+        return graph.unheard(self.node, self._namespace, self._joints)
 
     def send(
             self, setpoints: Sequence[tuple[float | Sequence[float], float]], *,
@@ -447,11 +424,6 @@ class PlannerClient:
             elif future.done() and self._verdict.state in ('at_rest', 'settling', 'idle'):
                 return bool(future.result().success)
         return False
-
-
-def _full_names(ends: Sequence[TopicEndpointInfo]) -> list[str]:
-    """Return the full names of the nodes that publishers or subscriptions belong to."""
-    return [f'{x.node_namespace.rstrip("/")}/{x.node_name}' for x in ends]
 
 
 @contextmanager
