@@ -49,6 +49,8 @@ def end_of(move, request):
         if span > 0.0:
             state = solve_ivp(
                 rates, (0.0, span), state, method='DOP853', rtol=1e-12, atol=1e-14,
+                # In longer steps the field, which decays within some lags, is off by 1e-9.
+                max_step=max(delivery.lag, span / 1000.0),
                 args=(load, slope, delivery.lag)).y[:, -1]
     return state
 

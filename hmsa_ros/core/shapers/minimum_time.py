@@ -252,7 +252,7 @@ def _zero(function: Callable[[float], float], low: float, high: float) -> float:
     for _ in range(_MOST_STEPS):
         step = value * (high - low) / (other - value)
         if abs(step) <= _ZERO_TOLERANCE * max(abs(high), 0.1):
-            break
+            return high + step
         new = function(high + step)
         if (new > 0.0) == (value > 0.0):
             # The same end moves again: the other one has less weight from now on.
