@@ -78,14 +78,14 @@ def test_a_node_that_is_told_to_end_while_it_compiles_ends_before_it_has(ros_env
     code = """
 import os, signal, sys
 from hmsa_ros.core import warmup
-from hmsa_ros.entry import plant
+from hmsa_ros.entry import planner
 class Options:
     def __iter__(self):
         os.kill(os.getpid(), signal.SIGTERM)
         yield None
 warmup._DELIVERIES = Options()
 sys.argv[1:] = []
-sys.exit(plant())
+sys.exit(planner())
 """
     done = subprocess.run(
         [sys.executable, '-c', code], capture_output=True, text=True, check=False, timeout=60)

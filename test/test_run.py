@@ -48,7 +48,7 @@ def test_a_plant_that_is_not_as_the_planner_thinks_fails_with_the_figures(start,
                      '--out', str(tmp_path / 'out'))
     assert run.wait(RUN_SECONDS) == 1, run.output
     # A block that is a tenth stiffer stays a tenth of the way short.
-    assert 'setpoint 1.1 of actuator is off target by -0.009' in run.stdout
+    assert 'setpoint 1.1 of actuator is off target by -0.009' in run.stdout, run.output
     again = start.hmsa('run', '1.10:0.1', '--simulate', '--out', str(tmp_path / 'out'))
     assert again.wait(RUN_SECONDS) == 2
     assert 'earlier run' in again.stderr
