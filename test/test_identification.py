@@ -344,6 +344,17 @@ def test_block_without_limit_of_its_chains_is_identified():
     assert max(map(abs, relative(found).values())) < 4.0
 
 
+@pytest.mark.parametrize(('modulus', 'damping'), [(1.88, 0.11), (7.7, 0.15)])
+def test_one_pass_at_sixty_frames_a_second_is_found_from_far_off(modulus, damping):
+    # Three samples or so fall on each step, and it rings one and a half times between two.
+    found = identify(
+        recorded(noise=1e-4, times=np.arange(120) / 60.0, repeats=1), actuator=replace(
+            BLOCK, shear_modulus=modulus * BLOCK.shear_modulus,
+            damping_coefficient=damping * BLOCK.damping_coefficient))
+    assert found.verdict == 'identified', found.reason
+    assert max(map(abs, relative(found).values())) < 4.0
+
+
 def test_sixty_uneven_points_of_a_figure_are_enough():
     random = np.random.default_rng(11)
     times = np.sort(random.uniform(0.0, 0.15, 60))

@@ -28,7 +28,8 @@ _FREQUENCIES = 160
 _DECAYS = (0.02, 0.1, 0.3)
 # Of the scan over the time unit: from one on over the other, and samples that count.
 _SCAN_RANGE, _SCAN_POINTS, _SCAN_DECAYS, _SCAN_SAMPLES = 12.0, 192, (0.05, 0.4), 300
-# Best ones of the scan that are taken, and the least factor between their time units.
+# Best ones of the scan that are taken of each damping, and the least factor between their time
+# units. Where few samples fall on the ringing, much damping leads there from farther away.
 _BEST, _APART = 5, 1.06
 _SHORTEST = 0.02  # time unit in intervals of the samples
 
@@ -227,7 +228,7 @@ def scan(
     part = replace(recording, time=recording.time[:first], stretch=recording.stretch[:first]) \
         if first < len(recording.time) else recording
     shortest = _SHORTEST * float(np.median(np.diff(recording.time)))
-    tried: list[tuple[float, dict[str, float]]] = []
+    tried: list[tuple[float, float, dict[str, float]]] = []
     timed = {'shear_modulus', 'density', 'time_unit'}.intersection(free)
     factors = np.geomspace(1.0 / _SCAN_RANGE, _SCAN_RANGE, _SCAN_POINTS) if timed else (1.0,)
     c1 = 2.0 * (values['half_thickness'] / values['half_length']) ** 2
@@ -244,14 +245,14 @@ def scan(
             response = respond(part, candidate, (), at_rest=at_rest, rtol=1e-5)
             if response is not None:
                 miss = float(np.mean(np.abs(part.stretch - response.stretch)))
-                tried.append((miss, candidate))
-    best: list[dict[str, float]] = []
-    for _, candidate in sorted(tried, key=lambda x: x[0]):
-        if len(best) < _BEST and (not timed or all(
-                abs(math.log(candidate['time_unit'] / x['time_unit'])) > math.log(_APART)
-                for x in best)):
-            best.append(candidate)
-    return best
+                tried.append((miss, decay, candidate))
+    best: list[tuple[float, dict[str, float]]] = []
+    for _, decay, candidate in sorted(tried, key=lambda x: x[0]):
+        alike = [x['time_unit'] for y, x in best if y == decay]
+        if len(alike) < _BEST and (not timed or all(
+                abs(math.log(candidate['time_unit'] / x)) > math.log(_APART) for x in alike)):
+            best.append((decay, candidate))
+    return [x for _, x in best]
 
 
 def _candidate(
