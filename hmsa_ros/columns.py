@@ -52,11 +52,13 @@ class Table:
 
 def _text(path: Path, kind: str) -> str:
     try:
-        if path.stat().st_size > _LARGEST_FILE:
+        with path.open('rb') as file:
+            # Not by its size: a device has none, and no end.
+            content = file.read(_LARGEST_FILE + 1)
+        if len(content) > _LARGEST_FILE:
             raise BadInputError(
-                f'{path} has {path.stat().st_size} bytes: expected a CSV of at most '
-                f'{_LARGEST_FILE}')
-        return path.read_text(encoding='utf-8-sig')
+                f'{path} has more than {_LARGEST_FILE} bytes: expected a smaller CSV')
+        return io.TextIOWrapper(io.BytesIO(content), encoding='utf-8-sig').read()
     except UnicodeDecodeError as error:
         raise BadInputError(f'{path} is no text: expected {kind}') from error
     except OSError as error:

@@ -198,11 +198,14 @@ def entries_of(path: Path) -> list[tuple[str, str, object]]:
 
     """
     try:
-        if path.stat().st_size > _LARGEST_FILE:
+        with path.open('rb') as file:
+            # Not by its size: a device has none, and no end.
+            content = file.read(_LARGEST_FILE + 1)
+        if len(content) > _LARGEST_FILE:
             raise BadInputError(
-                f'{path} has {path.stat().st_size} bytes: expected a parameter file of at most '
-                f'{_LARGEST_FILE}')
-        document = _load(path.read_text(encoding='utf-8'))
+                f'{path} has more than {_LARGEST_FILE} bytes: expected a parameter file of at '
+                'most that')
+        document = _load(content.decode('utf-8'))
     except (OSError, ValueError, RecursionError) as error:
         if isinstance(error, BadInputError):
             raise

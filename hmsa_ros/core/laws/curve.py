@@ -132,6 +132,8 @@ def points_in(name: str) -> tuple[list[float], list[float]]:
     from hmsa_ros.columns import read_table
 
     path = Path(os.path.abspath(Path(name).expanduser()))
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise BadInputError(f'{path} is a device or a pipe: expected a CSV')
     table = read_table(path, ('stretch', 'flux_density'))
     stretch, flux = (table.columns[x].tolist() for x in ('stretch', 'flux_density'))
     _check(stretch, flux, str(path), [f'line {x}' for x in table.lines])
