@@ -27,6 +27,7 @@ from hmsa_ros.core.simulation import simulate
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.two_step import plan_two_step
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification.excitation import excite
 from hmsa_ros.identification.files import read_belief
 from hmsa_ros.runs.bags import read_runs
 
@@ -245,6 +246,14 @@ def test_what_names_no_file_or_half_of_the_points_is_refused(tmp_path, monkeypat
     stretch, flux = sampled()
     Path('table.csv').write_text(text_of(stretch, 1e3 * flux, 'stretch,flux_density [mT]'))
     assert block(file='table.csv').shear_modulus == pytest.approx(GENT.shear_modulus, rel=1e-6)
+
+
+def test_a_sequence_to_record_keeps_inside_the_table_and_seeks_no_chain_limit():
+    found = of_points(*sampled(20, 0.8, 1.25))
+    program = excite(found, duration=0.4).best
+    assert 0.8 < program.reach[0] < 1.0 < program.reach[1] < 1.25
+    assert program.ends_at_rest
+    assert 'chain_limit' not in program.std
 
 
 def test_a_plan_and_an_identification_take_a_table_from_a_parameter_file(tmp_path, capsys):

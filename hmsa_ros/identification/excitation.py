@@ -8,7 +8,7 @@ levels and dwells is repeated; levels and dwells are sought at random and improv
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -178,8 +178,14 @@ class Designer:
             rate: float = 1000.0, noise: float = 1e-3,
             free: Sequence[str] = DEFAULT_FREE) -> None:
         """Check duration and rate."""
+        if actuator.law is not None:
+            # Beyond the ends of a table nothing is known of the motion.
+            least, most = (1.0 + _MARGIN * (x - 1.0) for x in actuator.law.limits)
+            bounds = replace(
+                bounds, stretch_min=max(bounds.stretch_min, least),
+                stretch_max=min(bounds.stretch_max, most))
         self._actuator, self._bounds, self._noise = actuator, bounds, noise
-        self._free = check_free(free)
+        self._free = check_free(free, actuator.law)
         self._values = values_of(actuator)
         self._group = actuator.nondimensional
         self.period = 2.0 * math.pi * actuator.time_unit / float(
@@ -393,7 +399,7 @@ class Designer:
         times = np.append(0.0, span * (np.arange(len(targets)) + 1e-3))
         for share in np.linspace(1.0, 0.1, 19).tolist():
             levels = np.append(0.0, [self._holding(1.0 + share * (x - 1.0)) for x in targets])
-            if self._inside(times, levels):
+            if np.all(np.isfinite(levels)) and self._inside(times, levels):
                 return self.judge(times, levels)
         return None
 
