@@ -54,6 +54,7 @@ TRIED_AGAIN = {
     'test_docs.py::test_page_does_what_it_says': _REAL_TIME,
     'test_demo.py::test_every_setpoint_is_reached_and_held': _REAL_TIME,
     'test_run.py::test_a_simulated_experiment_arrives_and_leaves_its_bag_and_a_report': _REAL_TIME,
+    'test_run.py::test_a_simulated_experiment_with_feedback': _REAL_TIME,
     'test_run.py::test_an_interrupted_experiment_brings_the_running_actuator_to_rest': _REAL_TIME,
     'test_launch.py::test_a_demonstration_is_recorded_and_its_replay_is_the_same': _REAL_TIME,
     'test_bag_verify.py::test_a_second_plant_moves_the_same_when_the_bag_is_played': _REAL_TIME,

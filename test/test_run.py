@@ -116,10 +116,14 @@ def test_feedback_that_there_is_not_is_refused(start, tmp_path):
 
 
 @pytest.mark.ros
-def test_a_simulated_experiment_with_feedback_records_what_is_believed(start, tmp_path):
-    run = start.hmsa(
-        'run', '1.1:0.2', '--simulate', '--feedback', 'observe', '--out', str(tmp_path / 'out'))
+def test_a_simulated_experiment_with_feedback_arrives_and_records_what_is_believed(
+        start, tmp_path):
+    file = tmp_path / 'mismatched.yaml'
+    file.write_text(MISMATCHED)
+    run = start.hmsa('run', '1.1:1.5', '1.3:1.5', '--simulate', '--feedback', 'adapt',
+                     '--params-file', str(file), '--out', str(tmp_path / 'out'))
     assert run.wait(RUN_SECONDS) == 0, run.output
+    assert 'all 2 moves arrived' in run.stdout
     file, = (tmp_path / 'out').rglob('*.mcap')
     with open(file, 'rb') as stream:
         topics = {channel.topic for _, channel, _ in make_reader(stream).iter_messages()}

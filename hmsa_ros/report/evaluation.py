@@ -184,10 +184,10 @@ def find_moves(
     """
     Find the setpoints of a run from its commands.
 
-    A setpoint is reached with the level that holds it. Which levels do is told, in this order,
-    by the stretches that were asked for (the level whose equilibrium is one of them; or the
-    point of the plan that is at rest at one of them), and else by how long a level lasts: at
-    least a period of the actuator.
+    A setpoint is reached with the level that holds it: the one whose equilibrium is a stretch that
+    was asked for, or at which the plan is at rest at one (with what feedback has learnt, levels
+    have another equilibrium). Where neither finds a setpoint, a level that lasts for a period
+    of the actuator holds one.
 
     Parameters
     ----------
@@ -210,22 +210,24 @@ def find_moves(
     period = 2.0 * math.pi / natural_frequency(balance, material) * run.planner.time_unit
     predicted = {x.stamp: x for x in plan}
 
-    def by_equilibrium(i: int, _: float) -> float | None:
-        return _nearest(asked, float(balance[i]))
-
-    def by_plan(i: int, previous: float) -> float | None:
+    def by_request(i: int, previous: float, *, first: bool) -> float | None:
+        held = _nearest(asked, float(balance[i]))
+        if held is not None:
+            return held
         point = predicted.get(levels[i].stamp)
         if point is None or abs(point.rate) * period[i] > 2.0 * math.pi * _AT_REST:
             return None
         near = _nearest(asked, point.stretch)
-        return near if near is not None and abs(near - previous) > _SAME else None
+        # The first level of a move begins at rest, too.
+        return None if near is None or first and abs(near - previous) <= _SAME else near
 
-    def by_duration(i: int, _: float) -> float | None:
+    def by_duration(i: int, _: float, *, first: bool) -> float | None:
+        del first
         until = levels[i + 1].stamp if i + 1 < len(levels) else last
         lasts = (until - levels[i].stamp) / NANOSECONDS >= period[i]
         return float(balance[i]) if lasts else None
 
-    for target_of in (by_equilibrium, by_plan, by_duration):
+    for target_of in (by_request, by_duration):
         moves = _group(run, levels, period, target_of, _start(run, levels, plan), last)
         if moves:
             return moves
@@ -234,18 +236,22 @@ def find_moves(
 
 def _group(
         run: Run, levels: Sequence[Level], period: Array,
-        target_of: Callable[[int, float], float | None], start: float,
-        last: int) -> list[Move]:
+        target_of: Callable[..., float | None], start: float, last: int) -> list[Move]:
     """Return the moves that end with the levels that hold a target."""
+    corrections = [x.sent for x in run.verdicts if x.code == 'corrected']
     found: list[tuple[int, int, float]] = []
     begin, previous = 0, start
     for i in range(len(levels)):
-        target = target_of(i, previous)
+        target = target_of(i, previous, first=i == begin)
         if target is None:
             continue
-        # The same level again, or one that holds what is held, is no move.
+        # The same level again, or one that holds what is held, is no move, but feedback may
+        # have made the move end there.
         if abs(target - previous) > _SAME:
             found.append((begin, i, target))
+        elif i > begin and found and any(
+                levels[found[-1][0]].stamp < x < levels[i].stamp for x in corrections):
+            found[-1] = found[-1][0], i, target
         begin, previous = i + 1, target
     slew = run.number('plant.slew_limit') or run.number('planner.slew_limit')
     moves = []
