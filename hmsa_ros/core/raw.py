@@ -17,7 +17,7 @@ from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.timeline import Draft, Model, PlannedLevel, PlannedSegment, scaled
 from hmsa_ros.core.units import NANOSECONDS
 
-# Share of the way to the limits of the chains that a motion may go.
+# Share of the way to the limits of the law that a motion may go.
 _MARGIN = 0.98
 # Periods after a change of level in which the motion is largest, and samples of each.
 _PERIODS, _SAMPLES = 2.0, 40
@@ -132,7 +132,7 @@ def _period(model: Model, stretch: float) -> float:
 
 
 def _check_motion(number: int, level: PlannedLevel, state: State, end: int | None) -> None:
-    """Refuse a level under which the block would come too near to the limits of its chains."""
+    """Refuse a level under which the block would come too near to the limits of its law."""
     model = level.model
     lower, upper = stretch_limits(model.material)
     least, most = 1.0 - _MARGIN * (1.0 - lower), 1.0 + _MARGIN * (upper - 1.0)
@@ -152,5 +152,5 @@ def _check_motion(number: int, level: PlannedLevel, state: State, end: int | Non
             raise RefusedError(
                 Code.OUT_OF_RANGE,
                 f'level {number} of {level.flux_density:g} T takes the stretch to {stretch:.4g}: '
-                f'expected {least:.4g} to {most:.4g}, as the chains of the block allow; lower '
+                f'expected {least:.4g} to {most:.4g}, as the law of the block allows; lower '
                 'the levels, or correct the parameters of the block')
