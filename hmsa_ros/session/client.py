@@ -271,15 +271,7 @@ class PlannerClient:
             self.spin_until(lambda: not self.unheard(), 'no plant', timeout=_UNHEARD_SECONDS)
 
     def unheard(self) -> list[str]:
-        """
-        Look who takes the commands.
-
-        Returns
-        -------
-        list of str
-            Topics of commands that nobody but recorders subscribes to.
-
-        """
+        """Return the topics of commands that nobody but recorders subscribes to."""
         return graph.unheard(self.node, self._namespace, self._joints)
 
     def send(
