@@ -19,7 +19,7 @@ import threading
 import time
 from typing import Any, ClassVar
 
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, Phase, settings
 import pytest
 
 from hmsa_ros.middleware import PROFILES
@@ -42,7 +42,9 @@ def pytest_configure(config: pytest.Config) -> None:
         config.addinivalue_line('filterwarnings', warning)
     # A deadline for an example would be a measure of this machine's speed.
     settings.register_profile(
-        'gate', deadline=None, suppress_health_check=[HealthCheck.too_slow])
+        'gate', deadline=None, suppress_health_check=[HealthCheck.too_slow],
+        # To explain an example, Python's lines are traced: integrations take minutes then.
+        phases=[x for x in Phase if x is not Phase.explain])
     settings.load_profile('gate')
 
 

@@ -55,10 +55,12 @@ def end_state(move: Move, request: Request) -> tuple[float, float]:
 
 
 def distance_from_rest(move: Move, request: Request) -> float:
-    """Return how far from rest at the target a move ends, as a share of the move."""
+    """Return how far from rest at the target a move ends, as a share of one that can be judged."""
     stretch, rate = end_state(move, request)
     frequency = float(natural_frequency(request.target, request.material))
     size = abs(request.target - request.state.stretch) + abs(request.state.rate) / frequency
+    # SciPy's own error is about INTEGRATION, however small the move.
+    size = max(size, 10.0 * INTEGRATION / AT_REST)
     return (abs(stretch - request.target) + abs(rate) / frequency) / size
 
 
