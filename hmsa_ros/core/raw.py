@@ -59,10 +59,27 @@ def check_levels(points: Sequence[tuple[float, int]], model: Model) -> None:
 
 def draft_levels(outset: Outset, points: Sequence[tuple[float, int]]) -> Steps[Draft]:
     """
-    Plan checked levels (T, ns), the first at the outset; yields where it may pause.
+    Plan checked levels.
 
     Where the motion has not ended with the last of them, a shaped move to the stretch that it
     holds takes its place.
+
+    Parameters
+    ----------
+    outset : Outset
+        Where the first of them applies.
+    points : sequence of (float, int)
+        Levels in T, and times in ns from which they apply.
+
+    Returns
+    -------
+    Draft
+        With one setpoint, the stretch that the last level holds.
+
+    Yields
+    ------
+    None
+        Where it may pause.
 
     Raises
     ------
