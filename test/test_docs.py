@@ -130,7 +130,7 @@ def test_console_blocks_are_commands_with_their_output():
 @pytest.mark.parametrize(('text', 'reason'), [
     ('ros2 run hmsa_ros plnner', 'no executable'),
     ('ros2 run hmsa_ros plant --ros-args -p publish_clk:=true', "'publish_clk' is not declared"),
-    ('ros2 run hmsa_ros hmsa send', 'hmsa does not understand'),
+    ('ros2 run hmsa_ros hmsa send 1.1', 'hmsa does not understand'),
     ('ros2 launch hmsa_ros demo.launch.py recrd:=true', "no argument 'recrd'"),
     ('ros2 launch hmsa_ros demo.launch.py record:=maybe', "record cannot be 'maybe'"),
     ('ros2 launch hmsa_ros nothing.launch.py', 'no launch file'),

@@ -34,8 +34,9 @@ def levels_of(arguments: argparse.Namespace) -> list[tuple[float, float]]:
     """
     if bool(arguments.setpoints) == (arguments.levels is not None):
         raise BadInputError(
-            f'{"both" if arguments.setpoints else "neither"} setpoints and --levels are given: '
-            'expected STRETCH:SECONDS ... or --levels CSV')
+            ('both setpoints and --levels are given' if arguments.setpoints
+             else 'neither setpoints nor --levels are given')
+            + ': expected STRETCH:SECONDS ... or --levels CSV')
     if arguments.levels is None:
         return []
     from hmsa_ros.identification.tables import read_levels
