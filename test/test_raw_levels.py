@@ -87,7 +87,7 @@ def test_levels_that_break_a_limit_are_refused(levels, options, code, words):
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [
-    ([], 'neither setpoints and --levels'), (['1.1:1', '--levels', 'x.csv'], 'both setpoints'),
+    ([], 'neither setpoints nor --levels'), (['1.1:1', '--levels', 'x.csv'], 'both setpoints'),
     (['--levels', 'x.csv'], 'x.csv cannot be read')])
 @pytest.mark.parametrize('command', ['send', 'run'])
 def test_bad_arguments_end_with_2_and_a_sentence(
