@@ -8,7 +8,8 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 from rclpy.parameter import Parameter
-from sensor_msgs.msg import MagneticField
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import JointState, MagneticField
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
@@ -518,6 +519,20 @@ def test_joint_has_the_name_of_the_parameter(bench):
     planner.ros.spin_until(lambda: planner.plans, 'the plan')
     assert planner.plans[-1].joint_names == ['knee']
     planner.send(trajectory(*SEQUENCE), 'unknown_joint')
+
+
+@pytest.mark.parametrize('data', [
+    b'', b'\0\1', b'\0\1\0\0' + b'\xff' * 20,
+    serialize_message(JointState(name=['actuator'], position=[1.1]))[:-9]], ids=len)
+def test_a_sample_that_cannot_be_read_is_ignored(serve, monkeypatch, data):
+    node = serve(PlannerNode).nodes[0]
+    monkeypatch.setattr(node._runtime, 'looks_at', lambda stamp: True)
+    seen = []
+    monkeypatch.setattr(node._runtime, 'observed', lambda *sample: seen.append(sample))
+    node._on_sample(data)
+    assert not seen
+    node._on_sample(serialize_message(JointState(name=['actuator'], position=[1.1])))
+    assert [x[0] for x in seen] == ['actuator']
 
 
 def test_diagnostics_count_what_was_sent_and_refused(bench):

@@ -10,7 +10,6 @@ from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -20,6 +19,7 @@ from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.core.warmup import warm_up
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import conversions, interface
+from hmsa_ros.nodes.capture import decode
 from hmsa_ros.nodes.channel import JointChannel
 from hmsa_ros.nodes.joints import declare_joints
 from hmsa_ros.nodes.managed import AUTOSTART, ManagedNode
@@ -161,8 +161,12 @@ class PlannerNode(ManagedNode):
         # Most of a thousand samples a second are of no use, and reading them takes time.
         if not self._runtime.looks_at(conversions.stamp_of(data)):
             return
-        message = deserialize_message(data, JointState)
-        stamp = conversions.from_time(message.header.stamp)
+        try:
+            message = decode(data, JointState)
+            stamp = conversions.from_time(message.header.stamp)
+        except BadInputError as error:
+            self.get_logger().error(f'sample ignored: {error}', throttle_duration_sec=1.0)
+            return
         # A field that is not measured is empty.
         for name, *values in zip_longest(
                 message.name, message.position, message.velocity, message.effort,
