@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmsa_ros.errors import BadInputError, excerpt
+from hmsa_ros.files import read_at_most
 
 Array = NDArray[np.float64]
 
@@ -52,12 +53,7 @@ class Table:
 
 def _text(path: Path, kind: str) -> str:
     try:
-        with path.open('rb') as file:
-            # Not by its size: a device has none, and no end.
-            content = file.read(_LARGEST_FILE + 1)
-        if len(content) > _LARGEST_FILE:
-            raise BadInputError(
-                f'{path} has more than {_LARGEST_FILE} bytes: expected a smaller CSV')
+        content = read_at_most(path, _LARGEST_FILE, 'a smaller CSV')
         return io.TextIOWrapper(io.BytesIO(content), encoding='utf-8-sig').read()
     except UnicodeDecodeError as error:
         raise BadInputError(f'{path} is no text: expected {kind}') from error

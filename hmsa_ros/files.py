@@ -90,6 +90,39 @@ def _known(value: object) -> object:
     return [_known(x) for x in value] if isinstance(value, (list, tuple)) else value
 
 
+def read_at_most(path: Path, size: int, expected: str) -> bytes:
+    """
+    Return the content of a file.
+
+    Parameters
+    ----------
+    path : Path
+        The file; a device, which has neither size nor end, is read as far as allowed.
+    size : int
+        Bytes that it may have.
+    expected : str
+        What it should be, for the message.
+
+    Returns
+    -------
+    bytes
+        All of it.
+
+    Raises
+    ------
+    BadInputError
+        If it is larger.
+    OSError
+        If it cannot be read.
+
+    """
+    with path.open('rb') as file:
+        content = file.read(size + 1)
+    if len(content) > size:
+        raise BadInputError(f'{path} has more than {size} bytes: expected {expected}')
+    return content
+
+
 def require_arrow() -> tuple[Any, Any]:
     """
     Return the modules ``pyarrow`` and ``pyarrow.parquet``.

@@ -79,7 +79,7 @@ def inject(fault: Fault, domain: int) -> Outcome:
     """
     Inject one fault into real processes of a ROS domain.
 
-    A fault after which the rig cannot go on counts as not survived, with the reason. An unhandled
+    A fault that stops the rig counts as a failure, and the reason is reported. An unhandled
     exception in the output of any process is never what was expected.
     """
     with tempfile.TemporaryDirectory(prefix='hmsa_faults_') as folder:

@@ -328,10 +328,17 @@ def _planned(
         short_spell=options.short_spell)
 
 
+def placed_level(model: Model, stamp: int, flux_density: float, state: State) -> PlannedLevel:
+    """Place a level in T at a stamp in ns, where it finds the actuator in a state."""
+    unit = model.units
+    return PlannedLevel(
+        stamp, flux_density, state.stretch, state.rate / unit.time, state.load * unit.load, model,
+        scaled(state.amplifier, unit.load))
+
+
 def _placed(
         model: Model, begin: int, segment: Segment) -> tuple[list[PlannedLevel], PlannedSegment]:
     """Place a planned move on the timeline, in SI units."""
-    unit = model.units
     start = begin + model.ns(segment.begin)
     state = segment.start
     if math.isnan(state.load):
@@ -342,10 +349,8 @@ def _placed(
         if number:
             state = model.follow(state, segment.move.levels[number - 1].load, level.time - time)
         time = level.time
-        levels.append(PlannedLevel(
-            start + model.ns(time), level.load * unit.load, state.stretch,
-            state.rate / unit.time, state.load * unit.load, model,
-            scaled(state.amplifier, unit.load)))
+        levels.append(placed_level(
+            model, start + model.ns(time), level.load * model.units.load, state))
     duration = segment.move.duration
     return levels, PlannedSegment(
         segment.setpoint.stretch, start,

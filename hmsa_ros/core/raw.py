@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 import math
 
-from hmsa_ros.core.drafting import draft_moves, Outset, Steps
+from hmsa_ros.core.drafting import draft_moves, Outset, placed_level, Steps
 from hmsa_ros.core.model import equilibrium_stretch, stretch_limits
 from hmsa_ros.core.moves import State
 from hmsa_ros.core.setpoint import Setpoint
 from hmsa_ros.core.status import Code, RefusedError
-from hmsa_ros.core.timeline import Draft, Model, PlannedLevel, PlannedSegment, scaled
+from hmsa_ros.core.timeline import Draft, Model, PlannedLevel, PlannedSegment
 from hmsa_ros.core.units import NANOSECONDS
 
 # Share of the way to the limits of the law that a motion may go.
@@ -101,7 +101,7 @@ def draft_levels(outset: Outset, points: Sequence[tuple[float, int]]) -> Steps[D
             _check_motion(number - 1, before, state, stamp)
             state = model.follow(
                 state, before.flux_density / model.units.load, model.time(stamp - before.stamp))
-        levels.append(_placed(model, stamp, flux_density, state))
+        levels.append(placed_level(model, stamp, flux_density, state))
         yield
     last = levels[-1]
     _check_motion(len(points) - 1, last, state, None)
@@ -126,13 +126,6 @@ def draft_levels(outset: Outset, points: Sequence[tuple[float, int]]) -> Steps[D
         arrival = end.segments[0].arrival
     return Draft(outset.begin, tuple(levels), (PlannedSegment(
         rest, outset.begin, arrival, Code.LEVELS, '', outset.begin),))
-
-
-def _placed(model: Model, stamp: int, flux_density: float, state: State) -> PlannedLevel:
-    unit = model.units
-    return PlannedLevel(
-        stamp, flux_density, state.stretch, state.rate / unit.time, state.load * unit.load, model,
-        scaled(state.amplifier, unit.load))
 
 
 def _settling(level: PlannedLevel, state: State) -> float:

@@ -65,10 +65,10 @@ def warm_up(
     with announced(say):
         if planning:
             _run(batch=batch)
-        for branches in (None, Creep((0.1,), (0.1,)))[:2 if creep else 1]:
-            plant = ActuatorSimulation(paper_actuator(), creep=branches)
-            plant.command(0, 0.01)
-            plant.advance(_MILLISECOND)
+        else:
+            _simulate(Creep())
+        if creep:
+            _simulate(Creep((0.1,), (0.1,)))
     return perf_counter() - begin
 
 
@@ -88,6 +88,12 @@ def _run(*, batch: bool) -> None:
         last.sample((last.stamp, last.stamp + _MILLISECOND))
     if batch:
         plan_two_step_batch(1.0, np.array([1.1, 1.2]))
+
+
+def _simulate(creep: Creep) -> None:
+    plant = ActuatorSimulation(paper_actuator(), creep=creep)
+    plant.command(0, 0.01)
+    plant.advance(_MILLISECOND)
 
 
 def main() -> int:

@@ -163,10 +163,10 @@ class PlannerNode(ManagedNode):
             return
         try:
             message = decode(data, JointState)
-            stamp = conversions.from_time(message.header.stamp)
         except BadInputError as error:
             self.get_logger().error(f'sample ignored: {error}', throttle_duration_sec=1.0)
             return
+        stamp = conversions.from_time(message.header.stamp)
         # A field that is not measured is empty.
         for name, *values in zip_longest(
                 message.name, message.position, message.velocity, message.effort,

@@ -210,7 +210,7 @@ def find_moves(
     period = 2.0 * math.pi / natural_frequency(balance, material) * run.planner.time_unit
     predicted = {x.stamp: x for x in plan}
 
-    def by_request(i: int, previous: float, *, first: bool) -> float | None:
+    def by_request(i: int, previous: float, begin: int) -> float | None:
         held = _nearest(asked, float(balance[i]))
         if held is not None:
             return held
@@ -219,10 +219,9 @@ def find_moves(
             return None
         near = _nearest(asked, point.stretch)
         # The first level of a move begins at rest, too.
-        return None if near is None or first and abs(near - previous) <= _SAME else near
+        return None if near is None or i == begin and abs(near - previous) <= _SAME else near
 
-    def by_duration(i: int, _: float, *, first: bool) -> float | None:
-        del first
+    def by_duration(i: int, *_: float) -> float | None:
         until = levels[i + 1].stamp if i + 1 < len(levels) else last
         lasts = (until - levels[i].stamp) / NANOSECONDS >= period[i]
         return float(balance[i]) if lasts else None
@@ -236,13 +235,14 @@ def find_moves(
 
 def _group(
         run: Run, levels: Sequence[Level], period: Array,
-        target_of: Callable[..., float | None], start: float, last: int) -> list[Move]:
+        target_of: Callable[[int, float, int], float | None], start: float,
+        last: int) -> list[Move]:
     """Return the moves that end with the levels that hold a target."""
     corrections = [x.sent for x in run.verdicts if x.code == 'corrected']
     found: list[tuple[int, int, float]] = []
     begin, previous = 0, start
     for i in range(len(levels)):
-        target = target_of(i, previous, first=i == begin)
+        target = target_of(i, previous, begin)
         if target is None:
             continue
         # The same level again, or one that holds what is held, is no move, but feedback may

@@ -20,6 +20,7 @@ from hmsa_ros.contract.topics import PLANNER, PLANT
 from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.errors import BadInputError, excerpt
+from hmsa_ros.files import read_at_most
 
 # Parameter files have some dozens of entries.
 _LARGEST_FILE = 1 << 20
@@ -198,13 +199,7 @@ def entries_of(path: Path) -> list[tuple[str, str, object]]:
 
     """
     try:
-        with path.open('rb') as file:
-            # Not by its size: a device has none, and no end.
-            content = file.read(_LARGEST_FILE + 1)
-        if len(content) > _LARGEST_FILE:
-            raise BadInputError(
-                f'{path} has more than {_LARGEST_FILE} bytes: expected a parameter file of at '
-                'most that')
+        content = read_at_most(path, _LARGEST_FILE, 'a parameter file of at most that')
         document = _load(content.decode('utf-8'))
     except (OSError, ValueError, RecursionError) as error:
         if isinstance(error, BadInputError):

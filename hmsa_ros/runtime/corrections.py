@@ -122,8 +122,11 @@ class Corrections:
 
 def _as_sent(planner: Planner, now: int) -> bool:
     """Whether levels are being carried out that are not to be changed."""
-    return any(x.code is Code.LEVELS and (x.arrival is None or now < x.arrival)
-               for _, x in filter(None, [planner.segment(planner.soonest(now))]))
+    found = planner.segment(planner.soonest(now))
+    if found is None:
+        return False
+    _, segment = found
+    return segment.code is Code.LEVELS and (segment.arrival is None or now < segment.arrival)
 
 
 def _course(plan: Plan, begin: int) -> tuple[Course, float]:

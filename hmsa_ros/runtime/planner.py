@@ -90,8 +90,7 @@ class PlannerRuntime:
         self._feedback = Feedback(group, settings, self._bulletin.outputs, clock)
         self._planning = Planning(
             group, self.following, Corrections(group, self._feedback, clock), self._bulletin,
-            clock, steady,
-            lambda: self._sending.send(clock()))
+            clock, steady, lambda: self._sending.send(clock()))
         self._last_jump: int | None = None
 
     @property

@@ -251,8 +251,7 @@ def _through_rest(curve: Curve, height: float) -> Curve:
             f'{allowed:.2g} T; stretch is the length over the length at rest without field')
     pieces = curve.pieces.copy()
     pieces[:, 0] -= offset
-    breaks = curve.breaks.copy()
-    return Curve(breaks, pieces, curve.at(1.0, 1), curve.scatter)
+    return Curve(curve.breaks, pieces, curve.at(1.0, 1), curve.scatter)
 
 
 def _knots(u: Array) -> Array:
