@@ -89,6 +89,17 @@ def test_derivatives_are_those_of_finite_differences_for_every_parameter(slew):
                 difference, abs=2e-5 * np.max(np.abs(difference))), name
 
 
+def test_derivatives_ring_on_after_a_shaped_move_however_rare_the_samples_are():
+    moves = shaped(2)
+    recording = replace(moves, time=moves.time[::17], stretch=moves.stretch[::17])
+    values = values_of(BLOCK)
+    exact = respond(recording, values, ('shear_modulus',)).jacobian[:, 0]
+    ends = [respond(
+        recording, values | {'shear_modulus': x * BLOCK.shear_modulus}, (), rtol=1e-12).stretch
+        for x in (1.0 + 1e-5, 1.0 - 1e-5)]
+    assert exact == pytest.approx((ends[0] - ends[1]) / 2e-5, abs=1e-5)
+
+
 def test_derivative_by_a_lag_of_nothing_is_the_limit_of_lags():
     times = np.arange(300) * 1e-3
     recording = Recording(times, 1.0 + 0.1 * np.sin(70.0 * times), *steps(SEQUENCE, SPAN))

@@ -39,6 +39,9 @@ CONSTANT, SWITCH = 500, 1000
 
 # Phase of the fastest motion over which a quintic interpolates to about 1e-8.
 _SMOOTH = 0.45
+# Largest phase of a step where there are derivatives: they ring on when the motion is over, and
+# the error that is controlled is that of the motion alone.
+_LONGEST = 1.0
 # Stages and, in the last row, the solution.
 _TABLEAU = np.vstack([MATRIX, WEIGHTS[None, :]])
 # Columns that are added at once; the state is filled up to a multiple of them.
@@ -245,8 +248,11 @@ def _follow(
             return True
         limit = begins[piece + 1] if piece + 1 < begins.size else math.inf
         p2 = elastic_stiffness(y[0], material)
-        smooth = _SMOOTH / math.sqrt(theta[STIFFNESS] * p2 / mass(y[0], material))
+        per_phase = math.sqrt(mass(y[0], material) / (theta[STIFFNESS] * p2))
+        smooth = _SMOOTH * per_phase
         target = min(limit, times[i] if times[i] - t >= smooth else t + smooth)
+        if count:
+            h = min(h, _LONGEST * per_phase)
         step = min(h, target - t)
         error = _step(
             k, y, new, n, count, t - begins[piece], step, drive, theta, unit, material,
