@@ -202,10 +202,18 @@ def test_seconds_of_an_epoch_are_as_good_as_those_of_the_run(folder, capsys):
     assert 'identified' in out
 
 
-def test_a_modulus_of_no_elastomer_is_not_passed_over(folder, capsys):
-    # Both in ms, and nothing says so.
-    write('camera.csv', 'time,stretch', zip(1e3 * TIMES, STRETCH, strict=True))
-    write('levels.csv', 'time,flux_density', zip(1e3 * LEVELS[0], LEVELS[1], strict=True))
-    _, out, err = identify(capsys, 'camera.csv', '--commands', 'levels.csv')
-    assert 'that of no elastomer' in out + err
-    assert 'check that times are in s' in out + err
+@pytest.mark.parametrize(('time', 'field', 'message'), [
+    (1e3, 1.0, 'a shear_modulus of 0.01 Pa, in samples 1 s apart: .*"time [ms]"'),
+    (1e6, 1.0, 'shear_modulus of 1.*e-08 Pa, in samples 1e.03 s apart: .*"time [us]"'),
+    (1.0, 1e-3, 'a remanence of 100 T, .*flux densities in T')])
+def test_numbers_of_no_elastomer_are_refused_with_the_unit_that_would_explain_them(
+        folder, capsys, time, field, message):
+    # Both files alike, and nothing says so.
+    write('camera.csv', 'time,stretch', zip(time * TIMES, STRETCH, strict=True))
+    write('levels.csv', 'time,flux_density', zip(
+        time * LEVELS[0], field * LEVELS[1], strict=True))
+    status, out, err = identify(
+        capsys, 'camera.csv', '--commands', 'levels.csv', '--report', 'page.html')
+    assert (status, out, err.count('\n')) == (2, '', 1)
+    assert re.search(message.replace('[', r'\['), err)
+    assert not (folder / 'page.html').exists()

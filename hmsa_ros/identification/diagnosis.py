@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from hmsa_ros.core.model import Array
+from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.fit import Fit
 from hmsa_ros.identification.noise import autocorrelation, inflation, Whiteness, whiteness
 from hmsa_ros.identification.quantities import QUANTITIES
@@ -27,6 +28,10 @@ _OUT = 0.5  # weight below which a sample does not count
 _SOON = 10  # samples after a change of level
 _NUMERICAL = 1e-6  # residuals below this are those of the integration
 DISTANT = 0.1  # residual over motion from which on nothing was fitted
+# What soft actuators have, with a wide margin, in SI, and the power of the time in it.
+_USUAL = {'shear_modulus': (100.0, 1e8, -2), 'density': (100.0, 2e4, 2),
+          'time_unit': (1e-6, 1.0, 1), 'remanence': (3e-4, 3.0, -2)}
+_FINER = {'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9}
 
 
 def allowed(fit: Fit) -> Array:
@@ -336,6 +341,42 @@ def distant(recording: Recording, fit: Fit, found: Whiteness) -> bool:
         float(found.autocorrelation[1])) > 0.2
 
 
+def check_plausible(recording: Recording, fit: Fit, unknown: Sequence[str] = ()) -> None:
+    """
+    Refuse what can only come from data in other units.
+
+    Parameters
+    ----------
+    recording : Recording
+        What was measured.
+    fit : Fit
+        The optimum.
+    unknown : sequence of str
+        Free parameters without a number.
+
+    Raises
+    ------
+    BadInputError
+        If a free parameter has a value that no elastomer has.
+
+    """
+    for name, (least, most, power) in _USUAL.items():
+        value = fit.values[name]
+        if name not in fit.free or name in unknown or least <= value <= most:
+            continue
+        hint = next((
+            f'; if all times are in {x}, write "time [{x}]" in the header of the CSV'
+            for x, y in _FINER.items() if least <= value * y ** power <= most), '')
+        if not hint and name == 'remanence' and least <= 1e3 * value <= most:
+            hint = '; if flux densities are in mT, write "flux_density [mT]" in the header'
+        unit = QUANTITIES[name].unit
+        raise BadInputError(
+            f'{recording.label} moves as with a {name} of {value:.3g} {unit}, in samples '
+            f'{float(np.median(np.diff(recording.time))):.3g} s apart: expected {least:g} to '
+            f'{most:g} {unit}; check that times are in s, flux densities in T, and the size of '
+            f'the block in --params-file{hint}')
+
+
 def misfit(
         recording: Recording, fit: Fit, found: Whiteness, marks: Sequence[Signature]
 ) -> str:
@@ -367,8 +408,8 @@ def misfit(
     if distant(recording, fit, found):
         return (
             f'no motion of the model is like the recorded one: {figures}, against a motion of '
-            f'{motion:.3g} rms; are levels and samples of one clock, of one run and in tesla, '
-            'and is the block described by --params-file?')
+            f'{motion:.3g} rms; are times in s and levels in tesla, of one clock and one run, and '
+            'is the block described by --params-file?')
     if fit.scale < _NUMERICAL:
         return ''
     seen = [x for x in marks if x.found]
