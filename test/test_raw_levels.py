@@ -99,6 +99,11 @@ def test_bad_arguments_end_with_2_and_a_sentence(
     assert message in err
 
 
+def test_a_tolerance_for_levels_is_refused(capsys):
+    assert main(['run', '--levels', 'x.csv', '--tolerance', '0.1']) == 2
+    assert '--tolerance is given with --levels' in capsys.readouterr().err
+
+
 @pytest.mark.ros
 def test_a_run_of_levels_has_them_in_force_and_ends_at_rest(start, tmp_path):
     file, out = tmp_path / 'levels.csv', tmp_path / 'out'
@@ -110,7 +115,8 @@ def test_a_run_of_levels_has_them_in_force_and_ends_at_rest(start, tmp_path):
     run = start.hmsa('run', '--levels', str(file), '--simulate', '--report', '--out', str(out),
                      '--json')
     assert run.wait(RUN_SECONDS) == 0, run.output
-    assert json.loads(run.stdout)['verdict'] == 'arrived'
+    result = json.loads(run.stdout)
+    assert result['verdict'] == 'arrived'
     assert '<html' in (out / 'report.html').read_text()
     applied, samples = [], []
     with next((out / 'run').glob('*.mcap')).open('rb') as bag:
@@ -134,3 +140,10 @@ def test_a_run_of_levels_has_them_in_force_and_ends_at_rest(start, tmp_path):
     held = stretch[stamps > changes[-1, 0]]
     assert len(held) > 100
     assert held == pytest.approx(1.0, abs=1e-3)
+    table = result['levels']
+    assert sum(x['times'] for x in table) >= len(levels)
+    largest = max(table[:-1], key=lambda x: x['greatest'])
+    assert largest['greatest'] == pytest.approx(np.max(stretch), abs=1e-12)
+    assert (table[-1]['flux_density'], table[-1]['mean']) == (
+        0.0, pytest.approx(np.mean(held), abs=1e-6))
+    assert level_of(largest['rest']) == pytest.approx(largest['flux_density'], rel=1e-9)

@@ -14,10 +14,14 @@ from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError
 
 if TYPE_CHECKING:
-    from hmsa_ros.report.outcome import Arrival
+    from rich.table import Table
+
+    from hmsa_ros.report.outcome import Arrival, LevelResult
     from hmsa_ros.session.experiment import Conducted, Experiment
 
 NOT_MEASURED = 'predicted, not measured'
+# Rows of the table of levels.
+_MOST_LEVELS = 12
 
 
 def add_parser(subparsers: Any) -> None:
@@ -44,7 +48,8 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         '--tolerance', type=float, metavar='X',
         help='offset and residual vibration of a setpoint that counts as reached, as a share of '
-             'the step, noise of the sensor apart (default 0.02)')
+             'the step, noise of the sensor apart (default 0.02); the end of --levels is judged '
+             "by the planner's arrival_tolerance and vibration_tolerance")
     parser.add_argument('--report', action='store_true', help='write report.html as well')
     parser.add_argument(
         '--out', type=Path, metavar='DIR',
@@ -81,6 +86,8 @@ def run(arguments: argparse.Namespace) -> int:
             update('evaluating the bag', None)
             measured = _measure(experiment, tolerance) if (
                 done.measured and not experiment.levels) else []
+            levels = _measure_levels(experiment) if (
+                done.measured and experiment.levels) else []
             report = _report(experiment.bag, folder / 'report.html') if (
                 arguments.report and done.measured) else None
     except KeyboardInterrupt:
@@ -92,10 +99,11 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps({
             'verdict': verdict, 'reason': reason, 'setpoints': [_record(x) for x in measured],
+            **({'levels': [_record(x) for x in levels]} if experiment.levels else {}),
             'notes': list(done.notes), 'exits': done.exits, 'bag': str(experiment.bag),
             'report': None if report is None else str(report)}, indent=2, allow_nan=False))
     else:
-        _print(measured, reason, done, experiment.bag, report)
+        _print(measured, levels, reason, done, experiment.bag, report)
     return 0 if verdict in ('arrived', NOT_MEASURED) else 1
 
 
@@ -103,6 +111,10 @@ def _tolerance(arguments: argparse.Namespace) -> float:
     """Return the tolerance; refuse what cannot be used."""
     from hmsa_ros.report.outcome import TOLERANCE
 
+    if arguments.tolerance is not None and arguments.levels is not None:
+        raise BadInputError(
+            '--tolerance is given with --levels: expected setpoints with it; the end of levels is '
+            "judged by the planner's arrival_tolerance and vibration_tolerance")
     tolerance = TOLERANCE if arguments.tolerance is None else arguments.tolerance
     if not 0.0 < tolerance < math.inf:
         raise BadInputError(f'tolerance is {tolerance:g}: expected a share above 0')
@@ -140,6 +152,15 @@ def _measure(experiment: 'Experiment', tolerance: float) -> 'list[Arrival]':
     return found
 
 
+def _measure_levels(experiment: 'Experiment') -> 'list[LevelResult]':
+    """Read the bag and measure the levels of each joint."""
+    from hmsa_ros.report.outcome import level_results
+    from hmsa_ros.runs.bags import read_runs
+
+    several = experiment.joints if len(experiment.joints) > 1 else ()
+    return [y for x in read_runs(experiment.bag, joints=several) for y in level_results(x)]
+
+
 def _report(bag: Path, path: Path) -> Path:
     from hmsa_ros.files import write_text
     from hmsa_ros.report.charts import Part
@@ -167,8 +188,8 @@ def _verdict(
     return missed[0].verdict, f'{missed[0].sentence()}{rest}'
 
 
-def _record(arrival: 'Arrival') -> dict[str, Any]:
-    """Return a setpoint as JSON."""
+def _record(arrival: 'Arrival | LevelResult') -> dict[str, Any]:
+    """Return a setpoint or a level as JSON."""
     from dataclasses import asdict
 
     return {key: None if isinstance(x, float) and not math.isfinite(x) else x
@@ -176,13 +197,15 @@ def _record(arrival: 'Arrival') -> dict[str, Any]:
 
 
 def _print(
-        measured: 'list[Arrival]', reason: str, done: 'Conducted', bag: Path,
-        report: Path | None) -> None:
+        measured: 'list[Arrival]', levels: 'list[LevelResult]', reason: str, done: 'Conducted',
+        bag: Path, report: Path | None) -> None:
     from rich.box import SIMPLE
     from rich.console import Console
     from rich.table import Table
 
     console = Console()
+    if levels:
+        console.print(_level_table(levels))
     if measured:
         table = Table(box=SIMPLE, collapse_padding=True, pad_edge=False, caption=(
             'measured after arrival: mean stretch, its distance from the target, and vibration '
@@ -200,3 +223,25 @@ def _print(
             *(f'note     {x}' for x in done.notes), f'verdict  {reason}', f'bag      {bag}',
             *([] if report is None else [f'report   {report}'])):
         console.print(line, highlight=False, soft_wrap=True)
+
+
+def _level_table(levels: 'list[LevelResult]') -> 'Table':
+    """Return the table of the levels that were in force for the longest."""
+    from rich.box import SIMPLE
+    from rich.table import Table
+
+    longest = sorted(levels, key=lambda x: -x.duration)[:_MOST_LEVELS]
+    chosen = [x for x in levels if x in longest or x is levels[-1]]
+    short = len(levels) - len(chosen)
+    few = f'; {short} short ones left out' if short else ''
+    table = Table(box=SIMPLE, collapse_padding=True, pad_edge=False, caption=(
+        'rest: stretch that the level holds by the parameters; then what was measured while it '
+        f'was in force; the last row is the end{few}'))
+    for name in ('level mT', 'times', 'in all ms', 'rest', 'mean', 'least', 'greatest'):
+        table.add_column(name, justify='right', no_wrap=True)
+    for x in chosen:
+        name = f'{x.joint} ' if len({y.joint for y in levels}) > 1 else ''
+        table.add_row(
+            f'{name}{x.flux_density * 1e3:.4g}', str(x.times), f'{x.duration * 1e3:.4g}', *(
+                f'{y:.5f}' for y in (x.rest, x.mean, x.least, x.greatest)))
+    return table

@@ -1,4 +1,4 @@
-"""Whether a run arrived: each setpoint, measured against a tolerance."""
+"""Whether a run arrived: each setpoint, measured against a tolerance; and each level."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from hmsa_ros.core.model import Array
+from hmsa_ros.core.model import Array, equilibrium_stretch
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.report.evaluation import evaluate, MoveResult, period_of
 from hmsa_ros.runs.record import Run
@@ -104,6 +104,60 @@ def _measure(
         verdict = OFF_TARGET if len(after) > 1 else MISSED
     return Arrival(
         run.joint, result.stretch, reached, offset, residual, allowed, result.arrival, verdict)
+
+
+@dataclass(frozen=True)
+class LevelResult:
+    """
+    A level of the field, measured.
+
+    Attributes
+    ----------
+    joint : str
+        Empty if it is not known.
+    flux_density : float
+        In T.
+    times : int
+        How often it was in force; the one at the end of the run counts apart.
+    duration : float
+        In s, of all times.
+    rest : float
+        Stretch that it holds by the parameters in the run; NaN beyond the law of the block.
+    mean, least, greatest : float
+        Measured stretch while it was in force; NaN without samples.
+
+    """
+
+    joint: str
+    flux_density: float
+    times: int
+    duration: float
+    rest: float
+    mean: float
+    least: float
+    greatest: float
+
+
+def level_results(run: Run) -> list[LevelResult]:
+    """Measure each level of a run, equal ones together, in the order in which they came first."""
+    levels = [x for x in run.levels if x.stamp <= run.time[-1]]
+    ends = [*(x.stamp for x in levels[1:]), int(run.time[-1]) + 1]
+    groups: dict[tuple[float, bool], list[tuple[int, int]]] = {}
+    for i, (level, end) in enumerate(zip(levels, ends, strict=True)):
+        groups.setdefault((level.flux_density, i + 1 == len(levels)), []).append(
+            (level.stamp, end))
+    results = []
+    for (flux_density, _), spans in groups.items():
+        parts = [run.stretch[slice(*np.searchsorted(run.time, x))] for x in spans]
+        inside = np.concatenate(parts)
+        rest = float(equilibrium_stretch(
+            flux_density / run.planner.flux_density_unit, run.planner.nondimensional))
+        figures = [float(x(inside)) for x in (np.mean, np.min, np.max)] if len(inside) else [
+            math.nan] * 3
+        results.append(LevelResult(
+            run.joint, flux_density, len(spans), sum(y - x for x, y in spans) / NANOSECONDS, rest,
+            *figures))
+    return results
 
 
 def _noise(run: Run) -> float:
