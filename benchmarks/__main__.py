@@ -10,7 +10,7 @@ NAME is planner, plant, preemption, joints, controller, recorder, player or cras
 of these are run.
 Those of recorder, player and crash take some seven minutes together. faults injects faults into
 running nodes and fails if one is not answered as it should be; soak runs for hours;
-identification fits thousands of simulated runs.
+identification fits thousands of simulated runs; studies kills the workers of a study.
 A page is a Markdown file with marks ``<!-- begin NAME -->`` and ``<!-- end NAME -->``, between
 which a table is put.
 """
@@ -34,7 +34,7 @@ _WIDTH = 120
 NAMES = ('planner', 'plant', 'preemption', 'joints', 'controller', 'recorder', 'player',
          'crash')
 #: Not run unless asked for: they take long and need the machine for themselves.
-LONG = ('faults', 'soak', 'identification')
+LONG = ('faults', 'soak', 'identification', 'studies')
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -118,6 +118,14 @@ def main(arguments: list[str] | None = None) -> int:
         if not reports[-1].passed:
             console.print('identification: not what is promised')
             status = 1
+    if 'studies' in names:
+        from benchmarks import bench_studies
+
+        add(bench_studies.compare(quick=options.quick))
+        if not reports[-1].passed:
+            console.print('studies: not what is promised')
+            status = 1
+        add(bench_studies.cluster(quick=options.quick))
     for name in ('joints', 'controller', 'recorder', 'player', 'crash'):
         if name in names and _has_ros(name):
             sheet = importlib.import_module(f'benchmarks.bench_{name}').compare(

@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 import stat
 from typing import Any
+import uuid
 
 from hmsa_ros.errors import BadInputError
 
@@ -41,7 +42,8 @@ def replacing(path: Path) -> Iterator[Path]:
         if target.exists() and not stat.S_ISREG(target.stat().st_mode):
             yield target
             return
-        beside = target.with_name(f'.{target.name}.{os.getpid()}.part')
+        # Processes of two hosts may have the same number.
+        beside = target.with_name(f'.{target.name}.{uuid.uuid4().hex}.part')
         try:
             yield beside
             os.replace(beside, target)

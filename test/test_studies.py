@@ -19,6 +19,7 @@ from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.figures.studies import draw_damped, draw_robustness, draw_sampled
 from hmsa_ros.studies import robustness
 from hmsa_ros.studies.__main__ import main, pictures, tables
+from hmsa_ros.studies.axes import MOST_VALUES, parse_grid, read_cases
 from hmsa_ros.studies.damped import damped_study, settling_time
 from hmsa_ros.studies.residual import arrival_of, Errors, residual, response, rest
 from hmsa_ros.studies.robustness import (
@@ -31,15 +32,10 @@ from hmsa_ros.studies.robustness import (
     write_csv,
 )
 from hmsa_ros.studies.sampled import ideal_move, sampled_study
-from hmsa_ros.studies.sweep import (
-    COLUMNS,
-    MOST_VALUES,
-    parse_grid,
-    read_cases,
-    Sweep,
-)
+from hmsa_ros.studies.sweep import Sweep
 from hmsa_ros.studies.tables import open_writer
 
+COLUMNS = Sweep({}).columns
 DOCS = Path(__file__).resolve().parent.parent / 'docs' / 'studies.md'
 MATERIAL = NondimensionalParameters()
 #: What is asked of the residual where there is no error.
@@ -395,7 +391,7 @@ def test_grids_are_values_lines_and_logarithms():
 ])
 def test_malformed_grids_are_refused(text, message):
     with pytest.raises(BadInputError, match=message):
-        parse_grid(text, 'j_lim')
+        Sweep({'c1': parse_grid(text, 'c1')})
 
 
 def test_sweep_is_the_product_of_its_columns_with_the_last_one_fastest():
@@ -468,7 +464,7 @@ def test_sweep_refuses_columns_that_do_not_fit(arguments, message):
 def test_cases_are_read_by_column_in_full_precision(tmp_path):
     path = tmp_path / 'cases.csv'
     path.write_text('\ufefftarget, zeta\n1.1000000000000001,0.2\n\nnan,-1\n', encoding='utf-8')
-    found = read_cases(path)
+    found = read_cases(path, COLUMNS)
     assert list(found) == ['target', 'zeta']
     assert found['target'][0] == 1.1000000000000001
     assert math.isnan(found['target'][1])
@@ -485,7 +481,7 @@ def test_tables_of_cases_that_are_none_are_refused(tmp_path, content, message):
     path = tmp_path / 'cases.csv'
     path.write_bytes(content)
     with pytest.raises(BadInputError, match=message):
-        read_cases(path)
+        read_cases(path, COLUMNS)
 
 
 def test_csv_keeps_every_digit(tmp_path):

@@ -3,6 +3,7 @@
 from concurrent.futures import ThreadPoolExecutor
 import os
 from pathlib import Path
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,10 +14,11 @@ pytest.importorskip('pyarrow')
 
 from hmsa_ros.cli import main
 from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.studies import chunks as chunk_module
 from hmsa_ros.studies import executors
 from hmsa_ros.studies.chunks import Chunks, LEAST_ROWS
 from hmsa_ros.studies.engine import compute, parse_shard
-from hmsa_ros.studies.sweep import COLUMNS, parse_grid, Sweep
+from hmsa_ros.studies.sweep import parse_grid, Sweep
 from hmsa_ros.studies.tables import open_writer
 
 #: Three chunks, the last one not full; some rows without a plan.
@@ -36,7 +38,7 @@ def expected(sweep, tmp_path_factory):
     """Return its table as Parquet and as CSV, planned without chunks on disk."""
     folder = tmp_path_factory.mktemp('expected')
     for name in ('t.parquet', 't.csv'):
-        with open_writer(folder / name, COLUMNS) as write:
+        with open_writer(folder / name, sweep.columns) as write:
             for block in sweep.blocks(LEAST_ROWS):
                 write(block)
     return (folder / 't.parquet').read_bytes(), (folder / 't.csv').read_bytes()
@@ -217,6 +219,7 @@ def test_an_address_without_a_scheduler_is_refused(run, tmp_path, monkeypatch):
         status, out, err = run(f'--dask={address}', '--out=a')
         assert (status, out, err.count('\n')) == (2, '', 1)
         assert f'no Dask scheduler answers at {address!r}' in err
+        assert list(tmp_path.iterdir()) == []
 
 
 def test_a_missing_dask_is_said_with_how_to_get_it(run, monkeypatch):
@@ -224,6 +227,23 @@ def test_a_missing_dask_is_said_with_how_to_get_it(run, monkeypatch):
     status, _, err = run('--dask=local', '--out=a')
     assert (status, err.count('\n')) == (2, 1)
     assert 'hmsa_ros[cluster]' in err
+
+
+def test_chunks_of_other_code_have_other_names(sweep, tmp_path, monkeypatch):
+    package = tmp_path / 'hmsa_ros'
+    for name in ('core', 'studies', 'contract'):
+        shutil.copytree(
+            Path(chunk_module.__file__).parent.parent / name, package / name,
+            ignore=shutil.ignore_patterns('__pycache__'))
+    before = Chunks.of(sweep, tmp_path).digest
+    monkeypatch.setattr(chunk_module, '__file__', str(package / 'studies' / 'chunks.py'))
+    for change in (False, True):
+        if change:
+            with (package / 'core' / 'two_step_kernel.py').open('a') as kernels:
+                kernels.write('# changed\n')
+        chunk_module.code.cache_clear()
+        assert (Chunks.of(sweep, tmp_path).digest == before) is not change
+    chunk_module.code.cache_clear()
 
 
 def test_the_folder_of_another_study_is_refused_and_kept(run, tmp_path):

@@ -75,19 +75,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _run_si(arguments: argparse.Namespace) -> int:
     """Plan in seconds and tesla for the actuator of a parameter file."""
-    from hmsa_ros.contract.actuator import actuator_from
-    from hmsa_ros.contract.parameters import (
-        BLOCK,
-        COIL_TIME_CONSTANT,
-        FLUX_DENSITY_MAX,
-        FLUX_DENSITY_MIN,
-        SLEW_LIMIT,
-    )
+    from hmsa_ros.contract.actuator import model_from
+    from hmsa_ros.contract.parameters import PLANNED
     from hmsa_ros.contract.topics import PLANNER
     from hmsa_ros.core.moves import State
     from hmsa_ros.core.sequence import plan_sequence
     from hmsa_ros.core.setpoint import Setpoint
-    from hmsa_ros.core.timeline import Model, Options
     from hmsa_ros.runs.parameters import read_parameter_file, values_of
 
     fixed = [f'--{name.replace("_", "-")}' for name in ('zeta', 'j_lim', 'c1')
@@ -96,21 +89,15 @@ def _run_si(arguments: argparse.Namespace) -> int:
         raise BadInputError(
             f'both --params-file and {", ".join(fixed)} are given: expected only one of them, '
             'since the file sets these values')
-    values = values_of(
-        read_parameter_file(arguments.params_file), PLANNER,
-        (*BLOCK, FLUX_DENSITY_MIN, FLUX_DENSITY_MAX, SLEW_LIMIT, COIL_TIME_CONSTANT))
-    actuator = actuator_from(values)
-    model = Model(actuator, Options(
-        flux_density_min=values['flux_density_min'], flux_density_max=values['flux_density_max'],
-        slew_limit=values['slew_limit'] or math.inf,
-        coil_time_constant=values['coil_time_constant']))
-    time, load = actuator.time_unit, actuator.flux_density_unit
+    model = model_from(values_of(
+        read_parameter_file(arguments.params_file), PLANNER, PLANNED))
+    time, load = model.units.time, model.units.load
     segments = plan_sequence(
         [Setpoint(stretch, span / time) for stretch, span in arguments.setpoints],
         model.material, start=State(arguments.start), shaper=arguments.shaper or 'two_step',
         limits=model.limits, delivery=model.delivery, units=model.units)
     rows = [_si_row(x, time, load) for x in segments]
-    group = actuator.nondimensional
+    group = model.material
     if arguments.json:
         print(json.dumps({
             'c1': group.c1, 'zeta': group.zeta, 'j_lim': group.j_lim, 'time_unit': time,

@@ -1,4 +1,4 @@
-"""``hmsa sweep``: two-step plans over grids of parameters."""
+"""``hmsa sweep``: plans over grids, tables and samples of parameters."""
 
 import argparse
 from collections import Counter
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from hmsa_ros.studies.engine import Outcome, Start
     from hmsa_ros.studies.sweep import Sweep
 
-#: Fewer points are planned at once, without chunks.
-_SMALL = 500_000
-#: From so many on, what a sweep takes is said before.
+#: What takes less time on a core, in s, is planned at once, without chunks.
+_SMALL = 3.4
+#: From so many points on, what a sweep takes is said before.
 _LARGE = 1_000_000
 # Column, option, and what it is.
 _AXES = (
@@ -34,20 +34,43 @@ _AXES = (
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
     parser = subparsers.add_parser(
-        'sweep', help='plan over grids of parameters or a table of cases',
-        description='Plan the two-step command for all combinations of the values given, '
-                    'nondimensional as in the paper. GRID is a value, FIRST:LAST:POINTS or '
-                    'log:FIRST:LAST:POINTS, or several of these separated by commas. A case '
-                    'that cannot be planned gives the reason in its status; the others are '
-                    'still planned. The table is the same, to the byte, however many workers '
-                    'or shards compute it.',
+        'sweep', help='plan over grids, tables and samples of parameters',
+        description='Plan a move for all combinations of the values given, nondimensional as '
+                    'in the paper, or in SI units with --params-file. GRID is a value, '
+                    'FIRST:LAST:POINTS or log:FIRST:LAST:POINTS, or several of these separated '
+                    'by commas; or sobol:LOW:HIGH or normal:MEAN:STD, of which samples are '
+                    'drawn. A case that cannot be planned gives the reason in its status; the '
+                    'others are still planned. The table is the same, to the byte, however many '
+                    'workers or shards compute it.',
         epilog='example: hmsa sweep --zeta 0:2:1000 --j-lim log:0.1:100:50 --out sweep.csv')
     for _, option, text in _AXES:
         parser.add_argument(option, metavar='GRID', help=text)
     parser.add_argument(
+        '--vary', action='append', default=[], metavar='NAME=GRID',
+        help='another column: load_min, load_max, period, slew, lag or a constant of the law '
+             '(law.c10, ...); with --params-file a parameter, such as actuator.shear_modulus, '
+             'flux_density_max, slew_limit, coil_time_constant or command_period')
+    parser.add_argument(
+        '--law', metavar='NAME,...', help='elastic laws to compare, separated by commas')
+    parser.add_argument(
+        '--shaper', metavar='NAME,...',
+        help='shapers to compare, separated by commas (default two_step)')
+    parser.add_argument(
+        '--params-file', type=Path, metavar='YAML',
+        help='parameter file (YAML) of planner and plant: plans in seconds and tesla, within the '
+             'limits of its coil')
+    parser.add_argument(
+        '--identified', action='store_true',
+        help='draw samples of what hmsa identify wrote to --params-file, normal with its '
+             'covariance')
+    parser.add_argument(
+        '--samples', type=int, metavar='N', help='how many samples are drawn (default 1024)')
+    parser.add_argument(
+        '--seed', type=int, default=0, metavar='S', help='of the samples (default 0)')
+    parser.add_argument(
         '--cases', type=Path, metavar='FILE.csv',
-        help='CSV with some of the columns start, target, zeta, j_lim, c1; each row is combined '
-             'with the grids of the other columns')
+        help='CSV with a header of columns; each row is combined with the samples, and with the '
+             'grids of the other columns')
     parser.add_argument(
         '--out', type=Path, metavar='FILE|DIR',
         help='file to write, ending in .csv or .parquet; an existing file is replaced. Or a '
@@ -72,15 +95,59 @@ def add_parser(subparsers: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Plan and write."""
-    from hmsa_ros.studies.sweep import parse_grid, read_cases, Sweep
-
-    grids = {
-        column: parse_grid(getattr(arguments, column), column)
-        for column, _, _ in _AXES if getattr(arguments, column) is not None}
-    cases = None if arguments.cases is None else read_cases(arguments.cases)
-    sweep = Sweep(grids, cases)
+    sweep = _sweep(arguments)
     return _plan_in_chunks(sweep, arguments) if _in_chunks(sweep, arguments) \
         else _plan_at_once(sweep, arguments.out)
+
+
+def _sweep(arguments: argparse.Namespace) -> 'Sweep':
+    """Return what the arguments ask for."""
+    from hmsa_ros.studies.axes import draw, NOTHING, parse_values, read_cases, Spread
+    from hmsa_ros.studies.settings import InSI, Nondimensional, System
+    from hmsa_ros.studies.sweep import Sweep
+
+    system: System = Nondimensional()
+    belief = NOTHING
+    if arguments.params_file is not None:
+        from hmsa_ros.contract.parameters import PLANNED
+        from hmsa_ros.contract.topics import PLANNER
+        from hmsa_ros.runs.parameters import read_parameter_file, values_of
+
+        system = InSI.of(values_of(
+            read_parameter_file(arguments.params_file), PLANNER, PLANNED))
+        if arguments.identified:
+            from hmsa_ros.studies.identified import belief_of
+
+            belief = belief_of(arguments.params_file)
+    elif arguments.identified:
+        raise BadInputError(
+            '--identified without --params-file: expected the file that hmsa identify --out wrote')
+    texts = {x: y for x, _, _ in _AXES if (y := getattr(arguments, x)) is not None}
+    for text in arguments.vary:
+        name, sign, grid = text.partition('=')
+        if not sign or name in texts:
+            raise BadInputError(f'--vary {text!r}: expected NAME=GRID, each name once')
+        texts[name] = grid
+    values = {name: parse_values(text, name) for name, text in texts.items()}
+    spreads = {name: x for name, x in values.items() if isinstance(x, Spread)}
+    samples = None
+    if spreads or belief.names:
+        samples = draw(
+            spreads, belief, 1024 if arguments.samples is None else arguments.samples,
+            arguments.seed)
+    elif arguments.samples is not None:
+        raise BadInputError(
+            '--samples without anything to draw: expected a column sobol:LOW:HIGH or '
+            'normal:MEAN:STD, or --identified')
+    return Sweep(
+        {name: x for name, x in values.items() if not isinstance(x, Spread)},
+        None if arguments.cases is None else read_cases(arguments.cases, system.ranges),
+        samples=samples, laws=_names(arguments.law), shapers=_names(arguments.shaper),
+        system=system)
+
+
+def _names(text: str | None) -> list[str]:
+    return [] if text is None else [x.strip() for x in text.split(',')]
 
 
 def _in_chunks(sweep: 'Sweep', arguments: argparse.Namespace) -> bool:
@@ -99,7 +166,7 @@ def _in_chunks(sweep: 'Sweep', arguments: argparse.Namespace) -> bool:
     if _is_folder(out) or asked:
         return True
     # What could not be written in the end is refused at the beginning, without a chunk.
-    return sweep.size > _SMALL and out.suffix.lower() in {'.csv', '.parquet'} and \
+    return sweep.size > _SMALL * sweep.rate and out.suffix.lower() in {'.csv', '.parquet'} and \
         not out.is_dir() and out.parent.is_dir() and (
             out.suffix.lower() == '.parquet' or _has_arrow())
 
@@ -116,11 +183,10 @@ def _has_arrow() -> bool:
 
 def _plan_at_once(sweep: 'Sweep', out: Path | None) -> int:
     from hmsa_ros.studies.chunks import Chunks
-    from hmsa_ros.studies.sweep import COLUMNS
     from hmsa_ros.studies.tables import open_writer
 
     counts: Counter[str] = Counter()
-    with open_writer(out, COLUMNS) as write, _progress(sweep.size) as advance:
+    with open_writer(out, sweep.columns) as write, _progress(sweep.size) as advance:
         for block in sweep.blocks(Chunks.of(sweep, Path()).rows):
             write(block)
             counts.update(block.status.tolist())
@@ -188,12 +254,12 @@ def _engine(arguments: argparse.Namespace) -> tuple['Start', int]:
 
 def _estimate(sweep: 'Sweep', chunks: 'Chunks', cores: int, shard: tuple[int, int]) -> None:
     """Say what a large sweep takes, and refuse one that the disk has no room for."""
-    from hmsa_ros.studies.sweep import RATE, ROW_BYTES
+    from hmsa_ros.studies.sweep import ROW_BYTES
 
     if sweep.size < _LARGE:
         return
     size = sweep.size * ROW_BYTES
-    seconds = sweep.size / shard[1] / (RATE * cores)
+    seconds = sweep.size / shard[1] / (sweep.rate * cores)
     time = f'{seconds / 3600:,.1f} h' if seconds > 3600 else f'{seconds / 60:.1f} min'
     _say(f'{sweep.size:,} plans in {chunks.count:,} chunks of {chunks.rows:,}: about '
          f'{size / 1e9:.3g} GB, the table as much again'

@@ -2,12 +2,15 @@
 
 from collections.abc import Mapping
 import math
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.contract.parameters import ACTUATOR_FIELDS, LAW, VISCOELASTIC
 from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.laws import LAWS
 from hmsa_ros.core.parameters import ActuatorParameters
+
+if TYPE_CHECKING:
+    from hmsa_ros.core.timeline import Model
 
 
 def completed(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -25,8 +28,13 @@ def completed(values: Mapping[str, Any]) -> dict[str, Any]:
     return law.completed(values) if law.completed is not None else {}
 
 
-def actuator_from(values: Mapping[str, Any]) -> ActuatorParameters:
-    """Return the block of ``actuator.*``, ``mismatch.*`` if any, and its law unless Gent."""
+def actuator_from(
+        values: Mapping[str, Any], modulus: float | None = None) -> ActuatorParameters:
+    """
+    Return the block of ``actuator.*``, ``mismatch.*`` if any, and its law unless Gent.
+
+    A modulus takes the place of the one that follows from the constants of a law.
+    """
     numbers = {name: values[f'actuator.{name}'] for name in ACTUATOR_FIELDS}
     law, elastic = LAWS[values.get('law', 'gent')], None
     if law.endless:
@@ -34,8 +42,21 @@ def actuator_from(values: Mapping[str, Any]) -> ActuatorParameters:
     if law.scaled is not None:
         numbers['shear_modulus'], elastic = law.scaled(
             {**{x.name: x.default for x in LAW}, **values})
+        if modulus is not None:
+            numbers['shear_modulus'] = modulus
     return ActuatorParameters(law=elastic, **{
         name: value * values.get(f'mismatch.{name}', 1.0) for name, value in numbers.items()})
+
+
+def model_from(
+        values: Mapping[str, Any], modulus: float | None = None, period: int = 0) -> 'Model':
+    """Return what the parameters `PLANNED` plan with, on a grid of a period in ns."""
+    from hmsa_ros.core.timeline import Model, Options  # imports Numba
+
+    return Model(actuator_from(values, modulus), Options(
+        flux_density_min=values['flux_density_min'], flux_density_max=values['flux_density_max'],
+        period=period, slew_limit=values['slew_limit'] or math.inf,
+        coil_time_constant=values['coil_time_constant']))
 
 
 def creep_from(values: Mapping[str, Any]) -> Creep:

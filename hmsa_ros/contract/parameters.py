@@ -213,6 +213,9 @@ COIL_TIME_CONSTANT = ParameterSpec(
     'coil_time_constant', 0.0, 'Time constant of the first-order coil lag; 0 for none.', 's',
     0.0, 1e3)
 
+#: What a plan depends on.
+PLANNED = (*BLOCK, FLUX_DENSITY_MIN, FLUX_DENSITY_MAX, SLEW_LIMIT, COIL_TIME_CONSTANT)
+
 #: Maxwell branches beside the elastic law.
 VISCOELASTIC = (
     ParameterSpec(

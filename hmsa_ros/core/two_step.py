@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hmsa_ros.core import kernels, law
 from hmsa_ros.core import two_step_kernel as kernel
-from hmsa_ros.core.laws.record import Elastic
+from hmsa_ros.core.laws.record import CONSTANTS, Elastic
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.status import Code
 from hmsa_ros.errors import BadInputError
@@ -33,6 +33,9 @@ CODES = {
     kernel.OUT_OF_RANGE: Code.OUT_OF_RANGE,
     kernel.BAD_INPUT: Code.BAD_INPUT,
 }
+
+# Numbers of packed materials that a batch keeps at a time; a table has some 330 a row.
+_MOST_NUMBERS = 1 << 20
 
 _WORK = kernels.work_space()
 
@@ -173,10 +176,14 @@ def plan_two_step_batch(
     shape = arrays[0].shape
     # Copies: NumPy warns of a broadcast array that Numba asks whether it may write to.
     columns = [np.array(a).ravel() for a in arrays]
-    materials = law.pack(columns[3], columns[4], columns[5], elastic)
     status = np.empty(columns[0].size, dtype=np.int64)
     results = [np.empty(status.size) for _ in range(3)]
-    kernel.two_step_batch(
-        *columns[:3], materials, float(load_limits[0]), float(load_limits[1]), float(rtol),
-        HOLD_TOLERANCE, status, *results)
+    each = _MOST_NUMBERS // (CONSTANTS + (1 if elastic is None else len(elastic.constants)))
+    for begin in range(0, status.size, each):
+        part = slice(begin, begin + each)
+        start, rate, target, zeta, j_lim, c1 = (x[part] for x in columns)
+        kernel.two_step_batch(
+            start, rate, target, law.pack(zeta, j_lim, c1, elastic), float(load_limits[0]),
+            float(load_limits[1]), float(rtol), HOLD_TOLERANCE, status[part],
+            *(x[part] for x in results))
     return TwoStepBatch(status.reshape(shape), *(a.reshape(shape) for a in results))

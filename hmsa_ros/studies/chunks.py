@@ -1,13 +1,14 @@
 """
 Chunks of a study: a file each, in one folder that any number of processes may share.
 
-The name of a file holds the number of its chunk, a hash of the input and of the package's
-version, and a checksum of the content. So a folder says which chunks there are and whether they
-are whole, and nobody has to keep a list.
+The name of a file holds the number of its chunk, a hash of the input and of the code that
+computes it, and a checksum of the content. So a folder says which chunks there are and whether
+they are whole, and nobody has to keep a list.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 import hashlib
 import io
 from itertools import chain
@@ -24,7 +25,8 @@ from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.files import make_folder, require_arrow, write_text
 from hmsa_ros.studies.tables import ArrowBlock, open_writer, repeating
 
-#: Rows of a chunk: a thousandth of the study, at least 0.1 s and at most some 100 MB of work.
+#: Rows of a chunk: a thousandth of the study, at least 0.1 s and at most some 100 MB of work; a
+#: study whose rows take longer says so itself (``chunk_rows``).
 SHARE, LEAST_ROWS, MOST_ROWS = 1000, 20_000, 500_000
 
 _NAME = re.compile(r'(\d{7,})-([0-9a-f]{16})-([0-9a-f]{8})\.parquet')
@@ -39,7 +41,7 @@ class Study(Protocol):
 
     @property
     def digest(self) -> str:
-        """A hash of everything that the rows depend on, but the package's version."""
+        """A hash of everything that the rows depend on, but the code."""
 
     def table(self, begin: int, end: int) -> Any:
         """Return rows as a `pyarrow.Table`, with the same columns in every block."""
@@ -55,26 +57,31 @@ class Chunks:
     folder : Path
         Absolute.
     digest : str
-        Of the study and the package's version.
+        Of the study and of the code that computes it.
     size : int
         Rows of the study, at least 1.
+    bounds : tuple of int
+        Rows of a chunk, least and most.
 
     """
 
     folder: Path
     digest: str
     size: int
+    bounds: tuple[int, int] = (LEAST_ROWS, MOST_ROWS)
 
     @classmethod
     def of(cls, study: Study, folder: Path) -> 'Chunks':
         """Return the chunks of a study; nothing is written."""
-        made = hashlib.sha256(f'{__version__} {study.digest} {study.size}'.encode())
-        return cls(Path(folder).resolve(), made.hexdigest(), study.size)
+        made = hashlib.sha256(f'{code()} {study.digest} {study.size}'.encode())
+        return cls(
+            Path(folder).resolve(), made.hexdigest(), study.size,
+            getattr(study, 'chunk_rows', (LEAST_ROWS, MOST_ROWS)))
 
     @property
     def rows(self) -> int:
         """Return the rows of a chunk; the last one may have fewer."""
-        return min(max(-(-self.size // SHARE), LEAST_ROWS), MOST_ROWS)
+        return min(max(-(-self.size // SHARE), self.bounds[0]), self.bounds[1])
 
     @property
     def count(self) -> int:
@@ -85,17 +92,17 @@ class Chunks:
         """Return the first row of a chunk, and the first after it."""
         return index * self.rows, min((index + 1) * self.rows, self.size)
 
-    def prepare(self) -> None:
+    def check(self) -> None:
         """
-        Make the folder, or find out that it is that of the same study.
+        Find out whether the folder is that of the same study; nothing is written.
 
         Raises
         ------
         BadInputError
-            If it belongs to something else, or cannot be made.
+            If it belongs to something else.
 
         """
-        described = self.folder / 'study.json'
+        described = self._described
         if described.exists():
             try:
                 found = json.loads(described.read_text(encoding='utf-8'))['digest']
@@ -110,16 +117,28 @@ class Chunks:
             raise BadInputError(
                 f'{self.folder} has chunks or a table but no study.json: expected an empty '
                 'folder or that of this study; name another with --out')
+
+    def prepare(self) -> None:
+        """
+        Make the folder, unless it is there.
+
+        Raises
+        ------
+        BadInputError
+            If it belongs to something else, or cannot be made.
+
+        """
+        self.check()
         make_folder(self.folder / 'chunks')
-        if not described.exists():
-            write_text(described, json.dumps({
+        if not self._described.exists():
+            write_text(self._described, json.dumps({
                 'digest': self.digest, 'version': __version__, 'rows': self.size,
                 'chunks': self.count, 'rows_of_a_chunk': self.rows}, indent=2) + '\n')
 
     def found(self) -> dict[int, list[Path]]:
         """Return the files of this study's chunks by number; their content is not looked at."""
         files: dict[int, list[Path]] = {}
-        for path in sorted((self.folder / 'chunks').iterdir()):
+        for path in sorted((self.folder / 'chunks').glob('*.parquet')):
             name = _NAME.fullmatch(path.name)
             if name and int(name[1]) < self.count and name[2] == self._hash(int(name[1])):
                 files.setdefault(int(name[1]), []).append(path)
@@ -203,6 +222,10 @@ class Chunks:
                 add_counts(counts, table)
         return counts
 
+    @property
+    def _described(self) -> Path:
+        return self.folder / 'study.json'
+
     def _hash(self, index: int) -> str:
         return hashlib.sha256(f'{self.digest} {self.span(index)}'.encode()).hexdigest()[:16]
 
@@ -215,6 +238,17 @@ class Chunks:
             return None
         name = _NAME.fullmatch(path.name)
         return content if name and zlib.crc32(content) == int(name[3], 16) else None
+
+
+@cache
+def code() -> str:
+    """Return a hash of the package's version, and of the sources that plan and simulate."""
+    package = Path(__file__).resolve().parent.parent
+    made = hashlib.sha256(__version__.encode())
+    for folder in ('contract', 'core', 'studies'):
+        for path in sorted((package / folder).rglob('*.py')):
+            made.update(path.relative_to(package).as_posix().encode() + path.read_bytes())
+    return made.hexdigest()
 
 
 def add_counts(counts: dict[str, int], table: Any) -> None:

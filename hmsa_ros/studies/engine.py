@@ -7,10 +7,10 @@ or in which order its chunks were computed.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, FIRST_COMPLETED, Future
 from concurrent.futures import wait as wait_for
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -127,7 +127,7 @@ def compute(
 
     """
     chunks = Chunks.of(study, folder)
-    chunks.prepare()
+    chunks.check()
     todo = list(range(chunks.count))[shard[0]::shard[1]]
     outcome = Outcome(chunks.count, len(todo))
     if resume:
@@ -135,25 +135,28 @@ def compute(
         todo = [x for x in todo if not (x in found and chunks.sound(found[x]))]
         outcome.kept = outcome.mine - len(todo)
     start = (lambda: given(executor)) if isinstance(executor, Executor) else executor
-    with _shared(study, chunks) as scratch:
-        _compute(chunks, deque(todo), start, scratch, outcome, say, advance or (lambda _: None))
+    scratch = chunks.folder / f'.run-{uuid.uuid4().hex}'
+    try:
+        _compute(
+            study, chunks, deque(todo), start, scratch, outcome, say,
+            advance or (lambda _: None))
+    except OSError as error:
+        raise HmsaError(
+            f'the study in {chunks.folder} stopped ({error.strerror or error}): expected a folder '
+            'with write permission and room, and workers that answer; go on with --resume'
+        ) from error
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
     return outcome
 
 
-@contextmanager
-def _shared(study: Study, chunks: Chunks) -> Iterator[Path]:
-    """Yield a folder of this run with the study in it; it goes with all that is in it."""
-    scratch = chunks.folder / f'.run-{uuid.uuid4().hex}'
-    try:
-        scratch.mkdir()
-        (scratch / 'study').write_bytes(pickle.dumps((study, chunks)))
-        yield scratch
-    except OSError as error:
-        raise HmsaError(
-            f'cannot write to {chunks.folder}: {error.strerror or error}; expected a folder with '
-            'write permission and room') from error
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+def _share(study: Study, chunks: Chunks, scratch: Path) -> None:
+    """Make a folder of this run with the study in it, unless it is there."""
+    if scratch.exists():
+        return
+    chunks.prepare()
+    scratch.mkdir()
+    (scratch / 'study').write_bytes(pickle.dumps((study, chunks)))
 
 
 @lru_cache(maxsize=2)
@@ -177,15 +180,17 @@ def _work(scratch: str, index: int) -> dict[str, int]:
 
 
 def _compute(
-        chunks: Chunks, waiting: deque[int], start: Start, scratch: Path, outcome: Outcome,
-        say: Say, advance: Callable[[int], object]) -> None:
+        study: Study, chunks: Chunks, waiting: deque[int], start: Start, scratch: Path,
+        outcome: Outcome, say: Say, advance: Callable[[int], object]) -> None:
     """Compute the chunks that wait; where workers die, start anew with those that are lost."""
     losses = 0
     while waiting:
         before = outcome.computed
         running: dict[Future[dict[str, int]], int] = {}
         try:
+            # Nothing is written before there is something that computes.
             with start() as (executor, ahead):
+                _share(study, chunks, scratch)
                 _feed(chunks, waiting, running, executor, ahead, scratch, outcome, advance)
         except BrokenExecutor as error:
             lost = sorted(running.values())

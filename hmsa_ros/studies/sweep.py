@@ -1,163 +1,44 @@
 """
-Sweeps: two-step plans over grids of parameters or a table of cases.
+Sweeps: plans over grids, tables of cases and samples of parameters.
 
 A sweep is a product of axes. It is planned in blocks, so that its size is bounded by the disk
 and not by the memory, and a row that cannot be planned says why in its status.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-import csv
 from dataclasses import dataclass
 from functools import cached_property
 import hashlib
 import math
-from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from hmsa_ros.core.laws import LAWS
 from hmsa_ros.core.model import Array, signed_root
-from hmsa_ros.core.two_step import CODES, plan_two_step_batch
+from hmsa_ros.core.shapers import get_shaper
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import require_arrow
+from hmsa_ros.studies.axes import parse_grid
+from hmsa_ros.studies.chunks import LEAST_ROWS, MOST_ROWS
+from hmsa_ros.studies.plans import by_batch, by_settings, Plans, STATUS
+from hmsa_ros.studies.settings import FINITE, Nondimensional, Setting, System
 
-#: What can be swept, with the value of what is not.
-DEFAULTS = {'start': 1.0, 'target': 1.1, 'zeta': 0.2, 'j_lim': 5.0, 'c1': 2.0}
-#: Columns of the numbers that a plan consists of, after the inputs and the status.
-RESULTS = ('beta_p', 'b_p', 'tau_p', 'beta_1', 'b_1')
-COLUMNS = (*DEFAULTS, 'status', *RESULTS)
-#: More values of one column, or cases, are refused: a sweep has no limit, but they are in memory.
-MOST_VALUES = 10_000_000
-#: Roughly: plans a second and core of an idle machine, and bytes of a row as Parquet.
-RATE, ROW_BYTES = 150_000.0, 50
+__all__ = ['parse_grid', 'ROW_BYTES', 'Rows', 'Sweep']
 
-_GRID = 'VALUE, FIRST:LAST:POINTS, log:FIRST:LAST:POINTS, or several separated by commas'
-_STATUS = np.array([str(CODES[number]) for number in sorted(CODES)])
+#: Roughly: bytes of a row as Parquet.
+ROW_BYTES = 50
+# Roughly: rows a second and core of an idle machine, and rows of a chunk, least and most: by the
+# batch alone, by the batch after a block was made of each row, and one by one.
+_RATES = (150_000.0, 15_000.0, 3_000.0)
+_CHUNKS = ((LEAST_ROWS, MOST_ROWS), (5_000, 50_000), (500, 5_000))
+_LAW, _SHAPER = 'law', 'shaper'
+_STATUS = np.array([str(x) for x in STATUS])
 
-
-def _too_many(column: str, points: int) -> BadInputError:
-    return BadInputError(
-        f'{column} has {points:,} points: expected at most {MOST_VALUES:,} of one column')
-
-
-def parse_grid(text: str, column: str) -> Array:
-    """
-    Read a column's values and grids: ``0.2``, ``0:2:1000``, ``log:0.1:100:50``, with commas.
-
-    Raises
-    ------
-    BadInputError
-        If the text is no grid, or a value is not finite or never has a plan.
-
-    """
-    parts = [_part(part.strip(), text, column) for part in text.split(',')]
-    if sum(x.size for x in parts) > MOST_VALUES:
-        raise _too_many(column, sum(x.size for x in parts))
-    values = np.concatenate(parts)
-    least = 'at least 0' if column == 'zeta' else 'greater than 0'
-    wrong = ~np.isfinite(values) | ((values < 0.0) if column == 'zeta' else (values <= 0.0))
-    if np.any(wrong):
-        raise BadInputError(
-            f'{column} of {text!r} takes the value {float(values[wrong][0]):g}: expected '
-            f'finite numbers {least}')
-    return values
-
-
-def _part(part: str, text: str, column: str) -> Array:
-    """Read one value or one grid."""
-    words = part.split(':')
-    spacing = np.geomspace if words[0] == 'log' else np.linspace
-    numbers = words[1:] if words[0] == 'log' else words
-    try:
-        if len(words) == 1:
-            return np.array([float(words[0])])
-        first, last = float(numbers[0]), float(numbers[1])
-        points = int(numbers[2])
-        if len(numbers) != 3:
-            raise ValueError(part)
-    except (ValueError, IndexError):
-        raise BadInputError(f'{column} is {text!r}: expected {_GRID}') from None
-    if points < 2:
-        raise BadInputError(f'{column} of {text!r} has {points} points: expected at least 2')
-    if points > MOST_VALUES:
-        raise _too_many(column, points)
-    if not math.isfinite(first) or not math.isfinite(last):
-        raise BadInputError(f'{column} is {text!r}: expected finite ends of the grid')
-    if words[0] == 'log' and not (first > 0.0 and last > 0.0):
-        raise BadInputError(
-            f'{column} is {text!r}: expected ends greater than 0 for a logarithmic grid')
-    with np.errstate(all='ignore'):
-        return np.asarray(spacing(first, last, points), dtype=np.float64)
-
-
-def read_cases(path: Path) -> dict[str, Array]:
-    """
-    Read a table of cases.
-
-    Parameters
-    ----------
-    path : Path
-        CSV file with a header; each column is one of `DEFAULTS`.
-
-    Returns
-    -------
-    dict of str to ndarray, shape (n,)
-        Columns by name. Numbers are taken as they are, those out of range and NaN too: the
-        plan of such a row says so.
-
-    Raises
-    ------
-    BadInputError
-        If the file cannot be read, a column is unknown or repeated, a row has more or fewer
-        cells than the header, or a cell is no number.
-
-    """
-    expected = ', '.join(DEFAULTS)
-    rows: list[list[float]] = []
-    try:
-        with path.open(newline='', encoding='utf-8-sig') as file:
-            reader = csv.reader(file, strict=True)
-            names = [name.strip() for name in next(reader, [])]
-            if not names:
-                raise BadInputError(
-                    f'{path} is empty: expected a header with some of {expected}, and cases')
-            for name in names:
-                if name not in DEFAULTS:
-                    raise BadInputError(
-                        f'{path} has a column {name!r}: expected some of {expected}')
-                if names.count(name) > 1:
-                    raise BadInputError(f'{path} has two columns {name!r}: expected one')
-            for cells in reader:
-                if cells:
-                    rows.append(_case(cells, names, f'{path}, line {reader.line_num}'))
-                if len(rows) > MOST_VALUES:
-                    raise BadInputError(
-                        f'{path} has more than {MOST_VALUES:,} cases: expected at most that '
-                        'many; split it')
-    except OSError as error:
-        raise BadInputError(
-            f'cannot read {path}: {error.strerror or error}; expected a CSV file of cases'
-        ) from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise BadInputError(f'{path} is no CSV file in UTF-8: {error}') from error
-    if not rows:
-        raise BadInputError(f'{path} has a header only: expected at least one case')
-    return dict(zip(names, np.array(rows).T, strict=True))
-
-
-def _case(cells: Sequence[str], names: Sequence[str], where: str) -> list[float]:
-    """Read a row of a table of cases."""
-    if len(cells) != len(names):
-        raise BadInputError(f'{where}: {len(cells)} cells, expected {len(names)}')
-    values = []
-    for name, cell in zip(names, cells, strict=True):
-        try:
-            values.append(float(cell))
-        except ValueError:
-            raise BadInputError(f'{where}: {name} is {cell!r}, expected a number') from None
-    return values
+Column = Array | NDArray[np.str_]
+Places = tuple[NDArray[np.int64], ...]
 
 
 @dataclass(frozen=True)
@@ -168,15 +49,15 @@ class Rows:
     Attributes
     ----------
     inputs : dict of str to ndarray, shape (n,)
-        Columns of `DEFAULTS`, in that order.
+        Columns that were given, in order.
     codes : ndarray of int64, shape (n,)
-        Keys of `CODES`.
+        Places in `hmsa_ros.studies.plans.STATUS`.
     results : dict of str to ndarray, shape (n,)
-        Columns of `RESULTS`, in that order; NaN where there is no such number.
+        Columns of numbers, in order; NaN where there is no such number.
 
     """
 
-    inputs: dict[str, Array]
+    inputs: dict[str, Column]
     codes: NDArray[np.int64]
     results: dict[str, Array]
 
@@ -200,60 +81,96 @@ class Rows:
 
 class Sweep:
     """
-    All combinations of the cases of a table and the values of other columns.
+    All combinations of the cases of a table, samples, and the values of other columns.
 
     Parameters
     ----------
-    grids : mapping of str to ndarray, shape (n,)
-        Values by column; a column that is named nowhere has its default.
-    cases : mapping of str to ndarray, shape (m,), optional
-        Columns of a table, taken row by row; none of them in ``grids``.
+    grids : mapping of str to array_like, shape (n,)
+        Values by column; a column of the system that is named nowhere has its default.
+    cases, samples : mapping of str to array_like, shape (m,), optional
+        Columns of tables, taken row by row. Their values may be out of range: the plan of such a
+        row says so.
+    laws, shapers : sequence of str
+        Names that are compared; they have columns if given.
+    system : System, optional
+        Units of the columns; default nondimensional.
 
     Attributes
     ----------
     size : int
-        Number of rows. The cases vary slowest, then the columns in the order of `DEFAULTS`.
+        Number of rows. The cases vary slowest, then the samples, then the columns in order.
+    columns : tuple of str
+        Names of all columns of the table.
+    rate : float
+        Roughly: rows a second and core.
+    chunk_rows : tuple of int
+        Rows of a chunk, least and most.
 
     Raises
     ------
     BadInputError
-        If a column is unknown, empty or in both, or the cases differ in length.
+        If a column is unknown, empty, out of range or named twice, or those of a table differ in
+        length.
 
     """
 
     def __init__(
-            self, grids: Mapping[str, Array],
-            cases: Mapping[str, Array] | None = None) -> None:
-        cases = cases or {}
-        for name in (*grids, *cases):
-            if name not in DEFAULTS:
+            self, grids: Mapping[str, ArrayLike],
+            cases: Mapping[str, ArrayLike] | None = None, *,
+            samples: Mapping[str, ArrayLike] | None = None, laws: Sequence[str] = (),
+            shapers: Sequence[str] = (), system: System | None = None) -> None:
+        self._system = system or Nondimensional()
+        ranges, defaults = self._system.ranges, self._system.columns
+        self._axes: list[dict[str, Column]] = [
+            _table(words, table) for words, table in (('cases', cases), ('samples', samples))
+            if table]
+        seen = [name for axis in self._axes for name in axis] + list(grids)
+        for name in seen:
+            if name not in ranges:
                 raise BadInputError(
-                    f'column {name!r} is unknown: expected some of {", ".join(DEFAULTS)}')
-            if name in grids and name in cases:
+                    f'column {name!r} is unknown: expected some of {", ".join(ranges)}')
+            if seen.count(name) > 1:
                 raise BadInputError(
-                    f'{name} is a column of the cases and has values of its own: expected one '
-                    'of them')
-        table = {name: np.asarray(x, dtype=np.float64) for name, x in cases.items()}
-        if len({x.size for x in table.values()}) > 1:
-            raise BadInputError('the columns of the cases differ in length: expected one length')
-        axes = [table] if table else []
-        axes += [
-            {name: np.asarray(grids.get(name, [default]), dtype=np.float64)}
-            for name, default in DEFAULTS.items() if name not in table]
-        self._axes = axes
-        self._shape = [next(iter(axis.values())).size for axis in axes]
+                    f'{name} is a column of the cases or samples and has other values: expected '
+                    'one of them')
+        self._axes += [
+            {x: _checked(x, grids[x], ranges[x]) if x in grids else np.array([defaults[x]])}
+            for x in ranges if x in grids or (x in defaults and x not in seen)]
+        for law in laws:
+            if law not in LAWS:
+                raise BadInputError(
+                    f'law {law!r} is unknown: expected one of {", ".join(LAWS)}')
+            if not any(x.startswith('law.') for x in seen):
+                # Constants that no row can have are not left to the rows.
+                self._system.setting({**defaults, 'law': law})
+        for shaper in shapers:
+            get_shaper(shaper)
+        self._axes += [
+            {name: np.array(words)} for name, words in ((_LAW, laws), (_SHAPER, shapers)) if words]
+        self._shape = [next(iter(axis.values())).size for axis in self._axes]
         self.size = math.prod(self._shape)
         if self.size == 0:
             raise BadInputError('a column of the sweep is empty: expected at least one value')
+        given = {name for axis in self._axes for name in axis}
+        self._inputs = [x for x in (*ranges, _LAW, _SHAPER) if x in given]
+        self.columns = (*self._inputs, 'status', *self._results(Plans.none(0), 1.0, 1.0))
+        one_by_one = bool(set(shapers) - {'two_step'} or given & self._system.delivery
+                          or not self._system.ideal)
+        self._plain = not one_by_one and given <= {*Nondimensional.columns, _SHAPER} \
+            and isinstance(self._system, Nondimensional)
+        kind = 0 if self._plain else 1 + one_by_one
+        self.rate, self.chunk_rows = _RATES[kind], _CHUNKS[kind]
 
     @cached_property
     def digest(self) -> str:
         """Return a hash of all inputs."""
-        made = hashlib.sha256(b'sweep of two-step plans, ' + ','.join(COLUMNS).encode())
+        made = hashlib.sha256(f'{self._system!r} {self.columns}'.encode())
         for axis in self._axes:
             for name, values in axis.items():
                 made.update(f'{name} {values.size} {len(axis)} '.encode())
-                made.update(np.ascontiguousarray(values, dtype='<f8').tobytes())
+                made.update(
+                    '\n'.join(values.tolist()).encode() if values.dtype.kind == 'U'
+                    else np.ascontiguousarray(values, dtype='<f8').tobytes())
         return made.hexdigest()
 
     def rows(self, begin: int, end: int) -> Rows:
@@ -263,14 +180,47 @@ class Sweep:
             name: column[place]
             for axis, place in zip(self._axes, places, strict=True)
             for name, column in axis.items()}
-        inputs = {name: values[name] for name in DEFAULTS}
-        plans = plan_two_step_batch(
-            inputs['start'], inputs['target'], zeta=inputs['zeta'], j_lim=inputs['j_lim'],
-            c1=inputs['c1'])
-        return Rows(inputs, plans.status, {
-            'beta_p': plans.beta_p, 'b_p': signed_root(plans.beta_p),
-            'tau_p': plans.tau_p, 'beta_1': plans.beta_1,
-            'b_1': signed_root(plans.beta_1)})
+        inputs: dict[str, Any] = {name: values[name] for name in self._inputs}
+        if self._plain:
+            plans = by_batch(*(inputs[name] for name in Nondimensional.columns))
+            return Rows(inputs, plans.codes, self._results(plans, 1.0, 1.0))
+        settings, which = self._settings(inputs, places)
+        shapers = inputs.get(_SHAPER, np.full(end - begin, 'two_step'))
+        plans = by_settings(settings, which, inputs['start'], inputs['target'], shapers)
+        units: Array = np.array([
+            (1.0, 1.0) if x is None else (x.units.time, x.units.load) for x in settings])[which]
+        return Rows(inputs, plans.codes, self._results(plans, units[:, 0], units[:, 1]))
+
+    def _settings(
+            self, inputs: Mapping[str, Column],
+            places: Places) -> tuple[list[Setting | None], NDArray[np.int64]]:
+        """Return all settings that occur, None where values are out of range, and which where."""
+        names = [x for x in self._inputs if x not in ('start', 'target', _SHAPER)]
+        number = np.zeros(len(inputs['start']), np.int64)
+        for axis, place, size in zip(self._axes, places, self._shape, strict=True):
+            if set(axis) & set(names):
+                # Within a block only differences count, and the product of all may be too large.
+                _, number = np.unique(number * size + place, return_inverse=True)
+        _, first, which = np.unique(number, return_index=True, return_inverse=True)
+        columns = [inputs[name][first].tolist() for name in names]
+        settings: list[Setting | None] = []
+        for values in zip(*columns, strict=True) if names else [()]:
+            try:
+                settings.append(self._system.setting(dict(zip(names, values, strict=True))))
+            except BadInputError:
+                settings.append(None)
+        return settings, which
+
+    def _results(
+            self, plans: Plans, time: Array | float, load: Array | float) -> dict[str, Array]:
+        """Return the columns of numbers, for units of time and load."""
+        if self._system.roots:
+            return {
+                'beta_p': plans.load_p, 'b_p': signed_root(plans.load_p), 'tau_p': plans.time_p,
+                'beta_1': plans.load_1, 'b_1': signed_root(plans.load_1)}
+        return {
+            'flux_density_p': plans.load_p * load, 'time_p': plans.time_p * time,
+            'flux_density_1': plans.load_1 * load}
 
     def table(self, begin: int, end: int) -> Any:
         """Plan rows from one number up to another on one core; return a table of pyarrow."""
@@ -285,3 +235,25 @@ class Sweep:
         """Plan the sweep and yield its rows in order, in blocks of so many."""
         for begin in range(0, self.size, rows):
             yield self.rows(begin, min(begin + rows, self.size))
+
+
+def _table(words: str, table: Mapping[str, ArrayLike]) -> dict[str, Column]:
+    """Return the columns of a table, which must have one length."""
+    found: dict[str, Column] = {
+        name: np.asarray(x, dtype=np.float64) for name, x in table.items()}
+    if len({x.size for x in found.values()}) > 1:
+        raise BadInputError(f'the columns of the {words} differ in length: expected one length')
+    return found
+
+
+def _checked(name: str, values: ArrayLike, limits: tuple[float, float]) -> Array:
+    """Return the values of a column unless no plan can have them."""
+    found = np.asarray(values, dtype=np.float64)
+    wrong = ~((found >= limits[0]) & (found <= limits[1]))
+    if np.any(wrong):
+        least = 'greater than 0' if 0.0 < limits[0] < 1e-300 else f'of at least {limits[0]:g}'
+        most = f' and at most {limits[1]:g}' if limits[1] < FINITE else ''
+        raise BadInputError(
+            f'{name} takes the value {float(found[wrong][0]):g}: expected finite numbers '
+            f'{least}{most}')
+    return found

@@ -1,0 +1,62 @@
+"""What an identification says of the parameters that a plan depends on, as columns of a sweep."""
+
+from pathlib import Path
+
+import numpy as np
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification.files import read_belief
+from hmsa_ros.studies.axes import Belief
+
+# Identified names that are no parameters of the block by that name.
+_OTHERS = {'coil_time_constant': 'coil_time_constant', 'time_unit': 'actuator.density'}
+
+
+def belief_of(path: Path) -> Belief:
+    """
+    Return mean and covariance of what was identified, without what belongs to the sensor.
+
+    Parameters
+    ----------
+    path : Path
+        Parameter file as ``hmsa identify --out`` writes it.
+
+    Returns
+    -------
+    Belief
+        Of columns in SI units; a unit of time becomes the density that gives it.
+
+    Raises
+    ------
+    BadInputError
+        If the file cannot be read, or has no covariance of the block.
+
+    """
+    found = read_belief(path)
+    numbers = found.actuator.numbers
+    means, names, places = [], [], []
+    slopes = np.eye(len(found.names))
+    for place, name in enumerate(found.names):
+        if name in numbers:
+            column, mean = f'actuator.{name}', numbers[name]
+        elif name in _OTHERS:
+            column, mean = _OTHERS[name], found.others.get(name, 0.0)
+        else:
+            continue
+        if name == 'time_unit':
+            # rho = G (T/L)^2, to first order.
+            mean = numbers['density']
+            slopes[place, place] = 2.0 * mean / found.actuator.time_unit
+            if 'shear_modulus' in found.names:
+                slopes[place, found.names.index('shear_modulus')] = (
+                    mean / numbers['shear_modulus'])
+        names.append(column)
+        means.append(mean)
+        places.append(place)
+    if not names:
+        raise BadInputError(
+            f'{path} has no covariance of the block: expected a file that hmsa identify --out '
+            'wrote')
+    covariance = slopes @ found.covariance @ slopes.T
+    return Belief(
+        tuple(names), np.array(means, dtype=np.float64), covariance[np.ix_(places, places)])

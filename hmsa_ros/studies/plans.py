@@ -1,0 +1,151 @@
+"""The plans of many rows: by the batch wherever it plans what is asked for, else one by one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmsa_ros.core import law
+from hmsa_ros.core.laws.record import Elastic
+from hmsa_ros.core.model import Array
+from hmsa_ros.core.moves import State
+from hmsa_ros.core.sequence import plan_sequence
+from hmsa_ros.core.setpoint import Setpoint
+from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.core.two_step import CODES, plan_two_step_batch
+from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.studies.settings import Setting
+
+#: All codes; plans have their places.
+STATUS = tuple(Code)
+_PLACES = np.array([STATUS.index(CODES[x]) for x in sorted(CODES)])
+_TWO_STEP, _LIMIT, _BAD = (
+    STATUS.index(x) for x in (Code.TWO_STEP, Code.FLUX_LIMIT, Code.BAD_INPUT))
+
+
+@dataclass(frozen=True)
+class Plans:
+    """
+    Plans of n rows, nondimensional.
+
+    Attributes
+    ----------
+    codes : ndarray of int64, shape (n,)
+        Places in `STATUS`.
+    load_p, time_p, load_1 : ndarray, shape (n,)
+        First level, duration and last level; NaN where there is none.
+
+    """
+
+    codes: NDArray[np.int64]
+    load_p: Array
+    time_p: Array
+    load_1: Array
+
+    @classmethod
+    def none(cls, size: int) -> 'Plans':
+        """Return rows that cannot be planned."""
+        return cls(np.full(size, _BAD), *(np.full(size, math.nan) for _ in range(3)))
+
+    def put(self, rows: NDArray[np.int64], plans: 'Plans') -> None:
+        """Put the plans of some rows in their places."""
+        self.codes[rows] = plans.codes
+        self.load_p[rows] = plans.load_p
+        self.time_p[rows] = plans.time_p
+        self.load_1[rows] = plans.load_1
+
+
+def by_batch(
+        start: Array, target: Array, zeta: Array, j_lim: Array, c1: Array,
+        elastic: Elastic | None = None) -> Plans:
+    """Return two-step plans from rest on ideal hardware without limits."""
+    found = plan_two_step_batch(
+        start, target, zeta=zeta, j_lim=j_lim, c1=c1, elastic=elastic)
+    return Plans(_PLACES[found.status], found.beta_p, found.tau_p, found.beta_1)
+
+
+def by_settings(
+        settings: Sequence[Setting | None], which: NDArray[np.int64], start: Array,
+        target: Array, shapers: NDArray[np.str_]) -> Plans:
+    """
+    Return plans from rest, each with a setting of its own.
+
+    Parameters
+    ----------
+    settings : sequence of Setting or None
+        All that occur; None for one that is out of range.
+    which : ndarray of int64, shape (n,)
+        Which of them each row has.
+    start, target : ndarray, shape (n,)
+        Stretches.
+    shapers : ndarray of str, shape (n,)
+        Names.
+
+    Returns
+    -------
+    Plans
+        As `hmsa_ros.core.sequence.plan_sequence` makes them.
+
+    """
+    plans = Plans.none(len(which))
+    # Laws by place: comparing tables would take longer than planning.
+    laws: dict[Elastic | None, int] = {}
+    groups = np.full(len(settings), -2)
+    for i, setting in enumerate(settings):
+        if setting is not None:
+            groups[i] = -1 if not setting.delivery.ideal else laws.setdefault(
+                setting.material.law, len(laws))
+    group = np.where((groups[which] >= 0) & (shapers != 'two_step'), -1, groups[which])
+    for elastic, number in laws.items():
+        rows = np.flatnonzero(group == number)
+        if len(rows):
+            plans.put(rows, _limited(
+                [settings[x] for x in which[rows]], start[rows], target[rows], elastic))
+    for row in np.flatnonzero(group == -1).tolist():
+        setting = settings[which[row]]
+        if setting is not None:
+            code, plans.load_p[row], plans.time_p[row], plans.load_1[row] = _one(
+                setting, float(start[row]), float(target[row]), str(shapers[row]))
+            plans.codes[row] = STATUS.index(code)
+    return plans
+
+
+def _limited(
+        settings: Sequence[Setting | None], start: Array, target: Array,
+        elastic: Elastic | None) -> Plans:
+    """Return plans of the batch, without those beyond the limits of the load."""
+    given = np.array([
+        (x.material.zeta, x.material.j_lim, x.material.c1, x.limits.minimum, x.limits.maximum)
+        for x in settings if x is not None]).T
+    zeta, j_lim, c1, least, most = given
+    plans = by_batch(start, target, zeta, j_lim, c1, elastic)
+    outside = (plans.load_1 < least) | (plans.load_1 > most)
+    outside |= (plans.codes == _TWO_STEP) & ((plans.load_p < least) | (plans.load_p > most))
+    plans.codes[outside] = _LIMIT
+    plans.load_p[outside] = plans.time_p[outside] = math.nan
+    return plans
+
+
+def _one(
+        setting: Setting, start: float, target: float,
+        shaper: str) -> tuple[Code, float, float, float]:
+    """Return code, first level, duration and last level of one plan."""
+    material = setting.material
+    if not math.isfinite(start + target):
+        return Code.BAD_INPUT, math.nan, math.nan, math.nan
+    load = float(law.elastic_force(target, material.packed))
+    try:
+        move = plan_sequence(
+            [Setpoint(target, math.inf)], material, start=State(start), shaper=shaper,
+            limits=setting.limits, delivery=setting.delivery, units=setting.units)[0].move
+    except RefusedError as error:
+        return error.code, math.nan, math.nan, load
+    except BadInputError:
+        return Code.OUT_OF_RANGE, math.nan, math.nan, load
+    except HmsaError:
+        return Code.NOT_CONVERGED, math.nan, math.nan, load
+    if move.code is not Code.HOLD and len(move.levels) == 1:
+        return move.code, math.nan, math.nan, load
+    return move.code, move.levels[0].load, move.duration, move.levels[-1].load

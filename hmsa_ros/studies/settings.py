@@ -1,0 +1,183 @@
+"""
+What the rows of a sweep are planned with: columns, in one of two systems of units.
+
+Nondimensional columns make a block at once. Those in SI units are parameters of the nodes, on top
+of what a parameter file says.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+import math
+import sys
+from typing import Any, ClassVar
+
+from hmsa_ros.contract.actuator import completed, model_from
+from hmsa_ros.contract.parameters import LAW, ParameterSpec, PLANNED
+from hmsa_ros.core.delivery import Delivery
+from hmsa_ros.core.laws import LAWS
+from hmsa_ros.core.moves import Limits
+from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.core.units import NANOSECONDS, Units
+
+#: Least and largest value of a column.
+Range = tuple[float, float]
+
+#: The largest number.
+FINITE = sys.float_info.max
+
+_INF = math.inf
+_POSITIVE = (math.ulp(0.0), FINITE)
+_MODULUS = 'actuator.shear_modulus'
+
+
+def _ranges(specs: tuple[ParameterSpec, ...]) -> dict[str, Range]:
+    """Return the ranges of parameters that are numbers."""
+    return {
+        x.name: (
+            -_INF if x.minimum is None else x.minimum, _INF if x.maximum is None else x.maximum)
+        for x in specs if isinstance(x.default, float)}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """
+    A block, and how commands reach it, as in `hmsa_ros.core.timeline.Model`.
+
+    Attributes
+    ----------
+    material : NondimensionalParameters
+        Of the block.
+    limits : Limits
+        Of the load.
+    delivery : Delivery
+        How commands reach the coil.
+    units : Units
+        Sizes of the nondimensional units.
+
+    """
+
+    material: NondimensionalParameters
+    limits: Limits = field(default_factory=Limits)
+    delivery: Delivery = field(default_factory=Delivery)
+    units: Units = field(default_factory=Units)
+
+
+class System(ABC):
+    """
+    A system of units.
+
+    Attributes
+    ----------
+    columns : dict of str to float
+        Those that each row has, with the value of what is not given.
+    ranges : dict of str to tuple of float
+        Of all columns that a row may have.
+    delivery : frozenset of str
+        Columns with which hardware is not ideal.
+    ideal : bool
+        Whether it is without them.
+    roots : bool
+        Whether results are beta and b, else tesla.
+
+    """
+
+    columns: ClassVar[Mapping[str, float]]
+    ranges: ClassVar[Mapping[str, Range]]
+    delivery: ClassVar[frozenset[str]]
+    roots: ClassVar[bool]
+
+    @property
+    @abstractmethod
+    def ideal(self) -> bool:
+        """Whether commands apply at any time and at once, unless columns say otherwise."""
+
+    @abstractmethod
+    def setting(self, values: Mapping[str, Any]) -> Setting:
+        """
+        Return what a row is planned with; the name of its law is under ``law``.
+
+        Raises
+        ------
+        BadInputError
+            If a value is out of range.
+
+        """
+
+
+@dataclass(frozen=True)
+class Nondimensional(System):
+    """The paper's units."""
+
+    columns = {'start': 1.0, 'target': 1.1, 'zeta': 0.2, 'j_lim': 5.0, 'c1': 2.0}
+    ranges = {
+        'start': _POSITIVE, 'target': _POSITIVE, 'zeta': (0.0, FINITE),
+        'j_lim': (_POSITIVE[0], _INF), 'c1': _POSITIVE, 'load_min': (-_INF, _INF),
+        'load_max': (-_INF, _INF), 'period': (0.0, FINITE), 'slew': (_POSITIVE[0], _INF),
+        'lag': (0.0, FINITE), **_ranges(LAW)}
+    delivery = frozenset({'period', 'slew', 'lag'})
+    roots = True
+
+    @property
+    def ideal(self) -> bool:
+        """Whether commands apply at any time and at once."""
+        return True
+
+    def setting(self, values: Mapping[str, Any]) -> Setting:
+        """Return what a row is planned with; only the ratios of a law's constants count."""
+        law, elastic = LAWS[values.get('law', 'gent')], None
+        if law.scaled is not None:
+            _, elastic = law.scaled(
+                {'actuator.remanence': 1.0, **{x.name: x.default for x in LAW}, **values})
+        return Setting(
+            NondimensionalParameters(
+                values['zeta'], _INF if law.endless else values['j_lim'], values['c1'], elastic),
+            Limits(values.get('load_min', -_INF), values.get('load_max', _INF)),
+            Delivery(values.get('period', 0.0), values.get('slew', _INF),
+                     lag=values.get('lag', 0.0)))
+
+
+@dataclass(frozen=True)
+class InSI(System):
+    """
+    Seconds, tesla and the parameters of the nodes.
+
+    Attributes
+    ----------
+    known : dict of str to object
+        Values of `hmsa_ros.contract.parameters.PLANNED`, and points of a law that were in a file.
+
+    """
+
+    columns = {'start': 1.0, 'target': 1.1}
+    ranges = {
+        'start': _POSITIVE, 'target': _POSITIVE, **_ranges(PLANNED), 'command_period': (0.0, 1e3)}
+    delivery = frozenset({'command_period', 'slew_limit', 'coil_time_constant'})
+    roots = False
+
+    known: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> 'InSI':
+        """
+        Return the system of parameters.
+
+        Raises
+        ------
+        BadInputError
+            If they name a file that cannot be used.
+
+        """
+        return cls({**values, **completed(values)})
+
+    @property
+    def ideal(self) -> bool:
+        """Whether commands apply at any time and at once."""
+        return not (self.known['slew_limit'] or self.known['coil_time_constant'])
+
+    def setting(self, values: Mapping[str, Any]) -> Setting:
+        """Return what a row is planned with; a modulus scales the constants of a law."""
+        model = model_from(
+            {**self.known, **values}, values.get(_MODULUS),
+            round(values.get('command_period', 0.0) * NANOSECONDS))
+        return Setting(model.material, model.limits, model.delivery, model.units)

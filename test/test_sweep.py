@@ -1,0 +1,228 @@
+"""Sweeps over laws, shapers, samples and SI parameters, each against plans made one by one."""
+
+import csv
+import json
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+import yaml
+
+from hmsa_ros.cli import main
+from hmsa_ros.core.laws import LAWS
+from hmsa_ros.core.two_step import plan_two_step_batch
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.studies.axes import Belief, draw, NOTHING, parse_values, Spread
+from hmsa_ros.studies.settings import Nondimensional
+from hmsa_ros.studies.sweep import Sweep
+
+ACTUATOR = {
+    'actuator.shear_modulus': 12e3, 'actuator.density': 1800.0, 'actuator.half_length': 0.008,
+    'actuator.half_thickness': 0.009, 'actuator.remanence': 0.12, 'actuator.chain_limit': 6.0,
+    'actuator.damping_coefficient': 0.6}
+LAW_CONSTANTS = {
+    'law.c10': 5e3, 'law.c01': 1e3, 'law.c20': 300.0, 'law.c30': 20.0, 'law.mu': [9e3],
+    'law.alpha': [2.5], 'law.lambda_m': 3.0,
+    'law.stretch': [0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6, 1.7],
+    'law.flux_density': []}
+STRETCH = np.array(LAW_CONSTANTS['law.stretch'])
+LAW_CONSTANTS['law.flux_density'] = (0.12 * (STRETCH - STRETCH ** -2)).tolist()
+COVARIANCE = [[1e4, -0.02, 0.0], [-0.02, 1e-6, 0.0], [0.0, 0.0, 1e-10]]
+
+
+@pytest.fixture
+def params_file(tmp_path):
+    """Return a writer of parameter files, with the constants of all laws."""
+    def write(**more):
+        path = tmp_path / 'actuator.yaml'
+        path.write_text(yaml.safe_dump({'/**': {'ros__parameters': {
+            **ACTUATOR, **LAW_CONSTANTS, **more}}}))
+        return path
+    return write
+
+
+@pytest.fixture
+def run(capsys, tmp_path, monkeypatch):
+    """Return a runner of commands in an empty folder: status, rows or output, and error."""
+    monkeypatch.chdir(tmp_path)
+
+    def run_words(*words):
+        try:
+            status = main([str(x) for x in words])
+        except SystemExit as end:
+            status = end.code
+        out, err = capsys.readouterr()
+        return status, list(csv.DictReader(out.splitlines())) if words[0] == 'sweep' else out, err
+
+    return run_words
+
+
+def planned(run, path, target, shaper):
+    """Return what hmsa plan says of a move, None where it refuses."""
+    status, out, _ = run('plan', f'{target}:100', '--params-file', path, '--shaper', shaper,
+                         '--json')
+    return None if status else json.loads(out)['segments'][0]
+
+
+@pytest.mark.parametrize('more', [
+    {}, {'slew_limit': 40.0}, {'coil_time_constant': 3e-4}, {'flux_density_max': 0.06}],
+    ids=['ideal', 'ramps', 'lag', 'weak coil'])
+def test_rows_in_si_units_are_the_plans_of_hmsa_plan_for_every_law_and_shaper(
+        run, params_file, more):
+    laws = list(LAWS) if not more else ['gent', 'yeoh']
+    shapers = ['two_step', 'robust', 'minimum_time', 'zvd', 'step'] if not more else [
+        'two_step', 'robust']
+    status, rows, _ = run(
+        'sweep', '--params-file', params_file(**more), '--target', '1.1,0.9,2.5',
+        '--law', ','.join(laws), '--shaper', ','.join(shapers))
+    assert status == 0
+    assert len(rows) == 3 * len(laws) * len(shapers)
+    for law in laws:
+        path = params_file(law=law, **more)
+        for row in (x for x in rows if x['law'] == law):
+            plan = planned(run, path, row['target'], row['shaper'])
+            assert (plan is None) == (row['status'] in (
+                'flux_limit', 'out_of_range', 'slew_limit', 'no_two_step', 'not_converged')), row
+            if plan is None:
+                continue
+            assert row['status'] == plan['status']
+            for name in ('flux_density_p', 'time_p', 'flux_density_1'):
+                expected = math.nan if plan[name] is None else plan[name]
+                assert float(row[name]) == pytest.approx(
+                    expected, rel=1e-6, abs=1e-9, nan_ok=True)
+
+
+def test_parameters_in_si_units_are_varied_one_by_one(run, params_file):
+    path = params_file(law='yeoh')
+    _, rows, _ = run(
+        'sweep', '--params-file', path, '--vary', 'law.c20=100,900', '--vary',
+        'actuator.density=1000:3000:2', '--vary', 'slew_limit=0,60', '--target', 1.2)
+    assert len({x['time_p'] for x in rows}) == 8
+    for row in rows:
+        path = params_file(law='yeoh', **{
+            x: float(row[x]) for x in ('law.c20', 'actuator.density', 'slew_limit')})
+        plan = planned(run, path, 1.2, 'two_step')
+        assert float(row['time_p']) == pytest.approx(plan['time_p'], rel=1e-6)
+        assert float(row['flux_density_p']) == pytest.approx(plan['flux_density_p'], rel=1e-6)
+
+
+def test_nondimensional_laws_limits_and_ramps_are_columns(run):
+    _, rows, _ = run(
+        'sweep', '--law', 'neo_hookean,mooney_rivlin', '--vary', 'law.c10=3', '--vary',
+        'law.c01=0,1', '--vary', 'load_max=0.2,1', '--vary', 'slew=2,inf', '--shaper',
+        'two_step,robust')
+    assert len(rows) == 32
+    assert {x['status'] for x in rows if x['load_max'] == '0.2'} == {'flux_limit'}
+    plain = [x for x in rows
+             if (x['load_max'], x['slew'], x['law.c01']) == ('1.0', 'inf', '0.0')]
+    # Without its second constant Mooney and Rivlin's law is the neo-Hookean one.
+    for shaper in ('two_step', 'robust'):
+        one, other = (x for x in plain if x['shaper'] == shaper)
+        assert {one['law'], other['law']} == {'neo_hookean', 'mooney_rivlin'}
+        assert float(one['tau_p']) == pytest.approx(float(other['tau_p']), rel=1e-9)
+    assert len({x['tau_p'] for x in rows if x['status'] != 'flux_limit'}) > 8
+
+
+def test_samples_of_an_identification_have_its_mean_and_covariance(run, params_file):
+    names = ['shear_modulus', 'damping_coefficient', 'stretch_bias']
+    path = params_file(**{
+        'identification.names': names,
+        'identification.covariance': np.ravel(COVARIANCE).tolist()})
+    status, rows, _ = run('sweep', '--params-file', path, '--identified', '--samples', 4096)
+    assert (status, len(rows)) == (0, 4096)
+    drawn = np.array([
+        [float(x['actuator.shear_modulus']), float(x['actuator.damping_coefficient'])]
+        for x in rows])
+    assert drawn.mean(axis=0) == pytest.approx([12e3, 0.6], rel=1e-5)
+    assert np.cov(drawn.T) == pytest.approx(np.array(COVARIANCE)[:2, :2], rel=0.02)
+    whitened = np.linalg.solve(np.linalg.cholesky(np.array(COVARIANCE)[:2, :2]),
+                               (drawn - [12e3, 0.6]).T)
+    for values in whitened:
+        assert stats.kstest(values, 'norm').pvalue > 0.5
+    assert 'no covariance of the block' in run(
+        'sweep', '--params-file', params_file(), '--identified')[2]
+
+
+def test_samples_are_those_of_sobol_and_follow_from_number_and_seed_alone(run):
+    spreads = {'zeta': Spread(False, 0.1, 0.3), 'j_lim': Spread(True, 5.0, 0.1)}
+    found = draw(spreads, NOTHING, 600, 3)
+    points = stats.qmc.Sobol(2, seed=np.random.default_rng(3)).random(1024)[:600]
+    assert found['zeta'] == pytest.approx(0.1 + 0.2 * points[:, 0], rel=1e-12)
+    assert found['j_lim'] == pytest.approx(stats.norm(5.0, 0.1).ppf(points[:, 1]), rel=1e-9)
+    words = ('sweep', '--zeta', 'sobol:0.1:0.3', '--j-lim', 'normal:5:0.1', '--target', '1.1,1.2',
+             '--samples', 8)
+    first = run(*words, '--seed', 3)
+    assert [float(x['zeta']) for x in first[1][::2]] == found['zeta'][:8].tolist()
+    assert run(*words, '--seed', 3) == first
+    assert run(*words, '--seed', 4) != first
+    digests = {Sweep({}, samples=draw(spreads, NOTHING, 8, seed)).digest for seed in (3, 3, 4)}
+    assert len(digests) == 2
+
+
+def test_chunks_of_samples_shapers_and_laws_merge_to_the_table_of_one_process(run, tmp_path):
+    pytest.importorskip('pyarrow')
+    words = ('sweep', '--zeta', 'sobol:0.1:0.3', '--samples', 200, '--shaper', 'two_step,robust',
+             '--law', 'gent,neo_hookean')
+    assert run(*words, '--workers', 1, '--out', 'a')[0] == 0
+    assert len(list((tmp_path / 'a' / 'chunks').iterdir())) == 2
+    assert run(*words, '--workers', 2, '--out', 'b.parquet')[0] == 0
+    assert run(*words, '--out', 'c.parquet')[0] == 0
+    tables = [(tmp_path / x).read_bytes() for x in ('a/table.parquet', 'b.parquet')]
+    assert tables[0] == tables[1]
+
+
+def test_a_law_of_many_constants_takes_no_room_for_each_row(monkeypatch):
+    from hmsa_ros.core import law, two_step
+
+    sizes = []
+    pack = law.pack
+    monkeypatch.setattr(law, 'pack', lambda *x: sizes.append((y := pack(*x)).size) or y)
+    monkeypatch.setattr(two_step, '_MOST_NUMBERS', 1000)
+    curve = LAWS['yeoh'].scaled({'law.c10': 1.0, 'law.c20': 0.1, 'law.c30': 0.0})[1]
+    targets = np.linspace(0.9, 1.3, 500)
+    found = plan_two_step_batch(1.0, targets, elastic=curve)
+    assert max(sizes) <= 1000 < sum(sizes)
+    monkeypatch.undo()
+    assert np.array_equal(
+        found.tau_p, plan_two_step_batch(1.0, targets, elastic=curve).tau_p, equal_nan=True)
+
+
+@pytest.mark.parametrize(('words', 'message'), [
+    (['--law', 'silk'], "law 'silk' is unknown"),
+    (['--law', 'ogden'], 'law.mu has 0 values'),
+    (['--shaper', 'two'], "shaper 'two' is unknown"),
+    (['--vary', 'mass=1'], "column 'mass' is unknown"),
+    (['--vary', 'slew'], 'expected NAME=GRID'),
+    (['--zeta', '1', '--vary', 'zeta=1'], 'each name once'),
+    (['--vary', 'slew=0'], 'greater than 0'),
+    (['--zeta', 'sobol:1:1'], 'LOW below HIGH'),
+    (['--zeta', 'normal:1'], 'sobol:LOW:HIGH'),
+    (['--zeta', 'normal:1:nan'], 'STD above 0'),
+    (['--samples', '4'], 'without anything to draw'),
+    (['--zeta', 'sobol:0:1', '--samples', '0'], '0 samples'),
+    (['--zeta', 'sobol:0:1', '--seed', '-1'], 'seed of the samples is -1'),
+    (['--identified'], '--identified without --params-file'),
+    (['--params-file', 'none.yaml'], 'none.yaml'),
+])
+def test_axes_that_do_not_exist_are_refused_in_one_line(run, words, message):
+    status, out, err = run('sweep', *words)
+    assert (status, out, err.count('\n')) == (2, [], 1)
+    assert message in err
+
+
+def test_nondimensional_parameters_do_not_go_with_a_parameter_file(run, params_file):
+    assert "column 'zeta' is unknown" in run(
+        'sweep', '--params-file', params_file(), '--zeta', 1)[2]
+
+
+def test_a_covariance_that_is_none_is_refused():
+    with pytest.raises(BadInputError, match=r'is none, at b: expected'):
+        draw({}, Belief(('a', 'b'), np.zeros(2), np.array([[1.0, 2.0], [2.0, 1.0]])), 8, 0)
+
+
+def test_values_are_grids_or_what_they_are_drawn_from():
+    assert parse_values('sobol:1:2', 'zeta') == Spread(False, 1.0, 2.0)
+    assert parse_values('normal:-1:2', 'zeta') == Spread(True, -1.0, 2.0)
+    assert parse_values('1:2:2', 'zeta').tolist() == [1.0, 2.0]
+    assert set(Nondimensional.columns) < set(Nondimensional.ranges)
