@@ -72,10 +72,11 @@ def test_file_written_is_that_of_the_nodes_and_keeps_the_covariance(folder, caps
     assert settings['flux_density_max'] == 0.2
     assert settings['joint'] == 'tip'
     assert settings['actuator.shear_modulus'] == pytest.approx(BLOCK.shear_modulus, rel=2e-3)
-    belief = read_belief(folder / 'found.yaml')
-    assert belief.names[0] == 'shear_modulus'
-    assert np.all(np.linalg.eigvalsh(belief.covariance / np.sqrt(np.outer(
-        np.diag(belief.covariance), np.diag(belief.covariance)))) > 0.0)
+    known = read_belief(folder / 'found.yaml').known
+    assert known.names[0] == 'shear_modulus'
+    assert known.value('shear_modulus') == settings['actuator.shear_modulus']
+    assert np.all(np.linalg.eigvalsh(known.covariance / np.sqrt(np.outer(
+        np.diag(known.covariance), np.diag(known.covariance)))) > 0.0)
     page = (folder / 'page.html').read_text(encoding='utf-8')
     for words in ('identified', 'shear_modulus', 'Autocorrelation', 'confounded'):
         assert words in page

@@ -134,11 +134,54 @@ def test_an_identified_covariance_is_the_prior(tmp_path):
         '/**:\n  ros__parameters:\n    actuator.shear_modulus: 12000.0\n'
         '    identification.names: [shear_modulus, damping_coefficient]\n'
         '    identification.covariance: [144.0, 0.0, 0.0, 1.0e-4]\n')
-    prior = Prior.identified(read_belief(path))
+    belief = read_belief(path)
+    prior = Prior.nominal(belief.actuator).informed(belief.known)
     _, found = run(np.ones(3), prior=prior, times=SAMPLED[:3])
     assert found.values['shear_modulus'] == pytest.approx(12000.0)
     assert found.deviations['shear_modulus'] == pytest.approx(12.0, rel=1e-3)
     assert found.deviations['damping_coefficient'] == pytest.approx(1e-2, rel=1e-3)
+
+
+@pytest.mark.parametrize(('value', 'word'), [
+    ('[144.0, 0.0, 0.0]', '3 numbers for 2 names'), ('[1.0, 2.0, 2.0, 1.0]', 'is not one'),
+    ('[1.0, 0.0, 0.0, .nan]', 'expected 4 finite'), ('[1.0, 0.0, 0.0, x]', 'expected numbers')])
+def test_a_covariance_that_is_none_is_refused(tmp_path, value, word):
+    path = tmp_path / 'block.yaml'
+    path.write_text(
+        '/**:\n  ros__parameters:\n    actuator.shear_modulus: 12000.0\n'
+        '    identification.names: [shear_modulus, damping_coefficient]\n'
+        f'    identification.covariance: {value}\n')
+    with pytest.raises(BadInputError, match=word):
+        read_belief(path)
+
+
+def test_parameters_that_are_frozen_stay_with_their_deviations_and_are_learnt_again_later():
+    block = replace(oracle.BLOCK, shear_modulus=1.1e4)
+    samples = measured(block)
+    estimator = Estimator(Prior.nominal(oracle.BLOCK), Options(noise=NOISE))
+    for time, level in zip(TIMES, LEVELS, strict=True):
+        estimator.level(ns(time), level)
+    found = {}
+    for i, (time, value) in enumerate(zip(SAMPLED, samples, strict=True)):
+        # Frozen in mid-move, with little learnt.
+        estimator.learning = not 35 <= i < 80
+        estimator.sample(ns(time), value)
+        found[i] = estimator.update(ns(time) + 2_000_000)
+    first, last = (found[i].values['shear_modulus'] for i in (36, 79))
+    assert last == pytest.approx(first, rel=1e-6)
+    assert found[79].deviations['shear_modulus'] == pytest.approx(
+        found[36].deviations['shear_modulus'])
+    assert found[35].deviations['shear_modulus'] > 10.0 * found[149].deviations['shear_modulus']
+    assert found[149].values['shear_modulus'] == pytest.approx(
+        1.1e4, abs=4.5 * found[149].deviations['shear_modulus'])
+
+
+def test_samples_that_nobody_asks_for_do_not_pile_up():
+    estimator = Estimator(Prior.nominal(oracle.BLOCK), Options(window=20))
+    for i in range(1000):
+        assert estimator.sample(i * 1_000_000, 1.0)
+    assert estimator.screening.late == 980
+    assert estimator.update(1_000_000_000).stretch == pytest.approx(1.0, abs=1e-5)
 
 
 def test_what_cannot_be_tracked_is_refused():

@@ -1,6 +1,9 @@
 """Planner and plant as processes, the plant with a G that is a fifth higher."""
 
 import pytest
+from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
+import yaml
 
 from hmsa_ros.nodes import interface
 
@@ -10,14 +13,14 @@ RUN_SECONDS = 300.0
 PLANT = ('--ros-args', '-p', 'mismatch.shear_modulus:=1.2', '-p', 'stretch_noise:=0.001')
 
 
-def begin(start, ros, mode):
+def begin(start, ros, mode, *more):
     """Start both and wait for them; return a function of the newest sentence and its values."""
     statuses = ros.collect(interface.STATUS.type, 'planner/status', interface.STATUS.qos)
     samples = ros.collect(interface.JOINT_STATES.type, 'joint_states', interface.JOINT_STATES.qos)
     start.hmsa('plant', *PLANT)
     # Commands far enough ahead for a busy machine.
     start.hmsa(
-        'planner', '--ros-args', '-p', f'feedback:={mode}', '-p', 'lead_time:=0.3')
+        'planner', '--ros-args', '-p', f'feedback:={mode}', '-p', 'lead_time:=0.3', *more)
     ros.spin_until(lambda: statuses and samples, 'planner and plant', RUN_SECONDS)
     found = ros.collect(interface.ESTIMATE.type, 'planner/estimate', interface.ESTIMATE.qos)
 
@@ -43,11 +46,23 @@ def test_a_planner_that_observes_says_what_is_wrong_with_the_actuator(start, ros
     assert (values['used_by_plans'], values['corrections']) == ('False', '0')
 
 
-def test_a_planner_that_adapts_arrives_with_the_second_move(start, ros):
-    estimate = begin(start, ros, 'adapt')
+def test_a_planner_that_adapts_arrives_with_the_second_move_and_saves_what_it_learnt(
+        start, ros, tmp_path):
+    file = tmp_path / 'learnt.yaml'
+    estimate = begin(start, ros, 'adapt', '-p', f'feedback_file:={file}')
     assert start.hmsa('send', '1.4:2', '--wait').wait(RUN_SECONDS) in (0, 1)
     ros.spin_until(lambda: 'plans use it' in estimate()[0], 'the estimate')
     assert int(estimate()[1]['corrections']) > 0
     second = start.hmsa('send', '1.1:2', '--wait')
     assert second.wait(RUN_SECONDS) == 0, second.output
     assert 'measured' in second.output
+    answer = ros.call(Trigger, 'planner/save_estimate')
+    assert answer.success, answer.message
+    saved = yaml.safe_load(file.read_text())['/**']['ros__parameters']
+    assert saved['actuator.shear_modulus'] == pytest.approx(1.2e4, rel=5e-3)
+    assert ros.call(Trigger, 'planner/reset_estimate').success
+    result, = ros.set_parameters('planner', [Parameter('feedback', value='off')])
+    assert result.successful
+    answer = ros.call(Trigger, 'planner/save_estimate')
+    assert not answer.success
+    assert 'feedback is off' in answer.message

@@ -308,6 +308,21 @@ def test_setpoint_sent_again_and_again_changes_nothing(bench):
     planner.check()
 
 
+def test_the_file_of_an_identification_is_a_parameter_file(bench, tmp_path):
+    file = tmp_path / 'found.yaml'
+    file.write_text(
+        '/**:\n  ros__parameters:\n    actuator.shear_modulus: 12000.0\n'
+        '    stretch_bias: 0.002\n    feedback: adapt\n'
+        '    identification.verdict: identified\n    identification.noise_std: 0.001\n'
+        '    identification.names: [shear_modulus, stretch_bias]\n'
+        '    identification.values: [12000.0, 0.002]\n'
+        '    identification.covariance: [144.0, 0.0, 0.0, 1.0e-10]\n')
+    planner = bench('--params-file', str(file))
+    answer = planner.ros.call(Trigger, planner.name(interface.SAVE_ESTIMATE))
+    assert not answer.success
+    assert 'feedback_file is empty' in answer.message
+
+
 def test_stop_comes_to_rest_without_vibration(bench):
     planner = bench()
     planner.request(*SEQUENCE)

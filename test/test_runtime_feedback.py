@@ -1,5 +1,6 @@
 """A planner that learns from samples: a simulated device, without ROS."""
 
+from functools import partial
 import math
 
 import numpy as np
@@ -9,6 +10,8 @@ from test_runtime_measured import Loop, MS, START
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.planner import Options
 from hmsa_ros.core.timeline import Model
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification.files import read_belief
 from hmsa_ros.runtime.records import EstimateChanged, Send, Settings, Severity, StatusChanged
 
 
@@ -95,6 +98,62 @@ def test_a_sensor_that_fails_leaves_the_plan_in_force_and_is_named():
         vibration, offset = left(truth, 400, 600, 1.4, 0.4)
         assert vibration < 0.005
         assert abs(offset) < 0.005
+
+
+def test_what_was_learnt_is_saved_and_the_next_run_begins_with_it(tmp_path):
+    loop = Loop(1.2, 1e-3, feedback='adapt')
+    feedback = loop.runtime.feedback
+    with pytest.raises(BadInputError, match='feedback_file is empty'):
+        feedback.save(by_joint=False)
+    settings = Settings(
+        feedback='adapt', takeover_timeout=0, feedback_file=str(tmp_path / 'learnt.yaml'))
+    model = loop.runtime.group.planners['a'].model
+    loop.runtime.change(settings, {'a': model}, simultaneous=False)
+    with pytest.raises(BadInputError, match='no samples yet'):
+        feedback.save(by_joint=False)
+    loop.run((1.4, 300 * MS))
+    assert 'learnt.yaml' in feedback.save(by_joint=False)
+    belief = read_belief(tmp_path / 'learnt.yaml')
+    assert belief.actuator.shear_modulus == pytest.approx(1.2e4, rel=5e-3)
+    last = estimates(loop)[-1].values
+    assert math.sqrt(belief.known.covariance[0, 0]) == pytest.approx(
+        float(last['shear_modulus.std']), rel=0.01)
+
+    again = Loop(1.2, 1e-3, feedback='adapt', known={'a': belief.known})
+    again.runtime.change(
+        Settings(feedback='adapt', takeover_timeout=0, known={'a': belief.known}),
+        {'a': Model(belief.actuator, again.runtime.group.planners['a'].options)},
+        simultaneous=False)
+    truth = again.run((1.4, 300 * MS))
+    # The first move is right, and its uncertainty is no more than what is left of the first run.
+    vibration, offset = left(truth, 60, 100, 1.4, 0.4)
+    assert vibration < 0.01
+    assert abs(offset) < 0.005
+    assert float(estimates(again)[0].values['shear_modulus.std']) < 1.5 * float(
+        last['shear_modulus.std'])
+
+
+def test_what_was_learnt_can_be_frozen_and_forgotten():
+    loop = Loop(1.2, 1e-3, feedback='adapt')
+    planner = loop.runtime.group.planners['a']
+    loop.run((1.4, 300 * MS))
+    frozen = Settings(feedback='adapt', takeover_timeout=0, feedback_frozen=True)
+    loop.runtime.change(frozen, {'a': Model(paper_actuator(), planner.options)},
+                        simultaneous=False)
+    learnt = planner.model.actuator
+    assert learnt.shear_modulus == pytest.approx(1.2e4, rel=5e-3)
+    # From now on the sensor shows too much, which looks like another modulus.
+    loop.spoil = lambda samples: [(x, 1.0 + 1.004 * (y - 1.0)) for x, y in samples]
+    loop.run((1.1, 300 * MS), (1.4, 300 * MS))
+    assert planner.model.actuator == learnt
+    assert estimates(loop)[-1].values['learning'] is False
+    assert 'forgotten' in loop.runtime.feedback.reset()
+    assert planner.model.actuator.shear_modulus == 1e4
+    loop.runtime.change(
+        Settings(takeover_timeout=0), {'a': planner.model}, simultaneous=False)
+    for call in (loop.runtime.feedback.reset, partial(loop.runtime.feedback.save, by_joint=True)):
+        with pytest.raises(BadInputError, match='feedback is off'):
+            call()
 
 
 def test_what_was_learnt_outlives_other_options_but_not_another_block():

@@ -154,7 +154,8 @@ def test_only_the_planner_and_a_replay_may_send_commands():
 
 def test_only_an_operator_may_send_setpoints_and_stop_the_planner():
     requests = {('publish', '/planner/joint_trajectory'), ('publish', '/planner/setpoint'),
-                ('request', '/planner/stop')}
+                *(('request', f'/planner/{x}') for x in (
+                    'reset_estimate', 'save_estimate', 'stop'))}
     for path, granted in GRANTS.items():
         assert granted & requests == (requests if path == '/hmsa/operator' else set())
 

@@ -228,6 +228,20 @@ VISCOELASTIC = (
         1e-9, 1e9, items=float),
 )
 
+#: How well parameters are known, as ``hmsa identify --out`` and ``~/save_estimate`` write it.
+KNOWN = (
+    ParameterSpec(
+        'identification.names', [],
+        'Parameters that were identified: what feedback knows of them before the first sample.'),
+    ParameterSpec(
+        'identification.values', [],
+        'Their values in SI; those that are parameters of the planner as well have them there.',
+        items=float),
+    ParameterSpec(
+        'identification.covariance', [],
+        'Covariance of these values, row after row, in SI.', items=float),
+)
+
 PUBLISH_RATE = ParameterSpec(
     'publish_rate', 1000.0, "Sample rate, in the plant's own time.", 'Hz', 1e-3, 1e6)
 

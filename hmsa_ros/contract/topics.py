@@ -168,6 +168,12 @@ DIAGNOSTICS = Topic(
 STOP = Service('~/stop', _TRIGGER, {
     PLANNER: 'Drops the rest of the sequence and comes to rest without vibration.',
     PLAYER: 'Ends playback.'})
+RESET_ESTIMATE = Service('~/reset_estimate', _TRIGGER, {
+    PLANNER: 'Forgets what feedback has learnt: plans and estimates begin again with the '
+             'parameters as given.'})
+SAVE_ESTIMATE = Service('~/save_estimate', _TRIGGER, {
+    PLANNER: 'Writes what feedback has learnt to the file named by `feedback_file`, with its '
+             'covariance, as a parameter file.'})
 RESET = Service('~/reset', _TRIGGER, {
     PLANT: 'Returns the actuators to their initial states, or to reset_stretch and reset_rate; '
            'time continues.'})

@@ -4,6 +4,7 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+import itertools
 import math
 
 import numpy as np
@@ -24,11 +25,15 @@ _FIRST_NOISE, _LEAST_NOISE = 1e-3, 2e-6
 _FEWEST_FOR_NOISE = 10
 # How fast the estimate of the noise follows the residuals.
 _NOISE_GAIN = 0.05
-# Deviations of the prior that an estimate may be off it.
+# Times the prior's spread that an estimate may be off it.
 _BOUND = 4.0
+# Share of a variance that keeps a parameter where it is.
+_FIXED = 1e-12
 # Deviation of stretch and, in natural frequencies, of rate of a block at rest, and of one whose
-# state is not known.
-_AT_REST, _ANYWHERE = 2e-6, 0.3
+# state is not known; and the units of time after a change of level from which on it rests.
+_AT_REST, _ANYWHERE, _SETTLED = 2e-6, 0.3, 25.0
+# So many windows of samples wait at most for an update.
+_WAITING = 10
 # Window, as a share, that is left when it moves on, its longest span in units of time, and the
 # samples from which on that counts.
 _KEPT, _LONGEST, _FEWEST = 0.5, 200.0, 20
@@ -46,11 +51,11 @@ class Options:
     noise : float
         Standard deviation of a sample of stretch; 0 to estimate it.
     learn : bool
-        Whether parameters are estimated; else the state alone.
+        Whether parameters are estimated from the first sample on; else the state alone.
     gate : float
         Deviations of the innovation from which a sample is rejected.
     drift : float
-        Share of the prior deviation that a parameter may wander in a second.
+        Share of the prior's spread that a parameter may wander in a second.
     slew_limit : float
         Of the amplifier in T/s; infinite for steps.
 
@@ -142,6 +147,9 @@ class Estimator:
         Standard deviation of a sample, as far as it is known.
     screening : Screening
         What was rejected, and why.
+    learning : bool
+        Whether parameters are estimated; else they stay as they are from the next update on,
+        and the state alone is followed.
 
     """
 
@@ -151,6 +159,9 @@ class Estimator:
         self.options = options or Options()
         self.noise = self.options.noise or _FIRST_NOISE
         self.screening = Screening(self.options.gate)
+        self.learning = self.options.learn
+        # Covariance of the parameters while they stay as they are.
+        self._fixed: Array | None = None
         self._levels: list[tuple[int, float]] = []
         self._pending: list[tuple[int, float]] = []
         self._origin = 0
@@ -198,12 +209,16 @@ class Estimator:
             self.screening.repeated += 1
             return False
         self._pending.insert(place, (stamp, stretch))
+        # Whoever does not ask for updates, as before the first move, needs the newest alone.
+        limit = self.options.window * (1 if self._window is None else _WAITING)
+        self.screening.late += len(self._pending[:-limit])
+        del self._pending[:-limit]
         return True
 
     def reset(self, prior: Prior | None = None) -> None:
         """Forget what was learnt, or go on from another prior."""
         self.prior = prior or self.prior
-        self._window = self._solution = None
+        self._window = self._solution = self._fixed = None
         self._pending.clear()
         self.screening = Screening(self.options.gate)
 
@@ -278,18 +293,20 @@ class Estimator:
         self._origin = stamp
         prior = self.prior
         mean = coordinates(prior.values, prior.free)
-        size = np.sqrt(np.diag(prior.covariance))
-        bounds = np.stack([mean - _BOUND * size, mean + _BOUND * size], axis=1)
+        bounds = np.stack(
+            [mean - _BOUND * prior.spread, mean + _BOUND * prior.spread], axis=1)
         for i, name in enumerate(prior.free):
             if QUANTITIES[name].scale == 'linear':
                 bounds[i, 0] = max(bounds[i, 0], QUANTITIES[name].least)
             elif QUANTITIES[name].scale == 'inverse':
                 bounds[i, 0] = max(bounds[i, 0], 0.2 * mean[i])
-        known = prior.covariance * (1.0 if self.options.learn else 1e-12)
+        self._fixed = None if self.learning else prior.covariance
+        known = prior.covariance * (1.0 if self.learning else _FIXED)
         at = rest(prior.values, prior.free, self._in_force(stamp))
         stretch, frequency, by = at or (
             self._pending[0][1], 1.0 / prior.values['time_unit'], np.zeros(len(mean)))
-        off = _AT_REST if at is not None else _ANYWHERE
+        off = _AT_REST if at is not None and _settled(
+            self._levels, stamp, prior.values['time_unit']) else _ANYWHERE
         covariance = np.zeros((len(mean) + 2, len(mean) + 2))
         covariance[:-2, :-2] = known
         covariance[:-2, -2] = covariance[-2, :-2] = known @ by
@@ -327,6 +344,8 @@ class Estimator:
 
     def _estimate(self, time: int, found: Solution) -> Estimate:
         state, covariance = found.at_end()
+        if self._fixed is not None:
+            covariance[:-2, :-2] = self._fixed
         deviations = {
             name: abs(derivative(name, found.values[name])) * math.sqrt(covariance[i, i])
             for i, name in enumerate(self.prior.free)}
@@ -346,17 +365,19 @@ class Estimator:
             place = int((1.0 - _KEPT) * count)
         elif count == 0 and until - window.begin > span:
             place = 0
+        elif self.learning is not (self._fixed is None):
+            place = max(count - 1, 0)
         else:
             return
         # After the last sample comes the time asked for.
         time = float(window.time[place]) if place < count else until
         drift = np.zeros(len(window.mean))
-        if self.options.learn:
-            drift[:-2] = self.options.drift ** 2 * (time - window.begin) * np.diag(
-                self.prior.covariance)
+        if self._fixed is None:
+            drift[:-2] = self.options.drift ** 2 * (time - window.begin) * self.prior.spread ** 2
         shift = round(time * NANOSECONDS)
         seconds = shift / NANOSECONDS
         moved = window.move_on(place, time, found, self.noise, drift)
+        self._fix(moved, found)
         moved.begin -= seconds
         moved.time = moved.time - seconds
         self._origin += shift
@@ -367,6 +388,16 @@ class Estimator:
         first = bisect_right(self._levels, self._origin, key=lambda x: x[0]) - 1
         # The field of a coil that lags remembers some levels more.
         del self._levels[:max(first - 8, 0)]
+
+    def _fix(self, window: Window, found: Solution) -> None:
+        """Keep the parameters of a window as they are, or let them go again."""
+        if self.learning is (self._fixed is None):
+            return
+        known = window.covariance[:-2, :-2].copy() if self._fixed is None else self._fixed
+        window.mean[:-2] = found.z[:-2]
+        window.covariance[:-2, -2:], window.covariance[-2:, :-2] = 0.0, 0.0
+        window.covariance[:-2, :-2] = known * (1.0 if self.learning else _FIXED)
+        self._fixed = None if self.learning else known
 
     # -- time ----------------------------------------------------------------------------------
 
@@ -389,6 +420,13 @@ class Estimator:
         return Levels(
             np.array([self._seconds(x) for x, _ in self._levels]),
             np.array([x for _, x in self._levels]), self.options.slew_limit)
+
+
+def _settled(levels: Sequence[tuple[int, float]], stamp: int, time_unit: float) -> bool:
+    """Return whether at a stamp the last change of level was long ago; the unit is in s."""
+    before = stamp - round(_SETTLED * time_unit * NANOSECONDS)
+    return all(
+        x[1] == y[1] or not before < y[0] <= stamp for x, y in itertools.pairwise(levels))
 
 
 @cache

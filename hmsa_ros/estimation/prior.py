@@ -1,7 +1,7 @@
 """What is known of an actuator before the first sample."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -9,7 +9,7 @@ import numpy as np
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.files import Belief
+from hmsa_ros.identification.known import Known
 from hmsa_ros.identification.quantities import check_free, derivative, values_of
 from hmsa_ros.identification.response import complete
 
@@ -25,6 +25,8 @@ DEVIATIONS = {
 _LEAST_LIMIT, _LEAST_ZETA = 0.02, 0.1
 # A force unknown to this share of the elastic one.
 _FORCE = 0.02
+# The planner has no parameters of these.
+_SENSED = ('stretch_bias', 'stretch_gain', 'sensor_latency', 'constant_force')
 _NOT_TRACKED = ('initial_stretch', 'initial_rate', 'viscoelastic_ratio', 'viscoelastic_time')
 #: Tracked unless others are named.
 TRACKED = ('shear_modulus', 'damping_coefficient', 'stretch_bias')
@@ -43,12 +45,16 @@ class Prior:
         What is tracked.
     covariance : ndarray, shape (p, p)
         Of the coordinates of these.
+    spread : ndarray, shape (p,)
+        Deviations of the coordinates of a block that was never identified: they bound how far
+        an estimate may go, and how fast, since a block changes after its identification.
 
     """
 
     values: dict[str, float]
     free: tuple[str, ...]
     covariance: Array
+    spread: Array
 
     @classmethod
     def nominal(
@@ -102,40 +108,39 @@ class Prior:
                 raise BadInputError(
                     f'the deviation of {name} is {deviation:g}: expected a number above 0')
             size.append(deviation)
-        return cls(values, free, np.diag(np.square(size)))
+        return cls(values, free, np.diag(np.square(size)), np.array(size))
 
-    @classmethod
-    def identified(cls, belief: Belief, free: Sequence[str] = TRACKED) -> 'Prior':
+    def informed(self, known: Known) -> 'Prior':
         """
-        Return what a parameter file says.
+        Return the prior of a block that was identified.
 
         Parameters
         ----------
-        belief : Belief
-            As read; its covariance counts for what was identified.
-        free : sequence of str
-            What is tracked.
+        known : Known
+            How well parameters are known; those of the block and the coil have the values of
+            this prior.
 
         Returns
         -------
         Prior
-            Defaults for what was not identified.
-
-        Raises
-        ------
-        BadInputError
-            If a name is unknown or cannot be tracked.
+            As before for what was not identified.
 
         """
-        found = cls.nominal(belief.actuator, free, others=belief.others)
-        covariance = found.covariance.copy()
-        both = [x for x in found.free if x in belief.names]
-        places = [belief.names.index(x) for x in both]
-        into = [found.free.index(x) for x in both]
-        scale = np.array([derivative(x, found.values[x]) for x in both])
+        values = dict(self.values)
+        for name in _SENSED:
+            value = known.value(name)
+            values[name] = values[name] if value is None else value
+        both = [x for x in self.free if x in known.names and (
+            x not in _SENSED or known.value(x) is not None)]
+        places = [known.names.index(x) for x in both]
+        into = [self.free.index(x) for x in both]
+        scale = np.array([derivative(x, values[x]) for x in both])
+        covariance = self.covariance.copy()
         covariance[np.ix_(into, into)] = (
-            belief.covariance[np.ix_(places, places)] / np.outer(scale, scale))
-        return cls(found.values, found.free, covariance)
+            known.covariance[np.ix_(places, places)] / np.outer(scale, scale))
+        return replace(
+            self, values=values, covariance=covariance,
+            spread=np.maximum(self.spread, np.sqrt(np.diag(covariance))))
 
 
 def _damping(actuator: ActuatorParameters) -> float:

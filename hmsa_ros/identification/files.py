@@ -1,27 +1,24 @@
 """
 The parameter file that an identification leaves, and what is read back out of one.
 
-It is the YAML that planner and plant take. The covariance travels in it as ROS parameters that
-no node declares, and that nodes leave alone: ``identification.names``, and
-``identification.covariance`` row after row.
+It is the YAML that planner and plant take. How well the parameters are known travels in it as
+``identification.names``, ``identification.values`` and ``identification.covariance``, which the
+planner takes as the prior of its feedback.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from hmsa_ros.contract.actuator import actuator_from, parameters_of
 from hmsa_ros.contract.parameters import BLOCK
 from hmsa_ros.contract.topics import PLANNER, PLANT
-from hmsa_ros.core.model import Array
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.quantities import actuator_of, check_free, QUANTITIES
+from hmsa_ros.identification.known import Known, PREFIX
+from hmsa_ros.identification.quantities import actuator_of, QUANTITIES
 from hmsa_ros.identification.result import Identification
 from hmsa_ros.runs.parameters import entries_of, number_of, values_of
 
@@ -31,7 +28,6 @@ _OTHERS = {
     'stretch_gain': 'stretch_gain', 'initial_stretch': 'initial_stretch'}
 _LISTS = {
     'viscoelastic_ratio': 'viscoelastic.ratio', 'viscoelastic_time': 'viscoelastic.time'}
-_PREFIX = 'identification.'
 _RANKS = {'': 1, PLANT: 2, PLANNER: 3}
 
 
@@ -48,18 +44,15 @@ class Belief:
         Of coil and sensor.
     settings : dict of str to object
         All parameters in the file, by dotted name.
-    names : tuple of str
-        Identified parameters, in the order of the covariance; empty if the file has none.
-    covariance : ndarray, shape (p, p)
-        Of their values in SI.
+    known : Known
+        How well parameters are known.
 
     """
 
     actuator: ActuatorParameters
     others: dict[str, float]
     settings: dict[str, Any]
-    names: tuple[str, ...]
-    covariance: Array
+    known: Known
 
     def number(self, name: str, default: float) -> float:
         """Return a setting that is a number."""
@@ -103,8 +96,11 @@ def read_belief(path: Path | None) -> Belief:
                 'creep is identified')
     if others.get('viscoelastic_ratio') == 0.0:
         others.pop('viscoelastic_time', None)
-    names, covariance = _covariance(path, settings)
-    return Belief(actuator_from(values), others, settings, names, covariance)
+    try:
+        known = Known.read(settings)
+    except BadInputError as error:
+        raise BadInputError(f'{path}: {error}') from error
+    return Belief(actuator_from(values), others, settings, known)
 
 
 def _number(path: Path | None, name: str, value: object) -> float:
@@ -112,20 +108,6 @@ def _number(path: Path | None, name: str, value: object) -> float:
     if number is None:
         raise BadInputError(f'{path} gives {name} as {value!r}: expected a number')
     return number
-
-
-def _covariance(path: Path | None, settings: Mapping[str, Any]) -> tuple[tuple[str, ...], Array]:
-    names = settings.get(f'{_PREFIX}names') or []
-    flat = settings.get(f'{_PREFIX}covariance') or []
-    if not names:
-        return (), np.zeros((0, 0))
-    free = check_free(names)
-    matrix = np.array(flat, dtype=np.float64)
-    if matrix.size != len(free) ** 2 or not np.all(np.isfinite(matrix)):
-        raise BadInputError(
-            f'{path} has {matrix.size} numbers in {_PREFIX}covariance for {len(free)} names: '
-            f'expected {len(free) ** 2} finite ones')
-    return free, matrix.reshape(len(free), len(free))
 
 
 def file_text(found: Identification, belief: Belief, run: str, now: datetime) -> str:
@@ -164,7 +146,7 @@ def file_text(found: Identification, belief: Belief, run: str, now: datetime) ->
         written[f'actuator.{name}'] = value
     for key, value in parameters_of(actuator).items():
         if key not in written:
-            lines.append(f'    {key}: {_yaml(value)}')
+            lines.append(f'    {key}: {yaml_text(value)}')
             written[key] = value
     for name, key in {**_OTHERS, **_LISTS}.items():
         if name in found.names:
@@ -172,30 +154,34 @@ def file_text(found: Identification, belief: Belief, run: str, now: datetime) ->
             lines.append(_line(key, [value] if name in _LISTS else value, found, name))
             written[key] = value
     for key, value in belief.settings.items():
-        if key not in written and not key.startswith(_PREFIX):
-            lines.append(f'    {key}: {_yaml(value)}')
-    lines += [
-        '    # The covariance of the values named, row after row, in SI units.',
-        f'    {_PREFIX}verdict: {found.verdict}',
-        f'    {_PREFIX}noise_std: {_yaml(found.noise_std)}',
-        f'    {_PREFIX}names: {_yaml(list(found.names))}',
-        f'    {_PREFIX}covariance: {_yaml(found.covariance.ravel().tolist())}']
+        if key not in written and not key.startswith(PREFIX):
+            lines.append(f'    {key}: {yaml_text(value)}')
+    lines += known_lines(Known(
+        found.names, tuple(float(found.values[x]) for x in found.names), found.covariance))
     return '\n'.join(lines) + '\n'
+
+
+def known_lines(known: Known, joint: str = '') -> list[str]:
+    """Return the lines of a parameter file that say how well parameters are known."""
+    return [
+        '    # The parameters named, their values and the covariance of these, row after row, in '
+        'SI units.',
+        *(f'    {joint}{key}: {yaml_text(x)}' for key, x in known.parameters().items())]
 
 
 def _line(key: str, value: Any, found: Identification, name: str) -> str:
     """Return the line of a value with its deviation and interval."""
     estimate = found.parameters[name]
     if not estimate.free:
-        return f'    {key}: {_yaml(value)}  # not identified'
+        return f'    {key}: {yaml_text(value)}  # not identified'
     unit = f' {QUANTITIES[name].unit}' if QUANTITIES[name].unit else ''
     of = '' if key.endswith(name) or '.' in key and name in _LISTS else f'{name} '
     return (
-        f'    {key}: {_yaml(value)}  # {of}standard deviation {estimate.std:.3g}{unit}, 95 % '
+        f'    {key}: {yaml_text(value)}  # {of}standard deviation {estimate.std:.3g}{unit}, 95 % '
         f'interval {estimate.low:.6g} to {estimate.high:.6g}')
 
 
-def _yaml(value: Any) -> str:
+def yaml_text(value: Any) -> str:
     """Return a value as every reader of YAML takes it, numbers with a point."""
     if isinstance(value, bool):
         return 'true' if value else 'false'
@@ -206,7 +192,7 @@ def _yaml(value: Any) -> str:
         mantissa, letter, exponent = text.partition('e')
         return f'{mantissa}.0e{exponent}' if letter and '.' not in mantissa else text
     if isinstance(value, list):
-        return f'[{", ".join(_yaml(x) for x in value)}]'
+        return f'[{", ".join(yaml_text(x) for x in value)}]'
     if isinstance(value, str):
         return "'" + value.replace("'", "''") + "'"
     return str(value)

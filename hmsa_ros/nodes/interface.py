@@ -78,6 +78,8 @@ CLOCK_TOPIC = _topic(topics.CLOCK_TOPIC)
 DIAGNOSTICS = _topic(topics.DIAGNOSTICS)
 
 STOP = _service(topics.STOP)
+RESET_ESTIMATE = _service(topics.RESET_ESTIMATE)
+SAVE_ESTIMATE = _service(topics.SAVE_ESTIMATE)
 RESET = _service(topics.RESET)
 STEP = _service(topics.STEP)
 SET_PAUSED = _service(topics.SET_PAUSED)

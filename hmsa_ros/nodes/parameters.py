@@ -31,6 +31,10 @@ __all__ = [
     'INITIAL_STRETCH', 'JOINT', 'ParameterSpec', 'refusal']
 
 
+# What hmsa identify once wrote beside the rest.
+_ONCE = {'identification.verdict', 'identification.noise_std'}
+
+
 def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
     """
     Return the descriptor that ``ros2 param describe`` shows.
@@ -162,7 +166,7 @@ def check_names(node: Node) -> None:
     if not unknown:
         return
     others = {spec.name for name in topics.NODES
-              for spec in import_module(f'hmsa_ros.nodes.{name}').PARAMETERS}
+              for spec in import_module(f'hmsa_ros.nodes.{name}').PARAMETERS} | _ONCE
     joints = node.get_parameter('joints').value or () if node.has_parameter('joints') else None
     for name in unknown:
         joint, _, rest = name.partition('.')

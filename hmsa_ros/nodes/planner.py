@@ -1,6 +1,7 @@
 """Planner node: setpoints in, the shaped stream of stamped flux density commands out."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import zip_longest
 import math
 from time import monotonic_ns
@@ -108,7 +109,11 @@ class PlannerNode(ManagedNode):
         topic = interface.JOINT_TRAJECTORY
         self.create_subscription(
             topic.type, topic.name, self._on_trajectory, topic.qos, raw=True)
-        self.create_service(interface.STOP.type, interface.STOP.name, self._on_stop)
+        for service, callback in (
+                (interface.STOP, self._on_stop),
+                (interface.RESET_ESTIMATE, self._on_reset_estimate),
+                (interface.SAVE_ESTIMATE, self._on_save_estimate)):
+            self.create_service(service.type, service.name, callback)
         # Steady time: timers on simulated time fire once a /clock message at the most, and
         # what is due is decided by the node's clock anyhow.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -156,6 +161,15 @@ class PlannerNode(ManagedNode):
         response.message = verdict.message
         self._serve()
         return response
+
+    def _on_reset_estimate(
+            self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return _answered(response, self._runtime.feedback.reset)
+
+    def _on_save_estimate(
+            self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return _answered(response, partial(
+            self._runtime.feedback.save, by_joint=bool(self._settings['joints'])))
 
     def _on_sample(self, data: bytes) -> None:
         # Most of a thousand samples a second are of no use, and reading them takes time.
@@ -286,6 +300,15 @@ class PlannerNode(ManagedNode):
         self._runtime.change(
             settings_from(changed), models, simultaneous=changed['simultaneous_arrival'])
         return SetParametersResult(successful=True)
+
+
+def _answered(response: Trigger.Response, work: Callable[[], str]) -> Trigger.Response:
+    """Return the response with what some work says, or why it is refused."""
+    try:
+        response.message, response.success = work(), True
+    except BadInputError as error:
+        response.message, response.success = str(error), False
+    return response
 
 
 def main(args: Sequence[str] | None = None) -> int:

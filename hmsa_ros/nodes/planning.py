@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 import math
 from typing import Any
 
@@ -10,6 +11,7 @@ from hmsa_ros.contract.parameters import (
     FIXED,
     FLUX_DENSITY_MAX,
     FLUX_DENSITY_MIN,
+    KNOWN,
     SLEW_LIMIT,
 )
 from hmsa_ros.core.group import PlannerGroup
@@ -19,6 +21,7 @@ from hmsa_ros.core.shapers import SHAPERS
 from hmsa_ros.core.timeline import Model
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification.known import Known
 from hmsa_ros.identification.quantities import check_free
 from hmsa_ros.nodes.joints import JointParameters, JOINTS
 from hmsa_ros.nodes.managed import AUTOSTART
@@ -51,6 +54,7 @@ OWN = (
     replace(COIL_TIME_CONSTANT, read_only=False),
     replace(FLUX_DENSITY_MIN, read_only=False),
     replace(FLUX_DENSITY_MAX, read_only=False),
+    *KNOWN,
 )
 
 SPECS = (
@@ -123,6 +127,14 @@ SPECS = (
         'What feedback estimates besides the state: shear_modulus, damping_coefficient, '
         'stretch_bias, remanence, chain_limit, coil_time_constant and others of hmsa identify.'),
     ParameterSpec(
+        'feedback_frozen', _SETTINGS.feedback_frozen,
+        'Whether feedback keeps the parameters as it has learnt them, and follows the state '
+        'alone.', read_only=False),
+    ParameterSpec(
+        'feedback_file', _SETTINGS.feedback_file,
+        'File that ~/save_estimate writes what was learnt to; planner and plant take it as a '
+        'parameter file.', read_only=False),
+    ParameterSpec(
         'takeover_timeout', _SETTINGS.takeover_timeout / NANOSECONDS,
         'How long the first request waits for a plant or a driver, and for a sample of the '
         'current state if samples are published; 0 for no wait.', 's', 0.0, 60.0),
@@ -183,6 +195,10 @@ def settings_from(values: JointParameters) -> Settings:
         allow_partial_joints=bool(values['allow_partial_joints']),
         feedback=str(values['feedback']),
         feedback_parameters=check_free(values['feedback_parameters']),
+        feedback_frozen=bool(values['feedback_frozen']),
+        feedback_file=str(values['feedback_file']),
+        known={name: _of(values, name, partial(Known.read, values.of(name)))
+               for name in values.names},
         tolerances=Tolerances(*(float(values[f'{x}_tolerance']) for x in (
             'arrival', 'vibration', 'stretch'))))
 

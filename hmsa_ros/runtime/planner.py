@@ -66,6 +66,8 @@ class PlannerRuntime:
         Whether requests are taken.
     following : Following
         What really happened, and the counters of it.
+    feedback : Feedback
+        What samples say of the joints.
     clock_jumps : int
         Counter.
 
@@ -87,9 +89,9 @@ class PlannerRuntime:
         self._watch = Watch(group, steady)
         self._bulletin = Bulletin(group, self.following, self._watch, clock, steady, unheard)
         self._sending = Sending(group, self.following, self._bulletin.outputs)
-        self._feedback = Feedback(group, settings, self._bulletin.outputs, clock)
+        self.feedback = Feedback(group, settings, self._bulletin.outputs, clock)
         self._planning = Planning(
-            group, self.following, Corrections(group, self._feedback, clock), self._bulletin,
+            group, self.following, Corrections(group, self.feedback, clock), self._bulletin,
             clock, steady, lambda: self._sending.send(clock()))
         self._last_jump: int | None = None
 
@@ -161,7 +163,7 @@ class PlannerRuntime:
         if self._takeover.waiting or not self._takeover.engaged:
             self._takeover.samples.add(joint, Sample(stamp, stretch, rate, flux_density))
         self._watch.add(joint, stamp, stretch)
-        self._feedback.add(joint, stamp, stretch)
+        self.feedback.add(joint, stamp, stretch)
 
     def clock_set_back(self, back: int) -> None:
         """Begin anew where the clock was set back by some ns; the state in force is read again."""
@@ -170,7 +172,7 @@ class PlannerRuntime:
         self.following.restart()
         self._planning.clear()
         self._watch.restart()
-        self._feedback.restart()
+        self.feedback.restart()
         self._takeover.drop()
         self._takeover.engaged = False
         last, self._last_jump = self._last_jump, self._steady()
@@ -206,7 +208,7 @@ class PlannerRuntime:
         if settings.heartbeat_period != self.settings.heartbeat_period:
             self._sending.next_beat = self._clock() + settings.heartbeat_period
         self.settings = settings
-        for name, model in self._feedback.change(settings, models).items():
+        for name, model in self.feedback.change(settings, models).items():
             self.group.planners[name].take_model(model)
         self.group.simultaneous = simultaneous
 
@@ -216,12 +218,12 @@ class PlannerRuntime:
     def wants_samples(self) -> bool:
         """Whether samples are waited for now, or will be of use soon."""
         return self._takeover.waiting or self.active and (
-            self._watch.open or self._feedback.on)
+            self._watch.open or self.feedback.on)
 
     def looks_at(self, stamp: int) -> bool:
         """Return whether a sample with a stamp in ns is of use; most are not."""
         return (self._takeover.waiting or self._watch.wants(stamp)
-                or self._feedback.looks_at(stamp))
+                or self.feedback.looks_at(stamp))
 
     @property
     def wake(self) -> int | None:
@@ -233,7 +235,7 @@ class PlannerRuntime:
         now = self._clock()
         times = [
             self.group.next_command(), self._bulletin.next_change, self._bulletin.preview_again,
-            self._watch.wake(now), self._feedback.wake]
+            self._watch.wake(now), self.feedback.wake]
         if self.settings.heartbeat_period:
             times.append(self._sending.next_beat)
         if self.following.astray:
@@ -265,7 +267,7 @@ class PlannerRuntime:
                 self._work_on()
             self._sending.send(now)
             self._sending.beat(now, self.settings)
-            self._feedback.update(now)
+            self.feedback.update(now)
         self._work_on()
         if self._bulletin.preview_again is not None and now >= self._bulletin.preview_again:
             self._bulletin.show()

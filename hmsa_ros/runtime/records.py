@@ -8,6 +8,7 @@ from hmsa_ros.core.group import Progress
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation.prior import TRACKED
+from hmsa_ros.identification.known import Known
 from hmsa_ros.runtime.measured import Finding, Tolerances
 
 
@@ -39,6 +40,12 @@ class Settings:
         ``off``; ``observe`` to estimate from samples; ``adapt`` to correct plans too.
     feedback_parameters : tuple of str
         What is estimated besides the state.
+    feedback_frozen : bool
+        Whether these stay as they are, and the state alone is estimated.
+    feedback_file : str
+        Where to write what was learnt; empty for nowhere.
+    known : mapping of str to Known
+        By joint, how well parameters are known before the first sample.
 
     Raises
     ------
@@ -57,6 +64,9 @@ class Settings:
     tolerances: Tolerances = field(default_factory=Tolerances)
     feedback: str = 'off'
     feedback_parameters: tuple[str, ...] = TRACKED
+    feedback_frozen: bool = False
+    feedback_file: str = ''
+    known: Mapping[str, Known] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check the numbers."""

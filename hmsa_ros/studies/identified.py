@@ -33,10 +33,10 @@ def belief_of(path: Path) -> Belief:
 
     """
     found = read_belief(path)
-    numbers = found.actuator.numbers
+    numbers, known = found.actuator.numbers, found.known
     means, names, places = [], [], []
-    slopes = np.eye(len(found.names))
-    for place, name in enumerate(found.names):
+    slopes = np.eye(len(known.names))
+    for place, name in enumerate(known.names):
         if name in numbers:
             column, mean = f'actuator.{name}', numbers[name]
         elif name in _OTHERS:
@@ -47,8 +47,8 @@ def belief_of(path: Path) -> Belief:
             # rho = G (T/L)^2, to first order.
             mean = numbers['density']
             slopes[place, place] = 2.0 * mean / found.actuator.time_unit
-            if 'shear_modulus' in found.names:
-                slopes[place, found.names.index('shear_modulus')] = (
+            if 'shear_modulus' in known.names:
+                slopes[place, known.names.index('shear_modulus')] = (
                     mean / numbers['shear_modulus'])
         names.append(column)
         means.append(mean)
@@ -57,6 +57,6 @@ def belief_of(path: Path) -> Belief:
         raise BadInputError(
             f'{path} has no covariance of the block: expected a file that hmsa identify --out '
             'wrote')
-    covariance = slopes @ found.covariance @ slopes.T
+    covariance = slopes @ known.covariance @ slopes.T
     return Belief(
         tuple(names), np.array(means, dtype=np.float64), covariance[np.ix_(places, places)])

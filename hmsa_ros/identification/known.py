@@ -1,0 +1,103 @@
+"""How well parameters are known: what an identification, or feedback, leaves for the next run."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from hmsa_ros.core.model import Array
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification.quantities import check_free
+
+#: Where parameter files have it.
+PREFIX = 'identification.'
+# Smallest eigenvalue of the correlation.
+_SINGULAR = 1e-12
+
+
+def _nothing() -> Array:
+    return np.zeros((0, 0))
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """
+    Values and their covariance, in SI.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Parameters; empty if nothing was identified.
+    values : tuple of float
+        Of these, in the same order; empty if they are only known from elsewhere.
+    covariance : ndarray, shape (p, p)
+        Of the values.
+
+    Raises
+    ------
+    BadInputError
+        If the sizes do not match, a number is not finite, or the covariance is none.
+
+    """
+
+    names: tuple[str, ...] = ()
+    values: tuple[float, ...] = ()
+    covariance: Array = field(default_factory=_nothing)
+
+    def __post_init__(self) -> None:
+        """Check that it is a covariance of these values."""
+        matrix, size = self.covariance, len(self.names)
+        if matrix.shape != (size, size) or not np.all(np.isfinite(matrix)):
+            raise BadInputError(
+                f'{PREFIX}covariance has {matrix.size} numbers for {size} names: expected '
+                f'{size ** 2} finite ones')
+        if len(self.values) not in (0, size):
+            raise BadInputError(
+                f'{PREFIX}values has {len(self.values)} numbers for {size} names: expected '
+                f'{size}')
+        scale = np.sqrt(np.abs(np.diag(matrix)))
+        if not np.all(scale > 0.0) or size and (
+                not np.allclose(matrix, matrix.T, 1e-6, 0.0)
+                or np.min(np.linalg.eigvalsh(matrix / np.outer(scale, scale))) < _SINGULAR):
+            raise BadInputError(
+                f'{PREFIX}covariance is not one: expected a symmetric matrix with positive '
+                'eigenvalues, row after row')
+
+    @classmethod
+    def read(cls, settings: Mapping[str, Any]) -> 'Known':
+        """
+        Return what parameters by dotted name say.
+
+        Raises
+        ------
+        BadInputError
+            If they cannot be used.
+
+        """
+        names, values, flat = (
+            settings.get(PREFIX + x) or [] for x in ('names', 'values', 'covariance'))
+        if not names:
+            return cls()
+        free = check_free(names)
+        try:
+            matrix = np.array(flat, dtype=np.float64).ravel()
+            numbers = tuple(float(x) for x in values)
+        except (TypeError, ValueError):
+            raise BadInputError(
+                f'{PREFIX}values and {PREFIX}covariance are not all numbers: expected numbers') \
+                from None
+        square = matrix.size == len(free) ** 2
+        return cls(free, numbers, matrix.reshape(len(free), -1) if square else matrix)
+
+    def value(self, name: str) -> float | None:
+        """Return a value; None where there is none."""
+        if name not in self.names or not self.values:
+            return None
+        return self.values[self.names.index(name)]
+
+    def parameters(self) -> dict[str, list[Any]]:
+        """Return the parameters by dotted name, the inverse of `read`."""
+        return {
+            f'{PREFIX}names': list(self.names), f'{PREFIX}values': list(self.values),
+            f'{PREFIX}covariance': self.covariance.ravel().tolist()}

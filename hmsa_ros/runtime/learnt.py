@@ -1,0 +1,87 @@
+"""What was learnt of an actuator: as a model to plan with, and as a parameter file."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from datetime import datetime
+
+import numpy as np
+
+from hmsa_ros.contract.actuator import parameters_of
+from hmsa_ros.core.simulation import check_stretch
+from hmsa_ros.core.timeline import Model
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.estimation import Estimate
+from hmsa_ros.identification.files import known_lines, yaml_text
+from hmsa_ros.identification.known import Known
+from hmsa_ros.identification.quantities import derivative, QUANTITIES
+
+# A model is another one from this share of a parameter, and this many of its deviations, on.
+_NEWS, _SURE = 1e-3, 2.0
+# Parameters of planner and plant besides those of the block.
+_OTHERS = ('coil_time_constant', 'stretch_bias', 'stretch_gain')
+
+
+def learnt_model(model: Model, estimate: Estimate, held: float) -> Model:
+    """Return a model with an estimate's parameters; as it is if that cannot hold a stretch."""
+    try:
+        found = Model(estimate.actuator, replace(
+            model.options, coil_time_constant=estimate.values['coil_time_constant']))
+        check_stretch(held, found.material, 'stretch')
+    except BadInputError:
+        return model
+    return found
+
+
+def differs(model: Model, estimate: Estimate) -> bool:
+    """Return whether an estimate is known to be of another actuator than a model."""
+    for key in estimate.free:
+        value = estimate.values[key]
+        before = model.options.coil_time_constant if key == 'coil_time_constant' else getattr(
+            model.actuator, key, value)
+        if abs(value - before) > max(_NEWS * abs(value), _SURE * estimate.deviations[key]):
+            return True
+    return False
+
+
+def known_of(estimate: Estimate) -> Known:
+    """Return how well an estimate knows parameters."""
+    count = len(estimate.free)
+    values = tuple(estimate.values[x] for x in estimate.free)
+    scale = np.array([derivative(x, y) for x, y in zip(estimate.free, values, strict=True)])
+    return Known(
+        estimate.free, values,
+        np.outer(scale, scale) * estimate.covariance[:count, :count])
+
+
+def file_text(estimates: Mapping[str, Estimate], now: datetime) -> str:
+    """
+    Return a parameter file with what was learnt.
+
+    Parameters
+    ----------
+    estimates : mapping of str to Estimate
+        By joint; the name is empty where parameters are those of all joints.
+    now : datetime
+        Date of it.
+
+    Returns
+    -------
+    str
+        YAML as planner and plant take it, with what the planner needs to go on.
+
+    """
+    lines = [
+        f'# What feedback learnt of an actuator until {now.isoformat(" ", "seconds")}.',
+        '# Planner and plant take it after their own parameter file.',
+        '/**:', '  ros__parameters:']
+    for joint, estimate in estimates.items():
+        prefix = f'{joint}.' if joint else ''
+        given = parameters_of(estimate.actuator) | {
+            x: estimate.values[x] for x in _OTHERS if x in estimate.free}
+        for key, value in given.items():
+            name = key.rpartition('.')[2]
+            note = f'  # standard deviation {estimate.deviations[name]:.3g} ' \
+                f'{QUANTITIES[name].unit}'.rstrip() if name in estimate.free else ''
+            lines.append(f'    {prefix}{key}: {yaml_text(value)}{note}')
+        lines += known_lines(known_of(estimate), prefix)
+    return '\n'.join(lines) + '\n'
