@@ -29,21 +29,21 @@ PAYLOAD = bytes((0, 1, 0, 0)) + bytes(8)
 MEGA = 2**20
 DECLARED = schema(1, FLOAT, b'float64 data\n') + channel(1, 1, '/a')
 
-# Reads a bag in every way there is, with no more memory than it is given.
+# Reads bags in every way there is, each in a process with no more memory than it is given.
 READER = """
-import resource, sys
+import os, resource, sys
 from hmsa_ros.bag.info import summarize, to_json, to_text
 from hmsa_ros.bag.reader import BagReader
 from hmsa_ros.bag.recover import recover
 from hmsa_ros.errors import HmsaError
 import lz4.frame, mcap_ros2.decoder, zstandard
-resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[3]) * 2**20,) * 2)
-try:
-    reader = BagReader(sys.argv[1], max_chunk_size=int(sys.argv[2]) * 2**20)
+
+def read(path, chunk):
+    reader = BagReader(path, max_chunk_size=int(chunk) * 2**20)
     count = sum(1 for _ in reader.messages())
     print(count, *reader.problems, sep='\\n')
     reader.counts()
-    to_json(summarize(sys.argv[1])), to_text(summarize(sys.argv[1]))
+    to_json(summarize(path)), to_text(summarize(path))
     for topic in reader.topics:
         try:
             decode = reader.decoder(topic)
@@ -51,19 +51,31 @@ try:
                 decode(message.data)
         except HmsaError as error:
             print(error)
-except HmsaError as error:
-    print(error)
+
+memory, *rest = sys.argv[1:]
+for path, chunk in zip(rest[::2], rest[1::2]):
+    child = os.fork()
+    if not child:
+        resource.setrlimit(resource.RLIMIT_AS, (int(memory) * 2**20,) * 2)
+        try:
+            read(path, chunk)
+        except HmsaError as error:
+            print(error)
+        sys.stdout.flush()
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0, path
+    print(end='\\0', flush=True)
 """
 
 
-def read_apart(path, *, chunk=4, memory=300):
-    """Read a bag in a process of few mebibytes; return what it said."""
+def read_apart(*files, memory=300):
+    """Read bags, each with its largest chunk in MiB, in processes of few MiB; return outputs."""
     result = subprocess.run(
-        [sys.executable, '-c', READER, str(path), str(chunk), str(memory)], check=False,
-        capture_output=True, text=True, env={**os.environ, 'PYTHONPATH': str(ROOT)})
+        [sys.executable, '-c', READER, str(memory), *(str(x) for file in files for x in file)],
+        check=False, capture_output=True, text=True, env={**os.environ, 'PYTHONPATH': str(ROOT)})
     assert result.returncode == 0, result.stderr
     assert not result.stderr
-    return result.stdout
+    return result.stdout.split('\0')[:-1]
 
 
 def message(data=PAYLOAD, time=1):
@@ -116,10 +128,13 @@ def hostile_files():
 
 
 def test_sizes_that_lie_take_no_memory(tmp_path):
+    files, wanted = [], []
     for name, content, expected in hostile_files():
         path = tmp_path / f'{name}.mcap'
         path.write_bytes(BEGIN + content + DECLARED + message() + END)
-        output = read_apart(path, chunk=16 if name == 'message of many messages' else 4)
+        files.append((path, 16 if name == 'message of many messages' else 4))
+        wanted.append((name, expected))
+    for (name, expected), output in zip(wanted, read_apart(*files), strict=True):
         assert expected in output, f'{name}: {output}'
         if name != 'large record':
             # What comes after it is read all the same.
@@ -132,7 +147,7 @@ def test_a_file_with_holes_takes_no_memory(tmp_path):
         with path.open('wb') as file:
             file.write(BEGIN + DECLARED + message() + struct.pack('<BQ', opcode, 2**36))
             file.truncate(2**36 + 2**20)
-        output = read_apart(path)
+        output, = read_apart((path, 4))
         assert int(output.split('\n', 1)[0]) == 1
         assert 'skipped' in output or 'is not complete' in output
 
@@ -187,7 +202,7 @@ def test_metadata_made_to_do_harm_are_left_aside(tmp_path, name):
     if isinstance(bomb, str):
         bomb = bomb.replace('{there}', str(there)).encode()
     (bag / 'metadata.yaml').write_bytes(bomb)
-    output = read_apart(bag)
+    output, = read_apart((bag, 4))
     assert output.startswith('1\n')
     assert 'the files themselves are read' in output
     assert not there.exists()
@@ -199,7 +214,7 @@ def test_metadata_that_are_no_file_are_left_aside(tmp_path):
     for make in (os.mkfifo, lambda path: path.symlink_to('/dev/zero'),
                  lambda path: path.symlink_to(path)):
         make(bag / 'metadata.yaml')
-        assert read_apart(bag).startswith('1\n')
+        assert read_apart((bag, 4))[0].startswith('1\n')
         (bag / 'metadata.yaml').unlink()
 
 
@@ -245,7 +260,7 @@ def test_profiles_made_to_do_harm_are_left_aside(tmp_path):
         path.write_bytes(BEGIN + schema(1, FLOAT, b'float64 data\n') + channel(
             1, 1, '/a', {'offered_qos_profiles': text[:2 * MEGA]})
             + message() + END)
-        output = read_apart(path)
+        output, = read_apart((path, 4))
         assert output.startswith('1\n')
 
 

@@ -12,7 +12,7 @@ PROGRAM = """
 from pathlib import Path
 import sys
 from hmsa_ros.core import compiling
-compiling._HERE = Path('/proc/nowhere')
+compiling._HERE = Path(sys.argv[2])
 compiling.stamp = lambda: sys.argv[1]
 
 @compiling.compiled()
@@ -25,15 +25,17 @@ print(double(2.1), sum(double.stats.cache_hits.values()))
 """
 
 
-def run(cache: Path | None, stamp: str = 'a') -> 'tuple[float, int, str]':
+def run(
+        cache: Path | None, stamp: str = 'a', package: str | Path = '/proc/nowhere',
+) -> 'tuple[float, int, str]':
     """Return the result, how often the cache gave it, and what was said."""
     environment = {**os.environ, 'HOME': '/proc/nowhere', 'XDG_CACHE_HOME': '/proc/nowhere'}
     environment.pop('NUMBA_CACHE_DIR', None)
     if cache is not None:
         environment['NUMBA_CACHE_DIR'] = str(cache)
     done = subprocess.run(
-        [sys.executable, '-W', 'error', '-c', PROGRAM, stamp], capture_output=True, text=True,
-        env=environment, check=True)
+        [sys.executable, '-W', 'error', '-c', PROGRAM, stamp, package], capture_output=True,
+        text=True, env=environment, check=True)
     result, hits = done.stdout.split()
     return float(result), int(hits), done.stderr
 
@@ -62,3 +64,11 @@ def test_an_entry_of_other_sources_is_replaced(tmp_path):
     assert run(tmp_path, 'b')[1] == 0
     assert run(tmp_path, 'b')[1] == 1
     assert len(list(tmp_path.rglob('*.hmsa'))) == 1
+
+
+def test_what_came_with_the_package_is_used_where_the_folder_is_empty(tmp_path):
+    package, folder = tmp_path / 'package', tmp_path / 'folder'
+    assert run(None, package=package)[1] == 0
+    assert run(folder, package=package)[1:] == (1, '')
+    assert list(folder.rglob('*.hmsa')) == []
+    assert run(folder, 'b', package)[1] == 0

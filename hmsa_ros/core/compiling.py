@@ -130,29 +130,33 @@ class _Entries:
     """The compiled versions of a function, a file each: a checksum, then what it holds."""
 
     def __init__(self, folder: str, name: str) -> None:
-        self._start = Path(folder) / name
+        self._folder, self._name = Path(folder), name
 
-    def _path(self, key: Any) -> Path:
+    def _file(self, key: Any) -> str:
         # Without the hash of the code, so that a new version takes the place of the old one.
-        name = hashlib.sha256(repr(key[:2]).encode()).hexdigest()[:16]
-        return self._start.with_name(f'{self._start.name}-{name}.hmsa')
+        made = hashlib.sha256(repr(key[:2]).encode()).hexdigest()[:16]
+        return f'{self._name}-{made}.hmsa'
 
     def load(self, key: Any) -> Any:
         """Return the compiled function, None where there is none, or an old or damaged one."""
-        try:
-            data = self._path(key).read_bytes()
-        except FileNotFoundError:
-            return None
-        # Damaged machine code would crash the process.
-        if zlib.crc32(data[4:]).to_bytes(4, 'little') != data[:4]:
-            return None
-        made, kept, compiled_function = pickle.loads(data[4:])
-        return compiled_function if (made, kept) == (stamp(), repr(key)) else None
+        # What was compiled with the installation serves a folder that is still empty too.
+        for folder in dict.fromkeys((self._folder, _HERE / '__pycache__')):
+            try:
+                data = (folder / self._file(key)).read_bytes()
+            except OSError:
+                continue
+            # Damaged machine code would crash the process.
+            if zlib.crc32(data[4:]).to_bytes(4, 'little') != data[:4]:
+                continue
+            made, kept, compiled_function = pickle.loads(data[4:])
+            if (made, kept) == (stamp(), repr(key)):
+                return compiled_function
+        return None
 
     def save(self, key: Any, compiled_function: Any) -> None:
         """Keep a compiled function."""
         data = serialize.dumps((stamp(), repr(key), compiled_function))
-        path = self._path(key)
+        path = self._folder / self._file(key)
         beside = path.with_suffix(f'.{os.getpid()}')
         try:
             beside.write_bytes(zlib.crc32(data).to_bytes(4, 'little') + data)
