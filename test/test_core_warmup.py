@@ -5,8 +5,10 @@ import subprocess
 import sys
 
 PROGRAM = """
+from dataclasses import replace
 import json
-from hmsa_ros.core import creep_kernel, kernels, lag_kernel, law, shooting_kernel, two_step_kernel
+from hmsa_ros.core import creep_kernel, creep_plan_kernel, kernels, lag_kernel, law
+from hmsa_ros.core import shooting_kernel, two_step_kernel
 from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.planner import Options, Planner
@@ -16,7 +18,8 @@ from hmsa_ros.core.warmup import warm_up
 def signatures():
     return {
         name: len(kernel.signatures)
-        for module in (law, creep_kernel, kernels, lag_kernel, shooting_kernel, two_step_kernel)
+        for module in (law, creep_kernel, creep_plan_kernel, kernels, lag_kernel,
+                       shooting_kernel, two_step_kernel)
         for name, kernel in vars(module).items()
         if hasattr(kernel, 'signatures')}
 
@@ -27,8 +30,11 @@ for options in (
         {}, {'period': millisecond}, {'slew_limit': 30.0}, {'shaper': 'robust'},
         {'shaper': 'minimum_time'}, {'shaper': 'ei'}, {'shaper': 'step'},
         {'period': millisecond, 'slew_limit': 100.0}, {'short_spell': 'continue'},
-        {'coil_time_constant': 3e-4}, {'coil_time_constant': 3e-4, 'period': millisecond}):
-    planner = Planner(paper_actuator(), Options(
+        {'coil_time_constant': 3e-4}, {'coil_time_constant': 3e-4, 'period': millisecond},
+        {'creep': Creep((0.1, 0.2), (0.01, 0.1))},
+        {'creep': Creep((0.1,), (0.01,)), 'period': millisecond}):
+    block = replace(paper_actuator(), creep=options.pop('creep', Creep()))
+    planner = Planner(block, Options(
         flux_density_min=-0.5, flux_density_max=0.5, lead_time=0, **options))
     plant = ActuatorSimulation(
         paper_actuator(), slew_limit=options.get('slew_limit', float('inf')),

@@ -197,6 +197,7 @@ def _answer(question: str) -> str:
 
 def _records(given: Mapping[str, float]) -> 'tuple[ActuatorParameters, Coil]':
     """Return the block and its coil."""
+    from hmsa_ros.core.creep import Creep
     from hmsa_ros.core.parameters import ActuatorParameters
     from hmsa_ros.core.scales import Coil
 
@@ -208,7 +209,8 @@ def _records(given: Mapping[str, float]) -> 'tuple[ActuatorParameters, Coil]':
     block = {x.parameter.partition('.')[2]: given[x.key] for x in QUANTITIES
              if x.parameter.startswith('actuator.')}
     return (
-        ActuatorParameters(damping_coefficient=damping, law=None, **block),
+        ActuatorParameters(
+            damping_coefficient=damping, law=None, creep=Creep(), **block),
         Coil(given['flux_min'], given['flux_max'], given['slew_limit']))
 
 

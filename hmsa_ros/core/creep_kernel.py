@@ -129,6 +129,42 @@ def _follow_one(k, state, beta, slope, excess, decay, duration, material, branch
 
 
 @compiled()
+def trajectory_creeping(
+        l, v, switches, loads, slopes, times, material, branches, rtol, out):  # noqa: E741
+    """
+    Sample the response to a piecewise linear load at increasing times.
+
+    Arguments are those of `hmsa_ros.core.kernels.trajectory`; ``branches`` (n, 3) is at the
+    start and goes on with the state. ``out`` (2 + n, m) takes stretch, rate and what the
+    branches follow. Returns the status of the integration.
+    """
+    count = branches.shape[0]
+    k = np.empty((STAGES + 2, 2 + count))
+    state = np.array([l, v, 0.0])
+    t, piece = switches[0], 0
+    for i in range(times.size):
+        while True:
+            end = times[i]
+            ends = piece + 1 < switches.size and switches[piece + 1] <= end
+            if ends:
+                end = switches[piece + 1]
+            status = _follow_one(
+                k, state, loads[piece] + slopes[piece] * (t - switches[piece]), slopes[piece],
+                0.0, 0.0, end - t, material, branches, rtol)
+            if status != DONE:
+                return status
+            t = end
+            if not ends:
+                break
+            piece += 1
+            state[2] = 0.0
+        out[0, i], out[1, i] = state[0], state[1]
+        for b in range(count):
+            out[2 + b, i] = branches[b, FOLLOWER]
+    return DONE
+
+
+@compiled()
 def follow_creeping(
         k, first, last, wanted, state, drive, material, branches, durations, rtol, status):
     """

@@ -188,7 +188,7 @@ def draft_stop(outset: Outset) -> Steps[Draft]:
     model, state = outset.model, outset.state
     work = work_space()
     found = brake(model, work, state)
-    if (holdable(model, found.stretch) == found.stretch
+    if (holdable(model, found.stretch) == found.stretch and not model.material.creep
             and (model.delivery.ideal or found.duration == 0.0 and _settled(model, state))):
         move = Move(Code.HOLD, tuple(
             [Level(0.0, found.load)] * (found.duration > 0.0)
@@ -298,7 +298,8 @@ def _meeting(outset: Outset, state: State, following: int) -> int | None:
     unit = level.model.units
     here = replace(
         level, stretch=state.stretch, rate=state.rate / unit.time,
-        in_force=state.load * unit.load, amplifier=scaled(state.amplifier, unit.load))
+        in_force=state.load * unit.load, amplifier=scaled(state.amplifier, unit.load),
+        followed=state.followed)
     return place if agree(here, level) else None
 
 
@@ -333,7 +334,7 @@ def placed_level(model: Model, stamp: int, flux_density: float, state: State) ->
     unit = model.units
     return PlannedLevel(
         stamp, flux_density, state.stretch, state.rate / unit.time, state.load * unit.load, model,
-        scaled(state.amplifier, unit.load))
+        scaled(state.amplifier, unit.load), state.followed)
 
 
 def _placed(
@@ -345,8 +346,11 @@ def _placed(
         raise ValueError('a segment on the timeline knows the load it starts from')
     levels = []
     time = 0.0
+    known = len(segment.move.levels) - len(segment.move.tail)
     for number, level in enumerate(segment.move.levels):
-        if number:
+        if number >= known:
+            state = segment.move.tail[number - known]
+        elif number:
             state = model.follow(state, segment.move.levels[number - 1].load, level.time - time)
         time = level.time
         levels.append(placed_level(

@@ -225,7 +225,8 @@ def _rests(draft: Draft, segment: PlannedSegment) -> bool:
     """Whether a joint can as well begin a move later, since it rests until then."""
     level = draft.levels[bisect_left(draft.levels, segment.begin, key=lambda x: x.stamp)]
     model = level.model
-    return (
+    # What creeps has relaxed further by then.
+    return not model.material.creep and (
         abs(level.rate) * model.units.time <= _AT_REST
         and math.isclose(
             level.in_force / model.units.load, model.holding(level.stretch), rel_tol=_AT_REST,

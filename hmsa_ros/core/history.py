@@ -162,7 +162,10 @@ def agree(one: PlannedLevel, other: PlannedLevel) -> bool:
         <= _AS_PLANNED * model.frequency(one.stretch)
         and _same(one.in_force, other.in_force)
         and (one.amplifier is None) is (other.amplifier is None)
-        and _same(one.amplifier or 0.0, other.amplifier or 0.0))
+        and _same(one.amplifier or 0.0, other.amplifier or 0.0)
+        and len(one.followed) == len(other.followed)
+        and all(abs(x - y) <= _AS_PLANNED for x, y in zip(
+            one.followed, other.followed, strict=True)))
 
 
 def _same(one: float, other: float) -> bool:

@@ -1,6 +1,6 @@
 """Records of a move: state, level, command and the limits it keeps."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 from hmsa_ros.core.status import Code, RefusedError
@@ -24,6 +24,8 @@ class State:
         slew limit makes the next level start from it, or where the field lags.
     amplifier : float or None
         Load that a field that lags is following; None where the two are the same.
+    followed : tuple of float
+        Elastic force that each Maxwell branch has followed; empty where they have relaxed.
 
     """
 
@@ -31,6 +33,7 @@ class State:
     rate: float = 0.0
     load: float = math.nan
     amplifier: float | None = None
+    followed: tuple[float, ...] = ()
 
     @property
     def ramps_from(self) -> float:
@@ -71,6 +74,11 @@ class Move:
         Time until rest at the target; infinite where it is only approached.
     reason : str
         Why it is not the requested command; empty if it is.
+    tail : tuple of State
+        Predicted at the last levels, which hold the target while branches relax; empty where
+        none do.
+    vibration : float
+        Bound of the vibration of the stretch that these levels leave, peak to peak.
 
     """
 
@@ -78,6 +86,16 @@ class Move:
     levels: tuple[Level, ...]
     duration: float
     reason: str = ''
+    tail: tuple[State, ...] = ()
+    vibration: float = 0.0
+
+    def until(self, time: float) -> 'Move':
+        """Return the move without the levels from a time on."""
+        # Times on a grid are rounded.
+        levels = tuple(x for x in self.levels if x.time < (1.0 - 1e-12) * time)
+        return replace(
+            self, levels=levels,
+            tail=self.tail[:max(len(self.tail) - len(self.levels) + len(levels), 0)])
 
 
 @dataclass(frozen=True)

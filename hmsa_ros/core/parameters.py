@@ -1,6 +1,6 @@
 """Parameters of an actuator, in SI units and as the nondimensional group of Eq. 11."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 import math
 import sys
@@ -8,6 +8,7 @@ import sys
 import numpy as np
 from numpy.typing import NDArray
 
+from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.laws.record import Elastic
 from hmsa_ros.core.units import MU_0
 from hmsa_ros.errors import BadInputError, excerpt
@@ -15,6 +16,7 @@ from hmsa_ros.errors import BadInputError, excerpt
 _ZERO_ALLOWED = ('zeta', 'damping_coefficient')
 # Infinite for neo-Hookean.
 _INFINITE_ALLOWED = ('j_lim', 'chain_limit')
+_NO_NUMBERS = ('law', 'creep')
 # Units and groups beyond this and its inverse are of no block, and overflow in the equations.
 _SMALLEST = 1e-100
 
@@ -23,10 +25,12 @@ def _check(record: object) -> None:
     """Refuse a record with a field that is out of range."""
     for field in fields(record):  # type: ignore[arg-type]
         value = getattr(record, field.name)
-        if field.name == 'law':
-            if value is not None and not isinstance(value, Elastic):
-                raise BadInputError(
-                    f'law is {excerpt(value)}: expected an elastic law, or none for Gent')
+        if field.name == 'law' and value is not None and not isinstance(value, Elastic):
+            raise BadInputError(
+                f'law is {excerpt(value)}: expected an elastic law, or none for Gent')
+        if field.name == 'creep' and not isinstance(value, Creep):
+            raise BadInputError(f'creep is {excerpt(value)}: expected Maxwell branches, or none')
+        if field.name in _NO_NUMBERS:
             continue
         if not isinstance(value, (int, float)) or isinstance(value, bool):
             raise BadInputError(f'{field.name} is {value!r}: expected a number')
@@ -59,6 +63,8 @@ class NondimensionalParameters:
         critical implies 2 (H = L).
     law : Elastic, optional
         Elastic energy in units of G, in place of the Gent model: J_lim is then without effect.
+    creep : Creep
+        Maxwell branches beside the law, their times in units of time; default none.
 
     Raises
     ------
@@ -71,6 +77,7 @@ class NondimensionalParameters:
     j_lim: float = 5.0
     c1: float = 2.0
     law: Elastic | None = None
+    creep: Creep = Creep()
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -82,6 +89,19 @@ class NondimensionalParameters:
         from hmsa_ros.core import law  # imports Numba, which not all who have parameters need
 
         return law.pack(self.zeta, self.j_lim, self.c1, self.law)
+
+    @cached_property
+    def branches(self) -> NDArray[np.float64]:
+        """Stiffness and 1/time of each branch that holds anything, shape (n, 2)."""
+        return np.array([
+            (ratio, 1.0 / time) for ratio, time in zip(
+                self.creep.ratios, self.creep.times, strict=True) if ratio > 0.0
+        ]).reshape(-1, 2)
+
+    @cached_property
+    def elastic(self) -> 'NondimensionalParameters':
+        """The group without its branches."""
+        return replace(self, creep=Creep())
 
 
 @dataclass(frozen=True)
@@ -108,6 +128,8 @@ class ActuatorParameters:
     law : Elastic, optional
         Elastic energy in units of G, in place of the Gent model: the chain limit is then without
         effect.
+    creep : Creep
+        Maxwell branches beside the law, for planning; default none.
 
     Raises
     ------
@@ -124,6 +146,7 @@ class ActuatorParameters:
     chain_limit: float
     damping_coefficient: float
     law: Elastic | None = None
+    creep: Creep = Creep()
 
     def __post_init__(self) -> None:
         """Check the values, and that the equations can be scaled by them."""
@@ -137,6 +160,7 @@ class ActuatorParameters:
                 f'the parameters of the actuator give a unit of time of {scales[0]:g} s, of flux '
                 f'density of {scales[1]:g} T and c1 of {scales[2]:g}: expected values of a block, '
                 'in SI units')
+        self.creep.check(scales[0])
 
     @classmethod
     def from_nondimensional(
@@ -170,12 +194,14 @@ class ActuatorParameters:
         damping = (8.0 * material.zeta * unfinished.half_length * half_thickness
                    * math.sqrt(density * shear_modulus))
         return cls(shear_modulus, density, half_length, half_thickness, remanence,
-                   material.j_lim, damping, material.law)
+                   material.j_lim, damping, material.law, replace(
+                       material.creep, times=tuple(
+                           x * unfinished.time_unit for x in material.creep.times)))
 
     @property
     def numbers(self) -> dict[str, float]:
         """All that is a number, by name."""
-        return {x.name: getattr(self, x.name) for x in fields(self) if x.name != 'law'}
+        return {x.name: getattr(self, x.name) for x in fields(self) if x.name not in _NO_NUMBERS}
 
     @property
     def time_unit(self) -> float:
@@ -196,7 +222,8 @@ class ActuatorParameters:
             / (area * math.sqrt(self.density * self.shear_modulus)),
             j_lim=self.chain_limit,
             c1=2.0 * (self.half_thickness / self.half_length) ** 2,
-            law=self.law)
+            law=self.law,
+            creep=replace(self.creep, times=tuple(x / self.time_unit for x in self.creep.times)))
 
 
 def paper_actuator(material: NondimensionalParameters | None = None) -> ActuatorParameters:

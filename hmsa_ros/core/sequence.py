@@ -1,5 +1,6 @@
 """Plans for a sequence of setpoints (Eq. 14), each from where the last one really ends."""
 
+from bisect import bisect_right
 from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, replace
 import math
@@ -12,7 +13,7 @@ from hmsa_ros.core.model import elastic_force, natural_frequency
 from hmsa_ros.core.moves import Level, Limits, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.setpoint import Setpoint
-from hmsa_ros.core.shapers import get_shaper
+from hmsa_ros.core.shapers import creeping, get_shaper
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.simulation import check_stretch, follow, longest_motion, simulate
 from hmsa_ros.core.status import Code, RefusedError
@@ -122,6 +123,7 @@ def segments(
         raise BadInputError(
             f'short_spell is {short_spell!r}: expected one of {", ".join(SHORT_SPELL)}')
     shape = get_shaper(shaper)
+    creeping.check(material, delivery, shaper)
     limits = limits or Limits()
     units = units or Units()
     state = start or State(1.0)
@@ -131,10 +133,10 @@ def segments(
     setpoint = next(upcoming, None)
     while setpoint is not None:
         following = next(upcoming, None)
-        move = _rounded(
-            shape(Request(
-                state, setpoint.stretch, material, limits, delivery, order, units)),
-            delivery)
+        request = Request(state, setpoint.stretch, material, limits, delivery, order, units)
+        move = creeping.held(
+            request, _rounded(shape(request), delivery),
+            math.inf if following is None else setpoint.span)
         # Both are rounded: a span that the move fills exactly is long enough.
         if setpoint.span * (1.0 + 1e-12) < move.duration < math.inf:
             if short_spell == 'refuse':
@@ -146,6 +148,8 @@ def segments(
                     'move')
             move = _cut(move, setpoint, units, last=following is None)
         end = _follow(state, move, setpoint, material, delivery)
+        if following is not None and move.tail:
+            move = move.until(setpoint.span)
         yield Segment(setpoint, begin, state, end, move)
         begin += setpoint.span
         state = end
@@ -154,10 +158,10 @@ def segments(
 
 def _cut(move: Move, setpoint: Setpoint, units: Units, *, last: bool) -> Move:
     """Return a move that its setpoint leaves no time for; the last one is finished."""
-    levels = move.levels if last else tuple(x for x in move.levels if x.time < setpoint.span)
-    return Move(
-        Code.SPELL_TOO_SHORT, levels, move.duration if last else math.inf,
-        f'the span {units.time_text(setpoint.span)} ends before stretch '
+    return replace(
+        move if last else move.until(setpoint.span), code=Code.SPELL_TOO_SHORT,
+        duration=move.duration if last else math.inf,
+        reason=f'the span {units.time_text(setpoint.span)} ends before stretch '
         f'{setpoint.stretch:g} is reached, which takes {units.time_text(move.duration)}')
 
 
@@ -177,11 +181,29 @@ def _follow(
         end = max(end, setpoint.span)
     if math.isnan(state.load):
         state = replace(state, load=float(elastic_force(state.stretch, material)))
+    if move.tail:
+        return _follow_tail(state, move, end, setpoint.stretch, material, delivery)
     parts, last = ramps(move.levels, state.ramps_from, end, delivery.slew)
     settled = longest_motion(last, material) + delivery.settling(0.0)
-    end = min(end, max(parts[-1][0], 0.0) + settled)
+    if not material.creep:
+        end = min(end, max(parts[-1][0], 0.0) + settled)
     _check_known(state, parts, end, setpoint.stretch, material, delivery.lag)
     return follow(move.levels, state, end, material, delivery)
+
+
+def _follow_tail(
+        state: State, move: Move, end: float, target: float, material: NondimensionalParameters,
+        delivery: Delivery) -> State:
+    """Return the state at a time after the arrival, where what branches do is known."""
+    if move.duration > 0.0:
+        parts, _ = ramps(
+            move.until(move.duration).levels, state.load, move.duration, delivery.slew)
+        _check_known(state, parts, move.duration, target, material, delivery.lag)
+    place = bisect_right(move.levels, end, key=lambda x: x.time) - 1
+    level = move.levels[place]
+    return follow(
+        (replace(level, time=0.0),), move.tail[place - len(move.levels)], end - level.time,
+        material, delivery)
 
 
 def _check_known(
@@ -197,7 +219,7 @@ def _check_known(
     switches, loads, slopes = np.array(parts).T
     stretch, _ = simulate(
         switches, loads, times, material, rtol=_LOOK_RTOL, stretch=state.stretch,
-        rate=state.rate, slopes=slopes, lag=lag, field=state.load)
+        rate=state.rate, slopes=slopes, lag=lag, field=state.load, followed=state.followed)
     for widest, beyond in ((np.min(stretch), -1.0), (np.max(stretch), 1.0)):
         limit = elastic.limits[beyond > 0.0]
         if beyond * (widest - limit) > 0.0:

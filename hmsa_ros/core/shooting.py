@@ -19,6 +19,7 @@ from hmsa_ros.core import shooting_kernel
 from hmsa_ros.core.delivery import Delivery
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.moves import Level
+from hmsa_ros.core.simulation import followed_by
 
 if TYPE_CHECKING:
     from hmsa_ros.core.shapers.request import Request
@@ -69,7 +70,8 @@ def solve(template: Template, request: 'Request', delivery: Delivery | None = No
     status, duration = shooting_kernel.solve(
         times, loads, template.d_times, template.d_loads, float(state.stretch),
         float(state.rate), float(request.field), float(request.load), float(request.target),
-        float(delivery.slew), float(delivery.lag), request.material.packed)
+        float(delivery.slew), float(delivery.lag), request.material.packed,
+        request.material.branches, np.array(followed_by(state, request.material)))
     if status != shooting_kernel.SOLVED:
         return None
     levels = tuple(Level(t, x) for t, x in zip(times.tolist(), loads.tolist(), strict=True))

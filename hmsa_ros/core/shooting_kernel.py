@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from hmsa_ros.core.compiling import compiled
+from hmsa_ros.core.creep_plan_kernel import respond_creeping
 from hmsa_ros.core.kernels import DONE, respond, STUCK
 from hmsa_ros.core.lag_kernel import respond_late
 from hmsa_ros.core.law import elastic_stiffness, natural_frequency
@@ -114,13 +115,14 @@ def _place(values, first, slopes, unknowns, share, step):
 @compiled()
 def solve(
         times, loads, d_times, d_loads, l, v, field, load, target, slew, lag,  # noqa: E741
-        material):
+        material, branches, followed):
     """
     Move levels along unknowns until they end at rest at the target, in place.
 
     ``d_times`` and ``d_loads`` (n, 2) are the derivatives of ``times`` and ``loads`` (n,) by two
     unknowns. With a lag of the field there are three: the ``field`` has to arrive at the last
-    load as well, and what ramps begin at the amplifier's ``load``. Returns the status and the
+    load as well, and what ramps begin at the amplifier's ``load``. Branches (n, 2) have
+    ``followed`` (n,) at the start; with any, nothing ramps or lags. Returns the status and the
     duration, the last ramp included.
     """
     room = 2 * times.size
@@ -158,6 +160,10 @@ def solve(
                     l, v, field, durations[:count], begins[:count], slopes[:count],
                     d_durations[:count], d_begins[:count], lag, material, rtol, jacobian)
                 misses[2] = (late - loads[-1]) / stiffness
+            elif count > 0 and followed.size > 0:
+                status, end, speed = respond_creeping(
+                    l, v, followed, durations[:count], begins[:count], d_durations[:count],
+                    d_begins[:count], material, branches, rtol, jacobian)
             elif count > 0:
                 status, end, speed = respond(
                     l, v, durations[:count], begins[:count], slopes[:count],

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hmsa_ros.core import kernels, lag_kernel, law
+from hmsa_ros.core import creep_kernel, kernels, lag_kernel, law
 from hmsa_ros.core.actuators import Actuators, check_stretch, RTOL, Setup
 from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.delivery import Delivery, Piece, ramps
@@ -36,7 +36,7 @@ def simulate(
         switches: ArrayLike, loads: ArrayLike, times: ArrayLike,
         material: NondimensionalParameters, *, stretch: float = 1.0, rate: float = 0.0,
         slopes: ArrayLike | None = None, rtol: float = RTOL, lag: float = 0.0,
-        field: float = math.nan) -> tuple[Array, Array]:
+        field: float = math.nan, followed: Sequence[float] = ()) -> tuple[Array, Array]:
     """
     Sample the response to a piecewise constant or linear load.
 
@@ -60,6 +60,8 @@ def simulate(
         Time constant with which the field follows these loads; 0 for at once.
     field : float
         Load in force at the first switch, for a lag; default the first of ``loads``.
+    followed : sequence of float
+        What the Maxwell branches have followed at the first switch; default relaxed.
 
     Returns
     -------
@@ -88,6 +90,11 @@ def simulate(
         raise BadInputError(
             'switches and times must not decrease, and no time may lie before the first switch')
     check_stretch(stretch, material)
+    if material.creep:
+        sampled = _creeping(
+            switches, loads, slope, times, State(stretch, rate, followed=tuple(followed)),
+            material, rtol)
+        return sampled[0], sampled[1]
     out = np.empty((3, times.size))
     if lag > 0.0:
         status = lag_kernel.trajectory_late(
@@ -107,10 +114,56 @@ def follow(
         delivery: Delivery) -> State:
     """Return the state that levels lead to at a time after the last of them, without checks."""
     pieces, last = ramps(levels, state.ramps_from, end, delivery.slew)
+    if material.creep:
+        return _follow_creeping(pieces, last, state, end, material)
     if delivery.lag > 0.0:
         return _follow_late(pieces, last, state, end, material, delivery.lag)
     stretch, rate = _endpoint(pieces, end, material, state.stretch, state.rate)
     return State(stretch, rate, last)
+
+
+def followed_by(state: State, material: NondimensionalParameters) -> tuple[float, ...]:
+    """Return what each branch that holds anything has followed in a state."""
+    count = len(material.branches)
+    if len(state.followed) == count:
+        return state.followed
+    return (float(law.elastic_force(state.stretch, material.packed)),) * count
+
+
+def _creeping(
+        switches: Array, loads: Array, slopes: Array, times: Array, state: State,
+        material: NondimensionalParameters, rtol: float) -> Array:
+    """Return samples of stretch, rate and what branches follow, shape (2 + n, m)."""
+    branches = np.column_stack([material.branches, followed_by(state, material)])
+    out = np.empty((2 + len(branches), times.size))
+    status = creep_kernel.trajectory_creeping(
+        float(state.stretch), float(state.rate), switches, loads, slopes, times, material.packed,
+        branches, float(rtol), out)
+    if status != kernels.DONE:
+        raise HmsaError(_STUCK)
+    return out
+
+
+def _follow_creeping(
+        pieces: Sequence[Piece], last: float, state: State, end: float,
+        material: NondimensionalParameters) -> State:
+    """Integrate until vibration has ended; from then on branches relax alone."""
+    switches, loads, slopes = np.array(pieces).T.copy()
+    rings = min(end, max(pieces[-1][0], 0.0) + longest_motion(last, material))
+    stretch, rate, *followed = _creeping(
+        switches, loads, slopes, np.array([float(rings)]), state, material, RTOL)[:, 0].tolist()
+    if rings == end:
+        return State(stretch, rate, last, followed=tuple(followed))
+    # Without inertia the elastic force is linear in what the branches follow, which follows it.
+    ratios, speeds = material.branches.T
+    share = ratios / (1.0 + np.sum(ratios))
+    values, vectors = np.linalg.eig(speeds[:, None] * (share - np.eye(len(share))))
+    left = np.linalg.solve(vectors, np.array(followed) - last)
+    relaxed = last + np.real(vectors @ (left * np.exp(values * (end - rings))))
+    force = last + float(share @ (relaxed - last))
+    return State(
+        float(law.equilibrium_stretch(force, material.packed)), 0.0, last,
+        followed=tuple(relaxed.tolist()))
 
 
 def _follow_late(

@@ -16,7 +16,7 @@ from hmsa_ros.core.delivery import Delivery, pieces
 from hmsa_ros.core.moves import Level, Limits, State
 from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.core.sequence import SHORT_SPELL
-from hmsa_ros.core.shapers import get_shaper
+from hmsa_ros.core.shapers import creeping, get_shaper
 from hmsa_ros.core.simulation import follow, longest_motion, simulate
 from hmsa_ros.core.status import Code
 from hmsa_ros.core.units import NANOSECONDS, Units
@@ -125,6 +125,7 @@ class Model:
         }
         for name, value in worked_out.items():
             object.__setattr__(self, name, value)
+        creeping.check(self.material, self.delivery, options.shaper)
 
     def ns(self, time: float) -> int:
         """Return a nondimensional time in ns."""
@@ -153,7 +154,8 @@ class Model:
         return State(
             state.stretch, state.rate / other.units.time * self.units.time,
             state.load * other.units.load / self.units.load,
-            scaled(scaled(state.amplifier, other.units.load), 1.0 / self.units.load))
+            scaled(scaled(state.amplifier, other.units.load), 1.0 / self.units.load),
+            creeping.carried(state, other.material, self.material))
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,6 +178,8 @@ class PlannedLevel:
     amplifier : float or None
         Output of the amplifier in T predicted at the stamp; None where the field does not lag
         behind it.
+    followed : tuple of float
+        What Maxwell branches have followed by then, in units of G; empty where they have relaxed.
 
     """
 
@@ -186,6 +190,7 @@ class PlannedLevel:
     in_force: float
     model: Model = field(repr=False)
     amplifier: float | None = None
+    followed: tuple[float, ...] = ()
 
     def at(self, time: int) -> State:
         """Predict the nondimensional state at a time in ns; before the stamp, as at the stamp."""
@@ -201,11 +206,13 @@ class PlannedLevel:
         units = self.model.units
         return State(
             self.stretch, self.rate * units.time, self.in_force / units.load,
-            scaled(self.amplifier, 1.0 / units.load))
+            scaled(self.amplifier, 1.0 / units.load), self.followed)
 
     def _longest(self) -> float:
         """Return for how long the motion is worth following."""
         model = self.model
+        if model.material.creep:
+            return math.inf
         end = self.flux_density / model.units.load
         return model.delivery.settling(end - self._begin().ramps_from) \
             + longest_motion(end, model.material)
@@ -215,6 +222,8 @@ class PlannedLevel:
         if self.stamp == ALWAYS or all(x == self.stamp for x in times):
             return [(self.stretch, self.rate)] * len(times)
         model = self.model
+        if model.material.creep:
+            return [(x.stretch, x.rate / model.units.time) for x in map(self.at, times)]
         end = self.flux_density / model.units.load
         longest = self._longest()
         after = [min(model.time(x - self.stamp), longest) for x in times]
@@ -232,7 +241,8 @@ class PlannedLevel:
         units = level.model.units
         return replace(
             self, stretch=state.stretch, rate=state.rate / units.time,
-            in_force=state.load * units.load, amplifier=scaled(state.amplifier, units.load))
+            in_force=state.load * units.load, amplifier=scaled(state.amplifier, units.load),
+            followed=state.followed)
 
 
 @dataclass(frozen=True, slots=True)

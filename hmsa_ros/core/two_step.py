@@ -110,6 +110,10 @@ def plan_two_step(
             f'start {start!r}, target {target!r}, rate {rate!r}: expected finite numbers')
     if not 1e-14 <= rtol <= 1e-4:
         raise BadInputError(f'rtol is {rtol!r}: expected 1e-14 to 1e-4')
+    if material.creep:
+        raise BadInputError(
+            'the group has Maxwell branches: expected one without, or plan_sequence for one that '
+            'creeps')
     status, beta_p, tau_p, beta_1, passes = kernel.two_step(
         _WORK, float(start), float(rate), float(target), material.packed,
         float(load_limits[0]), float(load_limits[1]), float(rtol), HOLD_TOLERANCE)

@@ -31,6 +31,7 @@ _DELIVERIES = (
     Options(shaper='zvd', period=_MILLISECOND),
     Options(coil_time_constant=5e-4),
 )
+_CREEP = Creep((0.1,), (0.1,))
 
 
 def warm_up(
@@ -46,7 +47,7 @@ def warm_up(
     batch : bool
         Also the parallel one, which no node uses.
     creep : bool
-        Also the one of a plant whose elastomer creeps.
+        Also those for an elastomer that creeps.
     planning : bool
         Also those that plan, which no plant uses.
 
@@ -68,7 +69,11 @@ def warm_up(
         else:
             _simulate(Creep())
         if creep:
-            _simulate(Creep((0.1,), (0.1,)))
+            _simulate(_CREEP)
+        if creep and planning:
+            planner = Planner(replace(paper_actuator(), creep=_CREEP), Options(lead_time=0))
+            planner.setpoint(1.2, 0)
+            planner.setpoint(1.1, _MILLISECOND)
     return perf_counter() - begin
 
 

@@ -6,7 +6,7 @@ before the level that holds the target. On a grid the heights of three levels ar
 through ramps and at any time two heights and a time.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import product
 import math
@@ -134,26 +134,32 @@ def three_levels(request: Request, code: Code, reason: str) -> Move:
         If there is none of up to seven half periods.
 
     """
+    found = free_heights(request, _FREE_LOADS)
+    if found is None:
+        raise RefusedError(*_refusal(request))
+    return Move(code, *found, reason)
+
+
+def free_heights(request: Request, free: Sequence[tuple[str, int]]) -> Attempt:
+    """Solve for levels of free heights, all as long: the shortest that keep the limits."""
     holding = request.holding_load()
-    for length in _lengths(request, holding):
-        times = [i * length for i in range(4)]
-        begin = 0.5 * (request.load + holding)
-        guess = tuple(
-            Level(t, x) for t, x in zip(times, (begin, holding, holding, holding), strict=True))
-        found = solve(Template.of(guess, _FREE_LOADS), request)
+    for length in _lengths(request, holding, len(free)):
+        guess = [Level(0.0, 0.5 * (request.load + holding))]
+        guess += [Level((1 + i) * length, holding) for i in range(len(free))]
+        found = solve(Template.of(guess, free), request)
         if found is not None and request.keeps(found[0]):
-            return Move(code, *found, reason)
-    raise RefusedError(*_refusal(request))
+            return found
+    return None
 
 
-def _lengths(request: Request, holding: float) -> Iterator[float]:
-    """Yield how long each of three levels may last."""
+def _lengths(request: Request, holding: float, count: int) -> Iterator[float]:
+    """Yield how long each of so many levels may last."""
     delivery = request.delivery
     half = math.pi / law.natural_frequency(request.target, request.material.packed)
     ramp = delivery.ramp(holding - request.load)
     before = 0.0
     for share in _LENGTHS:
-        each = (share * half + delivery.lag + ramp) / 3.0
+        each = (share * half + delivery.lag + ramp) / count
         if delivery.period > 0.0:
             each = math.ceil(each / delivery.period) * delivery.period
         each = delivery.rounded(each)

@@ -14,6 +14,7 @@ import math
 from hmsa_ros.core import law
 from hmsa_ros.core.delivery import IDEAL
 from hmsa_ros.core.moves import Level, Move, State
+from hmsa_ros.core.shapers.creeping import arrival
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.shapers.two_step import two_step
 from hmsa_ros.core.status import Code
@@ -49,7 +50,7 @@ def robust(request: Request) -> Move:
     if request.order == 1 or move.code is not Code.TWO_STEP:
         return move
     # Waypoints belong to the actuator, not to the hardware: they come from the ideal command.
-    ideal = replace(request, delivery=IDEAL)
+    ideal = replace(request, delivery=IDEAL, material=request.material.elastic)
     chain = two_step(ideal)
     for _ in range(request.order - 1):
         waypoints = [
@@ -58,7 +59,7 @@ def robust(request: Request) -> Move:
         chain = _chain(ideal, [*waypoints, request.target])
         if chain.code is not Code.ROBUST:
             return _single(move, request, chain)
-    if not request.delivery.ideal:
+    if request.material.creep or not request.delivery.ideal:
         chain = _chain(request, [*waypoints, request.target])
     return chain if chain.code is Code.ROBUST else _single(move, request, chain)
 
@@ -87,7 +88,10 @@ def _chain(request: Request, waypoints: list[float]) -> Move:
         if begin == levels[-1].time:
             # No ramp to finish: the next command takes over at once.
             levels.pop()
-        state = State(waypoint, 0.0, last.load)
+        if request.material.creep:
+            state = arrival(replace(request, state=state, target=waypoint), move)
+        else:
+            state = State(waypoint, 0.0, last.load)
     if begin > levels[-1].time and levels[-1].load == last.load:
         return Move(Code.ROBUST, tuple(levels), begin)
     return Move(Code.ROBUST, (*levels, Level(begin, last.load)), begin)

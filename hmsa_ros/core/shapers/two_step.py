@@ -8,7 +8,9 @@ import math
 import numpy as np
 
 from hmsa_ros.core import law
+from hmsa_ros.core.delivery import IDEAL
 from hmsa_ros.core.moves import Level, Limits, Move
+from hmsa_ros.core.shapers.creeping import free_levels, two_levels
 from hmsa_ros.core.shapers.lagged import at_rest, settle, three_levels
 from hmsa_ros.core.shapers.minimum_time import minimum_time
 from hmsa_ros.core.shapers.request import Request
@@ -54,6 +56,8 @@ def two_step(request: Request) -> Move:
     """
     if request.delivery.lag > 0.0:
         return _late(request)
+    if request.material.creep:
+        return _creeping(request)
     holding = request.holding_load()
     state, material, target = request.state, request.material, request.target
     plan = plan_two_step(
@@ -83,6 +87,29 @@ def two_step(request: Request) -> Move:
     if request.delivery.period > 0.0:
         return _sampled(request, *ideal)
     return _ramped(request, *ideal)
+
+
+def _creeping(request: Request) -> Move:
+    """Have branches arrive wherever they do: what they hold then is followed afterwards."""
+    request.holding_load()
+    try:
+        move = two_step(replace(
+            request, material=request.material.elastic, delivery=IDEAL, limits=Limits()))
+    except RefusedError:
+        move = None
+    if move is not None and (move.code is Code.HOLD or math.isinf(move.duration)):
+        return move
+    found = None
+    if move is not None and move.code is Code.TWO_STEP:
+        found = two_levels(request, move)
+    if found is not None and request.delivery.period > 0.0:
+        with contextlib.suppress(RefusedError):
+            return _sampled(request, *found[0])
+    elif found is not None and request.keeps(found[0]):
+        return Move(Code.TWO_STEP, *found)
+    if found is not None and request.state.rate == 0.0:
+        request.check(found[0])
+    return free_levels(request)
 
 
 def _late(request: Request) -> Move:

@@ -1,0 +1,184 @@
+"""
+Moves of an elastomer that creeps, and the levels that keep it at rest afterwards.
+
+A branch adds stiffness to a fast motion: level and duration of a move are found from those
+without branches, while their stiffness grows. At arrival the branches still hold something. To
+stay at rest the level has to follow it: psi'(l_d) + sum h_i exp(-t/tau_i), as a staircase.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from hmsa_ros.core import creep_plan_kernel as kernel
+from hmsa_ros.core import law
+from hmsa_ros.core.creep import Creep
+from hmsa_ros.core.creep_kernel import RATIO, SPEED
+from hmsa_ros.core.delivery import Delivery, IDEAL
+from hmsa_ros.core.moves import Level, Move, State
+from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.core.shapers.lagged import free_heights
+from hmsa_ros.core.shapers.request import Request
+from hmsa_ros.core.shooting import approach, Attempt, solve, Template
+from hmsa_ros.core.simulation import follow, followed_by
+from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.errors import BadInputError
+
+#: Shapers that know of creep.
+SHAPERS = ('two_step', 'robust', 'step')
+# Vibration that the staircase is to leave, as a share of the move, the least move that counts, and
+# how much more it may be.
+_RIPPLE, _LEAST_MOVE, _SURE = 8e-7, 1e-3, 1.25
+# Levels of a staircase at the most, and how its vibration grows until it has no more.
+_MOST, _COARSER = 300, 1.5
+_SHORTEST_STRIDE = 0.03
+# Time for which a target is held at the least.
+_SHORTEST = 1e-9
+
+
+def check(material: NondimensionalParameters, delivery: Delivery, shaper: str) -> None:
+    """
+    Refuse what creep is not planned for yet.
+
+    Raises
+    ------
+    BadInputError
+        If something creeps and the amplifier ramps, the field lags or the shaper is another.
+
+    """
+    if not material.creep:
+        return
+    if delivery.lag > 0.0 or delivery.slew < np.inf:
+        raise BadInputError(
+            'viscoelastic.ratio is set and so is '
+            + ('coil_time_constant' if delivery.lag > 0.0 else 'slew_limit')
+            + ': expected 0 for one of them, since creep is planned for a field that steps only')
+    if shaper not in SHAPERS:
+        raise BadInputError(
+            f'shaper {shaper} does not know of viscoelastic.ratio: expected one of '
+            + ', '.join(SHAPERS))
+
+
+def carried(
+        state: State, before: NondimensionalParameters,
+        after: NondimensionalParameters) -> tuple[float, ...]:
+    """Return what branches have followed of a state, for another material."""
+    # What they remember is a stretch: at rest, they are relaxed under any law.
+    if len(state.followed) != len(after.branches):
+        return ()
+    found = tuple(
+        float(law.elastic_force(law.equilibrium_stretch(x, before.packed), after.packed))
+        for x in state.followed)
+    return found if np.all(np.isfinite(found)) else ()
+
+
+def two_levels(request: Request, plain: Move) -> Attempt:
+    """Solve for level and duration with branches, given those without them."""
+    material, state = request.material, request.state
+    ratios, speeds = material.branches.T
+    frequency = law.natural_frequency(request.target, material.packed)
+    # How much of a branch a motion as fast as this feels.
+    felt = 1.0 / (1.0 + (speeds / frequency) ** 2)
+    force = float(law.elastic_force(state.stretch, material.packed))
+    held = force - np.array(followed_by(state, material))
+
+    def stiffer(levels: tuple[Level, ...], share: float, aim: float) -> Attempt:
+        before, after = np.expm1(share * np.log1p(ratios)), np.expm1(aim * np.log1p(ratios))
+        stiffness = (1.0 + felt @ after) / (1.0 + felt @ before)
+        load = force + after @ held + stiffness * (levels[0].load - force - before @ held)
+        guess = (Level(0.0, float(load)),
+                 Level(levels[1].time / float(np.sqrt(stiffness)), levels[1].load))
+        there = request if aim == 1.0 else replace(request, material=replace(
+            material, creep=Creep(tuple(after.tolist()), tuple((1.0 / speeds).tolist()))))
+        return solve(Template.of(guess, [('load', 0), ('time', 1)]), there, IDEAL)
+
+    return approach(plain.levels, stiffer, _SHORTEST_STRIDE)
+
+
+def free_levels(request: Request) -> Move:
+    """
+    Come to rest by two levels of free heights.
+
+    Raises
+    ------
+    RefusedError
+        If there are none within the limits.
+
+    """
+    found = free_heights(request, [('load', 0), ('load', 1)])
+    if found is None:
+        raise RefusedError(
+            Code.NO_TWO_STEP,
+            f'no two flux densities within the limits bring stretch {request.target:g} of this '
+            'creeping elastomer to rest: expected wider limits, a smaller move or several '
+            'setpoints')
+    return Move(Code.MINIMUM_TIME, *found, (
+        f'no single intermediate flux density within the limits leads to rest at '
+        f'{request.target:g}: two are used'))
+
+
+def arrival(request: Request, found: Move) -> State:
+    """Return the state to which a move leads, at rest at the target."""
+    end = request.state
+    if found.duration > 0.0:
+        end = follow(
+            found.levels[:-1], request.state, found.duration, request.material, IDEAL)
+    return State(
+        request.target, 0.0, end.load,
+        followed=followed_by(end, request.material))
+
+
+def held(request: Request, found: Move, span: float) -> Move:
+    """
+    Return a move with the staircase that keeps it at rest while branches relax.
+
+    Parameters
+    ----------
+    request : Request
+        The move.
+    found : Move
+        As a shaper answers, with times as commands carry them.
+    span : float
+        Time from the start of the move until which it is held.
+
+    Returns
+    -------
+    Move
+        As it was where nothing creeps or the target is only approached.
+
+    Raises
+    ------
+    RefusedError
+        If a level is outside the limits.
+
+    """
+    material, delivery = request.material, request.delivery
+    if not material.creep or not found.duration < np.inf:
+        return found
+    end = arrival(request, found)
+    holding = float(law.elastic_force(request.target, material.packed))
+    branches = material.branches
+    excess = branches[:, RATIO] * (holding - np.array(end.followed))
+    ripple = _RIPPLE * max(abs(request.target - request.state.stretch), _LEAST_MOVE)
+    out = np.empty((_MOST, 4))
+    while True:
+        count, vibration = kernel.staircase(
+            excess, branches, float(request.target), material.packed, float(delivery.period),
+            max(span - found.duration, _SHORTEST), ripple, out)
+        if count >= 0:
+            break
+        ripple *= _COARSER
+    times, loads = out[:count, kernel.TIME], holding + out[:count, kernel.EXCESS]
+    levels = tuple(
+        Level(delivery.rounded(x), y)
+        for x, y in zip((found.duration + times).tolist(), loads.tolist(), strict=True))
+    request.check(levels)
+    followed = holding - (holding - np.array(end.followed)) * np.exp(
+        -np.outer(times, branches[:, SPEED]))
+    tail = tuple(
+        State(x, v, load, None, tuple(by)) for x, v, load, by in zip(
+            (request.target + out[:count, kernel.DEVIATION]).tolist(),
+            out[:count, kernel.RATE].tolist(), [end.load, *loads[:-1].tolist()],
+            followed.tolist(), strict=True))
+    return replace(
+        found, levels=found.levels[:-1] + levels, tail=tail, vibration=_SURE * vibration)
