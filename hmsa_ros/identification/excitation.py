@@ -23,19 +23,23 @@ from hmsa_ros.core.setpoint import Setpoint
 from hmsa_ros.core.status import RefusedError
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.quantities import check_free, DEFAULT_FREE, derivative, values_of
-from hmsa_ros.identification.recording import Recording
+from hmsa_ros.identification.recording import Course
 from hmsa_ros.identification.response import respond
 
 _PATTERN = 5  # levels in the pattern that is repeated
-_HALVINGS = 6  # of the search for the largest pattern inside the limits
-_FIRST, _STEPS = 24, 300  # random patterns, and steps that improve the best
-_LAST = 4.0  # durations of a period that the last move and its rest take
+# Tries to find the largest pattern inside the limits, what they aim at, and what is large enough.
+_SCALINGS, _AIM, _ALMOST = 5, 0.99, 0.97
+# Random patterns, how many of the best are improved in so many steps, and steps for the winner.
+_FIRST, _KEPT, _FEW, _STEPS = 150, 5, 60, 300
+_LEAST_DWELL, _MOST_DWELL = 0.2, 6.0  # periods on a level
+_BEGIN = 0.2  # periods of rest before the first level
+_LAST = 3.0  # durations of a period that the last move and its rest take
 _SHORTEST = 3.0  # duration in periods that holds a sequence at all
 _MARGIN = 0.95  # of the way to the limits of the chains
 #: The paper's sequence, and a pass of plain steps; stretches.
 PAPER = (1.1, 1.2, 1.4)
 PLAIN = (1.1, 1.4, 1.0)
-_WEIGHT = 2.0  # of the worst parameter against the volume
+_WEIGHT = 4.0  # of the worst parameter against the volume
 _WINDOW = 30.0  # periods over which patterns are compared
 _REST = 1e-3  # deviation from rest at the end, stretch
 
@@ -224,23 +228,20 @@ class Designer:
         return float(model.elastic_force(stretch, self._group)
                      ) * self._actuator.flux_density_unit
 
-    def _recording(self, times: Array, level_times: Array, levels: Array) -> Recording:
-        # Only levels and times count.
-        return Recording(
-            times, np.linspace(1.0, 1.5, len(times), dtype=np.float64), level_times, levels,
-            self._bounds.slew_limit)
+    def _course(self, times: Array, level_times: Array, levels: Array) -> Course:
+        return Course(times, level_times, levels, self._bounds.slew_limit)
 
     def judge(self, level_times: Array, levels: Array) -> Program | None:
         """Return the information in a sequence, None if its motion cannot be followed."""
         coarse = respond(
-            self._recording(self._dense, level_times, levels), self._values, (), rtol=1e-6)
+            self._course(self._dense, level_times, levels), self._values, (), rtol=1e-6)
         if coarse is None:
             return None
         reach = float(np.min(coarse.stretch)), float(np.max(coarse.stretch))
         late = self._dense > self.duration - 0.5 * self.period
         rest = float(np.ptp(coarse.stretch[late])) < _REST
         response = respond(
-            self._recording(self._times, level_times, levels), self._values, self._free,
+            self._course(self._times, level_times, levels), self._values, self._free,
             rtol=1e-6)
         if response is None:
             return None
@@ -264,7 +265,7 @@ class Designer:
         level_times, levels = level_times[keep], levels[keep]
         # Ramps have to be over before the last move begins.
         state = respond(
-            self._recording(
+            self._course(
                 np.linspace(0.0, end, 50, dtype=np.float64), level_times, levels), self._values,
             (), rtol=1e-9)
         time, level = self._actuator.time_unit, float(levels[-1])
@@ -291,7 +292,7 @@ class Designer:
         """Return the levels of a pattern that is repeated; the first is rest without field."""
         fields = [float(np.clip(x, *self._range)) for x in targets]
         times, levels = [0.0], [0.0]
-        now, i = 0.5 * self.period, 0
+        now, i = _BEGIN * self.period, 0
         while now < self.duration:
             times.append(now)
             levels.append(fields[i % len(fields)])
@@ -299,13 +300,15 @@ class Designer:
             i += 1
         return np.array(times), np.array(levels)
 
-    def _inside(self, level_times: Array, levels: Array) -> bool:
-        """Whether a motion keeps within the limits of the stretch."""
+    def _excess(self, level_times: Array, levels: Array) -> float:
+        """Return the largest motion from 1 as a share of what the limits of the stretch allow."""
         response = respond(
-            self._recording(self._dense, level_times, levels), self._values, (), rtol=1e-4)
-        return response is not None and bool(
-            np.min(response.stretch) >= self._bounds.stretch_min
-            and np.max(response.stretch) <= self._bounds.stretch_max)
+            self._course(self._dense, level_times, levels), self._values, (), rtol=1e-4)
+        if response is None:
+            return math.inf
+        return max(
+            (1.0 - float(np.min(response.stretch))) / (1.0 - self._bounds.stretch_min),
+            (float(np.max(response.stretch)) - 1.0) / (self._bounds.stretch_max - 1.0))
 
     def _score(self, found: Program | None) -> float:
         """Return the information of a sequence inside the limits, with a rest at its end."""
@@ -321,14 +324,15 @@ class Designer:
 
     def _judged(self, point: Array) -> tuple[float, Program | None]:
         """Judge a pattern, as large as the limits of the stretch let it be."""
-        small, large = 0.0, 1.0
-        for i in range(_HALVINGS):
-            middle = 1.0 if i == 0 else 0.5 * (small + large)
-            inside = self._inside(*self._pattern(
-                middle * point[:_PATTERN], point[_PATTERN:]))
-            small, large = (middle, large) if inside else (small, middle)
-            if small == 1.0:
+        small, share = 0.0, 1.0
+        for _ in range(_SCALINGS):
+            excess = self._excess(*self._pattern(share * point[:_PATTERN], point[_PATTERN:]))
+            if excess <= 1.0:
+                small = max(small, share)
+            if _ALMOST <= excess <= 1.0 or small == 1.0:
                 break
+            # What moves more is driven in proportion, and what cannot be followed by much less.
+            share = min(share * max(_AIM / excess, 0.3), 1.0)
         if not small:
             return -math.inf, None
         found = self.judge(*self._ended(*self._pattern(
@@ -351,47 +355,51 @@ class Designer:
                 self._actuator, self._bounds, _WINDOW * self.period, rate=self._rate,
                 noise=self._noise, free=self._free)
             part.search(seed)
-            found = self._judged(part.point)[1]
-            if found is not None and found.ends_at_rest:
+            score, found = self._judged(part.point)
+            if found is not None and score > -math.inf:
                 return found
         plain = self.plain()
         if plain is not None and all(math.isfinite(x) for x in plain.std.values()):
             self._reference = plain.std
         random = np.random.default_rng(seed)
         low, high = self._range
+        # Large steps to both sides, each with the time to ring; and at random, long and short.
+        points: list[Array] = [
+            np.append([0.5 * high, high, low, 0.0, 0.3 * high], np.full(_PATTERN, 4.0)),
+            *(np.append(random.uniform(low, high, _PATTERN), np.exp(
+                random.uniform(math.log(_LEAST_DWELL), math.log(_MOST_DWELL), _PATTERN)))
+              for _ in range(_FIRST))]
+        tried = sorted(((*self._judged(x), x) for x in points), key=lambda x: -x[0])[:_KEPT]
+        for steps in (_FEW, _STEPS):
+            tried = sorted((self._improved(*x, steps, random) for x in tried),
+                           key=lambda x: -x[0])[:1]
+        score, best, self.point = tried[0]
+        if best is None or score == -math.inf:
+            raise BadInputError(
+                f'no sequence keeps within stretches of {self._bounds.stretch_min:g} to '
+                f'{self._bounds.stretch_max:g} and ends at rest: expected wider limits or a '
+                'longer duration')
+        return best
 
-        point: Array = np.zeros(2 * _PATTERN)
-        best, score = None, -math.inf
-        for i in range(_FIRST):
-            trial: Array = np.append(
-                random.uniform(low, high, _PATTERN), random.uniform(0.3, 5.0, _PATTERN))
-            if i == 0:
-                # Large steps to both sides, each with the time to ring.
-                trial = np.append([0.5 * high, high, low, 0.0, 0.3 * high], np.full(
-                    _PATTERN, 4.0))
-            value, found = self._judged(trial)
-            if value > score:
-                best, score, point = found, value, trial
+    def _improved(
+            self, score: float, best: Program | None, point: Array, steps: int,
+            random: np.random.Generator) -> tuple[float, Program | None, Array]:
+        """Change the numbers of a pattern one by one, and keep what is better."""
+        low, high = self._range
         width = 0.5
-        for i in range(_STEPS):
+        for i in range(steps):
             trial = point.copy()
             place = i % len(trial)
             size = (high - low) if place < _PATTERN else 2.0
             trial[place] += width * size * random.standard_normal()
             trial[:_PATTERN] = np.clip(trial[:_PATTERN], low, high)
-            trial[_PATTERN:] = np.clip(trial[_PATTERN:], 0.2, 6.0)
+            trial[_PATTERN:] = np.clip(trial[_PATTERN:], _LEAST_DWELL, _MOST_DWELL)
             value, found = self._judged(trial)
             if value > score:
                 best, score, point = found, value, trial
             elif place == len(trial) - 1:
                 width = max(0.8 * width, 0.02)
-        if best is None:
-            raise BadInputError(
-                f'no sequence keeps within stretches of {self._bounds.stretch_min:g} to '
-                f'{self._bounds.stretch_max:g} and ends at rest: expected wider limits or a '
-                'longer duration')
-        self.point = point
-        return best
+        return score, best, point
 
     def plain(self, targets: Sequence[float] = PLAIN) -> Program | None:
         """Return one pass of plain steps, smaller where they would break the limits."""
@@ -399,7 +407,7 @@ class Designer:
         times = np.append(0.0, span * (np.arange(len(targets)) + 1e-3))
         for share in np.linspace(1.0, 0.1, 19).tolist():
             levels = np.append(0.0, [self._holding(1.0 + share * (x - 1.0)) for x in targets])
-            if np.all(np.isfinite(levels)) and self._inside(times, levels):
+            if np.all(np.isfinite(levels)) and self._excess(times, levels) <= 1.0:
                 return self.judge(times, levels)
         return None
 

@@ -199,6 +199,32 @@ class Recording:
         return least if float(np.max(np.abs(whole - np.round(whole)))) < 0.01 else 0.0
 
 
+@dataclass(frozen=True, eq=False)
+class Course:
+    """
+    What may be recorded: samples to come, not checked, as a search makes thousands.
+
+    Attributes
+    ----------
+    time : ndarray, shape (n,)
+        Times of the samples in s, increasing.
+    level_times, levels, slew_limit
+        As of a `Recording`.
+
+    """
+
+    time: Array
+    level_times: Array
+    levels: Array
+    slew_limit: float = math.inf
+    earlier: float = 0.0
+
+    @property
+    def uncertain(self) -> NDArray[np.int64]:
+        """Places of the levels that switch at an uncertain time: none."""
+        return np.zeros(0, np.int64)
+
+
 def pieces(
         times: Array, levels: Array, slew: float, begin: float
 ) -> tuple[Array, Array, Array]:

@@ -21,7 +21,7 @@ from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.units import MU_0
 from hmsa_ros.identification import kernels
 from hmsa_ros.identification.quantities import derivative, group_of, QUANTITIES
-from hmsa_ros.identification.recording import pieces, Recording
+from hmsa_ros.identification.recording import Course, pieces, Recording
 
 #: Relative tolerance of the integration: far below the noise of any sensor.
 RTOL = 1e-8
@@ -187,7 +187,7 @@ class Setup:
 
 
 def respond(
-        recording: Recording, values: Mapping[str, float], free: Sequence[str], *,
+        recording: Recording | Course, values: Mapping[str, float], free: Sequence[str], *,
         at_rest: bool = True, rtol: float = RTOL, shifts: Array | None = None
 ) -> Response | None:
     """
@@ -195,7 +195,7 @@ def respond(
 
     Parameters
     ----------
-    recording : Recording
+    recording : Recording or Course
         Its levels and the times of its samples.
     values : mapping of str to float
         Of all quantities.
