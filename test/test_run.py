@@ -19,6 +19,13 @@ MISMATCHED = """\
   ros__parameters:
     mismatch.shear_modulus: 1.1
 """
+CREEPING = """\
+/**:
+  ros__parameters:
+    actuator.density: 1900.0
+    viscoelastic.ratio: [0.1, 0.05]
+    viscoelastic.time: [0.02, 1.0]
+"""
 
 pytestmark = pytest.mark.ros
 
@@ -52,6 +59,23 @@ def test_a_plant_that_is_not_as_the_planner_thinks_fails_with_the_figures(start,
     again = start.hmsa('run', '1.10:0.1', '--simulate', '--out', str(tmp_path / 'out'))
     assert again.wait(RUN_SECONDS) == 2
     assert 'earlier run' in again.stderr
+
+
+def test_a_block_arrives_and_stays_though_it_creeps_and_not_where_feedback_would_not_know(
+        start, tmp_path):
+    file = tmp_path / 'creeping.yaml'
+    file.write_text(CREEPING)
+    run = start.hmsa('run', '1.4:0.1', '1.1:0.2', '--simulate', '--params-file', str(file),
+                     '--report', '--out', str(tmp_path / 'out'), '--json')
+    assert run.wait(RUN_SECONDS) == 0, run.output
+    for x, step in zip(json.loads(run.stdout)['setpoints'], (0.4, 0.3), strict=True):
+        # Unknown to the planner, creep leaves a fifth of the step.
+        assert x['residual'] < 1e-3 * step
+        assert abs(x['offset']) < 1e-3 * step
+    refused = start.hmsa('planner', '--ros-args', '--params-file', str(file), '-p',
+                         'feedback:=observe')
+    assert refused.wait(RUN_SECONDS) == 2, refused.output
+    assert 'expected feedback off, since estimates do not know of creep yet' in refused.stderr
 
 
 def test_an_interrupted_experiment_brings_the_running_actuator_to_rest(start, ros, tmp_path):

@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 import json
 import math
 from pathlib import Path
@@ -76,8 +77,9 @@ def run(arguments: argparse.Namespace) -> int:
 def _run_si(arguments: argparse.Namespace) -> int:
     """Plan in seconds and tesla for the actuator of a parameter file."""
     from hmsa_ros.contract.actuator import model_from
-    from hmsa_ros.contract.parameters import PLANNED
+    from hmsa_ros.contract.parameters import CREEP_TOLERANCE, PLANNED, VISCOELASTIC
     from hmsa_ros.contract.topics import PLANNER
+    from hmsa_ros.core.delivery import IDEAL
     from hmsa_ros.core.moves import State
     from hmsa_ros.core.sequence import plan_sequence
     from hmsa_ros.core.setpoint import Setpoint
@@ -90,7 +92,9 @@ def _run_si(arguments: argparse.Namespace) -> int:
             f'both --params-file and {", ".join(fixed)} are given: expected only one of them, '
             'since the file sets these values')
     model = model_from(values_of(
-        read_parameter_file(arguments.params_file), PLANNER, PLANNED))
+        read_parameter_file(arguments.params_file), PLANNER,
+        # Nobody has to send these levels: unless the file says how fine, they are very fine.
+        (*PLANNED, *VISCOELASTIC, replace(CREEP_TOLERANCE, default=IDEAL.ripple))))
     time, load = model.units.time, model.units.load
     segments = plan_sequence(
         [Setpoint(stretch, span / time) for stretch, span in arguments.setpoints],
@@ -119,7 +123,7 @@ def _si_row(segment: 'Segment', time: float, load: float) -> dict[str, Any]:
         'span': row['span'] * time,
         'time_p': None if row['tau_p'] is None else row['tau_p'] * time,
         'flux_density_p': None if row['beta_p'] is None else row['beta_p'] * load,
-        'flux_density_1': levels[-1].load * load,
+        'flux_density_1': row['beta_1'] * load,
         'levels': [[x.time * time, x.load * load] for x in levels]}
 
 
@@ -127,11 +131,13 @@ def _row(segment: 'Segment') -> dict[str, float | str | None]:
     """Return a segment as the JSON output shows it; null where there is no such number."""
     from hmsa_ros.core.model import signed_root
 
-    levels = segment.move.levels
-    shaped = len(levels) > 1
+    levels, tail = segment.move.levels, segment.move.tail
+    shaped = len(levels) > max(len(tail), 1)
     beta_p = levels[0].load if shaped else None
-    beta_1 = levels[-1].load
+    # Where a span ends before the creep does, the last level is another.
+    beta_1 = segment.holding if tail else levels[-1].load
     duration = segment.move.duration
+    told = {'vibration': segment.move.vibration} if tail else {}
     return {
         'stretch': segment.setpoint.stretch,
         'span': segment.setpoint.span,
@@ -143,7 +149,7 @@ def _row(segment: 'Segment') -> dict[str, float | str | None]:
         'start_stretch': segment.start.stretch,
         'start_rate': segment.start.rate,
         'status': str(segment.move.code),
-    }
+    } | told
 
 
 def _print_table(
@@ -167,3 +173,9 @@ def _print_reasons(segments: Sequence['Segment']) -> None:
     for segment in segments:
         if segment.move.reason:
             print(f'note: {segment.move.reason}')
+        if segment.move.tail:
+            step = abs(segment.setpoint.stretch - segment.start.stretch) or 1.0
+            print(
+                f'note: {len(segment.move.tail)} levels follow creep at stretch '
+                f'{segment.setpoint.stretch:g}; they leave a vibration of at most '
+                f'{100.0 * segment.move.vibration / step:.2g} % of the move')

@@ -1,6 +1,7 @@
 """The actuator that a set of parameters describes."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 import math
 from typing import Any, TYPE_CHECKING
 
@@ -53,10 +54,17 @@ def model_from(
     """Return what the parameters `PLANNED` plan with, on a grid of a period in ns."""
     from hmsa_ros.core.timeline import Model, Options  # imports Numba
 
-    return Model(actuator_from(values, modulus), Options(
+    return Model(planned_from(values, modulus), Options(
         flux_density_min=values['flux_density_min'], flux_density_max=values['flux_density_max'],
         period=period, slew_limit=values['slew_limit'] or math.inf,
-        coil_time_constant=values['coil_time_constant']))
+        coil_time_constant=values['coil_time_constant'],
+        creep_tolerance=values.get('creep_tolerance', Options.creep_tolerance)))
+
+
+def planned_from(
+        values: Mapping[str, Any], modulus: float | None = None) -> ActuatorParameters:
+    """Return the block that a planner plans for: with its branches, if any."""
+    return replace(actuator_from(values, modulus), creep=creep_from(values))
 
 
 def creep_from(values: Mapping[str, Any]) -> Creep:

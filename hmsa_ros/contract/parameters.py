@@ -242,6 +242,11 @@ KNOWN = (
         'Covariance of these values, row after row, in SI.', items=float),
 )
 
+CREEP_TOLERANCE = ParameterSpec(
+    'creep_tolerance', 1e-4,
+    'Vibration that the levels which follow creep at rest may leave, peak to peak, as a share of '
+    'the move; the smaller, the more levels, up to 300 a move.', '', 1e-6, 1.0)
+
 PUBLISH_RATE = ParameterSpec(
     'publish_rate', 1000.0, "Sample rate, in the plant's own time.", 'Hz', 1e-3, 1e6)
 

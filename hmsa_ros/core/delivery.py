@@ -35,6 +35,8 @@ class Delivery:
         Times of commands are rounded to multiples of this; 0 for none.
     lag : float
         Time constant with which the field follows the amplifier; 0 for at once.
+    ripple : float
+        Vibration that levels which follow creep may leave, as a share of the move.
 
     Raises
     ------
@@ -47,6 +49,7 @@ class Delivery:
     slew: float = math.inf
     resolution: float = 0.0
     lag: float = 0.0
+    ripple: float = 1e-6
 
     def __post_init__(self) -> None:
         """Check the numbers."""
@@ -58,6 +61,8 @@ class Delivery:
         if not 0.0 <= self.lag < math.inf:
             raise BadInputError(
                 f'coil time constant is {self.lag:g}: expected a finite number of at least 0')
+        if not 0.0 < self.ripple <= 1.0:
+            raise BadInputError(f'creep tolerance is {self.ripple:g}: expected above 0 to 1')
 
     @property
     def ideal(self) -> bool:

@@ -196,7 +196,7 @@ def draft_stop(outset: Outset) -> Steps[Draft]:
             found.duration, 'stopped')
         end = State(found.stretch, 0.0, move.levels[-1].load)
         levels, placed = _placed(model, outset.begin, Segment(
-            Setpoint(found.stretch, math.inf), 0.0, state, end, move))
+            Setpoint(found.stretch, math.inf), 0.0, state, end, move, end.load))
         return Draft(outset.begin, tuple(levels), (placed,))
     for share in _BRAKE_SHARES:
         stretch = holdable(model, brake(model, work, state, share).stretch)
@@ -359,7 +359,7 @@ def _placed(
     return levels, PlannedSegment(
         segment.setpoint.stretch, start,
         None if math.isinf(duration) else start + model.ns(duration),
-        segment.move.code, segment.move.reason, start)
+        segment.move.code, segment.move.reason, start, segment.move.vibration)
 
 
 def _over(points: Sequence[tuple[float, int]], base: int, now: int) -> RefusedError:

@@ -42,6 +42,8 @@ class Segment:
         an infinite span).
     move : Move
         The command; its times count from ``begin``.
+    holding : float
+        Load that holds the stretch once nothing creeps.
 
     """
 
@@ -50,6 +52,7 @@ class Segment:
     start: State
     end: State
     move: Move
+    holding: float
 
 
 def plan_sequence(
@@ -150,7 +153,9 @@ def segments(
         end = _follow(state, move, setpoint, material, delivery)
         if following is not None and move.tail:
             move = move.until(setpoint.span)
-        yield Segment(setpoint, begin, state, end, move)
+        yield Segment(
+            setpoint, begin, state, end, move,
+            float(elastic_force(setpoint.stretch, material)))
         begin += setpoint.span
         state = end
         setpoint = following

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import math
 
 from hmsa_ros.core import law
-from hmsa_ros.core.delivery import Delivery, pieces
+from hmsa_ros.core.delivery import Delivery, IDEAL, pieces
 from hmsa_ros.core.moves import Level, Limits, State
 from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.core.sequence import SHORT_SPELL
@@ -55,6 +55,8 @@ class Options:
         Of the robust shaper.
     coil_time_constant : float
         In s: the field follows the amplifier with this lag of first order; 0 for at once.
+    creep_tolerance : float
+        Vibration that levels which follow creep may leave, as a share of the move.
 
     """
 
@@ -67,6 +69,7 @@ class Options:
     slew_limit: float = math.inf
     order: int = 2
     coil_time_constant: float = 0.0
+    creep_tolerance: float = IDEAL.ripple
 
 
 @dataclass(frozen=True)
@@ -121,7 +124,8 @@ class Model:
             'limits': Limits(options.flux_density_min / load, options.flux_density_max / load),
             'delivery': Delivery(
                 options.period / NANOSECONDS / time, options.slew_limit / load * time,
-                1.0 / NANOSECONDS / time, options.coil_time_constant / time),
+                1.0 / NANOSECONDS / time, options.coil_time_constant / time,
+                options.creep_tolerance),
         }
         for name, value in worked_out.items():
             object.__setattr__(self, name, value)
@@ -264,6 +268,8 @@ class PlannedSegment:
         Why it is not the requested one; empty if it is.
     since : int
         Time in ns from which the setpoint holds; the move may begin later.
+    vibration : float
+        Bound of what levels that follow creep leave of it in stretch, peak to peak.
 
     """
 
@@ -273,6 +279,7 @@ class PlannedSegment:
     code: Code
     reason: str
     since: int
+    vibration: float = 0.0
 
 
 @dataclass(frozen=True)

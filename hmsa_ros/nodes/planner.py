@@ -75,7 +75,8 @@ class PlannerNode(ManagedNode):
         self._listen_until = 0
         self._several_clocks = False
         check_names(self)
-        seconds = warm_up(self.get_logger().info)
+        seconds = warm_up(self.get_logger().info, creep=any(
+            x.model.material.creep for x in self._runtime.group.planners.values()))
         if seconds > 1.0:
             self.get_logger().info(f'loaded the numerical kernels in {seconds:.1f} s')
         self.add_on_set_parameters_callback(self._on_parameters)

@@ -6,15 +6,19 @@ from functools import partial
 import math
 from typing import Any
 
+from hmsa_ros.contract.actuator import planned_from
 from hmsa_ros.contract.parameters import (
     COIL_TIME_CONSTANT,
+    CREEP_TOLERANCE,
     FIXED,
     FLUX_DENSITY_MAX,
     FLUX_DENSITY_MIN,
     KNOWN,
     SLEW_LIMIT,
+    VISCOELASTIC,
 )
 from hmsa_ros.core.group import PlannerGroup
+from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.sequence import SHORT_SPELL
 from hmsa_ros.core.shapers import SHAPERS
@@ -27,7 +31,6 @@ from hmsa_ros.nodes.joints import JointParameters, JOINTS
 from hmsa_ros.nodes.managed import AUTOSTART
 from hmsa_ros.nodes.marker_publisher import MARKER_SCALE
 from hmsa_ros.nodes.parameters import (
-    actuator_from,
     BLOCK,
     INITIAL_STRETCH,
     JOINT,
@@ -52,6 +55,8 @@ OWN = (
         1, 16, read_only=False),
     replace(SLEW_LIMIT, read_only=False),
     replace(COIL_TIME_CONSTANT, read_only=False),
+    *VISCOELASTIC,
+    replace(CREEP_TOLERANCE, read_only=False),
     replace(FLUX_DENSITY_MIN, read_only=False),
     replace(FLUX_DENSITY_MAX, read_only=False),
     *KNOWN,
@@ -178,7 +183,8 @@ def options_from(values: Mapping[str, Any]) -> Options:
         else nanoseconds(values['command_period']),
         slew_limit=float(values['slew_limit']) or math.inf,
         order=int(values['robust_order']),
-        coil_time_constant=float(values['coil_time_constant']))
+        coil_time_constant=float(values['coil_time_constant']),
+        creep_tolerance=float(values['creep_tolerance']))
 
 
 def nanoseconds(seconds: float) -> int:
@@ -227,7 +233,8 @@ def group_from(parameters: JointParameters) -> PlannerGroup:
     for name in parameters.names:
         values = parameters.of(name)
         planners[name] = _of(parameters, name, lambda values=values: Planner(
-            actuator_from(values), options_from(values), stretch=values['initial_stretch']))
+            _block(parameters, values), options_from(values),
+            stretch=values['initial_stretch']))
     return PlannerGroup(planners, simultaneous=parameters['simultaneous_arrival'])
 
 
@@ -258,8 +265,18 @@ def models_from(parameters: JointParameters, group: PlannerGroup) -> dict[str, M
         values = parameters.of(name)
         models[name] = _of(
             parameters, name, lambda values=values, planner=planner:
-            planner.checked_model(options_from(values), actuator_from(values)))
+            planner.checked_model(options_from(values), _block(parameters, values)))
     return models
+
+
+def _block(parameters: JointParameters, values: Mapping[str, Any]) -> ActuatorParameters:
+    """Return the block of a joint; feedback knows of none that creeps."""
+    block = planned_from(values)
+    if block.creep and parameters['feedback'] != 'off':
+        raise BadInputError(
+            f"parameter feedback is {parameters['feedback']} and viscoelastic.ratio is set: "
+            'expected feedback off, since estimates do not know of creep yet')
+    return block
 
 
 def _of(parameters: JointParameters, name: str, make: Any) -> Any:

@@ -100,10 +100,12 @@ def actuators(
             'The planner and the plant had different parameters of the actuator: see the table '
             'of parameters.')
     try:
-        if creep_of({**parameters, **given}, joint):
+        if creep := creep_of({**parameters, **given}, joint):
+            known = creep == creep_from(_own(parameters, joint, PLANNER, VISCOELASTIC))
             notes.append(
-                'The elastomer of the plant creeps (viscoelastic.*), which the planner does not '
-                'know; plain steps are simulated without it.')
+                'The elastomer of the plant creeps (viscoelastic.*)'
+                + ('' if known else ', which the planner does not know')
+                + '; plain steps and predictions are simulated without it.')
     except BadInputError as error:
         notes.append(f'What the plant says of creep cannot be used: {error}.')
     return plant, planner, bool(found), notes

@@ -166,7 +166,8 @@ class Planning:
             self._bulletin.give(Verdict(
                 Severity.WARN, str(warnings[0].code), warnings[0].reason, request.name), log=True)
         elif changed:
-            self._bulletin.give(Verdict(Severity.OK, 'accepted', 'accepted', request.name))
+            self._bulletin.give(Verdict(
+                Severity.OK, 'accepted', _accepted(drafts), request.name))
         else:
             self._bulletin.give(Verdict(
                 Severity.OK, 'unchanged', 'already on the way there: the plan is unchanged',
@@ -203,3 +204,11 @@ class Planning:
         verdict = self._following.give_up(next(
             iter(self._group.planners.values())).options.lead_time, self._bulletin.verdict.request)
         self._bulletin.give(verdict, log=self._following.tell_replanned())
+
+
+def _accepted(drafts: Mapping[str, Draft]) -> str:
+    """Return in words that drafts are taken, and what following creep leaves."""
+    left = max((x.vibration for draft in drafts.values() for x in draft.segments), default=0.0)
+    if left == 0.0:
+        return 'accepted'
+    return f'accepted; levels that follow creep leave a vibration of up to {left:.1e} in stretch'

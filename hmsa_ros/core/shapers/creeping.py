@@ -26,9 +26,8 @@ from hmsa_ros.errors import BadInputError
 
 #: Shapers that know of creep.
 SHAPERS = ('two_step', 'robust', 'step')
-# Vibration that the staircase is to leave, as a share of the move, the least move that counts, and
-# how much more it may be.
-_RIPPLE, _LEAST_MOVE, _SURE = 8e-7, 1e-3, 1.25
+# The least move that counts, and how much more a staircase may leave than is worked out.
+_LEAST_MOVE, _SURE = 1e-3, 1.25
 # Levels of a staircase at the most, and how its vibration grows until it has no more.
 _MOST, _COARSER = 300, 1.5
 _SHORTEST_STRIDE = 0.03
@@ -159,7 +158,8 @@ def held(request: Request, found: Move, span: float) -> Move:
     holding = float(law.elastic_force(request.target, material.packed))
     branches = material.branches
     excess = branches[:, RATIO] * (holding - np.array(end.followed))
-    ripple = _RIPPLE * max(abs(request.target - request.state.stretch), _LEAST_MOVE)
+    step = max(abs(request.target - request.state.stretch), _LEAST_MOVE)
+    ripple = delivery.ripple / _SURE * step
     out = np.empty((_MOST, 4))
     while True:
         count, vibration = kernel.staircase(
