@@ -63,9 +63,9 @@ def test_robustness_prints_a_table_and_names_its_files(run, tmp_path):
                   'ZV: linear, designed at the target'):
         assert words in out
     assert 'robust, order 3' not in out
-    files = out.split()[-3:]
-    assert files == [f'new/folder/robustness{x}' for x in (
-        '.csv', '_1_to_1.4.png', '_1_to_0.9.png')]
+    files = out.split()[-4:]
+    assert files == [f'new/folder/{x}' for x in (
+        'robustness.csv', 'robustness_1_to_1.4.png', 'robustness_1_to_0.9.png', 'front.png')]
     rows = list(csv.DictReader((tmp_path / files[0]).read_text().splitlines()))
     assert {x['shaper'] for x in rows} == {'two_step', 'robust', 'zv'}
     assert all((tmp_path / x).read_bytes().startswith(PNG) for x in files[1:])
@@ -90,7 +90,7 @@ def test_robustness_as_json_has_everything_in_full_precision(run):
     assert (plain['arrives'], shaped['arrives']) == (False, True)
     assert plain['arrival'] == shaped['arrival']
     assert [Path(x).name for x in made['files']] == [
-        'robustness.csv', 'robustness_1_to_1.1.png']
+        'robustness.csv', 'robustness_1_to_1.1.png', 'front.png']
 
 
 def test_robustness_says_what_could_not_be_had(run):

@@ -28,7 +28,7 @@ before = signatures()
 millisecond = 1_000_000
 for options in (
         {}, {'period': millisecond}, {'slew_limit': 30.0}, {'shaper': 'robust'},
-        {'shaper': 'minimum_time'}, {'shaper': 'ei'}, {'shaper': 'step'},
+        {'shaper': 'minimax'}, {'shaper': 'minimum_time'}, {'shaper': 'ei'}, {'shaper': 'step'},
         {'period': millisecond, 'slew_limit': 100.0}, {'short_spell': 'continue'},
         {'coil_time_constant': 3e-4}, {'coil_time_constant': 3e-4, 'period': millisecond},
         {'creep': Creep((0.1, 0.2), (0.01, 0.1))},

@@ -214,6 +214,8 @@ def test_lead_time_of_the_parameter_is_kept(bench):
     (('-p', 'slew_limit:=100.0'), {'slew_limit': 100.0}),
     (('-p', 'coil_time_constant:=0.0005'), {'coil_time_constant': 5e-4}),
     (('-p', 'shaper:=robust', '-p', 'robust_order:=3'), {'shaper': 'robust', 'order': 3}),
+    (('-p', 'shaper:=minimax', '-p', 'minimax_errors:=[0.05, 0.1, 0.0]'),
+     {'shaper': 'minimax', 'errors': (0.05, 0.1, 0.0)}),
     (('-p', 'flux_density_max:=0.2', '-p', 'shaper:=minimum_time'),
      {'flux_density_max': 0.2, 'shaper': 'minimum_time'}),
 ])

@@ -16,7 +16,7 @@ from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameter
 from hmsa_ros.core.status import Code
 from hmsa_ros.core.two_step import plan_two_step
 from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.figures.studies import draw_damped, draw_robustness, draw_sampled
+from hmsa_ros.figures.studies import draw_damped, draw_front, draw_robustness, draw_sampled
 from hmsa_ros.studies import robustness
 from hmsa_ros.studies.__main__ import main, pictures, tables
 from hmsa_ros.studies.axes import MOST_VALUES, parse_grid, read_cases
@@ -250,8 +250,8 @@ def test_studies_refuse_what_is_out_of_range(make, message):
 
 def test_shapers_are_compared_once_each_and_robust_with_each_order():
     assert [x.name for x in candidates()] == [
-        'two-step', 'robust, order 2', 'robust, order 3', 'minimum time', 'plain step', 'ZV',
-        'ZVD', 'EI']
+        'two-step', 'robust, order 2', 'robust, order 3', 'minimax, order 2',
+        'minimax, order 3', 'minimum time', 'plain step', 'ZV', 'ZVD', 'EI']
     assert candidates(['robust', 'zv', 'robust', 'zv'], [4, 1]) == (
         Candidate('robust', 4), Candidate('robust', 1), Candidate('zv'))
 
@@ -331,13 +331,15 @@ def test_tables_of_the_documentation_are_what_is_computed():
 
 def test_pictures_of_the_documentation_exist_where_it_shows_them():
     shown = re.findall(r'!\[[^]]+\]\(([^)]+)\)', DOCS.read_text(encoding='utf-8'))
-    assert sorted(shown) == [f'images/{x}.png' for x in ('damped', 'robustness', 'sampled')]
+    assert sorted(shown) == [
+        f'images/{x}.png' for x in ('damped', 'front', 'robustness', 'sampled')]
     for name in shown:
         assert (DOCS.parent / name).read_bytes().startswith(PNG)
 
 
 def test_documentation_is_drawn_into_a_folder_that_exists(tmp_path, capsys):
-    assert [x.name for x in pictures(tmp_path)] == ['robustness.png', 'sampled.png', 'damped.png']
+    assert [x.name for x in pictures(tmp_path)] == [
+        'robustness.png', 'sampled.png', 'damped.png', 'front.png']
     for path in tmp_path.iterdir():
         assert path.read_bytes().startswith(PNG)
     assert main(['--out', str(tmp_path / 'missing')]) == 2
@@ -348,6 +350,7 @@ def test_pictures_take_what_is_missing(tmp_path, lost):
     case, result = lost
     refused = study(Case(1.0, 1.1, limits=Limits(-0.1, 0.1)), Candidate('two_step'))
     draw_robustness(tmp_path / 'r.png', case, [result, refused])
+    draw_front(tmp_path / 'f.png', [(case, [result, refused])] * 4)
     assert (tmp_path / 'r.png').read_bytes().startswith(PNG)
     with pytest.raises(BadInputError, match='cannot write'):
         draw_robustness(tmp_path / 'none' / 'r.png', case, [])

@@ -259,7 +259,7 @@ class Parameters(Generated):
             elif isinstance(default, str):
                 shown = f"'{default}'"
             elif isinstance(default, list):
-                shown = '[' + ', '.join(default) + ']'
+                shown = '[' + ', '.join(map(str, default)) + ']'
             else:
                 shown = str(default).lower()
             details = [

@@ -41,7 +41,15 @@ def add_parser(subparsers: Any) -> None:
         help='shape 2 H^2/L^2, above 0 (default 2)')
     parser.add_argument(
         '--shaper', metavar='NAME',
-        help='two_step (default), robust, minimum_time, step, zv, zvd or ei')
+        help='two_step (default), robust, minimax, minimum_time, step, zv, zvd or ei')
+    parser.add_argument(
+        '--order', type=int, default=2, metavar='N',
+        help='two-step commands that robust chains; minimax takes as long (default 2)')
+    parser.add_argument(
+        '--errors', metavar='G,C,J',
+        help='errors of shear modulus, damping coefficient and chain limit, as shares, for which '
+             'minimax plans (default 0.1,0.1,0.1, or the 95 %% intervals that hmsa identify wrote '
+             'to --params-file)')
     parser.add_argument(
         '--params-file', type=Path, metavar='YAML',
         help='parameter file (YAML) of planner and plant, for a plan in seconds and tesla')
@@ -62,7 +70,8 @@ def run(arguments: argparse.Namespace) -> int:
              if (value := getattr(arguments, name)) is not None}
     segments = plan_sequence(
         [Setpoint(*x) for x in arguments.setpoints], NondimensionalParameters(**given),
-        start=State(arguments.start), shaper=arguments.shaper or 'two_step')
+        start=State(arguments.start), shaper=arguments.shaper or 'two_step',
+        order=arguments.order, errors=_errors(arguments))
     rows = [_row(segment) for segment in segments]
     if arguments.json:
         print(json.dumps({'segments': rows}, indent=2))
@@ -99,7 +108,8 @@ def _run_si(arguments: argparse.Namespace) -> int:
     segments = plan_sequence(
         [Setpoint(stretch, span / time) for stretch, span in arguments.setpoints],
         model.material, start=State(arguments.start), shaper=arguments.shaper or 'two_step',
-        limits=model.limits, delivery=model.delivery, units=model.units)
+        limits=model.limits, delivery=model.delivery, units=model.units, order=arguments.order,
+        errors=_errors(arguments))
     rows = [_si_row(x, time, load) for x in segments]
     group = model.material
     if arguments.json:
@@ -113,6 +123,26 @@ def _run_si(arguments: argparse.Namespace) -> int:
             f'time unit {time:.6g} s')
         _print_reasons(segments)
     return 0
+
+
+def _errors(arguments: argparse.Namespace) -> tuple[float, float, float]:
+    """Return the errors for which minimax plans."""
+    from hmsa_ros.core.shapers.request import as_errors, ERRORS
+
+    if arguments.errors is not None:
+        try:
+            return as_errors([float(x) for x in arguments.errors.split(',')])
+        except ValueError as error:
+            if isinstance(error, BadInputError):
+                raise
+            raise BadInputError(
+                f'--errors is {arguments.errors!r}: expected three numbers such as 0.1,0.1,0.05'
+            ) from None
+    if arguments.shaper != 'minimax' or arguments.params_file is None:
+        return ERRORS
+    from hmsa_ros.identification.files import errors_of, read_belief
+
+    return errors_of(read_belief(arguments.params_file), ERRORS)
 
 
 def _si_row(segment: 'Segment', time: float, load: float) -> dict[str, Any]:

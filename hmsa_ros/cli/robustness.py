@@ -29,8 +29,9 @@ def add_parser(subparsers: Any) -> None:
         description='Plan moves with each shaper and the nominal parameters, simulate them with '
                     'errors in shear modulus G, damping coefficient zeta and J_lim, and compare '
                     'the residuals: peak-to-peak stretch after arrival as a share of the step, '
-                    'without the steady offset. Prints a table and writes robustness.csv and a '
-                    'picture of each move; existing files are replaced.',
+                    'without the steady offset. Minimax plans for these errors. Prints a table '
+                    'and writes robustness.csv, a picture of each move, and front.png, the worst '
+                    'residual over the duration; existing files are replaced.',
         epilog='example: hmsa robustness --move 1.0:1.4 1.2:0.8 --errors 0.05 --order 2 3 4')
     parser.add_argument(
         '--move', nargs='+', type=_move, default=list(_MOVES), metavar='START:TARGET',
@@ -43,7 +44,7 @@ def add_parser(subparsers: Any) -> None:
              'to twice that')
     parser.add_argument(
         '--order', nargs='+', type=int, metavar='N',
-        help='orders of the robust shaper (default 2 3)')
+        help='orders of robust and minimax (default 2 3)')
     parser.add_argument(
         '--zeta', type=float, default=0.2, metavar='Z',
         help='nominal nondimensional damping coefficient, at least 0 (default 0.2)')
@@ -115,7 +116,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _write(folder: Path, studies: 'list[tuple[Case, list[Result]]]') -> list[Path]:
     """Write the numbers and the pictures."""
-    from hmsa_ros.figures.studies import draw_robustness
+    from hmsa_ros.figures.studies import draw_front, draw_robustness
     from hmsa_ros.studies.robustness import write_csv
 
     files = [folder / 'robustness.csv']
@@ -123,19 +124,21 @@ def _write(folder: Path, studies: 'list[tuple[Case, list[Result]]]') -> list[Pat
     for case, results in studies:
         files.append(folder / f'robustness_{case.start:g}_to_{case.target:g}.png')
         draw_robustness(files[-1], case, results)
+    files.append(folder / 'front.png')
+    draw_front(files[-1], studies)
     return files
 
 
 def _record(case: 'Case', results: 'list[Result]') -> dict[str, Any]:
     """Return a case as the JSON output shows it; null where there is no such number."""
-    from hmsa_ros.studies.robustness import PARAMETERS
+    from hmsa_ros.studies.robustness import ORDERED, PARAMETERS
 
     errors = case.errors().tolist()
     records = []
     for result in results:
         record: dict[str, Any] = {
             'shaper': result.candidate.shaper,
-            'order': result.candidate.order if result.candidate.shaper == 'robust' else None,
+            'order': result.candidate.order if result.candidate.shaper in ORDERED else None,
             'label': result.candidate.label,
             'status': str(result.code),
             'reason': result.reason,

@@ -326,7 +326,7 @@ def _planned(
     return segments(
         setpoints, model.material, start=state, shaper=shaper or options.shaper,
         limits=model.limits, delivery=model.delivery, order=options.order, units=model.units,
-        short_spell=options.short_spell)
+        short_spell=options.short_spell, errors=options.errors)
 
 
 def placed_level(model: Model, stamp: int, flux_density: float, state: State) -> PlannedLevel:

@@ -14,7 +14,7 @@ from hmsa_ros.core.moves import Level, Limits, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.setpoint import Setpoint
 from hmsa_ros.core.shapers import creeping, get_shaper
-from hmsa_ros.core.shapers.request import Request
+from hmsa_ros.core.shapers.request import ERRORS, Request
 from hmsa_ros.core.simulation import check_stretch, follow, longest_motion, simulate
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.units import Units
@@ -59,7 +59,8 @@ def plan_sequence(
         setpoints: Sequence[Setpoint], material: NondimensionalParameters, *,
         start: State | None = None, shaper: str = 'two_step', limits: Limits | None = None,
         delivery: Delivery = IDEAL, order: int = 2, units: Units | None = None,
-        short_spell: str = 'refuse') -> tuple[Segment, ...]:
+        short_spell: str = 'refuse',
+        errors: tuple[float, float, float] = ERRORS) -> tuple[Segment, ...]:
     """
     Plan a sequence of setpoints.
 
@@ -85,6 +86,8 @@ def plan_sequence(
     short_spell : {'refuse', 'continue'}
         For a span that ends before the move: refuse, or plan the next move from the state that
         is really reached; the last move is then finished after its span.
+    errors : tuple of float
+        Of G, damping coefficient and J_lim, as shares, for which minimax plans.
 
     Returns
     -------
@@ -103,14 +106,15 @@ def plan_sequence(
         raise RefusedError(Code.BAD_INPUT, 'no setpoint given: expected at least one')
     return tuple(segments(
         setpoints, material, start=start, shaper=shaper, limits=limits, delivery=delivery,
-        order=order, units=units, short_spell=short_spell))
+        order=order, units=units, short_spell=short_spell, errors=errors))
 
 
 def segments(
         setpoints: Iterable[Setpoint], material: NondimensionalParameters, *,
         start: State | None = None, shaper: str = 'two_step', limits: Limits | None = None,
         delivery: Delivery = IDEAL, order: int = 2, units: Units | None = None,
-        short_spell: str = 'refuse') -> Generator[Segment, None, None]:
+        short_spell: str = 'refuse',
+        errors: tuple[float, float, float] = ERRORS) -> Generator[Segment, None, None]:
     """
     Plan as `plan_sequence` does, but setpoint by setpoint, each when it is requested.
 
@@ -136,7 +140,8 @@ def segments(
     setpoint = next(upcoming, None)
     while setpoint is not None:
         following = next(upcoming, None)
-        request = Request(state, setpoint.stretch, material, limits, delivery, order, units)
+        request = Request(
+            state, setpoint.stretch, material, limits, delivery, order, units, errors)
         move = creeping.held(
             request, _rounded(shape(request), delivery),
             math.inf if following is None else setpoint.span)

@@ -10,7 +10,7 @@ class Code(str, Enum):
     """
     The outcome of a move or a request; the value is what messages and files carry.
 
-    The first nine are plans that can be carried out, the next ones refusals, and the last four
+    The first ten are plans that can be carried out, the next ones refusals, and the last four
     what was measured.
     """
 
@@ -18,6 +18,7 @@ class Code(str, Enum):
     STEP = 'step'
     HOLD = 'hold'
     ROBUST = 'robust'
+    MINIMAX = 'minimax'
     MINIMUM_TIME = 'minimum_time'
     LINEAR = 'linear'
     TOO_DAMPED = 'too_damped'
@@ -54,6 +55,9 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
     Code.STEP: ('One step to the level that holds the target; it rings.', ''),
     Code.HOLD: ('The actuator is already there and is held.', ''),
     Code.ROBUST: ('A chain of two-step commands, which tolerates model errors.', ''),
+    Code.MINIMAX: (
+        'Levels that leave the least vibration at the worst, while the parameters are within the '
+        'errors given.', ''),
     Code.MINIMUM_TIME: ('Full push, full brake, then the level that holds the target.', ''),
     Code.LINEAR: ('A linear input shaper designed at the target; it leaves some vibration.', ''),
     Code.TOO_DAMPED: (

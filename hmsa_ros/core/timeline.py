@@ -17,6 +17,7 @@ from hmsa_ros.core.moves import Level, Limits, State
 from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.core.sequence import SHORT_SPELL
 from hmsa_ros.core.shapers import creeping, get_shaper
+from hmsa_ros.core.shapers.request import as_errors, ERRORS
 from hmsa_ros.core.simulation import follow, longest_motion, simulate
 from hmsa_ros.core.status import Code
 from hmsa_ros.core.units import NANOSECONDS, Units
@@ -53,6 +54,8 @@ class Options:
         Largest change of the flux density in T/s; infinite for steps.
     order : int
         Of the robust shaper.
+    errors : tuple of float
+        Of G, damping coefficient and J_lim, as shares, for which minimax plans.
     coil_time_constant : float
         In s: the field follows the amplifier with this lag of first order; 0 for at once.
     creep_tolerance : float
@@ -70,6 +73,7 @@ class Options:
     order: int = 2
     coil_time_constant: float = 0.0
     creep_tolerance: float = IDEAL.ripple
+    errors: tuple[float, float, float] = ERRORS
 
 
 @dataclass(frozen=True)
@@ -110,6 +114,7 @@ class Model:
         """Work out the nondimensional side."""
         actuator, options = self.actuator, self.options
         get_shaper(options.shaper)
+        as_errors(options.errors)
         if options.short_spell not in SHORT_SPELL:
             raise BadInputError(
                 f'short_spell is {options.short_spell!r}: expected one of '

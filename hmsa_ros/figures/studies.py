@@ -1,6 +1,7 @@
 """Pictures of the studies: robustness, sampled hardware, heavy damping."""
 
 from collections.abc import Sequence
+import math
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from hmsa_ros.core.shapers.step import step
 from hmsa_ros.figures import style
 from hmsa_ros.studies.damped import DampedStudy, LIMITS, limits_of, SETTLED
 from hmsa_ros.studies.residual import Errors, response
-from hmsa_ros.studies.robustness import Candidate, Case, PARAMETERS, percent, Result
+from hmsa_ros.studies.robustness import Candidate, Case, ORDERED, PARAMETERS, percent, Result
 from hmsa_ros.studies.sampled import ideal_move, PROMISED, rounded_move, SampledStudy, solved_move
 
 # Residuals below this are drawn on it.
@@ -32,15 +33,17 @@ _CURVES: dict[str, dict[str, Any]] = {
     'zvd': {'color': style.GREY, 'linewidth': 1.1, 'linestyle': (0, (4, 1.5))},
     'ei': {'color': style.BLACK, 'linewidth': 1.0, 'linestyle': (0, (6, 1, 1, 1, 1, 1))},
 }
+_MARKERS = {
+    'two_step': 'o', 'robust': 's', 'minimax': 'D', 'minimum_time': '^', 'zv': 'v', 'zvd': '<',
+    'ei': '>'}
 # Orders of the robust shaper, one after the other.
 _ORDERS: tuple[dict[str, Any], ...] = (
     {'color': style.GREEN, 'linewidth': 1.9},
     {'color': style.GREEN, 'linewidth': 1.2, 'linestyle': (0, (4, 1.5))},
     {'color': style.ORANGE, 'linewidth': 1.2},
     {'color': style.ORANGE, 'linewidth': 1.2, 'linestyle': (0, (4, 1.5))},
-    {'color': style.SKY_BLUE, 'linewidth': 1.2},
-    {'color': style.SKY_BLUE, 'linewidth': 1.2, 'linestyle': (0, (4, 1.5))},
 )
+_DASHES = ('-', (0, (4, 1.5)), (0, (1, 1)))
 
 
 def draw_robustness(path: str | Path, case: Case, results: Sequence[Result]) -> None:
@@ -74,10 +77,52 @@ def draw_robustness(path: str | Path, case: Case, results: Sequence[Result]) -> 
 
 
 def _looks(candidates: Sequence[Candidate]) -> list[dict[str, Any]]:
-    orders = list(dict.fromkeys(x.order for x in candidates if x.shaper == 'robust'))
-    return [
-        _ORDERS[orders.index(x.order) % len(_ORDERS)] if x.shaper == 'robust'
-        else _CURVES.get(x.shaper, {'color': style.BLACK}) for x in candidates]
+    orders = list(dict.fromkeys(x.order for x in candidates if x.shaper in ORDERED))
+
+    def look(candidate: Candidate) -> dict[str, Any]:
+        if candidate.shaper not in ORDERED:
+            return _CURVES.get(candidate.shaper, {'color': style.BLACK})
+        place = orders.index(candidate.order)
+        if candidate.shaper == 'robust':
+            return _ORDERS[place % len(_ORDERS)]
+        return {'color': style.SKY_BLUE, 'linewidth': 1.6,
+                'linestyle': _DASHES[place % len(_DASHES)]}
+
+    return [look(x) for x in candidates]
+
+
+def draw_front(path: str | Path, studies: Sequence[tuple[Case, Sequence[Result]]]) -> None:
+    """Write a PNG of the worst residuals over the duration of a move, a panel for each."""
+    rows = max(-(-len(studies) // 3), 1)
+    with style.picture(Path(path), 0.9 + 2.7 * rows) as figure:
+        columns = max(min(len(studies), 3), 1)
+        axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
+        for panel, (case, results) in zip(axes, studies, strict=False):
+            shown = [
+                x for x in results if x.move is not None and math.isfinite(x.move.duration)]
+            for result, look in zip(shown, _looks([x.candidate for x in shown]), strict=True):
+                label = result.candidate.name
+                for worst, face in ((result.worst, look['color']), (result.alone['G'], 'white')):
+                    panel.plot(
+                        [result.arrival], [100.0 * max(worst.residual, _FLOOR)],
+                        color=look['color'], linestyle='none',
+                        marker=_MARKERS.get(result.candidate.shaper, 'x'), markersize=6.0,
+                        markerfacecolor=face, label=label)
+                    label = '_nolegend_'
+            panel.set_yscale('log')
+            style.finish(
+                panel, r'arrival [$L\sqrt{\rho/G}$]',
+                'worst residual [% of the step]' if panel is axes[0] else '', '')
+            panel.yaxis.minorticks_off()
+            panel.set_title(
+                rf'$\lambda$ = {case.start:g} to {case.target:g}, $\pm${100.0 * case.box:g} %',
+                fontsize=9)
+        for panel in axes[len(studies):]:
+            panel.set_axis_off()
+        figure.legend(
+            *axes[0].get_legend_handles_labels(), loc='outside lower center', ncols=4,
+            title='filled: G, zeta and J_lim off together; open: G alone', fontsize=8,
+            title_fontsize=8)
 
 
 def _label(result: Result) -> str:

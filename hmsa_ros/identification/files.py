@@ -16,6 +16,7 @@ from hmsa_ros.contract.actuator import actuator_from, parameters_of
 from hmsa_ros.contract.parameters import BLOCK
 from hmsa_ros.contract.topics import PLANNER, PLANT
 from hmsa_ros.core.parameters import ActuatorParameters
+from hmsa_ros.core.shapers.request import LARGEST_ERROR
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.known import Known, PREFIX
 from hmsa_ros.identification.quantities import actuator_of, QUANTITIES
@@ -28,6 +29,8 @@ _OTHERS = {
     'stretch_gain': 'stretch_gain', 'initial_stretch': 'initial_stretch'}
 _LISTS = {
     'viscoelastic_ratio': 'viscoelastic.ratio', 'viscoelastic_time': 'viscoelastic.time'}
+# Half of a 95 % interval, in standard deviations.
+_HALF_95 = 1.96
 _RANKS = {'': 1, PLANT: 2, PLANNER: 3}
 
 
@@ -101,6 +104,34 @@ def read_belief(path: Path | None) -> Belief:
     except BadInputError as error:
         raise BadInputError(f'{path}: {error}') from error
     return Belief(actuator_from(values), others, settings, known)
+
+
+def errors_of(
+        belief: Belief, others: tuple[float, float, float]) -> tuple[float, float, float]:
+    """
+    Return how far off the block may be, as the shaper minimax takes it.
+
+    Parameters
+    ----------
+    belief : Belief
+        As read.
+    others : tuple of float
+        For what was not identified.
+
+    Returns
+    -------
+    tuple of float
+        Half the 95 % intervals of G, damping coefficient and J_lim, as shares of their values.
+
+    """
+    found = list(others)
+    for i, name in enumerate(('shear_modulus', 'damping_coefficient', 'chain_limit')):
+        value = belief.actuator.numbers[name]
+        if name in belief.known.names and value > 0.0:
+            place = belief.known.names.index(name)
+            std = math.sqrt(belief.known.covariance[place, place])
+            found[i] = min(_HALF_95 * std / value, LARGEST_ERROR)
+    return found[0], found[1], found[2]
 
 
 def _number(path: Path | None, name: str, value: object) -> float:

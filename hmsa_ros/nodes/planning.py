@@ -22,6 +22,7 @@ from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.sequence import SHORT_SPELL
 from hmsa_ros.core.shapers import SHAPERS
+from hmsa_ros.core.shapers.request import as_errors, ERRORS, LARGEST_ERROR
 from hmsa_ros.core.timeline import Model
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
@@ -53,6 +54,11 @@ OWN = (
     ParameterSpec(
         'robust_order', 2, 'Number of two-step commands that the shaper robust chains.', '',
         1, 16, read_only=False),
+    ParameterSpec(
+        'minimax_errors', list(ERRORS),
+        'Errors of shear modulus, damping coefficient and chain limit, as shares, within which '
+        'the shaper minimax leaves least vibration; it takes as long as robust.', '',
+        0.0, LARGEST_ERROR, read_only=False, items=float),
     replace(SLEW_LIMIT, read_only=False),
     replace(COIL_TIME_CONSTANT, read_only=False),
     *VISCOELASTIC,
@@ -182,7 +188,7 @@ def options_from(values: Mapping[str, Any]) -> Options:
         period=0 if values['command_mode'] == 'continuous'
         else nanoseconds(values['command_period']),
         slew_limit=float(values['slew_limit']) or math.inf,
-        order=int(values['robust_order']),
+        order=int(values['robust_order']), errors=as_errors(values['minimax_errors']),
         coil_time_constant=float(values['coil_time_constant']),
         creep_tolerance=float(values['creep_tolerance']))
 

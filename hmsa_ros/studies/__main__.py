@@ -16,7 +16,7 @@ from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.shapers import SHAPERS
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.errors import BadInputError, complain, HmsaError
-from hmsa_ros.figures.studies import draw_damped, draw_robustness, draw_sampled
+from hmsa_ros.figures.studies import draw_damped, draw_front, draw_robustness, draw_sampled
 from hmsa_ros.studies.damped import damped_study, DampedStudy, LIMITS
 from hmsa_ros.studies.residual import Errors, residual
 from hmsa_ros.studies.robustness import Candidate, candidates, Case, PARAMETERS, percent, study
@@ -97,8 +97,12 @@ def tables() -> list[Table]:
 def pictures(folder: Path) -> list[Path]:
     """Draw all pictures of the documentation into a folder; return their paths."""
     case = Case(1.0, 1.4, MATERIAL)
-    written = [folder / 'robustness.png', folder / 'sampled.png', folder / 'damped.png']
-    draw_robustness(written[0], case, [study(case, x) for x in candidates()])
+    written = [
+        folder / 'robustness.png', folder / 'sampled.png', folder / 'damped.png',
+        folder / 'front.png']
+    results = [study(case, x) for x in (*candidates(), Candidate('robust', 4))]
+    draw_robustness(written[0], case, results[:-1])
+    draw_front(written[3], [(case, results)])
     draw_sampled(written[1], sampled_study(
         1.0, 1.4, MATERIAL, np.geomspace(0.041, 0.99, 700)))
     draw_damped(written[2], damped_study(1.0, 1.1, np.linspace(2.2, 6.0, 77)))

@@ -28,8 +28,9 @@ from hmsa_ros.studies.residual import arrival_of, Errors, residual, rest
 
 #: Parameters in error: name for a person, name in `Errors`.
 PARAMETERS = {'G': 'shear_modulus', 'zeta': 'zeta', 'J_lim': 'j_lim'}
-#: Orders of the robust shaper that are compared.
+#: Orders that are compared of the shapers that have one.
 ORDERS = (2, 3)
+ORDERED = ('robust', 'minimax')
 #: A chain is of no use long before this order.
 MOST_ORDER = 100
 #: Values a parameter takes in the curves, besides the edges of the box.
@@ -55,7 +56,7 @@ class Candidate:
     shaper : str
         One of `SHAPERS`.
     order : int
-        Of the robust shaper, 1 to `MOST_ORDER`; without meaning for the others.
+        Of those in `ORDERED`, 1 to `MOST_ORDER`; without meaning for the others.
 
     Raises
     ------
@@ -72,13 +73,13 @@ class Candidate:
         get_shaper(self.shaper)
         if not 1 <= self.order <= MOST_ORDER:
             raise BadInputError(
-                f'order of the robust shaper is {self.order}: expected 1 to {MOST_ORDER}')
+                f'order of the shaper {self.shaper} is {self.order}: expected 1 to {MOST_ORDER}')
 
     @property
     def name(self) -> str:
         """Name for a person."""
-        if self.shaper == 'robust':
-            return f'robust, order {self.order}'
+        if self.shaper in ORDERED:
+            return f'{self.shaper}, order {self.order}'
         return _NAMES.get(self.shaper, self.shaper)
 
     @property
@@ -222,7 +223,7 @@ def candidates(
     shapers : sequence of str, optional
         Names; default all.
     orders : sequence of int
-        The robust shaper enters once with each.
+        Those in `ORDERED` enter once with each.
 
     Returns
     -------
@@ -238,7 +239,7 @@ def candidates(
     found = [
         Candidate(name, order)
         for name in (SHAPERS if shapers is None else shapers)
-        for order in (orders if name == 'robust' else (2,))]
+        for order in (orders if name in ORDERED else (2,))]
     return tuple(dict.fromkeys(found))
 
 
@@ -261,7 +262,8 @@ def study(case: Case, candidate: Candidate) -> Result:
     """
     try:
         move = get_shaper(candidate.shaper)(Request(
-            State(case.start), case.target, case.material, case.limits, order=candidate.order))
+            State(case.start), case.target, case.material, case.limits, order=candidate.order,
+            errors=(case.box, case.box, case.box)))
     except RefusedError as error:
         nothing = Worst(math.nan, Errors())
         return Result(
@@ -360,7 +362,7 @@ def write_csv(path: Path, studies: Sequence[tuple[Case, Sequence[Result]]]) -> N
 
 
 def _rows(case: Case, result: Result) -> Iterator[tuple[str | float, ...]]:
-    order: int | str = result.candidate.order if result.candidate.shaper == 'robust' else ''
+    order: int | str = result.candidate.order if result.candidate.shaper in ORDERED else ''
     fixed = (
         case.start, case.target, case.material.zeta, case.material.j_lim, case.material.c1,
         result.candidate.shaper, order, str(result.code))

@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 from hmsa_ros.core.moves import Move
 from hmsa_ros.core.shapers.linear import ei, zv, zvd
+from hmsa_ros.core.shapers.minimax import minimax
 from hmsa_ros.core.shapers.minimum_time import minimum_time
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.shapers.robust import robust
@@ -22,6 +23,7 @@ Shaper = Callable[[Request], Move]
 SHAPERS: dict[str, Shaper] = {
     'two_step': two_step,
     'robust': robust,
+    'minimax': minimax,
     'minimum_time': minimum_time,
     'step': step,
     'zv': zv,

@@ -13,6 +13,28 @@ from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.units import Units
 from hmsa_ros.errors import BadInputError
 
+#: How far off G, damping coefficient and J_lim are expected to be, as shares.
+ERRORS = (0.1, 0.1, 0.1)
+#: The largest of them.
+LARGEST_ERROR = 0.9
+
+
+def as_errors(values: Sequence[float]) -> tuple[float, float, float]:
+    """
+    Return errors of G, damping coefficient and J_lim, checked.
+
+    Raises
+    ------
+    BadInputError
+        If they are not three numbers of 0 to 0.9.
+
+    """
+    if len(values) != 3 or not all(0.0 <= x <= LARGEST_ERROR for x in values):
+        raise BadInputError(
+            f'errors of G, damping coefficient and J_lim are {", ".join(f"{x:g}" for x in values)}'
+            f': expected three shares of 0 to {LARGEST_ERROR:g}')
+    return float(values[0]), float(values[1]), float(values[2])
+
 
 @dataclass(frozen=True)
 class Request:
@@ -32,9 +54,13 @@ class Request:
     delivery : Delivery
         How commands reach the coil.
     order : int
-        Number of chained two-step commands of the robust shaper, at least 1.
+        Number of chained two-step commands of the robust shaper, at least 1; minimax takes as
+        long.
     units : Units
         For the messages.
+    errors : tuple of float
+        Of G, damping coefficient and J_lim, as `as_errors` returns them: minimax plans for
+        these.
 
     """
 
@@ -45,6 +71,7 @@ class Request:
     delivery: Delivery = IDEAL
     order: int = 2
     units: Units = field(default_factory=Units)
+    errors: tuple[float, float, float] = ERRORS
 
     @property
     def load(self) -> float:

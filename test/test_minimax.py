@@ -1,0 +1,177 @@
+"""The shaper minimax, judged by SciPy's integration and by its optimisers."""
+
+from itertools import pairwise, product
+import json
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq, linprog, minimize
+import yaml
+
+from hmsa_ros.cli import main
+from hmsa_ros.core.delivery import Delivery
+from hmsa_ros.core.mismatch import Errors
+from hmsa_ros.core.model import acceleration, elastic_force
+from hmsa_ros.core.moves import Limits, State
+from hmsa_ros.core.parameters import NondimensionalParameters, paper_actuator
+from hmsa_ros.core.shapers import get_shaper
+from hmsa_ros.core.shapers.minimax import _cases, largest, least_largest, left
+from hmsa_ros.core.shapers.request import Request
+from hmsa_ros.core.status import Code
+from hmsa_ros.core.timeline import Model, Options
+from hmsa_ros.errors import BadInputError
+
+PAPER = NondimensionalParameters()
+WIDE = Limits(-20.0, 20.0)
+TURN = np.exp(2j * np.pi * np.arange(96) / 96)
+
+
+def vibration(move, start, target, errors):
+    """Return the peak to peak that SciPy finds after arrival on another actuator, as a share."""
+    actual, stiffer = errors.actual(PAPER), 1.0 + errors.shear_modulus
+    begin = float(elastic_force(start, PAPER)) / stiffer
+    state = [brentq(lambda x: elastic_force(x, actual) - begin, 0.4, 2.2, xtol=1e-13), 0.0]
+    times = [x.time * math.sqrt(stiffer) for x in move.levels]
+    for (since, until), level in zip(
+            pairwise([*times, times[-1] + 3.0]), move.levels, strict=True):
+        load = level.load / stiffer
+        solution = solve_ivp(
+            lambda _, y, load=load: [y[1], float(acceleration(*y, load, actual))],
+            (since, until), state, method='DOP853', rtol=1e-7, atol=1e-7,
+            t_eval=np.linspace(since, until, 200 if level is move.levels[-1] else 2))
+        state = solution.y[:, -1]
+    return float(np.ptp(solution.y[0])) / abs(target - start)
+
+
+@pytest.mark.parametrize(('start', 'target'), [(1.0, 1.1), (1.0, 1.4), (1.0, 0.7)])
+def test_at_most_half_of_the_chain_is_left_at_the_worst_in_the_same_time(start, target):
+    request = Request(State(start), target, PAPER)
+    chain, move = (get_shaper(x)(request) for x in ('robust', 'minimax'))
+    assert move.code is Code.MINIMAX
+    assert move.duration == move.levels[-1].time == chain.duration
+    worst = [
+        max(vibration(x, start, target, Errors(e)) for e in (-0.1, 0.0, 0.1))
+        for x in (chain, move)]
+    assert worst[1] < 0.5 * worst[0]
+    held = float(elastic_force(start, PAPER)), move.levels[-1].load
+    assert all(min(held) - 1e-12 <= x.load <= max(held) + 1e-12 for x in move.levels)
+
+
+def test_what_it_measures_is_the_peak_to_peak_of_an_integration():
+    request = Request(State(1.0), 1.3, PAPER)
+    move = get_shaper('minimax')(request)
+    cases = _cases(request, move.levels[-1].load)
+    found = left(request, cases, move.levels, move.duration)
+    corners = [Errors(*x) for x in product((-0.1, 0.1), repeat=3)]
+    for length, errors in zip(np.hypot(*found[3::3].T), corners[::3], strict=True):
+        # The first swing may begin before its peak, and be less than the formula by so much.
+        assert 0.7 < vibration(move, 1.0, 1.3, errors) / length < 1.1
+
+
+@pytest.mark.parametrize('order', [2, 3])
+def test_no_other_optimiser_finds_much_better_levels(order):
+    request = Request(State(1.0), 1.4, PAPER, order=order)
+    move = get_shaper('minimax')(request)
+    cases = _cases(request, move.levels[-1].load)
+    times, loads = (np.array(x) for x in zip(
+        *((x.time, x.load) for x in move.levels), strict=True))
+
+    def lengths(free):
+        levels = [type(move.levels[0])(t, x) for t, x in zip(times, [*free, loads[-1]],
+                                                             strict=True)]
+        return 1e3 * np.hypot(*left(request, cases, levels, move.duration).T)
+
+    before = lengths(loads[:-1]).max()
+    found = minimize(
+        lambda x: x[-1], [*loads[:-1], before], method='SLSQP',
+        bounds=[(0.0, loads[-1])] * (len(loads) - 1) + [(0.0, None)],
+        constraints={'type': 'ineq', 'fun': lambda x: x[-1] - lengths(x[:-1])})
+    assert lengths(np.clip(found.x[:-1], 0.0, loads[-1])).max() > 0.95 * before
+
+
+def test_the_least_longest_vector_is_that_of_linear_programming():
+    dice = np.random.default_rng(1)
+    for _ in range(20):
+        now, slopes = dice.normal(size=(9, 2)), dice.normal(size=(9, 2, 6))
+        low, high = -dice.uniform(0.0, 0.4, 6), dice.uniform(0.0, 0.4, 6)
+        x = least_largest(now, slopes, low, high)
+        assert np.all((low <= x) & (x <= high))
+        rows = np.stack([TURN.real, TURN.imag], axis=1)
+        bound = np.einsum('kc,nc->nk', rows, now).ravel()
+        matrix = np.einsum('kc,nci->nki', rows, slopes).reshape(-1, 6)
+        exact = linprog(
+            [0.0] * 6 + [1.0], np.hstack([matrix, -np.ones((len(matrix), 1))]), -bound,
+            bounds=[*zip(low, high, strict=True), (0.0, None)]).fun
+        assert exact <= largest(now + slopes @ x) * 1.001
+        assert largest(now + slopes @ x) < 1.05 * exact
+
+
+@pytest.mark.parametrize('delivery', [
+    Delivery(period=0.05), Delivery(period=0.3), Delivery(slew=50.0), Delivery(slew=1.0),
+    Delivery(slew=0.3), Delivery(lag=0.05), Delivery(lag=0.2),
+    Delivery(period=0.05, slew=10.0, lag=0.1)], ids=str)
+@pytest.mark.parametrize('state', [State(1.0), State(1.2, -0.5)], ids=['rest', 'moving'])
+def test_it_is_never_worse_than_the_chain_on_any_hardware(delivery, state):
+    request = Request(state, 1.4, PAPER, WIDE, delivery)
+    chain, move = (get_shaper(x)(request) for x in ('robust', 'minimax'))
+    cases = _cases(request, chain.levels[-1].load)
+    worst = [largest(left(request, cases, x.levels, x.duration)) for x in (chain, move)]
+    assert worst[1] <= worst[0]
+    assert (move.code is Code.MINIMAX) is (worst[1] < worst[0])
+    assert move.duration == chain.duration
+    if move.code is Code.MINIMAX and delivery.period:
+        for level in move.levels:
+            assert level.time / delivery.period == pytest.approx(
+                round(level.time / delivery.period), abs=1e-9)
+    if move.code is not Code.MINIMAX:
+        assert 'the chain of order 2' in move.reason or chain.reason
+
+
+def test_a_move_is_designed_once_and_anew_for_other_errors():
+    request = Request(State(1.0), 1.234, PAPER)
+    first = get_shaper('minimax')(request)
+    assert get_shaper('minimax')(request) is first
+    assert get_shaper('minimax')(
+        Request(State(1.0 + 1e-12, 1e-9), 1.234, PAPER)) is first
+    other = get_shaper('minimax')(Request(State(1.0), 1.234, PAPER, errors=(0.02, 0.0, 0.0)))
+    assert other.levels != first.levels
+    assert vibration(other, 1.0, 1.234, Errors()) < 0.1 * vibration(first, 1.0, 1.234, Errors())
+
+
+def test_where_there_is_no_chain_it_answers_what_the_chain_does():
+    assert get_shaper('minimax')(Request(State(1.1), 1.1, PAPER)).code is Code.HOLD
+    exact = get_shaper('minimax')(Request(State(1.0), 1.1, PAPER, errors=(0.0, 0.0, 0.0)))
+    assert exact.code is Code.ROBUST
+    assert 'no levels leave less' in exact.reason
+    damped = NondimensionalParameters(zeta=4.0)
+    assert get_shaper('minimax')(Request(State(1.0), 1.1, damped)).code is Code.TOO_DAMPED
+
+
+@pytest.mark.parametrize(
+    'errors', [(0.1, 0.1), (0.1, 0.1, 1.0), (math.nan, 0.1, 0.1), (-0.1, 0.0, 0.0)])
+def test_errors_that_no_command_can_be_planned_for_are_refused(errors):
+    with pytest.raises(BadInputError, match='expected three shares of 0 to 0.9'):
+        get_shaper('minimax')(Request(State(1.0), 1.1, PAPER, errors=errors))
+    with pytest.raises(BadInputError, match='expected three shares of 0 to 0.9'):
+        Model(paper_actuator(), Options(errors=errors))
+
+
+def test_hmsa_plan_takes_errors_from_the_command_line_or_from_an_identification(
+        capsys, tmp_path):
+    path = tmp_path / 'block.yaml'
+    base = {'actuator.shear_modulus': 1e4}
+    known = {'identification.names': ['shear_modulus'], 'identification.covariance': [1e4]}
+
+    def levels(*words, **more):
+        path.write_text(yaml.safe_dump({'/**': {'ros__parameters': {**base, **more}}}))
+        assert main(['plan', '1.2:1', '--shaper', 'minimax', '--params-file', str(path), '--json',
+                     *words]) == 0
+        return json.loads(capsys.readouterr().out)['segments'][0]['levels']
+
+    assert levels() == levels('--errors', '0.1,0.1,0.1')
+    assert levels(**known) == levels('--errors', '0.0196,0.1,0.1') != levels()
+    for text, message in (('0.1', 'three shares'), ('a,b,c', "'a,b,c'"), ('2,0,0', '2, 0, 0')):
+        assert main(['plan', '1.2:9', '--errors', text]) == 2
+        assert message in capsys.readouterr().err
