@@ -12,7 +12,9 @@ from hmsa_ros.core.planner import Options
 from hmsa_ros.core.timeline import Model
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.files import read_belief
+from hmsa_ros.identification.known import Known
 from hmsa_ros.runtime.records import EstimateChanged, Send, Settings, Severity, StatusChanged
+from hmsa_ros.studies.feedback import SCENARIOS
 
 
 def estimates(loop):
@@ -69,6 +71,42 @@ def test_adapting_corrects_the_first_move_and_plans_the_second_with_what_was_lea
     assert 'corrected' in codes(loop)
     assert codes(loop)[-1] == 'arrived'
     assert 'plans use it' in estimates(loop)[-1].message
+
+
+@pytest.mark.parametrize('factor', [0.8, 1.2])
+def test_a_cautious_first_move_takes_longer_and_arrives_and_the_next_one_does_not(factor):
+    # Unit of time 44 ms; a camera.
+    block = SCENARIOS[2].block
+    seen = {}
+    for cautious in (False, True):
+        loop = Loop(
+            factor, 1e-3, 200, 10 * MS, block, 2 * MS, feedback='adapt',
+            feedback_cautious=cautious)
+        truth = loop.run((1.4, 1000 * MS), (1.1, 1000 * MS))
+        first, second = loop.runtime.group.planners['a'].plan.segments[-2:]
+        begin = (first.arrival - START) // MS if cautious else 60
+        seen[cautious] = left(truth, begin, begin + 180, 1.4, 0.4)
+        vibration, offset = left(
+            truth, (second.arrival - START) // MS + 1, 1900, 1.1, 0.3)
+        assert max(vibration, abs(offset)) < 0.005
+    assert seen[False][0] > 0.05
+    assert seen[True][0] < 0.004
+    assert abs(seen[True][1]) < 0.003
+    assert begin == pytest.approx(3 * 59.4, abs=3)
+    assert (second.arrival - second.begin) / MS < 80
+
+
+def test_an_actuator_that_was_identified_is_not_moved_with_caution():
+    block = SCENARIOS[2].block
+    size = (1e-3 * block.shear_modulus, 0.01 * block.damping_coefficient)
+    known = Known(
+        ('shear_modulus', 'damping_coefficient'), (), np.diag(np.square(size)))
+    loop = Loop(
+        1.0, 1e-3, 200, 10 * MS, block, 2 * MS, feedback='adapt', feedback_cautious=True,
+        known={'a': known})
+    loop.run((1.4, 1000 * MS))
+    first = loop.runtime.group.planners['a'].plan.segments[-1]
+    assert (first.arrival - first.begin) / MS == pytest.approx(59.4, abs=1)
 
 
 def test_an_actuator_that_is_as_known_is_left_alone():

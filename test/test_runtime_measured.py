@@ -26,14 +26,16 @@ STEP = 0.2
 class Loop:
     """A planner runtime and a simulated device, in one loop of 1 ms."""
 
-    def __init__(self, shear_modulus=1.0, noise=0.0, rate=1000, delay=0, **changes):
-        block = paper_actuator()
+    def __init__(
+            self, shear_modulus=1.0, noise=0.0, rate=1000, delay=0, block=None, lead=50 * MS,
+            **changes):
+        block = block or paper_actuator()
         real = replace(block, shear_modulus=block.shear_modulus * shear_modulus)
         self.now = START
         self.device = SimulatedDevice(
             [SimulatedJoint(Setup(real), errors=SensorErrors(stretch_noise=noise))],
             period=1000 * MS // rate, time=START, measurement_delay=delay, seed=1)
-        options = Options(flux_density_min=-0.5, flux_density_max=0.5)
+        options = Options(flux_density_min=-0.5, flux_density_max=0.5, lead_time=lead)
         self.unheard = ''
         self.runtime = PlannerRuntime(
             PlannerGroup({'a': Planner(block, options)}),

@@ -7,6 +7,7 @@ whoever plans a long sequence can do other things in between. `finish` does it a
 
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 import math
 from typing import TypeVar
 
@@ -15,6 +16,8 @@ from hmsa_ros.core.kernels import work_space
 from hmsa_ros.core.moves import Level, Move, State
 from hmsa_ros.core.sequence import Segment, segments
 from hmsa_ros.core.setpoint import Setpoint
+from hmsa_ros.core.shapers import Shaper
+from hmsa_ros.core.shapers.through import through
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.stopping import brake, holdable
 from hmsa_ros.core.timeline import Draft, Model, Plan, PlannedLevel, PlannedSegment, scaled
@@ -223,9 +226,26 @@ def later_outsets(outset: Outset) -> Iterator[int]:
         yield outset.on_grid(outset.begin + model.ns(share * period))
 
 
-def draft_resumption(outset: Outset) -> Steps[Draft | None]:
+def draft_resumption(outset: Outset, arrival: int | None = None) -> Steps[Draft | None]:
     """
     Plan what is left of the running plan anew, until it is on its way again; None if nothing is.
+
+    Parameters
+    ----------
+    outset : Outset
+        From where.
+    arrival : int, optional
+        Time in ns of rest at the setpoint under way; default as soon as its shaper can.
+
+    Returns
+    -------
+    Draft or None
+        The setpoints that are left.
+
+    Yields
+    ------
+    None
+        Wherever it may be continued later.
 
     Raises
     ------
@@ -241,10 +261,10 @@ def draft_resumption(outset: Outset) -> Steps[Draft | None]:
     for index in range(first, len(planned)):
         # Left out setpoints make room for the next one, which is gone to at once.
         try:
-            draft = yield from _rejoining(outset, index)
+            draft = yield from _rejoining(outset, index, arrival)
         except RefusedError as error:
             refusal = refusal or error
-            if error.code is not Code.SPELL_TOO_SHORT:
+            if error.code is not Code.SPELL_TOO_SHORT or arrival is not None:
                 break
             yield
             continue
@@ -257,12 +277,15 @@ def draft_resumption(outset: Outset) -> Steps[Draft | None]:
     return None
 
 
-def _rejoining(outset: Outset, index: int) -> Steps[Draft]:
+def _rejoining(outset: Outset, index: int, arrival: int | None) -> Steps[Draft]:
     """Plan the setpoints from a place on, until the running plan is met."""
+    first = None if arrival is None else partial(
+        through, duration=outset.model.time(arrival - outset.begin))
     planned = outset.plan.segments
     levels: list[PlannedLevel] = []
     placed: list[PlannedSegment] = []
-    for segment in _planned(outset.model, outset.state, _left(outset, index)):
+    for segment in _planned(
+            outset.model, outset.state, _left(outset, index), first=first):
         more, one = _placed(outset.model, outset.begin, segment)
         levels += more
         placed.append(one)
@@ -320,11 +343,11 @@ def draft_moves(
 
 
 def _planned(
-        model: Model, state: State, setpoints: Iterable[Setpoint],
-        shaper: str = '') -> Iterator[Segment]:
+        model: Model, state: State, setpoints: Iterable[Setpoint], shaper: str = '',
+        first: Shaper | None = None) -> Iterator[Segment]:
     options = model.options
     return segments(
-        setpoints, model.material, start=state, shaper=shaper or options.shaper,
+        setpoints, model.material, start=state, shaper=shaper or options.shaper, first=first,
         limits=model.limits, delivery=model.delivery, order=options.order, units=model.units,
         short_spell=options.short_spell, errors=options.errors)
 

@@ -180,14 +180,20 @@ class Planner(RunningPlan):
         """Work out how to come to rest."""
         return (yield from draft_stop(self._outset(self.soonest(now))))
 
-    def draft_resumption(self, now: int) -> Steps[Draft | None]:
-        """Plan what is left anew, from where the actuator really is; None if nothing is left."""
+    def draft_resumption(self, now: int, arrival: int | None = None) -> Steps[Draft | None]:
+        """
+        Plan what is left anew, from where the actuator really is; None if nothing is left.
+
+        Where a time of arrival in ns is given, the setpoint under way is reached then.
+        """
         # From the first time that a command can reach, or, where there is no way from the motion
         # it meets, a part of a period later.
         begin = self.soonest(now)
         if self.plan.segments:
             begin = max(begin, self.plan.segments[0].since)
         outset = self._outset(begin)
+        if arrival is not None:
+            return (yield from draft_resumption(outset, arrival))
         for later in later_outsets(outset):
             try:
                 return (yield from draft_resumption(self._outset(later)))

@@ -13,7 +13,7 @@ from hmsa_ros.core.model import elastic_force, natural_frequency
 from hmsa_ros.core.moves import Level, Limits, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.setpoint import Setpoint
-from hmsa_ros.core.shapers import creeping, get_shaper
+from hmsa_ros.core.shapers import creeping, get_shaper, Shaper
 from hmsa_ros.core.shapers.request import ERRORS, Request
 from hmsa_ros.core.simulation import check_stretch, follow, longest_motion, simulate
 from hmsa_ros.core.status import Code, RefusedError
@@ -114,9 +114,12 @@ def segments(
         start: State | None = None, shaper: str = 'two_step', limits: Limits | None = None,
         delivery: Delivery = IDEAL, order: int = 2, units: Units | None = None,
         short_spell: str = 'refuse',
-        errors: tuple[float, float, float] = ERRORS) -> Generator[Segment, None, None]:
+        errors: tuple[float, float, float] = ERRORS,
+        first: Shaper | None = None) -> Generator[Segment, None, None]:
     """
     Plan as `plan_sequence` does, but setpoint by setpoint, each when it is requested.
+
+    The first move may have a shaper of its own.
 
     Raises
     ------
@@ -129,7 +132,7 @@ def segments(
     if short_spell not in SHORT_SPELL:
         raise BadInputError(
             f'short_spell is {short_spell!r}: expected one of {", ".join(SHORT_SPELL)}')
-    shape = get_shaper(shaper)
+    shape = first or get_shaper(shaper)
     creeping.check(material, delivery, shaper)
     limits = limits or Limits()
     units = units or Units()
@@ -164,6 +167,7 @@ def segments(
         begin += setpoint.span
         state = end
         setpoint = following
+        shape = get_shaper(shaper)
 
 
 def _cut(move: Move, setpoint: Setpoint, units: Units, *, last: bool) -> Move:

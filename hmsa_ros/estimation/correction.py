@@ -9,16 +9,17 @@ for parameters which are a guess.
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 import math
 
 import numpy as np
 
-from hmsa_ros.core.moves import Level, Move, State
+from hmsa_ros.core.moves import Move, State
 from hmsa_ros.core.shapers import get_shaper
 from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.core.shooting import solve, Template
-from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.core.shapers.through import through
+from hmsa_ros.core.status import RefusedError
 from hmsa_ros.core.timeline import Model, Options
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
@@ -262,31 +263,9 @@ class Corrector:
         # On the way in the time that is left, and afterwards in times of their own.
         durations = [left] if left > 0.0 else [x * half for x in _TRIED]
         for duration in durations:
-            found = _through(request, duration) if duration > _LEAST * half else None
-            if found is not None:
-                yield _placed(found, model, begin, course.target)
-
-
-def _through(request: Request, duration: float) -> Move | None:
-    """Return levels, each as long as the others, that lead to rest in a given time."""
-    try:
-        holding = request.holding_load()
-    except RefusedError:
-        return None
-    delivery = replace(request.delivery, period=0.0)
-    count = 3 if delivery.lag > 0.0 else 2
-    edges = duration / count * np.arange(count + 1)
-    period = request.delivery.period
-    if period > 0.0:
-        edges = period * np.round(edges / period)
-        if np.any(np.diff(edges) <= 0.0):
-            return None
-    guess = [Level(float(x), holding) for x in edges]
-    found = solve(
-        Template.of(guess, [('load', i) for i in range(count)]), request, delivery)
-    if found is None or not request.keeps(found[0]):
-        return None
-    return Move(Code.MINIMUM_TIME, found[0], found[1])
+            if duration > _LEAST * half:
+                with suppress(RefusedError):
+                    yield _placed(through(request, duration), model, begin, course.target)
 
 
 def _placed(move: Move, model: Model, begin: int, target: float) -> Course:

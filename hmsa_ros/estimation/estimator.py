@@ -239,9 +239,9 @@ class Estimator:
             None before the first sample.
 
         """
-        window = self._window or self._begin()
-        if window is None:
+        if self._window is None and not self._pending:
             return None
+        window = self._window or self._new_window(*self._pending[0])
         self._window = window
         self._take(window)
         until = max(self._seconds(time), window.begin,
@@ -269,11 +269,15 @@ class Estimator:
         Returns
         -------
         Estimate or None
-            None before the first update, or if the motion cannot be followed.
+            Before the first update what the prior says of rest; None if the motion cannot be
+            followed.
 
         """
         window, found = self._window, self._solution
-        if window is None or found is None:
+        if window is None:
+            window = self._new_window(time, 1.0)
+            found = window.solve(window.mean, self._as_levels(), self.noise, window.begin)
+        if found is None:
             return None
         motion = follow(
             found.values, self.prior.free, (float(found.z[-2]), float(found.z[-1])),
@@ -283,11 +287,8 @@ class Estimator:
             return None
         return self._estimate(time, replace(found, motion=motion, residual=np.zeros(0)))
 
-    def _begin(self) -> Window | None:
-        """Return a window at rest under the level in force at the first sample."""
-        if not self._pending:
-            return None
-        stamp = self._pending[0][0]
+    def _new_window(self, stamp: int, shown: float) -> Window:
+        """Return a window at rest under the level in force, or at what is shown if none is."""
         if not self._levels or self._levels[0][0] > stamp:
             self._levels.insert(0, (stamp, 0.0))
         self._origin = stamp
@@ -304,7 +305,7 @@ class Estimator:
         known = prior.covariance * (1.0 if self.learning else _FIXED)
         at = rest(prior.values, prior.free, self._in_force(stamp))
         stretch, frequency, by = at or (
-            self._pending[0][1], 1.0 / prior.values['time_unit'], np.zeros(len(mean)))
+            shown, 1.0 / prior.values['time_unit'], np.zeros(len(mean)))
         off = _AT_REST if at is not None and _settled(
             self._levels, stamp, prior.values['time_unit']) else _ANYWHERE
         covariance = np.zeros((len(mean) + 2, len(mean) + 2))
@@ -372,6 +373,8 @@ class Estimator:
         # After the last sample comes the time asked for.
         time = float(window.time[place]) if place < count else until
         drift = np.zeros(len(window.mean))
+        # Vibration decays to nothing, and a state that is known exactly has no covariance.
+        drift[-2:] = _AT_REST ** 2, (_AT_REST / found.values['time_unit']) ** 2
         if self._fixed is None:
             drift[:-2] = self.options.drift ** 2 * (time - window.begin) * self.prior.spread ** 2
         shift = round(time * NANOSECONDS)

@@ -138,6 +138,10 @@ SPECS = (
         'What feedback estimates besides the state: shear_modulus, damping_coefficient, '
         'stretch_bias, remanence, chain_limit, coil_time_constant and others of hmsa identify.'),
     ParameterSpec(
+        'feedback_cautious', _SETTINGS.feedback_cautious,
+        'Whether a move with an actuator that is not well known takes three times as long in '
+        'feedback adapt, and is corrected until then.', read_only=False),
+    ParameterSpec(
         'feedback_frozen', _SETTINGS.feedback_frozen,
         'Whether feedback keeps the parameters as it has learnt them, and follows the state '
         'alone.', read_only=False),
@@ -207,6 +211,7 @@ def settings_from(values: JointParameters) -> Settings:
         allow_partial_joints=bool(values['allow_partial_joints']),
         feedback=str(values['feedback']),
         feedback_parameters=check_free(values['feedback_parameters']),
+        feedback_cautious=bool(values['feedback_cautious']),
         feedback_frozen=bool(values['feedback_frozen']),
         feedback_file=str(values['feedback_file']),
         known={name: _of(values, name, partial(Known.read, values.of(name)))

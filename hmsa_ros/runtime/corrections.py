@@ -1,16 +1,18 @@
 """Plans that are corrected from what feedback has seen."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 import math
 
 from hmsa_ros.core.drafting import Steps
 from hmsa_ros.core.group import PlannerGroup
 from hmsa_ros.core.planner import Planner
-from hmsa_ros.core.status import Code
+from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.timeline import Draft, Plan
+from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.estimation import Estimate
-from hmsa_ros.estimation.correction import Course, expect
+from hmsa_ros.estimation.correction import CAUTIOUS, Course, expect
 from hmsa_ros.runtime.feedback import Feedback
 from hmsa_ros.runtime.records import Severity, Verdict
 from hmsa_ros.runtime.slices import Clock, in_time, Work
@@ -18,6 +20,9 @@ from hmsa_ros.runtime.slices import Clock, in_time, Work
 # A correction leaves at most this share of what the plan leaves, in squares, and gains this share
 # of the step.
 _SHARE, _GAIN = 0.5, 5e-4
+# A move that is expected to leave more than this share of the step is not well known, and units of
+# time before its end from which on it is not corrected any more.
+_WIDE, _SHORTEST = 5e-3, 0.3
 # A step that is smaller counts as this one.
 _LEAST_STEP = 0.1
 
@@ -40,6 +45,37 @@ class Corrections:
     def __init__(self, group: PlannerGroup, feedback: Feedback, clock: Clock) -> None:
         """Begin with nothing corrected."""
         self._group, self._feedback, self._clock = group, feedback, clock
+        # Times in ns at which moves that take longer are at rest.
+        self._arrivals: dict[str, int] = {}
+
+    def cautious(self, drafts: Mapping[str, Draft]) -> Mapping[str, Draft]:
+        """
+        Give first moves more time to be corrected in, where they are expected to leave much.
+
+        Their levels stay: the early effect of these shows what the actuator is.
+        """
+        self._arrivals = {x: y for x, y in self._arrivals.items() if x not in drafts}
+        if not self._feedback.cautious:
+            return drafts
+        return {name: self._slowly(name, draft) for name, draft in drafts.items()}
+
+    def _slowly(self, name: str, draft: Draft) -> Draft:
+        segment, *rest = draft.segments
+        model = self._group.planners[name].model
+        estimate = self._feedback.foreseen(name, draft.begin)
+        if (estimate is None or segment.arrival is None or segment.code is Code.LEVELS
+                or model.material.creep):
+            return draft
+        course = _drafted(draft)
+        slew = model.options.slew_limit
+        step = max(abs(segment.stretch - draft.levels[0].stretch), _LEAST_STEP)
+        if expect(estimate, course, slew).size <= _WIDE * step:
+            return draft
+        arrival = segment.begin + round(CAUTIOUS * (segment.arrival - segment.begin))
+        if rest:
+            arrival = max(min(arrival, rest[0].begin), segment.arrival)
+        self._arrivals[name] = arrival
+        return replace(draft, segments=(replace(segment, arrival=arrival), *rest))
 
     def due(self, now: int) -> Iterator[Work]:
         """
@@ -75,7 +111,15 @@ class Corrections:
     def _correct(self, name: str, now: int) -> Steps[Mapping[str, Draft]]:
         """Plan the rest anew, if that is expected to leave less."""
         planner = self._group.planners[name]
-        draft = yield from planner.draft_resumption(now)
+        arrival = self._arrivals.get(name, 0)
+        if arrival - planner.soonest(now) < _SHORTEST * planner.model.units.time * NANOSECONDS:
+            arrival = 0
+        try:
+            draft = yield from planner.draft_resumption(now, arrival or None)
+        except RefusedError:
+            if not arrival:
+                raise
+            return {}
         estimate = None if draft is None else self._feedback.state(name, draft.begin)
         if draft is None or estimate is None:
             return {}
@@ -83,11 +127,7 @@ class Corrections:
         course, step = _course(planner.plan, draft.begin)
         segment = draft.segments[0]
         before = expect(estimate, course, slew, segment.arrival or 0).size
-        end = draft.segments[1].begin if len(draft.segments) > 1 else None
-        after = expect(estimate, Course(
-            tuple((x.stamp, x.flux_density) for x in draft.levels
-                  if end is None or x.stamp < end),
-            segment.arrival or draft.begin, segment.stretch), slew).size
+        after = expect(estimate, _drafted(draft), slew).size
         if after < min(math.sqrt(_SHARE) * before, before - _GAIN * step):
             return {name: draft}
         return {}
@@ -127,6 +167,15 @@ def _as_sent(planner: Planner, now: int) -> bool:
         return False
     _, segment = found
     return segment.code is Code.LEVELS and (segment.arrival is None or now < segment.arrival)
+
+
+def _drafted(draft: Draft) -> Course:
+    """Return the course of the first setpoint of a draft."""
+    segment, *rest = draft.segments
+    return Course(
+        tuple((x.stamp, x.flux_density) for x in draft.levels
+              if not rest or x.stamp < rest[0].begin),
+        segment.arrival or draft.begin, segment.stretch)
 
 
 def _course(plan: Plan, begin: int) -> tuple[Course, float]:

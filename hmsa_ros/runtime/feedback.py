@@ -304,6 +304,20 @@ class Feedback:
             return None
         return joint.estimator.predict(time)
 
+    def foreseen(self, name: str, time: int) -> Estimate | None:
+        """Return what moves may be corrected from at a time in ns, before samples come too."""
+        joint = self._joints.get(name)
+        if joint is None or joint.latest is not None:
+            return self.state(name, time)
+        joint.estimator.set_levels(
+            [(x.stamp, x.flux_density) for x in self._group.planners[name].plan.levels])
+        return joint.estimator.predict(time)
+
+    @property
+    def cautious(self) -> bool:
+        """Whether moves with actuators that are not well known are to take longer."""
+        return self.mode == 'adapt' and self._settings.feedback_cautious
+
     def news(self) -> Iterator[tuple[str, Planner]]:
         """
         Learn from the latest estimates.

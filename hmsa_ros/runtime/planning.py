@@ -10,7 +10,7 @@ from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.runtime.bulletin import Bulletin
 from hmsa_ros.runtime.corrections import Corrections
 from hmsa_ros.runtime.following import Following
-from hmsa_ros.runtime.records import Note, Request, Severity, Verdict
+from hmsa_ros.runtime.records import Note, Request, Severity, Stop, Verdict
 from hmsa_ros.runtime.slices import Clock, Work, work_on
 
 #: How long planning goes on before commands and requests are served again, in ns.
@@ -155,6 +155,8 @@ class Planning:
     def _answer(self, request: Request, drafts: Mapping[str, Draft], now: int) -> None:
         """Begin to carry out a request."""
         self._following.astray -= drafts.keys()
+        if not isinstance(request, Stop):
+            drafts = self._corrections.cautious(drafts)
         changed = self._group.take(drafts, now)
         # First, since reporting takes time.
         self._send()

@@ -40,6 +40,8 @@ class Settings:
         ``off``; ``observe`` to estimate from samples; ``adapt`` to correct plans too.
     feedback_parameters : tuple of str
         What is estimated besides the state.
+    feedback_cautious : bool
+        Whether a first move takes longer where it is expected to leave much.
     feedback_frozen : bool
         Whether these stay as they are, and the state alone is estimated.
     feedback_file : str
@@ -64,6 +66,7 @@ class Settings:
     tolerances: Tolerances = field(default_factory=Tolerances)
     feedback: str = 'off'
     feedback_parameters: tuple[str, ...] = TRACKED
+    feedback_cautious: bool = False
     feedback_frozen: bool = False
     feedback_file: str = ''
     known: Mapping[str, Known] = field(default_factory=dict)
