@@ -66,8 +66,9 @@ def planned(run, path, target, shaper):
 
 
 @pytest.mark.parametrize('more', [
-    {}, {'slew_limit': 40.0}, {'coil_time_constant': 3e-4}, {'flux_density_max': 0.06}],
-    ids=['ideal', 'ramps', 'lag', 'weak coil'])
+    {}, {'slew_limit': 40.0}, {'coil_time_constant': 3e-4}, {'flux_density_max': 0.06},
+    {'viscoelastic.ratio': [0.1], 'viscoelastic.time': [0.05]}],
+    ids=['ideal', 'ramps', 'lag', 'weak coil', 'creep'])
 def test_rows_in_si_units_are_the_plans_of_hmsa_plan_for_every_law_and_shaper(
         run, params_file, more):
     laws = list(LAWS) if not more else ['gent', 'yeoh']
@@ -90,7 +91,7 @@ def test_rows_in_si_units_are_the_plans_of_hmsa_plan_for_every_law_and_shaper(
             for name in ('flux_density_p', 'time_p', 'flux_density_1'):
                 expected = math.nan if plan[name] is None else plan[name]
                 assert float(row[name]) == pytest.approx(
-                    expected, rel=1e-6, abs=1e-9, nan_ok=True)
+                    expected, rel=1e-6, abs=1e-9, nan_ok=True), name
 
 
 def test_parameters_in_si_units_are_varied_one_by_one(run, params_file):

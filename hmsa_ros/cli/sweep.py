@@ -109,17 +109,12 @@ def _sweep(arguments: argparse.Namespace) -> 'Sweep':
     system: System = Nondimensional()
     belief = NOTHING
     if arguments.params_file is not None:
-        from hmsa_ros.contract.actuator import creep_from
         from hmsa_ros.contract.parameters import PLANNED, VISCOELASTIC
         from hmsa_ros.contract.topics import PLANNER
         from hmsa_ros.runs.parameters import read_parameter_file, values_of
 
-        given = read_parameter_file(arguments.params_file)
-        if creep_from(values_of(given, PLANNER, VISCOELASTIC)):
-            raise BadInputError(
-                f'{arguments.params_file} sets viscoelastic.ratio: expected none, since sweeps do '
-                'not know of creep yet')
-        system = InSI.of(values_of(given, PLANNER, PLANNED))
+        system = InSI.of(values_of(
+            read_parameter_file(arguments.params_file), PLANNER, (*PLANNED, *VISCOELASTIC)))
         if arguments.identified:
             from hmsa_ros.studies.identified import belief_of
 

@@ -95,8 +95,8 @@ def by_settings(
     groups = np.full(len(settings), -2)
     for i, setting in enumerate(settings):
         if setting is not None:
-            groups[i] = -1 if not setting.delivery.ideal else laws.setdefault(
-                setting.material.law, len(laws))
+            alone = setting.material.creep or not setting.delivery.ideal
+            groups[i] = -1 if alone else laws.setdefault(setting.material.law, len(laws))
     group = np.where((groups[which] >= 0) & (shapers != 'two_step'), -1, groups[which])
     for elastic, number in laws.items():
         rows = np.flatnonzero(group == number)

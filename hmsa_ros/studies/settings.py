@@ -145,7 +145,8 @@ class InSI(System):
     Attributes
     ----------
     known : dict of str to object
-        Values of `hmsa_ros.contract.parameters.PLANNED`, and points of a law that were in a file.
+        Values of `hmsa_ros.contract.parameters.PLANNED` and of creep, and points of a law that
+        were in a file.
 
     """
 
@@ -172,8 +173,9 @@ class InSI(System):
 
     @property
     def ideal(self) -> bool:
-        """Whether commands apply at any time and at once."""
-        return not (self.known['slew_limit'] or self.known['coil_time_constant'])
+        """Whether commands apply at any time and at once, to a block that does not creep."""
+        return not any(self.known.get(x) for x in (
+            'slew_limit', 'coil_time_constant', 'viscoelastic.ratio'))
 
     def setting(self, values: Mapping[str, Any]) -> Setting:
         """Return what a row is planned with; a modulus scales the constants of a law."""
