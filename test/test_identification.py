@@ -374,6 +374,21 @@ def test_sixty_uneven_points_of_a_figure_are_enough():
     assert max(map(abs, relative(found).values())) < 4.0
 
 
+@pytest.mark.parametrize('seed', range(4))
+def test_points_of_a_figure_with_stamps_off_by_a_fiftieth_of_a_period_cover_the_truth(seed):
+    random = np.random.default_rng(seed)
+    times = np.sort(random.uniform(0.0, 0.15, 80))
+    clean = recorded(noise=2e-3, times=times, repeats=1, seed=seed)
+    stamps = times + 0.02 * 2.56 * T * random.standard_normal(80)
+    order = np.argsort(stamps)
+    found = identify(
+        replace(clean, time=stamps[order], stretch=clean.stretch[order]), actuator=replace(
+            BLOCK, shear_modulus=3.0 * BLOCK.shear_modulus))
+    assert any('as with stamps that are off by' in x for x in found.warnings)
+    assert found.verdict == 'identified' or 'jitter of the stamps' in found.reason
+    assert max(map(abs, relative(found).values())) < 4.0
+
+
 @pytest.mark.parametrize(('change', 'message'), [
     ({'stretch': np.ones(1200)}, 'stays within 0.*expected a motion'),
     ({'stretch': 1.0 + 1e-3 * np.random.default_rng(0).standard_normal(1200)},

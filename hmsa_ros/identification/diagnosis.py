@@ -219,7 +219,7 @@ def signatures(
         The largest first.
 
     """
-    root = np.sqrt(fit.weights)
+    root = fit.root
     known = np.hstack([fit.response.jacobian, fit.response.by_switch])
     base, _ = np.linalg.qr(root[:, None] * known / np.maximum(
         np.linalg.norm(known, axis=0), 1e-300))
@@ -306,7 +306,7 @@ def in_motion(recording: Recording, fit: Fit) -> float:
     part = len(order) // 4
     if part < _FEWEST_PARTS:
         return 1.0
-    slow, fast = (np.sqrt(np.mean((fit.weights * fit.residual ** 2)[x]))
+    slow, fast = (np.sqrt(np.mean((fit.root * fit.residual)[x] ** 2))
                   for x in (order[:part], order[-part:]))
     return float(fast / slow) if slow > 0.0 else 1.0
 
@@ -403,7 +403,7 @@ def misfit(
     motion = float(np.std(recording.stretch))
     figures = (
         f'residuals of {fit.scale:.3g} with an autocorrelation of '
-        f'{float(autocorrelation(fit.residual * np.sqrt(fit.weights))[1]):.2f} from one sample '
+        f'{float(autocorrelation(fit.residual * fit.root)[1]):.2f} from one sample '
         f'to the next (white with a probability of {found.p_value:.2g})')
     if distant(recording, fit, found):
         return (

@@ -51,6 +51,8 @@ class Fit:
         Whether the last step was small against the standard deviations.
     passes : int
         Simulations that it took.
+    spread : ndarray, shape (n,)
+        Deviation of each sample over that of one at rest.
     prior : float
         Information on each uncertain switch besides the samples, for a noise of 1.
 
@@ -64,7 +66,14 @@ class Fit:
     scale: float
     converged: bool
     passes: int
+    spread: Array
     prior: float = 0.0
+
+    @property
+    def root(self) -> Array:
+        """By which residuals and derivatives are multiplied to count as they should."""
+        found: Array = np.sqrt(self.weights) / self.spread
+        return found
 
     @property
     def jacobian(self) -> Array:
@@ -72,7 +81,7 @@ class Fit:
         jacobian, extra = self.response.jacobian, self.response.by_switch
         if not extra.shape[1]:
             return jacobian
-        weighted = self.weights[:, None] * extra
+        weighted = self.root[:, None] ** 2 * extra
         matrix = extra.T @ weighted + self.prior * np.eye(extra.shape[1])
         found: Array = jacobian - extra @ np.linalg.solve(matrix, weighted.T @ jacobian)
         return found
@@ -80,7 +89,7 @@ class Fit:
     @property
     def information(self) -> Array:
         """Information matrix by the coordinates, for a noise of 1; shape (p, p)."""
-        matrix: Array = self.response.jacobian.T @ (self.weights[:, None] * self.jacobian)
+        matrix: Array = self.response.jacobian.T @ (self.root[:, None] ** 2 * self.jacobian)
         return 0.5 * (matrix + matrix.T)
 
 
@@ -127,7 +136,8 @@ def moved(values: Mapping[str, float], free: Sequence[str], step: Array) -> dict
 
 def fit(
         recording: Recording, values: Mapping[str, float], free: Sequence[str], *,
-        at_rest: bool = True, most: int = _MAX_PASSES) -> Fit | None:
+        at_rest: bool = True, most: int = _MAX_PASSES, spread: Array | None = None
+) -> Fit | None:
     """
     Descend from start values to a minimum.
 
@@ -143,6 +153,8 @@ def fit(
         Whether the motion begins at rest.
     most : int
         Simulations at most.
+    spread : ndarray, shape (n,), optional
+        Deviation of each sample over that of one at rest; all alike without it.
 
     Returns
     -------
@@ -150,14 +162,16 @@ def fit(
         None if the motion of the start cannot be followed.
 
     """
-    return _Search(recording, tuple(free), at_rest, most).run(values)
+    return _Search(recording, tuple(free), at_rest, most, spread).run(values)
 
 
 class _Search:
     """A descent, with the uncertain switches beside the parameters."""
 
     def __init__(
-            self, recording: Recording, free: tuple[str, ...], at_rest: bool, most: int) -> None:
+            self, recording: Recording, free: tuple[str, ...], at_rest: bool, most: int,
+            spread: Array | None) -> None:
+        self._spread: Array = np.ones(len(recording.time)) if spread is None else spread
         self._recording, self._free, self._at_rest = recording, free, at_rest
         self._most = most
         self._passes = 0
@@ -171,6 +185,9 @@ class _Search:
         self._passes += 1
         return respond(
             self._recording, values, self._free, at_rest=self._at_rest, shifts=shifts)
+
+    def _residual(self, response: Response) -> Array:
+        return (self._recording.stretch - response.stretch) / self._spread
 
     def _prior(self, scale: float) -> float:
         return (scale / self._deviation) ** 2 if self._deviation else 0.0
@@ -187,7 +204,7 @@ class _Search:
         response = self._respond(values, shifts)
         if response is None:
             return None
-        residual = self._recording.stretch - response.stretch
+        residual = self._residual(response)
         scale = robust_scale(residual)
         damping, converged = 1e-4, False
         while self._passes < self._most:
@@ -213,7 +230,7 @@ class _Search:
                     shifts + step[len(self._free):], -self._recording.earlier, 0.0)
                 trial = self._respond(trial_values, trial_shifts)
                 if trial is not None:
-                    trial_residual = self._recording.stretch - trial.stretch
+                    trial_residual = self._residual(trial)
                     after = self._loss(trial_residual, trial_shifts, scale)
                     if after <= allowed:
                         break
@@ -252,6 +269,7 @@ class _Search:
         jacobian = response.jacobian
         if len(shifts):
             jacobian = np.hstack([jacobian, response.by_switch])
+        jacobian = jacobian / self._spread[:, None]
         matrix = jacobian.T @ (weights[:, None] * jacobian)
         gradient = jacobian.T @ (weights * residual)
         if len(shifts):
@@ -266,8 +284,8 @@ class _Search:
             self, values: dict[str, float], response: Response, residual: Array, scale: float,
             converged: bool) -> Fit:
         return Fit(
-            values, self._free, response, residual, weights_of(residual, scale), scale,
-            converged, self._passes, self._prior(scale))
+            values, self._free, response, residual * self._spread, weights_of(residual, scale),
+            scale, converged, self._passes, self._spread, self._prior(scale))
 
 
 def _stride(values: Mapping[str, float], free: Sequence[str], step: Array) -> float:

@@ -12,7 +12,7 @@ from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification import diagnosis
 from hmsa_ros.identification.fit import Fit, fit, LEAST_SCALE, loss, robust_scale
-from hmsa_ros.identification.noise import whiteness, widening
+from hmsa_ros.identification.noise import spread_in_motion, whiteness, widening
 from hmsa_ros.identification.quantities import (
     check_free,
     DEFAULT_FREE,
@@ -42,6 +42,8 @@ _FAR = 4.0
 _DOUBT = 0.05
 # As many fits at one optimum end the search.
 _ENOUGH = 2
+# Times that the errors of the stamps are estimated anew.
+_MOST_SPREADS = 3
 # Fits within this share of the deviations, or of the scale, are one optimum.
 _SAME = 0.02
 # A run whose fastest motion after a change of level is this much slower than a step's is shaped.
@@ -106,6 +108,7 @@ def identify(
             f'{recording.label} has {len(recording.time)} samples for {len(free)} free '
             f'parameters: expected {2 * len(free)} or more')
     best, tried, agreed = _search(recording, values, free, at_rest)
+    best = _with_errors_of_stamps(recording, best, at_rest)
     return _conclude(recording, best, tried, agreed, at_rest)
 
 
@@ -178,6 +181,24 @@ def _search(
     return best, len(found), agreed
 
 
+def _with_errors_of_stamps(recording: Recording, best: Fit, at_rest: bool) -> Fit:
+    """Return a fit in which samples in motion count less, if errors of the stamps show there."""
+    found = best
+    for _ in range(_MOST_SPREADS):
+        spread = spread_in_motion(found.residual, found.response.rate)
+        if np.max(spread) == 1.0:
+            return found
+        again = fit(recording, found.values, found.free, at_rest=at_rest, spread=spread)
+        # What the model leaves out is larger in motion too, but not from sample to sample.
+        if again is None or not again.converged or not whiteness(
+                again.root * again.residual, len(again.free)).white or (
+                robust_scale(again.residual) > 2.0 * diagnosis.DISTANT * float(
+                    np.std(recording.stretch))):
+            return best
+        found = again
+    return found
+
+
 def _best(found: Sequence[Fit]) -> tuple[Fit, int]:
     """Return the likeliest fit, and how many ended there."""
     scale = min(x.scale for x in found)
@@ -213,7 +234,7 @@ def _conclude(
         recording: Recording, best: Fit, tried: int, agreed: int, at_rest: bool
 ) -> Identification:
     """Return the result of a fit."""
-    root = np.sqrt(best.weights)
+    root = best.root
     weighted = root * best.residual
     counted = float(np.sum(best.weights))
     deviation = max(math.sqrt(
@@ -246,11 +267,12 @@ def _conclude(
         weak.names if weak else ())
     parameters, matrix = _estimates(best, covariance, lost)
     outliers = int(np.count_nonzero(best.weights == 0.0))
-    warnings = (*recording.notes, *_warnings(recording, best, factors, outliers, found.white))
+    warnings = (*recording.notes, *_warnings(
+        recording, best, deviation, factors, outliers, found.white))
     return Identification(
         verdict, reason, warnings, parameters, best.free, matrix, deviation,
         float(np.sqrt(np.mean(best.residual ** 2))), len(recording.time), outliers, recording,
-        best.response.stretch, best.residual, best.weights, found, marks,
+        best.response.stretch, best.residual, best.weights, best.spread, found, marks,
         float(np.max(factors)), complete(best.values, best.free), at_rest, tried, agreed)
 
 
@@ -296,7 +318,8 @@ def _estimates(
 
 
 def _warnings(
-        recording: Recording, best: Fit, factors: Array, outliers: int, white: bool
+        recording: Recording, best: Fit, deviation: float, factors: Array, outliers: int,
+        white: bool
 ) -> list[str]:
     """Return what a reader should know besides the verdict, a sentence each."""
     found = []
@@ -304,6 +327,13 @@ def _warnings(
         found.append(
             f'{outliers} of {len(recording.time)} samples are more than six deviations off and '
             'did not count')
+    if np.max(best.spread) > 1.0:
+        place = int(np.argmax(best.spread))
+        error = deviation * math.sqrt(float(best.spread[place]) ** 2 - 1.0) / max(
+            abs(float(best.response.rate[place])), 1e-300)
+        found.append(
+            f'the residuals grow with the rate, as with stamps that are off by {error:.2g} s rms: '
+            'samples in motion count less')
     if not white:
         found.append(
             'the residuals are not white: correlation widened the intervals by up to '
@@ -367,13 +397,15 @@ def profile(
     std = math.sqrt(float(found.covariance[place, place])) / abs(
         derivative(name, found.values[name])) if math.isfinite(
             found.covariance[place, place]) else 0.2 * max(abs(centre), 0.1)
-    base = float(np.sum(found.weights * found.residual ** 2))
+    weights = found.weights / found.spread ** 2
+    base = float(np.sum(weights * found.residual ** 2))
     kept = replace(found.recording, notes=())
     rows = []
     for x in centre + 4.0 * std * np.linspace(-1.0, 1.0, points):
         values = {**found.values, name: from_coordinate(name, float(x))}
-        one = fit(kept, values, others, at_rest=found.at_rest) if others else None
+        one = fit(kept, values, others, at_rest=found.at_rest,
+                  spread=found.spread) if others else None
         if one is not None:
-            loss = float(np.sum(found.weights * one.residual ** 2))
+            loss = float(np.sum(weights * one.residual ** 2))
             rows.append((values[name], max(loss - base, 0.0) / found.noise_std ** 2))
     return rows

@@ -13,6 +13,7 @@ import math
 import numpy as np
 
 from hmsa_ros.core.model import Array
+from hmsa_ros.identification.fit import loss, robust_scale
 
 # Below this probability residuals are not white.
 _WHITE = 1e-3
@@ -20,6 +21,9 @@ _LAGS = 20
 # A window of this many correlation times (A. Sokal, "Monte Carlo methods in statistical
 # mechanics", 1997).
 _WINDOW = 6.0
+# Deviation at the fastest motion over that at rest, as tried, and the gain of the logarithm of the
+# likelihood that speaks for one.
+_LARGEST_SPREADS, _MUCH_LIKELIER = np.geomspace(0.5, 200.0, 13).tolist(), 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +97,47 @@ def whiteness(residual: Array, free: int) -> Whiteness:
             window = lag
             break
     return Whiteness(rho, p_value, max(window, 1))
+
+
+def spread_in_motion(residual: Array, rate: Array) -> Array:
+    """
+    Return the deviation of each sample over that of one at rest.
+
+    Errors of the stamps add to the noise in proportion to the rate. Their size is the likeliest of
+    several, and none unless that is much likelier.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (n,)
+        Of a fit, few of them outliers.
+    rate : ndarray, shape (n,)
+        Of the stretch.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        All 1 where nothing speaks for errors of the stamps.
+
+    """
+    fastest = float(np.max(np.abs(rate), initial=0.0))
+    none: Array = np.ones(len(residual))
+    if fastest == 0.0:
+        return none
+    best, found = -_MUCH_LIKELIER, none
+    reference = _surprise(residual, none)
+    for largest in _LARGEST_SPREADS:
+        spread: Array = np.sqrt(1.0 + (largest * rate / fastest) ** 2)
+        gain = _surprise(residual, spread) - reference
+        if gain < best:
+            best, found = gain, spread
+    return found
+
+
+def _surprise(residual: Array, spread: Array) -> float:
+    """Return the negative logarithm of the likelihood, outliers bounded."""
+    scaled = residual / spread
+    scale = robust_scale(scaled)
+    return len(scaled) * math.log(scale) + float(np.sum(np.log(spread))) + loss(scaled, scale)
 
 
 def widening(jacobian: Array, residual: Array, inverse: Array, found: Whiteness) -> Array:

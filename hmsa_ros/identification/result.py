@@ -94,8 +94,9 @@ class Identification:
         How many samples there are, and how many of them did not count.
     recording : Recording
         What was measured.
-    fitted, residual, weights : ndarray, shape (n,)
-        Simulated stretch, measured less simulated, and how far each sample counted.
+    fitted, residual, weights, spread : ndarray, shape (n,)
+        Simulated stretch, measured less simulated, how far each sample counted, and its deviation
+        over that of one at rest.
     whiteness : Whiteness
         Of the residuals.
     signatures : tuple of Signature
@@ -125,6 +126,7 @@ class Identification:
     fitted: Array
     residual: Array
     weights: Array
+    spread: Array
     whiteness: Whiteness
     signatures: tuple[Signature, ...]
     widened: float
