@@ -18,10 +18,12 @@ from hmsa_ros.core.shooting import approach, Attempt, solve, Template
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.two_step import plan_two_step
 
-# How many later half periods are tried where the first that fits gives no solution.
-_LATER = 4
+# Where a search begins: shares of the way between the least and the largest level, and the longest
+# hold in eighths of a period.
+_HEIGHTS = (0.5, 0.3, 0.7, 0.1, 0.9)
+_LONGEST_HOLD = 18
 # Ramps slower than this are refused without a search, which would take seconds.
-_MOST_HALF_PERIODS = 40
+_MOST_HALF_PERIODS = 80
 _SHORTEST_STRIDE = 0.05
 # Ramps to begin the search for two swings with, in quarters of a period.
 _SWINGS = (0.3, 0.1, 0.7, 0.03, 1.2)
@@ -179,15 +181,16 @@ def _ramped(request: Request, first: Level, last: Level) -> Move:
     Solve for the level between two ramps and for how long it holds.
 
     A linear oscillator comes to rest where ramps and hold together span an odd number of half
-    periods: slow ramps wait for a later one, until which more of the first ramp's vibration
-    has decayed. The solution is followed from fast ramps to the real ones.
+    periods. The solution for the first that fits is followed from fast ramps to the real ones;
+    where that fails, levels and holds in between are tried.
     """
     slew = request.delivery.slew
     start, change = request.load, last.load - request.load
     decay = 1.0
     if first.load != start:
         decay = min(1.0, abs((last.load - first.load) / (first.load - start)))
-    least = 1 + 2 * max(0, math.ceil(0.5 * (abs(change) / slew / (2.0 * last.time) - 1.0)))
+    half_periods = 1 + 2 * max(
+        0, math.ceil(0.5 * (abs(change) / slew / (2.0 * last.time) - 1.0)))
 
     def slower(levels: tuple[Level, ...], share: float, aim: float) -> Attempt:
         # The ramps lengthen about their middles, so that the second one begins earlier.
@@ -198,20 +201,21 @@ def _ramped(request: Request, first: Level, last: Level) -> Move:
             Template.of(guess, [('load', 0), ('time', 1)]), request,
             replace(request.delivery, slew=slew / aim))
 
-    most = min(least + 2 * _LATER, _MOST_HALF_PERIODS)
-    for half_periods in range(least, most, 2):
-        if half_periods == least + 2 and request.state.rate != 0.0:
-            # Sooner there than by waiting for a later half period.
-            found = _swings(request, last.load)
-            if found is not None:
-                return Move(Code.MINIMUM_TIME, *found, _no_single(request))
-        between = first.load
-        if half_periods > 1:
-            between = start + change / (1.0 + decay ** half_periods)
-        ideal = (Level(0.0, between), Level(half_periods * last.time, last.load))
-        found = approach(ideal, slower, _SHORTEST_STRIDE)
-        if found is not None and request.keeps(found[0]):
-            return Move(Code.TWO_STEP, *found)
+    between = first.load
+    if half_periods > 1:
+        between = start + change / (1.0 + decay ** half_periods)
+    ideal = (Level(0.0, between), Level(half_periods * last.time, last.load))
+    found = approach(ideal, slower, _SHORTEST_STRIDE)
+    if found is not None and request.keeps(found[0]):
+        return Move(Code.TWO_STEP, *found)
+    if request.state.rate != 0.0:
+        # Sooner there than by waiting.
+        found = _swings(request, last.load)
+        if found is not None:
+            return Move(Code.MINIMUM_TIME, *found, _no_single(request))
+    found = _searched(request, last.load)
+    if found is not None:
+        return Move(Code.TWO_STEP, *found)
     if request.state.rate != 0.0:
         with contextlib.suppress(RefusedError):
             return minimum_time(request, _no_single(request))
@@ -220,6 +224,24 @@ def _ramped(request: Request, first: Level, last: Level) -> Move:
         f'no command through ramps of {request.units.slew_text(slew)} brings stretch '
         f'{request.target:g} to rest: expected a slew limit of about '
         f'{request.units.slew_text(abs(change) / last.time)}')
+
+
+def _searched(request: Request, holding: float) -> Attempt:
+    """Solve for a level and its hold from many guesses, those that hold shortest first."""
+    slew, start = request.delivery.slew, request.load
+    eighth = 0.25 * math.pi / law.natural_frequency(request.target, request.material.packed)
+    if abs(holding - start) > _MOST_HALF_PERIODS * 4.0 * eighth * slew:
+        return None
+    reach = 8.0 * eighth * slew
+    low = max(request.limits.minimum, min(start, holding) - reach)
+    high = min(request.limits.maximum, max(start, holding) + reach)
+    for hold, height in product(range(_LONGEST_HOLD), _HEIGHTS):
+        level = low + height * (high - low)
+        guess = (Level(0.0, level), Level(abs(level - start) / slew + hold * eighth, holding))
+        found = solve(Template.of(guess, [('load', 0), ('time', 1)]), request)
+        if found is not None and request.keeps(found[0]):
+            return found
+    return None
 
 
 def _no_single(request: Request) -> str:
@@ -235,6 +257,9 @@ def _two_levels(request: Request, holding: float) -> Move:
         found = _swings(request, holding)
         if found is not None:
             return Move(Code.MINIMUM_TIME, *found, _no_single(request))
+        found = _searched(request, holding)
+        if found is not None:
+            return Move(Code.TWO_STEP, *found)
     return minimum_time(request, _no_single(request))
 
 
