@@ -181,13 +181,9 @@ class Planner(RunningPlan):
         return (yield from draft_stop(self._outset(self.soonest(now))))
 
     def draft_resumption(self, now: int, arrival: int | None = None) -> Steps[Draft | None]:
-        """
-        Plan what is left anew, from where the actuator really is; None if nothing is left.
-
-        Where a time of arrival in ns is given, the setpoint under way is reached then.
-        """
-        # From the first time that a command can reach, or, where there is no way from the motion
-        # it meets, a part of a period later.
+        """Plan what is left anew from where the actuator is, to arrive in time if one is given."""
+        # None if nothing is left. From the first time that a command can reach, or, where there is
+        # no way from the motion it meets, a part of a period later.
         begin = self.soonest(now)
         if self.plan.segments:
             begin = max(begin, self.plan.segments[0].since)

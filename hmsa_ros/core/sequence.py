@@ -117,9 +117,7 @@ def segments(
         errors: tuple[float, float, float] = ERRORS,
         first: Shaper | None = None) -> Generator[Segment, None, None]:
     """
-    Plan as `plan_sequence` does, but setpoint by setpoint, each when it is requested.
-
-    The first move may have a shaper of its own.
+    Plan as `plan_sequence` does, setpoint by setpoint; the first may have a shaper of its own.
 
     Raises
     ------

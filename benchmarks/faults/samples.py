@@ -1,0 +1,71 @@
+"""Faults of the sensor while feedback adapts: they are named, and never move the field."""
+
+import signal
+
+from benchmarks.faults.common import await_change, jump, move, pair, Register, share
+from benchmarks.faults.rig import Rig
+from benchmarks.faults.table import Seen
+from hmsa_ros.nodes import interface
+
+FAULTS = Register()
+_TARGET = 1.2
+# What noise of 1e-3 may leave, as a share of the step.
+_LEFT = 0.02
+
+
+def _failing(rig: Rig, fault: str, word: str, counter: str) -> Seen:
+    """Learn with a sensor that works, have it fail at rest, and move again."""
+    told: list[tuple[str, dict[str, str]]] = []
+    topic = interface.ESTIMATE
+    rig.node.create_subscription(
+        topic.type, interface.from_outside(topic.name, interface.PLANNER),
+        lambda x: told.extend(
+            (y.message, {z.key: z.value for z in y.values}) for y in x.status), topic.qos)
+    name = interface.JOINT_STATES.name
+    sensor = rig.run('sensor', '-m', 'benchmarks.faults.sensor', name, f'{name}_seen', fault)
+    pair(rig, plant={'mismatch.shear_modulus': 1.1}, planner={'feedback': 'adapt'},
+         remap={name: f'{name}_seen'})
+    mark = rig.count()
+    rig.setpoint(_TARGET)
+    await_change(rig, mark)
+    rig.spin_until(lambda: told and 'plans use it' in told[-1][0], 'what is learnt')
+    # Until nothing is left to be corrected.
+    rig.let_pass(2.0)
+    first = rig.count()
+    sensor.send(signal.SIGUSR1)
+    rig.let_pass(1.5)
+    moved = jump(rig, first)
+    seen = len(told)
+    residual, error = move(rig, 1.1, start=_TARGET, pause=1.0)
+    said = any(word in message for message, _ in told[seen - 1:]) if word else True
+    count = int(told[-1][1].get(counter, 0)) if counter else 1
+    silent = fault == 'silence' and len(told) - seen < 2
+    trusted = all(x['trusted'] == 'True' for _, x in told[seen:])
+    harmless = fault in ('swap', 'twice')
+    return Seen(
+        f'field changed by {moved:.2g} T on its own; '
+        + ('no estimate any more' if silent else f'"{told[-1][0]}"')
+        + (f'; {count} {counter}' if counter else '') + f'; error {error:.1%}', share(residual),
+        said and count > 0 and max(residual, error) < _LEFT
+        and (harmless and trusted or moved == 0.0))
+
+
+for _fault, _name, _how, _expected, _word, _counter in (
+        ('nan', 'a sensor that gives no numbers', 'NaN for each sample',
+         'counted as unreadable', '', 'unreadable'),
+        ('freeze', 'a sensor that freezes', 'the last value again and again',
+         'rejected and named once the actuator moves', 'open loop until samples fit again', ''),
+        ('jump', 'a sensor that jumps', '0.05 of stretch more from now on',
+         'rejected and named', 'open loop until samples fit again', 'rejected'),
+        ('swap', 'samples in the wrong order', 'each two swapped',
+         'put in order by their stamps', '', ''),
+        ('twice', 'samples that come twice', 'each sample sent twice', 'counted as repeated', '',
+         'repeated'),
+        ('silence', 'a sensor that falls silent', 'no samples any more', 'open loop', '', '')):
+    FAULTS.fault(
+        f'sensor_{_fault}', f'{_name}, feedback adapt',
+        f'{_how}, at rest, after a move with G 10 % higher, noise 1e-3; then 1.2 -> 1.1',
+        f'{_expected}; the field does not change on its own, the next move is planned with what '
+        f'was learnt: residual and error below {_LEFT:g}')(
+            lambda rig, fault=_fault, word=_word, counter=_counter: _failing(
+                rig, fault, word, counter))

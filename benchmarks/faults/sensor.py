@@ -1,0 +1,95 @@
+"""
+Stand between plant and planner as a sensor with noise, which fails when it gets SIGUSR1.
+
+    python -m benchmarks.faults.sensor IN OUT FAULT
+
+Takes samples from topic IN and sends them to topic OUT.
+"""
+
+import argparse
+from collections.abc import Sequence
+import copy
+import math
+import random
+import signal
+import sys
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
+from rclpy.task import Future
+from sensor_msgs.msg import JointState
+
+from hmsa_ros.nodes import interface
+
+#: What can happen to a sensor.
+FAULTS = ('nan', 'freeze', 'jump', 'swap', 'twice', 'silence')
+_NOISE, _JUMP = 1e-3, 0.05
+
+
+class Sensor(Node):
+    """Passes samples on, with a fault once it has been asked for."""
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        """Listen and pass on."""
+        super().__init__('sensor', enable_rosout=False)
+        self._fault = options.fault
+        self.failed = False
+        self._random = random.Random(1)
+        self._held: JointState | None = None
+        self._last = 0.0
+        topic = interface.JOINT_STATES
+        self._publisher = self.create_publisher(topic.type, options.target, topic.qos)
+        self.create_subscription(topic.type, options.source, self._on_sample, topic.qos)
+
+    def _on_sample(self, message: JointState) -> None:
+        stretch = message.position[0] + self._random.gauss(0.0, _NOISE)
+        # A camera has neither of them.
+        message.velocity, message.effort = [], []
+        if not self.failed:
+            self._last = stretch
+        elif self._fault in ('nan', 'freeze', 'jump'):
+            stretch = {
+                'nan': math.nan, 'freeze': self._last, 'jump': stretch + _JUMP}[self._fault]
+        message.position = [stretch]
+        for x in self._passed_on(message) if self.failed else (message,):
+            self._publisher.publish(x)
+
+    def _passed_on(self, message: JointState) -> Sequence[JointState]:
+        if self._fault == 'twice':
+            return message, message
+        if self._fault == 'silence':
+            return ()
+        if self._fault == 'swap':
+            if self._held is None:
+                self._held = copy.copy(message)
+                return ()
+            held, self._held = self._held, None
+            return message, held
+        return (message,)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Pass on until interrupted."""
+    parser = argparse.ArgumentParser(description='Pass samples on, with a fault.')
+    parser.add_argument('source')
+    parser.add_argument('target')
+    parser.add_argument('fault', choices=FAULTS)
+    options = parser.parse_args(arguments)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    rclpy.init(args=[])
+    node = Sensor(options)
+    signal.signal(signal.SIGUSR1, lambda *_: setattr(node, 'failed', True))
+    executor = EventsExecutor()
+    executor.add_node(node)
+    never = Future()
+    try:
+        while True:
+            executor.spin_until_future_complete(never, 0.1)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
