@@ -56,7 +56,9 @@ def test_at_most_half_of_the_chain_is_left_at_the_worst_in_the_same_time(start, 
         for x in (chain, move)]
     assert worst[1] < 0.5 * worst[0]
     held = float(elastic_force(start, PAPER)), move.levels[-1].load
-    assert all(min(held) - 1e-12 <= x.load <= max(held) + 1e-12 for x in move.levels)
+    # Reports tell moves apart by the levels that hold their targets.
+    inside = 1e-4 * abs(held[1] - held[0])
+    assert all(min(held) + inside < x.load < max(held) - inside for x in move.levels[:-1])
 
 
 def test_what_it_measures_is_the_peak_to_peak_of_an_integration():

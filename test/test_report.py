@@ -293,7 +293,7 @@ def test_setpoints_are_found_and_measured_as_the_demo_measures_them(bag):
         previous = x.stretch
 
 
-@pytest.mark.parametrize('shaper', ['robust', 'minimum_time', 'zv', 'step'])
+@pytest.mark.parametrize('shaper', ['robust', 'minimax', 'minimum_time', 'zv', 'step'])
 def test_setpoints_are_found_whatever_the_shaper(tmp_path, shaper):
     part = one(
         tmp_path / 'bag', simulated(shaper=shaper),
@@ -304,6 +304,8 @@ def test_setpoints_are_found_whatever_the_shaper(tmp_path, shaper):
         assert residual < ROUNDING
     else:
         assert residual > 1e-3
+    if shaper == 'minimax':
+        assert residual < 0.02
 
 
 def test_without_the_requests_setpoints_are_told_by_the_levels_that_last(tmp_path, bag):

@@ -34,6 +34,8 @@ _RTOL = 1e-9
 # change of a first pass.
 _CHANGE, _STRIDE = 1e-5, 0.3
 _PASSES = 6
+# Of the range of the levels.
+_MARGIN = 1e-3
 # Vibration that is rounding.
 _NOTHING = 1e-8
 # A pass that gains a smaller share is the last one.
@@ -213,6 +215,8 @@ def _search(
     bounds = [request.field, *(x.load for x in chain.levels)]
     low = max(min(bounds), request.limits.minimum)
     high = min(max(bounds), request.limits.maximum)
+    # A level in between must not look like one that holds start or target.
+    low, high = low + _MARGIN * (high - low), high - _MARGIN * (high - low)
 
     def command(loads: Array) -> tuple[Level, ...]:
         return tuple(
