@@ -44,6 +44,8 @@ _DOUBT = 0.05
 _ENOUGH = 2
 # Times that the errors of the stamps are estimated anew.
 _MOST_SPREADS = 3
+# Probability of residuals to be white below which no chance makes them look like this.
+_CERTAIN = 1e-5
 # Fits within this share of the deviations, or of the scale, are one optimum.
 _SAME = 0.02
 # A run whose fastest motion after a change of level is this much slower than a step's is shaped.
@@ -190,11 +192,11 @@ def _with_errors_of_stamps(recording: Recording, best: Fit, at_rest: bool) -> Fi
             return found
         again = fit(recording, found.values, found.free, at_rest=at_rest, spread=spread)
         # What the model leaves out is larger in motion too, but not from sample to sample.
-        if again is None or not again.converged or not whiteness(
-                again.root * again.residual, len(again.free)).white or (
+        if again is None or not again.converged or whiteness(
+                again.root * again.residual, len(again.free)).p_value < _CERTAIN or (
                 robust_scale(again.residual) > 2.0 * diagnosis.DISTANT * float(
                     np.std(recording.stretch))):
-            return best
+            return found
         found = again
     return found
 
