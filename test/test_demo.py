@@ -33,6 +33,11 @@ def test_every_setpoint_is_reached_and_held_while_another_process_loads_a_core(s
     assert result['setpoints'][0]['tau_p'] == pytest.approx(1.315749737, abs=1e-6)
     assert result['setpoints'][2]['b_p'] ** 2 == pytest.approx(0.778278436, abs=1e-6)
     assert result['exits'] == {'recorder': 0, 'plant': 0, 'planner': 0}
+    # The second act: open loop misses, feedback arrives.
+    for move in result['adapting']['moves']:
+        worst = max(move['vibration'], abs(move['offset']))
+        assert worst < 0.005 if move['feedback'] == 'adapt' else worst > 0.1
+    assert Path(result['adapting']['picture']).read_bytes().startswith(b'\x89PNG')
     assert Path(result['picture']).read_bytes().startswith(b'\x89PNG')
     _check_bag(Path(result['bag']))
 

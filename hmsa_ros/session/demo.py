@@ -17,6 +17,7 @@ from hmsa_ros.errors import HmsaError
 from hmsa_ros.report.evaluation import evaluate, MoveResult
 from hmsa_ros.runs.bags import read_runs
 from hmsa_ros.runs.levels import without_repeats
+from hmsa_ros.session.adapting import second_act, SecondAct
 from hmsa_ros.session.experiment import conduct, Experiment
 from hmsa_ros.session.processes import NodeProcess
 
@@ -44,12 +45,13 @@ class SetpointResult(MoveResult):
 
 @dataclass(frozen=True)
 class DemoResult:
-    """What the demo found: setpoints, exit statuses by process, and the files written."""
+    """What the demo found: setpoints, exit statuses by process, files, and the second act."""
 
     setpoints: tuple[SetpointResult, ...]
     exits: dict[str, int]
     bag: Path
     picture: Path
+    adapting: SecondAct
 
     @property
     def succeeded(self) -> bool:
@@ -60,7 +62,8 @@ class DemoResult:
         """Return the result for JSON."""
         return {
             'succeeded': self.succeeded, 'setpoints': [asdict(x) for x in self.setpoints],
-            'exits': self.exits, 'bag': str(self.bag), 'picture': str(self.picture)}
+            'exits': self.exits, 'bag': str(self.bag), 'picture': str(self.picture),
+            'adapting': self.adapting.as_json()}
 
 
 def run_demo(
@@ -71,10 +74,13 @@ def run_demo(
         ((stretch,), span * paper_actuator().time_unit) for stretch, span in SEQUENCE], _NODES)
     exits = conduct(experiment, environment, progress).exits
     progress('evaluating the bag', 1.0)
-    return _evaluate(experiment.bag, folder / 'run.png', exits)
+    results = _evaluate(experiment.bag, folder / 'run.png')
+    progress('a plant that is not as planned', 1.0)
+    return DemoResult(
+        results, exits, experiment.bag, folder / 'run.png', second_act(folder / 'adapting.png'))
 
 
-def _evaluate(bag: Path, picture: Path, exits: dict[str, int]) -> DemoResult:
+def _evaluate(bag: Path, picture: Path) -> tuple[SetpointResult, ...]:
     """Read the run back from the bag, measure it and draw it."""
     from hmsa_ros.figures.run import draw_run
 
@@ -92,4 +98,4 @@ def _evaluate(bag: Path, picture: Path, exits: dict[str, int]) -> DemoResult:
         command_time=np.array([evaluation.seconds(x.stamp) for x in levels]),
         command=np.array([x.flux_density for x in levels]), unshaped=evaluation.unshaped,
         targets=[(x.stretch, x.begin, x.arrival, x.end) for x in results])
-    return DemoResult(results, exits, bag, picture)
+    return results
