@@ -4,6 +4,8 @@ Draw the figures of docs/theory.md and docs/laws.md into docs/images, from the p
 Used by ``make theory``.
 """
 
+from dataclasses import replace
+import math
 from pathlib import Path
 import sys
 
@@ -12,6 +14,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
+from hmsa_ros.core.creep import Creep  # noqa: E402
 from hmsa_ros.core.delivery import Delivery, pieces  # noqa: E402
 from hmsa_ros.core.laws import LAWS  # noqa: E402
 from hmsa_ros.core.model import elastic_force, stretch_limits  # noqa: E402
@@ -153,6 +156,33 @@ def laws(path: Path) -> None:
         style.finish(axes, r'stretch $\lambda$', r"load that holds it, $\beta_1 = \psi'$")
 
 
+def creep(path: Path) -> None:
+    """Draw a creeping block commanded by the paper's two-step and by a plan that knows it."""
+    creeping = replace(MATERIAL, creep=Creep((0.1, 0.1), (2.0, 20.0)))
+    span, grid = 15.0, Delivery(0.25)
+    setpoints = [Setpoint(1.4, span), Setpoint(1.1, math.inf)]
+    time = np.linspace(0.0, 2.0 * span, 3001)
+    looks = ((MATERIAL, "the paper's two-step", style.UNSHAPED),
+             (creeping, 'two-step and staircase', style.SHAPED))
+    with style.picture(path, 4.2) as figure:
+        rows = figure.subplots(3, 1, sharex=True, height_ratios=[1.0, 1.2, 0.9])
+        for material, name, look in looks:
+            segments = plan_sequence(setpoints, material, delivery=grid)
+            levels = [(x.begin + y.time, y.load) for x in segments for y in x.move.levels]
+            switches, loads = np.array([x for x in levels if x[0] < time[-1]]).T
+            stretch, _ = simulate(switches, loads, time, creeping)
+            rows[0].step(np.append(switches, time[-1]), np.append(loads, loads[-1]),
+                         where='post', **look)
+            rows[1].plot(time, stretch, label=name, **look)
+            off = 100.0 * (stretch - np.where(time < span, 1.4, 1.1))
+            rows[2].plot(time, off / np.where(time < span, 0.4, 0.3), **look)
+        rows[1].legend(loc='upper right')
+        rows[2].set_ylim(-18.0, 18.0)
+        style.finish(rows[0], '', r'load $\beta$', 'a')
+        style.finish(rows[1], '', r'stretch $\lambda$', 'b')
+        style.finish(rows[2], r'time $\tau$', 'off target,\n% of the step', 'c')
+
+
 def main() -> int:
     """Draw all of them."""
     force(FOLDER / 'theory_force.png')
@@ -160,6 +190,7 @@ def main() -> int:
     energy(FOLDER / 'theory_paths.png')
     deliveries(FOLDER / 'theory_deliveries.png')
     laws(FOLDER / 'laws.png')
+    creep(FOLDER / 'creep.png')
     return 0
 
 

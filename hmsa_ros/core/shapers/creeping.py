@@ -7,6 +7,7 @@ stay at rest the level has to follow it: psi'(l_d) + sum h_i exp(-t/tau_i), as a
 """
 
 from dataclasses import replace
+import math
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from hmsa_ros.core import law
 from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.creep_kernel import RATIO, SPEED
 from hmsa_ros.core.delivery import Delivery, IDEAL
+from hmsa_ros.core.model import Array
 from hmsa_ros.core.moves import Level, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.shapers.lagged import free_heights
@@ -28,8 +30,9 @@ from hmsa_ros.errors import BadInputError
 SHAPERS = ('two_step', 'robust', 'step')
 # The least move that counts, and how much more a staircase may leave than is worked out.
 _LEAST_MOVE, _SURE = 1e-3, 1.25
-# Levels of a staircase at the most, and how its vibration grows until it has no more.
-_MOST, _COARSER = 300, 1.5
+# Levels of a staircase at the most, how its vibration grows until it has no more, and how often
+# the way back is halved.
+_MOST, _COARSER, _HALVINGS = 300, 3.0, 5
 _SHORTEST_STRIDE = 0.03
 # Time for which a target is held at the least.
 _SHORTEST = 1e-9
@@ -159,16 +162,9 @@ def held(request: Request, found: Move, span: float) -> Move:
     branches = material.branches
     excess = branches[:, RATIO] * (holding - np.array(end.followed))
     step = max(abs(request.target - request.state.stretch), _LEAST_MOVE)
-    ripple = delivery.ripple / _SURE * step
-    out = np.empty((_MOST, 4))
-    while True:
-        count, vibration = kernel.staircase(
-            excess, branches, float(request.target), material.packed, float(delivery.period),
-            max(span - found.duration, _SHORTEST), ripple, out)
-        if count >= 0:
-            break
-        ripple *= _COARSER
-    times, loads = out[:count, kernel.TIME], holding + out[:count, kernel.EXCESS]
+    out, vibration = _staircase(
+        request, excess, max(span - found.duration, _SHORTEST), delivery.ripple / _SURE * step)
+    times, loads = out[:, kernel.TIME], holding + out[:, kernel.EXCESS]
     levels = tuple(
         Level(delivery.rounded(x), y)
         for x, y in zip((found.duration + times).tolist(), loads.tolist(), strict=True))
@@ -177,8 +173,33 @@ def held(request: Request, found: Move, span: float) -> Move:
         -np.outer(times, branches[:, SPEED]))
     tail = tuple(
         State(x, v, load, None, tuple(by)) for x, v, load, by in zip(
-            (request.target + out[:count, kernel.DEVIATION]).tolist(),
-            out[:count, kernel.RATE].tolist(), [end.load, *loads[:-1].tolist()],
+            (request.target + out[:, kernel.DEVIATION]).tolist(), out[:, kernel.RATE].tolist(),
+            [end.load, *loads[:-1].tolist()],
             followed.tolist(), strict=True))
     return replace(
         found, levels=found.levels[:-1] + levels, tail=tail, vibration=_SURE * vibration)
+
+
+def _staircase(
+        request: Request, excess: Array, span: float, ripple: float) -> tuple[Array, float]:
+    """Return the levels that follow a tail, and their vibration: the wanted, or what they can."""
+    out = np.empty((_MOST, 4))
+
+    def levels(ripple: float) -> tuple[Array, float] | None:
+        count, vibration = kernel.staircase(
+            excess, request.material.branches, float(request.target), request.material.packed,
+            float(request.delivery.period), span, ripple, out)
+        return None if count < 0 else (out[:count].copy(), float(vibration))
+
+    found, fine, coarse = levels(ripple), ripple, ripple
+    while found is None:
+        fine, coarse = coarse, _COARSER * coarse
+        found = levels(coarse)
+    for _ in range(_HALVINGS if coarse > fine else 0):
+        middle = math.sqrt(fine * coarse)
+        better = levels(middle)
+        if better is None:
+            fine = middle
+        else:
+            found, coarse = better, middle
+    return found
