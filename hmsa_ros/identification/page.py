@@ -8,12 +8,16 @@ import numpy as np
 
 from hmsa_ros import __version__
 from hmsa_ros.core.model import Array
+from hmsa_ros.identification.recording import Course
+from hmsa_ros.identification.response import respond
 from hmsa_ros.identification.result import Identification
 from hmsa_ros.report import charts
 from hmsa_ros.report.charts import decimate, Figure, numbers
 from hmsa_ros.report.page import Cell, cell, document, placed, table, text
 
 _LAGS = 60
+# Points of the fitted curve, in time units, and how many at most.
+_FINE, _MOST_FINE = 0.05, 20_000
 _HEADINGS = {
     'identified': 'identified', 'not_identifiable': 'not identifiable',
     'model_rejected': 'model rejected'}
@@ -87,7 +91,7 @@ def _motion(found: Identification) -> Figure:
         _curve('measured', *decimate(time, recording.stretch), mode='markers' if few else 'lines',
                marker={'size': 3 if len(time) > 200 else 6, 'color': charts.BLUE},
                line={'color': charts.BLUE, 'width': 1.0}),
-        _curve('fitted', *decimate(time, found.fitted),
+        _curve('fitted', *_fitted(found, size),
                line={'color': charts.VERMILION, 'width': 1.6}),
         _curve('level', level_times, levels, yaxis='y2',
                line={'color': charts.BLACK, 'width': 1.6, 'shape': 'hv'})]
@@ -97,6 +101,21 @@ def _motion(found: Identification) -> Figure:
         'yaxis2': _axis('flux density B [mT]', domain=[0.74, 1.0], anchor='x')})
 
 
+def _fitted(found: Identification, size: float) -> tuple[Array, Array]:
+    """Return times and stretch of the fit, between few samples too."""
+    recording = found.recording
+    unit = found.values['time_unit']
+    dense = np.union1d(recording.time, np.arange(
+        recording.time[0], recording.time[-1], _FINE * unit, dtype=np.float64)) if (
+            recording.time[-1] - recording.time[0] < _MOST_FINE * _FINE * unit) else recording.time
+    course = Course(dense, recording.level_times, recording.levels, recording.slew_limit)
+    response = None if recording.earlier else respond(
+        course, found.values, (), at_rest=found.at_rest)
+    if response is None:
+        return decimate(recording.time / size, found.fitted)
+    return decimate(dense / size, response.stretch)
+
+
 def _residuals(found: Identification) -> Figure:
     """Return the residuals over time, outliers apart."""
     size, unit = _unit(found)
@@ -104,7 +123,7 @@ def _residuals(found: Identification) -> Figure:
     out = found.weights == 0.0
     data = [_curve(
         'residual', *decimate(time[~out], found.residual[~out]), mode='markers',
-        marker={'size': 3, 'color': charts.BLUE})]
+        marker={'size': 3 if len(time) > 200 else 6, 'color': charts.BLUE})]
     if np.any(out):
         data.append(_curve(
             'outlier', time[out], found.residual[out], mode='markers',
@@ -138,7 +157,7 @@ def _parameters(found: Identification) -> str:
             rows.append([
                 name, x.unit or '1', *(cell(y) for y in (x.value, x.std, x.low, x.high)),
                 'not identifiable' if lost else cell(100.0 * x.std / abs(x.value), '.3g')
-                if x.value else ''])
+                if abs(x.value) > x.std else ''])
         else:
             rows.append([name, x.unit or '1', cell(x.value), '', '', '', 'known'])
     return table(
