@@ -30,6 +30,9 @@ TOO_CLOSE = 3
 # A closer approach to an equilibrium than this share of the move counts as rest: what happens
 # below it is lost in rounding.
 _AT_REST = 1e-12
+# A rate on which only damping still acts falls to numbers with which processors take ten times as
+# long.
+_NOTHING = 1e-200
 MAX_STEPS = 200_000
 # One swing takes tens of steps, a creep into an equilibrium thousands.
 _MAX_TURN_STEPS = 20_000
@@ -186,6 +189,8 @@ def advance(k, l, v, s, r, beta, slope, p, q, duration, material, rtol, h):  # n
             attainable(rtol, l, v, rate))
         if error <= 1.0:
             l, v, s, r = new_l, new_v, new_s, new_r  # noqa: E741
+            if abs(v) < _NOTHING:
+                v = 0.0
             done = duration if span == left else done + span
             if span == h or error > 0.5:
                 h = resize(span, error)
