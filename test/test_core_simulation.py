@@ -99,10 +99,9 @@ def test_a_tighter_tolerance_is_closer():
 
 
 def test_a_rate_that_dies_away_ends_at_zero_before_it_slows_the_processor_down():
-    loads = [float(elastic_force(x, PAPER)) for x in (1.1, 1.2, 1.4)]
-    _, rate = simulate([0.0, 2000.0, 4000.0], loads, np.arange(0.0, 6000.0, 0.05), PAPER)
-    assert rate[-1] == 0.0
-    assert not np.any((rate != 0.0) & (np.abs(rate) < 1e-200))
+    _, rate = simulate([0.0], [0.0], [50.0, 100.0], PAPER, rate=1e-190)
+    assert rate[0] > 1e-200
+    assert rate[1] == 0.0
 
 
 def test_an_equilibrium_is_kept():
