@@ -99,7 +99,7 @@ def test_a_tighter_tolerance_is_closer():
 
 
 def test_a_rate_that_dies_away_ends_at_zero_before_it_slows_the_processor_down():
-    _, rate = simulate([0.0], [0.0], [50.0, 100.0], PAPER, rate=1e-190)
+    _, rate = simulate([0.0], [0.0], [1.0, 10.0], PAPER, rate=1e-199)
     assert rate[0] > 1e-200
     assert rate[1] == 0.0
 
