@@ -119,7 +119,7 @@ def draw() -> str:
     drawing.names(middle, y + 16, requests, 'middle')
     y += 22 + LINE * len(requests)
     drawing.arrow(middle, y, middle, y + 24)
-    y = node(y + 28, PLANNER, f'services: {services(PLANNER)}')
+    y = node(y + 28, PLANNER, 'shapes the commands')
     gap = LINE * max(len(down), len(up)) + 20
     drawing.arrow(DOWN, y, DOWN, y + gap)
     drawing.names(DOWN - 10, y + (gap - LINE * len(down)) / 2 - 2, down, 'end')
@@ -128,6 +128,9 @@ def draw() -> str:
         drawing.names(UP + 10, y + (gap - LINE * len(up)) / 2 - 2, up)
     y = node(y + gap + 4, PLANT, 'or a driver of your own')
     y += 24
+    drawing.text(
+        middle, y, f'services of the planner: {services(PLANNER)}', 'small', 'middle')
+    y += 16
     drawing.text(
         middle, y, f'services of the plant: {services(PLANT)}; for all: '
         + ', '.join(absolute), 'small', 'middle')

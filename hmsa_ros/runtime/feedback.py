@@ -1,9 +1,7 @@
 """Feedback: what samples say of the actuators, and models that are learnt from them."""
 
 from collections.abc import Iterator, Mapping
-from datetime import datetime
 from functools import partial
-from pathlib import Path
 
 from hmsa_ros.core.group import PlannerGroup
 from hmsa_ros.core.planner import Planner
@@ -13,9 +11,8 @@ from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.estimation import Estimate, Estimator, Options, Prior
 from hmsa_ros.estimation.estimator import warm_up
 from hmsa_ros.estimation.words import differences
-from hmsa_ros.files import write_text
 from hmsa_ros.identification.known import Known
-from hmsa_ros.runtime.learnt import differs, file_text, learnt_model
+from hmsa_ros.runtime.learnt import differs, learnt_model, save
 from hmsa_ros.runtime.records import EstimateChanged, Output, Settings, Severity
 from hmsa_ros.runtime.slices import Clock
 from hmsa_ros.runtime.tracked import Joint
@@ -180,20 +177,9 @@ class Feedback:
 
         """
         self._check_on()
-        path = self._settings.feedback_file
-        if not path:
-            raise BadInputError(
-                'parameter feedback_file is empty: expected the file to write to')
-        found: dict[str, Estimate] = {}
-        for name, joint in self._joints.items():
-            if joint.latest is None or not joint.latest.trusted:
-                why = 'no samples yet' if joint.latest is None else joint.latest.trouble
-                raise BadInputError(
-                    f'what was learnt of joint {name} is not saved: {why}; expected samples on '
-                    'joint_states that fit')
-            found[name if by_joint else ''] = joint.latest
-        write_text(Path(path), file_text(found, datetime.now()))
-        return f'saved what was learnt to {path}'
+        return save(
+            self._settings.feedback_file,
+            {name: joint.latest for name, joint in self._joints.items()}, by_joint=by_joint)
 
     def _check_on(self) -> None:
         if not self.on:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from datetime import datetime
+from pathlib import Path
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from hmsa_ros.core.simulation import check_stretch
 from hmsa_ros.core.timeline import Model
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation import Estimate
+from hmsa_ros.files import write_text
 from hmsa_ros.identification.files import known_lines, yaml_text
 from hmsa_ros.identification.known import Known
 from hmsa_ros.identification.quantities import derivative, QUANTITIES
@@ -85,3 +87,41 @@ def file_text(estimates: Mapping[str, Estimate], now: datetime) -> str:
             lines.append(f'    {prefix}{key}: {yaml_text(value)}{note}')
         lines += known_lines(known_of(estimate), prefix)
     return '\n'.join(lines) + '\n'
+
+
+def save(file: str, estimates: Mapping[str, Estimate | None], *, by_joint: bool) -> str:
+    """
+    Write what was learnt; say so.
+
+    Parameters
+    ----------
+    file : str
+        Where to.
+    estimates : mapping of str to Estimate or None
+        By joint; None without samples.
+    by_joint : bool
+        Whether joints have parameters of their own.
+
+    Returns
+    -------
+    str
+        What was written.
+
+    Raises
+    ------
+    BadInputError
+        If nothing was learnt yet, or it cannot be written.
+
+    """
+    if not file:
+        raise BadInputError('parameter feedback_file is empty: expected the file to write to')
+    found: dict[str, Estimate] = {}
+    for name, estimate in estimates.items():
+        if estimate is None or not estimate.trusted:
+            why = 'no samples yet' if estimate is None else estimate.trouble
+            raise BadInputError(
+                f'what was learnt of joint {name} is not saved: {why}; expected samples on '
+                'joint_states that fit')
+        found[name if by_joint else ''] = estimate
+    write_text(Path(file), file_text(found, datetime.now()))
+    return f'saved what was learnt to {file}'
