@@ -455,7 +455,8 @@ def test_commands_that_are_repeated_change_nothing_but_their_number(tmp_path, ba
     part = one(
         tmp_path / 'bag', messages + repeats, **parameters(planner=ACTUATOR, plant=ACTUATOR))
     expected, = parts_of(bag)
-    assert part.evaluation.levels == expected.evaluation.levels
+    # As text: NaN, where nothing is predicted, is not equal to itself.
+    assert str(part.evaluation.levels) == str(expected.evaluation.levels)
     assert part.evaluation.results == expected.evaluation.results
     assert part.timing.repeats == len(repeats)
     assert np.array_equal(part.timing.lead, expected.timing.lead)

@@ -86,8 +86,10 @@ def minimax(request: Request) -> Move:
     away = abs(state.rate) / frequency + (
         abs(request.field - held) + abs(request.load - held)) / stiffness
     if away < _AT_REST * span:
-        # So that the same move is found again.
-        return _kept(replace(request, state=State(round(state.stretch, 9))))
+        # So that the same move is found again: NaN for the load that holds it would be none.
+        start = round(state.stretch, 9)
+        return _kept(replace(
+            request, state=State(start, load=float(law.elastic_force(start, packed)))))
     return _designed(request)
 
 
