@@ -285,7 +285,7 @@ def least_largest(now: Array, slopes: Array, low: Array, high: Array) -> Array:
         To a percent or so of the least.
 
     """
-    x = np.zeros(len(low))
+    x: Array = np.zeros(len(low))
     best, least = x, largest(now)
     for power in _POWERS:
         for _ in range(_NEWTON_PASSES):
