@@ -208,17 +208,13 @@ def _ramped(request: Request, first: Level, last: Level) -> Move:
     found = approach(ideal, slower, _SHORTEST_STRIDE)
     if found is not None and request.keeps(found[0]):
         return Move(Code.TWO_STEP, *found)
-    if request.state.rate != 0.0:
-        # Sooner there than by waiting.
-        found = _swings(request, last.load)
+    if request.state.rate == 0.0:
+        found = _searched(request, last.load)
         if found is not None:
-            return Move(Code.MINIMUM_TIME, *found, _no_single(request))
-    found = _searched(request, last.load)
-    if found is not None:
-        return Move(Code.TWO_STEP, *found)
-    if request.state.rate != 0.0:
+            return Move(Code.TWO_STEP, *found)
+    else:
         with contextlib.suppress(RefusedError):
-            return minimum_time(request, _no_single(request))
+            return _two_levels(request, last.load)
     raise RefusedError(
         Code.SLEW_LIMIT,
         f'no command through ramps of {request.units.slew_text(slew)} brings stretch '
@@ -252,8 +248,9 @@ def _no_single(request: Request) -> str:
 
 
 def _two_levels(request: Request, holding: float) -> Move:
-    """Use two levels where one does not do."""
+    """Use two levels where one does not do, or one that is held for longer."""
     if request.delivery.period == 0.0 and math.isfinite(request.delivery.slew):
+        # Sooner there than by waiting.
         found = _swings(request, holding)
         if found is not None:
             return Move(Code.MINIMUM_TIME, *found, _no_single(request))
