@@ -10,6 +10,7 @@ the clock of the nodes does.
 
 import argparse
 from collections import deque
+from contextlib import suppress
 import signal
 import sys
 from time import monotonic
@@ -17,13 +18,11 @@ from time import monotonic
 from builtin_interfaces.msg import Time
 import rclpy
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import ExternalShutdownException
-from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
-from rclpy.task import Future
 from sensor_msgs.msg import MagneticField
 
 from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.runner import spin
 
 _TICK_SECONDS = 0.0005
 
@@ -88,14 +87,9 @@ def main(arguments: list[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     rclpy.init(args=[])
     node = Relay(options)
-    executor = EventsExecutor()
-    executor.add_node(node)
-    never = Future()
-    try:
-        while True:
-            executor.spin_until_future_complete(never, 0.1)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        return 0
+    with suppress(KeyboardInterrupt):
+        spin((node,), lambda: False)
+    return 0
 
 
 if __name__ == '__main__':

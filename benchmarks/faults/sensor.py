@@ -8,6 +8,7 @@ Takes samples from topic IN and sends them to topic OUT.
 
 import argparse
 from collections.abc import Sequence
+from contextlib import suppress
 import copy
 import math
 import random
@@ -15,13 +16,11 @@ import signal
 import sys
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
-from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
-from rclpy.task import Future
 from sensor_msgs.msg import JointState
 
 from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.runner import spin
 
 #: What can happen to a sensor.
 FAULTS = ('nan', 'freeze', 'jump', 'swap', 'twice', 'silence')
@@ -81,14 +80,9 @@ def main(arguments: list[str] | None = None) -> int:
     rclpy.init(args=[])
     node = Sensor(options)
     signal.signal(signal.SIGUSR1, lambda *_: setattr(node, 'failed', True))
-    executor = EventsExecutor()
-    executor.add_node(node)
-    never = Future()
-    try:
-        while True:
-            executor.spin_until_future_complete(never, 0.1)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        return 0
+    with suppress(KeyboardInterrupt):
+        spin((node,), lambda: False)
+    return 0
 
 
 if __name__ == '__main__':
