@@ -63,12 +63,14 @@ def test_robustness_prints_a_table_and_names_its_files(run, tmp_path):
                   'ZV: linear, designed at the target'):
         assert words in out
     assert 'robust, order 3' not in out
-    files = out.split()[-4:]
-    assert files == [f'new/folder/{x}' for x in (
-        'robustness.csv', 'robustness_1_to_1.4.png', 'robustness_1_to_0.9.png', 'front.png')]
+    files = out.split()[-7:]
+    assert files == ['new/folder/robustness.csv', *(
+        f'new/folder/{x}.{kind}' for x in ('robustness_1_to_1.4', 'robustness_1_to_0.9', 'front')
+        for kind in ('png', 'pdf'))]
     rows = list(csv.DictReader((tmp_path / files[0]).read_text().splitlines()))
     assert {x['shaper'] for x in rows} == {'two_step', 'robust', 'zv'}
-    assert all((tmp_path / x).read_bytes().startswith(PNG) for x in files[1:])
+    for path in files[1:]:
+        assert (tmp_path / path).read_bytes().startswith(PNG if path[-3:] == 'png' else b'%PDF')
 
 
 def test_robustness_as_json_has_everything_in_full_precision(run):
@@ -90,7 +92,8 @@ def test_robustness_as_json_has_everything_in_full_precision(run):
     assert (plain['arrives'], shaped['arrives']) == (False, True)
     assert plain['arrival'] == shaped['arrival']
     assert [Path(x).name for x in made['files']] == [
-        'robustness.csv', 'robustness_1_to_1.1.png', 'front.png']
+        'robustness.csv', 'robustness_1_to_1.1.png', 'robustness_1_to_1.1.pdf', 'front.png',
+        'front.pdf']
 
 
 def test_robustness_says_what_could_not_be_had(run):

@@ -332,14 +332,14 @@ def test_tables_of_the_documentation_are_what_is_computed():
 def test_pictures_of_the_documentation_exist_where_it_shows_them():
     shown = re.findall(r'!\[[^]]+\]\(([^)]+)\)', DOCS.read_text(encoding='utf-8'))
     assert sorted(shown) == [
-        f'images/{x}.png' for x in ('damped', 'front', 'robustness', 'sampled')]
+        f'images/{x}.png' for x in ('damped', 'front', 'map', 'robustness', 'sampled')]
     for name in shown:
         assert (DOCS.parent / name).read_bytes().startswith(PNG)
 
 
 def test_documentation_is_drawn_into_a_folder_that_exists(tmp_path, capsys):
     assert [x.name for x in pictures(tmp_path)] == [
-        'robustness.png', 'sampled.png', 'damped.png', 'front.png']
+        'robustness.png', 'sampled.png', 'damped.png', 'front.png', 'map.png']
     for path in tmp_path.iterdir():
         assert path.read_bytes().startswith(PNG)
     assert main(['--out', str(tmp_path / 'missing')]) == 2

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import shutil
 
 import numpy as np
 import pytest
@@ -227,3 +228,50 @@ def test_values_are_grids_or_what_they_are_drawn_from():
     assert parse_values('normal:-1:2', 'zeta') == Spread(True, -1.0, 2.0)
     assert parse_values('1:2:2', 'zeta').tolist() == [1.0, 2.0]
     assert set(Nondimensional.columns) < set(Nondimensional.ranges)
+
+
+# --- pictures
+
+
+def test_a_folder_gets_the_map_or_the_bands_of_its_table(run, tmp_path):
+    for words in (
+            ('--zeta', '0:3:7', '--j-lim', 'log:0.1:100:6', '--law', 'gent,neo_hookean'),
+            ('--zeta', 'normal:0.2:0.1', '--samples', 20, '--target', '1.1:1.4:6'),
+            ('--zeta', 'normal:0.2:0.1', '--samples', 20, '--shaper', 'two_step,zv')):
+        assert run('sweep', *words, '--out', 'study')[0] == 0
+        assert (tmp_path / 'study' / 'table.png').read_bytes().startswith(b'\x89PNG')
+        assert (tmp_path / 'study' / 'table.pdf').read_bytes().startswith(b'%PDF')
+        shutil.rmtree(tmp_path / 'study')
+    # What cannot be drawn is still computed.
+    status, _, err = run('sweep', '--zeta', 0.3, '--out', 'study')
+    assert (status, 'no picture' in err) == (0, True)
+    assert sorted(x.name for x in (tmp_path / 'study').iterdir()) == [
+        'chunks', 'study.json', 'table.parquet']
+
+
+def test_a_view_puts_each_row_of_a_sweep_where_its_axes_say():
+    sweep = Sweep(
+        {'target': [1.1, 1.2], 'zeta': np.linspace(0.0, 3.0, 7), 'j_lim': np.linspace(1, 9, 6)},
+        samples={'c1': [1.0, 2.0, 3.0]})
+    view = sweep.view()
+    table = sweep.rows(0, sweep.size).inputs
+    assert (view.x.name, view.y.name, view.samples) == ('j_lim', 'zeta', 3)
+    assert view.labels == ('target 1.1', 'target 1.2')
+    for name, shape in (('j_lim', (6, 1)), ('zeta', (7, 1, 1)), ('c1', (3,)),
+                        ('target', (2, 1, 1, 1))):
+        values = np.unique(table[name]).reshape(shape)
+        assert np.array_equal(view.arranged(table[name]), np.broadcast_to(values, (2, 7, 6, 3)))
+
+
+@pytest.mark.parametrize(('words', 'message'), [
+    (('--zeta', '0:1:9', '--picture', 'x.svg'), 'ends in .png or .pdf'),
+    (('--zeta', '0:1:9', '--picture', 'x.png', '--show', 'zeta'), 'expected some of beta_p'),
+    (('--zeta', '0:1:9', '--j-lim', '1:9:9', '--c1', '1:2:9', '--picture', 'x.png'),
+     'one or two columns of several numbers'),
+    (('--zeta', ','.join(['0.1'] * 2001), '--j-lim', '1:9:2000', '--picture', 'x.png'),
+     'at most 4,000,000')])
+def test_pictures_that_cannot_be_drawn_are_refused_before_anything_is_computed(
+        run, words, message):
+    status, rows, err = run('sweep', *words)
+    assert (status, rows, err.count('\n')) == (2, [], 1)
+    assert message in err

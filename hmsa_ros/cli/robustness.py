@@ -31,7 +31,8 @@ def add_parser(subparsers: Any) -> None:
                     'the residuals: peak-to-peak stretch after arrival as a share of the step, '
                     'without the steady offset. Minimax plans for these errors. Prints a table '
                     'and writes robustness.csv, a picture of each move, and front.png, the worst '
-                    'residual over the duration; existing files are replaced.',
+                    'residual over the duration; pictures as PDF too; existing files are '
+                    'replaced.',
         epilog='example: hmsa robustness --move 1.0:1.4 1.2:0.8 --errors 0.05 --order 2 3 4')
     parser.add_argument(
         '--move', nargs='+', type=_move, default=list(_MOVES), metavar='START:TARGET',
@@ -121,12 +122,15 @@ def _write(folder: Path, studies: 'list[tuple[Case, list[Result]]]') -> list[Pat
 
     files = [folder / 'robustness.csv']
     write_csv(files[0], studies)
+    kinds = ('png', 'pdf')
     for case, results in studies:
-        files.append(folder / f'robustness_{case.start:g}_to_{case.target:g}.png')
-        draw_robustness(files[-1], case, results)
-    files.append(folder / 'front.png')
-    draw_front(files[-1], studies)
-    return files
+        paths = [
+            folder / f'robustness_{case.start:g}_to_{case.target:g}.{kind}' for kind in kinds]
+        draw_robustness(paths, case, results)
+        files += paths
+    fronts = [folder / f'front.{kind}' for kind in kinds]
+    draw_front(fronts, studies)
+    return files + fronts
 
 
 def _record(case: 'Case', results: 'list[Result]') -> dict[str, Any]:

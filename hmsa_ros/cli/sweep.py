@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from hmsa_ros.studies.chunks import Chunks
     from hmsa_ros.studies.engine import Outcome, Start
     from hmsa_ros.studies.sweep import Sweep
+    from hmsa_ros.studies.views import View
 
 #: What takes less time on a core, in s, is planned at once, without chunks.
 _SMALL = 3.4
@@ -77,6 +78,14 @@ def add_parser(subparsers: Any) -> None:
              'folder, which keeps the chunks and gets table.parquet once all are there '
              '(default: CSV on standard output)')
     parser.add_argument(
+        '--picture', type=Path, nargs='+', default=[], metavar='FILE',
+        help='draw the results too, each name ending in .png or .pdf: curves over one column of '
+             'numbers, a map with contours over two, bands of quantiles of samples; hatched where '
+             'there is no plan. A folder of --out gets table.png and table.pdf')
+    parser.add_argument(
+        '--show', metavar='COLUMN,...',
+        help='columns to draw (default: duration and first level)')
+    parser.add_argument(
         '--workers', type=int, metavar='N',
         help='processes; 1 computes in this one (default: one a core for large sweeps)')
     parser.add_argument(
@@ -96,8 +105,60 @@ def add_parser(subparsers: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Plan and write."""
     sweep = _sweep(arguments)
-    return _plan_in_chunks(sweep, arguments) if _in_chunks(sweep, arguments) \
-        else _plan_at_once(sweep, arguments.out)
+    in_chunks = _in_chunks(sweep, arguments)
+    picture = _Picture(sweep, arguments)
+    return _plan_in_chunks(sweep, arguments, picture) if in_chunks \
+        else _plan_at_once(sweep, arguments.out, picture)
+
+
+class _Picture:
+    """What is drawn of a sweep, and where."""
+
+    def __init__(self, sweep: 'Sweep', arguments: argparse.Namespace) -> None:
+        """Find out what, before anything is computed."""
+        from hmsa_ros.studies.views import Shown
+
+        self._sweep = sweep
+        self._view: View | None = None
+        self._shown: Shown | None = None
+        self._paths: list[Path] = arguments.picture
+        names = list(sweep.shown) if arguments.show is None else _names(arguments.show)
+        wrong = [x for x in names if x not in sweep.results]
+        if wrong:
+            raise BadInputError(
+                f'--show has {wrong[0]!r}: expected some of {", ".join(sweep.results)}')
+        for path in self._paths:
+            if path.suffix.lower() not in {'.png', '.pdf'}:
+                raise BadInputError(
+                    f'the format of {path} is unknown: expected a name that ends in .png or .pdf')
+        out: Path | None = arguments.out
+        asked = bool(self._paths)
+        if out is not None and _is_folder(out) and not asked:
+            self._paths = [out / 'table.png', out / 'table.pdf']
+        if not self._paths:
+            return
+        try:
+            self._view = sweep.view()
+        except BadInputError as error:
+            if asked:
+                raise
+            _say(str(error))
+            return
+        self._shown = Shown(names, sweep.size)
+
+    def add(self, table: Any) -> None:
+        """Take the next rows, by column."""
+        if self._shown is not None:
+            self._shown.add(table)
+
+    def draw(self) -> list[Path]:
+        """Draw all rows; return the files."""
+        if self._shown is None or self._view is None:
+            return []
+        from hmsa_ros.figures.sweeps import draw_sweep
+
+        draw_sweep(self._paths, self._view, self._shown.columns, self._sweep.fixed)
+        return self._paths
 
 
 def _sweep(arguments: argparse.Namespace) -> 'Sweep':
@@ -181,7 +242,7 @@ def _has_arrow() -> bool:
     return find_spec('pyarrow') is not None
 
 
-def _plan_at_once(sweep: 'Sweep', out: Path | None) -> int:
+def _plan_at_once(sweep: 'Sweep', out: Path | None, picture: _Picture) -> int:
     from hmsa_ros.studies.chunks import Chunks
     from hmsa_ros.studies.tables import open_writer
 
@@ -189,15 +250,18 @@ def _plan_at_once(sweep: 'Sweep', out: Path | None) -> int:
     with open_writer(out, sweep.columns) as write, _progress(sweep.size) as advance:
         for block in sweep.blocks(Chunks.of(sweep, Path()).rows):
             write(block)
+            picture.add(block.results)
             counts.update(block.status.tolist())
             advance(block.status.size)
     _report(sweep.size, counts)
+    pictures = picture.draw()
     if out is not None:
-        print(out)
+        print(out, *pictures, sep='\n')
     return 0
 
 
-def _plan_in_chunks(sweep: 'Sweep', arguments: argparse.Namespace) -> int:
+def _plan_in_chunks(
+        sweep: 'Sweep', arguments: argparse.Namespace, picture: _Picture) -> int:
     from hmsa_ros.files import require_arrow
     from hmsa_ros.studies.chunks import Chunks
     from hmsa_ros.studies.engine import compute, parse_shard
@@ -205,7 +269,7 @@ def _plan_in_chunks(sweep: 'Sweep', arguments: argparse.Namespace) -> int:
     require_arrow()
     shard = (0, 1) if arguments.shard is None else parse_shard(arguments.shard)
     table, folder = _places(arguments.out)
-    start, cores = _engine(arguments)
+    start, cores = _engine(arguments, small=sweep.size <= _SMALL * sweep.rate)
     chunks = Chunks.of(sweep, folder)
     _estimate(sweep, chunks, cores, shard)
     try:
@@ -215,14 +279,15 @@ def _plan_in_chunks(sweep: 'Sweep', arguments: argparse.Namespace) -> int:
                 advance=advance)
         if len(chunks.found()) < chunks.count:
             return _part(outcome, chunks, folder)
-        _report(sweep.size, chunks.merge(table))
+        _report(sweep.size, chunks.merge(table, picture.add))
+        pictures = picture.draw()
     except KeyboardInterrupt:
         _say(f'{len(chunks.found()):,} of {chunks.count:,} chunks are in {folder}: go on with '
              '--resume')
         raise
     if table.parent.resolve() != chunks.folder and arguments.shard is None:
         shutil.rmtree(folder, ignore_errors=True)
-    print(table)
+    print(table, *pictures, sep='\n')
     return 0
 
 
@@ -241,14 +306,14 @@ def _places(out: Path) -> tuple[Path, Path]:
     return out, out.with_name(f'{out.name}.chunks')
 
 
-def _engine(arguments: argparse.Namespace) -> tuple['Start', int]:
+def _engine(arguments: argparse.Namespace, *, small: bool) -> tuple['Start', int]:
     """Return what computes, and on how many cores as far as that is known."""
     from hmsa_ros.studies.executors import cores, dask, here, local_processes
 
     if arguments.dask is not None:
         return (partial(dask, arguments.dask, arguments.workers),
                 arguments.workers or (cores() if arguments.dask == 'local' else 1))
-    workers = arguments.workers or cores()
+    workers = arguments.workers or (1 if small else cores())
     return (here if workers == 1 else partial(local_processes, workers)), workers
 
 

@@ -46,12 +46,13 @@ _ORDERS: tuple[dict[str, Any], ...] = (
 _DASHES = ('-', (0, (4, 1.5)), (0, (1, 1)))
 
 
-def draw_robustness(path: str | Path, case: Case, results: Sequence[Result]) -> None:
-    """Write a PNG of one move's residuals: over each error alone, and the worst in the box."""
+def draw_robustness(
+        paths: Path | Sequence[Path], case: Case, results: Sequence[Result]) -> None:
+    """Draw one move's residuals, PNG or PDF: over each error alone, and the worst in the box."""
     shown = [x for x in results if x.move is not None]
     looks = _looks([x.candidate for x in shown])
     errors = 100.0 * case.errors()
-    with style.picture(Path(path), 6.4) as figure:
+    with style.picture(paths, 6.4) as figure:
         figure.suptitle(
             rf'Residual vibration, $\lambda$ = {case.start:g} to {case.target:g}; nominal '
             rf'$\zeta$ = {case.material.zeta:g}, $J_\mathrm{{lim}}$ = {case.material.j_lim:g}, '
@@ -91,10 +92,11 @@ def _looks(candidates: Sequence[Candidate]) -> list[dict[str, Any]]:
     return [look(x) for x in candidates]
 
 
-def draw_front(path: str | Path, studies: Sequence[tuple[Case, Sequence[Result]]]) -> None:
-    """Write a PNG of the worst residuals over the duration of a move, a panel for each."""
+def draw_front(
+        paths: Path | Sequence[Path], studies: Sequence[tuple[Case, Sequence[Result]]]) -> None:
+    """Draw the worst residuals over the duration of a move, PNG or PDF, a panel for each."""
     rows = max(-(-len(studies) // 3), 1)
-    with style.picture(Path(path), 0.9 + 2.7 * rows) as figure:
+    with style.picture(paths, 0.9 + 2.7 * rows) as figure:
         columns = max(min(len(studies), 3), 1)
         axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
         for panel, (case, results) in zip(axes, studies, strict=False):

@@ -6,7 +6,7 @@ matplotlib (backend, settings, open windows) has a say or is changed, and the sa
 gives the same bytes.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -69,16 +69,18 @@ _SETTINGS: dict[str, Any] = {
 
 @contextmanager
 def picture(
-        path: Path, height: float, *, width: float = WIDTH,
-        kind: str = 'png') -> Iterator[Figure]:
+        paths: Path | Sequence[Path], height: float, *, width: float = WIDTH,
+        kind: str = '') -> Iterator[Figure]:
     """Yield a figure (sizes in inches), which the end of the block writes as PNG or PDF."""
     with style.context(['default', _SETTINGS]):
         figure = Figure(figsize=(width, height), layout='constrained')
         FigureCanvasAgg(figure)
         yield figure
-        with replacing(path) as beside:
-            # Without the entries that name matplotlib's version and the time.
-            figure.savefig(beside, format=kind, metadata=_METADATA[kind])
+        for path in [paths] if isinstance(paths, Path) else paths:
+            form = kind or ('pdf' if path.suffix.lower() == '.pdf' else 'png')
+            with replacing(path) as beside:
+                # Without the entries that name matplotlib's version and the time.
+                figure.savefig(beside, format=form, metadata=_METADATA[form])
 
 
 def finish(axes: Axes, x_label: str, y_label: str, letter: str = '') -> None:

@@ -17,10 +17,12 @@ from hmsa_ros.core.shapers import SHAPERS
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.errors import BadInputError, complain, HmsaError
 from hmsa_ros.figures.studies import draw_damped, draw_front, draw_robustness, draw_sampled
+from hmsa_ros.figures.sweeps import draw_sweep
 from hmsa_ros.studies.damped import damped_study, DampedStudy, LIMITS
 from hmsa_ros.studies.residual import Errors, residual
 from hmsa_ros.studies.robustness import Candidate, candidates, Case, PARAMETERS, percent, study
 from hmsa_ros.studies.sampled import sampled_study
+from hmsa_ros.studies.sweep import parse_grid, Sweep
 
 MOVES = ((1.0, 1.1), (1.0, 1.4), (1.0, 0.7))
 MATERIAL = NondimensionalParameters()
@@ -98,14 +100,17 @@ def pictures(folder: Path) -> list[Path]:
     """Draw all pictures of the documentation into a folder; return their paths."""
     case = Case(1.0, 1.4, MATERIAL)
     written = [
-        folder / 'robustness.png', folder / 'sampled.png', folder / 'damped.png',
-        folder / 'front.png']
+        folder / f'{x}.png' for x in ('robustness', 'sampled', 'damped', 'front', 'map')]
     results = [study(case, x) for x in (*candidates(), Candidate('robust', 4))]
     draw_robustness(written[0], case, results[:-1])
     draw_front(written[3], [(case, results)])
     draw_sampled(written[1], sampled_study(
         1.0, 1.4, MATERIAL, np.geomspace(0.041, 0.99, 700)))
     draw_damped(written[2], damped_study(1.0, 1.1, np.linspace(2.2, 6.0, 77)))
+    sweep = Sweep({
+        'zeta': parse_grid('0:3:240', 'zeta'), 'j_lim': parse_grid('log:0.1:100:160', 'j_lim')})
+    rows = sweep.rows(0, sweep.size).results
+    draw_sweep([written[4]], sweep.view(), {x: rows[x] for x in sweep.shown}, sweep.fixed)
     return written
 
 

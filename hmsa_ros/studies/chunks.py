@@ -6,7 +6,7 @@ computes it, and a checksum of the content. So a folder says which chunks there 
 they are whole, and nobody has to keep a list.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 import hashlib
@@ -203,9 +203,22 @@ class Chunks:
                     f'chunk {index} of {self.folder} is missing or damaged: run the study again '
                     'with --resume, which computes it')
 
-    def merge(self, path: Path) -> dict[str, int]:
+    def merge(
+            self, path: Path, look: Callable[[Any], object] | None = None) -> dict[str, int]:
         """
         Write the whole table, in the order of its rows; return how often each status occurs.
+
+        Parameters
+        ----------
+        path : Path
+            File to write, CSV or Parquet.
+        look : callable, optional
+            Called with each chunk's table of pyarrow.
+
+        Returns
+        -------
+        dict of str to int
+            Counts by status.
 
         Raises
         ------
@@ -220,6 +233,8 @@ class Chunks:
             for table in chain([first], tables):
                 write(ArrowBlock(table))
                 add_counts(counts, table)
+                if look is not None:
+                    look(table)
         return counts
 
     @property

@@ -25,6 +25,7 @@ from hmsa_ros.studies.axes import parse_grid
 from hmsa_ros.studies.chunks import LEAST_ROWS, MOST_ROWS
 from hmsa_ros.studies.plans import by_batch, by_settings, Plans, STATUS
 from hmsa_ros.studies.settings import FINITE, Nondimensional, Setting, System
+from hmsa_ros.studies.views import Axis, View
 
 __all__ = ['parse_grid', 'ROW_BYTES', 'Rows', 'Sweep']
 
@@ -99,8 +100,8 @@ class Sweep:
     ----------
     size : int
         Number of rows. The cases vary slowest, then the samples, then the columns in order.
-    columns : tuple of str
-        Names of all columns of the table.
+    columns, results : tuple of str
+        Names of all columns of the table, and of those that are computed numbers.
     rate : float
         Roughly: rows a second and core.
     chunk_rows : tuple of int
@@ -124,6 +125,7 @@ class Sweep:
         self._axes: list[dict[str, Column]] = [
             _table(words, table) for words, table in (('cases', cases), ('samples', samples))
             if table]
+        self._sampled = len(self._axes) - 1 if samples else None
         seen = [name for axis in self._axes for name in axis] + list(grids)
         for name in seen:
             if name not in ranges:
@@ -153,13 +155,40 @@ class Sweep:
             raise BadInputError('a column of the sweep is empty: expected at least one value')
         given = {name for axis in self._axes for name in axis}
         self._inputs = [x for x in (*ranges, _LAW, _SHAPER) if x in given]
-        self.columns = (*self._inputs, 'status', *self._results(Plans.none(0), 1.0, 1.0))
+        self.results = tuple(self._results(Plans.none(0), 1.0, 1.0))
+        self.columns = (*self._inputs, 'status', *self.results)
         one_by_one = bool(set(shapers) - {'two_step'} or given & self._system.delivery
                           or not self._system.ideal)
         self._plain = not one_by_one and given <= {*Nondimensional.columns, _SHAPER} \
             and isinstance(self._system, Nondimensional)
         kind = 0 if self._plain else 1 + one_by_one
         self.rate, self.chunk_rows = _RATES[kind], _CHUNKS[kind]
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """Return the columns that are drawn unless others are named."""
+        return ('tau_p', 'beta_p') if self._system.roots else ('time_p', 'flux_density_p')
+
+    def view(self) -> View:
+        """
+        Return how the sweep is drawn.
+
+        Raises
+        ------
+        BadInputError
+            If there is no picture of it.
+
+        """
+        return View.of([
+            Axis.of(axis, samples=i == self._sampled) for i, axis in enumerate(self._axes)
+            if self._shape[i] > 1])
+
+    @property
+    def fixed(self) -> dict[str, float]:
+        """Return the columns of numbers that are the same in all rows."""
+        return {
+            name: float(column[0]) for axis, size in zip(self._axes, self._shape, strict=True)
+            for name, column in axis.items() if size == 1 and column.dtype.kind == 'f'}
 
     @cached_property
     def digest(self) -> str:

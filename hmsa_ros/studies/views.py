@@ -1,0 +1,179 @@
+"""
+What a picture of a sweep shows: curves, maps, or how samples spread, by what its axes are.
+
+A column with more than one number is an axis of the picture; laws, shapers, cases and columns of a
+few values are curves or rows of panels; samples become quantiles.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+import math
+
+import numpy as np
+
+from hmsa_ros.core.model import Array
+from hmsa_ros.errors import BadInputError
+
+#: Rows of a sweep that are drawn, at most: they are in memory.
+MOST_ROWS = 4_000_000
+# Points of an axis that a picture can show, curves in a panel, and maps below each other.
+_MOST_POINTS, _MOST_CURVES, _MOST_MAPS = 1000, 8, 4
+# Numbers of a column that are curves rather than an axis, if there is another axis.
+_FEW = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """
+    One axis of a sweep that has more than one value.
+
+    Attributes
+    ----------
+    name : str
+        Of its column; of all its columns, for a table.
+    size : int
+        How many values.
+    values : ndarray, shape (size,), optional
+        Of a column of numbers.
+    labels : tuple of str
+        Of values without an order; empty for samples and for more than are drawn.
+    sampled : bool
+        Whether they are samples.
+
+    """
+
+    name: str
+    size: int
+    values: Array | None = None
+    labels: tuple[str, ...] = ()
+    sampled: bool = False
+
+    @classmethod
+    def of(cls, table: Mapping[str, np.ndarray], *, samples: bool) -> 'Axis':
+        """Return the axis of columns that vary together."""
+        name = ', '.join(table)
+        size = len(next(iter(table.values())))
+        if samples:
+            return cls(name, size, sampled=True)
+        columns = list(table.values())
+        if len(columns) == 1 and columns[0].dtype.kind == 'f':
+            return cls(name, size, np.asarray(columns[0], dtype=np.float64))
+        if size > _MOST_CURVES:
+            return cls(name, size)
+        if len(columns) == 1:
+            return cls(name, size, labels=tuple(str(x) for x in columns[0]))
+        return cls(name, size, labels=tuple(
+            ', '.join(f'{key} {x:g}' for key, x in zip(table, row, strict=True))
+            for row in zip(*columns, strict=True)))
+
+    def as_labels(self) -> 'Axis':
+        """Return a column of a few numbers as curves."""
+        values = [] if self.values is None else self.values.tolist()
+        return Axis(self.name, self.size, labels=tuple(f'{self.name} {x:g}' for x in values))
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """
+    How the rows of a sweep are drawn.
+
+    Attributes
+    ----------
+    x, y : Axis or None
+        Axes of the picture; without ``y`` they are curves, without both the samples' shares.
+    labels : tuple of str
+        Of each curve or map.
+    samples : int
+        How many are drawn at each point; 1 for none.
+
+    """
+
+    x: Axis | None
+    y: Axis | None
+    labels: tuple[str, ...]
+    samples: int
+    _sizes: tuple[int, ...]
+    _order: tuple[int, ...]
+
+    @classmethod
+    def of(cls, axes: Sequence[Axis]) -> 'View':
+        """
+        Choose a view.
+
+        Parameters
+        ----------
+        axes : sequence of Axis
+            Those of a sweep with more than one value, in order.
+
+        Raises
+        ------
+        BadInputError
+            If there is no picture of that many.
+
+        """
+        rows = math.prod(x.size for x in axes)
+        if rows > MOST_ROWS:
+            raise BadInputError(
+                f'no picture of {rows:,} rows: expected at most {MOST_ROWS:,}')
+        samples = next((x for x in axes if x.sampled), None)
+        shown = [x for x in axes if x is not samples]
+        numbers = sorted((x for x in shown if x.values is not None), key=lambda x: x.size)
+        few = [x for x in numbers if x.size <= _FEW][:max(len(numbers) - 1, 0)]
+        shown = [x.as_labels() if x in few else x for x in shown]
+        numbers = [x for x in shown if x.values is not None]
+        others = [x for x in shown if x.values is None]
+        maps = len(numbers) == 2
+        if len(numbers) > 2 or not all(x.labels for x in others) or not (numbers or samples):
+            raise BadInputError(
+                'no picture of a sweep over '
+                f'{" x ".join(f"{x.name} ({x.size})" for x in axes) or "nothing"}: expected one '
+                'or two columns of several numbers, or samples; others of at most '
+                f'{_FEW} values, and at most {_MOST_CURVES} cases')
+        labels = tuple(', '.join(x) for x in product(*(x.labels for x in others)))
+        most = _MOST_MAPS if maps else _MOST_CURVES
+        if len(labels) > most:
+            raise BadInputError(
+                f'no picture of {len(labels)} {"maps" if maps else "curves"}: expected at most '
+                f'{most}; give fewer values')
+        # Rows vary slowest in the first axis: it goes up, the last one to the right.
+        order = [*others, *numbers, *([samples] if samples else [])]
+        places = [x.name for x in axes]
+        return cls(
+            numbers[-1] if numbers else None, numbers[0] if maps else None, labels,
+            samples.size if samples else 1, tuple(x.size for x in axes),
+            tuple(places.index(x.name) for x in order))
+
+    def arranged(self, values: Array) -> Array:
+        """Return a column of all rows as (labels, y, x, samples), thinned to what can be seen."""
+        columns = 1 if self.x is None else self.x.size
+        rows = 1 if self.y is None else self.y.size
+        found: Array = values.reshape(self._sizes).transpose(self._order).reshape(
+            len(self.labels), rows, columns, self.samples)
+        return found[:, ::_stride(rows), ::_stride(columns)]
+
+    @staticmethod
+    def places(axis: Axis) -> Array:
+        """Return the values of an axis, thinned alike."""
+        values: Array = np.zeros(0) if axis.values is None else axis.values
+        return values[::_stride(axis.size)]
+
+
+def _stride(size: int) -> int:
+    return -(-size // _MOST_POINTS)
+
+
+class Shown:
+    """Collects the columns that are drawn while the rows of a sweep are computed or read."""
+
+    def __init__(self, names: Sequence[str], size: int) -> None:
+        self.columns: dict[str, Array] = {name: np.full(size, math.nan) for name in names}
+        self._done = 0
+
+    def add(self, table: Mapping[str, np.ndarray]) -> None:
+        """Add the next rows, from all their columns by name."""
+        size = 0
+        for name, column in self.columns.items():
+            size = len(table[name])
+            column[self._done:self._done + size] = table[name]
+        self._done += size
