@@ -40,7 +40,7 @@ DIMENSIONLESS = {
     'actuator.chain_limit', 'initial_stretch', 'real_time_factor', 'robust_order', 'play.rate',
     'play.read_ahead_queue_size', 'play.realtime_priority', 'record.queue_depth',
     'reset_stretch', 'seed', 'law.alpha', 'law.lambda_m', 'law.stretch', 'step_count',
-    'stretch_bias', 'stretch_gain', 'stretch_noise', 'viscoelastic.ratio',
+    'smooth_periods', 'stretch_bias', 'stretch_gain', 'stretch_noise', 'viscoelastic.ratio',
     # Each number of them has its own unit.
     'identification.values', 'identification.covariance',
     'arrival_tolerance', 'stretch_tolerance', 'vibration_tolerance',

@@ -16,6 +16,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.planner import Options, PlannedLevel, Planner
+from hmsa_ros.core.shapers.pace import Pace
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import (
@@ -216,6 +217,8 @@ def test_lead_time_of_the_parameter_is_kept(bench):
     (('-p', 'shaper:=robust', '-p', 'robust_order:=3'), {'shaper': 'robust', 'order': 3}),
     (('-p', 'shaper:=minimax', '-p', 'minimax_errors:=[0.05, 0.1, 0.0]'),
      {'shaper': 'minimax', 'errors': (0.05, 0.1, 0.0)}),
+    (('-p', 'shaper:=smooth', '-p', 'smooth_periods:=0.5', '-p', 'stretch_rate_max:=40.0'),
+     {'shaper': 'smooth', 'pace': Pace(0.5, 40.0)}),
     (('-p', 'flux_density_max:=0.2', '-p', 'shaper:=minimum_time'),
      {'flux_density_max': 0.2, 'shaper': 'minimum_time'}),
 ])

@@ -293,14 +293,14 @@ def test_setpoints_are_found_and_measured_as_the_demo_measures_them(bag):
         previous = x.stretch
 
 
-@pytest.mark.parametrize('shaper', ['robust', 'minimax', 'minimum_time', 'zv', 'step'])
+@pytest.mark.parametrize('shaper', ['robust', 'minimax', 'minimum_time', 'smooth', 'zv', 'step'])
 def test_setpoints_are_found_whatever_the_shaper(tmp_path, shaper):
     part = one(
         tmp_path / 'bag', simulated(shaper=shaper),
         **parameters(planner=ACTUATOR, plant=ACTUATOR))
     assert [x.stretch for x in part.evaluation.results] == [1.1, 1.2, 1.4]
     residual = max(x.residual for x in part.evaluation.results)
-    if shaper in ('robust', 'minimum_time'):
+    if shaper in ('robust', 'minimum_time', 'smooth'):
         assert residual < ROUNDING
     else:
         assert residual > 1e-3

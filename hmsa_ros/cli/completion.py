@@ -17,7 +17,8 @@ ROS_ARGUMENTS = {
     '--enclave': 'security enclave', '--disable-rosout-logs': 'do not publish the log'}
 _ROS_FILES = ('--params-file',)
 # Values of options that are checked later than by the parser.
-_SHAPERS = ('two_step', 'robust', 'minimax', 'minimum_time', 'step', 'zv', 'zvd', 'ei')
+_SHAPERS = (
+    'two_step', 'robust', 'minimax', 'minimum_time', 'smooth', 'step', 'zv', 'zvd', 'ei')
 VALUES = {'--shaper': _SHAPERS, '--shapers': _SHAPERS}
 _FILES = ('FILE', 'FILE.csv', 'BAG')
 _FOLDERS = ('DIR',)

@@ -41,7 +41,7 @@ def add_parser(subparsers: Any) -> None:
         help='shape 2 H^2/L^2, above 0 (default 2)')
     parser.add_argument(
         '--shaper', metavar='NAME',
-        help='two_step (default), robust, minimax, minimum_time, step, zv, zvd or ei')
+        help='two_step (default), robust, minimax, minimum_time, smooth, step, zv, zvd or ei')
     parser.add_argument(
         '--order', type=int, default=2, metavar='N',
         help='two-step commands that robust chains; minimax takes as long (default 2)')
@@ -50,6 +50,12 @@ def add_parser(subparsers: Any) -> None:
         help='errors of shear modulus, damping coefficient and chain limit, as shares, for which '
              'minimax plans (default 0.1,0.1,0.1, or the 95 %% intervals that hmsa identify wrote '
              'to --params-file)')
+    parser.add_argument(
+        '--periods', type=float, default=1.0, metavar='N',
+        help='natural periods that a move of smooth takes at the least (default 1)')
+    parser.add_argument(
+        '--max-rate', type=float, default=math.inf, metavar='R',
+        help='largest stretch rate on the way of smooth (default any)')
     parser.add_argument(
         '--params-file', type=Path, metavar='YAML',
         help='parameter file (YAML) of planner and plant, for a plan in seconds and tesla')
@@ -65,13 +71,15 @@ def run(arguments: argparse.Namespace) -> int:
     from hmsa_ros.core.parameters import NondimensionalParameters
     from hmsa_ros.core.sequence import plan_sequence
     from hmsa_ros.core.setpoint import Setpoint
+    from hmsa_ros.core.shapers.pace import Pace
 
     given = {name: value for name in ('zeta', 'j_lim', 'c1')
              if (value := getattr(arguments, name)) is not None}
     segments = plan_sequence(
         [Setpoint(*x) for x in arguments.setpoints], NondimensionalParameters(**given),
         start=State(arguments.start), shaper=arguments.shaper or 'two_step',
-        order=arguments.order, errors=_errors(arguments))
+        order=arguments.order, errors=_errors(arguments),
+        pace=Pace(arguments.periods, arguments.max_rate))
     rows = [_row(segment) for segment in segments]
     if arguments.json:
         print(json.dumps({'segments': rows}, indent=2))
@@ -92,6 +100,7 @@ def _run_si(arguments: argparse.Namespace) -> int:
     from hmsa_ros.core.moves import State
     from hmsa_ros.core.sequence import plan_sequence
     from hmsa_ros.core.setpoint import Setpoint
+    from hmsa_ros.core.shapers.pace import Pace
     from hmsa_ros.runs.parameters import read_parameter_file, values_of
 
     fixed = [f'--{name.replace("_", "-")}' for name in ('zeta', 'j_lim', 'c1')
@@ -109,7 +118,7 @@ def _run_si(arguments: argparse.Namespace) -> int:
         [Setpoint(stretch, span / time) for stretch, span in arguments.setpoints],
         model.material, start=State(arguments.start), shaper=arguments.shaper or 'two_step',
         limits=model.limits, delivery=model.delivery, units=model.units, order=arguments.order,
-        errors=_errors(arguments))
+        errors=_errors(arguments), pace=Pace(arguments.periods, arguments.max_rate * time))
     rows = [_si_row(x, time, load) for x in segments]
     group = model.material
     if arguments.json:

@@ -191,7 +191,10 @@ def draft_stop(outset: Outset) -> Steps[Draft]:
     model, state = outset.model, outset.state
     work = work_space()
     found = brake(model, work, state)
-    if (holdable(model, found.stretch) == found.stretch and not model.material.creep
+    # A coil that must not step brakes as the shaper smooth does, on from where it would turn.
+    smooth = model.options.shaper == 'smooth'
+    if (not smooth and holdable(model, found.stretch) == found.stretch
+            and not model.material.creep
             and (model.delivery.ideal or found.duration == 0.0 and _settled(model, state))):
         move = Move(Code.HOLD, tuple(
             [Level(0.0, found.load)] * (found.duration > 0.0)
@@ -201,10 +204,11 @@ def draft_stop(outset: Outset) -> Steps[Draft]:
         levels, placed = _placed(model, outset.begin, Segment(
             Setpoint(found.stretch, math.inf), 0.0, state, end, move, end.load))
         return Draft(outset.begin, tuple(levels), (placed,))
-    for share in _BRAKE_SHARES:
+    ways = [(0.0, 'smooth')] * smooth + [(x, 'two_step') for x in _BRAKE_SHARES]
+    for share, shaper in ways:
         stretch = holdable(model, brake(model, work, state, share).stretch)
         try:
-            return (yield from draft_moves(outset, [Setpoint(stretch, math.inf)], 'two_step'))
+            return (yield from draft_moves(outset, [Setpoint(stretch, math.inf)], shaper))
         except RefusedError:
             yield
     # Nothing stops it at once: let it settle.
@@ -349,7 +353,7 @@ def _planned(
     return segments(
         setpoints, model.material, start=state, shaper=shaper or options.shaper, first=first,
         limits=model.limits, delivery=model.delivery, order=options.order, units=model.units,
-        short_spell=options.short_spell, errors=options.errors)
+        short_spell=options.short_spell, errors=options.errors, pace=model.pace)
 
 
 def placed_level(model: Model, stamp: int, flux_density: float, state: State) -> PlannedLevel:

@@ -14,6 +14,7 @@ from hmsa_ros.core.moves import Level, Limits, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.setpoint import Setpoint
 from hmsa_ros.core.shapers import creeping, get_shaper, Shaper
+from hmsa_ros.core.shapers.pace import PACE, Pace
 from hmsa_ros.core.shapers.request import ERRORS, Request
 from hmsa_ros.core.simulation import check_stretch, follow, longest_motion, simulate
 from hmsa_ros.core.status import Code, RefusedError
@@ -60,7 +61,8 @@ def plan_sequence(
         start: State | None = None, shaper: str = 'two_step', limits: Limits | None = None,
         delivery: Delivery = IDEAL, order: int = 2, units: Units | None = None,
         short_spell: str = 'refuse',
-        errors: tuple[float, float, float] = ERRORS) -> tuple[Segment, ...]:
+        errors: tuple[float, float, float] = ERRORS,
+        pace: Pace = PACE) -> tuple[Segment, ...]:
     """
     Plan a sequence of setpoints.
 
@@ -88,6 +90,8 @@ def plan_sequence(
         is really reached; the last move is then finished after its span.
     errors : tuple of float
         Of G, damping coefficient and J_lim, as shares, for which minimax plans.
+    pace : Pace
+        How fast the shaper smooth moves; the rate per unit of nondimensional time.
 
     Returns
     -------
@@ -106,7 +110,7 @@ def plan_sequence(
         raise RefusedError(Code.BAD_INPUT, 'no setpoint given: expected at least one')
     return tuple(segments(
         setpoints, material, start=start, shaper=shaper, limits=limits, delivery=delivery,
-        order=order, units=units, short_spell=short_spell, errors=errors))
+        order=order, units=units, short_spell=short_spell, errors=errors, pace=pace))
 
 
 def segments(
@@ -114,7 +118,7 @@ def segments(
         start: State | None = None, shaper: str = 'two_step', limits: Limits | None = None,
         delivery: Delivery = IDEAL, order: int = 2, units: Units | None = None,
         short_spell: str = 'refuse',
-        errors: tuple[float, float, float] = ERRORS,
+        errors: tuple[float, float, float] = ERRORS, pace: Pace = PACE,
         first: Shaper | None = None) -> Generator[Segment, None, None]:
     """
     Plan as `plan_sequence` does, setpoint by setpoint; the first may have a shaper of its own.
@@ -142,7 +146,8 @@ def segments(
     while setpoint is not None:
         following = next(upcoming, None)
         request = Request(
-            state, setpoint.stretch, material, limits, delivery, order, units, errors)
+            state, setpoint.stretch, material, limits, delivery, order, units, errors,
+            pace)
         move = creeping.held(
             request, _rounded(shape(request), delivery),
             math.inf if following is None else setpoint.span)

@@ -91,7 +91,7 @@ def simulate(
             'switches and times must not decrease, and no time may lie before the first switch')
     check_stretch(stretch, material)
     if material.creep:
-        sampled = _creeping(
+        sampled = creeping_samples(
             switches, loads, slope, times, State(stretch, rate, followed=tuple(followed)),
             material, rtol)
         return sampled[0], sampled[1]
@@ -130,10 +130,18 @@ def followed_by(state: State, material: NondimensionalParameters) -> tuple[float
     return (float(law.elastic_force(state.stretch, material.packed)),) * count
 
 
-def _creeping(
+def creeping_samples(
         switches: Array, loads: Array, slopes: Array, times: Array, state: State,
         material: NondimensionalParameters, rtol: float) -> Array:
-    """Return samples of stretch, rate and what branches follow, shape (2 + n, m)."""
+    """
+    Return samples of stretch, rate and what branches follow, shape (2 + n, m).
+
+    Raises
+    ------
+    HmsaError
+        If the integration does not get through.
+
+    """
     branches = np.column_stack([material.branches, followed_by(state, material)])
     out = np.empty((2 + len(branches), times.size))
     status = creep_kernel.trajectory_creeping(
@@ -150,7 +158,7 @@ def _follow_creeping(
     """Integrate until vibration has ended; from then on branches relax alone."""
     switches, loads, slopes = np.array(pieces).T.copy()
     rings = min(end, max(pieces[-1][0], 0.0) + longest_motion(last, material))
-    stretch, rate, *followed = _creeping(
+    stretch, rate, *followed = creeping_samples(
         switches, loads, slopes, np.array([float(rings)]), state, material, RTOL)[:, 0].tolist()
     if rings == end:
         return State(stretch, rate, last, followed=tuple(followed))

@@ -10,7 +10,7 @@ class Code(str, Enum):
     """
     The outcome of a move or a request; the value is what messages and files carry.
 
-    The first ten are plans that can be carried out, the next ones refusals, and the last four
+    The first eleven are plans that can be carried out, the next ones refusals, and the last four
     what was measured.
     """
 
@@ -20,6 +20,7 @@ class Code(str, Enum):
     ROBUST = 'robust'
     MINIMAX = 'minimax'
     MINIMUM_TIME = 'minimum_time'
+    SMOOTH = 'smooth'
     LINEAR = 'linear'
     TOO_DAMPED = 'too_damped'
     INDISTINGUISHABLE = 'indistinguishable'
@@ -59,6 +60,7 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'Levels that leave the least vibration at the worst, while the parameters are within the '
         'errors given.', ''),
     Code.MINIMUM_TIME: ('Full push, full brake, then the level that holds the target.', ''),
+    Code.SMOOTH: ('Levels without a step between them, along a smooth path of the stretch.', ''),
     Code.LINEAR: ('A linear input shaper designed at the target; it leaves some vibration.', ''),
     Code.TOO_DAMPED: (
         'The actuator is too heavily damped to overshoot, so there is no two-step command. A '

@@ -17,6 +17,7 @@ from hmsa_ros.core.moves import Level, Limits, State
 from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.core.sequence import SHORT_SPELL
 from hmsa_ros.core.shapers import creeping, get_shaper
+from hmsa_ros.core.shapers.pace import PACE, Pace
 from hmsa_ros.core.shapers.request import as_errors, ERRORS
 from hmsa_ros.core.simulation import follow, longest_motion, simulate
 from hmsa_ros.core.status import Code
@@ -60,6 +61,8 @@ class Options:
         In s: the field follows the amplifier with this lag of first order; 0 for at once.
     creep_tolerance : float
         Vibration that levels which follow creep may leave, as a share of the move.
+    pace : Pace
+        How fast the shaper smooth moves; the rate in 1/s.
 
     """
 
@@ -74,6 +77,7 @@ class Options:
     coil_time_constant: float = 0.0
     creep_tolerance: float = IDEAL.ripple
     errors: tuple[float, float, float] = ERRORS
+    pace: Pace = PACE
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,8 @@ class Model:
         Admissible loads.
     delivery : Delivery
         Nondimensional.
+    pace : Pace
+        Nondimensional.
 
     Raises
     ------
@@ -109,6 +115,7 @@ class Model:
     units: Units = field(init=False)
     limits: Limits = field(init=False)
     delivery: Delivery = field(init=False)
+    pace: Pace = field(init=False)
 
     def __post_init__(self) -> None:
         """Work out the nondimensional side."""
@@ -131,6 +138,7 @@ class Model:
                 options.period / NANOSECONDS / time, options.slew_limit / load * time,
                 1.0 / NANOSECONDS / time, options.coil_time_constant / time,
                 options.creep_tolerance),
+            'pace': replace(options.pace, rate=options.pace.rate * time),
         }
         for name, value in worked_out.items():
             object.__setattr__(self, name, value)

@@ -242,7 +242,8 @@ class Corrector:
         return Request(
             State(estimate.stretch, estimate.rate * units.time, load,
                   load if model.delivery.lag > 0.0 else None),
-            target, model.material, model.limits, model.delivery, units=units)
+            target, model.material, model.limits, model.delivery, units=units,
+            pace=model.pace)
 
     def _candidates(
             self, model: Model, estimate: Estimate, course: Course) -> Iterator[Course]:

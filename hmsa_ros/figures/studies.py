@@ -28,14 +28,15 @@ _SYMBOLS = {'G': '$G$', 'zeta': r'$\zeta$', 'J_lim': r'$J_\mathrm{lim}$'}
 _CURVES: dict[str, dict[str, Any]] = {
     'two_step': {'color': style.BLUE, 'linewidth': 1.9},
     'minimum_time': {'color': style.PURPLE, 'linewidth': 1.3, 'linestyle': (0, (5, 1, 1, 1))},
+    'smooth': {'color': style.BLUE, 'linewidth': 1.3, 'linestyle': (0, (1, 1))},
     'step': {'color': style.VERMILION, 'linewidth': 1.1, 'linestyle': (0, (4, 1.5))},
     'zv': {'color': style.GREY, 'linewidth': 1.1, 'linestyle': (0, (1, 1))},
     'zvd': {'color': style.GREY, 'linewidth': 1.1, 'linestyle': (0, (4, 1.5))},
     'ei': {'color': style.BLACK, 'linewidth': 1.0, 'linestyle': (0, (6, 1, 1, 1, 1, 1))},
 }
 _MARKERS = {
-    'two_step': 'o', 'robust': 's', 'minimax': 'D', 'minimum_time': '^', 'zv': 'v', 'zvd': '<',
-    'ei': '>'}
+    'two_step': 'o', 'robust': 's', 'minimax': 'D', 'minimum_time': '^', 'smooth': 'P', 'zv': 'v',
+    'zvd': '<', 'ei': '>'}
 # Orders of the robust shaper, one after the other.
 _ORDERS: tuple[dict[str, Any], ...] = (
     {'color': style.GREEN, 'linewidth': 1.9},

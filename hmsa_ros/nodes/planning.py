@@ -22,6 +22,7 @@ from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.sequence import SHORT_SPELL
 from hmsa_ros.core.shapers import SHAPERS
+from hmsa_ros.core.shapers.pace import LEAST_PERIODS, MOST_PERIODS, Pace
 from hmsa_ros.core.shapers.request import as_errors, ERRORS, LARGEST_ERROR
 from hmsa_ros.core.timeline import Model
 from hmsa_ros.core.units import NANOSECONDS
@@ -59,6 +60,15 @@ OWN = (
         'Errors of shear modulus, damping coefficient and chain limit, as shares, within which '
         'the shaper minimax leaves least vibration; it takes as long as robust.', '',
         0.0, LARGEST_ERROR, read_only=False, items=float),
+    ParameterSpec(
+        'smooth_periods', _OPTIONS.pace.periods,
+        'Natural periods that a move of the shaper smooth takes at the least; it takes longer '
+        'where limits of flux density, slew or stretch rate ask for it.', '',
+        LEAST_PERIODS, MOST_PERIODS, read_only=False),
+    ParameterSpec(
+        'stretch_rate_max', 0.0,
+        'Largest stretch rate on the way of the shaper smooth; 0 for any.', '1/s', 0.0, 1e12,
+        read_only=False),
     replace(SLEW_LIMIT, read_only=False),
     replace(COIL_TIME_CONSTANT, read_only=False),
     *VISCOELASTIC,
@@ -194,7 +204,8 @@ def options_from(values: Mapping[str, Any]) -> Options:
         slew_limit=float(values['slew_limit']) or math.inf,
         order=int(values['robust_order']), errors=as_errors(values['minimax_errors']),
         coil_time_constant=float(values['coil_time_constant']),
-        creep_tolerance=float(values['creep_tolerance']))
+        creep_tolerance=float(values['creep_tolerance']),
+        pace=Pace(float(values['smooth_periods']), float(values['stretch_rate_max']) or math.inf))
 
 
 def nanoseconds(seconds: float) -> int:

@@ -14,6 +14,7 @@ from hmsa_ros.cli import Parser
 from hmsa_ros.core.moves import State
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.shapers import SHAPERS
+from hmsa_ros.core.shapers.pace import Pace
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.errors import BadInputError, complain, HmsaError
 from hmsa_ros.figures.studies import draw_damped, draw_front, draw_robustness, draw_sampled
@@ -28,6 +29,8 @@ MOVES = ((1.0, 1.1), (1.0, 1.4), (1.0, 0.7))
 MATERIAL = NondimensionalParameters()
 #: Command periods in the table, as shares of tau_p; none divides it.
 PERIODS = (0.03, 0.07, 0.13, 0.23, 0.33, 0.45)
+#: Natural periods that smooth moves take in the table.
+PACES = (0.5, 1.0, 1.5, 2.0, 3.0)
 ZETAS = (2.2, 3.0, 4.0, 5.0, 6.0)
 
 Table = list[tuple[str, ...]]
@@ -66,6 +69,20 @@ def single_error_table() -> Table:
     return rows
 
 
+def smooth_table() -> Table:
+    """Return header and rows of what smooth moves of several durations leave."""
+    rows: Table = [('smooth, at least', *(f'{x:g} periods' for x in PACES))]
+    for start, target in MOVES:
+        moves = [SHAPERS['smooth'](Request(State(start), target, MATERIAL, pace=Pace(x)))
+                 for x in PACES]
+        name = f'{start:g} to {target:g}'
+        rows.append((f'arrival, {name}', *(f'{x.duration:.3f}' for x in moves)))
+        rows.append((f'G ±10 %, {name}', *(percent(max(
+            residual(x, start, target, MATERIAL, Errors(error), x.duration)
+            for error in (-0.1, 0.1))) for x in moves)))
+    return rows
+
+
 def sampled_table() -> Table:
     """Return header and rows of residuals on sampled hardware."""
     rows: Table = [('command, move', *(f'T = {x:g} tau_p' for x in PERIODS))]
@@ -92,8 +109,8 @@ def damped_table(found: DampedStudy) -> Table:
 def tables() -> list[Table]:
     """Return all tables of the documentation in their order there."""
     return [
-        *(robustness_table(*move) for move in MOVES), single_error_table(), sampled_table(),
-        damped_table(damped_study(1.0, 1.1, np.array(ZETAS)))]
+        *(robustness_table(*move) for move in MOVES), single_error_table(), smooth_table(),
+        sampled_table(), damped_table(damped_study(1.0, 1.1, np.array(ZETAS)))]
 
 
 def pictures(folder: Path) -> list[Path]:

@@ -13,6 +13,7 @@ from hmsa_ros.core.shapers.minimax import minimax
 from hmsa_ros.core.shapers.minimum_time import minimum_time
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.shapers.robust import robust
+from hmsa_ros.core.shapers.smooth import smooth
 from hmsa_ros.core.shapers.step import step
 from hmsa_ros.core.shapers.two_step import two_step
 from hmsa_ros.errors import BadInputError
@@ -25,6 +26,7 @@ SHAPERS: dict[str, Shaper] = {
     'robust': robust,
     'minimax': minimax,
     'minimum_time': minimum_time,
+    'smooth': smooth,
     'step': step,
     'zv': zv,
     'zvd': zvd,

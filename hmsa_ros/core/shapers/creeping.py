@@ -27,7 +27,7 @@ from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.errors import BadInputError
 
 #: Shapers that know of creep.
-SHAPERS = ('two_step', 'robust', 'step')
+SHAPERS = ('two_step', 'robust', 'smooth', 'step')
 # The least move that counts, and how much more a staircase may leave than is worked out.
 _LEAST_MOVE, _SURE = 1e-3, 1.25
 # Levels of a staircase at the most, how its vibration grows until it has no more, and how often

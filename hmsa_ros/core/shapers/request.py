@@ -8,6 +8,7 @@ from hmsa_ros.core import law
 from hmsa_ros.core.delivery import Delivery, IDEAL
 from hmsa_ros.core.moves import Level, Limits, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.core.shapers.pace import PACE, Pace
 from hmsa_ros.core.simulation import check_stretch
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.units import Units
@@ -61,6 +62,8 @@ class Request:
     errors : tuple of float
         Of G, damping coefficient and J_lim, as `as_errors` returns them: minimax plans for
         these.
+    pace : Pace
+        How fast the shaper smooth moves; the rate per unit of nondimensional time.
 
     """
 
@@ -72,6 +75,7 @@ class Request:
     order: int = 2
     units: Units = field(default_factory=Units)
     errors: tuple[float, float, float] = ERRORS
+    pace: Pace = PACE
 
     @property
     def load(self) -> float:
