@@ -36,14 +36,19 @@ demo: env ## run the demonstration
 	$(BIN)/hmsa demo $(ARGS)
 
 .PHONY: test
-test: tools ## run the whole gate: ruff, then mypy and all tests in parallel
+test: tools ## run the gate: ruff, then mypy and all tests but the slow ones, in parallel
+	$(BIN)/python -m ruff check .
+	$(PYTEST) -m 'not slow' $(ARGS)
+
+.PHONY: full
+full: tools ## run the gate with the slow tests too, as before a release
 	$(BIN)/python -m ruff check .
 	$(PYTEST) $(ARGS)
 
 .PHONY: check
 check: tools ## run what needs no nodes of the gate: ruff, mypy, tests of the rest
 	$(BIN)/python -m ruff check .
-	$(PYTEST) -m 'not ros' $(ARGS)
+	$(PYTEST) -m 'not slow and not ros' $(ARGS)
 
 .PHONY: bench
 bench: $(VENV)/.bench env ## measure speed and accuracy

@@ -94,7 +94,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         item.add_marker(pytest.mark.xdist_group(item.path.stem))
     if 'PYTEST_XDIST_WORKER' in os.environ:
         items.sort(key=lambda item: (
-            not item.get_closest_marker('slow'), bool(item.get_closest_marker('ros'))))
+            not any(item.get_closest_marker(x) for x in ('long', 'slow')),
+            bool(item.get_closest_marker('ros'))))
 
 
 def wait_until(

@@ -8,14 +8,13 @@ It waits for its subscribers, sends, prints "done" and stays until it is told to
 """
 
 import argparse
-import contextlib
 import sys
 import time
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Float64
 
 
@@ -30,7 +29,8 @@ def main():
     parser.add_argument('--first', type=float, default=0.0)
     parser.add_argument('--wait', type=int, default=1)
     options = parser.parse_args()
-    rclpy.init()
+    # Told to end, it dies at once: two participants that end at a time may wait for each other.
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = Node('talker', enable_rosout=False, start_parameter_services=False)
     publisher = node.create_publisher(Float64, options.topic, QoSProfile(
         history=HistoryPolicy.KEEP_LAST, depth=options.depth,
@@ -47,8 +47,7 @@ def main():
             time.sleep(delay)
         publisher.publish(Float64(data=options.first + i))
     print('done', flush=True)
-    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
-        rclpy.spin(node)
+    rclpy.spin(node)
     return 0
 
 

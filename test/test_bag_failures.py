@@ -156,7 +156,7 @@ while True:
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_killed_writer_loses_nothing_it_has_flushed(tmp_path):
     environment = {**os.environ, 'PYTHONPATH': str(Path(__file__).resolve().parent.parent)}
     # As `python -m benchmarks crash` does with fifty recorders.
@@ -213,6 +213,7 @@ def test_time_that_jumps_to_and_fro_does_not_make_a_file_each_time(tmp_path):
     assert status.written == {'/a': 500}
 
 
+@pytest.mark.slow
 def test_an_end_that_takes_too_long_is_cut_off_and_counted(tmp_path, monkeypatch):
     monkeypatch.setattr('hmsa_ros.bag.recording.END_SECONDS', 0.0)
     recording = Recording(BagWriter(tmp_path / 'bag'), Limits())

@@ -127,6 +127,7 @@ def hostile_files():
         1, 'x/msg/Y', b'Y y\n') + channel(1, 1, '/a') + message(), 'does not decode'
 
 
+@pytest.mark.slow
 def test_sizes_that_lie_take_no_memory(tmp_path):
     files, wanted = [], []
     for name, content, expected in hostile_files():
@@ -253,6 +254,7 @@ class NoAliases(yaml.SafeDumper):
         return True
 
 
+@pytest.mark.slow
 def test_profiles_made_to_do_harm_are_left_aside(tmp_path):
     path = tmp_path / 'bag.mcap'
     for bomb in YAML_BOMBS.values():

@@ -77,6 +77,7 @@ def test_a_recorded_run_comes_out_again(recorded_run, start, tmp_path):
     assert 'largest difference of the stretch' in process.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_a_second_plant_moves_the_same_when_the_bag_is_played(
         recorded_run, start, ros, tmp_path):
@@ -244,6 +245,7 @@ def test_a_bag_without_a_run_is_refused(tmp_path):
         verify(tmp_path / 'bag')
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_late_commands_a_slow_coil_creep_and_the_watchdog_come_out_again(start, ros, tmp_path):
     bag = tmp_path / 'run'

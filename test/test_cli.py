@@ -96,6 +96,7 @@ def test_bad_input_is_answered_in_one_line_with_status_2(words, said, capsys):
     assert said in captured.err
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_send_reports_until_the_sequence_has_been_carried_out(start, ros):
     # Commands far enough ahead for a busy machine.
@@ -113,6 +114,7 @@ def test_send_reports_until_the_sequence_has_been_carried_out(start, ros):
     assert 'setpoint 3 of 3' in send.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_send_is_patient_in_simulated_time_that_is_slower_than_the_wall(start, ros):
     start.hmsa(
@@ -124,6 +126,7 @@ def test_send_is_patient_in_simulated_time_that_is_slower_than_the_wall(start, r
     assert send.wait(60.0) == 0, send.output
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_send_trusts_a_driver_that_publishes_samples_alone(start, ros):
     from hmsa_ros.nodes import interface
@@ -143,6 +146,7 @@ def test_send_trusts_a_driver_that_publishes_samples_alone(start, ros):
     assert 'done: at_rest, predicted, not measured' in send.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_send_fails_where_the_actuator_is_measured_to_miss_the_setpoint(start, ros):
     start.hmsa('plant', '--ros-args', '-p', 'mismatch.shear_modulus:=1.1')
@@ -158,6 +162,7 @@ def test_send_fails_where_the_actuator_is_measured_to_miss_the_setpoint(start, r
     assert list(map(float, found.groups())) == pytest.approx([0.0393, 89.9, 0.0366], rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_send_moves_several_joints_each_to_its_stretch_or_all_to_one(start, ros):
     from hmsa_ros.nodes import interface

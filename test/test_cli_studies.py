@@ -53,6 +53,7 @@ def refused(run):
 # --- robustness
 
 
+@pytest.mark.slow
 def test_robustness_prints_a_table_and_names_its_files(run, tmp_path):
     status, out, err = run(
         'robustness', '--move', '1.0:1.4', '1:0.9', '--shapers', 'two_step,robust,zv',

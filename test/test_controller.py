@@ -84,6 +84,7 @@ def test_a_sequence_arrives_commanded_a_few_cycles_ahead_and_the_bag_shows_it(
     assert len(changes) == 4
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_a_plant_that_is_not_as_planned_fails_and_commands_of_others_are_obeyed(
         start, ros, tmp_path):
@@ -119,6 +120,7 @@ def test_a_plant_that_is_not_as_planned_fails_and_commands_of_others_are_obeyed(
         lambda: any(x.magnetic_field.z == -0.0125 for x in applied), 'the command of ours')
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_a_plant_that_is_taken_away_is_missed_and_comes_back(start, ros):
     statuses = ros.collect(interface.STATUS.type, 'planner/status', interface.STATUS.qos)

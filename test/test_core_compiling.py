@@ -46,6 +46,7 @@ def test_where_no_folder_can_be_written_kernels_compile_and_it_is_said_once():
     assert said.count('cannot write to') == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('damage', [
     lambda data: b'', lambda data: data[:len(data) // 2],
     lambda data: data[:-100] + bytes([data[-100] ^ 1]) + data[-99:]])
@@ -59,6 +60,7 @@ def test_a_broken_entry_is_compiled_anew(tmp_path, damage):
     assert run(tmp_path)[1] == 1
 
 
+@pytest.mark.slow
 def test_an_entry_of_other_sources_is_replaced(tmp_path):
     run(tmp_path)
     assert run(tmp_path, 'b')[1] == 0
@@ -66,6 +68,7 @@ def test_an_entry_of_other_sources_is_replaced(tmp_path):
     assert len(list(tmp_path.rglob('*.hmsa'))) == 1
 
 
+@pytest.mark.slow
 def test_what_came_with_the_package_is_used_where_the_folder_is_empty(tmp_path):
     package, folder = tmp_path / 'package', tmp_path / 'folder'
     assert run(None, package=package)[1] == 0

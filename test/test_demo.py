@@ -16,6 +16,7 @@ LARGEST_RESIDUAL = 1e-6
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
 
+@pytest.mark.slow
 def test_every_setpoint_is_reached_and_held_while_another_process_loads_a_core(start, tmp_path):
     out = tmp_path / 'out'
     busy = start.python('-c', 'while True: pass')
@@ -64,6 +65,7 @@ def _check_bag(bag: Path) -> None:
         assert make_reader(file).get_summary().statistics.message_count == sum(counts.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize('moment', ['starting the nodes', 'running the sequence'])
 def test_an_interrupted_demo_ends_its_processes_and_leaves_a_readable_bag(

@@ -49,9 +49,11 @@ def test_every_block_of_the_page_is_run_or_checked(page):
 
 
 @pytest.mark.ros
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize('page', RUNNING, ids=name_of)
+@pytest.mark.parametrize('page', [
+    pytest.param(x, marks=[] if x.name == 'README.md' else pytest.mark.slow, id=name_of(x))
+    for x in RUNNING])
 def test_page_does_what_it_says(page, ros_env, tmp_path):
     # How long each block took: shown if it fails, or by pytest -rP.
     print(*run_page(page, tmp_path, ros_env), sep='\n')
@@ -208,6 +210,7 @@ def test_topics_and_services_are_those_that_the_nodes_have(start, ros, ros_env):
         assert of_ours(ros.node.get_service_names_and_types_by_node(name, '/')) <= served
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_driver_of_the_tutorial_keeps_the_contract_of_a_driver(start, ros):
     from hmsa_ros.nodes import interface

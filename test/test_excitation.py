@@ -36,6 +36,7 @@ def test_design_keeps_the_limits_and_ends_at_rest(designed):
     assert stretch[times > 1.0 - PERIOD] == pytest.approx(1.0, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_ramps_of_the_amplifier_are_reckoned_with():
     found = excite(BLOCK, Bounds(slew_limit=20.0), duration=0.3)
     assert found.best.ends_at_rest
@@ -43,6 +44,7 @@ def test_ramps_of_the_amplifier_are_reckoned_with():
     assert found.best.reach[1] <= 2.0
 
 
+@pytest.mark.slow
 def test_command_prints_and_writes_the_levels(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(['excite', '--duration', '0.3', '--out', 'levels.csv', '--json']) == 0

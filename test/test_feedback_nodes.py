@@ -32,6 +32,7 @@ def begin(start, ros, mode, *more):
     return read
 
 
+@pytest.mark.slow
 def test_a_planner_that_observes_says_what_is_wrong_with_the_actuator(start, ros):
     estimate = begin(start, ros, 'observe')
     send = start.hmsa('send', '1.4:2', '--wait')
@@ -46,6 +47,7 @@ def test_a_planner_that_observes_says_what_is_wrong_with_the_actuator(start, ros
     assert (values['used_by_plans'], values['corrections']) == ('False', '0')
 
 
+@pytest.mark.slow
 def test_a_planner_that_adapts_arrives_with_the_second_move_and_saves_what_it_learnt(
         start, ros, tmp_path):
     file = tmp_path / 'learnt.yaml'

@@ -149,6 +149,7 @@ def test_estimates_lie_within_their_intervals_from_starts_ten_times_off(start, r
         assert found.noise_std == pytest.approx(1e-3, rel=0.2)
 
 
+@pytest.mark.slow
 def test_errors_of_many_runs_are_as_large_as_the_deviations_say():
     errors = np.array([
         [*relative(identify(recorded(seed=seed, repeats=3, times=TIMES[:500]))).values()]
@@ -299,6 +300,7 @@ def test_what_the_sensor_does_rejects_the_model_by_name(change, word):
     assert word in found.reason
 
 
+@pytest.mark.slow
 def test_foreign_motion_is_rejected_without_a_number():
     recording = recorded()
     found = identify(replace(recording, stretch=recording.stretch[::-1].copy()))
@@ -323,6 +325,7 @@ def test_small_stretches_do_not_hold_the_chain_limit():
     assert 'larger stretches' in found.reason
 
 
+@pytest.mark.slow
 def test_gain_of_the_sensor_and_nine_more_are_not_read_out_of_one_shaped_pass():
     found = identify(shaped(1), free=(*NINE, 'stretch_gain'))
     assert found.verdict == 'not_identifiable'

@@ -311,6 +311,7 @@ def test_it_asks_with_units_and_defaults_and_takes_no_for_an_answer(tmp_path):
     assert found['joints'] == ['left', 'right']
 
 
+@pytest.mark.slow
 def test_what_is_given_is_not_asked_for(tmp_path):
     status, _, err = ask(tmp_path, '', *OWN)
     assert (status, err) == (0, '')
@@ -334,6 +335,7 @@ def test_answers_that_end_early_write_nothing(tmp_path):
 
 # Used ----------------------------------------------------------------------------------------
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_planner_and_plant_take_the_file_and_arrive_when_it_says(start, tmp_path, run):
     status, out, _ = run(*OWN, '--json', '--joint', 'finger')

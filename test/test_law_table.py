@@ -248,6 +248,7 @@ def test_what_names_no_file_or_half_of_the_points_is_refused(tmp_path, monkeypat
     assert block(file='table.csv').shear_modulus == pytest.approx(GENT.shear_modulus, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_sequence_to_record_keeps_inside_the_table_and_seeks_no_chain_limit():
     found = of_points(*sampled(20, 0.8, 1.25))
     program = excite(found, duration=0.4).best
@@ -288,6 +289,7 @@ def test_a_plan_and_an_identification_take_a_table_from_a_parameter_file(tmp_pat
     assert parameters_of(found)['law.flux_density'] == pytest.approx(flux.tolist(), rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_the_bag_of_a_table_is_verified_and_reported_without_its_file(start, tmp_path):
     table, file, out = tmp_path / 'table.csv', tmp_path / 'block.yaml', tmp_path / 'out'

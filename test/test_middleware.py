@@ -79,6 +79,7 @@ def test_who_has_profiles_of_his_own_keeps_them(monkeypatch):
     assert os.environ[PROFILES] == '/somewhere/else.xml'
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_what_a_busy_reader_misses_comes_again_sooner_than_by_default(start, wait_until):
     reader = start.python('-c', READER)

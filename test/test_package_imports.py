@@ -39,12 +39,25 @@ def modules(package: str) -> list[str]:
             if path.stem != '__init__']
 
 
-@pytest.mark.parametrize(
-    'package', ['core', 'device', 'runtime', 'bag', 'studies', 'contract', 'runs', 'report',
-                'estimation'])
-def test_physics_runtime_bags_and_studies_import_without_ros_each_module_by_itself(package):
+PACKAGES = ('core', 'device', 'runtime', 'bag', 'studies', 'contract', 'runs', 'report',
+            'identification', 'estimation')
+
+
+def test_physics_runtime_bags_and_studies_import_without_ros():
+    names = [name for package in PACKAGES for name in modules(package)]
     result = run(BLOCKED.format(blocked=ROS) + f"""
 import importlib
+for name in {names!r}:
+    importlib.import_module(name)
+""")
+    assert (result.returncode, result.stderr) == (0, '')
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('package', PACKAGES)
+def test_each_module_imports_by_itself(package):
+    result = run(f"""
+import importlib, sys
 for name in {modules(package)!r}:
     for loaded in [x for x in sys.modules if x.startswith('hmsa_ros')]:
         del sys.modules[loaded]

@@ -296,6 +296,7 @@ def test_first_request_waits_for_the_state_in_force(rig, ros):
     assert driver.residual(1.25) < 0.1 * RESIDUAL
 
 
+@pytest.mark.slow
 def test_planner_that_is_killed_is_followed_by_one_that_takes_over(ros, start, make_clock):
     arguments = ('planner', '--ros-args', *QUIET)
     clock = ros.node.create_publisher(

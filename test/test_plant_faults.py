@@ -269,6 +269,7 @@ def test_the_achieved_real_time_factor_is_told_and_can_be_changed(stand):
     plant.ros.spin_until(lambda: 0.0 < achieved() <= 0.26, 'a factor')
 
 
+@pytest.mark.slow
 def test_an_inactive_plant_holds_time_and_takes_no_commands(ros, serve):
     serve(PlantNode, '-p', 'publish_clock:=true', '-p', 'autostart:=false')
 

@@ -89,6 +89,7 @@ def test_messages_of_equal_stamp_keep_their_order_over_topics(ros, play, tmp_pat
             i for i in range(600) if (i % 3 != 0) == (topic == '/a')]
 
 
+@pytest.mark.slow
 def test_commands_are_only_sent_if_asked_for_by_name(ros, play, tmp_path):
     bag = write_bag(tmp_path / 'bag', [
         entry for i in range(20)
@@ -317,6 +318,7 @@ def test_a_subscriber_that_does_not_come_fails_the_run(play, tmp_path):
         'hmsa: error: no subscriber of /a within 0.3 s')
 
 
+@pytest.mark.slow
 def test_it_waits_for_the_node_that_obeys_and_not_for_a_listener(ros, start, play, tmp_path):
     bag = write_bag(tmp_path / 'bag', [
         ('/flux_density_command', i, 0.1) for i in range(50)])
@@ -331,6 +333,7 @@ def test_it_waits_for_the_node_that_obeys_and_not_for_a_listener(ros, start, pla
     ros.spin_until(lambda: applied, 'the level in force')
 
 
+@pytest.mark.slow
 def test_topics_without_end_are_refused_and_those_named_are_played(ros, play, tmp_path):
     path = tmp_path / 'bag.mcap'
     encoding, text = message_definition(FLOAT)

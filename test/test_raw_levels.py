@@ -40,6 +40,7 @@ def followed(plan, end=0.3):
         samples, np.append(0.0, times + 0.02), np.append(0.0, fields))
 
 
+@pytest.mark.slow
 def test_what_excite_designs_is_carried_out_to_the_letter():
     best = excite(BLOCK, Bounds(-0.1, 0.2), duration=0.5).best
     plan = planned(zip(best.level_times, best.levels, strict=True), flux_density_max=0.2)
@@ -104,6 +105,7 @@ def test_a_tolerance_for_levels_is_refused(capsys):
     assert '--tolerance is given with --levels' in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_a_run_of_levels_has_them_in_force_and_ends_at_rest(start, tmp_path):
     file, out = tmp_path / 'levels.csv', tmp_path / 'out'

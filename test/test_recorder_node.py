@@ -107,6 +107,7 @@ def test_everything_sent_is_in_the_bag_after_a_clean_end(record, talk, ending):
                 for connection, _, data in other.messages()] == list(range(2000))
 
 
+@pytest.mark.slow
 def test_it_says_when_every_topic_asked_for_is_subscribed_to(record, ros):
     recorder = record(topics='[/a, b]')
     recorder.wait_for('subscribed', '0/2')
@@ -140,6 +141,7 @@ def test_lost_messages_are_counted_to_the_last_one(record, ros):
     assert f'{lost} lost' in recorder.process.stdout
 
 
+@pytest.mark.slow
 def test_several_publishers_of_one_topic_are_counted_apart(record, start):
     recorder = record()
     talkers = [start.python(TALKER, '/a', '3000', '--rate', '2000', '--first', str(10_000 * i))
@@ -182,6 +184,7 @@ def small_disk(tmp_path):
     subprocess.run(['umount', '--lazy', str(folder)], check=True)
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_told_and_nothing_is_lost_when_there_is_room_again(
         start, ros, small_disk):
     recorder = Recorder(start, ros, small_disk / 'bag')
@@ -257,6 +260,7 @@ def test_latched_and_best_effort_publishers_are_recorded_alike(record, talk):
     assert reader.topics['/fast'].profiles[0].reliability == 'best_effort'
 
 
+@pytest.mark.slow
 def test_a_publisher_that_asks_for_less_is_heard_after_one_that_offered_more(
         record, talk, make_ros):
     recorder = record()
@@ -362,6 +366,7 @@ def test_garbage_on_the_clock_is_left_aside(record, ros):
     assert values(recorder.end()) == [1.0]
 
 
+@pytest.mark.slow
 def test_simulated_time_is_waited_for_and_stamped(record, ros):
     recorder = record('use_sim_time:=true')
     clock = ros.node.create_publisher(
@@ -482,6 +487,7 @@ def test_the_experiment_goes_into_the_bag(record, ros, make_ros):
         planner.destroy_node()
 
 
+@pytest.mark.slow
 def test_it_records_while_it_is_active(record, ros):
     recorder = record('autostart:=false')
 

@@ -65,6 +65,7 @@ def drawn(opened):
         '.map(x => x.id)'))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('name', ['one', 'both'])
 def test_every_plot_is_drawn_without_a_complaint_or_a_request(browser, files, name):
     opened = browser.open(files / f'{name}.html')
@@ -82,6 +83,7 @@ def test_a_complaint_would_be_seen(browser, tmp_path):
     assert 'http://example.invalid/x.png' in found
 
 
+@pytest.mark.slow
 def test_a_click_in_the_legend_hides_a_curve(browser, files):
     opened = browser.open(files / 'one.html')
     drawn(opened)
@@ -105,6 +107,7 @@ def test_a_click_in_the_legend_hides_a_curve(browser, files):
     assert shown('recorded') is True
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('name', ['one', 'both'])
 def test_toolbar_legend_and_curves_do_not_lie_over_each_other(browser, files, name):
     opened = browser.open(files / f'{name}.html')
@@ -134,6 +137,7 @@ def test_toolbar_legend_and_curves_do_not_lie_over_each_other(browser, files, na
             assert apart, (one, a, other, b)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('dark', [False, True])
 def test_a_phone_shows_the_page_in_its_width_and_the_dark_is_dark(browser, files, dark):
     opened = browser.open(files / 'one.html', width=390, height=844, dark=dark, mobile=True)
@@ -154,6 +158,7 @@ def test_a_phone_shows_the_page_in_its_width_and_the_dark_is_dark(browser, files
     assert opened.complaints == []
 
 
+@pytest.mark.slow
 def test_a_change_of_light_while_the_page_is_open_is_followed(browser, files):
     opened = browser.open(files / 'one.html')
     drawn(opened)
@@ -165,6 +170,7 @@ def test_a_change_of_light_while_the_page_is_open_is_followed(browser, files):
     assert opened.complaints == []
 
 
+@pytest.mark.slow
 def test_a_table_is_copied_in_full_precision(browser, files):
     opened = browser.open(files / 'one.html')
     copied = opened.evaluate(
@@ -180,6 +186,7 @@ def test_a_table_is_copied_in_full_precision(browser, files):
     assert float(rows[1][1]) == 1.1
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_ten_minutes_at_1_khz_keep_their_peaks_on_a_page_that_opens(browser, bags, tmp_path):
     run, = read_runs(bags[0])

@@ -48,6 +48,7 @@ def test_a_simulated_experiment_arrives_and_leaves_its_bag_and_a_report(start, t
     assert len(without_repeats(found.commands)[0]) == 2 * len(SETPOINTS)
 
 
+@pytest.mark.slow
 def test_a_plant_that_is_not_as_the_planner_thinks_fails_with_the_figures(start, tmp_path):
     file = tmp_path / 'mismatched.yaml'
     file.write_text(MISMATCHED)
@@ -61,6 +62,7 @@ def test_a_plant_that_is_not_as_the_planner_thinks_fails_with_the_figures(start,
     assert 'earlier run' in again.stderr
 
 
+@pytest.mark.slow
 def test_a_block_arrives_and_stays_though_it_creeps_and_not_where_feedback_would_not_know(
         start, tmp_path):
     file = tmp_path / 'creeping.yaml'
@@ -78,6 +80,7 @@ def test_a_block_arrives_and_stays_though_it_creeps_and_not_where_feedback_would
     assert 'expected feedback off, since estimates do not know of creep yet' in refused.stderr
 
 
+@pytest.mark.slow
 def test_an_interrupted_experiment_brings_the_running_actuator_to_rest(start, ros, tmp_path):
     from hmsa_ros.nodes import interface
 
@@ -101,6 +104,7 @@ def test_an_interrupted_experiment_brings_the_running_actuator_to_rest(start, ro
     assert abs(found.rate[-1]) < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('moment', ['plant.log', 'recorder.log', 'run/*.mcap'])
 def test_an_experiment_can_be_interrupted_at_any_moment(start, tmp_path, wait_until, moment):
     out = tmp_path / 'out'
@@ -113,6 +117,7 @@ def test_an_experiment_can_be_interrupted_at_any_moment(start, tmp_path, wait_un
             assert make_reader(opened).get_summary() is not None
 
 
+@pytest.mark.slow
 def test_commands_that_nobody_takes_fail_before_anything_is_sent(start, tmp_path):
     start.hmsa('planner')
     run = start.hmsa('run', '1.1:0.1', '--out', str(tmp_path / 'out'))
@@ -121,6 +126,7 @@ def test_commands_that_nobody_takes_fail_before_anything_is_sent(start, tmp_path
     assert not (tmp_path / 'out' / 'run').exists()
 
 
+@pytest.mark.slow
 def test_nodes_with_other_parameters_than_the_file_are_refused(start, tmp_path):
     file = tmp_path / 'other.yaml'
     file.write_text('/**:\n  ros__parameters:\n    actuator.shear_modulus: 66000.0\n')
@@ -139,6 +145,7 @@ def test_feedback_that_there_is_not_is_refused(start, tmp_path):
     assert "invalid choice: 'guess'" in run.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_a_simulated_experiment_with_feedback_arrives_and_records_what_is_believed(
         start, tmp_path):

@@ -316,6 +316,7 @@ def test_late_command_in_a_long_plan_makes_only_the_next_setpoints_anew():
     assert state.stretch == pytest.approx(rig.plant.stretch, abs=1e-7)
 
 
+@pytest.mark.slow
 def test_preview_of_a_long_plan_comes_in_parts():
     rig = Rig()
     rig.runtime.request(zigzag(400))

@@ -188,6 +188,7 @@ def test_a_player_may_send_commands_and_forces_in_a_replay_alone():
     assert GRANTS['/hmsa/player'] < GRANTS['/hmsa/replay']
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_policies_grant_exactly_what_the_nodes_do(tmp_path, start, ros):
     seen: dict[str, set[Grant]] = {}

@@ -124,12 +124,14 @@ def test_two_step_leaves_one_percent_for_five_in_zeta_and_five_and_a_half_for_fi
     assert at(case, results['two-step'], 'G', -0.1) == pytest.approx(12.3, abs=0.1)
 
 
+@pytest.mark.slow
 def test_chain_turns_eleven_percent_for_ten_in_g_into_less_than_two(large):
     case, results = large
     assert at(case, results['two-step'], 'G', -0.1) == pytest.approx(11.0, abs=0.1)
     assert at(case, results['robust, order 2'], 'G', -0.1) == pytest.approx(1.64, abs=0.02)
 
 
+@pytest.mark.slow
 def test_each_order_of_the_chain_forgives_more(small, large):
     for _, results in (small, large):
         worst = [results[x].worst.residual for x in (
@@ -309,6 +311,7 @@ def test_settling_refuses_a_command_that_leads_elsewhere():
 # --- pictures and documentation
 
 
+@pytest.mark.slow
 def test_tables_of_the_documentation_are_what_is_computed():
     found = [
         [[cell.strip() for cell in line.strip('|').split('|')] for line in block.splitlines()
@@ -337,6 +340,7 @@ def test_pictures_of_the_documentation_exist_where_it_shows_them():
         assert (DOCS.parent / name).read_bytes().startswith(PNG)
 
 
+@pytest.mark.slow
 def test_documentation_is_drawn_into_a_folder_that_exists(tmp_path, capsys):
     assert [x.name for x in pictures(tmp_path)] == [
         'robustness.png', 'sampled.png', 'damped.png', 'front.png', 'map.png']
@@ -346,6 +350,7 @@ def test_documentation_is_drawn_into_a_folder_that_exists(tmp_path, capsys):
     assert 'missing' in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_pictures_take_what_is_missing(tmp_path, lost):
     case, result = lost
     refused = study(Case(1.0, 1.1, limits=Limits(-0.1, 0.1)), Candidate('two_step'))

@@ -64,6 +64,7 @@ def chunk_files(folder):
     return sorted((folder / 'chunks').iterdir())
 
 
+@pytest.mark.slow
 def test_two_workers_write_the_table_of_one_to_the_byte(run, tmp_path, expected):
     assert run('--workers=1', '--out=a')[:2] == (0, 'a/table.parquet\n')
     assert (tmp_path / 'a' / 'table.parquet').read_bytes() == expected[0]
@@ -131,6 +132,7 @@ class Deadly:
         return pyarrow.table({'row': list(range(begin, end))})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('workers', [1, 2])
 def test_a_killed_worker_costs_its_chunk_and_nothing_that_was_done(tmp_path, workers):
     said = []
@@ -149,6 +151,7 @@ def test_a_killed_worker_costs_its_chunk_and_nothing_that_was_done(tmp_path, wor
     assert sorted(x.name for x in (tmp_path / 'study').iterdir()) == ['chunks', 'study.json']
 
 
+@pytest.mark.slow
 def test_interrupt_leaves_whole_chunks_and_nothing_else(tmp_path):
     # A session of its own, so that the signal goes to all workers too, as on a terminal.
     process = subprocess.Popen(
@@ -178,6 +181,7 @@ def test_any_executor_computes_a_study(sweep, tmp_path, expected):
     assert (tmp_path / 'table.parquet').read_bytes() == expected[0]
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_writes_the_same_table(run, tmp_path, expected):
     pytest.importorskip('distributed')
     assert run('--dask=local', '--workers=1', '--out=a.parquet')[:2] == (0, 'a.parquet\n')

@@ -351,6 +351,7 @@ def test_garbage_on_its_topics_neither_ends_nor_misleads_it(ros, ros_env, wait_u
         wait_until(lambda: {x.name: x for x in listener.look().joints}['finger'].stretch == 1.25)
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_the_view_follows_a_real_run_and_leaves_the_terminal_clean(start, terminal):
     start.hmsa('plant')
@@ -392,6 +393,7 @@ def test_with_nothing_there_it_says_what_it_waits_for(terminal, ros_domain_id, n
     assert view.raw.rstrip().endswith(b'\x1b[?1049l')
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_a_dumb_terminal_and_a_pipe_get_lines(start, terminal, wait_until):
     start.hmsa('plant', '--ros-args', '-p', 'joint:=finger')
