@@ -21,7 +21,7 @@ from hmsa_ros.studies import robustness
 from hmsa_ros.studies.__main__ import main, pictures, tables
 from hmsa_ros.studies.axes import MOST_VALUES, parse_grid, read_cases
 from hmsa_ros.studies.damped import damped_study, settling_time
-from hmsa_ros.studies.residual import arrival_of, Errors, residual, response, rest
+from hmsa_ros.studies.residual import Actual, arrival_of, Errors, residual, response
 from hmsa_ros.studies.robustness import (
     Candidate,
     candidates,
@@ -97,7 +97,7 @@ def test_response_in_error_is_that_of_another_actuator_in_si_units(start, target
     times = (tau_p + later) / model.time_unit
     assert response(move, start, times, MATERIAL, errors) == pytest.approx(expected, abs=1e-8)
     assert response(move, start, np.array([0.0]), MATERIAL, errors) == pytest.approx(begin)
-    assert rest(move, MATERIAL, errors) == pytest.approx(
+    assert Actual.off(MATERIAL, errors).rest(move) == pytest.approx(
         brentq(balance, 0.5, 2.0, args=(last,), xtol=1e-13))
     peaks = residual(move, start, target, MATERIAL, errors, move.duration)
     fine = motion(last, middle, 4.0 * tau_p, np.linspace(0.0, 4.0 * tau_p, 4001))[0]
@@ -143,7 +143,7 @@ def test_each_order_of_the_chain_forgives_more(small, large):
 def test_steady_offset_is_no_residual(small):
     _, results = small
     result = results['robust, order 3']
-    offset = abs(rest(result.move, MATERIAL, Errors(shear_modulus=0.1)) - 1.1) / 0.1
+    offset = abs(Actual.off(MATERIAL, Errors(0.1)).offset(result.move, 1.0, 1.1))
     assert offset > 0.09
     assert 100.0 * offset > 100.0 * at(_, result, 'G', 0.1)
 

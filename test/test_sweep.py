@@ -3,19 +3,27 @@
 import csv
 import json
 import math
-import shutil
 
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.integrate import solve_ivp
 import yaml
 
 from hmsa_ros.cli import main
+from hmsa_ros.contract.parameters import PLANNED
 from hmsa_ros.core.laws import LAWS
+from hmsa_ros.core.model import acceleration_si
+from hmsa_ros.core.moves import State
+from hmsa_ros.core.parameters import ActuatorParameters
+from hmsa_ros.core.shapers.request import Request
+from hmsa_ros.core.shapers.two_step import two_step
 from hmsa_ros.core.two_step import plan_two_step_batch
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.runs.parameters import read_parameter_file, values_of
 from hmsa_ros.studies.axes import Belief, draw, NOTHING, parse_values, Spread
-from hmsa_ros.studies.settings import Nondimensional
+from hmsa_ros.studies.residual import Errors, residual
+from hmsa_ros.studies.settings import InSI, Nondimensional
 from hmsa_ros.studies.sweep import Sweep
 
 ACTUATOR = {
@@ -230,18 +238,80 @@ def test_values_are_grids_or_what_they_are_drawn_from():
     assert set(Nondimensional.columns) < set(Nondimensional.ranges)
 
 
+# --- residuals
+
+
+def test_a_plan_that_meets_another_actuator_leaves_what_another_solver_says(run, params_file):
+    path = params_file(coil_time_constant=3e-4)
+    status, rows, _ = run(
+        'sweep', '--params-file', path, '--target', 1.3, '--vary', 'actual.shear_modulus=12.7e3',
+        '--vary', 'actual.remanence=0.116', '--vary', 'actual.coil_time_constant=4e-4',
+        '--shaper', 'two_step,robust')
+    assert status == 0
+    for row in rows:
+        levels = planned(run, path, 1.3, row['shaper'])['levels']
+        actual = ActuatorParameters(
+            12.7e3, *(ACTUATOR[f'actuator.{x}'] for x in ('density', 'half_length',
+                                                          'half_thickness')),
+            0.116, *(ACTUATOR[f'actuator.{x}'] for x in ('chain_limit', 'damping_coefficient')))
+        arrival = float(row['time_p'])
+        ends = [*(x for x, _ in levels[1:]), arrival]
+        state = [1.0, 0.0, 0.0]
+
+        def motion(state, level, span, times=None, actual=actual):
+            return solve_ivp(
+                lambda _, y: [y[1], float(acceleration_si(y[0], y[1], y[2], actual)),
+                              (level - y[2]) / 4e-4],
+                (0.0, span), state, method='DOP853', rtol=1e-10, atol=1e-12, t_eval=times).y
+
+        for (begin, level), end in zip(levels, ends, strict=True):
+            if end > begin:
+                state = motion(state, level, end - begin)[:, -1]
+        later = motion(state, levels[-1][1], 0.4, np.linspace(0.0, 0.4, 8001))
+        late = later[0, later.shape[1] - 1]
+        ringing = later[0, :800]
+        assert float(row['residual']) == pytest.approx(np.ptp(ringing) / 0.3, rel=2e-3)
+        assert float(row['offset']) == pytest.approx((late - 1.3) / 0.3, abs=1e-5)
+
+
+def test_samples_of_an_identification_are_actuators_and_the_plan_is_the_same(run, params_file):
+    path = params_file(**{
+        'identification.names': ['shear_modulus', 'damping_coefficient', 'stretch_bias'],
+        'identification.covariance': np.ravel(COVARIANCE).tolist()})
+    status, rows, _ = run(
+        'sweep', '--params-file', path, '--identified', '--residual', '--samples', 16,
+        '--shaper', 'two_step,robust', '--law', 'gent,yeoh')
+    assert (status, len(rows)) == (0, 64)
+    assert len({(x['law'], x['shaper'], x['time_p']) for x in rows}) == 4
+    assert len({x['actual.shear_modulus'] for x in rows}) == 16
+    left = {x: np.array([float(y['residual']) for y in rows if y['shaper'] == x])
+            for x in ('two_step', 'robust')}
+    assert np.max(left['robust']) < 0.1 * np.max(left['two_step']) < 0.01
+    # As a study of errors says of the same error.
+    row = next(x for x in rows if x['law'] == 'gent' and x['shaper'] == 'two_step')
+    errors = Errors(float(row['actual.shear_modulus']) / 12e3 - 1.0,
+                    float(row['actual.damping_coefficient']) / 0.6 - 1.0)
+    model = InSI.of(values_of(read_parameter_file(path), 'planner', PLANNED)).setting(
+        {}).material
+    move = two_step(Request(State(1.0), 1.1, model))
+    # Times of levels in SI units are whole nanoseconds.
+    assert float(row['residual']) == pytest.approx(
+        residual(move, 1.0, 1.1, model, errors, move.duration), abs=1e-6)
+
+
 # --- pictures
 
 
-def test_a_folder_gets_the_map_or_the_bands_of_its_table(run, tmp_path):
-    for words in (
-            ('--zeta', '0:3:7', '--j-lim', 'log:0.1:100:6', '--law', 'gent,neo_hookean'),
-            ('--zeta', 'normal:0.2:0.1', '--samples', 20, '--target', '1.1:1.4:6'),
-            ('--zeta', 'normal:0.2:0.1', '--samples', 20, '--shaper', 'two_step,zv')):
-        assert run('sweep', *words, '--out', 'study')[0] == 0
-        assert (tmp_path / 'study' / 'table.png').read_bytes().startswith(b'\x89PNG')
-        assert (tmp_path / 'study' / 'table.pdf').read_bytes().startswith(b'%PDF')
-        shutil.rmtree(tmp_path / 'study')
+def test_a_folder_gets_the_map_of_its_table_and_other_pictures_are_named(run, tmp_path):
+    assert run('sweep', '--zeta', '0:3:7', '--j-lim', 'log:0.1:100:6', '--out', 'map',
+               '--show', 'tau_p')[0] == 0
+    assert (tmp_path / 'map' / 'table.png').read_bytes().startswith(b'\x89PNG')
+    assert (tmp_path / 'map' / 'table.pdf').read_bytes().startswith(b'%PDF')
+    samples = ('sweep', '--zeta', 'normal:0.2:0.1', '--samples', 20, '--show', 'tau_p')
+    for name, words in (('bands.png', ('--target', '1.1:1.4:6')),
+                        ('shares.png', ('--shaper', 'two_step,zv'))):
+        assert run(*samples, *words, '--picture', name)[0] == 0
+        assert (tmp_path / name).read_bytes().startswith(b'\x89PNG')
     # What cannot be drawn is still computed.
     status, _, err = run('sweep', '--zeta', 0.3, '--out', 'study')
     assert (status, 'no picture' in err) == (0, True)

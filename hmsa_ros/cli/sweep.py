@@ -4,6 +4,7 @@ import argparse
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 import shutil
@@ -50,7 +51,15 @@ def add_parser(subparsers: Any) -> None:
         '--vary', action='append', default=[], metavar='NAME=GRID',
         help='another column: load_min, load_max, period, slew, lag or a constant of the law '
              '(law.c10, ...); with --params-file a parameter, such as actuator.shear_modulus, '
-             'flux_density_max, slew_limit, coil_time_constant or command_period')
+             'flux_density_max, slew_limit, coil_time_constant or command_period. The actuator '
+             'may differ from what is planned with, in error.shear_modulus, error.zeta and '
+             'error.j_lim (shares); with --params-file in actual.shear_modulus, '
+             'actual.remanence, actual.coil_time_constant and so on (SI)')
+    parser.add_argument(
+        '--residual', action='store_true',
+        help='carry out each plan too: columns residual (vibration after arrival, peak to peak) '
+             'and offset at rest, as shares of the step; so do columns of the actuator. With '
+             '--identified the samples are actuators, and plans are made with the file')
     parser.add_argument(
         '--law', metavar='NAME,...', help='elastic laws to compare, separated by commas')
     parser.add_argument(
@@ -84,7 +93,7 @@ def add_parser(subparsers: Any) -> None:
              'there is no plan. A folder of --out gets table.png and table.pdf')
     parser.add_argument(
         '--show', metavar='COLUMN,...',
-        help='columns to draw (default: duration and first level)')
+        help='columns to draw (default: duration and first level, or residual and offset)')
     parser.add_argument(
         '--workers', type=int, metavar='N',
         help='processes; 1 computes in this one (default: one a core for large sweeps)')
@@ -164,7 +173,7 @@ class _Picture:
 def _sweep(arguments: argparse.Namespace) -> 'Sweep':
     """Return what the arguments ask for."""
     from hmsa_ros.studies.axes import draw, NOTHING, parse_values, read_cases, Spread
-    from hmsa_ros.studies.settings import InSI, Nondimensional, System
+    from hmsa_ros.studies.settings import ACTUAL, BLOCK_OF, InSI, Nondimensional, System
     from hmsa_ros.studies.sweep import Sweep
 
     system: System = Nondimensional()
@@ -180,10 +189,17 @@ def _sweep(arguments: argparse.Namespace) -> 'Sweep':
             from hmsa_ros.studies.identified import belief_of
 
             belief = belief_of(arguments.params_file)
+            if arguments.residual:
+                belief = replace(belief, names=tuple(
+                    f'{ACTUAL}{x.removeprefix(BLOCK_OF)}' for x in belief.names))
     elif arguments.identified:
         raise BadInputError(
             '--identified without --params-file: expected the file that hmsa identify --out wrote')
     texts = {x: y for x, _, _ in _AXES if (y := getattr(arguments, x)) is not None}
+    if arguments.residual and f'{ACTUAL}shear_modulus' in belief.names:
+        # Under any law, plans are made with the modulus about which the samples are.
+        texts[f'{BLOCK_OF}shear_modulus'] = repr(
+            float(belief.mean[belief.names.index(f'{ACTUAL}shear_modulus')]))
     for text in arguments.vary:
         name, sign, grid = text.partition('=')
         if not sign or name in texts:
@@ -202,9 +218,10 @@ def _sweep(arguments: argparse.Namespace) -> 'Sweep':
             'normal:MEAN:STD, or --identified')
     return Sweep(
         {name: x for name, x in values.items() if not isinstance(x, Spread)},
-        None if arguments.cases is None else read_cases(arguments.cases, system.ranges),
+        None if arguments.cases is None else read_cases(
+            arguments.cases, {**system.ranges, **system.actual}),
         samples=samples, laws=_names(arguments.law), shapers=_names(arguments.shaper),
-        system=system)
+        system=system, residual=arguments.residual)
 
 
 def _names(text: str | None) -> list[str]:

@@ -15,11 +15,13 @@ import numpy as np
 from hmsa_ros.contract.parameters import PLANNED
 from hmsa_ros.core.model import Array
 from hmsa_ros.figures import style
+from hmsa_ros.studies.settings import ACTUAL, BLOCK_OF
 from hmsa_ros.studies.views import Axis, View
 
 #: Shares of the samples between which the bands are, and the one that maps show.
 BANDS, MAPPED = ((0.05, 0.95), (0.25, 0.75)), 0.95
 
+_PERCENT = '[% of the step]'
 _TIME = r'[$L\sqrt{\rho/G}$]'
 _NAMES = {
     'start': r'start stretch $\lambda_0$ [1]', 'target': r'target stretch $\lambda_d$ [1]',
@@ -30,7 +32,12 @@ _NAMES = {
     'beta_p': r'first load $\beta_p$ [1]', 'b_p': 'first level $b_p$ [1]',
     'tau_p': rf'duration $\tau_p$ {_TIME}', 'beta_1': r'holding load $\beta_1$ [1]',
     'b_1': 'holding level $b_1$ [1]', 'flux_density_p': 'first flux density $B_p$ [T]',
-    'time_p': 'duration $t_p$ [s]', 'flux_density_1': 'holding flux density $B_1$ [T]'}
+    'residual': f'residual vibration {_PERCENT}', 'offset': f'offset at rest {_PERCENT}',
+    'error.shear_modulus': 'error of $G$ [%]', 'error.j_lim': r'error of $J_\mathrm{lim}$ [%]',
+    'error.zeta': r'error of $\zeta$ [%]', 'time_p': 'duration $t_p$ [s]',
+    'flux_density_1': 'holding flux density $B_1$ [T]'}
+# Shares, drawn in percent.
+_SHARES = ('residual', 'offset', 'error.shear_modulus', 'error.zeta', 'error.j_lim')
 _UNITS = {x.name: x.unit or '1' for x in PLANNED}
 _LOOKS: tuple[dict[str, Any], ...] = tuple(
     {'color': colour, 'linestyle': dashes} for colour, dashes in (
@@ -66,7 +73,7 @@ def draw_sweep(
         If a file cannot be written.
 
     """
-    values = {name: view.arranged(x) for name, x in columns.items()}
+    values = {name: _scale(name) * view.arranged(x) for name, x in columns.items()}
     rows = len(view.labels) if view.y else 1
     with style.picture(paths, 1.1 + 2.6 * rows) as figure:
         panels = figure.subplots(rows, len(values), squeeze=False)
@@ -82,7 +89,7 @@ def draw_sweep(
                          else found[row, :, :, 0])
                     panels[row, column].set_title(label, fontsize=9)
         _notes(figure, panels[0, 0], view, values)
-        common = ', '.join(f'{label_of(x).rpartition(" [")[0]} = {y:g}' for x, y in (
+        common = ', '.join(f'{label_of(x).rpartition(" [")[0]} = {_scale(x) * y:g}' for x, y in (
             fixed or {}).items())
         if common:
             figure.suptitle(common, fontsize=9)
@@ -92,8 +99,15 @@ def label_of(name: str) -> str:
     """Return what an axis or a column is, with its unit in brackets."""
     if name in _NAMES:
         return _NAMES[name]
-    words = name.removeprefix('actuator.').replace('_', ' ')
-    return f'{words} [{_UNITS.get(name, "1")}]'
+    planned = f'{BLOCK_OF}{name.removeprefix(ACTUAL)}'
+    planned = planned if planned in _UNITS else name.removeprefix(ACTUAL)
+    words = planned.removeprefix(BLOCK_OF).replace('_', ' ')
+    return (f'{"actual " if name.startswith(ACTUAL) else ""}{words} '
+            f'[{_UNITS.get(planned, "1")}]')
+
+
+def _scale(name: str) -> float:
+    return 100.0 if name in _SHARES else 1.0
 
 
 def _quantile(values: Array, share: float) -> Array:
@@ -120,7 +134,7 @@ def _even(axis: Axis) -> bool:
 
 def _map(figure: Figure, panel: Axes, axes: tuple[Axis, Axis], name: str, values: Array) -> None:
     """Draw a map with contours; hatched where there is no plan."""
-    places = [View.places(x) for x in axes]
+    places = [_scale(x.name) * View.places(x) for x in axes]
     orders = [np.argsort(x, kind='stable') for x in places]
     x, y = (place[order] for place, order in zip(places, orders, strict=True))
     values = values[np.ix_(orders[1], orders[0])]
@@ -151,7 +165,7 @@ def _map(figure: Figure, panel: Axes, axes: tuple[Axis, Axis], name: str, values
 
 def _curves(panel: Axes, view: View, axis: Axis, name: str, values: Array) -> None:
     """Draw curves over one axis, or the bands between which samples lie."""
-    x = View.places(axis)
+    x = _scale(axis.name) * View.places(axis)
     order = np.argsort(x, kind='stable')
     x, values = x[order], values[:, order]
     for label, look, found in zip(view.labels, _LOOKS, values, strict=False):
@@ -164,7 +178,9 @@ def _curves(panel: Axes, view: View, axis: Axis, name: str, values: Array) -> No
         lonely = bool(np.isfinite(middle).sum() < 2)
         panel.plot(
             x, middle, label=label, linewidth=1.5, marker='o' if lonely else None, **look)
-    panel.set_xscale('linear' if _even(axis) else 'log')
+    style.finish(panel, label_of(axis.name), label_of(name))
+    if not _even(axis):
+        panel.set_xscale('log')
     if _wide(values):
         panel.set_yscale('log')
     panel.set_xlim(x[0], x[-1])
@@ -172,7 +188,6 @@ def _curves(panel: Axes, view: View, axis: Axis, name: str, values: Array) -> No
     panel.fill_between(
         np.repeat(edges, 2)[1:-1], 0.0, 1.0, transform=panel.get_xaxis_transform(),
         where=np.repeat(np.all(np.isnan(values), axis=(0, 2)), 2), linewidth=0.0, **_HATCH)
-    style.finish(panel, label_of(axis.name), label_of(name))
 
 
 def _shares(panel: Axes, view: View, name: str, values: Array) -> None:
@@ -188,10 +203,10 @@ def _shares(panel: Axes, view: View, name: str, values: Array) -> None:
             **look)
         for x, y in ((low, BANDS[0][0]), (middle, 0.5), (high, BANDS[0][1])):
             panel.plot([x], [y * known.size / found.size], 'o', color=look['color'], markersize=4)
+    style.finish(panel, label_of(name), 'share of the samples below [1]')
     if _wide(values):
         panel.set_xscale('log')
     panel.set_ylim(0.0, 1.0)
-    style.finish(panel, label_of(name), 'share of the samples below [1]')
     panel.legend(loc='upper center', bbox_to_anchor=(0.5, -0.22), fontsize=7,
                  title='median (5 % to 95 %)', title_fontsize=8)
 

@@ -1,6 +1,7 @@
 """The plans of many rows: by the batch wherever it plans what is asked for, else one by one."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 import math
 
@@ -10,12 +11,13 @@ from numpy.typing import NDArray
 from hmsa_ros.core import law
 from hmsa_ros.core.laws.record import Elastic
 from hmsa_ros.core.model import Array
-from hmsa_ros.core.moves import State
+from hmsa_ros.core.moves import Move, State
 from hmsa_ros.core.sequence import plan_sequence
 from hmsa_ros.core.setpoint import Setpoint
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.two_step import CODES, plan_two_step_batch
 from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.studies.residual import Actual, arrival_of
 from hmsa_ros.studies.settings import Setting
 
 #: All codes; plans have their places.
@@ -106,9 +108,9 @@ def by_settings(
     for row in np.flatnonzero(group == -1).tolist():
         setting = settings[which[row]]
         if setting is not None:
-            code, plans.load_p[row], plans.time_p[row], plans.load_1[row] = _one(
-                setting, float(start[row]), float(target[row]), str(shapers[row]))
-            plans.codes[row] = STATUS.index(code)
+            found = _planned(setting, float(start[row]), float(target[row]), str(shapers[row]))
+            plans.load_p[row], plans.time_p[row], plans.load_1[row] = found.numbers
+            plans.codes[row] = STATUS.index(found.code)
     return plans
 
 
@@ -128,24 +130,89 @@ def _limited(
     return plans
 
 
-def _one(
-        setting: Setting, start: float, target: float,
-        shaper: str) -> tuple[Code, float, float, float]:
-    """Return code, first level, duration and last level of one plan."""
+def carried_out(
+        settings: Sequence[Setting | None], actuals: Sequence[Setting | None],
+        which: NDArray[np.int64], start: Array, target: Array,
+        shapers: NDArray[np.str_]) -> tuple[Plans, Array, Array]:
+    """
+    Plan rows, and carry the plans out on actuators that may be others.
+
+    Parameters
+    ----------
+    settings, actuals : sequence of Setting or None
+        All that occur, in pairs; None for one that is out of range.
+    which : ndarray of int64, shape (n,)
+        Which of them each row has.
+    start, target : ndarray, shape (n,)
+        Stretches.
+    shapers : ndarray of str, shape (n,)
+        Names.
+
+    Returns
+    -------
+    plans : Plans
+        As `by_settings`.
+    residual, offset : ndarray, shape (n,)
+        Vibration after arrival, and how far beyond the target the actuator rests, as shares of
+        the step; NaN where there is no plan, no move, or a motion that cannot be followed.
+
+    """
+    plans = Plans.none(len(which))
+    left = np.full((2, len(which)), math.nan)
+    # Rows that differ in the actuator alone have one plan.
+    made: dict[tuple[Setting, float, float, str], tuple[_Planned, float]] = {}
+    rows = zip(which.tolist(), start.tolist(), target.tolist(), shapers.tolist(), strict=True)
+    for row, (place, begin, end, shaper) in enumerate(rows):
+        setting, actual = settings[place], actuals[place]
+        if setting is None:
+            continue
+        key = setting, begin, end, shaper
+        if key not in made:
+            planned = _planned(*key)
+            made[key] = planned, math.nan if planned.move is None else arrival_of(
+                planned.move, begin, end, setting.material)
+        planned, arrival = made[key]
+        plans.codes[row] = STATUS.index(planned.code)
+        plans.load_p[row], plans.time_p[row], plans.load_1[row] = planned.numbers
+        if planned.move is not None and actual is not None and begin != end:
+            with suppress(HmsaError):
+                plant = Actual.of(setting, actual)
+                left[1, row] = plant.offset(planned.move, begin, end)
+                left[0, row] = plant.residual(planned.move, begin, end, arrival)
+    return plans, left[0], left[1]
+
+
+@dataclass(frozen=True)
+class _Planned:
+    """A plan of one row: its code, its command if there is one, and the load that holds it."""
+
+    code: Code
+    move: Move | None
+    load: float
+
+    @property
+    def numbers(self) -> tuple[float, float, float]:
+        """Return first level, duration and last level."""
+        move = self.move
+        if move is None or (move.code is not Code.HOLD and len(move.levels) == 1):
+            return math.nan, math.nan, self.load
+        return move.levels[0].load, move.duration, move.levels[-1].load
+
+
+def _planned(setting: Setting, start: float, target: float, shaper: str) -> _Planned:
+    """Plan one row."""
     material = setting.material
     if not math.isfinite(start + target):
-        return Code.BAD_INPUT, math.nan, math.nan, math.nan
+        return _Planned(Code.BAD_INPUT, None, math.nan)
     load = float(law.elastic_force(target, material.packed))
     try:
         move = plan_sequence(
             [Setpoint(target, math.inf)], material, start=State(start), shaper=shaper,
             limits=setting.limits, delivery=setting.delivery, units=setting.units)[0].move
     except RefusedError as error:
-        return error.code, math.nan, math.nan, load
+        return _Planned(error.code, None, load)
     except BadInputError:
-        return Code.OUT_OF_RANGE, math.nan, math.nan, load
+        return _Planned(Code.OUT_OF_RANGE, None, load)
     except HmsaError:
-        return Code.NOT_CONVERGED, math.nan, math.nan, load
-    if move.code is not Code.HOLD and len(move.levels) == 1:
-        return move.code, math.nan, math.nan, load
-    return move.code, move.levels[0].load, move.duration, move.levels[-1].load
+        return _Planned(Code.NOT_CONVERGED, None, load)
+    return _Planned(move.code, move, load)

@@ -1,9 +1,11 @@
 """What is left of a move on an actuator that is not the one it was planned for."""
 
+from dataclasses import dataclass
 import math
 
 import numpy as np
 
+from hmsa_ros.core.delivery import Delivery, IDEAL, ramps
 from hmsa_ros.core.mismatch import Errors
 from hmsa_ros.core.model import (
     Array,
@@ -13,14 +15,16 @@ from hmsa_ros.core.model import (
     Floats,
     natural_frequency,
 )
-from hmsa_ros.core.moves import Move
+from hmsa_ros.core.moves import Level, Move
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.residual import residual_vibration
 from hmsa_ros.core.simulation import simulate
 from hmsa_ros.core.status import Code
 from hmsa_ros.core.two_step import plan_two_step
+from hmsa_ros.errors import HmsaError
+from hmsa_ros.studies.settings import Setting
 
-__all__ = ['arrival_of', 'Errors', 'residual', 'response', 'rest']
+__all__ = ['Actual', 'arrival_of', 'Errors', 'residual', 'response']
 
 # Peak-to-peak of a decaying motion is final after one period, or once it has died out.
 _PERIODS = 2.0
@@ -36,111 +40,152 @@ def arrival_of(
     # command would; where there is none, from half a natural period on.
     if math.isfinite(move.duration):
         return move.duration
-    plan = plan_two_step(start, target, material)
-    if plan.code is Code.TWO_STEP:
-        return plan.tau_p
+    if not material.creep:
+        plan = plan_two_step(start, target, material)
+        if plan.code is Code.TWO_STEP:
+            return plan.tau_p
     return math.pi / float(natural_frequency(target, material))
+
+
+@dataclass(frozen=True)
+class Actual:
+    """
+    An actuator that carries out moves planned with a model that may be another.
+
+    Stretches, times and loads of moves and results are the model's.
+
+    Attributes
+    ----------
+    model, material : NondimensionalParameters
+        Of the model and of the actuator, each in units of its own.
+    time, load : float
+        The actuator's units in those of the model.
+    delivery : Delivery
+        How commands reach its coil, in its own units; commands are those of the move.
+
+    """
+
+    model: NondimensionalParameters
+    material: NondimensionalParameters
+    time: float = 1.0
+    load: float = 1.0
+    delivery: Delivery = IDEAL
+
+    @classmethod
+    def off(cls, model: NondimensionalParameters, errors: Errors) -> 'Actual':
+        """Return the actuator of a model in error."""
+        stiffer = 1.0 + errors.shear_modulus
+        return cls(model, errors.actual(model), 1.0 / math.sqrt(stiffer), stiffer)
+
+    @classmethod
+    def of(cls, model: Setting, actual: Setting) -> 'Actual':
+        """Return an actuator with parameters of its own."""
+        return cls(
+            model.material, actual.material, actual.units.time / model.units.time,
+            actual.units.load / model.units.load, actual.delivery)
+
+    def response(self, move: Move, start: float, times: Floats) -> Array:
+        """
+        Sample the stretch from rest where the model's load for the start really holds it.
+
+        Parameters
+        ----------
+        move : Move
+            The command.
+        start : float
+            Stretch at rest from which it was planned.
+        times : ndarray, shape (n,)
+            Not decreasing, at least 0.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            Stretch.
+
+        Raises
+        ------
+        BadInputError
+            If an argument is out of range.
+        HmsaError
+            If the motion cannot be followed.
+
+        """
+        held = float(elastic_force(start, self.model)) / self.load
+        end = float(times[-1]) / self.time
+        levels = [Level(x.time / self.time, x.load / self.load) for x in move.levels]
+        rows, _ = ramps(
+            [x for x in levels if x.time <= end] or levels[:1], held, end, self.delivery.slew)
+        switches, loads, slopes = np.array(rows).T
+        if self.material.creep and self.delivery.lag > 0.0:
+            raise HmsaError('creep behind a coil that lags: expected one of them')
+        stretch, _ = simulate(
+            switches, loads, times / self.time, self.material, slopes=slopes,
+            stretch=float(equilibrium_stretch(held, self.material)), lag=self.delivery.lag,
+            field=held)
+        return stretch
+
+    def rest(self, move: Move) -> float:
+        """Return the stretch at which the last level of a move really holds the actuator."""
+        return float(equilibrium_stretch(move.levels[-1].load / self.load, self.material))
+
+    def residual(self, move: Move, start: float, target: float, arrival: float) -> float:
+        """
+        Return the peak-to-peak stretch after arrival as a share of the commanded step.
+
+        A steady offset, from a load that holds another stretch than the model says, is no
+        vibration and does not count.
+
+        Parameters
+        ----------
+        move : Move
+            The command.
+        start, target : float
+            Stretches that it was planned for, at rest at the start; not equal.
+        arrival : float
+            Time from which it counts.
+
+        Returns
+        -------
+        float
+            A share, not percent.
+
+        Raises
+        ------
+        BadInputError
+            If an argument is out of range.
+        HmsaError
+            If the motion cannot be followed.
+
+        """
+        end = self.rest(move)
+        frequency = float(natural_frequency(end, self.material))
+        ratio = self.material.zeta / float(critical_zeta(end, self.material))
+        if ratio < 1.0:
+            period = 2.0 * math.pi / (frequency * math.sqrt(1.0 - ratio * ratio))
+            decay = frequency * ratio
+        else:
+            period = math.inf
+            decay = frequency * (ratio - math.sqrt(ratio * ratio - 1.0))
+        horizon = min(_PERIODS * period, _DECADES / decay if decay > 0.0 else math.inf)
+        times = arrival + np.linspace(0.0, horizon * self.time, _SAMPLES)
+        return residual_vibration(
+            times, self.response(move, start, times), arrival=arrival, end=float(times[-1]),
+            step=target - start)
+
+    def offset(self, move: Move, start: float, target: float) -> float:
+        """Return how far beyond the target a move comes to rest, as a share of the step."""
+        return (self.rest(move) - target) / (target - start)
 
 
 def response(
         move: Move, start: float, times: Floats, material: NondimensionalParameters,
         errors: Errors) -> Array:
-    """
-    Sample the stretch of an actuator that carries out a move planned for another.
-
-    It starts at rest where the model's load for the start really holds it.
-
-    Parameters
-    ----------
-    move : Move
-        The command, in the model's units.
-    start : float
-        Stretch at rest from which the move was planned.
-    times : ndarray, shape (n,)
-        In the model's unit of time, not decreasing, at least 0.
-    material : NondimensionalParameters
-        Of the model.
-    errors : Errors
-        Of the model.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Stretch.
-
-    Raises
-    ------
-    BadInputError
-        If an argument is out of range.
-    HmsaError
-        If the motion cannot be followed.
-
-    """
-    stiffer = 1.0 + errors.shear_modulus
-    faster = math.sqrt(stiffer)
-    actual = errors.actual(material)
-    begin = equilibrium_stretch(elastic_force(start, material) / stiffer, actual)
-    stretch, _ = simulate(
-        np.array([x.time for x in move.levels]) * faster,
-        np.array([x.load for x in move.levels]) / stiffer, times * faster, actual,
-        stretch=float(begin))
-    return stretch
-
-
-def rest(move: Move, material: NondimensionalParameters, errors: Errors) -> float:
-    """Return the stretch at which the last level of a move really holds the actuator."""
-    load = move.levels[-1].load / (1.0 + errors.shear_modulus)
-    return float(equilibrium_stretch(load, errors.actual(material)))
+    """Sample the stretch of a model in error, as `Actual.response`."""
+    return Actual.off(material, errors).response(move, start, times)
 
 
 def residual(
         move: Move, start: float, target: float, material: NondimensionalParameters,
         errors: Errors, arrival: float) -> float:
-    """
-    Return the peak-to-peak stretch after arrival as a share of the commanded step.
-
-    A steady offset, from a load that holds another stretch than the model says, is no
-    vibration and does not count.
-
-    Parameters
-    ----------
-    move : Move
-        The command, in the model's units.
-    start, target : float
-        Stretches that it was planned for, at rest at the start; not equal.
-    material : NondimensionalParameters
-        Of the model.
-    errors : Errors
-        Of the model.
-    arrival : float
-        Time from which it counts, in the model's unit; not before the last level.
-
-    Returns
-    -------
-    float
-        A share, not percent.
-
-    Raises
-    ------
-    BadInputError
-        If an argument is out of range.
-    HmsaError
-        If the motion cannot be followed.
-
-    """
-    actual = errors.actual(material)
-    end = rest(move, material, errors)
-    frequency = float(natural_frequency(end, actual))
-    ratio = actual.zeta / float(critical_zeta(end, actual))
-    if ratio < 1.0:
-        period = 2.0 * math.pi / (frequency * math.sqrt(1.0 - ratio * ratio))
-        decay = frequency * ratio
-    else:
-        period = math.inf
-        decay = frequency * (ratio - math.sqrt(ratio * ratio - 1.0))
-    horizon = min(_PERIODS * period, _DECADES / decay if decay > 0.0 else math.inf)
-    times = arrival + np.linspace(
-        0.0, horizon / math.sqrt(1.0 + errors.shear_modulus), _SAMPLES)
-    stretch = response(move, start, times, material, errors)
-    return residual_vibration(
-        times, stretch, arrival=arrival, end=float(times[-1]), step=target - start)
+    """Return what a move leaves of a model in error, as `Actual.residual`."""
+    return Actual.off(material, errors).residual(move, start, target, arrival)

@@ -24,7 +24,7 @@ from hmsa_ros.core.simulation import check_stretch
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.files import replacing
-from hmsa_ros.studies.residual import arrival_of, Errors, residual, rest
+from hmsa_ros.studies.residual import Actual, arrival_of, Errors, residual
 
 #: Parameters in error: name for a person, name in `Errors`.
 PARAMETERS = {'G': 'shear_modulus', 'zeta': 'zeta', 'J_lim': 'j_lim'}
@@ -375,7 +375,5 @@ def _rows(case: Case, result: Result) -> Iterator[tuple[str | float, ...]]:
         for error, value in zip(case.errors().tolist(), curve.tolist(), strict=True)]
     points.append(('box', result.worst.errors, result.worst.residual))
     for name, errors, value in points:
-        offset = (
-            (rest(result.move, case.material, errors) - case.target)
-            / (case.target - case.start))
+        offset = Actual.off(case.material, errors).offset(result.move, case.start, case.target)
         yield (*fixed, name, errors.shear_modulus, errors.zeta, errors.j_lim, value, offset)

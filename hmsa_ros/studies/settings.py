@@ -16,6 +16,7 @@ from hmsa_ros.contract.actuator import completed, model_from
 from hmsa_ros.contract.parameters import LAW, ParameterSpec, PLANNED
 from hmsa_ros.core.delivery import Delivery
 from hmsa_ros.core.laws import LAWS
+from hmsa_ros.core.mismatch import Errors
 from hmsa_ros.core.moves import Limits
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.units import NANOSECONDS, Units
@@ -29,6 +30,8 @@ FINITE = sys.float_info.max
 _INF = math.inf
 _POSITIVE = (math.ulp(0.0), FINITE)
 _MODULUS = 'actuator.shear_modulus'
+#: Begin of the columns of the actuator, in place of that of a block's parameters.
+ACTUAL, BLOCK_OF = 'actual.', 'actuator.'
 
 
 def _ranges(specs: tuple[ParameterSpec, ...]) -> dict[str, Range]:
@@ -73,6 +76,8 @@ class System(ABC):
         Those that each row has, with the value of what is not given.
     ranges : dict of str to tuple of float
         Of all columns that a row may have.
+    actual : dict of str to tuple of float
+        Ranges of the columns in which the actuator differs from what is planned with.
     delivery : frozenset of str
         Columns with which hardware is not ideal.
     ideal : bool
@@ -84,6 +89,7 @@ class System(ABC):
 
     columns: ClassVar[Mapping[str, float]]
     ranges: ClassVar[Mapping[str, Range]]
+    actual: ClassVar[Mapping[str, Range]]
     delivery: ClassVar[frozenset[str]]
     roots: ClassVar[bool]
 
@@ -104,6 +110,18 @@ class System(ABC):
 
         """
 
+    @abstractmethod
+    def carried(self, values: Mapping[str, Any]) -> Setting:
+        """
+        Return the actuator that carries out the plan of a row.
+
+        Raises
+        ------
+        BadInputError
+            If a value is out of range.
+
+        """
+
 
 @dataclass(frozen=True)
 class Nondimensional(System):
@@ -115,6 +133,9 @@ class Nondimensional(System):
         'j_lim': (_POSITIVE[0], _INF), 'c1': _POSITIVE, 'load_min': (-_INF, _INF),
         'load_max': (-_INF, _INF), 'period': (0.0, FINITE), 'slew': (_POSITIVE[0], _INF),
         'lag': (0.0, FINITE), **_ranges(LAW)}
+    actual = {
+        'error.shear_modulus': (-1.0, FINITE), 'error.zeta': (-1.0, FINITE),
+        'error.j_lim': (-1.0, FINITE)}
     delivery = frozenset({'period', 'slew', 'lag'})
     roots = True
 
@@ -136,6 +157,16 @@ class Nondimensional(System):
             Delivery(values.get('period', 0.0), values.get('slew', _INF),
                      lag=values.get('lag', 0.0)))
 
+    def carried(self, values: Mapping[str, Any]) -> Setting:
+        """Return the actuator of a row, its units in those of the model."""
+        planned = self.setting(values)
+        errors = Errors(**{x.removeprefix('error.'): values.get(x, 0.0) for x in self.actual})
+        stiffer = 1.0 + errors.shear_modulus
+        time, delivery = 1.0 / math.sqrt(stiffer), planned.delivery
+        return Setting(
+            errors.actual(planned.material), units=Units(time, stiffer),
+            delivery=Delivery(slew=delivery.slew * time / stiffer, lag=delivery.lag / time))
+
 
 @dataclass(frozen=True)
 class InSI(System):
@@ -153,6 +184,9 @@ class InSI(System):
     columns = {'start': 1.0, 'target': 1.1}
     ranges = {
         'start': _POSITIVE, 'target': _POSITIVE, **_ranges(PLANNED), 'command_period': (0.0, 1e3)}
+    actual = {
+        f'{ACTUAL}{x.removeprefix(BLOCK_OF)}': y for x, y in _ranges(PLANNED).items()
+        if x not in ('flux_density_min', 'flux_density_max')}
     delivery = frozenset({'command_period', 'slew_limit', 'coil_time_constant'})
     roots = False
 
@@ -183,3 +217,11 @@ class InSI(System):
             {**self.known, **values}, values.get(_MODULUS),
             round(values.get('command_period', 0.0) * NANOSECONDS))
         return Setting(model.material, model.limits, model.delivery, model.units)
+
+    def carried(self, values: Mapping[str, Any]) -> Setting:
+        """Return the actuator of a row: what is not given of it is as in the plan."""
+        names = {x.removeprefix(BLOCK_OF): x for x in _ranges(PLANNED)}
+        given = {names[x.removeprefix(ACTUAL)]: y for x, y in values.items()
+                 if x.startswith(ACTUAL)}
+        planned = {x: y for x, y in values.items() if not x.startswith(ACTUAL)}
+        return self.setting({**planned, **given})

@@ -5,7 +5,7 @@ A sweep is a product of axes. It is planned in blocks, so that its size is bound
 and not by the memory, and a row that cannot be planned says why in its status.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 import hashlib
@@ -23,8 +23,8 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import require_arrow
 from hmsa_ros.studies.axes import parse_grid
 from hmsa_ros.studies.chunks import LEAST_ROWS, MOST_ROWS
-from hmsa_ros.studies.plans import by_batch, by_settings, Plans, STATUS
-from hmsa_ros.studies.settings import FINITE, Nondimensional, Setting, System
+from hmsa_ros.studies.plans import by_batch, by_settings, carried_out, Plans, STATUS
+from hmsa_ros.studies.settings import FINITE, Nondimensional, Range, Setting, System
 from hmsa_ros.studies.views import Axis, View
 
 __all__ = ['parse_grid', 'ROW_BYTES', 'Rows', 'Sweep']
@@ -36,6 +36,8 @@ ROW_BYTES = 50
 _RATES = (150_000.0, 15_000.0, 3_000.0)
 _CHUNKS = ((LEAST_ROWS, MOST_ROWS), (5_000, 50_000), (500, 5_000))
 _LAW, _SHAPER = 'law', 'shaper'
+#: What a plan leaves when it is carried out.
+_LEFT = ('residual', 'offset')
 _STATUS = np.array([str(x) for x in STATUS])
 
 Column = Array | NDArray[np.str_]
@@ -95,6 +97,8 @@ class Sweep:
         Names that are compared; they have columns if given.
     system : System, optional
         Units of the columns; default nondimensional.
+    residual : bool
+        Carry the plans out, and return what they leave; so do columns of the actuator.
 
     Attributes
     ----------
@@ -119,9 +123,11 @@ class Sweep:
             self, grids: Mapping[str, ArrayLike],
             cases: Mapping[str, ArrayLike] | None = None, *,
             samples: Mapping[str, ArrayLike] | None = None, laws: Sequence[str] = (),
-            shapers: Sequence[str] = (), system: System | None = None) -> None:
+            shapers: Sequence[str] = (), system: System | None = None,
+            residual: bool = False) -> None:
         self._system = system or Nondimensional()
-        ranges, defaults = self._system.ranges, self._system.columns
+        ranges: dict[str, Range] = {**self._system.ranges, **self._system.actual}
+        defaults = self._system.columns
         self._axes: list[dict[str, Column]] = [
             _table(words, table) for words, table in (('cases', cases), ('samples', samples))
             if table]
@@ -155,10 +161,11 @@ class Sweep:
             raise BadInputError('a column of the sweep is empty: expected at least one value')
         given = {name for axis in self._axes for name in axis}
         self._inputs = [x for x in (*ranges, _LAW, _SHAPER) if x in given]
+        self._carried = residual or bool(given & set(self._system.actual))
         self.results = tuple(self._results(Plans.none(0), 1.0, 1.0))
         self.columns = (*self._inputs, 'status', *self.results)
         one_by_one = bool(set(shapers) - {'two_step'} or given & self._system.delivery
-                          or not self._system.ideal)
+                          or self._carried or not self._system.ideal)
         self._plain = not one_by_one and given <= {*Nondimensional.columns, _SHAPER} \
             and isinstance(self._system, Nondimensional)
         kind = 0 if self._plain else 1 + one_by_one
@@ -167,6 +174,8 @@ class Sweep:
     @property
     def shown(self) -> tuple[str, ...]:
         """Return the columns that are drawn unless others are named."""
+        if self._carried:
+            return _LEFT
         return ('tau_p', 'beta_p') if self._system.roots else ('time_p', 'flux_density_p')
 
     def view(self) -> View:
@@ -213,17 +222,26 @@ class Sweep:
         if self._plain:
             plans = by_batch(*(inputs[name] for name in Nondimensional.columns))
             return Rows(inputs, plans.codes, self._results(plans, 1.0, 1.0))
-        settings, which = self._settings(inputs, places)
-        shapers = inputs.get(_SHAPER, np.full(end - begin, 'two_step'))
-        plans = by_settings(settings, which, inputs['start'], inputs['target'], shapers)
+        occurring, which = self._occurring(inputs, places)
+        settings = [_setting(self._system.setting, {
+            x: y for x, y in values.items() if x not in self._system.actual})
+            for values in occurring]
+        moves = which, inputs['start'], inputs['target'], inputs.get(
+            _SHAPER, np.full(end - begin, 'two_step'))
+        left: Sequence[Array] = ()
+        if self._carried:
+            plans, *left = carried_out(
+                settings, [_setting(self._system.carried, x) for x in occurring], *moves)
+        else:
+            plans = by_settings(settings, *moves)
         units: Array = np.array([
             (1.0, 1.0) if x is None else (x.units.time, x.units.load) for x in settings])[which]
-        return Rows(inputs, plans.codes, self._results(plans, units[:, 0], units[:, 1]))
+        return Rows(inputs, plans.codes, self._results(plans, units[:, 0], units[:, 1], *left))
 
-    def _settings(
+    def _occurring(
             self, inputs: Mapping[str, Column],
-            places: Places) -> tuple[list[Setting | None], NDArray[np.int64]]:
-        """Return all settings that occur, None where values are out of range, and which where."""
+            places: Places) -> tuple[list[dict[str, Any]], NDArray[np.int64]]:
+        """Return all values of the columns that make a block, and which are where."""
         names = [x for x in self._inputs if x not in ('start', 'target', _SHAPER)]
         number = np.zeros(len(inputs['start']), np.int64)
         for axis, place, size in zip(self._axes, places, self._shape, strict=True):
@@ -232,24 +250,21 @@ class Sweep:
                 _, number = np.unique(number * size + place, return_inverse=True)
         _, first, which = np.unique(number, return_index=True, return_inverse=True)
         columns = [inputs[name][first].tolist() for name in names]
-        settings: list[Setting | None] = []
-        for values in zip(*columns, strict=True) if names else [()]:
-            try:
-                settings.append(self._system.setting(dict(zip(names, values, strict=True))))
-            except BadInputError:
-                settings.append(None)
-        return settings, which
+        return [dict(zip(names, values, strict=True))
+                for values in (zip(*columns, strict=True) if names else [()])], which
 
     def _results(
-            self, plans: Plans, time: Array | float, load: Array | float) -> dict[str, Array]:
+            self, plans: Plans, time: Array | float, load: Array | float,
+            *left: Array) -> dict[str, Array]:
         """Return the columns of numbers, for units of time and load."""
+        more = dict(zip(_LEFT, left or (plans.time_p,) * 2, strict=True)) if self._carried else {}
         if self._system.roots:
             return {
                 'beta_p': plans.load_p, 'b_p': signed_root(plans.load_p), 'tau_p': plans.time_p,
-                'beta_1': plans.load_1, 'b_1': signed_root(plans.load_1)}
+                'beta_1': plans.load_1, 'b_1': signed_root(plans.load_1), **more}
         return {
             'flux_density_p': plans.load_p * load, 'time_p': plans.time_p * time,
-            'flux_density_1': plans.load_1 * load}
+            'flux_density_1': plans.load_1 * load, **more}
 
     def table(self, begin: int, end: int) -> Any:
         """Plan rows from one number up to another on one core; return a table of pyarrow."""
@@ -264,6 +279,15 @@ class Sweep:
         """Plan the sweep and yield its rows in order, in blocks of so many."""
         for begin in range(0, self.size, rows):
             yield self.rows(begin, min(begin + rows, self.size))
+
+
+def _setting(
+        make: Callable[[Mapping[str, Any]], Setting], values: Mapping[str, Any]) -> Setting | None:
+    """Return a setting, None where values are out of range."""
+    try:
+        return make(values)
+    except BadInputError:
+        return None
 
 
 def _table(words: str, table: Mapping[str, ArrayLike]) -> dict[str, Column]:
