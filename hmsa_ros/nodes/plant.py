@@ -1,6 +1,5 @@
 """Plant node: simulated actuators, driven by stamped flux density commands."""
 
-from array import array
 from collections.abc import Callable, Sequence
 from time import monotonic_ns, time_ns
 
@@ -37,6 +36,7 @@ from hmsa_ros.nodes.markers import State
 from hmsa_ros.nodes.parameters import JOINT, ParameterSpec
 from hmsa_ros.nodes.plant_joint import joint_from, OWN, PlantJoint
 from hmsa_ros.nodes.runner import run
+from hmsa_ros.nodes.samples import SamplePublisher
 
 PARAMETERS = (
     AUTOSTART,
@@ -133,17 +133,16 @@ class PlantNode(ManagedNode):
         self._measured = (start, monotonic_ns())
         self._clocks_warned = False
 
-        self._joint_states = self._publisher(interface.JOINT_STATES)
-        self._message = interface.JOINT_STATES.type(name=list(values.names))
         self._diagnostics = self._publisher(interface.DIAGNOSTICS)
         self._clock_publisher = (
             self._publisher(interface.CLOCK_TOPIC) if self._authority else None)
         scalars = values['publish_scalars']
-        self._scalars = scalars == 'always' or (
-            scalars == 'auto' and len(values.names) == 1)
+        self._samples = SamplePublisher(
+            self, values.names, scalars=scalars == 'always' or (
+                scalars == 'auto' and len(values.names) == 1))
         self._joints = [
             PlantJoint(
-                self, self._device, i, values.names, values.of(x), self._scalars, self.companion)
+                self, self._device, i, values.names, values.of(x), self.companion)
             for i, x in enumerate(values.names)]
         self._publish_news()
         StateMarkers(self, values, factor, self._states)
@@ -250,16 +249,7 @@ class PlantNode(ManagedNode):
         self._joints[change.joint].publish_applied(change)
 
     def _publish_sample(self, sample: Sample) -> None:
-        message = self._message
-        message.header.stamp = conversions.to_time(sample.time)
-        message.position = array('d', sample.stretch.tobytes())
-        message.velocity = array('d', sample.rate.tobytes())
-        message.effort = array('d', sample.flux_density.tobytes())
-        self._joint_states.publish(message)
-        if self._scalars:
-            for joint, stretch, rate in zip(
-                    self._joints, message.position, message.velocity, strict=True):
-                joint.publish_scalars(stretch, rate)
+        self._samples.publish(sample)
 
     def _states(self) -> tuple[int, list[State]]:
         """Return the time and what the joints do, for who looks."""

@@ -6,7 +6,6 @@ from typing import Any
 
 from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import MagneticField
-from std_msgs.msg import Float64
 
 from hmsa_ros.contract.actuator import actuator_from, creep_from
 from hmsa_ros.contract.parameters import (
@@ -82,8 +81,7 @@ class PlantJoint:
 
     def __init__(
             self, node: ManagedNode, device: SimulatedDevice, number: int,
-            names: Sequence[str], values: Mapping[str, Any], scalars: bool,
-            companion: str = '') -> None:
+            names: Sequence[str], values: Mapping[str, Any], companion: str = '') -> None:
         """Create its topics."""
         self.name = names[number]
         self._node = node
@@ -99,8 +97,6 @@ class PlantJoint:
             return node.create_publisher(placed.type, placed.name, placed.qos)
 
         self._applied = publisher(interface.FLUX_DENSITY_APPLIED)
-        self._scalars = (publisher(interface.STRETCH), publisher(interface.STRETCH_RATE)) \
-            if scalars else ()
         self.commands = CommandInput(
             node, interface.of_joint(interface.FLUX_DENSITY_COMMAND, self.name, names),
             self._on_command, values['command_source'], companion)
@@ -112,12 +108,6 @@ class PlantJoint:
     def publish_applied(self, change: Change) -> None:
         """Publish that a level has taken effect."""
         self._applied.publish(conversions.to_command(change.stamp, change.level, ''))
-
-    def publish_scalars(self, stretch: float, rate: float) -> None:
-        """Publish a measured stretch and rate in 1/s by themselves, where that is wanted."""
-        if self._scalars:
-            self._scalars[0].publish(Float64(data=stretch))
-            self._scalars[1].publish(Float64(data=rate))
 
     def log(self, notice: Notice) -> None:
         """Count and log what the device has noticed."""
