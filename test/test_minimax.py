@@ -12,7 +12,7 @@ import yaml
 
 from hmsa_ros.cli import main
 from hmsa_ros.core.delivery import Delivery
-from hmsa_ros.core.mismatch import Errors
+from hmsa_ros.core.mismatch import Ellipsoid, Errors
 from hmsa_ros.core.model import acceleration, elastic_force
 from hmsa_ros.core.moves import Limits, State
 from hmsa_ros.core.parameters import NondimensionalParameters, paper_actuator
@@ -30,10 +30,11 @@ TURN = np.exp(2j * np.pi * np.arange(96) / 96)
 
 def vibration(move, start, target, errors):
     """Return the peak to peak that SciPy finds after arrival on another actuator, as a share."""
-    actual, stiffer = errors.actual(PAPER), 1.0 + errors.shear_modulus
+    actual = errors.actual(PAPER)
+    stiffer = (1.0 + errors.shear_modulus) / (1.0 + errors.remanence)
     begin = float(elastic_force(start, PAPER)) / stiffer
     state = [brentq(lambda x: elastic_force(x, actual) - begin, 0.4, 2.2, xtol=1e-13), 0.0]
-    times = [x.time * math.sqrt(stiffer) for x in move.levels]
+    times = [x.time * math.sqrt(1.0 + errors.shear_modulus) for x in move.levels]
     for (since, until), level in zip(
             pairwise([*times, times[-1] + 3.0]), move.levels, strict=True):
         load = level.load / stiffer
@@ -59,6 +60,20 @@ def test_at_most_half_of_the_chain_is_left_at_the_worst_in_the_same_time(start, 
     # Reports tell moves apart by the levels that hold their targets.
     inside = 1e-4 * abs(held[1] - held[0])
     assert all(min(held) + inside < x.load < max(held) - inside for x in move.levels[:-1])
+
+
+@pytest.mark.parametrize('delivery', [Delivery(), Delivery(period=0.05)], ids=str)
+def test_an_ellipsoid_of_errors_costs_less_than_the_box_around_it(delivery):
+    # G and Br are known only together, as an identification leaves them.
+    region = Ellipsoid(((0.14, 0.0, 0.0, 0.13), (0.02, 0.0, 0.0, -0.02), (0.0, 0.1, 0.0, 0.0)))
+    moves = [get_shaper('minimax')(Request(State(1.0), 1.4, PAPER, WIDE, delivery, errors=x))
+             for x in (region, (0.142, 0.1, 0.0))]
+    assert [x.code for x in moves] == [Code.MINIMAX] * 2
+    shares = np.random.default_rng(3).normal(size=(12, 3))
+    shares /= np.linalg.norm(shares, axis=1, keepdims=True)
+    worst = [max(vibration(x, 1.0, 1.4, Errors(*off)) for off in shares @ np.array(region.axes))
+             for x in moves]
+    assert worst[0] < 0.9 * worst[1]
 
 
 def test_what_it_measures_is_the_peak_to_peak_of_an_integration():
@@ -174,6 +189,9 @@ def test_hmsa_plan_takes_errors_from_the_command_line_or_from_an_identification(
 
     assert levels() == levels('--errors', '0.1,0.1,0.1')
     assert levels(**known) == levels('--errors', '0.0196,0.1,0.1') != levels()
+    both = {'identification.names': ['shear_modulus', 'remanence'],
+            'identification.covariance': [1e4, 0.0999, 0.0999, 1e-6]}
+    assert levels(**both) not in (levels(), levels(**known))
     for text, message in (('0.1', 'three shares'), ('a,b,c', "'a,b,c'"), ('2,0,0', '2, 0, 0')):
         assert main(['plan', '1.2:9', '--errors', text]) == 2
         assert message in capsys.readouterr().err

@@ -12,6 +12,7 @@ from hmsa_ros.cli.setpoints import setpoint
 from hmsa_ros.errors import BadInputError
 
 if TYPE_CHECKING:
+    from hmsa_ros.core.mismatch import Uncertainty
     from hmsa_ros.core.sequence import Segment
 
 
@@ -48,8 +49,8 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         '--errors', metavar='G,C,J',
         help='errors of shear modulus, damping coefficient and chain limit, as shares, for which '
-             'minimax plans (default 0.1,0.1,0.1, or the 95 %% intervals that hmsa identify wrote '
-             'to --params-file)')
+             'minimax plans (default 0.1,0.1,0.1, or where 95 %% of the covariance lie that hmsa '
+             'identify wrote to --params-file)')
     parser.add_argument(
         '--periods', type=float, default=1.0, metavar='N',
         help='natural periods that a move of smooth takes at the least (default 1)')
@@ -134,7 +135,7 @@ def _run_si(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _errors(arguments: argparse.Namespace) -> tuple[float, float, float]:
+def _errors(arguments: argparse.Namespace) -> 'Uncertainty':
     """Return the errors for which minimax plans."""
     from hmsa_ros.core.shapers.request import as_errors, ERRORS
 

@@ -52,9 +52,9 @@ def add_parser(subparsers: Any) -> None:
         help='another column: load_min, load_max, period, slew, lag or a constant of the law '
              '(law.c10, ...); with --params-file a parameter, such as actuator.shear_modulus, '
              'flux_density_max, slew_limit, coil_time_constant or command_period. The actuator '
-             'may differ from what is planned with, in error.shear_modulus, error.zeta and '
-             'error.j_lim (shares); with --params-file in actual.shear_modulus, '
-             'actual.remanence, actual.coil_time_constant and so on (SI)')
+             'may differ from what is planned with, in error.shear_modulus, error.zeta, '
+             'error.j_lim and error.remanence (shares); with --params-file in '
+             'actual.shear_modulus, actual.remanence, actual.coil_time_constant and so on (SI)')
     parser.add_argument(
         '--residual', action='store_true',
         help='carry out each plan too: columns residual (vibration after arrival, peak to peak) '
@@ -181,10 +181,13 @@ def _sweep(arguments: argparse.Namespace) -> 'Sweep':
     if arguments.params_file is not None:
         from hmsa_ros.contract.parameters import PLANNED, VISCOELASTIC
         from hmsa_ros.contract.topics import PLANNER
+        from hmsa_ros.core.shapers.request import ERRORS
+        from hmsa_ros.identification.files import errors_of, read_belief
         from hmsa_ros.runs.parameters import read_parameter_file, values_of
 
         system = InSI.of(values_of(
-            read_parameter_file(arguments.params_file), PLANNER, (*PLANNED, *VISCOELASTIC)))
+            read_parameter_file(arguments.params_file), PLANNER, (*PLANNED, *VISCOELASTIC)),
+            errors_of(read_belief(arguments.params_file), ERRORS))
         if arguments.identified:
             from hmsa_ros.studies.identified import belief_of
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from hmsa_ros.core.delivery import Delivery, IDEAL, Piece, ramps
 from hmsa_ros.core.laws.record import ENDLESS
+from hmsa_ros.core.mismatch import Uncertainty
 from hmsa_ros.core.model import elastic_force, natural_frequency
 from hmsa_ros.core.moves import Level, Limits, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
@@ -61,7 +62,7 @@ def plan_sequence(
         start: State | None = None, shaper: str = 'two_step', limits: Limits | None = None,
         delivery: Delivery = IDEAL, order: int = 2, units: Units | None = None,
         short_spell: str = 'refuse',
-        errors: tuple[float, float, float] = ERRORS,
+        errors: Uncertainty = ERRORS,
         pace: Pace = PACE) -> tuple[Segment, ...]:
     """
     Plan a sequence of setpoints.
@@ -88,7 +89,7 @@ def plan_sequence(
     short_spell : {'refuse', 'continue'}
         For a span that ends before the move: refuse, or plan the next move from the state that
         is really reached; the last move is then finished after its span.
-    errors : tuple of float
+    errors : tuple of float or Ellipsoid
         Of G, damping coefficient and J_lim, as shares, for which minimax plans.
     pace : Pace
         How fast the shaper smooth moves; the rate per unit of nondimensional time.
@@ -118,7 +119,7 @@ def segments(
         start: State | None = None, shaper: str = 'two_step', limits: Limits | None = None,
         delivery: Delivery = IDEAL, order: int = 2, units: Units | None = None,
         short_spell: str = 'refuse',
-        errors: tuple[float, float, float] = ERRORS, pace: Pace = PACE,
+        errors: Uncertainty = ERRORS, pace: Pace = PACE,
         first: Shaper | None = None) -> Generator[Segment, None, None]:
     """
     Plan as `plan_sequence` does, setpoint by setpoint; the first may have a shaper of its own.

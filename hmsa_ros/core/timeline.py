@@ -13,6 +13,7 @@ import math
 
 from hmsa_ros.core import law
 from hmsa_ros.core.delivery import Delivery, IDEAL, pieces
+from hmsa_ros.core.mismatch import Uncertainty
 from hmsa_ros.core.moves import Level, Limits, State
 from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.core.sequence import SHORT_SPELL
@@ -55,7 +56,7 @@ class Options:
         Largest change of the flux density in T/s; infinite for steps.
     order : int
         Of the robust shaper.
-    errors : tuple of float
+    errors : tuple of float or Ellipsoid
         Of G, damping coefficient and J_lim, as shares, for which minimax plans.
     coil_time_constant : float
         In s: the field follows the amplifier with this lag of first order; 0 for at once.
@@ -76,7 +77,7 @@ class Options:
     order: int = 2
     coil_time_constant: float = 0.0
     creep_tolerance: float = IDEAL.ripple
-    errors: tuple[float, float, float] = ERRORS
+    errors: Uncertainty = ERRORS
     pace: Pace = PACE
 
 

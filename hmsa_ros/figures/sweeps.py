@@ -15,7 +15,7 @@ import numpy as np
 from hmsa_ros.contract.parameters import PLANNED
 from hmsa_ros.core.model import Array
 from hmsa_ros.figures import style
-from hmsa_ros.studies.settings import ACTUAL, BLOCK_OF
+from hmsa_ros.studies.settings import ACTUAL, BLOCK_OF, Nondimensional
 from hmsa_ros.studies.views import Axis, View
 
 #: Shares of the samples between which the bands are, and the one that maps show.
@@ -34,10 +34,10 @@ _NAMES = {
     'b_1': 'holding level $b_1$ [1]', 'flux_density_p': 'first flux density $B_p$ [T]',
     'residual': f'residual vibration {_PERCENT}', 'offset': f'offset at rest {_PERCENT}',
     'error.shear_modulus': 'error of $G$ [%]', 'error.j_lim': r'error of $J_\mathrm{lim}$ [%]',
-    'error.zeta': r'error of $\zeta$ [%]', 'time_p': 'duration $t_p$ [s]',
-    'flux_density_1': 'holding flux density $B_1$ [T]'}
+    'error.zeta': r'error of $\zeta$ [%]', 'error.remanence': 'error of $B_r$ [%]',
+    'time_p': 'duration $t_p$ [s]', 'flux_density_1': 'holding flux density $B_1$ [T]'}
 # Shares, drawn in percent.
-_SHARES = ('residual', 'offset', 'error.shear_modulus', 'error.zeta', 'error.j_lim')
+_SHARES = ('residual', 'offset', *Nondimensional.actual)
 _UNITS = {x.name: x.unit or '1' for x in PLANNED}
 _LOOKS: tuple[dict[str, Any], ...] = tuple(
     {'color': colour, 'linestyle': dashes} for colour, dashes in (

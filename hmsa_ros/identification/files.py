@@ -12,9 +12,12 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hmsa_ros.contract.actuator import actuator_from, parameters_of
 from hmsa_ros.contract.parameters import BLOCK
 from hmsa_ros.contract.topics import PLANNER, PLANT
+from hmsa_ros.core.mismatch import Ellipsoid, Uncertainty
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.shapers.request import LARGEST_ERROR
 from hmsa_ros.errors import BadInputError
@@ -29,8 +32,10 @@ _OTHERS = {
     'stretch_gain': 'stretch_gain', 'initial_stretch': 'initial_stretch'}
 _LISTS = {
     'viscoelastic_ratio': 'viscoelastic.ratio', 'viscoelastic_time': 'viscoelastic.time'}
-# Half of a 95 % interval, in standard deviations.
-_HALF_95 = 1.96
+# Half of a 95 % interval, or half an axis of the ellipsoid of so many, in standard deviations.
+_HALF_95 = (0.0, 1.96, 2.448, 2.795, 3.080)
+# What changes how a block moves, in the order of `hmsa_ros.core.mismatch.Errors`.
+_MISMATCH = ('shear_modulus', 'damping_coefficient', 'chain_limit', 'remanence')
 _RANKS = {'': 1, PLANT: 2, PLANNER: 3}
 
 
@@ -106,8 +111,7 @@ def read_belief(path: Path | None) -> Belief:
     return Belief(actuator_from(values), others, settings, known)
 
 
-def errors_of(
-        belief: Belief, others: tuple[float, float, float]) -> tuple[float, float, float]:
+def errors_of(belief: Belief, others: tuple[float, float, float]) -> Uncertainty:
     """
     Return how far off the block may be, as the shaper minimax takes it.
 
@@ -116,22 +120,32 @@ def errors_of(
     belief : Belief
         As read.
     others : tuple of float
-        For what was not identified.
+        Of G, damping coefficient and J_lim, for what was not identified.
 
     Returns
     -------
-    tuple of float
-        Half the 95 % intervals of G, damping coefficient and J_lim, as shares of their values.
+    tuple of float or Ellipsoid
+        Where the block is with a probability of 95 %, in shares of its values: the ellipsoid of
+        G, damping coefficient, J_lim and remanence by their covariance, or intervals if no
+        two of them were identified.
 
     """
-    found = list(others)
-    for i, name in enumerate(('shear_modulus', 'damping_coefficient', 'chain_limit')):
-        value = belief.actuator.numbers[name]
-        if name in belief.known.names and value > 0.0:
-            place = belief.known.names.index(name)
-            std = math.sqrt(belief.known.covariance[place, place])
-            found[i] = min(_HALF_95 * std / value, LARGEST_ERROR)
-    return found[0], found[1], found[2]
+    sizes = [*others, 0.0]
+    covariance = np.diag(np.square(sizes))
+    numbers, known = belief.actuator.numbers, belief.known
+    rows = [(i, known.names.index(x), numbers[x]) for i, x in enumerate(_MISMATCH)
+            if x in known.names and 0.0 < numbers[x] < math.inf]
+    factor = _HALF_95[len(rows)]
+    for i, row, first in rows:
+        for j, column, second in rows:
+            covariance[i, j] = factor ** 2 * known.covariance[row, column] / (first * second)
+    if len(rows) < 2:
+        a, b, c = (min(math.sqrt(x), LARGEST_ERROR) for x in np.diag(covariance)[:3])
+        return a, b, c
+    lengths, axes = np.linalg.eigh(covariance)
+    # The shortest of four is left out: it would double the cases.
+    found = [math.sqrt(max(lengths[i], 0.0)) * axes[:, i] for i in (3, 2, 1)]
+    return Ellipsoid(tuple((float(a), float(b), float(c), float(d)) for a, b, c, d in found))
 
 
 def _number(path: Path | None, name: str, value: object) -> float:

@@ -208,7 +208,8 @@ def _planned(setting: Setting, start: float, target: float, shaper: str) -> _Pla
     try:
         move = plan_sequence(
             [Setpoint(target, math.inf)], material, start=State(start), shaper=shaper,
-            limits=setting.limits, delivery=setting.delivery, units=setting.units)[0].move
+            limits=setting.limits, delivery=setting.delivery, units=setting.units,
+            errors=setting.errors)[0].move
     except RefusedError as error:
         return _Planned(error.code, None, load)
     except BadInputError:

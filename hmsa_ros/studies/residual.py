@@ -74,8 +74,7 @@ class Actual:
     @classmethod
     def off(cls, model: NondimensionalParameters, errors: Errors) -> 'Actual':
         """Return the actuator of a model in error."""
-        stiffer = 1.0 + errors.shear_modulus
-        return cls(model, errors.actual(model), 1.0 / math.sqrt(stiffer), stiffer)
+        return cls(model, errors.actual(model), 1.0 / errors.faster, errors.stiffer)
 
     @classmethod
     def of(cls, model: Setting, actual: Setting) -> 'Actual':

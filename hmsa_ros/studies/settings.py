@@ -16,9 +16,10 @@ from hmsa_ros.contract.actuator import completed, model_from
 from hmsa_ros.contract.parameters import LAW, ParameterSpec, PLANNED
 from hmsa_ros.core.delivery import Delivery
 from hmsa_ros.core.laws import LAWS
-from hmsa_ros.core.mismatch import Errors
+from hmsa_ros.core.mismatch import Errors, Uncertainty
 from hmsa_ros.core.moves import Limits
 from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.core.shapers.request import ERRORS
 from hmsa_ros.core.units import NANOSECONDS, Units
 
 #: Least and largest value of a column.
@@ -57,6 +58,8 @@ class Setting:
         How commands reach the coil.
     units : Units
         Sizes of the nondimensional units.
+    errors : tuple of float or Ellipsoid
+        For which minimax plans.
 
     """
 
@@ -64,6 +67,7 @@ class Setting:
     limits: Limits = field(default_factory=Limits)
     delivery: Delivery = field(default_factory=Delivery)
     units: Units = field(default_factory=Units)
+    errors: Uncertainty = ERRORS
 
 
 class System(ABC):
@@ -135,7 +139,7 @@ class Nondimensional(System):
         'lag': (0.0, FINITE), **_ranges(LAW)}
     actual = {
         'error.shear_modulus': (-1.0, FINITE), 'error.zeta': (-1.0, FINITE),
-        'error.j_lim': (-1.0, FINITE)}
+        'error.j_lim': (-1.0, FINITE), 'error.remanence': (-1.0, FINITE)}
     delivery = frozenset({'period', 'slew', 'lag'})
     roots = True
 
@@ -161,11 +165,10 @@ class Nondimensional(System):
         """Return the actuator of a row, its units in those of the model."""
         planned = self.setting(values)
         errors = Errors(**{x.removeprefix('error.'): values.get(x, 0.0) for x in self.actual})
-        stiffer = 1.0 + errors.shear_modulus
-        time, delivery = 1.0 / math.sqrt(stiffer), planned.delivery
+        time, load, delivery = 1.0 / errors.faster, errors.stiffer, planned.delivery
         return Setting(
-            errors.actual(planned.material), units=Units(time, stiffer),
-            delivery=Delivery(slew=delivery.slew * time / stiffer, lag=delivery.lag / time))
+            errors.actual(planned.material), units=Units(time, load),
+            delivery=Delivery(slew=delivery.slew * time / load, lag=delivery.lag / time))
 
 
 @dataclass(frozen=True)
@@ -178,6 +181,8 @@ class InSI(System):
     known : dict of str to object
         Values of `hmsa_ros.contract.parameters.PLANNED` and of creep, and points of a law that
         were in a file.
+    errors : tuple of float or Ellipsoid
+        For which minimax plans.
 
     """
 
@@ -191,9 +196,10 @@ class InSI(System):
     roots = False
 
     known: Mapping[str, Any]
+    errors: Uncertainty = ERRORS
 
     @classmethod
-    def of(cls, values: Mapping[str, Any]) -> 'InSI':
+    def of(cls, values: Mapping[str, Any], errors: Uncertainty = ERRORS) -> 'InSI':
         """
         Return the system of parameters.
 
@@ -203,7 +209,7 @@ class InSI(System):
             If they name a file that cannot be used.
 
         """
-        return cls({**values, **completed(values)})
+        return cls({**values, **completed(values)}, errors)
 
     @property
     def ideal(self) -> bool:
@@ -216,7 +222,8 @@ class InSI(System):
         model = model_from(
             {**self.known, **values}, values.get(_MODULUS),
             round(values.get('command_period', 0.0) * NANOSECONDS))
-        return Setting(model.material, model.limits, model.delivery, model.units)
+        return Setting(
+            model.material, model.limits, model.delivery, model.units, self.errors)
 
     def carried(self, values: Mapping[str, Any]) -> Setting:
         """Return the actuator of a row: what is not given of it is as in the plan."""

@@ -1,5 +1,5 @@
 """
-Levels that leave the least vibration at the worst, wherever in a box the parameters are.
+Levels that leave the least vibration at the worst, wherever in a box or ellipsoid parameters are.
 
 A chain of two-step commands leaves none if the model is exact, and more the further it is off.
 Here the nominal case is one of many: in the time of the chain, some levels of equal length are
@@ -20,10 +20,10 @@ import numpy as np
 
 from hmsa_ros.core import kernels, lag_kernel, law
 from hmsa_ros.core.delivery import ramps
-from hmsa_ros.core.mismatch import Errors
+from hmsa_ros.core.mismatch import Ellipsoid, Errors
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.moves import Level, Move, State
-from hmsa_ros.core.shapers.request import as_errors, Request
+from hmsa_ros.core.shapers.request import as_errors, LARGEST_ERROR, Request
 from hmsa_ros.core.shapers.robust import robust
 from hmsa_ros.core.status import Code
 
@@ -114,22 +114,25 @@ class _Case:
 
 
 def _cases(request: Request, holding: float) -> list[_Case]:
-    """Return the nominal actuator, and others along G and at the corners of the box."""
-    g, zeta, j_lim = request.errors
+    """Return the nominal actuator, and others in and on the box or ellipsoid of errors."""
+    errors = request.errors
+    offs: list[tuple[float, ...]] = [(0.0, 0.0, 0.0, 0.0)]
+    if isinstance(errors, Ellipsoid):
+        offs += errors.offs(LARGEST_ERROR)
+    else:
+        g, zeta, j_lim = errors
+        offs += [(-0.5 * g, 0.0, 0.0, 0.0), (0.5 * g, 0.0, 0.0, 0.0),
+                 *product((-g, g), (-zeta, zeta), (-j_lim, j_lim), (0.0,))]
     if request.material.law is not None or math.isinf(request.material.j_lim):
-        j_lim = 0.0
-    offs = dict.fromkeys([
-        (0.0, 0.0, 0.0), (-0.5 * g, 0.0, 0.0), (0.5 * g, 0.0, 0.0),
-        *product((-g, g), (-zeta, zeta), (-j_lim, j_lim))])
-    found = [_case(request, holding, Errors(*x)) for x in offs]
+        offs = [(x[0], x[1], 0.0, x[3]) for x in offs]
+    found = [_case(request, holding, Errors(*x)) for x in dict.fromkeys(offs)]
     return [x for x in found if x is not None]
 
 
 def _case(request: Request, holding: float, errors: Errors) -> _Case | None:
     """Return an actuator in error, None if it does not oscillate about where it would rest."""
     state, nominal = request.state, request.material.packed
-    stiffer = 1.0 + errors.shear_modulus
-    faster = math.sqrt(stiffer)
+    stiffer, faster = errors.stiffer, errors.faster
     packed = errors.actual(request.material).packed
     rest = law.equilibrium_stretch(holding / stiffer, packed)
     # What the field in force holds is off by as much as its stretch.

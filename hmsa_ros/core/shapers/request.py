@@ -6,6 +6,7 @@ import math
 
 from hmsa_ros.core import law
 from hmsa_ros.core.delivery import Delivery, IDEAL
+from hmsa_ros.core.mismatch import Ellipsoid, Uncertainty
 from hmsa_ros.core.moves import Level, Limits, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.shapers.pace import PACE, Pace
@@ -20,9 +21,9 @@ ERRORS = (0.1, 0.1, 0.1)
 LARGEST_ERROR = 0.9
 
 
-def as_errors(values: Sequence[float]) -> tuple[float, float, float]:
+def as_errors(values: Sequence[float] | Ellipsoid) -> Uncertainty:
     """
-    Return errors of G, damping coefficient and J_lim, checked.
+    Return errors of G, damping coefficient and J_lim, checked; an ellipsoid is checked already.
 
     Raises
     ------
@@ -30,6 +31,8 @@ def as_errors(values: Sequence[float]) -> tuple[float, float, float]:
         If they are not three numbers of 0 to 0.9.
 
     """
+    if isinstance(values, Ellipsoid):
+        return values
     if len(values) != 3 or not all(0.0 <= x <= LARGEST_ERROR for x in values):
         raise BadInputError(
             f'errors of G, damping coefficient and J_lim are {", ".join(f"{x:g}" for x in values)}'
@@ -59,7 +62,7 @@ class Request:
         long.
     units : Units
         For the messages.
-    errors : tuple of float
+    errors : tuple of float or Ellipsoid
         Of G, damping coefficient and J_lim, as `as_errors` returns them: minimax plans for
         these.
     pace : Pace
@@ -74,7 +77,7 @@ class Request:
     delivery: Delivery = IDEAL
     order: int = 2
     units: Units = field(default_factory=Units)
-    errors: tuple[float, float, float] = ERRORS
+    errors: Uncertainty = ERRORS
     pace: Pace = PACE
 
     @property
