@@ -19,6 +19,7 @@ from hmsa_ros.bag.definitions import message_definition
 from hmsa_ros.bag.writer import BagWriter, Topic
 from hmsa_ros.cli import main
 from hmsa_ros.contract.parameters import ACTUATOR_FIELDS
+from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.parameters import NondimensionalParameters, paper_actuator
 from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.residual import residual_vibration
@@ -109,15 +110,15 @@ def parameters(**nodes):
 
 def simulated(
         sequence=SEQUENCE, *, space='', actuator=ACTUATOR, plant=None, period=PERIOD,
-        shaper='two_step', slew=0.0, lag=0.0, noise=0.0, extra=0.0):
+        shaper='two_step', slew=0.0, lag=0.0, noise=0.0, extra=0.0, creep=None):
     """Return the messages of a run: (log time, topic, type, message)."""
-    planner = Planner(actuator, Options(
+    planner = Planner(replace(actuator, creep=creep or Creep()), Options(
         shaper=shaper, lead_time=LEAD, slew_limit=slew or math.inf, coil_time_constant=lag,
         flux_density_min=-0.5,
         flux_density_max=0.5))
     simulation = ActuatorSimulation(
         plant or actuator, time=START, slew_limit=slew or math.inf,
-        coil_time_constant=lag)
+        coil_time_constant=lag, creep=creep)
     ends = np.cumsum([
         round(span * actuator.time_unit * NANOSECONDS) for _, span in sequence]).tolist()
     points = [(x, end) for (x, _), end in zip(sequence, ends, strict=True)]
@@ -306,6 +307,27 @@ def test_setpoints_are_found_whatever_the_shaper(tmp_path, shaper):
         assert residual > 1e-3
     if shaper == 'minimax':
         assert residual < 0.02
+
+
+def test_plain_steps_and_predictions_are_those_of_a_creeping_block_and_its_ramps(tmp_path):
+    creep = Creep((0.1, 0.05), (2.0 * UNIT, 0.1))
+    told = {f'{node}.viscoelastic.{name}': json.dumps(list(values)) for node in (
+        'planner', 'plant') for name, values in (('ratio', creep.ratios), ('time', creep.times))}
+    bag = tmp_path / 'bag'
+    part = one(bag, simulated(creep=creep), **parameters(planner=ACTUATOR, plant=ACTUATOR), **told)
+    found, run = part.evaluation, part.run
+    known = np.isfinite(found.predicted[0])
+    assert np.max(np.abs(found.predicted[0] - run.stretch)[known]) < 1e-6
+    # The example block's steps, by the plant itself.
+    steps = ActuatorSimulation(ACTUATOR, time=found.zero, creep=creep)
+    for move in found.moves:
+        steps.command(move.begin, move.flux_densities[-1])
+    worst = 0.0
+    for time, stretch in zip(run.time.tolist(), found.unshaped[0].tolist(), strict=True):
+        if time > found.zero:
+            steps.advance(time)
+            worst = max(worst, abs(steps.stretch - stretch))
+    assert worst < 1e-6
 
 
 def test_without_the_requests_setpoints_are_told_by_the_levels_that_last(tmp_path, bag):

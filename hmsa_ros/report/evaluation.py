@@ -6,11 +6,12 @@ Times are in s from the first command of the run; stamps stay integer nanosecond
 
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
 
+from hmsa_ros.contract.topics import PLANNER
 from hmsa_ros.core.delivery import late, pieces
 from hmsa_ros.core.model import (
     Array,
@@ -21,12 +22,14 @@ from hmsa_ros.core.model import (
     stretch_limits,
 )
 from hmsa_ros.core.moves import Level as PlannedLoad
+from hmsa_ros.core.moves import State
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.residual import residual_vibration
-from hmsa_ros.core.simulation import simulate
+from hmsa_ros.core.simulation import creeping_samples, RTOL, simulate
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.runs.levels import in_force, Level, without_repeats
+from hmsa_ros.runs.parameters import creep_of
 from hmsa_ros.runs.record import Run
 
 # Stretches that differ by less are one setpoint: what comes back from a flux density in double
@@ -329,17 +332,30 @@ def _unshaped(
     grid = _fine(time[running], period_of(run))
     lower, upper = stretch_limits(run.plant.nondimensional)
     margin = 1e-6 * (min(upper, 2.0) - lower)
+    start = min(max(start, lower + margin), upper - margin)
     try:
+        # By the same amplifier, coil and elastomer as in the run.
+        material = replace(
+            run.plant, creep=creep_of(run.parameters, run.joint)).nondimensional
+        held = float(elastic_force(start, material))
+        switches, loads, slopes, _ = pieces(
+            [PlannedLoad(x / unit, y.flux_densities[-1] / run.plant.flux_density_unit)
+             for x, y in zip(begins, moves, strict=True)], held, float(grid[-1]) / unit,
+            _slew(run, run.plant, 'plant'))
         fine, fine_rate = simulate(
-            [x / unit for x in begins],
-            [x.flux_densities[-1] / run.plant.flux_density_unit for x in moves],
-            grid / unit, run.plant.nondimensional,
-            stretch=min(max(start, lower + margin), upper - margin))
+            switches, loads, grid / unit, material, stretch=start, slopes=slopes,
+            lag=run.number('plant.coil_time_constant') / unit, field=held)
     except HmsaError:
         return nothing
     places = np.searchsorted(grid, time[running])
     stretch[running], rate[running] = fine[places], fine_rate[places] / unit
     return stretch, rate, grid, fine
+
+
+def _slew(run: Run, actuator: ActuatorParameters, node: str) -> float:
+    """Return the slew limit of a node without a dimension; infinite for none."""
+    return run.number(f'{node}.slew_limit') / actuator.flux_density_unit \
+        * actuator.time_unit or math.inf
 
 
 def _fine(time: Array, period: float) -> Array:
@@ -387,37 +403,46 @@ def _predict(run: Run, plan: Sequence[Level]) -> tuple[Array, Array]:
     """Return what the plan predicts for the samples: stretch and rate, from point to point."""
     predicted = np.full((2, len(run.time)), np.nan)
     actuator: ActuatorParameters = run.planner
-    material = actuator.nondimensional
+    creep = creep_of(run.parameters, run.joint, PLANNER)
+    material = replace(actuator, creep=creep).nondimensional
     lower, upper = stretch_limits(material)
     # No block can be where the others are; a message of anything may have been recorded.
     plan = [x for x in plan if lower < x.stretch < upper]
     if not plan:
         return predicted[0], predicted[1]
-    slew = run.number('planner.slew_limit') / actuator.flux_density_unit * actuator.time_unit
+    slew = _slew(run, actuator, 'planner')
     lag = run.number('planner.coil_time_constant') / actuator.time_unit
     load = field = float(elastic_force(plan[0].stretch, material))
+    followed: tuple[float, ...] = ()
     for i, point in enumerate(plan):
         until = plan[i + 1].stamp if i + 1 < len(plan) else max(int(run.time[-1]), point.stamp)
         duration = (until - point.stamp) / NANOSECONDS / actuator.time_unit
-        if not slew:
+        if math.isinf(slew):
             load = point.flux_density / actuator.flux_density_unit
         switches, loads, slopes, load = pieces(
             (PlannedLoad(0.0, point.flux_density / actuator.flux_density_unit),), load,
-            duration, slew or math.inf)
+            duration, slew)
         begun = field
         if lag:
             field = late(list(zip(switches, loads, slopes, strict=True)), duration, field, lag)
         part = slice(
             int(np.searchsorted(run.time, point.stamp)), int(np.searchsorted(
                 run.time, until, side='right' if i + 1 == len(plan) else 'left')))
-        if part.start == part.stop:
+        if part.start == part.stop and not creep:
             continue
+        times = (run.time[part] - point.stamp) / NANOSECONDS / actuator.time_unit
+        rate = point.rate * actuator.time_unit
         try:
+            if creep:
+                rows = creeping_samples(
+                    switches, loads, slopes, np.append(times, duration),
+                    State(point.stretch, rate, followed=followed), material, RTOL)
+                predicted[:, part] = rows[:2, :-1]
+                followed = tuple(rows[2:, -1].tolist())
+                continue
             predicted[:, part] = simulate(
-                switches, loads,
-                (run.time[part] - point.stamp) / NANOSECONDS / actuator.time_unit, material,
-                stretch=point.stretch, rate=point.rate * actuator.time_unit, slopes=slopes,
-                lag=lag, field=begun)
+                switches, loads, times, material, stretch=point.stretch, rate=rate,
+                slopes=slopes, lag=lag, field=begun)
         except HmsaError:
             # A plan of other parameters than are known here: nothing to compare.
             continue

@@ -101,19 +101,18 @@ def actuators(
             'of parameters.')
     try:
         if creep := creep_of({**parameters, **given}, joint):
-            known = creep == creep_from(_own(parameters, joint, PLANNER, VISCOELASTIC))
+            known = creep == creep_of(parameters, joint, PLANNER)
             notes.append(
                 'The elastomer of the plant creeps (viscoelastic.*)'
-                + ('' if known else ', which the planner does not know')
-                + '; plain steps and predictions are simulated without it.')
+                + ('.' if known else ', which the planner does not know.'))
     except BadInputError as error:
         notes.append(f'What the plant says of creep cannot be used: {error}.')
     return plant, planner, bool(found), notes
 
 
-def creep_of(parameters: Mapping[str, object], joint: str) -> Creep:
+def creep_of(parameters: Mapping[str, object], joint: str, node: str = PLANT) -> Creep:
     """
-    Return the Maxwell branches of the plant of a run.
+    Return the Maxwell branches of the plant of a run, or those that its planner knows.
 
     Raises
     ------
@@ -121,7 +120,7 @@ def creep_of(parameters: Mapping[str, object], joint: str) -> Creep:
         If these are none that an elastomer can have.
 
     """
-    return creep_from(_own(parameters, joint, PLANT, VISCOELASTIC))
+    return creep_from(_own(parameters, joint, node, VISCOELASTIC))
 
 
 def _own(

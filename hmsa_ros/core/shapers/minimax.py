@@ -23,6 +23,7 @@ from hmsa_ros.core.delivery import ramps
 from hmsa_ros.core.mismatch import Ellipsoid, Errors
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.moves import Level, Move, State
+from hmsa_ros.core.shapers.creeping import check
 from hmsa_ros.core.shapers.request import as_errors, LARGEST_ERROR, Request
 from hmsa_ros.core.shapers.robust import robust
 from hmsa_ros.core.status import Code
@@ -74,10 +75,11 @@ def minimax(request: Request) -> Move:
     RefusedError
         As `robust`.
     BadInputError
-        If the order is below 1, or an error is out of range.
+        If the order is below 1, an error is out of range, or the elastomer creeps.
 
     """
     as_errors(request.errors)
+    check(request.material, request.delivery, 'minimax')
     state, packed = request.state, request.material.packed
     span = abs(request.target - state.stretch)
     held = float(law.elastic_force(state.stretch, packed))

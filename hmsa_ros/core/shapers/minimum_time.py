@@ -8,6 +8,7 @@ import math
 from hmsa_ros.core import kernels, law
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.moves import Level, Move, State
+from hmsa_ros.core.shapers.creeping import check
 from hmsa_ros.core.shapers.lagged import (
     at_rest,
     fastest_on_grid,
@@ -57,8 +58,11 @@ def minimum_time(request: Request, reason: str = '') -> Move:
     RefusedError
         If the target lies outside the stretch limits, needs a load outside the limits, or the
         limits leave no room.
+    BadInputError
+        If the elastomer creeps.
 
     """
+    check(request.material, request.delivery, 'minimum_time')
     holding = request.holding_load()
     state, target = request.state, request.target
     frequency = _frequency(request)
