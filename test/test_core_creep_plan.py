@@ -14,6 +14,8 @@ from hmsa_ros.core.parameters import NondimensionalParameters, paper_actuator
 from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.sequence import plan_sequence
 from hmsa_ros.core.setpoint import Setpoint
+from hmsa_ros.core.shapers import creeping, get_shaper, SHAPERS
+from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.status import RefusedError
 from hmsa_ros.core.two_step import plan_two_step
 from hmsa_ros.errors import BadInputError
@@ -147,6 +149,14 @@ def test_levels_that_follow_creep_keep_inside_the_coil():
     with pytest.raises(RefusedError, match='stretch 1.4 needs a flux density of'):
         plan_sequence(
             [Setpoint(1.4, math.inf)], ONE, limits=Limits(-1.0, 0.999 * highest))
+
+
+@pytest.mark.parametrize('name', SHAPERS)
+def test_a_shaper_called_directly_refuses_what_it_does_not_know_of_creep(name):
+    delivery = Delivery(slew=1.0) if name in creeping.SHAPERS else Delivery()
+    if name != 'step':
+        with pytest.raises(BadInputError, match=r'viscoelastic\.ratio'):
+            get_shaper(name)(Request(State(1.0), 1.1, ONE, delivery=delivery))
 
 
 @pytest.mark.parametrize(('options', 'sentence'), [

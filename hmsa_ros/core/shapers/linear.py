@@ -13,6 +13,7 @@ import math
 
 from hmsa_ros.core import law
 from hmsa_ros.core.moves import Level, Move
+from hmsa_ros.core.shapers.creeping import check
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.status import Code
 
@@ -50,6 +51,8 @@ def ei(request: Request) -> Move:
     ------
     RefusedError
         If the target lies outside the stretch limits or needs a load outside the limits.
+    BadInputError
+        If the elastomer creeps.
 
     """
     return _shaped(
@@ -58,6 +61,7 @@ def ei(request: Request) -> Move:
 
 def _shaped(request: Request, weights: tuple[float, ...]) -> Move:
     """Shape the step with impulses half a damped period apart, decaying as the motion does."""
+    check(request.material, request.delivery, str(Code.LINEAR))
     holding = request.holding_load()
     material, target = request.material, request.target
     xi = material.zeta / law.critical_zeta(target, material.packed)

@@ -17,6 +17,7 @@ import numpy as np
 from hmsa_ros.core import law
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.moves import Level, Move
+from hmsa_ros.core.shapers.creeping import check
 from hmsa_ros.core.shapers.lagged import at_rest
 from hmsa_ros.core.shapers.pace import MOST_PERIODS
 from hmsa_ros.core.shapers.request import Request
@@ -60,8 +61,11 @@ def smooth(request: Request) -> Move:
     ------
     RefusedError
         If the target is out of range, or no path keeps the limits.
+    BadInputError
+        If the elastomer creeps and the amplifier ramps or the field lags.
 
     """
+    check(request.material, request.delivery, 'smooth')
     holding = request.holding_load()
     if _there(request, holding):
         return Move(Code.HOLD, (Level(0.0, holding),), 0.0)
@@ -123,7 +127,7 @@ def _path(request: Request, holding: float, duration: float) -> _Path | None:
     packed = material.packed
     times = duration * _SHARES
     try:
-        free, rate, change, followed = _free(request, times)
+        free, rate, change, field, followed = _free(request, times)
     except HmsaError:
         return None
     away = request.target - free
@@ -142,7 +146,9 @@ def _path(request: Request, holding: float, duration: float) -> _Path | None:
     if material.creep:
         loads = loads + _branches(request, stretch, followed, times[1])
     if delivery.lag > 0.0:
-        loads = loads + delivery.lag * np.gradient(loads, times[1], edge_order=2)
+        # The field as it would go on needs no change of the level.
+        more: Array = loads - field
+        loads = request.load + more + delivery.lag * np.gradient(more, times[1], edge_order=2)
     slopes: Array = np.gradient(loads, times[1], edge_order=2)
     slack = _SLACK * (abs(holding - request.load) + abs(holding))
     if not (limits.minimum - slack <= loads.min() and loads.max() <= limits.maximum + slack
@@ -151,8 +157,13 @@ def _path(request: Request, holding: float, duration: float) -> _Path | None:
     return _Path(duration, loads, slopes)
 
 
-def _free(request: Request, times: Array) -> tuple[Array, Array, Array, tuple[float, ...]]:
-    """Return stretch, rate and acceleration under the level in force, and what branches follow."""
+def _free(
+        request: Request, times: Array) -> tuple[Array, Array, Array, Array, tuple[float, ...]]:
+    """
+    Return the motion under the level in force.
+
+    Stretch, rate, acceleration, the load left for the law, and what branches follow at first.
+    """
     material, state = request.material, request.state
     load, field = request.load, request.field
     followed = followed_by(state, material)
@@ -167,7 +178,7 @@ def _free(request: Request, times: Array) -> tuple[Array, Array, Array, tuple[fl
     elif state.rate == 0.0 and field == load == law.elastic_force(
             state.stretch, material.packed):
         nothing = np.zeros(_POINTS)
-        return np.full(_POINTS, state.stretch), nothing, nothing, followed
+        return np.full(_POINTS, state.stretch), nothing, nothing, loads, followed
     else:
         lag = request.delivery.lag
         stretch, rate = simulate(
@@ -177,7 +188,7 @@ def _free(request: Request, times: Array) -> tuple[Array, Array, Array, tuple[fl
             loads += (field - load) * np.exp(-times / lag)
     change = np.empty(_POINTS)
     law.accelerations(stretch, rate, loads, material.packed, change)
-    return stretch, rate, change, followed
+    return stretch, rate, change, loads, followed
 
 
 def _branches(

@@ -10,7 +10,7 @@ import numpy as np
 from hmsa_ros.core import law
 from hmsa_ros.core.delivery import IDEAL
 from hmsa_ros.core.moves import Level, Limits, Move
-from hmsa_ros.core.shapers.creeping import free_levels, two_levels
+from hmsa_ros.core.shapers.creeping import check, free_levels, two_levels
 from hmsa_ros.core.shapers.lagged import at_rest, settle, three_levels
 from hmsa_ros.core.shapers.minimum_time import minimum_time
 from hmsa_ros.core.shapers.request import Request
@@ -54,8 +54,11 @@ def two_step(request: Request) -> Move:
     RefusedError
         If the target lies outside the stretch limits, or no command within the load limits
         was found.
+    BadInputError
+        If the elastomer creeps and the amplifier ramps or the field lags.
 
     """
+    check(request.material, request.delivery, 'two_step')
     if request.delivery.lag > 0.0:
         return _late(request)
     if request.material.creep:
