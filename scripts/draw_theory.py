@@ -130,6 +130,27 @@ def deliveries(path: Path) -> None:
             style.finish(rows[1, i], r'time $\tau$', '' if i else r'stretch $\lambda$')
 
 
+def smooth(path: Path) -> None:
+    """Draw the same move by the two-step command, the chain and a smooth path."""
+    time = np.linspace(-0.3, 4.0, 1721)
+    looks = (('two_step', style.GREY, '--'), ('robust', style.GREEN, '-.'),
+             ('smooth', style.BLUE, '-'))
+    with style.picture(path, 2.9) as figure:
+        left, right = figure.subplots(1, 2)
+        for shaper, colour, line in looks:
+            segment, = plan_sequence([Setpoint(1.4, math.inf)], MATERIAL, shaper=shaper)
+            switches, loads = np.array([
+                (-0.3, 0.0), *((x.time, x.load) for x in segment.move.levels)]).T
+            stretch, _ = simulate(switches, loads, time, MATERIAL)
+            left.step(np.append(switches, time[-1]), np.append(loads, loads[-1]), where='post',
+                      color=colour, linestyle=line, label=shaper)
+            right.plot(time, stretch, color=colour, linestyle=line)
+        left.legend(loc='lower right')
+        right.axhline(1.4, **style.TARGET)
+        style.finish(left, r'time $\tau$', r'load $\beta$', 'a')
+        style.finish(right, r'time $\tau$', r'stretch $\lambda$', 'b')
+
+
 def laws(path: Path) -> None:
     """Draw the load that holds a stretch by each law, all with the same modulus."""
     cases = {
@@ -189,6 +210,7 @@ def main() -> int:
     two_steps(FOLDER / 'theory_two_steps.png')
     energy(FOLDER / 'theory_paths.png')
     deliveries(FOLDER / 'theory_deliveries.png')
+    smooth(FOLDER / 'theory_smooth.png')
     laws(FOLDER / 'laws.png')
     creep(FOLDER / 'creep.png')
     return 0
