@@ -120,7 +120,8 @@ def test_levels_sampled_beside_the_stretch_serve_with_semicolons_and_units(folde
     ('time,stretch\n"0,1","1,02"\n', "line 2 has '0,1' in column time: .*need semicolons"),
     ('time,stretch [mm]\n0,1\n', 'gives stretch in mm: expected no unit: divide'),
     ('time,stretch\n0,1\n0.1,abc\n', "line 3 has 'abc' in column stretch"),
-    ('time,stretch\n0,1\n0.1,1\n0.05,1\n', 'line 4 jumps back in time from 0.1 to 0.05 s.*sort'),
+    ('time,stretch\n' + 2 * ''.join(f'{x / 10},1\n' for x in range(12)),
+     'line 14 jumps back in time from 1.1 to 0 s.*clock was set.*sort'),
     ('time,stretch\n0,1\n0,1\n0,1\n0.1,1\n', '2 of 4 rows .* stamp of its own'),
     ('time,stretch\n0,1\n0.1,1\n0.2,1\n0.3,1\n0.4,1\n', 'has 5 samples: expected 12 or more')])
 def test_bad_samples_end_with_2_and_a_sentence(folder, capsys, text, message):
@@ -156,6 +157,16 @@ def test_times_in_two_units_are_refused_with_which_is_which(
     status, out, err = identify(capsys, 'camera.csv', '--commands', 'levels.csv')
     assert (status, out, err.count('\n')) == (2, '', 1)
     assert wrong in err
+
+
+def test_points_in_any_order_are_sorted_and_that_is_said(folder, capsys):
+    order = np.random.default_rng(1).permutation(500)
+    write('camera.csv', 'time,stretch', zip(TIMES[order], STRETCH[order], strict=True))
+    status, out, _ = identify(capsys, 'camera.csv', '--commands', 'levels.csv', '--json')
+    found = json.loads(out)
+    assert status == 0
+    assert abs(found['parameters']['shear_modulus']['value'] / BLOCK.shear_modulus - 1.0) < 2e-3
+    assert any('not in the order of time' in x for x in found['warnings'])
 
 
 def test_a_few_samples_of_nothing_are_no_other_unit(folder, capsys):

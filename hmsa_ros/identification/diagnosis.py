@@ -237,7 +237,7 @@ def signatures(
         size = float(direction @ residual)
         rest = residual - size * direction
         spread = float(np.linalg.norm(rest)) / math.sqrt(max(len(rest) - len(fit.free) - 1, 1))
-        factor = 1.0 if found.white else inflation(direction, whiteness(rest, len(fit.free)))
+        factor = 1.0 if found.white else inflation(direction, whiteness(rest))
         deviations = abs(size) / max(spread * factor, 1e-300)
         share = size * size / total
         results.append(Signature(name, share, deviations, bool(
@@ -257,7 +257,10 @@ def _jitter(recording: Recording, fit: Fit) -> list[Signature]:
     if fit.scale < _NUMERICAL:
         return []
     keep = fit.weights > 0.0
-    squares, speed = fit.residual[keep] ** 2, fit.response.rate[keep] ** 2
+    # A device that stamps evenly can be mended; of other stamps the errors are a part of the fit.
+    counted = fit.residual if _even(recording) else fit.root * fit.residual
+    weighted = counted[keep]
+    squares, speed = weighted ** 2, fit.response.rate[keep] ** 2
     centred = speed - np.mean(speed)
     variance = float(centred @ centred)
     if variance == 0.0 or not np.any(squares):
@@ -267,17 +270,21 @@ def _jitter(recording: Recording, fit: Fit) -> list[Signature]:
     deviations = slope / math.sqrt(
         max(float(np.sum((centred * rest) ** 2)), 1e-300)) * variance
     share = max(slope * float(np.mean(speed)) / float(np.mean(squares)), 0.0)
-    near = whiteness(fit.residual[keep], len(fit.free)).autocorrelation[1]
+    near = autocorrelation(weighted)[1]
     error = math.sqrt(max(slope, 0.0))
     return [Signature(
         f'jitter of the stamps of {error:.2g} s rms', min(share, 1.0), max(deviations, 0.0),
         bool(share > 0.5 and deviations > _DEVIATIONS and abs(near) < 0.5))]
 
 
+def _even(recording: Recording) -> bool:
+    gaps = np.diff(recording.time)
+    return bool(np.max(gaps) <= 1.5 * np.min(gaps))
+
+
 def _second_mode(recording: Recording, fit: Fit) -> list[Signature]:
     """Look for one sharp frequency in the residuals, of evenly spaced samples."""
-    gaps = np.diff(recording.time)
-    if np.max(gaps) > 1.5 * np.min(gaps):
+    if not _even(recording):
         return []
     power = np.abs(np.fft.rfft(fit.residual * fit.weights)) ** 2
     power = power[3:]
@@ -288,7 +295,8 @@ def _second_mode(recording: Recording, fit: Fit) -> list[Signature]:
     share = float(np.sum(near) / np.sum(power))
     # Fisher's g: the chance of the largest of m exponential shares.
     chance = len(power) * math.exp(-len(power) * float(power[place]) / float(np.sum(power)))
-    frequency = (place + 3) / (gaps.mean() * len(recording.time))
+    frequency = (place + 3) / (
+        float(np.mean(np.diff(recording.time))) * len(recording.time))
     own = math.sqrt(fit.values['shear_modulus'] / fit.values['density'] * 6.0 / (
         1.0 + 2.0 * (fit.values['half_thickness'] / fit.values['half_length']) ** 2)
         * 3.0) / fit.values['half_length'] / (2.0 * math.pi)

@@ -12,7 +12,7 @@ from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification import diagnosis
 from hmsa_ros.identification.fit import Fit, fit, LEAST_SCALE, loss, robust_scale
-from hmsa_ros.identification.noise import spread_in_motion, whiteness, widening
+from hmsa_ros.identification.noise import errors_of_stamps, hinted, whiteness, widening
 from hmsa_ros.identification.quantities import (
     check_free,
     DEFAULT_FREE,
@@ -28,7 +28,8 @@ from hmsa_ros.identification.response import complete, respond
 from hmsa_ros.identification.result import Estimate, Identification, Verdict
 from hmsa_ros.identification.start import scan, segments, starts
 
-_95 = 1.959963984540054
+# Of these, each does what an offset of the stamps does.
+_DELAYS = {'sensor_latency', 'coil_time_constant'}
 # Residuals this near to the scatter of their differences are white enough for a first look.
 _NEAR_WHITE = 1.5
 # Neighbours that are both outliers, as a share of all, from which on they may be motion.
@@ -45,7 +46,7 @@ _ENOUGH = 2
 # Times that the errors of the stamps are estimated anew.
 _MOST_SPREADS = 3
 # Probability of residuals to be white below which no chance makes them look like this.
-_CERTAIN = 1e-5
+_CERTAIN = 1e-4
 # Fits within this share of the deviations, or of the scale, are one optimum.
 _SAME = 0.02
 # A run whose fastest motion after a change of level is this much slower than a step's is shaped.
@@ -187,13 +188,13 @@ def _with_errors_of_stamps(recording: Recording, best: Fit, at_rest: bool) -> Fi
     """Return a fit in which samples in motion count less, if errors of the stamps show there."""
     found = best
     for _ in range(_MOST_SPREADS):
-        spread = spread_in_motion(found.residual, found.response.rate)
-        if np.max(spread) == 1.0:
+        spread, _ = errors_of_stamps(found.jacobian, found.residual, found.response.rate)
+        if np.array_equal(spread, found.spread):
             return found
         again = fit(recording, found.values, found.free, at_rest=at_rest, spread=spread)
         # What the model leaves out is larger in motion too, but not from sample to sample.
         if again is None or not again.converged or whiteness(
-                again.root * again.residual, len(again.free)).p_value < _CERTAIN or (
+                again.root * again.residual).p_value < _CERTAIN or (
                 robust_scale(again.residual) > 2.0 * diagnosis.DISTANT * float(
                     np.std(recording.stretch))):
             return found
@@ -239,13 +240,24 @@ def _conclude(
     root = best.root
     weighted = root * best.residual
     counted = float(np.sum(best.weights))
+    freedom = max(counted - len(best.free), 1.0)
     deviation = max(math.sqrt(
-        float(weighted @ weighted) / max(counted - len(best.free), 1.0)), LEAST_SCALE)
-    found = whiteness(weighted, len(best.free))
+        float(weighted @ weighted) / freedom), LEAST_SCALE)
+    found = whiteness(weighted)
     inverse = _inverse(best.information)
-    factors = widening(root[:, None] * best.jacobian, weighted, inverse, found)
+    columns = root[:, None] * best.jacobian
+    correlated = widening(columns, weighted, inverse, found)
+    _, variance = errors_of_stamps(best.jacobian, best.residual, best.response.rate)
+    variance += _blurred(recording, best, deviation, columns, inverse, at_rest)
+    hint = np.zeros(len(best.free))
+    if not recording.earlier and not _DELAYS.intersection(best.free):
+        hint = hinted(root * best.response.rate, columns, weighted, inverse, found)
+    # A hint that becomes a proof rejects the model: it does not make a recording a weak one.
+    held, factors = (
+        correlated * np.sqrt(np.maximum(x / np.diag(inverse) / deviation ** 2, 1.0))
+        for x in (variance, variance + hint))
     covariance = inverse * deviation ** 2 * np.outer(factors, factors)
-    weak = diagnosis.weakness(best, deviation, factors)
+    weak = diagnosis.weakness(best, deviation, held)
     marks = diagnosis.signatures(recording, best, found, at_rest=at_rest)
     reason = diagnosis.misfit(recording, best, found, marks)
     verdict: Verdict = 'model_rejected'
@@ -267,15 +279,38 @@ def _conclude(
             f'{deviation:.3g}')
     lost = set(best.free) if verdict == 'model_rejected' and distant else set(
         weak.names if weak else ())
-    parameters, matrix = _estimates(best, covariance, lost)
+    parameters, matrix = _estimates(best, covariance, freedom, lost)
     outliers = int(np.count_nonzero(best.weights == 0.0))
     warnings = (*recording.notes, *_warnings(
-        recording, best, deviation, factors, outliers, found.white))
+        recording, best, deviation, correlated, outliers, found.white))
     return Identification(
         verdict, reason, warnings, parameters, best.free, matrix, deviation,
         float(np.sqrt(np.mean(best.residual ** 2))), len(recording.time), outliers, recording,
         best.response.stretch, best.residual, best.weights, best.spread, found, marks,
-        float(np.max(factors)), complete(best.values, best.free), at_rest, tried, agreed)
+        float(np.max(correlated)), complete(best.values, best.free), at_rest, tried, agreed)
+
+
+def _stamp_error(best: Fit, deviation: float) -> float:
+    """Return the root mean square error of the stamps in s, as far as one was estimated."""
+    place = int(np.argmax(best.spread))
+    return deviation * math.sqrt(float(best.spread[place]) ** 2 - 1.0) / max(
+        abs(float(best.response.rate[place])), 1e-300)
+
+
+def _blurred(
+        recording: Recording, best: Fit, deviation: float, columns: Array, inverse: Array,
+        at_rest: bool) -> Array:
+    """Return the squares of what the curvature of the motion moves where stamps are off."""
+    error = _stamp_error(best, deviation)
+    nothing: Array = np.zeros(len(best.free))
+    late = {**best.values, 'sensor_latency': best.values['sensor_latency'] + error}
+    after = respond(recording, late, (), at_rest=at_rest) if error else None
+    if after is None:
+        return nothing
+    # In the mean a sample lies half the square of the error times the acceleration off.
+    missed = 0.5 * error * best.values['stretch_gain'] * (best.response.rate - after.rate)
+    moved: Array = inverse @ (columns.T @ (best.root * missed))
+    return moved ** 2
 
 
 def _inverse(information: Array) -> Array:
@@ -288,8 +323,14 @@ def _inverse(information: Array) -> Array:
 
 
 def _estimates(
-        best: Fit, covariance: Array, lost: set[str]) -> tuple[dict[str, Estimate], Array]:
+        best: Fit, covariance: Array, freedom: float, lost: set[str]
+) -> tuple[dict[str, Estimate], Array]:
     """Return all parameters with intervals, and the covariance of the free values in SI."""
+    # Slow to load, and no use to a planner that estimates.
+    from scipy.special import stdtrit
+
+    # The noise is estimated too: Student's interval.
+    quantile = float(stdtrit(freedom, 0.975))
     values = complete(best.values, best.free)
     scales = np.array([derivative(x, values[x]) for x in best.free])
     matrix = covariance * np.outer(scales, scales)
@@ -301,7 +342,7 @@ def _estimates(
                 math.nan, math.nan, math.nan, math.nan, quantity.unit, True)
         elif name in best.free:
             place = best.free.index(name)
-            half = _95 * math.sqrt(covariance[place, place])
+            half = quantile * math.sqrt(covariance[place, place])
             x = to_coordinate(name, value)
             ends = sorted(from_coordinate(name, y) for y in (x - half, x + half))
             if quantity.scale == 'inverse' and x - half <= 1e-9:
@@ -330,12 +371,9 @@ def _warnings(
             f'{outliers} of {len(recording.time)} samples are more than six deviations off and '
             'did not count')
     if np.max(best.spread) > 1.0:
-        place = int(np.argmax(best.spread))
-        error = deviation * math.sqrt(float(best.spread[place]) ** 2 - 1.0) / max(
-            abs(float(best.response.rate[place])), 1e-300)
         found.append(
-            f'the residuals grow with the rate, as with stamps that are off by {error:.2g} s rms: '
-            'samples in motion count less')
+            'the residuals grow with the rate, as with stamps that are off by '
+            f'{_stamp_error(best, deviation):.2g} s rms: samples in motion count less')
     if not white:
         found.append(
             'the residuals are not white: correlation widened the intervals by up to '

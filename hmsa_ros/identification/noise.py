@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from hmsa_ros.core.model import Array
-from hmsa_ros.identification.fit import loss, robust_scale
+from hmsa_ros.identification.fit import LEAST_SCALE, loss, robust_scale, weights_of
 
 # Below this probability residuals are not white.
 _WHITE = 1e-3
@@ -21,9 +21,11 @@ _LAGS = 20
 # A window of this many correlation times (A. Sokal, "Monte Carlo methods in statistical
 # mechanics", 1997).
 _WINDOW = 6.0
-# Deviation at the fastest motion over that at rest, as tried, and the gain of the logarithm of the
-# likelihood that speaks for one.
-_LARGEST_SPREADS, _MUCH_LIKELIER = np.geomspace(0.5, 200.0, 13).tolist(), 4.0
+# Deviation at the fastest motion over that at rest, as tried.
+_LARGEST_SPREADS = np.geomspace(0.5, 200.0, 13)
+# Median of chi-squared with one degree of freedom: by so much the square of a deviation is too
+# large in the median.
+_MEDIAN = 0.455
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +64,7 @@ def autocorrelation(values: Array) -> Array:
     return found / found[0] if found[0] > 0.0 else np.append(1.0, np.zeros(n - 1))
 
 
-def whiteness(residual: Array, free: int) -> Whiteness:
+def whiteness(residual: Array) -> Whiteness:
     """
     Test residuals for correlation.
 
@@ -70,8 +72,6 @@ def whiteness(residual: Array, free: int) -> Whiteness:
     ----------
     residual : ndarray, shape (n,)
         Weighted.
-    free : int
-        Number of parameters that were fitted.
 
     Returns
     -------
@@ -87,7 +87,8 @@ def whiteness(residual: Array, free: int) -> Whiteness:
     lags = max(1, min(_LAGS, n // 5))
     k = np.arange(1, lags + 1)
     q = n * (n + 2.0) * float(np.sum(rho[1:lags + 1] ** 2 / (n - k)))
-    p_value = float(chdtrc(max(lags - min(free, lags // 2), 1), q))
+    # Parameters of a motion, unlike those of a filter of the noise, cost no degrees of freedom.
+    p_value = float(chdtrc(lags, q))
     if p_value > _WHITE:
         return Whiteness(rho, p_value, 0)
     window, time = n // 4, 0.5
@@ -99,38 +100,56 @@ def whiteness(residual: Array, free: int) -> Whiteness:
     return Whiteness(rho, p_value, max(window, 1))
 
 
-def spread_in_motion(residual: Array, rate: Array) -> Array:
+def errors_of_stamps(jacobian: Array, residual: Array, rate: Array) -> tuple[Array, Array]:
     """
-    Return the deviation of each sample over that of one at rest.
+    Weigh how far off the stamps may be: their errors add to the noise in proportion to the rate.
 
-    Errors of the stamps add to the noise in proportion to the rate. Their size is the likeliest of
-    several, and none unless that is much likelier.
+    Noise at rest and errors of the stamps have a variance each. How likely each ratio of the two
+    is says the restricted likelihood of a linear model (H. D. Patterson and R. Thompson,
+    Biometrika 58 (1971) 545); beforehand, exact stamps are as likely as all errors together.
 
     Parameters
     ----------
+    jacobian : ndarray, shape (n, p)
+        Of a fit, by the coordinates.
     residual : ndarray, shape (n,)
-        Of a fit, few of them outliers.
+        Of the fit, few of them outliers.
     rate : ndarray, shape (n,)
         Of the stretch.
 
     Returns
     -------
-    ndarray, shape (n,)
-        All 1 where nothing speaks for errors of the stamps.
+    spread : ndarray, shape (n,)
+        Deviation of each sample over that of one at rest; all 1 where exact stamps are likelier.
+    variance : ndarray, shape (p,)
+        Of the coordinates, with what is not known of the ratio.
 
     """
     fastest = float(np.max(np.abs(rate), initial=0.0))
-    none: Array = np.ones(len(residual))
-    if fastest == 0.0:
-        return none
-    best, found = -_MUCH_LIKELIER, none
-    reference = _surprise(residual, none)
-    for largest in _LARGEST_SPREADS:
-        spread: Array = np.sqrt(1.0 + (largest * rate / fastest) ** 2)
-        gain = _surprise(residual, spread) - reference
-        if gain < best:
-            best, found = gain, spread
-    return found
+    largest = np.append(0.0, _LARGEST_SPREADS if fastest > 0.0 else [])
+    spreads = np.sqrt(1.0 + np.square(np.outer(largest, rate / max(fastest, 1e-300))))
+    # Outliers are those of the likeliest, or the ratios could not be compared.
+    scaled = residual / min(spreads, key=lambda x: _surprise(residual, x))
+    weights = weights_of(scaled, robust_scale(scaled))
+    size = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-100)
+    freedom = max(float(np.sum(weights)) - jacobian.shape[1], 1.0)
+    logarithms, variances = [], []
+    for spread in spreads:
+        root = np.sqrt(weights) / spread
+        columns, values = root[:, None] * jacobian / size, root * residual
+        matrix = columns.T @ columns
+        matrix += 1e-13 * np.trace(matrix) * np.eye(len(matrix))
+        inverse = np.linalg.inv(matrix)
+        shift = inverse @ (columns.T @ values)
+        rest = max(float(np.sum((values - columns @ shift) ** 2)), freedom * LEAST_SCALE ** 2)
+        logarithms.append(-float(weights @ np.log(spread)) - 0.5 * (
+            float(np.linalg.slogdet(matrix)[1]) + freedom * math.log(rest)))
+        variances.append((rest / freedom * np.diag(inverse) + shift ** 2) / size ** 2)
+    share = np.exp(np.array(logarithms) - max(logarithms))
+    share[1:] /= max(len(share) - 1, 1)
+    share /= np.sum(share)
+    place = 0 if share[0] >= 0.5 else 1 + int(np.argmax(share[1:]))
+    return spreads[place], share @ np.array(variances)
 
 
 def _surprise(residual: Array, spread: Array) -> float:
@@ -175,6 +194,40 @@ def widening(jacobian: Array, residual: Array, inverse: Array, found: Whiteness)
     largest = np.maximum(np.maximum(by_noise, by_score), plain)
     factors: Array = np.sqrt(largest / np.maximum(plain, 1e-300))
     return factors
+
+
+def hinted(
+        column: Array, jacobian: Array, residual: Array, inverse: Array, found: Whiteness
+) -> Array:
+    """
+    Return the variance by what the residuals hint at, though too little to prove it.
+
+    An effect outside the model moves the estimates. How far it would is known from the residuals,
+    as far as it shows there; the interval is widened to hold the estimates with and without it.
+
+    Parameters
+    ----------
+    column : ndarray, shape (n,)
+        Effect on the samples, weighted.
+    jacobian, residual, inverse, found
+        As for `widening`.
+
+    Returns
+    -------
+    ndarray, shape (p,)
+        To be added to the variances of the coordinates.
+
+    """
+    moved = inverse @ (jacobian.T @ column)
+    rest = column - jacobian @ moved
+    norm = float(rest @ rest)
+    if norm <= 1e-9 * float(column @ column):
+        return np.zeros(len(moved))
+    size = float(rest @ residual) / norm
+    variance = float(residual @ residual) / max(len(residual) - len(moved), 1) / norm
+    square = size ** 2 - _MEDIAN * variance * inflation(rest, found) ** 2
+    added: Array = moved ** 2 * max(square, 0.0)
+    return added
 
 
 def _sum_of_lags(columns: Array, weights: Array) -> Array:

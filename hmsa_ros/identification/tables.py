@@ -16,6 +16,8 @@ _MOST_LEFT_OUT = 0.2
 # A jump of the stamps this many intervals long is said; a level for nearly every sample is a
 # measured field.
 _GAP = 20.0
+# As many rows in order on either side of a jump back by so many intervals are a clock set back.
+_RUN, _OVERTAKEN = 10, 3.0
 _MEASURED_FIELD = 0.3
 _FEW_LEVELS = 8
 # More unknown times of switches than this take too long.
@@ -122,37 +124,55 @@ def read_csv(
         tuple(notes))
 
 
-def _kept(path: Path, table: Table, notes: list[str]) -> NDArray[np.bool_]:
-    """Return which rows can be used, and note the others; refuse a file with too many."""
+def _kept(path: Path, table: Table, notes: list[str]) -> NDArray[np.int64]:
+    """Return the rows that can be used, by time, and note the others; refuse too many of them."""
     time, stretch = table.columns['time'], table.columns['stretch']
-    keep: NDArray[np.bool_] = np.isfinite(time) & np.isfinite(stretch)
-    lost = int(np.count_nonzero(~keep))
+    places: NDArray[np.int64] = np.flatnonzero(np.isfinite(time) & np.isfinite(stretch))
+    lost = len(time) - len(places)
     if lost:
         notes.append(f'{lost} rows without a number were left out')
-    places = np.flatnonzero(keep)
+    places = _ordered(path, table, places, notes)
     steps = np.diff(time[places])
-    back = np.flatnonzero(steps < 0.0)
-    if len(back):
-        i, j = places[back[0]], places[back[0] + 1]
+    double = int(np.count_nonzero(steps == 0.0))
+    if double:
+        places = places[np.append(True, steps > 0.0)]
+        notes.append(f'{double} rows with the stamp of the row before were left out')
+    if lost + double > _MOST_LEFT_OUT * len(time):
         raise BadInputError(
-            f'{path} line {table.lines[j]} jumps back in time from {time[i]:.9g} to '
-            f'{time[j]:.9g} s, {len(back)} times in all: expected increasing times of one clock; '
-            'sort the rows by time, or cut the file where the clock was set')
-    double = places[1:][steps == 0.0]
-    if len(double):
-        keep[double] = False
-        notes.append(f'{len(double)} rows with the stamp of the row before were left out')
-    left_out = lost + len(double)
-    if left_out > _MOST_LEFT_OUT * len(time):
-        raise BadInputError(
-            f'{path} has {left_out} of {len(time)} rows without a number or with the stamp of '
-            'the row before: expected a stamp of its own for each sample')
+            f'{path} has {lost + double} of {len(time)} rows without a number or with the stamp '
+            'of the row before: expected a stamp of its own for each sample')
     steps = steps[steps > 0.0]
     if len(steps) and float(np.max(steps)) > _GAP * float(np.median(steps)):
         notes.append(
             f'the stamps have a gap of {np.max(steps):.3g} s, where the others are '
             f'{np.median(steps):.3g} s apart')
-    return keep
+    return places
+
+
+def _ordered(
+        path: Path, table: Table, places: NDArray[np.int64], notes: list[str]
+) -> NDArray[np.int64]:
+    """Return rows sorted by time, as points of a figure need; refuse a clock that was set back."""
+    time = table.columns['time'][places]
+    steps = np.diff(time)
+    back = np.flatnonzero(steps < 0.0)
+    if not len(back):
+        return places
+    # Samples in order before and after, and more than frames that overtook each other.
+    runs = np.diff(np.concatenate([[0], back + 1, [len(time)]]))
+    usual = float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else math.inf
+    clock = back[(np.minimum(runs[:-1], runs[1:]) >= _RUN) & (-steps[back] > _OVERTAKEN * usual)]
+    if len(clock):
+        i, j = places[clock[0]], places[clock[0] + 1]
+        raise BadInputError(
+            f'{path} line {table.lines[j]} jumps back in time from '
+            f'{table.columns["time"][i]:.9g} to {table.columns["time"][j]:.9g} s, between '
+            'rows that are in order: expected increasing times of one clock; cut the '
+            'file where the clock was set, or, if these are points in any order, sort the rows '
+            'by time')
+    notes.append(f'the rows were not in the order of time ({len(back)} jumps back): sorted')
+    order: NDArray[np.int64] = np.argsort(time, kind='stable')
+    return places[order]
 
 
 def _check_units(
