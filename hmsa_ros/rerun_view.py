@@ -27,7 +27,7 @@ MARKERS = tuple(
 TIMELINE = 'message_log_time'
 
 # As visualization_msgs has them; the messages themselves need a ROS installation.
-_ARROW, _CUBE, _TEXT = 0, 1, 9
+_ARROW, _CUBE, _TEXT, _TRIANGLES = 0, 1, 9, 11
 _ADD, _DELETE, _DELETE_ALL = 0, 2, 3
 
 
@@ -147,6 +147,11 @@ def _log_marker(recording: Any, root: str, marker: Any) -> None:
             origins=[[start.x, start.y, start.z]],
             vectors=[[end.x - start.x, end.y - start.y, end.z - start.z]],
             radii=[marker.scale.x / 2], colors=[colour]))
+    elif marker.type == _TRIANGLES:
+        recording.log(path, rr.Mesh3D(
+            vertex_positions=[
+                [position.x + p.x, position.y + p.y, position.z + p.z] for p in marker.points],
+            albedo_factor=colour))
     elif marker.type == _TEXT:
         recording.log(path, rr.Points3D(
             [[position.x, position.y, position.z]], radii=[0.0], labels=[marker.text],

@@ -78,7 +78,7 @@ def test_too_much_damping_falls_back_to_the_plain_step_and_says_so(capsys):
     (['plan', '1.1,1.2:10'], 'expected STRETCH:SPAN'),
     (['send', 'x'], 'expected STRETCH:SPAN'),
     (['send', '1.1,:1'], 'expected STRETCH:SPAN'),
-    (['send', '1.1,-1:1'], 'greater than 0'),
+    (['send', '1.1,nan:1'], 'stretch is nan'),
     (['send', '1.1:1', '--timeout', '0'], 'timeout is 0'),
     (['send', '1.1:1', '--namespace', '9 bad'], "namespace '9 bad': Invalid namespace"),
     (['nonsense'], 'invalid choice'),

@@ -4,9 +4,12 @@ from itertools import pairwise
 import math
 
 from hypothesis import given, strategies
+import numpy as np
 import pytest
 from visualization_msgs.msg import Marker, MarkerArray
 
+from hmsa_ros.contract import parameters as contract
+from hmsa_ros.contract.actuator import actuator_from
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import interface
@@ -233,3 +236,28 @@ def test_rate_zero_shows_nothing(ros, serve):
         interface.JOINT_STATES.type, 'joint_states', interface.JOINT_STATES.qos)
     ros.spin_until(lambda: len(states) > 300, 'time to run')
     assert not arrays
+
+
+@pytest.mark.parametrize('deflection', [0.0, 0.4, -0.7])
+def test_a_bent_beam_is_closed_keeps_its_volume_and_ends_where_its_tip_is(deflection):
+    beam = actuator_from({x.name: x.default for x in contract.BLOCK} | {
+        'law': 'beam', 'law.youngs_modulus': 1e6, 'law.width': 0.005,
+        'actuator.half_length': 0.0125, 'actuator.half_thickness': 0.0005})
+    markers = Scene((Block.of('actuator', beam),), 'coil').states(0, [State(deflection, 0.001)])
+    body = of(markers, BLOCK)
+    assert body.type == Marker.TRIANGLE_LIST
+    points = np.array([(p.x, p.y, p.z) for p in body.points])
+    triangles = points.reshape(-1, 3, 3)
+    edges = [(tuple(a), tuple(b)) for t in triangles.tolist()
+             for a, b in zip(t, t[1:] + t[:1], strict=True)]
+    # Each edge is passed once in both directions: nothing is open, all faces look outwards.
+    assert sorted(edges) == sorted((b, a) for a, b in edges)
+    volume = np.linalg.det(triangles).sum() / 6.0
+    assert volume == pytest.approx(0.025 * 0.005 * 0.001, rel=0.02)
+    tip = points[points[:, 0] == points[:, 0].max()] if not deflection else points
+    assert np.abs(tip[:, 2]).max() == pytest.approx(abs(deflection) * 0.025, abs=0.0006)
+    arrow = of(markers, MAGNETISATION)
+    begin, end = arrow.points
+    assert math.hypot(end.x - begin.x, end.z - begin.z) == pytest.approx(0.0125)
+    assert length(of(markers, FIELD)) > 0.0
+    assert of(Scene((Block.of('actuator', beam),), 'coil').targets(0, [0.1]), TARGET).points

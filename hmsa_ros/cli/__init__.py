@@ -10,6 +10,7 @@ import argparse
 from collections.abc import Sequence
 from importlib import import_module
 import os
+import re
 import sys
 from typing import Any, NoReturn
 
@@ -40,6 +41,8 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, **settings: Any) -> None:
         """Take argparse's settings."""
         super().__init__(**{'formatter_class': _Help, **settings})
+        # A setpoint such as -0.2:1 is no option.
+        self._negative_number_matcher = re.compile(r'-\.?\d')
 
     def error(self, message: str) -> NoReturn:
         """Print one line on standard error and exit with status 2."""

@@ -1,8 +1,8 @@
 """``hmsa init``: a parameter file for one's own actuator, with what follows from it."""
 
 import argparse
-from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
 import json
 import math
 from pathlib import Path
@@ -10,11 +10,13 @@ import sys
 from typing import Any, cast, TYPE_CHECKING
 
 from hmsa_ros.cli.quantities import (
+    BEAM,
     BY_KEY,
     DAMPING,
     default_of,
     joint_names,
     NEEDED,
+    NEEDED_OF_BEAM,
     QUANTITIES,
     Quantity,
 )
@@ -27,10 +29,15 @@ if TYPE_CHECKING:
     from hmsa_ros.core.scales import Coil, Scales
 
 _JOINT = 'actuator'
+# In place of which the damping coefficient may be given.
+_DAMPED = ('zeta', 'damping_ratio')
 _FILE = Path('actuator.yaml')
 _FOLLOWS = {'half_thickness': 'as --half-length', 'flux_min': 'minus --flux-max'}
 # What differs much from one elastomer to another, and no data sheet gives.
-_GUESSES = ('zeta', 'j_lim')
+_GUESSES = ('zeta', 'j_lim', 'damping_ratio')
+# Deflection under its own weight, over the length, from which on a beam must not lie.
+_SAG = 0.02
+_GRAVITY = 9.81
 # The coil's reach that is hardly a motion.
 _HARDLY = 0.01
 
@@ -46,15 +53,26 @@ def add_parser(subparsers: Any) -> None:
         epilog='example: hmsa init --half-length 5mm --half-thickness 5mm --density 1.9g/cm3 \\\n'
                '    --shear-modulus 30kPa --j-lim 20 --zeta 0.1 --remanence 80mT \\\n'
                '    --flux-max 200mT --out my_actuator.yaml')
+    parser.add_argument(
+        '--beam', action='store_true',
+        help='a beam, clamped at one end and free at the other, magnetised along its length, in a '
+             'field across it; its setpoints are deflections of the tip over the length')
     for quantity in QUANTITIES:
         unit = f' [{quantity.unit}]' if quantity.unit else ''
         default = _FOLLOWS.get(quantity.key) or f'{quantity.default:g}'
         parser.add_argument(
             quantity.option, type=_reader(quantity), metavar='X', dest=quantity.key,
             help=f'{quantity.text}{unit} (default {default})')
+    for quantity in BEAM:
+        if quantity.key not in BY_KEY:
+            unit = f' [{quantity.unit}]' if quantity.unit else ''
+            parser.add_argument(
+                quantity.option, type=_reader(quantity), metavar='X', dest=quantity.key,
+                help=f'{quantity.text}{unit} (default {quantity.default:g}), with --beam')
     parser.add_argument(
         DAMPING.option, type=_reader(DAMPING), metavar='X', dest=DAMPING.key,
-        help=f'{DAMPING.text} [{DAMPING.unit}], in place of --zeta')
+        help=f'{DAMPING.text} [{DAMPING.unit}], in place of --zeta; with --beam of its tip, in '
+             'place of --damping-ratio')
     parser.add_argument(
         '--joint', default='', metavar='NAME',
         help=f'joint name (default {_JOINT}), or several separated by commas for identical '
@@ -96,26 +114,25 @@ def run(arguments: argparse.Namespace) -> int:
     if not path.resolve().parent.is_dir():
         raise BadInputError(
             f'cannot write {path}: {path.parent} is no folder; expected one that exists (--out)')
-    if arguments.zeta is not None and arguments.damping is not None:
-        raise BadInputError('both --zeta and --damping are given: expected one of them')
-    given = {key: getattr(arguments, key) for key in (*BY_KEY, DAMPING.key)
-             if getattr(arguments, key) is not None}
+    asked = BEAM if arguments.beam else QUANTITIES
+    given = _given(arguments, asked)
     joints = joint_names(arguments.joint)
-    missing = [key for key in NEEDED
-               if key not in given and not (key == 'zeta' and DAMPING.key in given)]
+    missing = [key for key in (NEEDED_OF_BEAM if arguments.beam else NEEDED)
+               if key not in given and not (key in _DAMPED and DAMPING.key in given)]
+    by_key = {x.key: x for x in asked}
     if missing and not arguments.yes:
         if not sys.stdin.isatty():
             raise BadInputError(
                 'standard input is not a terminal, and '
-                f'{", ".join(BY_KEY[x].option for x in missing)} '
+                f'{", ".join(by_key[x].option for x in missing)} '
                 f'{"is" if len(missing) == 1 else "are"} not given: give them, or add --yes for '
                 'the defaults')
-        given, joints = _ask(given, joints)
+        given, joints = _ask(asked, given, joints)
     guessed = [key for key in _GUESSES if key in missing and arguments.yes]
-    for key, quantity in BY_KEY.items():
-        if key not in given and not (key == 'zeta' and DAMPING.key in given):
+    for key, quantity in by_key.items():
+        if key not in given and not (key in _DAMPED and DAMPING.key in given):
             given[key] = default_of(quantity, given)
-    actuator, coil = _records(given)
+    actuator, coil = _beam(given) if arguments.beam else _block(given)
 
     from hmsa_ros.core.scales import scales
 
@@ -123,7 +140,7 @@ def run(arguments: argparse.Namespace) -> int:
     doubts = _doubts(given, found)
     if guessed:
         doubts.append(
-            f'{" and ".join(f"{BY_KEY[x].words} {given[x]:g}" for x in guessed)} '
+            f'{" and ".join(f"{by_key[x].words} {given[x]:g}" for x in guessed)} '
             f'{"is a guess" if len(guessed) == 1 else "are guesses"}: a plan is only as exact '
             'as its parameters; measure them and pass the values')
     joints = joints or [_JOINT]
@@ -137,7 +154,7 @@ def run(arguments: argparse.Namespace) -> int:
                        for key, x in asdict(found).items()},
             'warnings': doubts}, indent=2))
         return 0
-    for line in table(found):
+    for line in table(found, actuator):
         print(line)
     print(f'\n{path} written; to use it:')
     for node in ('plant', 'planner'):
@@ -145,23 +162,48 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _given(arguments: argparse.Namespace, asked: Sequence[Quantity]) -> dict[str, float]:
+    """Return the values of the options, checked against each other."""
+    given = {x.key: value for x in (*QUANTITIES, *BEAM, DAMPING)
+             if (value := getattr(arguments, x.key)) is not None}
+    for key in _DAMPED:
+        if key in given and DAMPING.key in given:
+            raise BadInputError(
+                f'both --{key.replace("_", "-")} and --damping are given: expected one of them')
+    if arguments.beam and 'shear_modulus' in given:
+        if 'youngs_modulus' in given:
+            raise BadInputError(
+                'both --shear-modulus and --youngs-modulus are given: expected one of them, '
+                'since E is 3 G')
+        given['youngs_modulus'] = 3.0 * given.pop('shear_modulus')
+    others = given.keys() - {x.key for x in asked} - {DAMPING.key}
+    if others:
+        raise BadInputError(
+            f'{", ".join(sorted("--" + x.replace("_", "-") for x in others))} is given: expected '
+            + ('sizes of a beam, --length, --thickness and --width, and no --zeta or --j-lim'
+               if arguments.beam else '--beam with it'))
+    return given
+
+
 def _ask(
-        given: Mapping[str, float], joints: list[str]) -> tuple[dict[str, float], list[str]]:
+        asked: Sequence[Quantity], given: Mapping[str, float],
+        joints: list[str]) -> tuple[dict[str, float], list[str]]:
     """Ask for what is not given."""
     answers = dict(given)
     print(
         'Numbers are in the unit shown unless another unit follows: 10 mm, 50 kPa. Press Enter '
         'for the value in brackets.', file=sys.stderr)
-    for quantity in QUANTITIES:
+    for quantity in asked:
         key = quantity.key
-        if key in answers or (key == 'zeta' and DAMPING.key in answers):
+        if key in answers or (key in _DAMPED and DAMPING.key in answers):
             continue
         default = default_of(quantity, answers)
         while True:
-            words = quantity.text + (', or c in N s/m with its unit' if key == 'zeta' else '')
+            words = quantity.text + (
+                ', or c in N s/m with its unit' if key in _DAMPED else '')
             text = _answer(f'{words} [{quantity.show(default)}]: ')
             try:
-                if key == 'zeta' and text.replace(' ', '').endswith('Ns/m'):
+                if key in _DAMPED and text.replace(' ', '').endswith('Ns/m'):
                     answers[DAMPING.key] = DAMPING.parse(text)
                     break
                 value = quantity.parse(text) if text else default
@@ -195,7 +237,27 @@ def _answer(question: str) -> str:
     return line.strip()
 
 
-def _records(given: Mapping[str, float]) -> 'tuple[ActuatorParameters, Coil]':
+def _beam(given: Mapping[str, float]) -> 'tuple[ActuatorParameters, Coil]':
+    """Return the beam and its coil."""
+    from hmsa_ros.contract.actuator import actuator_from
+    from hmsa_ros.contract.parameters import BLOCK
+    from hmsa_ros.core.model import critical_zeta
+    from hmsa_ros.core.scales import Coil
+
+    beam = actuator_from({x.name: x.default for x in BLOCK} | {
+        'law': 'beam', 'actuator.damping_coefficient': 0.0} | {
+        x.parameter: given[x.key] * (0.5 if x.parameter.startswith('actuator.half_') else 1.0)
+        for x in BEAM if x.parameter and not x.parameter.startswith(('flux', 'slew'))})
+    damping = given.get(DAMPING.key)
+    if damping is None:
+        damping = given['damping_ratio'] * beam.damping_unit * float(
+            critical_zeta(beam.rest, beam.nondimensional))
+    return (
+        replace(beam, damping_coefficient=damping),
+        Coil(given['flux_min'], given['flux_max'], given['slew_limit']))
+
+
+def _block(given: Mapping[str, float]) -> 'tuple[ActuatorParameters, Coil]':
     """Return the block and its coil."""
     from hmsa_ros.core.creep import Creep
     from hmsa_ros.core.parameters import ActuatorParameters
@@ -216,16 +278,29 @@ def _records(given: Mapping[str, float]) -> 'tuple[ActuatorParameters, Coil]':
 
 def _doubts(given: Mapping[str, float], found: 'Scales') -> list[str]:
     """Return what is implausible, a sentence each."""
-    values = {**given, 'zeta': found.zeta}
-    doubts = [x for quantity in QUANTITIES if (x := quantity.doubt(values[quantity.key]))]
+    beam = 'length' in given
+    values = {**given, 'zeta': found.zeta, 'damping_ratio': found.zeta / found.critical_zeta}
+    doubts = [x for quantity in (BEAM if beam else QUANTITIES)
+              if (x := quantity.doubt(values[quantity.key]))]
     if found.zeta >= found.critical_zeta:
         doubts.append(
             f'zeta {found.zeta:g} is above the critical {found.critical_zeta:g}: small motion '
             'about rest does not oscillate, and there is no two-step command for it')
-    if max(abs(x - 1.0) for x in found.held) < _HARDLY:
+    if found.held[1] - found.held[0] < 2.0 * _HARDLY:
+        what = 'deflection of 0.1' if beam else 'stretch of 1.1 or 0.9'
         doubts.append(
-            f'the coil only reaches stretches from {found.held[0]:.6g} to {found.held[1]:.6g}: '
-            f'a stretch of 1.1 or 0.9 needs about {0.3 * found.flux_density_unit:.3g} T')
+            f'the coil only reaches {"deflections" if beam else "stretches"} from '
+            f'{found.held[0]:.6g} to {found.held[1]:.6g}: a {what} needs about '
+            f'{0.3 * found.flux_density_unit:.3g} T')
+    if beam:
+        # q L^4/(8 E I) of an even load, over L.
+        sag = 1.5 * given['density'] * _GRAVITY * given['length'] ** 3 / (
+            given['youngs_modulus'] * given['thickness'] ** 2)
+        if sag > _SAG:
+            doubts.append(
+                f'lying, the beam sags by {sag:.2g} of its length under its own weight, which the '
+                'model does not know: clamp it so that it bends in a horizontal plane')
+        return doubts
     ratio = given['half_thickness'] / given['half_length']
     if not 0.05 <= ratio <= 20.0:
         doubts.append(
@@ -234,21 +309,23 @@ def _doubts(given: Mapping[str, float], found: 'Scales') -> list[str]:
     return doubts
 
 
-def table(found: 'Scales') -> list[str]:
+def table(found: 'Scales', actuator: 'ActuatorParameters') -> list[str]:
     """Return what follows from the parameters, aligned, a line each."""
+    beam = actuator.rest == 0.0
+    words = 'deflections' if beam else 'stretches'
     rows = [
-        ('time unit L sqrt(rho/G)', _time(found.time_unit)),
+        ('time unit' if beam else 'time unit L sqrt(rho/G)', _time(found.time_unit)),
         ('natural frequency at rest', f'{found.frequency:.5g} Hz'),
         ('damping', f'{found.damping:.4g} N s/m, zeta {found.zeta:.4g}'),
         ('critical damping at rest',
          f'{found.critical_damping:.4g} N s/m, zeta {found.critical_zeta:.4g}'),
-        ('limiting stretches', '{:.4f} and {:.4f}'.format(*found.stretch_limits)),
-        ('shape c1', f'{found.c1:.4g}'),
+        (f'limiting {words}', '{:.4f} and {:.4f}'.format(*found.stretch_limits)),
+        *([] if beam else [('shape c1', f'{found.c1:.4g}')]),
         *((f'flux density for {stretch:.6g}', f'{1e3 * flux:.4g} mT')
           for stretch, flux in found.flux_densities),
-        ('coil holds stretches', _range(found.held)),
+        (f'coil holds {words}', _range(found.held)),
         ('two steps reach from rest',
-         'nothing' if found.reached == (1.0, 1.0) else _range(found.reached)),
+         'nothing' if found.reached == (actuator.rest,) * 2 else _range(found.reached)),
         ('a move from rest', 'none in two steps' if math.isnan(found.duration)
          else f'{_time(found.duration)} to {found.target:.6g}'),
     ]
@@ -276,9 +353,15 @@ def file_text(
         f'#   hmsa plant --ros-args --params-file {path.name}',
         f'#   hmsa planner --ros-args --params-file {path.name}',
         '#', '# What follows from them (computed by hmsa init when it wrote this file):',
-        *(f'#   {line}' for line in table(found)),
+        *(f'#   {line}' for line in table(found, actuator)),
         '/**:', '  ros__parameters:']
     texts = {x.parameter: (x.text, x.unit) for x in (*QUANTITIES, DAMPING)}
+    if not actuator.rest:
+        texts |= {
+            x.parameter: (('half of the ' if 'half_' in x.parameter else '') + x.text, x.unit)
+            for x in BEAM} | {
+            'law': ('a beam: positions are deflections of the tip over the length', ''),
+            DAMPING.parameter: ('damping coefficient of the tip', DAMPING.unit)}
     for name, value in _parameters(actuator, coil).items():
         text, unit = texts[name]
         lines += [f'    # {text[0].upper()}{text[1:]}{f" [{unit}]" if unit else ""}.',
@@ -312,15 +395,21 @@ def _sampling(actuator: 'ActuatorParameters') -> list[str]:
         f'    publish_rate: {_number(rate)}']
 
 
-def _parameters(actuator: 'ActuatorParameters', coil: 'Coil') -> dict[str, float]:
+def _parameters(actuator: 'ActuatorParameters', coil: 'Coil') -> dict[str, Any]:
     """Return the nodes' parameters by name."""
-    return {
-        **{f'actuator.{name}': value for name, value in actuator.numbers.items()},
-        **asdict(coil)}
+    from hmsa_ros.contract.actuator import parameters_of
+
+    values = parameters_of(actuator)
+    if not actuator.rest:
+        # They follow from the others, or have no effect.
+        del values['actuator.shear_modulus'], values['actuator.chain_limit']
+    return {**values, **asdict(coil)}
 
 
-def _number(value: float) -> str:
-    """Return a number that every reader of YAML takes for a float."""
+def _number(value: float | str) -> str:
+    """Return a number that every reader of YAML takes for a float, or a word as it is."""
+    if isinstance(value, str):
+        return value
     text = repr(float(value))
     mantissa, letter, exponent = text.partition('e')
     return f'{mantissa}.0e{exponent}' if letter and '.' not in mantissa else text

@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.setpoints import setpoint
+from hmsa_ros.core.setpoint import impossible
 from hmsa_ros.errors import BadInputError
 
 if TYPE_CHECKING:
     from hmsa_ros.core.mismatch import Uncertainty
+    from hmsa_ros.core.moves import State
     from hmsa_ros.core.sequence import Segment
 
 
@@ -29,8 +31,8 @@ def add_parser(subparsers: Any) -> None:
         'setpoints', nargs='+', type=setpoint, metavar='STRETCH:SPAN',
         help='stretch to come to rest at, and how long this setpoint lasts (move plus hold)')
     parser.add_argument(
-        '--start', type=float, default=1.0, metavar='S',
-        help='initial stretch, at rest (default 1)')
+        '--start', type=float, metavar='S',
+        help='initial stretch, at rest (default 1; 0 for the deflection of a beam)')
     parser.add_argument(
         '--zeta', type=float, metavar='Z',
         help='nondimensional damping coefficient, at least 0 (default 0.2)')
@@ -68,7 +70,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Plan and print."""
     if arguments.params_file is not None:
         return _run_si(arguments)
-    from hmsa_ros.core.moves import State
     from hmsa_ros.core.parameters import NondimensionalParameters
     from hmsa_ros.core.sequence import plan_sequence
     from hmsa_ros.core.setpoint import Setpoint
@@ -77,9 +78,9 @@ def run(arguments: argparse.Namespace) -> int:
     given = {name: value for name in ('zeta', 'j_lim', 'c1')
              if (value := getattr(arguments, name)) is not None}
     segments = plan_sequence(
-        [Setpoint(*x) for x in arguments.setpoints], NondimensionalParameters(**given),
-        start=State(arguments.start), shaper=arguments.shaper or 'two_step',
-        order=arguments.order, errors=_errors(arguments),
+        [Setpoint(*x) for x in _possible(arguments.setpoints, 1.0)],
+        NondimensionalParameters(**given), start=_start(arguments, 1.0),
+        shaper=arguments.shaper or 'two_step', order=arguments.order, errors=_errors(arguments),
         pace=Pace(arguments.periods, arguments.max_rate))
     rows = [_row(segment) for segment in segments]
     if arguments.json:
@@ -98,7 +99,6 @@ def _run_si(arguments: argparse.Namespace) -> int:
     from hmsa_ros.contract.parameters import CREEP_TOLERANCE, PLANNED, VISCOELASTIC
     from hmsa_ros.contract.topics import PLANNER
     from hmsa_ros.core.delivery import IDEAL
-    from hmsa_ros.core.moves import State
     from hmsa_ros.core.sequence import plan_sequence
     from hmsa_ros.core.setpoint import Setpoint
     from hmsa_ros.core.shapers.pace import Pace
@@ -116,10 +116,12 @@ def _run_si(arguments: argparse.Namespace) -> int:
         (*PLANNED, *VISCOELASTIC, replace(CREEP_TOLERANCE, default=IDEAL.ripple))))
     time, load = model.units.time, model.units.load
     segments = plan_sequence(
-        [Setpoint(stretch, span / time) for stretch, span in arguments.setpoints],
-        model.material, start=State(arguments.start), shaper=arguments.shaper or 'two_step',
-        limits=model.limits, delivery=model.delivery, units=model.units, order=arguments.order,
-        errors=_errors(arguments), pace=Pace(arguments.periods, arguments.max_rate * time))
+        [Setpoint(stretch, span / time)
+         for stretch, span in _possible(arguments.setpoints, model.material.rest)],
+        model.material, start=_start(arguments, model.material.rest),
+        shaper=arguments.shaper or 'two_step', limits=model.limits, delivery=model.delivery,
+        units=model.units, order=arguments.order, errors=_errors(arguments),
+        pace=Pace(arguments.periods, arguments.max_rate * time))
     rows = [_si_row(x, time, load) for x in segments]
     group = model.material
     if arguments.json:
@@ -133,6 +135,21 @@ def _run_si(arguments: argparse.Namespace) -> int:
             f'time unit {time:.6g} s')
         _print_reasons(segments)
     return 0
+
+
+def _possible(setpoints: Sequence[tuple[float, float]], rest: float) -> list[tuple[float, float]]:
+    """Return setpoints after checking that an actuator with a rest there may have them."""
+    for stretch, _ in setpoints:
+        if reason := impossible(stretch, rest):
+            raise BadInputError(reason)
+    return list(setpoints)
+
+
+def _start(arguments: argparse.Namespace, rest: float) -> 'State':
+    """Return the state at the start, unless given at rest without a field."""
+    from hmsa_ros.core.moves import State
+
+    return State(rest if arguments.start is None else arguments.start)
 
 
 def _errors(arguments: argparse.Namespace) -> 'Uncertainty':

@@ -5,7 +5,7 @@ Nothing slow is imported here, since the options of the command line are made of
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 import re
 
@@ -195,11 +195,38 @@ QUANTITIES: tuple[Quantity, ...] = (
         (0.0, math.inf), ''),
 )
 BY_KEY: Mapping[str, Quantity] = {x.key: x for x in QUANTITIES}
+_STRIPS = f'from printed strips to fingers in {_REVIEW}'
+#: Of a beam: sizes are whole ones.
+BEAM: tuple[Quantity, ...] = (
+    Quantity(
+        'length', 'actuator.half_length', 'free length of the beam, from clamp to tip', 'm', 0.025,
+        1e-9, 1e3, (1e-4, 0.2), _STRIPS, ((0.5, 1e3, 'did you mean mm?'),)),
+    Quantity(
+        'thickness', 'actuator.half_thickness', 'thickness of the section, along the field', 'm',
+        0.001, 1e-9, 1e3, (1e-5, 0.02), _STRIPS, ((0.1, 1e3, 'did you mean mm?'),)),
+    Quantity(
+        'width', 'law.width', 'width of the section, across the field', 'm', 0.005, 1e-9, 1e3,
+        (1e-5, 0.1), _STRIPS, ((0.5, 1e3, 'did you mean mm?'),)),
+    Quantity(
+        'youngs_modulus', 'law.youngs_modulus', "Young's modulus E, 3 G of an elastomer", 'Pa',
+        1e6, 1e-3, 1e12, (3e3, 1e7), f'from silicone gels to filled rubber; 909 kPa in {_ZHAO}',
+        ((1e9, 1e12, 'that is a hard plastic or a metal'), (0.0, 3e3, 'did you mean kPa?'))),
+    BY_KEY['density'],
+    replace(
+        BY_KEY['remanence'], text='residual flux density Br along the length'),
+    Quantity(
+        'damping_ratio', '', 'damping ratio about rest, as the ringing shows it', '', 0.05, 0.0,
+        1e3, (0.005, 0.9), 'of silicone strips in air'),
+    *(BY_KEY[x] for x in ('flux_max', 'flux_min', 'slew_limit')),
+)
 #: In place of zeta.
 DAMPING = Quantity.of(
     'damping', _BLOCK['damping_coefficient'], 'damping coefficient c', (0.0, math.inf), '',
     follows=True)
 #: What only the user can know: given, or entered, or left to --yes.
+NEEDED_OF_BEAM = (
+    'length', 'thickness', 'width', 'youngs_modulus', 'density', 'remanence', 'damping_ratio',
+    'flux_max')
 NEEDED = ('half_length', 'half_thickness', 'shear_modulus', 'density', 'remanence', 'j_lim',
           'zeta', 'flux_max')
 

@@ -195,7 +195,9 @@ JOINT = ParameterSpec(
     'joint', 'actuator', 'Name of the joint in trajectories and joint states.')
 
 INITIAL_STRETCH = ParameterSpec(
-    'initial_stretch', 1.0, 'Stretch at rest before the first command.', '', 1e-3, 1e3)
+    'initial_stretch', 1.0,
+    'Stretch at rest before the first command; the deflection of a beam, 0 unless given.', '',
+    -1.0, 1e3)
 
 SLEW_LIMIT = ParameterSpec(
     'slew_limit', 0.0,

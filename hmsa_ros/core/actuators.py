@@ -41,10 +41,11 @@ def check_stretch(stretch: float, material: Material, name: str = 'stretch') -> 
     lower, upper = stretch_limits(material)
     if not lower < stretch < upper:
         elastic = getattr(material, 'law', None)
+        coordinate = getattr(material, 'coordinate', 'stretch')
         whose = f'J_lim {getattr(material, "j_lim", material):g}' if elastic is None \
             else f'law {elastic.law}'
         raise BadInputError(
-            f'{name} is {stretch:g}: expected a stretch between the limits {lower:.4f} and '
+            f'{name} is {stretch:g}: expected a {coordinate} between the limits {lower:.4f} and '
             f'{upper:.4f} of {whose}')
 
 
@@ -128,9 +129,8 @@ class Setup:
 
     @property
     def load_per_newton(self) -> float:
-        """Load of a force of 1 N: work over both faces against G times the volume."""
-        block = self.actuator
-        return 1.0 / (4.0 * block.half_length ** 2 * block.shear_modulus)
+        """Load of a force of 1 N."""
+        return self.actuator.load_per_newton
 
     def check_level(self, flux_density: float) -> None:
         """

@@ -23,7 +23,7 @@ from hmsa_ros.core.kernels import (
     RESOLVED,
     STUCK,
 )
-from hmsa_ros.core.law import acceleration, elastic_force, natural_frequency
+from hmsa_ros.core.law import acceleration, at_rest, elastic_force, natural_frequency
 from hmsa_ros.core.laws.record import ANY
 
 #: Columns of a branch: gamma, 1/tau and w.
@@ -110,7 +110,8 @@ def _follow_one(k, state, beta, slope, excess, decay, duration, material, branch
             return DONE
         span = min(h, left)
         frequency = stiff * natural_frequency(x[0], material)
-        if attainable(0.0, x[0], x[1], frequency) > RESOLVED and x[1] * (x[0] - 1.0) > 0.0:
+        if attainable(0.0, x[0], x[1], frequency) > RESOLVED and x[1] * (
+                x[0] - at_rest(material)) > 0.0:
             x[1] = -x[1]
         rest = excess
         if excess != 0.0:

@@ -16,7 +16,7 @@ from hmsa_ros.core.creep_kernel import RATIO, SPEED
 from hmsa_ros.core.dop853 import ERROR_3, ERROR_5, MATRIX, STAGES, WEIGHTS
 from hmsa_ros.core.kernels import attainable, DONE, first_step, MAX_STEPS, resize, STUCK
 from hmsa_ros.core.law import (
-    DAMPING,
+    damping,
     elastic_force,
     elastic_stiffness,
     mass,
@@ -259,17 +259,17 @@ def staircase(excess, branches, stretch, material, period, end, ripple, out):
     stiffness = elastic_stiffness(stretch, material)
     inertia = mass(stretch, material)
     # Branches are springs to fast motion, dampers to slow motion.
-    frequency, damping = natural_frequency(stretch, material), material[DAMPING]
+    frequency, drag = natural_frequency(stretch, material), damping(stretch, material)
     stiff = stiffness
     for _ in range(3):
-        stiff, damping = stiffness, material[DAMPING]
+        stiff, drag = stiffness, damping(stretch, material)
         for b in range(excess.size):
             phase = frequency / branches[b, SPEED]
             part = branches[b, RATIO] * stiffness * phase / (1.0 + phase * phase)
             stiff += part * phase
-            damping += part / frequency
+            drag += part / frequency
         frequency = math.sqrt(stiff / inertia)
-    decay = 0.5 * damping / inertia
+    decay = 0.5 * drag / inertia
     root = cmath.sqrt(complex(decay * decay - frequency * frequency, 0.0))
     if abs(root) < 1e-6 * frequency:
         root = complex(1e-6 * frequency, 0.0)

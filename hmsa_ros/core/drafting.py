@@ -15,7 +15,7 @@ from hmsa_ros.core.history import agree
 from hmsa_ros.core.kernels import work_space
 from hmsa_ros.core.moves import Level, Move, State
 from hmsa_ros.core.sequence import Segment, segments
-from hmsa_ros.core.setpoint import Setpoint
+from hmsa_ros.core.setpoint import impossible, Setpoint
 from hmsa_ros.core.shapers import Shaper
 from hmsa_ros.core.shapers.through import through
 from hmsa_ros.core.status import Code, RefusedError
@@ -92,7 +92,7 @@ def on_grid(time: int, model: Model) -> int:
     return time if period == 0 else -(-time // period) * period
 
 
-def check_points(points: Sequence[tuple[float, int]]) -> Steps[None]:
+def check_points(points: Sequence[tuple[float, int]], rest: float) -> Steps[None]:
     """
     Check stretches and ends (ns from the start) of a sequence; yields where it may pause.
 
@@ -107,7 +107,7 @@ def check_points(points: Sequence[tuple[float, int]]) -> Steps[None]:
             Code.BAD_INPUT, 'the trajectory has no points: expected at least one')
     previous = -1
     for number, (stretch, time) in enumerate(points):
-        check_target(stretch)
+        check_target(stretch, rest)
         if time <= previous:
             raise RefusedError(
                 Code.NOT_INCREASING,
@@ -119,9 +119,9 @@ def check_points(points: Sequence[tuple[float, int]]) -> Steps[None]:
             yield
 
 
-def check_target(stretch: float) -> None:
+def check_target(stretch: float, rest: float) -> None:
     """
-    Check that a number can be a stretch.
+    Check that a number can be a stretch of an actuator with a rest there.
 
     Raises
     ------
@@ -129,9 +129,8 @@ def check_target(stretch: float) -> None:
         If not.
 
     """
-    if not (math.isfinite(stretch) and stretch > 0.0):
-        raise RefusedError(
-            Code.BAD_INPUT, f'stretch is {stretch:g}: expected a finite number greater than 0')
+    if reason := impossible(stretch, rest):
+        raise RefusedError(Code.BAD_INPUT, reason)
 
 
 def draft_sequence(

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from hmsa_ros.core.compiling import compiled
 from hmsa_ros.core.dop853 import ERROR_3, ERROR_5, MATRIX, NODES, STAGES, WEIGHTS
-from hmsa_ros.core.law import acceleration, KIND, motion, natural_frequency, ZETA
-from hmsa_ros.core.laws.record import ANY, GENT, NEO_HOOKEAN, OGDEN, POLYNOMIAL, TABLE
+from hmsa_ros.core.law import acceleration, at_rest, KIND, motion, natural_frequency, ZETA
+from hmsa_ros.core.laws.record import ANY, BEAM, GENT, NEO_HOOKEAN, OGDEN, POLYNOMIAL, TABLE
 
 # Status codes of the integration.
 DONE = 0
@@ -83,6 +83,8 @@ def step(k, l, v, s, r, beta, slope, p, q, h, material, rtol):  # noqa: E741
         return _polynomial_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol)
     if material[KIND] == OGDEN:
         return _ogden_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol)
+    if material[KIND] == BEAM:
+        return _beam_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol)
     return _table_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol)
 
 
@@ -102,6 +104,12 @@ def _ogden_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol):  # noqa: E
 def _table_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol):  # noqa: E741
     """Make a step, compiled by itself to keep the one for Gent short."""
     return _step(k, l, v, s, r, beta, slope, p, q, h, material, rtol, TABLE)
+
+
+@compiled()
+def _beam_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol):  # noqa: E741
+    """Make a step, compiled by itself to keep the one for Gent short."""
+    return _step(k, l, v, s, r, beta, slope, p, q, h, material, rtol, BEAM)
 
 
 @compiled(inline=True)
@@ -153,7 +161,7 @@ def attainable(rtol, l, v, frequency):  # noqa: E741
     ``l frequency^2``, and a step lasts about ``1/frequency``. That matters close to the
     limiting stretches.
     """
-    return max(rtol, 3e-16 * l * frequency / (1.0 + abs(v)))
+    return max(rtol, 3e-16 * abs(l) * frequency / (1.0 + abs(v)))
 
 
 @compiled()
@@ -182,7 +190,7 @@ def advance(k, l, v, s, r, beta, slope, p, q, duration, material, rtol, h):  # n
             return DONE, l, v, s, r, h
         span = min(h, left)
         rate = natural_frequency(l, material)
-        if attainable(0.0, l, v, rate) > RESOLVED and v * (l - 1.0) > 0.0:
+        if attainable(0.0, l, v, rate) > RESOLVED and v * (l - at_rest(material)) > 0.0:
             v, s, r = -v, -s, -r
         new_l, new_v, new_s, new_r, error = step(
             k, l, v, s, r, beta + slope * done, slope, p + q * done, q, span, material,
@@ -415,7 +423,7 @@ def follow_one(k, l, v, h, beta, slope, excess, decay, duration, material, rtol)
             return DONE, l, v, h
         span = min(h, left)
         rate = natural_frequency(l, material)
-        if attainable(0.0, l, v, rate) > RESOLVED and v * (l - 1.0) > 0.0:
+        if attainable(0.0, l, v, rate) > RESOLVED and v * (l - at_rest(material)) > 0.0:
             v = -v
         rest = excess
         if excess != 0.0:

@@ -7,7 +7,8 @@ In nondimensional energy form every actuator of this package obeys
 
 with stretch ``l``, time in units of ``L sqrt(rho/G)`` and the signed load
 ``beta = Br B/(mu0 G)``. This module has the parts: everything else takes them from here. Gent
-and its limit are inlined; the other laws are families in `hmsa_ros.core.laws.kernels`.
+and its limit are inlined; the other laws are families in `hmsa_ros.core.laws.kernels`. A beam
+has the deflection of its tip for ``l``, inertia m of its own, and a damping that grows with it.
 
 The compiled functions take one array ``material``, as `pack` makes it: a header (`KIND` to
 `UPPER`), then the constants of the law from `CONSTANTS` on, as many as it has, tables included.
@@ -26,6 +27,7 @@ from hmsa_ros.core.compiling import compiled
 from hmsa_ros.core.laws import kernels as families
 from hmsa_ros.core.laws.record import (
     ANY,
+    BEAM,
     CONSTANTS,
     Elastic,
     GENT,
@@ -39,7 +41,7 @@ from hmsa_ros.core.laws.record import (
 KIND = 0  # which law
 ZETA = 1  # damping of the group
 C1 = 2  # shape of the block, 2 H^2/L^2
-DAMPING = 3  # d
+DAMPING = 3  # d, of a beam at rest
 LOWER = 4  # limiting stretches; 0 and infinity where there are none
 UPPER = 5
 
@@ -98,11 +100,12 @@ def pack(zeta: Any, j_lim: Any, c1: Any, elastic: Elastic | None = None) -> Arra
 
 @lru_cache(maxsize=256)
 def held(elastic: Elastic) -> tuple[float, float]:
-    """Return the stretches around 1 between which the force of a law rises."""
+    """Return the stretches around that at rest between which the force of a law rises."""
     material = np.array([elastic.family, 0.0, 1.0, 0.0, *elastic.limits, *elastic.constants])
 
     def boundary(end: float) -> float:
-        path: Array = np.geomspace(1.0, end, _LOOK).astype(np.float64)
+        space = np.geomspace if elastic.rest else np.linspace
+        path: Array = space(elastic.rest, end, _LOOK).astype(np.float64)
         path[-1] = end
         stiffness = np.empty(_LOOK)
         evaluate(STIFFNESS, path, material, stiffness)
@@ -147,6 +150,8 @@ def _elastic(l, material, family):  # noqa: E741
             force, stiffness = families.ogden(l, material)
     elif family == TABLE:
         force, stiffness = families.table(l, material)
+    elif family == BEAM:
+        force, stiffness = families.beam(l, material)
     elif family == ANY and material[KIND] > NEO_HOOKEAN:
         force, stiffness = families.elastic(l, material[KIND], material)
     elif material[KIND] == GENT:
@@ -176,6 +181,8 @@ def motion(l, v, beta, material, family):  # noqa: E741
     Outside the limits they are NaN, which makes a step control reject its step. ``family`` is as
     for `_elastic`.
     """
+    if family == BEAM or (family == ANY and material[KIND] == BEAM):
+        return families.beam_motion(l, v, beta, material[DAMPING], material)
     force, stiffness = _elastic(l, material, family)
     i_l = 1.0 / l
     l3 = l * l * l
@@ -194,6 +201,20 @@ def acceleration(l, v, beta, material, family):  # noqa: E741
     return motion(l, v, beta, material, family)[0]
 
 
+@compiled(inline=True)
+def at_rest(material):
+    """Return the stretch at rest without a field; the deflection of a beam."""
+    return 0.0 if material[KIND] == BEAM else 1.0
+
+
+@compiled()
+def damping(l, material):  # noqa: E741
+    """Return what multiplies the rate at a stretch: d, which grows with a beam's deflection."""
+    if material[KIND] == BEAM:
+        return material[DAMPING] * families.beam_inertia(l, material)[3]
+    return material[DAMPING]
+
+
 @compiled()
 def elastic_force(l, material):  # noqa: E741
     """Return the load that balances the stretch at rest, psi'(l)."""
@@ -208,7 +229,7 @@ def elastic_stiffness(l, material):  # noqa: E741
 
 @compiled()
 def elastic_energy(l, material):  # noqa: E741
-    """Return psi(l), zero at l = 1."""
+    """Return psi(l), zero at rest."""
     if material[KIND] > NEO_HOOKEAN:
         return families.energy(l, material[KIND], material)
     if not material[LOWER] < l < material[UPPER]:
@@ -223,7 +244,9 @@ def elastic_energy(l, material):  # noqa: E741
 
 @compiled()
 def mass(l, material):  # noqa: E741
-    """Return the inertia m(l) = (l^-3 + c1)/6 of a block, from Eq. 7."""
+    """Return the inertia m(l) = (l^-3 + c1)/6 of a block, from Eq. 7, or that of a beam."""
+    if material[KIND] == BEAM:
+        return families.beam_inertia(l, material)[0]
     return (1.0 / (l * l * l) + material[C1]) / 6.0
 
 
@@ -240,7 +263,10 @@ def natural_frequency(l, material):  # noqa: E741
 @compiled()
 def critical_zeta(l, material):  # noqa: E741
     """Return the damping that is critical for small motion about a stretch."""
-    return 4.0 / material[C1] * math.sqrt(mass(l, material) * elastic_stiffness(l, material))
+    critical = 4.0 / material[C1] * math.sqrt(mass(l, material) * elastic_stiffness(l, material))
+    if material[KIND] == BEAM:
+        critical /= families.beam_inertia(l, material)[3]
+    return critical
 
 
 @compiled()
@@ -250,17 +276,17 @@ def equilibrium_stretch(beta, material):
 
     A load beyond what can be held gives the limit on its side.
     """
-    lower, upper = material[LOWER], material[UPPER]
+    lower, upper, rest = material[LOWER], material[UPPER], at_rest(material)
     if beta > 0.0:
-        lower = 1.0
+        lower = rest
         if upper == math.inf:
             upper = 2.0
             while elastic_force(upper, material) < beta:
                 upper *= 2.0
     elif beta < 0.0:
-        upper = 1.0
+        upper = rest
     else:
-        return 1.0
+        return rest
     l = 0.5 * (lower + upper)  # noqa: E741
     for _ in range(200):
         force, stiffness = _elastic(l, material, ANY)
@@ -283,7 +309,7 @@ def equilibrium_stretch(beta, material):
         new = l - step
         if not lower < new < upper:
             new = 0.5 * (lower + upper)
-        if abs(new - l) <= 2e-16 * l:
+        if abs(new - l) <= 2e-16 * abs(l):
             return new
         l = new  # noqa: E741
     return l
@@ -304,6 +330,11 @@ def acceleration_slopes(l, v, beta, material, slopes):  # noqa: E741
     slopes[BY_LOAD] = i_mass
     slopes[BY_MODULUS] = -force * i_mass
     slopes[BY_ZETA] = -0.5 * material[C1] * v * i_mass
+    if material[KIND] == BEAM:
+        # Its inertia has no c1, and none of its constants is sought.
+        slopes[BY_ZETA] *= families.beam_inertia(l, material)[3]
+        slopes[BY_C1] = material[ZETA] / material[C1] * slopes[BY_ZETA]
+        return a, a_l, a_v, i_mass
     slopes[BY_C1] = -(0.5 * material[ZETA] * v + a / 6.0) * i_mass
     if material[KIND] == GENT:
         extension = (l - 1.0) * (l - 1.0) * (l + 2.0)

@@ -83,6 +83,16 @@ class NondimensionalParameters:
         """Check the values."""
         _check(self)
 
+    @property
+    def rest(self) -> float:
+        """Stretch at rest without a field; the deflection of a beam."""
+        return 1.0 if self.law is None else self.law.rest
+
+    @property
+    def coordinate(self) -> str:
+        """What the coordinate is called: stretch, or deflection of a beam."""
+        return 'stretch' if self.law is None else self.law.coordinate
+
     @cached_property
     def packed(self) -> NDArray[np.float64]:
         """The one argument of the compiled law, see `hmsa_ros.core.law`."""
@@ -193,15 +203,22 @@ class ActuatorParameters:
         half_thickness = half_length * math.sqrt(material.c1 / 2.0)
         damping = (8.0 * material.zeta * unfinished.half_length * half_thickness
                    * math.sqrt(density * shear_modulus))
-        return cls(shear_modulus, density, half_length, half_thickness, remanence,
+        made = cls(shear_modulus, density, half_length, half_thickness, remanence,
                    material.j_lim, damping, material.law, replace(
                        material.creep, times=tuple(
                            x * unfinished.time_unit for x in material.creep.times)))
+        return made if material.rest else replace(
+            made, damping_coefficient=material.zeta * made.damping_unit)
 
     @property
     def numbers(self) -> dict[str, float]:
         """All that is a number, by name."""
         return {x.name: getattr(self, x.name) for x in fields(self) if x.name not in _NO_NUMBERS}
+
+    @property
+    def rest(self) -> float:
+        """Stretch at rest without a field; the deflection of a beam."""
+        return 1.0 if self.law is None else self.law.rest
 
     @property
     def time_unit(self) -> float:
@@ -213,15 +230,33 @@ class ActuatorParameters:
         """Flux density in T of the load beta = 1, mu0 G/Br."""
         return MU_0 * self.shear_modulus / self.remanence
 
+    @property
+    def damping_unit(self) -> float:
+        """Damping coefficient in N s/m of zeta 1: 8 L H sqrt(rho G), or that of a beam's tip."""
+        return 8.0 * self._damped * math.sqrt(self.density * self.shear_modulus)
+
+    @property
+    def _damped(self) -> float:
+        """L H of a block in m^2, and what takes its place for a beam."""
+        if self.law is not None and self.law.section:
+            return 0.625 * self.law.section * self.half_length ** 2
+        return self.half_length * self.half_thickness
+
+    @property
+    def load_per_newton(self) -> float:
+        """Load of a force of 1 N on both faces of a block, or on the tip of a beam."""
+        section = self.law.section if self.law is not None and self.law.section else 1.0
+        return 1.0 / (4.0 * section * self.half_length ** 2 * self.shear_modulus)
+
     @cached_property
     def nondimensional(self) -> NondimensionalParameters:
         """The group that Eq. 11 depends on."""
-        area = self.half_length * self.half_thickness
+        shape = None if self.law is None else self.law.shape
         return NondimensionalParameters(
             zeta=self.damping_coefficient / 8.0
-            / (area * math.sqrt(self.density * self.shear_modulus)),
+            / (self._damped * math.sqrt(self.density * self.shear_modulus)),
             j_lim=self.chain_limit,
-            c1=2.0 * (self.half_thickness / self.half_length) ** 2,
+            c1=shape or 2.0 * (self.half_thickness / self.half_length) ** 2,
             law=self.law,
             creep=replace(self.creep, times=tuple(x / self.time_unit for x in self.creep.times)))
 

@@ -51,7 +51,7 @@ class Planner(RunningPlan):
     options : Options
         How to plan.
     stretch : float
-        Stretch at rest before the first request.
+        Stretch at rest before the first request; default that without a field.
 
     Raises
     ------
@@ -62,9 +62,10 @@ class Planner(RunningPlan):
 
     def __init__(
             self, actuator: ActuatorParameters, options: Options, *,
-            stretch: float = 1.0) -> None:
+            stretch: float | None = None) -> None:
         """Start at rest."""
-        super().__init__(Model(actuator, options), stretch)
+        super().__init__(
+            Model(actuator, options), actuator.rest if stretch is None else stretch)
         #: Returns stretch and rate in 1/s believed of a time in ns where samples show them; None
         #: for what is predicted.
         self.believed: Callable[[int], tuple[float, float] | None] = lambda time: None
@@ -144,7 +145,7 @@ class Planner(RunningPlan):
             If the request cannot be carried out.
 
         """
-        yield from check_points(points)
+        yield from check_points(points, self.model.material.rest)
         soonest = self.soonest(now)
         base = soonest if stamp is None else stamp
         outset = self._outset(on_grid(max(base, soonest), self.model))
@@ -173,7 +174,7 @@ class Planner(RunningPlan):
 
     def draft_setpoint(self, stretch: float, now: int) -> Steps[Draft | None]:
         """Work out a move to one stretch; None where it changes nothing."""
-        check_target(stretch)
+        check_target(stretch, self.model.material.rest)
         return (yield from draft_target(self._outset(self.soonest(now)), stretch))
 
     def draft_stop(self, now: int) -> Steps[Draft]:

@@ -135,17 +135,18 @@ def _settling(level: PlannedLevel, state: State) -> float:
 
 
 def _period(model: Model, stretch: float) -> float:
-    """Return the shorter period, in ns, of vibration about a stretch and about 1."""
+    """Return the shorter period, in ns, of vibration about a stretch and about rest."""
     return min(
         2.0 * math.pi / model.frequency(x) * model.units.time * NANOSECONDS
-        for x in (1.0, stretch))
+        for x in (model.material.rest, stretch))
 
 
 def _check_motion(number: int, level: PlannedLevel, state: State, end: int | None) -> None:
     """Refuse a level under which the block would come too near to the limits of its law."""
     model = level.model
     lower, upper = stretch_limits(model.material)
-    least, most = 1.0 - _MARGIN * (1.0 - lower), 1.0 + _MARGIN * (upper - 1.0)
+    home = model.material.rest
+    least, most = (home + _MARGIN * (x - home) for x in (lower, upper))
     rest = float(equilibrium_stretch(level.flux_density / model.units.load, model.material))
     if least < rest < most:
         step = _period(model, rest) / _SAMPLES

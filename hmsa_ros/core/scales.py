@@ -18,10 +18,11 @@ from hmsa_ros.core.status import Code
 from hmsa_ros.core.two_step import CODES, plan_two_step, plan_two_step_batch
 from hmsa_ros.errors import BadInputError
 
-#: Stretches whose flux density is given, where the coil reaches them.
+#: Stretches whose flux density is given, where the coil reaches them, and deflections of a beam.
 STRETCHES = (0.6, 0.8, 0.9, 1.05, 1.1, 1.2, 1.4, 2.0)
-#: Stretch of the move whose duration is given, where the coil allows it.
-USUAL_TARGET = 1.1
+DEFLECTIONS = (0.05, 0.1, 0.2, 0.4, 0.6, 0.7, 0.78)
+#: Move from rest whose duration is given, where the coil allows it.
+USUAL_MOVE = 0.1
 # Search for the reach: points of the first look on either side, and halvings after it.
 _LOOK = 400
 _HALVINGS = 50
@@ -71,7 +72,7 @@ class Scales:
     time_unit : float
         L sqrt(rho/G) in s.
     frequency : float
-        Undamped natural frequency about rest, stretch 1, in Hz.
+        Undamped natural frequency about rest without field, in Hz.
     c1 : float
         Shape 2 H^2/L^2.
     zeta, critical_zeta : float
@@ -88,7 +89,7 @@ class Scales:
         Lowest and highest stretch that the coil can hold.
     reached : tuple of float
         Lowest and highest stretch that the two-step command reaches from rest within the coil's
-        range; 1 on a side where there is none.
+        range; that at rest without field on a side where there is none.
     target, duration : float
         Stretch of a usual move from rest and how long the two-step command takes, in s; both
         NaN where there is none.
@@ -129,63 +130,62 @@ def scales(actuator: ActuatorParameters, coil: Coil) -> Scales:
 
     """
     material = actuator.nondimensional
+    home = material.rest
     unit = actuator.flux_density_unit
     loads = coil.flux_density_min / unit, coil.flux_density_max / unit
     lower, upper = stretch_limits(material)
     held = tuple(float(equilibrium_stretch(x, material)) for x in loads)
 
     def duration(target: float) -> float:
-        plan = plan_two_step(1.0, target, material, load_limits=loads)
+        plan = plan_two_step(home, target, material, load_limits=loads)
         within = loads[0] <= min(plan.beta_p, plan.beta_1) and max(
             plan.beta_p, plan.beta_1) <= loads[1]
         return plan.tau_p if plan.code is Code.TWO_STEP and within else math.nan
 
     def reach(end: float) -> float:
         # Fractions of the way out, so that the stretches near rest are looked at closely.
-        targets = 1.0 + (end - 1.0) * np.linspace(0.0, 1.0, _LOOK + 1)[1:] ** 2
+        targets = home + (end - home) * np.linspace(0.0, 1.0, _LOOK + 1)[1:] ** 2
         plans = plan_two_step_batch(
-            1.0, targets, zeta=material.zeta, j_lim=material.j_lim, c1=material.c1,
+            home, targets, zeta=material.zeta, j_lim=material.j_lim, c1=material.c1,
             load_limits=loads, elastic=material.law)
         both = np.stack([plans.beta_p, plans.beta_1])
         good = np.array([CODES[x] is Code.TWO_STEP for x in plans.status.tolist()]) & np.all(
             (both >= loads[0]) & (both <= loads[1]), axis=0)
         found = np.flatnonzero(good)
         if not len(found):
-            return 1.0
+            return home
         last = int(found[-1])
         beyond = targets[last + 1] if last + 1 < len(targets) else end
         return _boundary(
             lambda x: math.isfinite(duration(x)), float(targets[last]), float(beyond))
 
-    reached = tuple(reach(x) if abs(x - 1.0) > 1e-12 else 1.0 for x in held)
+    reached = tuple(reach(x) if abs(x - home) > 1e-12 else home for x in held)
     # Else half of the way, or all of it, on the side that reaches further.
-    end = max(reached, key=lambda x: abs(math.log(x)))
-    target = next((x for x in (USUAL_TARGET, 0.5 * (1.0 + end), end)
-                   if x != 1.0 and math.isfinite(duration(x))), math.nan)
+    end = max(reached, key=lambda x: abs(math.log(x)) if home else abs(x))
+    target = next((x for x in (home + USUAL_MOVE, 0.5 * (home + end), end)
+                   if x != home and math.isfinite(duration(x))), math.nan)
     tau = duration(target) if math.isfinite(target) else math.nan
-    critical = float(critical_zeta(1.0, material))
-    per_zeta = 8.0 * actuator.half_length * actuator.half_thickness * math.sqrt(
-        actuator.density * actuator.shear_modulus)
+    critical = float(critical_zeta(home, material))
     return Scales(
         time_unit=actuator.time_unit,
-        frequency=float(natural_frequency(1.0, material)) / (2.0 * math.pi) / actuator.time_unit,
+        frequency=float(natural_frequency(home, material)) / (2.0 * math.pi) / actuator.time_unit,
         c1=material.c1, zeta=material.zeta, critical_zeta=critical,
         damping=actuator.damping_coefficient,
-        critical_damping=critical * per_zeta, flux_density_unit=unit,
+        critical_damping=critical * actuator.damping_unit, flux_density_unit=unit,
         flux_densities=tuple(
             (x, float(elastic_force(x, material)) * unit)
-            for x in _shown(held[0], held[1])),
+            for x in _shown(held[0], held[1], home)),
         stretch_limits=(lower, upper), held=(held[0], held[1]),
         reached=(reached[0], reached[1]), target=target,
         duration=tau * actuator.time_unit)
 
 
-def _shown(least: float, largest: float) -> tuple[float, ...]:
+def _shown(least: float, largest: float, home: float) -> tuple[float, ...]:
     """Return the usual stretches that a coil holds, or else half and all of its reach."""
-    usual = tuple(x for x in STRETCHES if least <= x <= largest)
+    usual = tuple(x for x in (STRETCHES if home else DEFLECTIONS) if least <= x <= largest)
     return usual or tuple(
-        1.0 + share * (end - 1.0) for end, share in (
-            (least, 1.0), (least, 0.5), (largest, 0.5), (largest, 1.0)) if end != 1.0)
+        home + share * (end - home) for end, share in (
+            (least, 1.0), (least, 0.5), (largest, 0.5), (largest, 1.0)) if end != home)
 
 
 def _boundary(holds: Callable[[float], bool], inside: float, outside: float) -> float:

@@ -139,7 +139,7 @@ def segments(
     creeping.check(material, delivery, shaper)
     limits = limits or Limits()
     units = units or Units()
-    state = start or State(1.0)
+    state = start or State(material.rest)
     check_stretch(state.stretch, material, 'start stretch')
     begin = 0.0
     upcoming = iter(setpoints)

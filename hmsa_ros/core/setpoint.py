@@ -6,6 +6,14 @@ import math
 from hmsa_ros.errors import BadInputError
 
 
+def impossible(stretch: float, rest: float) -> str:
+    """Return why no actuator with a rest there has a stretch; empty if one may have it."""
+    if math.isfinite(stretch) and (stretch > 0.0 or rest == 0.0):
+        return ''
+    more = ' greater than 0' if rest else ''
+    return f'stretch is {stretch:g}: expected a finite number{more}'
+
+
 @dataclass(frozen=True)
 class Setpoint:
     """
@@ -14,7 +22,7 @@ class Setpoint:
     Attributes
     ----------
     stretch : float
-        Target, greater than 0.
+        Target; the deflection of a beam.
     span : float
         Time from leaving the previous setpoint to leaving this one, greater than 0; infinite
         for the last one of a sequence that is held.
@@ -31,8 +39,7 @@ class Setpoint:
 
     def __post_init__(self) -> None:
         """Check both numbers."""
-        if not (math.isfinite(self.stretch) and self.stretch > 0.0):
-            raise BadInputError(
-                f'stretch is {self.stretch:g}: expected a finite number greater than 0')
+        if not math.isfinite(self.stretch):
+            raise BadInputError(f'stretch is {self.stretch:g}: expected a finite number')
         if not self.span > 0.0:
             raise BadInputError(f'span is {self.span:g}: expected a number greater than 0')

@@ -15,7 +15,7 @@ from hmsa_ros.core import creep_kernel, kernels, lag_kernel, law
 from hmsa_ros.core.actuators import Actuators, check_stretch, RTOL, Setup
 from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.delivery import Delivery, Piece, ramps
-from hmsa_ros.core.model import Array, damping
+from hmsa_ros.core.model import Array
 from hmsa_ros.core.moves import Level, State
 from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.core.schedule import CommandSchedule
@@ -34,7 +34,7 @@ _STUCK = 'the integration ran out of steps: the load is too large to follow'
 
 def simulate(
         switches: ArrayLike, loads: ArrayLike, times: ArrayLike,
-        material: NondimensionalParameters, *, stretch: float = 1.0, rate: float = 0.0,
+        material: NondimensionalParameters, *, stretch: float | None = None, rate: float = 0.0,
         slopes: ArrayLike | None = None, rtol: float = RTOL, lag: float = 0.0,
         field: float = math.nan, followed: Sequence[float] = ()) -> tuple[Array, Array]:
     """
@@ -51,7 +51,7 @@ def simulate(
     material : NondimensionalParameters
         zeta, J_lim and c1.
     stretch, rate : float
-        State at the first switch.
+        State at the first switch; default at rest without a field.
     slopes : array_like, shape (m,), optional
         Change of the load per unit of time from each switch on; default none.
     rtol : float
@@ -89,6 +89,7 @@ def simulate(
             times.size and times[0] < switches[0]):
         raise BadInputError(
             'switches and times must not decrease, and no time may lie before the first switch')
+    stretch = material.rest if stretch is None else stretch
     check_stretch(stretch, material)
     if material.creep:
         sampled = creeping_samples(
@@ -214,7 +215,8 @@ def longest_motion(load: float, material: NondimensionalParameters) -> float:
     stretch = law.equilibrium_stretch(float(load), material.packed)
     frequency = float(law.natural_frequency(stretch, material.packed))
     longest = _MOST_PERIODS * 2.0 * math.pi / frequency
-    decay = damping(material) / (2.0 * float(law.mass(stretch, material.packed)))
+    decay = float(law.damping(stretch, material.packed)) / (
+        2.0 * float(law.mass(stretch, material.packed)))
     if decay == 0.0:
         return longest
     if decay < frequency:
@@ -227,14 +229,14 @@ class ActuatorSimulation:
     """`Actuators` with one actuator, seen as numbers; the parameters are those of `Setup`."""
 
     def __init__(
-            self, actuator: ActuatorParameters, *, time: int = 0, stretch: float = 1.0,
+            self, actuator: ActuatorParameters, *, time: int = 0, stretch: float | None = None,
             slew_limit: float = math.inf, coil_time_constant: float = 0.0,
             creep: Creep | None = None) -> None:
         """Start at rest."""
         self.actuator = actuator
         self._all = Actuators(
-            [Setup(actuator, stretch, slew_limit, coil_time_constant, creep or Creep())],
-            time=time)
+            [Setup(actuator, actuator.rest if stretch is None else stretch, slew_limit,
+                   coil_time_constant, creep or Creep())], time=time)
 
     @property
     def time(self) -> int:
@@ -312,7 +314,7 @@ def too_large(time: int, flux_density: float) -> str:
 
 def unshaped(
         targets: Sequence[float], begins: Sequence[float], times: ArrayLike,
-        material: NondimensionalParameters, *, start: float = 1.0) -> tuple[Array, Array]:
+        material: NondimensionalParameters, *, start: float | None = None) -> tuple[Array, Array]:
     """
     Sample the response to plain steps, the paper's unshaped input.
 
@@ -327,7 +329,7 @@ def unshaped(
     material : NondimensionalParameters
         zeta, J_lim and c1.
     start : float
-        Stretch at rest before the first step.
+        Stretch at rest before the first step; default that without a field.
 
     Returns
     -------

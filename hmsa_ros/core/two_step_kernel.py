@@ -22,9 +22,10 @@ from hmsa_ros.core.kernels import (
     turning_point,
 )
 from hmsa_ros.core.law import (
+    at_rest,
     C1,
     critical_zeta,
-    DAMPING,
+    damping,
     elastic_energy,
     elastic_force,
     elastic_stiffness,
@@ -68,7 +69,7 @@ def crosses(k, l, v, target, material, rtol):  # noqa: E741
     if material[ZETA] < critical_zeta(target, material):
         return True
     beta = elastic_force(target, material)
-    half = 0.5 * material[DAMPING] / mass(target, material)
+    half = 0.5 * damping(target, material) / mass(target, material)
     fast = -half - math.sqrt(
         max(half * half - natural_frequency(target, material) ** 2, 0.0))
     lower, upper = material[LOWER], material[UPPER]
@@ -109,7 +110,7 @@ def _guess(l, v, target, direction, beta_1, material):  # noqa: E741
     half = 0.5 * (l + target)
     kinetic = start + beta * (half - l) - elastic_energy(half, material)
     fastest = math.sqrt(max(2.0 * kinetic / mass(half, material), 0.0))
-    xi = 0.5 * material[DAMPING] * fastest / abs(delta)
+    xi = 0.5 * damping(half, material) * fastest / abs(delta)
     decay = 1e-3
     if xi < 0.9:
         decay = math.exp(-math.pi * xi / math.sqrt(1.0 - xi * xi))
@@ -141,7 +142,7 @@ def shoot(
     enough = max(0.1 * math.sqrt(rtol), 1e-14 * size / move)
     tolerance = max(rtol, _COARSE * min(size, move, target - lower, upper - target) / size)
     # A smaller difference of loads is rounding of the elastic force.
-    least = 1e-14 * (abs(beta_1) + target * elastic_stiffness(target, material))
+    least = 1e-14 * (abs(beta_1) + abs(target) * elastic_stiffness(target, material))
     most = math.inf
     if v == 0.0:
         most = direction * (beta_1 - elastic_force(l, material))
@@ -275,7 +276,7 @@ def two_step_batch(
         k = np.empty((STAGES, 4))
         material = materials[min(np.int64(i), materials.shape[0] - 1)]
         if not (material[ZETA] >= 0.0 and material[C1] > 0.0
-                and material[LOWER] < 1.0 < material[UPPER] and math.isfinite(
+                and material[LOWER] < at_rest(material) < material[UPPER] and math.isfinite(
                     material[ZETA] + material[C1] + start[i] + rate[i] + target[i])):
             status[i], beta_p[i], tau_p[i], beta_1[i] = BAD_INPUT, math.nan, math.nan, math.nan
             continue

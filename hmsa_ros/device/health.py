@@ -49,8 +49,8 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def enough_samples(actuator: ActuatorParameters) -> float:
-    """Return the least sample rate in Hz that shows the actuator's small vibration about 1."""
-    frequency = float(natural_frequency(1.0, actuator.nondimensional))
+    """Return the least sample rate in Hz that shows the actuator's small vibration about rest."""
+    frequency = float(natural_frequency(actuator.rest, actuator.nondimensional))
     return _SAMPLES_A_PERIOD * frequency / (2.0 * math.pi * actuator.time_unit)
 
 

@@ -193,7 +193,7 @@ class Designer:
         self._values = values_of(actuator)
         self._group = actuator.nondimensional
         self.period = 2.0 * math.pi * actuator.time_unit / float(
-            model.natural_frequency(1.0, self._group))
+            model.natural_frequency(self._group.rest, self._group))
         if not (rate > 0.0 and math.isfinite(rate) and noise > 0.0):
             raise BadInputError(
                 f'rate is {rate:g} Hz and noise {noise:g}: expected finite numbers above 0')
@@ -462,7 +462,7 @@ def excite(
     bounds = bounds or Bounds()
     if duration is None:
         duration = 180.0 * 2.0 * math.pi * actuator.time_unit / float(
-            model.natural_frequency(1.0, actuator.nondimensional))
+            model.natural_frequency(actuator.rest, actuator.nondimensional))
     designer = Designer(actuator, bounds, duration, rate=rate, noise=noise, free=free)
     best = designer.search()
     nothing = Program(

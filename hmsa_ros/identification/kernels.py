@@ -23,9 +23,11 @@ from hmsa_ros.core.compiling import compiled
 from hmsa_ros.core.dop853 import ERROR_3, ERROR_5, MATRIX, NODES, STAGES, WEIGHTS
 from hmsa_ros.core.law import (
     acceleration_slopes,
+    at_rest,
     BY_CONSTANT,
     BY_LOAD,
     BY_MODULUS,
+    BY_ZETA,
     elastic_force,
     elastic_stiffness,
     mass,
@@ -111,7 +113,7 @@ def _slope(
     acc_l *= total
     acc_v *= speed
     partial[STIFFNESS] = held * i_m + share * slopes[BY_MODULUS]
-    partial[DAMPING] = -v * i_m
+    partial[DAMPING] = 2.0 * speed / material[law.C1] * slopes[BY_ZETA]
     partial[DRIVE] = field * i_m
     partial[FORCE] = i_m
     partial[LAG] = drive * field_lag * i_m
@@ -225,7 +227,7 @@ def _follow(
     t, piece, i = begins[0], 0, 0
     fresh = True
     material[law.DAMPING] = theta[DAMPING] / unit[2]
-    fastest = math.sqrt(theta[STIFFNESS] / mass(1.0, material))
+    fastest = math.sqrt(theta[STIFFNESS] / mass(at_rest(material), material))
     h = 0.2 / fastest
     for _ in range(_MAX_STEPS + _STEPS_PER_SAMPLE * times.size):
         if fresh:

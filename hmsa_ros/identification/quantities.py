@@ -106,6 +106,9 @@ def check_free(names: Iterable[str], law: Elastic | None = None) -> tuple[str, .
         raise BadInputError(
             f'free parameter {", ".join(map(repr, unknown)) or "missing"}: expected some of '
             f'{", ".join(QUANTITIES)}')
+    if law is not None and law.rest == 0.0:
+        raise BadInputError(
+            f'the actuator has law {law.law}: expected a block, a beam is not identified')
     if law is not None and 'chain_limit' in free:
         if free != DEFAULT_FREE:
             raise BadInputError(

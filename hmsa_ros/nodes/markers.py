@@ -9,17 +9,24 @@ A block keeps its volume: along the field, which is z, it measures 2 H times the
 it 2 L over the square root of the stretch. The magnetisation moves with the material, so that
 the remanence in the deformed block is Br times the stretch. It and the applied field are arrows
 of one scale: as long as H for each Br, upwards where positive.
+
+A beam lies along x, clamped at the end of smaller x, and bends towards z. The arrow of its
+magnetisation is along its middle and as long as half of it; that of the field is as long as the
+deflection of a beam that would not stiffen.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 import math
 
 from builtin_interfaces.msg import Duration, Time
 from geometry_msgs.msg import Point, Pose, Quaternion, Vector3
+import numpy as np
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
+from hmsa_ros.core.laws.bending import centreline
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
@@ -33,6 +40,8 @@ ROW = 8
 PITCH = 6.0
 #: From the middle of a block to its field, in half lengths.
 BESIDE = 2.0
+# Along a beam, an odd number.
+_STATIONS = 17
 
 # Okabe and Ito's palette: orange, blue, vermilion, grey. What is seen through is the material.
 _BLOCK_COLOUR = (0.90, 0.62, 0.00, 0.55)
@@ -55,6 +64,10 @@ class Block:
         L and H in m, greater than 0.
     remanence : float
         Br in T, greater than 0.
+    width : float
+        Width of a beam in m; 0 for a block.
+    per_tesla : float
+        Length of the arrow of a beam's field in m/T.
 
     Raises
     ------
@@ -67,6 +80,8 @@ class Block:
     half_length: float
     half_thickness: float
     remanence: float
+    width: float = 0.0
+    per_tesla: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -82,8 +97,49 @@ class Block:
     @classmethod
     def of(cls, joint: str, actuator: ActuatorParameters) -> 'Block':
         """Return the block of a joint's parameters."""
-        return cls(
-            joint, actuator.half_length, actuator.half_thickness, actuator.remanence)
+        block = cls(joint, actuator.half_length, actuator.half_thickness, actuator.remanence)
+        if actuator.law is None or not actuator.law.section:
+            return block
+        return replace(
+            block, width=2.0 * actuator.law.section * actuator.half_length ** 2
+            / actuator.half_thickness,
+            per_tesla=2.0 * actuator.half_length / (3.0 * actuator.flux_density_unit))
+
+    def bent(self, deflection: float) -> tuple[list[tuple[float, float, float]], float, float]:
+        """
+        Return a bent beam about the middle of the straight one.
+
+        Parameters
+        ----------
+        deflection : float
+            Of its tip over its length.
+
+        Returns
+        -------
+        points : list of (float, float, float)
+            Corners of triangles in m, three for each.
+        x, z : float
+            Direction of the tangent in the middle.
+
+        """
+        along, across = (2.0 * self.half_length * x for x in centreline(deflection, _STATIONS))
+        angle = np.arctan2(np.gradient(across), np.gradient(along))
+        x, z = along - self.half_length, across
+        normal = self.half_thickness * np.stack([-np.sin(angle), np.cos(angle)])
+        # Round the section: four corners at each station.
+        rings = [[(float(x[i] + s * normal[0, i]), t * self.width / 2,
+                   float(z[i] + s * normal[1, i]))
+                  for s, t in ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))]
+                 for i in range(_STATIONS)]
+        points = []
+        for a, b in pairwise(rings):
+            for i in range(4):
+                j = (i + 1) % 4
+                points += [a[i], b[i], b[j], a[i], b[j], a[j]]
+        for ring in (rings[0], rings[-1][::-1]):
+            points += [ring[0], ring[1], ring[2], ring[0], ring[2], ring[3]]
+        middle = float(angle[_STATIONS // 2])
+        return points, math.cos(middle), math.sin(middle)
 
     def size(self, stretch: float) -> tuple[float, float, float]:
         """Return 2 l, 2 l and 2 h in m at a stretch along z; the volume stays as it is."""
@@ -93,7 +149,7 @@ class Block:
 
 @dataclass(frozen=True)
 class State:
-    """Stretch (greater than 0) and flux density along z in T of a joint at a moment."""
+    """Stretch, or deflection of a beam, and flux density along z in T of a joint at a moment."""
 
     stretch: float
     flux_density: float
@@ -160,8 +216,8 @@ class Scene:
             if stretch is None:
                 markers.append(self._marker(stamp, block, TARGET, Marker.CUBE, None))
             else:
-                markers.append(self._cube(
-                    stamp, block, TARGET, place, block.size(stretch), _TARGET_COLOUR))
+                markers.append(self._body(
+                    stamp, block, TARGET, place, stretch, _TARGET_COLOUR))
         return MarkerArray(markers=markers)
 
     def nothing(self) -> MarkerArray:
@@ -172,29 +228,58 @@ class Scene:
     def _state(
             self, stamp: int, block: Block, place: tuple[float, float],
             state: State) -> Iterable[Marker]:
-        size = block.size(state.stretch)
-        unit = block.half_thickness / block.remanence
+        unit = block.per_tesla or block.half_thickness / block.remanence
         beside = (place[0] + BESIDE * block.half_length, place[1])
-        yield self._cube(stamp, block, BLOCK, place, size, _BLOCK_COLOUR)
-        yield self._arrow(
-            stamp, block, MAGNETISATION, place, unit * block.remanence * state.stretch,
-            _MAGNETISATION_COLOUR)
+        yield self._body(stamp, block, BLOCK, place, state.stretch, _BLOCK_COLOUR)
+        if block.width:
+            height = block.half_length
+            yield self._along(stamp, block, place, state.stretch)
+        else:
+            height = block.half_thickness * state.stretch
+            yield self._arrow(
+                stamp, block, MAGNETISATION, place, unit * block.remanence * state.stretch,
+                _MAGNETISATION_COLOUR)
         yield self._arrow(
             stamp, block, FIELD, beside, unit * state.flux_density, _FIELD_COLOUR)
         label = self._marker(stamp, block, LABEL, Marker.TEXT_VIEW_FACING, _LABEL_COLOUR)
-        label.pose = self._pose(place, size[2] / 2 + 0.8 * block.half_thickness)
+        label.pose = self._pose(place, height + 0.8 * block.half_thickness)
         label.scale = Vector3(z=0.4 * block.half_length * self.scale)
         label.text = f'{block.joint} {state.stretch:.4f}'
         yield label
 
-    def _cube(
+    def _body(
             self, stamp: int, block: Block, number: int, place: tuple[float, float],
-            size: tuple[float, float, float],
-            colour: tuple[float, float, float, float]) -> Marker:
+            stretch: float, colour: tuple[float, float, float, float]) -> Marker:
+        """Return a block at a stretch, or a beam at a deflection."""
+        if block.width:
+            marker = self._marker(stamp, block, number, Marker.TRIANGLE_LIST, colour)
+            marker.pose = self._pose(place, 0.0)
+            marker.scale = Vector3(x=1.0, y=1.0, z=1.0)
+            marker.points = [
+                Point(x=x * self.scale, y=y * self.scale, z=z * self.scale)
+                for x, y, z in block.bent(stretch)[0]]
+            return marker
+        size = block.size(stretch)
         marker = self._marker(stamp, block, number, Marker.CUBE, colour)
         marker.pose = self._pose(place, 0.0)
         marker.scale = Vector3(
             x=size[0] * self.scale, y=size[1] * self.scale, z=size[2] * self.scale)
+        return marker
+
+    def _along(
+            self, stamp: int, block: Block, place: tuple[float, float],
+            deflection: float) -> Marker:
+        """Return the arrow of a beam's magnetisation, along its middle."""
+        marker = self._arrow(
+            stamp, block, MAGNETISATION, place, block.half_length, _MAGNETISATION_COLOUR)
+        _, x, z = block.bent(deflection)
+        along, across = centreline(deflection, 3)
+        begin = Point(
+            x=(place[0] + (2.0 * along[1] - 1.0 - 0.5 * x) * block.half_length) * self.scale,
+            y=place[1] * self.scale,
+            z=(2.0 * across[1] - 0.5 * z) * block.half_length * self.scale)
+        reach = block.half_length * self.scale
+        marker.points = [begin, Point(x=begin.x + reach * x, y=begin.y, z=begin.z + reach * z)]
         return marker
 
     def _arrow(

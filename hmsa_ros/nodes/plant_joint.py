@@ -63,7 +63,7 @@ OWN = (
     ParameterSpec(
         'reset_stretch', 0.0,
         'Stretch after ~/reset, held by its equilibrium flux density; 0 for initial_stretch.', '',
-        0.0, 1e3, read_only=False),
+        -1.0, 1e3, read_only=False),
     ParameterSpec(
         'reset_rate', 0.0, 'Stretch rate after ~/reset.', '1/s', -1e9, 1e9,
         read_only=False),

@@ -371,7 +371,7 @@ def _fine(time: Array, period: float) -> Array:
 def period_of(run: Run) -> float:
     """Return the period in s of small undamped motion about rest."""
     material = run.plant.nondimensional
-    return 2.0 * math.pi / float(natural_frequency(1.0, material)) * run.plant.time_unit
+    return 2.0 * math.pi / float(natural_frequency(material.rest, material)) * run.plant.time_unit
 
 
 def _measure(

@@ -463,7 +463,7 @@ def _parameters(parts: Sequence[Part]) -> str:
     rows += [
         ['zeta', '1', *(cell(x.zeta) for x in groups)],
         ['critical zeta about stretch 1', '1', *(
-            cell(float(critical_zeta(1.0, x))) for x in groups)],
+            cell(float(critical_zeta(x.rest, x))) for x in groups)],
         ['J_lim', '1', *(cell(x.j_lim) for x in groups)],
         ['c1', '1', *(cell(x.c1) for x in groups)],
         ['time unit', 'ms', *(cell(x.time_unit * 1e3) for x in columns)],

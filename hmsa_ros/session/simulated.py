@@ -24,7 +24,8 @@ def simulated_nodes(
     """Return a paused plant that leads simulated time, and a planner that follows it."""
     # What the parameter file sets goes before what is chosen here.
     block = actuator_from(values_of(settings, PLANT, BLOCK))
-    period = 2.0 * math.pi / float(natural_frequency(1.0, block.nondimensional)) * block.time_unit
+    period = 2.0 * math.pi * block.time_unit / float(
+        natural_frequency(block.rest, block.nondimensional))
     rate = _number(settings, f'{PLANT}.publish_rate', max(1000.0, _SAMPLES_A_PERIOD / period))
     factor = _number(
         settings, f'{PLANT}.real_time_factor', min(1.0, _SAMPLES_A_SECOND / rate))

@@ -4,10 +4,10 @@ The laws of elasticity: one table, and one module for each with its constants an
 Nothing here is compiled; the functions that kernels call are in `hmsa_ros.core.laws.kernels`.
 """
 
-from hmsa_ros.core.laws import arruda_boyce, gent, mooney_rivlin, ogden, table, yeoh
+from hmsa_ros.core.laws import arruda_boyce, beam, gent, mooney_rivlin, ogden, table, yeoh
 from hmsa_ros.core.laws.record import Law
 
 #: By name; the first is the default.
 LAWS: dict[str, Law] = {x.name: x for x in (
     gent.GENT, gent.NEO_HOOKEAN, mooney_rivlin.LAW, yeoh.LAW, ogden.LAW, arruda_boyce.LAW,
-    table.LAW)}
+    table.LAW, beam.LAW)}

@@ -2,13 +2,14 @@
 Compiled force, stiffness and energy of the families of laws beside Gent.
 
 Each takes a stretch and a packed material, whose numbers from `CONSTANTS` on are those of the
-law, and works in units of the shear modulus at small strain. The stretch is above 0.
+law, and works in units of the shear modulus at small strain. The stretch is above 0; a beam has
+a deflection of its tip in its place.
 """
 
 import math
 
 from hmsa_ros.core.compiling import compiled
-from hmsa_ros.core.laws.record import CONSTANTS, OGDEN, POLYNOMIAL, TABLE
+from hmsa_ros.core.laws.record import BEAM, CONSTANTS, OGDEN, POLYNOMIAL, TABLE
 
 
 @compiled(inline=True)
@@ -136,9 +137,96 @@ def _table_energy(l, material):  # noqa: E741
     return material[i + 1] + total
 
 
+@compiled(inline=True)
+def _bent(a, material):
+    """Return the place of the piece of a beam's tables that a deflection's size is in."""
+    i = int((1.0 - math.sqrt(1.0 - a / material[CONSTANTS + 1])) * material[CONSTANTS + 3])
+    return CONSTANTS + 8 + 26 * min(max(i, 0), int(material[CONSTANTS]) - 1)
+
+
+@compiled(inline=True)
+def _seventh(u, i, material):
+    """Return a polynomial of degree 7, whose factors begin at a place, and its derivatives."""
+    value = slope = curve = 0.0
+    for k in range(7, -1, -1):
+        curve = 2.0 * slope + u * curve
+        slope = value + u * slope
+        value = material[i + k] + u * value
+    return value, slope, curve
+
+
+@compiled()
+def beam(l, material):  # noqa: E741
+    """
+    Return psi' and psi'' of a beam against the deflection of its tip.
+
+    Beyond the end of the tables the force goes on as that of `table`.
+    """
+    a = abs(l)
+    way = a - material[CONSTANTS + 2]
+    if way > 0.0:
+        force, stiffness = material[CONSTANTS + 4], material[CONSTANTS + 5]
+        room = 1.0 - way / (material[CONSTANTS + 1] - material[CONSTANTS + 2])
+        if not room > 0.0:
+            return math.nan, math.nan
+        return math.copysign(force + stiffness * way / room, l), stiffness / (room * room)
+    if not a >= 0.0:
+        return math.nan, math.nan
+    i = _bent(a, material)
+    force, stiffness, _ = _seventh(a - material[i], i + 2, material)
+    return math.copysign(force, l), stiffness
+
+
+@compiled()
+def beam_inertia(l, material):  # noqa: E741
+    """Return m, m', m'' of a beam, and by what its damping grows, with its derivative."""
+    a = abs(l)
+    if not a <= material[CONSTANTS + 2]:
+        return material[CONSTANTS + 6], 0.0, 0.0, material[CONSTANTS + 7], 0.0
+    i = _bent(a, material)
+    u = a - material[i]
+    m, m1, m2 = _seventh(u, i + 10, material)
+    d, d1, _ = _seventh(u, i + 18, material)
+    return m, math.copysign(m1, m1 * l), m2, d, math.copysign(d1, d1 * l)
+
+
+@compiled()
+def beam_motion(l, v, beta, damping, material):  # noqa: E741
+    """Return what `hmsa_ros.core.law.motion` does, for a beam."""
+    force, stiffness = beam(l, material)
+    m, m1, m2, d, d1 = beam_inertia(l, material)
+    i_mass = 1.0 / m
+    a = (beta - force - (damping * d + 0.5 * m1 * v) * v) * i_mass
+    a_l = -(stiffness + (damping * d1 + 0.5 * m2 * v) * v + m1 * a) * i_mass
+    return a, a_l, -(damping * d + m1 * v) * i_mass, i_mass
+
+
+@compiled()
+def _beam_energy(l, material):  # noqa: E741
+    """Return the integral of a beam's force."""
+    a = abs(l)
+    way = a - material[CONSTANTS + 2]
+    i = _bent(min(a, material[CONSTANTS + 2]), material)
+    u = min(a, material[CONSTANTS + 2]) - material[i]
+    total = 0.0
+    for k in range(8, 0, -1):
+        total = u * (material[i + 1 + k] / k + total)
+    total += material[i + 1]
+    if way > 0.0:
+        depth = material[CONSTANTS + 1] - material[CONSTANTS + 2]
+        share = way / depth
+        if not share < 1.0:
+            return math.nan
+        total += material[CONSTANTS + 4] * way \
+            - material[CONSTANTS + 5] * depth * depth * (math.log1p(-share) + share)
+    return total
+
+
 @compiled()
 def elastic(l, family, material):  # noqa: E741
     """Return psi' and psi''; NaN at a stretch that there is not."""
+    if family == BEAM:
+        return beam(l, material)
     if not 0.0 < l < math.inf:
         return math.nan, math.nan
     if family == POLYNOMIAL:
@@ -152,7 +240,9 @@ def elastic(l, family, material):  # noqa: E741
 
 @compiled()
 def energy(l, family, material):  # noqa: E741
-    """Return psi, zero at l = 1; NaN at a stretch that there is not."""
+    """Return psi, zero at rest; NaN at a stretch that there is not."""
+    if family == BEAM:
+        return _beam_energy(l, material)
     if not 0.0 < l < math.inf:
         return math.nan
     if family == POLYNOMIAL:

@@ -13,6 +13,7 @@ NEO_HOOKEAN = 1.0  # none
 POLYNOMIAL = 2.0  # b, a_1 to a_5 of b (I2 - 3) + sum a_k (I1 - 3)^k
 OGDEN = 3.0  # number of terms, then mu and alpha of each
 TABLE = 4.0  # number of pieces, then what `hmsa_ros.core.laws.curve.Curve.packed` returns
+BEAM = 5.0  # what `hmsa_ros.core.laws.bending.packed` returns
 
 #: Place of the constants in a packed material.
 CONSTANTS = 6
@@ -72,6 +73,10 @@ class Elastic:
     limits : tuple of float
         Stretches beyond which nothing is known; those that can be held are in
         `hmsa_ros.core.model.stretch_limits`.
+    shape : float, optional
+        c1 in place of that of a block.
+    section : float
+        Width times thickness of a beam over its length squared; 0 for a block.
 
     """
 
@@ -80,6 +85,18 @@ class Elastic:
     constants: tuple[float, ...]
     given: tuple[tuple[str, Any], ...]
     limits: tuple[float, float] = ENDLESS
+    shape: float | None = None
+    section: float = 0.0
+
+    @property
+    def rest(self) -> float:
+        """Coordinate at rest without a field: stretch 1, or deflection 0 of a beam."""
+        return 0.0 if self.family == BEAM else 1.0
+
+    @property
+    def coordinate(self) -> str:
+        """What the coordinate is called."""
+        return 'deflection' if self.family == BEAM else 'stretch'
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,187 @@
+"""Law beam: its mode, statics and plans against equations written down anew."""
+
+from dataclasses import replace
+from functools import cache
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_bvp, solve_ivp
+from scipy.interpolate import CubicSpline
+from scipy.optimize import brentq
+
+from hmsa_ros.contract.actuator import actuator_from, parameters_of
+from hmsa_ros.contract.parameters import BLOCK
+from hmsa_ros.core import model
+from hmsa_ros.core.creep import Creep
+from hmsa_ros.core.laws import bending
+from hmsa_ros.core.parameters import ActuatorParameters
+from hmsa_ros.core.planner import Options, Planner
+from hmsa_ros.core.simulation import ActuatorSimulation
+from hmsa_ros.core.status import Code
+from hmsa_ros.core.two_step import plan_two_step
+from hmsa_ros.core.units import MU_0
+from hmsa_ros.errors import BadInputError
+
+# A strip of silicone with 20 % of magnetised powder, in SI.
+YOUNGS, LENGTH, WIDTH, THICKNESS, DENSITY, REMANENCE = 1e6, 0.025, 0.005, 0.001, 2000.0, 0.1
+DAMPING = 2e-4
+_AREA, _BENDING = WIDTH * THICKNESS, YOUNGS * WIDTH * THICKNESS ** 3 / 12.0
+
+
+def silicone(**changes: float) -> ActuatorParameters:
+    """Return the strip, with some parameters of another value."""
+    return actuator_from({x.name: x.default for x in BLOCK} | {
+        'law': 'beam', 'law.youngs_modulus': YOUNGS, 'law.width': WIDTH,
+        'actuator.half_length': LENGTH / 2, 'actuator.half_thickness': THICKNESS / 2,
+        'actuator.density': DENSITY, 'actuator.remanence': REMANENCE,
+        'actuator.damping_coefficient': DAMPING} | changes)
+
+
+@cache
+def _mode():
+    """Return nodes and weights of Simpson's rule along the beam, and the slope of its mode."""
+    root = brentq(lambda x: math.cos(x) * math.cosh(x) + 1.0, 1.5, 2.2, xtol=1e-15)
+    s = np.linspace(0.0, 1.0, 2001)
+    weights = np.full(2001, 2.0)
+    weights[1::2] = 4.0
+    weights[[0, -1]] = 1.0
+    x = root * s
+    ratio = (math.cosh(root) + math.cos(root)) / (math.sinh(root) + math.sin(root))
+    slope = np.sinh(x) + np.sin(x) - ratio * (np.cosh(x) - np.cos(x))
+    curved = root * (np.cosh(x) + np.cos(x) - ratio * (np.sinh(x) + np.sin(x)))
+    return s, weights / 6000.0, slope / slope[-1], curved / slope[-1], root
+
+
+def _up_to(values):
+    """Return the integral from the clamp to each node, by cubics through neighbours."""
+    s = _mode()[0]
+    return CubicSpline(s, values).antiderivative()(s)
+
+
+def _of_angle(q):
+    """Return kinetic mass, stiffness, lever of the field and deflection at an angle, in SI."""
+    _, w, f, curved, _ = _mode()
+    across, along = (_up_to(part(q * f) * f) for part in (np.cos, np.sin))
+    return (
+        DENSITY * _AREA * LENGTH ** 3 * (w @ (across ** 2 + along ** 2)),
+        _BENDING / LENGTH * (w @ curved ** 2),
+        REMANENCE / MU_0 * _AREA * LENGTH * (w @ (np.cos(q * f) * f)),
+        w @ np.sin(q * f))
+
+
+@cache
+def _series():
+    """Return mass, lever and deflection as Chebyshev series of the angle, and the stiffness."""
+    nodes = 1.6 * np.cos(np.pi * (np.arange(49) + 0.5) / 49)
+    values = np.array([_of_angle(x) for x in nodes])
+    return [np.polynomial.Chebyshev.fit(nodes, values[:, i], 40, domain=[-1.6, 1.6])
+            for i in (0, 2, 3)], values[0, 1]
+
+
+def follow(deflection, pieces):
+    """Return deflection and rate after pieces of (s, T), from rest, by the angle of the tip."""
+    (mass, lever, across), stiffness = _series()
+    by_angle = across.deriv()
+    change, damping = mass.deriv(), DAMPING * (LENGTH * by_angle(0.0)) ** 2
+    end = np.array([brentq(lambda q: across(q) - deflection, -1.5, 1.5, xtol=1e-15), 0.0])
+    for duration, flux in pieces:
+        end = solve_ivp(
+            lambda _, z, flux=flux: [z[1], (
+                flux * lever(z[0]) - stiffness * z[0] - damping * z[1]
+                - 0.5 * change(z[0]) * z[1] ** 2) / mass(z[0])],
+            (0.0, duration), end, method='DOP853', rtol=1e-12, atol=1e-13).y[:, -1]
+    return across(end[0]), by_angle(end[0]) * end[1]
+
+
+def test_the_first_frequency_is_that_of_euler_and_bernoulli():
+    beam = silicone()
+    frequency = model.natural_frequency(0.0, beam.nondimensional) / beam.time_unit
+    wanted = _mode()[4] ** 2 * math.sqrt(_BENDING / (DENSITY * _AREA * LENGTH ** 4))
+    assert frequency == pytest.approx(wanted, rel=1e-10)
+
+
+@pytest.mark.parametrize('deflection', [0.05, 0.3, -0.55, 0.7, 0.78])
+def test_a_field_holds_the_deflection_that_the_full_elastica_has_within_3_percent(deflection):
+    beam = silicone()
+    flux = float(model.elastic_force(deflection, beam.nondimensional)) * beam.flux_density_unit
+    force = REMANENCE * flux / MU_0 * _AREA * LENGTH ** 2 / _BENDING
+    s = np.linspace(0.0, 1.0, 30)
+    angle = float(bending.angle_of(deflection))
+    solved = solve_bvp(
+        lambda _, z: np.vstack([z[1], -force * np.cos(z[0]), np.sin(z[0])]),
+        lambda a, b: np.array([a[0], b[1], a[2]]), s,
+        np.vstack([angle * np.sin(np.pi * s / 2), angle * (1.0 - s), deflection * s ** 2]),
+        tol=1e-6)
+    assert solved.success
+    assert deflection == pytest.approx(solved.y[2, -1], rel=0.03)
+
+
+@pytest.mark.parametrize(('start', 'target'), [
+    (0.0, 0.3), (0.3, -0.2), (-0.1, 0.0), (0.2, 0.78), (0.75, -0.75)])
+def test_a_two_step_plan_ends_at_rest_by_the_equation_of_the_angle(start, target):
+    beam = silicone()
+    plan = plan_two_step(start, target, beam.nondimensional)
+    assert plan.code is Code.TWO_STEP
+    unit, time = beam.flux_density_unit, beam.time_unit
+    deflection, rate = follow(start, [(plan.tau_p * time, plan.beta_p * unit)])
+    assert deflection == pytest.approx(target, abs=1e-9)
+    assert abs(rate * time) < 1e-8
+    # What holds the target: its plant stays there.
+    _, held = follow(target, [(0.05, plan.beta_1 * unit)])
+    assert abs(held * time) < 1e-8
+
+
+def test_the_plant_swings_as_the_equation_of_the_angle_does():
+    beam = silicone()
+    plant = ActuatorSimulation(beam, stretch=0.1)
+    flux = 0.7 * plant.flux_density * 4.0
+    plant.command(0, flux)
+    plant.advance(230_000_000)
+    deflection, rate = follow(0.1, [(0.23, flux)])
+    assert plant.stretch == pytest.approx(deflection, abs=1e-9)
+    assert plant.rate * beam.time_unit == pytest.approx(rate * beam.time_unit, abs=1e-8)
+
+
+@pytest.mark.parametrize(('changes', 'creep'), [
+    ({'coil_time_constant': 2e-3}, Creep()), ({'slew_limit': 1.0}, Creep()),
+    ({'period': 10_000_000}, Creep()), ({'shaper': 'robust'}, Creep()),
+    ({'shaper': 'minimum_time'}, Creep()), ({'shaper': 'smooth'}, Creep()),
+    ({'creep_tolerance': 1e-5}, Creep((0.1,), (0.2,)))])
+def test_every_delivery_and_shaper_moves_a_beam_through_0_to_rest(changes, creep):
+    beam = replace(silicone(), creep=creep)
+    options = Options(flux_density_min=-0.02, flux_density_max=0.02, **changes)
+    planner, plant = Planner(beam, options), ActuatorSimulation(
+        beam, creep=creep, slew_limit=changes.get('slew_limit', math.inf),
+        coil_time_constant=changes.get('coil_time_constant', 0.0))
+    plan = planner.request([(0.3, 500_000_000), (-0.4, 1_500_000_000)], 0, 0)
+    for level in plan.levels:
+        plant.command(level.stamp, level.flux_density)
+    plant.advance(plan.segments[-1].arrival + 1)
+    assert plant.stretch == pytest.approx(-0.4, abs=1e-6)
+    plant.advance(1_500_000_000)
+    # The staircase that follows creep leaves what it was allowed.
+    assert plant.stretch == pytest.approx(-0.4, abs=1e-5 if creep else 1e-6)
+
+
+def test_parameters_of_a_beam_give_the_same_beam_and_modulus_and_geometry_scale_it():
+    beam = silicone()
+    again = actuator_from({x.name: x.default for x in BLOCK} | parameters_of(beam))
+    assert again.shear_modulus == pytest.approx(beam.shear_modulus, rel=1e-14)
+    assert again.nondimensional.zeta == pytest.approx(beam.nondimensional.zeta, rel=1e-14)
+    stiffer = silicone(**{'mismatch.shear_modulus': 1.21, 'mismatch.half_thickness': 1.5})
+    assert stiffer.shear_modulus == pytest.approx(1.21 * 1.5 ** 2 * beam.shear_modulus)
+
+
+@pytest.mark.parametrize(('changes', 'message'), [
+    ({'law.width': 0.0}, 'law.width is 0 m: expected more than 0'),
+    ({'law.youngs_modulus': 0.0}, 'constants of law beam'),
+    ({'actuator.half_thickness': 0.004}, '0.008 m thick: expected a thickness of at most 0.25')])
+def test_what_is_no_beam_is_refused_in_a_sentence(changes, message):
+    with pytest.raises(BadInputError, match=message):
+        silicone(**changes)
+
+
+def test_a_target_beyond_what_one_mode_describes_is_refused():
+    with pytest.raises(BadInputError, match='a deflection between the limits -0.7862 and 0.7862'):
+        ActuatorSimulation(silicone(), stretch=0.8)
