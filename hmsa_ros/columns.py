@@ -27,6 +27,7 @@ _ALIASES = {
     't': 'time', 'stamp': 'time', 'timestamp': 'time', 'lambda': 'stretch',
     'position': 'stretch', 'b': 'flux_density', 'flux': 'flux_density', 'field': 'flux_density',
     'effort': 'flux_density'}
+_NO_TEXT = re.compile(rb'[\x00-\x08\x0e-\x1f]')
 _HEADER = re.compile(r'\s*([A-Za-z_µ ]+?)\s*(?:[\[(/]\s*([^\])]*?)\s*[\])]?)?\s*')
 
 
@@ -54,12 +55,24 @@ class Table:
 def _text(path: Path, kind: str) -> str:
     try:
         content = read_at_most(path, _LARGEST_FILE, 'a smaller CSV')
-        return io.TextIOWrapper(io.BytesIO(content), encoding='utf-8-sig').read()
+        return io.TextIOWrapper(io.BytesIO(content), encoding=_encoding(content)).read()
     except UnicodeDecodeError as error:
-        raise BadInputError(f'{path} is no text: expected {kind}') from error
+        raise BadInputError(
+            f'{path} is no text: expected {kind}; save a spreadsheet as CSV') from error
     except OSError as error:
         raise BadInputError(
             f'{path} cannot be read ({error.strerror or error}): expected {kind}') from error
+
+
+def _encoding(content: bytes) -> str:
+    """Return how a spreadsheet wrote text: by its mark, or in the code page of western Windows."""
+    if content.startswith((b'\xff\xfe', b'\xfe\xff')):
+        return 'utf-16'
+    try:
+        content.decode('utf-8-sig')
+    except UnicodeDecodeError:
+        return 'ascii' if _NO_TEXT.search(content) else 'cp1252'
+    return 'utf-8-sig'
 
 
 def read_table(path: Path, wanted: tuple[str, ...], *, kind: str = 'a CSV') -> Table:
@@ -93,6 +106,8 @@ def read_table(path: Path, wanted: tuple[str, ...], *, kind: str = 'a CSV') -> T
     if not rows:
         raise BadInputError(f'{path} is empty: expected a header and rows of numbers')
     head = rows[0][1]
+    if '\0' in head:
+        raise BadInputError(f'{path} has zero bytes in its header: expected {kind} in UTF-8')
     separator = next((x for x in _SEPARATORS if x in head), None)
     cells = _split(head, separator)
     if all(_number(x, separator) is not None for x in cells):
@@ -167,7 +182,11 @@ def _places(
             if not unit and stem != name and _ALIASES.get(stem, stem) in names:
                 name, unit = stem, suffix
         name = _ALIASES.get(name, name)
-        if name not in names or name in places:
+        if name not in names:
+            continue
+        if cell in cells[:place]:
+            raise BadInputError(f'{path} has two columns {excerpt(cell)}: expected one')
+        if name in places:
             continue
         known = _UNITS[name]
         default = {'time': 's', 'stretch': '', 'flux_density': 't'}[name]

@@ -114,6 +114,8 @@ def test_levels_sampled_beside_the_stretch_serve_with_semicolons_and_units(folde
     ('time,stretch\n', 'has a header and no row'),
     ('0.0,1.0\n0.1,1.1\n', 'begins with numbers .*expected a header'),
     ('time,length\n0,1\n', 'has no column stretch'),
+    ('time,time,stretch\n0,0,1\n', "has two columns 'time': expected one"),
+    ('t\0i\0m\0e\0,\0', 'zero bytes in its header: .*UTF-8'),
     ('time,strain\n0,0\n', 'has no column stretch: .*stretch is strain plus 1'),
     ('time,stretch [%]\n0,100\n', 'gives stretch in %: .*percent by 100'),
     ('time,stretch\n0,1\n0,1,1,02\n', 'line 3 has 4 cells in 2 columns .*need semicolons'),
@@ -167,6 +169,16 @@ def test_points_in_any_order_are_sorted_and_that_is_said(folder, capsys):
     assert status == 0
     assert abs(found['parameters']['shear_modulus']['value'] / BLOCK.shear_modulus - 1.0) < 2e-3
     assert any('not in the order of time' in x for x in found['warnings'])
+
+
+@pytest.mark.parametrize('encoding', ['utf-16', 'utf-8-sig', 'cp1252'])
+def test_files_of_spreadsheets_are_read(folder, capsys, encoding):
+    rows = (f'{1e6 * t:.9g},{y:.12g}' for t, y in zip(TIMES, STRETCH, strict=True))
+    text = '\n'.join(['time [µs],stretch', *rows])
+    (folder / 'camera.csv').write_text(text, encoding=encoding)
+    status, out, _ = identify(capsys, 'camera.csv', '--commands', 'levels.csv', '--json')
+    assert status == 0
+    assert 'from µs' in json.loads(out)['warnings'][0]
 
 
 def test_a_few_samples_of_nothing_are_no_other_unit(folder, capsys):

@@ -210,7 +210,7 @@ REFUSED = {
     'noise': (text_of(sampled(40)[0], sampled(40)[1] + 0.05 * np.random.default_rng(
         3).standard_normal(40)), 'has a scatter of .*: expected at most .*, 5% of its range'),
     'binary': (b'\x89PNG\xff\xfe\x00\x01', 'is no text: expected a CSV'),
-    'zeros': (b'\x00' * 4096, 'has no column stretch and no column flux_density'),
+    'zeros': (b'\x00' * 4096, 'has zero bytes in its header: expected a CSV'),
 }
 
 
