@@ -14,7 +14,7 @@ from hmsa_ros.core.parameters import NondimensionalParameters, paper_actuator
 from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.sequence import plan_sequence
 from hmsa_ros.core.setpoint import Setpoint
-from hmsa_ros.core.shapers import creeping, get_shaper, SHAPERS
+from hmsa_ros.core.shapers import get_shaper, SHAPERS
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.status import RefusedError
 from hmsa_ros.core.two_step import plan_two_step
@@ -153,7 +153,7 @@ def test_levels_that_follow_creep_keep_inside_the_coil():
 
 @pytest.mark.parametrize('name', SHAPERS)
 def test_a_shaper_called_directly_refuses_what_it_does_not_know_of_creep(name):
-    delivery = Delivery(slew=1.0) if name in creeping.SHAPERS else Delivery()
+    delivery = Delivery(lag=0.1) if name == 'smooth' else Delivery(slew=1.0)
     if name != 'step':
         with pytest.raises(BadInputError, match=r'viscoelastic\.ratio'):
             get_shaper(name)(Request(State(1.0), 1.1, ONE, delivery=delivery))

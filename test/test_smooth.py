@@ -158,6 +158,14 @@ def test_a_slower_move_forgives_more():
     assert shares[2] < 0.01
 
 
+@pytest.mark.parametrize('delivery', [Delivery(), Delivery(0.1, slew=3.0), Delivery(lag=0.1)])
+def test_a_move_may_be_as_small_as_rounding(delivery):
+    for away in (1e-4, 1e-8):
+        request = Request(State(1.4 + away), 1.4, PAPER, WIDE, delivery)
+        move = get_shaper('smooth')(request)
+        assert left(move, request)[0] < 1e-3
+
+
 def test_what_cannot_be_had_is_refused_with_the_limits():
     # Ramps of so little would take thousands of periods.
     with pytest.raises(RefusedError, match='ramps of') as error:
@@ -170,14 +178,16 @@ def test_what_cannot_be_had_is_refused_with_the_limits():
     assert get_shaper('smooth')(Request(State(1.4), 1.4, PAPER)).code is Code.HOLD
 
 
-def test_a_creeping_block_is_moved_smoothly_and_held_after():
+@pytest.mark.parametrize('delivery', [Delivery(), Delivery(slew=3.0), Delivery(0.1, slew=3.0)])
+def test_a_creeping_block_is_moved_smoothly_and_held_after(delivery):
     creep = Creep((0.1, 0.2), (0.4, 3.0))
     segments = plan_sequence(
         [Setpoint(1.4, 4.0), Setpoint(1.1, math.inf)], replace(PAPER, creep=creep),
-        shaper='smooth')
+        shaper='smooth', delivery=delivery)
     end = segments[1].begin + 12.0
     levels = [(x.begin + y.time, y.load) for x in segments for y in x.move.levels]
-    times, stretch, _ = judged([x for x in levels if x[0] < end], State(1.0), end, creep=creep)
+    times, stretch, _ = judged(
+        [x for x in levels if x[0] < end], State(1.0), end, slew=delivery.slew, creep=creep)
     for segment, until in zip(segments, (4.0, end), strict=True):
         assert segment.move.code is Code.SMOOTH
         here = stretch[(times >= segment.begin + segment.move.duration) & (times <= until)]

@@ -22,6 +22,7 @@ from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.stopping import brake, holdable
 from hmsa_ros.core.timeline import Draft, Model, Plan, PlannedLevel, PlannedSegment, scaled
 from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.errors import BadInputError
 
 T = TypeVar('T')
 #: Work that pauses now and then.
@@ -208,7 +209,7 @@ def draft_stop(outset: Outset) -> Steps[Draft]:
         stretch = holdable(model, brake(model, work, state, share).stretch)
         try:
             return (yield from draft_moves(outset, [Setpoint(stretch, math.inf)], shaper))
-        except RefusedError:
+        except BadInputError:
             yield
     # Nothing stops it at once: let it settle.
     return (yield from draft_moves(

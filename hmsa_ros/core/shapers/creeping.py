@@ -26,8 +26,9 @@ from hmsa_ros.core.simulation import follow, followed_by
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.errors import BadInputError
 
-#: Shapers that know of creep.
+#: Shapers that know of creep, and those that know of it through ramps.
 SHAPERS = ('two_step', 'robust', 'smooth', 'step')
+RAMPED = ('smooth', 'step')
 # The least move that counts, and how much more a staircase may leave than is worked out.
 _LEAST_MOVE, _SURE = 1e-3, 1.25
 # Levels of a staircase at the most, how its vibration grows until it has no more, and how often
@@ -45,16 +46,20 @@ def check(material: NondimensionalParameters, delivery: Delivery, shaper: str) -
     Raises
     ------
     BadInputError
-        If something creeps and the amplifier ramps, the field lags or the shaper is another.
+        If something creeps and the field lags, the shaper is another, or the amplifier ramps
+        and it is not one of `RAMPED`.
 
     """
     if not material.creep:
         return
-    if delivery.lag > 0.0 or delivery.slew < np.inf:
+    if delivery.lag > 0.0:
         raise BadInputError(
-            'viscoelastic.ratio is set and so is '
-            + ('coil_time_constant' if delivery.lag > 0.0 else 'slew_limit')
-            + ': expected 0 for one of them, since creep is planned for a field that steps only')
+            'viscoelastic.ratio is set and so is coil_time_constant: expected 0 for one of them, '
+            'since creep is planned for a field that follows at once only')
+    if delivery.slew < np.inf and shaper in SHAPERS and shaper not in RAMPED:
+        raise BadInputError(
+            'viscoelastic.ratio is set and so is slew_limit: expected 0 for one of them, or the '
+            f'shaper smooth in place of {shaper}, which plans for creep and steps only')
     if shaper not in SHAPERS:
         raise BadInputError(
             f'shaper {shaper} does not know of viscoelastic.ratio: expected one of '
@@ -121,10 +126,10 @@ def free_levels(request: Request) -> Move:
 
 def arrival(request: Request, found: Move) -> State:
     """Return the state to which a move leads, at rest at the target."""
-    end = request.state
+    end = replace(request.state, load=request.load)
     if found.duration > 0.0:
         end = follow(
-            found.levels[:-1], request.state, found.duration, request.material, IDEAL)
+            found.levels[:-1], end, found.duration, request.material, request.delivery)
     return State(
         request.target, 0.0, end.load,
         followed=followed_by(end, request.material))
@@ -165,19 +170,42 @@ def held(request: Request, found: Move, span: float) -> Move:
     out, vibration = _staircase(
         request, excess, max(span - found.duration, _SHORTEST), delivery.ripple / _SURE * step)
     times, loads = out[:, kernel.TIME], holding + out[:, kernel.EXCESS]
+    late, more = _ramped(request, times, np.diff(loads, prepend=end.load))
+    vibration += more
+    # Not before the last level of the move, nor before its start.
+    before = found.levels[-2].time if len(found.levels) > 1 else found.duration
+    late[0] = min(late[0], 0.5 * (found.duration - before))
     levels = tuple(
         Level(delivery.rounded(x), y)
-        for x, y in zip((found.duration + times).tolist(), loads.tolist(), strict=True))
+        for x, y in zip((found.duration + times - late).tolist(), loads.tolist(), strict=True))
     request.check(levels)
     followed = holding - (holding - np.array(end.followed)) * np.exp(
-        -np.outer(times, branches[:, SPEED]))
+        -np.outer(times - late, branches[:, SPEED]))
+    deviation: Array = out[:, kernel.DEVIATION] - late * out[:, kernel.RATE]
     tail = tuple(
         State(x, v, load, None, tuple(by)) for x, v, load, by in zip(
-            (request.target + out[:, kernel.DEVIATION]).tolist(), out[:, kernel.RATE].tolist(),
+            (request.target + deviation).tolist(), out[:, kernel.RATE].tolist(),
             [end.load, *loads[:-1].tolist()],
             followed.tolist(), strict=True))
     return replace(
         found, levels=found.levels[:-1] + levels, tail=tail, vibration=_SURE * vibration)
+
+
+def _ramped(request: Request, times: Array, changes: Array) -> tuple[Array, float]:
+    """Return how much sooner to command levels that are ramped to, and what ramps add."""
+    delivery, packed = request.delivery, request.material.packed
+    ramps: Array = np.abs(changes) / delivery.slew
+    if np.any(ramps > np.diff(times, append=np.inf)):
+        raise RefusedError(
+            Code.SLEW_LIMIT,
+            f'ramps of {request.units.slew_text(delivery.slew)} are too slow to follow creep at '
+            f'stretch {request.target:g}: expected a larger slew limit')
+    inertia = law.mass(request.target, packed)
+    if delivery.period == 0.0:
+        # In the middle of the ramp the step would have been: what is left is of second order.
+        return 0.5 * ramps, float(np.sum(np.abs(changes) * ramps ** 2) / (12.0 * inertia))
+    frequency = law.natural_frequency(request.target, packed)
+    return 0.0 * ramps, float(np.sum(np.abs(changes) * ramps) / (inertia * frequency))
 
 
 def _staircase(

@@ -9,7 +9,7 @@ either end. So it begins with whatever motion, field and level there are, and en
 commands carry of the level, a staircase or ramps, is corrected to end there exactly.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -22,7 +22,13 @@ from hmsa_ros.core.shapers.lagged import at_rest
 from hmsa_ros.core.shapers.pace import MOST_PERIODS
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.shooting import Attempt, solve, Template
-from hmsa_ros.core.simulation import creeping_samples, followed_by, RTOL, simulate
+from hmsa_ros.core.simulation import (
+    creeping_samples,
+    follow,
+    followed_by,
+    RTOL,
+    simulate,
+)
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.errors import HmsaError
 
@@ -39,6 +45,10 @@ _CURVED = 420.0 * (_SHARES * _LEFT) ** 2 * (_LEFT - _SHARES)
 _LONGER, _HALVINGS = 1.25, 5
 # How much longer a command may get that cannot be solved for, and how often.
 _RETRY, _RETRIES = 1.08, 5
+# Passes of a solution by differences, their change as a share of the loads and at least, and
+# what they may miss, as a share of the move and at least.
+_PASSES, _CHANGE, _LEAST_CHANGE = 8, 1e-5, 1e-6
+_AT_REST, _ROUNDING = 1e-10, 1e-12
 # Share of the slew limit that the path may use, and of the limits that corrections may need.
 _SLEW_SHARE, _SLACK = 0.95, 0.01
 
@@ -62,7 +72,7 @@ def smooth(request: Request) -> Move:
     RefusedError
         If the target is out of range, or no path keeps the limits.
     BadInputError
-        If the elastomer creeps and the amplifier ramps or the field lags.
+        If the elastomer creeps and the field lags.
 
     """
     check(request.material, request.delivery, 'smooth')
@@ -235,8 +245,49 @@ def _delivered(request: Request, path: _Path, holding: float, period: float) -> 
     d_loads = np.zeros((count + 1, len(changes)))
     d_loads[:-1] = np.array(changes).T
     rounded = np.array([delivery.rounded(x) for x in times.tolist()])
-    return solve(
-        Template(rounded, np.append(loads, holding), np.zeros_like(d_loads), d_loads), request)
+    loads = np.append(loads, holding)
+    found = None
+    if not (request.material.creep and delivery.slew < math.inf):
+        found = solve(Template(rounded, loads, np.zeros_like(d_loads), d_loads), request)
+    return found or _settled(request, rounded, loads, d_loads)
+
+
+def _settled(request: Request, times: Array, loads: Array, d_loads: Array) -> Attempt:
+    """
+    Solve for rest with differences.
+
+    For ramps where branches follow, and for moves so small that rounding counts.
+    """
+    packed = request.material.packed
+    state = replace(request.state, load=request.field)
+    frequency = law.natural_frequency(request.target, packed)
+    stiffness = law.elastic_stiffness(request.target, packed)
+    move = abs(request.target - state.stretch) + abs(state.rate) / frequency
+    change = max(_CHANGE * float(np.ptp(loads)), _LEAST_CHANGE)
+
+    def levels(factors: Array) -> tuple[Level, ...]:
+        return tuple(Level(t, x) for t, x in zip(
+            times.tolist(), (loads + d_loads @ factors).tolist(), strict=True))
+
+    def miss(factors: Array) -> Array:
+        end = follow(
+            levels(factors)[:-1], state, float(times[-1]), request.material, request.delivery)
+        misses = [end.stretch - request.target, end.rate / frequency,
+                  (end.load - loads[-1]) / stiffness]
+        return np.array(misses[:len(factors)])
+
+    factors: Array = np.zeros(d_loads.shape[1])
+    try:
+        for _ in range(_PASSES):
+            missed = miss(factors)
+            if np.max(np.abs(missed)) <= max(_AT_REST * move, _ROUNDING):
+                return levels(factors), float(times[-1])
+            slopes = np.column_stack([
+                (miss(factors + change * x) - missed) / change for x in np.eye(len(factors))])
+            factors = factors - np.linalg.solve(slopes, missed)
+    except (HmsaError, np.linalg.LinAlgError):
+        pass
+    return None
 
 
 def _refusal(request: Request) -> tuple[Code, str]:
