@@ -10,7 +10,8 @@ NAME is planner, plant, preemption, joints, controller, recorder, player or cras
 of these are run.
 Those of recorder, player and crash take some seven minutes together. faults injects faults into
 running nodes and fails if one is not answered as it should be; soak runs for hours;
-identification fits thousands of simulated runs; studies kills the workers of a study.
+identification fits thousands of simulated runs; studies kills the workers of a study; rates
+measures how many plans a second studies make, for some seven minutes.
 A page is a Markdown file with marks ``<!-- begin NAME -->`` and ``<!-- end NAME -->``, between
 which a table is put.
 """
@@ -34,7 +35,7 @@ _WIDTH = 120
 NAMES = ('planner', 'plant', 'preemption', 'joints', 'controller', 'recorder', 'player',
          'crash')
 #: Not run unless asked for: they take long and need the machine for themselves.
-LONG = ('faults', 'soak', 'identification', 'studies')
+LONG = ('faults', 'soak', 'identification', 'studies', 'rates')
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -127,7 +128,10 @@ def main(arguments: list[str] | None = None) -> int:
         if not reports[-1].passed:
             console.print('studies: not what is promised')
             status = 1
-        add(bench_studies.cluster(quick=options.quick))
+    if 'rates' in names:
+        from benchmarks import bench_studies
+
+        add(bench_studies.rates(quick=options.quick))
     for name in ('joints', 'controller', 'recorder', 'player', 'crash'):
         if name in names and _has_ros(name):
             sheet = importlib.import_module(f'benchmarks.bench_{name}').compare(

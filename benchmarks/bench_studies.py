@@ -2,10 +2,12 @@
 What studies lose when workers are killed, and what a cluster leaves of the kernel's rate.
 
     python -m benchmarks studies [--quick]
+    python -m benchmarks rates [--quick]
 
 A study runs on two processes. Twenty times, once some chunks are done, one of its workers is
-killed with SIGKILL; the table is compared with that of a run that nobody disturbs. Then the same
-plans are made by the batch kernel alone on one core, and by a Dask cluster of two processes.
+killed with SIGKILL; the table is compared with that of a run that nobody disturbs. The rates are
+those of the batch kernel alone on one core, of the same method in C with several moves in
+lock-step, and of studies on two processes and on a Dask cluster of two.
 """
 
 from contextlib import suppress
@@ -14,6 +16,7 @@ import os
 from pathlib import Path
 import random
 import signal
+import subprocess
 import tempfile
 import threading
 from time import perf_counter, sleep
@@ -21,6 +24,7 @@ from time import perf_counter, sleep
 import numba
 import numpy as np
 
+from benchmarks import contenders
 from benchmarks.sheet import Sheet
 from hmsa_ros.core.two_step import plan_two_step_batch
 from hmsa_ros.studies.chunks import Chunks
@@ -49,7 +53,8 @@ class Watched:
 def grid(points):
     """Return a sweep of so many points, in steps of 1000."""
     return Sweep({
-        'zeta': parse_grid('0:2:1000', 'zeta'), 'j_lim': parse_grid(f'4:9:{points // 1000}', 'j')})
+        'zeta': parse_grid('0:1.5:1000', 'zeta'),
+        'j_lim': parse_grid(f'4:9:{points // 1000}', 'j_lim')})
 
 
 class Killer(threading.Thread):
@@ -105,12 +110,11 @@ def compare(*, quick):
         same and killer.killed == kills and again <= WORKERS * kills)
 
 
-def cluster(*, quick):
-    """Compare a Dask cluster with the kernel alone."""
-    sweep = grid(200_000 if quick else 10_000_000)
+def rates(*, quick):
+    """Compare plans a second: in lock-step in C, the kernel, two processes, a Dask cluster."""
     numba.set_num_threads(1)
-    size = 200_000
-    zeta, j_lim = (np.resize(parse_grid(x, x), size) for x in ('0:2:1000', '4:9:997'))
+    size = 2_000 if quick else 200_000
+    zeta, j_lim = (np.resize(parse_grid(x, x), size) for x in ('0:1.5:1000', '4:9:997'))
     plan_two_step_batch(1.0, 1.1, zeta=zeta[:10], j_lim=j_lim[:10])
 
     def kernel():
@@ -118,18 +122,52 @@ def cluster(*, quick):
         plan_two_step_batch(1.0, 1.1, zeta=zeta, j_lim=j_lim)
         return size / (perf_counter() - begin)
 
-    rates = [kernel()]
-    with tempfile.TemporaryDirectory() as name, dask('local', WORKERS) as (executor, _):
-        # Each worker loads the kernels.
-        compute(grid(160_000), Path(name) / 'first', executor)
-        begin = perf_counter()
-        compute(sweep, Path(name) / 'study', executor)
-        found = sweep.size / (perf_counter() - begin)
-    rates.append(kernel())
+    found = {'kernel, one core': kernel()}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for lanes in (1, 4, 8):
+            found[f'C, {lanes} moves in lock-step'] = _in_c(folder, lanes, zeta, j_lim)
+        found['kernel, one core'] = max(kernel(), found['kernel, one core'])
+        # As many as take some five minutes, at most 1e8.
+        points = 200_000 if quick else min(
+            100_000, int(found['kernel, one core'] * WORKERS * 0.28)) * 1000
+        for words, start, rows in (
+                ('processes', lambda: local_processes(WORKERS), points),
+                ('Dask', lambda: dask('local', WORKERS), min(points, 20_000_000))):
+            begin, before = perf_counter(), _spent()
+            with start() as (executor, _):
+                # Each worker loads the kernels.
+                compute(grid(160_000), folder / f'{words} first', executor)
+                begin, before = perf_counter(), _spent()
+                compute(grid(rows), folder / words, executor)
+                taken = perf_counter() - begin
+            label = f'{rows:,} by {WORKERS} {words}'
+            found[label] = rows / taken
+            print(f'{label}: {taken:.0f} s, the parent {_spent() - before:.1f} s of a core')
+    found['kernel, one core'] = rate = max(kernel(), found['kernel, one core'])
     load = os.getloadavg()[0]
-    rate = max(rates)
+    cores = {x: WORKERS if ' by ' in x else 1 for x in found}
     return Sheet(
-        'cluster', f'Plans a second on a Dask cluster of {WORKERS} processes on this machine',
-        ['kernel, one core', 'cluster', 'share', 'load average'],
-        [[f'{rate:,.0f}', f'{found:,.0f}', f'{found / WORKERS / rate:.0%}', f'{load:.1f}']],
-        {'kernel': rates, 'cluster': found, 'load_average': load})
+        'rates', f'Plans a second; load average {load:.1f} at the end',
+        ['by', 'plans/s', 'of the kernel, for each core'],
+        [[x, f'{y:,.0f}', f'{y / cores[x] / rate:.0%}'] for x, y in found.items()],
+        {'rates': found, 'load_average': load})
+
+
+def _spent():
+    """Return the processor time of this process, in s."""
+    times = os.times()
+    return times.user + times.system
+
+
+def _in_c(folder, lanes, zeta, j_lim):
+    """Return the plans a second of lanes.c on one core."""
+    program = contenders.compile_c(folder, f'lanes{lanes}', [
+        f'-DLANES={lanes}', '-O3', '-march=native', '-mprefer-vector-width=512',
+        '-fno-math-errno'], 'lanes.c')
+    moves = ''.join(
+        f'1 1.1 {x!r} {y!r} 2\n' for x, y in zip(zeta[:2000].tolist(), j_lim.tolist(),
+                                               strict=False))
+    done = subprocess.run(
+        [str(program), '1e-12', '20'], input=moves, capture_output=True, text=True, check=True)
+    return 1e9 / float(done.stdout.split()[-3])

@@ -281,11 +281,12 @@ def compiler() -> str | None:
     return shutil.which(os.environ.get('CC') or 'cc')
 
 
-def compile_c(directory: Path, name: str, options: Sequence[str]) -> Path:
-    """Compile the C program with -O2."""
+def compile_c(
+        directory: Path, name: str, options: Sequence[str], source: str = 'two_step.c') -> Path:
+    """Compile a C program with -O2, unless options say otherwise."""
     program = directory / name
     subprocess.run(
-        [compiler() or 'cc', '-O2', *options, '-o', str(program), str(HERE / 'two_step.c'),
+        [compiler() or 'cc', '-O2', *options, '-o', str(program), str(HERE / source),
          '-lm'], check=True, capture_output=True, timeout=_PATIENCE)
     return program
 
