@@ -1,5 +1,5 @@
 """
-Draw the figures of docs/theory.md and docs/laws.md into docs/images, from the package itself.
+Draw the figures of docs/theory.md, laws.md and beam.md into docs/images, from the package itself.
 
 Used by ``make theory``.
 """
@@ -14,9 +14,13 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
+from benchmarks.beam_segments import Chain  # noqa: E402
+from hmsa_ros.contract.actuator import actuator_from  # noqa: E402
+from hmsa_ros.contract.parameters import BLOCK  # noqa: E402
 from hmsa_ros.core.creep import Creep  # noqa: E402
 from hmsa_ros.core.delivery import Delivery, pieces  # noqa: E402
 from hmsa_ros.core.laws import LAWS  # noqa: E402
+from hmsa_ros.core.laws.bending import centreline  # noqa: E402
 from hmsa_ros.core.model import elastic_force, stretch_limits  # noqa: E402
 from hmsa_ros.core.moves import State  # noqa: E402
 from hmsa_ros.core.parameters import NondimensionalParameters  # noqa: E402
@@ -204,6 +208,46 @@ def creep(path: Path) -> None:
         style.finish(rows[2], r'time $\tau$', 'off target,\n% of the step', 'c')
 
 
+def beam(path: Path) -> None:
+    """Draw bent beams, and a move on a chain of many links that is planned for one mode."""
+    youngs, length, width, thickness, density, remanence, damping = (
+        1e6, 0.025, 0.005, 0.001, 2000.0, 0.1, 2.27e-4)
+    strip = actuator_from({x.name: x.default for x in BLOCK} | {
+        'law': 'beam', 'law.youngs_modulus': youngs, 'law.width': width,
+        'actuator.half_length': length / 2, 'actuator.half_thickness': thickness / 2,
+        'actuator.density': density, 'actuator.remanence': remanence,
+        'actuator.damping_coefficient': damping})
+    chain = Chain(24, length, width, thickness, density, youngs, remanence, damping)
+    unit, period, target = strip.flux_density_unit, chain.first_period, 0.3
+    plan = plan_two_step(0.0, target, strip.nondimensional)
+    hold, arrival = plan.beta_1 * unit, plan.tau_p * strip.time_unit
+    with style.picture(path, 2.9, width=7.5) as figure:
+        shapes, move, left = figure.subplots(1, 3)
+        looks = ((0.1, style.GREEN), (0.3, style.BLUE), (0.6, style.VERMILION), (0.75, 'black'))
+        for deflection, colour in looks:
+            shapes.plot(*centreline(deflection, 41), color=colour)
+            flux = 1e3 * float(elastic_force(deflection, strip.nondimensional)) * unit
+            x, y = (part[-1] for part in centreline(deflection, 41))
+            shapes.annotate(f'{flux:.1f} mT', (x + 0.02, y), color=colour, fontsize=8)
+        shapes.plot([0.0, 0.0], [-0.08, 0.08], color='black', linewidth=3.0)
+        shapes.set_aspect('equal')
+        shapes.set_xlim(-0.05, 1.35)
+        for label, colour, levels in (
+                ('plain step', style.VERMILION, [(4.0 * period, hold)]),
+                ('two-step', style.BLUE, [
+                    (arrival, plan.beta_p * unit), (4.0 * period - arrival, hold)])):
+            time, deflection = chain.follow(levels, 400)
+            move.plot(1e3 * time, deflection, color=colour, label=label)
+        after = time > arrival
+        left.plot(1e3 * time[after], 100.0 * (deflection[after] / target - 1.0), color=style.BLUE)
+        move.legend(fontsize=8)
+        left.axhline(0.0, color='grey', linewidth=0.5)
+        left.set_ylim(-0.5, 3.5)
+        style.finish(shapes, 'along / length', 'across / length', 'a')
+        style.finish(move, 'time (ms)', 'deflection / length', 'b')
+        style.finish(left, 'time (ms)', 'off target, % of the move', 'c')
+
+
 def main() -> int:
     """Draw all of them."""
     force(FOLDER / 'theory_force.png')
@@ -213,6 +257,7 @@ def main() -> int:
     smooth(FOLDER / 'theory_smooth.png')
     laws(FOLDER / 'laws.png')
     creep(FOLDER / 'creep.png')
+    beam(FOLDER / 'beam.png')
     return 0
 
 

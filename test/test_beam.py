@@ -10,6 +10,7 @@ from scipy.integrate import solve_bvp, solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 
+from benchmarks.beam_segments import Chain
 from hmsa_ros.contract.actuator import actuator_from, parameters_of
 from hmsa_ros.contract.parameters import BLOCK
 from hmsa_ros.core import model
@@ -185,3 +186,20 @@ def test_what_is_no_beam_is_refused_in_a_sentence(changes, message):
 def test_a_target_beyond_what_one_mode_describes_is_refused():
     with pytest.raises(BadInputError, match='a deflection between the limits -0.7862 and 0.7862'):
         ActuatorSimulation(silicone(), stretch=0.8)
+
+
+@pytest.mark.parametrize(('target', 'offset'), [(0.1, 0.03), (0.6, 0.001)])
+def test_other_modes_keep_little_of_a_two_step_move_on_a_chain_of_20_links(target, offset):
+    beam = silicone()
+    chain = Chain(
+        20, LENGTH, WIDTH, THICKNESS, DENSITY, YOUNGS, REMANENCE, DAMPING)
+    plan = plan_two_step(0.0, target, beam.nondimensional)
+    unit, period = beam.flux_density_unit, chain.first_period
+    _, deflection = chain.follow([
+        (plan.tau_p * beam.time_unit, plan.beta_p * unit), (2.0 * period, plan.beta_1 * unit)],
+        200)
+    first, second = deflection[200:300], deflection[300:]
+    # The static field bends more than one mode; the second mode rings, and is soon gone.
+    assert second.mean() == pytest.approx((1.0 + offset) * target, abs=0.004 * target)
+    assert np.ptp(first) < 0.025 * target
+    assert np.ptp(second) < 0.01 * target
