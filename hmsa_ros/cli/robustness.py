@@ -234,16 +234,22 @@ def _feedback(seeds: int, *, as_json: bool) -> int:
         return 0
     print('peak-to-peak vibration (offset) in % of the step, root mean square: after the first '
           'move\n(1 to 1.4), a cycle and two cycles later, after the next move (to 1.1); what '
-          'would be left\nif nothing was corrected from then on. Worst: vibration after the '
-          'first move.')
+          'would be left\nif nothing was corrected from then on. LQR and MPC: as seen in the '
+          'cycle that follows, the\nloop closed. Learning: after each of four trials of the first '
+          'move. Worst: vibration after\nthe first move. No worse: no vibration above 1.2 times '
+          'that of the chain, or, where the model\nis exact, above half of what noise alone '
+          'shows.')
     before = ''
     for row in matrix(seeds):
         if row.scenario != before:
             print(f'\n{row.scenario}\n{"G off":>6} {"strategy":<9} {"after the move":>16} '
-                  f'{"a cycle later":>16} {"two cycles":>16} {"next move":>16} {"worst":>7}')
+                  f'{"a cycle later":>16} {"two cycles":>16} {"next move":>16} {"worst":>7} '
+                  'no worse')
             before = row.scenario
         cells = ' '.join(
             f'{100.0 * x.vibration:>7.3f} ({100.0 * x.offset:6.3f})' for x in row.left)
-        print(f'{100.0 * row.error:>4g} % {row.strategy:<9} {cells} {100.0 * row.worst[0]:>7.3f}',
-              flush=True)
+        verdict = {None: '', True: 'yes', False: 'no'}[row.no_worse]
+        line = (f'{100.0 * row.error:>4g} % {row.strategy:<9} {cells} '
+                f'{100.0 * row.worst[0]:>7.3f} {verdict}')
+        print(line.rstrip(), flush=True)
     return 0

@@ -157,12 +157,12 @@ class Corrector:
     def first(
             self, estimate: Estimate, target: float, in_force: float, *,
             shaper: str = 'two_step', order: int = 2,
-            tolerance: float = math.inf) -> Course:
+            tolerance: float = math.inf, longer: float = CAUTIOUS) -> Course:
         """
         Plan a move.
 
         Where it is expected to leave too much, its levels stay, since their early effect shows
-        what the actuator is, but it gets `CAUTIOUS` times as long for corrections until rest.
+        what the actuator is, but it gets more time for corrections until rest.
 
         Parameters
         ----------
@@ -178,6 +178,8 @@ class Corrector:
             Of the robust shaper.
         tolerance : float
             Share of the step from which on that is too much.
+        longer : float
+            How many times as long the move takes then.
 
         Returns
         -------
@@ -198,8 +200,8 @@ class Corrector:
         if math.isinf(tolerance) or expect(
                 estimate, found, self.options.slew_limit).size <= tolerance * step:
             return found
-        longer = round((CAUTIOUS - 1.0) * (found.arrival - estimate.time))
-        return replace(found, arrival=found.arrival + longer)
+        return replace(found, arrival=estimate.time + round(
+            longer * (found.arrival - estimate.time)))
 
     def correct(self, estimate: Estimate, course: Course) -> Course | None:
         """

@@ -1,0 +1,151 @@
+"""Who commands an actuator in the study of feedback: open loop, corrections, linear control."""
+
+from dataclasses import replace
+import math
+from typing import Protocol, TYPE_CHECKING
+
+import numpy as np
+
+from hmsa_ros.core.timeline import Options as PlannerOptions
+from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.estimation import Estimate, Estimator, Options, Prior
+from hmsa_ros.estimation.correction import Corrector, Course
+from hmsa_ros.studies.linear import Controller, Predictive, Quadratic
+
+if TYPE_CHECKING:
+    from hmsa_ros.studies.feedback import Scenario, Strategy
+
+#: Largest load, and time in ns from a sample's arrival to the first level that depends on it.
+LARGEST, REACTION = 2.0, 300_000
+# A move that is expected to leave more than this share of the step takes longer.
+_TOLERANCE = 3e-5
+_LINEAR: dict[str, type[Controller]] = {'lqr': Quadratic, 'mpc': Predictive}
+
+
+class Commander(Protocol):
+    """
+    Commands one actuator.
+
+    Attributes
+    ----------
+    steadily : bool
+        Whether a level follows each sample; else a course is carried out until another one.
+
+    """
+
+    steadily: bool
+
+    def move(self, time: int, target: float, course: Course) -> Course:
+        """Return the course to a target from a time in ns on, and from another course."""
+
+    def seen(self, stamp: int, stretch: float, begin: int, course: Course) -> Course | None:
+        """Take in a sample; return a better course that differs from a time in ns on, if any."""
+
+
+def commander(scenario: 'Scenario', strategy: 'Strategy') -> Commander:
+    """
+    Return who carries out a strategy.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Nominal actuator, and sensor.
+    strategy : Strategy
+        Not ``learning``, which is repeated trials in open loop.
+
+    Returns
+    -------
+    Commander
+        Before the first sample.
+
+    """
+    if strategy.kind == 'adapt':
+        return _Adapting(scenario, strategy)
+    if strategy.kind in _LINEAR:
+        return _Steady(scenario, strategy)
+    return _Open(scenario, strategy)
+
+
+class _Open:
+    """Plans with the nominal parameters."""
+
+    steadily = False
+
+    def __init__(self, scenario: 'Scenario', strategy: 'Strategy') -> None:
+        block = scenario.block
+        unit = block.flux_density_unit
+        self._strategy, self._longer = strategy, scenario.longer
+        self._prior = Prior.nominal(block, scenario.free)
+        self._corrector = Corrector(PlannerOptions(
+            flux_density_min=-LARGEST * unit, flux_density_max=LARGEST * unit))
+
+    def _first(
+            self, estimate: Estimate, target: float, course: Course,
+            tolerance: float = math.inf) -> Course:
+        return self._corrector.first(
+            estimate, target, course.holding, shaper=self._strategy.shaper,
+            order=self._strategy.order, tolerance=tolerance, longer=self._longer)
+
+    def move(self, time: int, target: float, course: Course) -> Course:
+        nominal = Estimate(
+            time, course.target, 0.0, self._prior.values, self._prior.free, {},
+            np.zeros((0, 0)), 0.0, True, '')
+        return self._first(nominal, target, course)
+
+    def seen(self, stamp: int, stretch: float, begin: int, course: Course) -> Course | None:
+        return None
+
+
+class _Adapting(_Open):
+    """Corrects moves and plans them with what it has learnt."""
+
+    def __init__(self, scenario: 'Scenario', strategy: 'Strategy') -> None:
+        super().__init__(scenario, strategy)
+        self._estimator = Estimator(self._prior, Options(noise=scenario.noise))
+        self._estimator.level(0, 0.0)
+        self._moving = False
+
+    def move(self, time: int, target: float, course: Course) -> Course:
+        estimate = self._estimator.update(time)
+        self._moving = True
+        if estimate is None:
+            return super().move(time, target, course)
+        return self._taken(self._first(estimate, target, course, _TOLERANCE), time)
+
+    def seen(self, stamp: int, stretch: float, begin: int, course: Course) -> Course | None:
+        self._estimator.sample(stamp, stretch)
+        estimate = self._estimator.update(begin)
+        if estimate is None or not self._moving:
+            return None
+        found = self._corrector.correct(estimate, course)
+        return None if found is None else self._taken(found, begin)
+
+    def _taken(self, course: Course, begin: int) -> Course:
+        for stamp, level in course.levels:
+            if stamp >= begin:
+                self._estimator.level(stamp, level)
+        return course
+
+
+class _Steady(_Open):
+    """Commands a level after each sample, and has as long as a move that is cautious."""
+
+    steadily = True
+
+    def __init__(self, scenario: 'Scenario', strategy: 'Strategy') -> None:
+        super().__init__(scenario, strategy)
+        self._controller = _LINEAR[strategy.kind](
+            scenario.block, LARGEST, round(scenario.period * NANOSECONDS),
+            round(scenario.delay * NANOSECONDS) + REACTION, scenario.noise,
+            scenario.weights[strategy.kind])
+
+    def move(self, time: int, target: float, course: Course) -> Course:
+        planned = super().move(time, target, course)
+        arrival = time + round(self._longer * (planned.arrival - time))
+        level = self._controller.move(target, planned.holding)
+        return Course(((time, level),), arrival, target)
+
+    def seen(self, stamp: int, stretch: float, begin: int, course: Course) -> Course | None:
+        level = self._controller.seen(stretch)
+        return None if level is None else replace(
+            course, levels=(course.levels[-1], (begin, level)))
