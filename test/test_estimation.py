@@ -8,6 +8,7 @@ import pytest
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation import Estimator, Options, Prior
+from hmsa_ros.estimation.words import confounded, sentence
 from hmsa_ros.identification.files import read_belief
 
 # Rest without field, a push, rest near 1.4, and back to rest near 1.1; in s and T.
@@ -189,3 +190,18 @@ def test_what_cannot_be_tracked_is_refused():
         Prior.nominal(oracle.BLOCK, ('initial_rate',))
     with pytest.raises(BadInputError, match='window is 3'):
         Options(window=3)
+
+
+def test_a_bias_and_a_constant_force_are_said_to_be_confounded_until_two_targets_were_held():
+    nominal = Prior.nominal(oracle.BLOCK, (
+        'shear_modulus', 'damping_coefficient', 'stretch_bias', 'constant_force'))
+    samples = measured(oracle.BLOCK, oracle.Extras(bias=4e-3, force=0.03), noise=2e-4)
+    said = []
+    for count in (25, len(samples)):
+        _, found = run(samples[:count], prior=nominal, times=SAMPLED[:count])
+        words = sentence(found, nominal.values, 0.0, 1.0, 1.0, 0.0, adapting=True)
+        said.append('cannot be told apart until two targets were held' in words)
+        assert said[-1] is confounded(found)
+    assert said == [True, False]
+    assert found.values['constant_force'] == pytest.approx(
+        0.03, abs=4.0 * found.deviations['constant_force'])

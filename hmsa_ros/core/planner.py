@@ -8,10 +8,12 @@ take all of a request or none of it (`hmsa_ros.core.group`).
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+import math
 
 from hmsa_ros.core.drafting import (
     check_points,
     check_target,
+    draft_moves,
     draft_resumption,
     draft_sequence,
     draft_stop,
@@ -22,9 +24,11 @@ from hmsa_ros.core.drafting import (
     Outset,
     Steps,
 )
+from hmsa_ros.core.model import equilibrium_stretch
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.raw import check_levels, draft_levels
 from hmsa_ros.core.running import RunningPlan
+from hmsa_ros.core.setpoint import Setpoint
 from hmsa_ros.core.simulation import check_stretch
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.timeline import (
@@ -198,6 +202,20 @@ class Planner(RunningPlan):
                 # From another phase of the motion it may be possible.
                 yield
         return (yield from draft_resumption(outset))
+
+    def draft_trim(self, now: int, flux_density: float) -> Steps[Draft]:
+        """Work out how to hold the setpoint under way by another level in T, from rest."""
+        model, begin = self.model, self.soonest(now)
+        state, place = self.state(begin), self.plan.under_way(begin)
+        # Beside the target, by what the model does not know of: it goes by its own stretches.
+        held, wanted = (float(equilibrium_stretch(x / model.units.load, model.material)) for x in (
+            self.plan.level(begin).flux_density, flux_density))
+        draft = yield from draft_moves(
+            Outset(self.plan, model, begin, replace(state, stretch=held, rate=0.0)),
+            [Setpoint(wanted, math.inf)])
+        segment = self.plan.segments[place]
+        anew = replace(draft.segments[0], stretch=segment.stretch, since=segment.since)
+        return replace(draft, segments=(anew,), resumed=place)
 
     def _outset(self, begin: int) -> Outset:
         state = self.state(begin)

@@ -10,6 +10,9 @@ from hmsa_ros.estimation.motion import rest
 _SURE, _MATTERS = 3.0, 0.01
 # Offset and vibration that are worth a word, as shares of the step.
 _OFFSET, _RINGING = 0.01, 0.01
+# A bias and a force that hide each other by this correlation, while where the block rests is known
+# no better than this.
+_PAIR, _HIDDEN, _UNKNOWN = ('stretch_bias', 'constant_force'), 0.9, 1e-3
 # Smaller steps have no percentage.
 _STEP = 0.01
 _NAMES = {
@@ -42,8 +45,34 @@ def differences(estimate: Estimate, nominal: Mapping[str, float]) -> list[str]:
     return list(_differences(estimate, nominal))
 
 
+def confounded(estimate: Estimate) -> bool:
+    """
+    Return whether a bias of the sensor and a constant force cannot be told apart yet.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        What is believed.
+
+    Returns
+    -------
+    bool
+        False where not both are tracked.
+
+    """
+    if not set(_PAIR) <= set(estimate.free):
+        return False
+    i, j = (estimate.free.index(x) for x in _PAIR)
+    covariance = estimate.covariance
+    together = covariance[i, j] / math.sqrt(covariance[i, i] * covariance[j, j])
+    return abs(together) > _HIDDEN and estimate.deviations[_PAIR[0]] > _UNKNOWN
+
+
 def _differences(estimate: Estimate, nominal: Mapping[str, float]) -> Iterator[str]:
+    hidden = _PAIR if confounded(estimate) else ()
     for name in estimate.free:
+        if name in hidden:
+            continue
         value, before = estimate.values[name], nominal[name]
         change = value - before
         if abs(change) < _SURE * estimate.deviations[name]:
@@ -95,10 +124,14 @@ def sentence(
         if 2.0 * amplitude > _RINGING * abs(step):
             wrong.append(f'rings at {at[1] / (2.0 * math.pi):.0f} Hz')
     found = ', '.join(differences(estimate, nominal))
+    apart = ('a bias of the sensor and a constant force cannot be told apart until two targets '
+             'were held' if confounded(estimate) else '')
     if not wrong and not found:
-        return 'as known'
+        return apart or 'as known'
     words = ' and '.join(wrong)
     words += f'{": " if words and found else ""}{found}'
-    if adapting:
-        return f'{words}; plans use it' if found else words
-    return f'{words}; `hmsa identify` or feedback: adapt mends it'
+    if not adapting:
+        words += '; `hmsa identify` or feedback: adapt mends it'
+    elif found:
+        words += '; plans use it'
+    return f'{words}; {apart}' if apart else words

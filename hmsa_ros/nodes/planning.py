@@ -152,6 +152,11 @@ SPECS = (
         'Whether a move with an actuator that is not well known takes three times as long in '
         'feedback adapt, and is corrected until then.', read_only=False),
     ParameterSpec(
+        'feedback_trim', _SETTINGS.feedback_trim,
+        'How far feedback adapt may change a level that holds a setpoint to make up for a '
+        'constant force, in small moves one after the other; constant_force must be among '
+        'feedback_parameters.', 'T', 0.0, 10.0, read_only=False),
+    ParameterSpec(
         'feedback_frozen', _SETTINGS.feedback_frozen,
         'Whether feedback keeps the parameters as it has learnt them, and follows the state '
         'alone.', read_only=False),
@@ -223,6 +228,7 @@ def settings_from(values: JointParameters) -> Settings:
         feedback=str(values['feedback']),
         feedback_parameters=check_free(values['feedback_parameters']),
         feedback_cautious=bool(values['feedback_cautious']),
+        feedback_trim=float(values['feedback_trim']),
         feedback_frozen=bool(values['feedback_frozen']),
         feedback_file=str(values['feedback_file']),
         known={name: _of(values, name, partial(Known.read, values.of(name)))

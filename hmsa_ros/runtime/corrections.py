@@ -16,6 +16,7 @@ from hmsa_ros.estimation.correction import CAUTIOUS, Course, expect
 from hmsa_ros.runtime.feedback import Feedback
 from hmsa_ros.runtime.records import Severity, Verdict
 from hmsa_ros.runtime.slices import Clock, in_time, Work
+from hmsa_ros.runtime.trimming import trimmed
 
 # A correction leaves at most this share of what the plan leaves, in squares, and gains this share
 # of the step.
@@ -96,11 +97,21 @@ class Corrections:
             if not planner.plan.segments or _as_sent(planner, now):
                 continue
             estimate = self._feedback.state(name, planner.soonest(now))
-            if estimate is None or not self._worthwhile(estimate, planner):
+            if estimate is None:
+                continue
+            level = trimmed(planner, estimate, self._feedback.trim)
+            if level is not None:
+                steps = partial(self._trim, name, level)
+            elif self._worthwhile(estimate, planner):
+                steps = partial(self._correct, name)
+            else:
                 continue
             yield Work(frozenset([name]), in_time(
-                partial(self._correct, name), self._group, frozenset([name]), self._clock),
-                corrects=True)
+                steps, self._group, frozenset([name]), self._clock), corrects=True)
+
+    def _trim(self, name: str, level: float, now: int) -> Steps[Mapping[str, Draft]]:
+        """Hold by another level in T."""
+        return {name: (yield from self._group.planners[name].draft_trim(now, level))}
 
     def _worthwhile(self, estimate: Estimate, planner: Planner) -> bool:
         """Return whether a plan is expected to leave more than it must."""

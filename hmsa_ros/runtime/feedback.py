@@ -300,6 +300,11 @@ class Feedback:
         return joint.estimator.predict(time)
 
     @property
+    def trim(self) -> float:
+        """How far in T holding levels may be changed; 0 for not at all."""
+        return self._settings.feedback_trim if self.mode == 'adapt' else 0.0
+
+    @property
     def cautious(self) -> bool:
         """Whether moves with actuators that are not well known are to take longer."""
         return self.mode == 'adapt' and self._settings.feedback_cautious

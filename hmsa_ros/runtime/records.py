@@ -42,6 +42,8 @@ class Settings:
         What is estimated besides the state.
     feedback_cautious : bool
         Whether a first move takes longer where it is expected to leave much.
+    feedback_trim : float
+        Largest change in T of a holding level against an estimated constant force; 0 for none.
     feedback_frozen : bool
         Whether these stay as they are, and the state alone is estimated.
     feedback_file : str
@@ -67,6 +69,7 @@ class Settings:
     feedback: str = 'off'
     feedback_parameters: tuple[str, ...] = TRACKED
     feedback_cautious: bool = False
+    feedback_trim: float = 0.0
     feedback_frozen: bool = False
     feedback_file: str = ''
     known: Mapping[str, Known] = field(default_factory=dict)
