@@ -1,6 +1,7 @@
 """``hmsa robustness`` and ``hmsa sweep``: what users type, see and get."""
 
 import builtins
+from concurrent.futures import ThreadPoolExecutor
 import csv
 import errno
 import io
@@ -16,7 +17,8 @@ import pytest
 from hmsa_ros.cli import main
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.figures import paper_data
-from hmsa_ros.studies import robustness
+from hmsa_ros.studies import feedback, robustness
+from hmsa_ros.studies.executors import given, here
 
 ROOT = Path(__file__).resolve().parent.parent
 PNG = b'\x89PNG\r\n\x1a\n'
@@ -266,11 +268,9 @@ def test_sweep_ends_quietly_when_its_reader_has_gone():
 
 
 def test_robustness_with_feedback_compares_open_loop_with_corrections(run, monkeypatch):
-    from hmsa_ros.studies import feedback
-
     monkeypatch.setattr(feedback, 'ERRORS', ((-0.2, 0.2),))
     monkeypatch.setattr(feedback.matrix, '__defaults__', (
-        feedback.SCENARIOS[1:2], feedback.STRATEGIES[1::5]))
+        feedback.SCENARIOS[1:2], feedback.STRATEGIES[1::5], here))
     status, out, err = run('robustness', '--feedback', '--seeds', 1, '--json')
     assert (status, err) == (0, '')
     rows = json.loads(out)['rows']
@@ -283,5 +283,13 @@ def test_robustness_with_feedback_compares_open_loop_with_corrections(run, monke
     assert out.splitlines()[-1].startswith('  20 % adapt')
 
 
+def test_trials_on_any_executor_make_the_same_matrix():
+    scenarios, strategies = feedback.SCENARIOS[:1], feedback.STRATEGIES[:2]
+    with ThreadPoolExecutor(2) as executor:
+        found = list(feedback.matrix(2, scenarios, strategies, lambda: given(executor)))
+    assert found == list(feedback.matrix(2, scenarios, strategies))
+
+
 def test_robustness_with_feedback_needs_a_seed(refused):
     assert '--seeds is 0' in refused('robustness', '--feedback', '--seeds', 0)
+    assert '--workers is 0' in refused('robustness', '--feedback', '--workers', 0)

@@ -1,13 +1,17 @@
 """``hmsa robustness``: what each shaper leaves of a move when the model is in error."""
 
 import argparse
+from functools import partial
+from itertools import product
 import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
+from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text, make_folder
 
 if TYPE_CHECKING:
+    from hmsa_ros.studies.engine import Start
     from hmsa_ros.studies.robustness import Case, Result
 
 _MOVES = ((1.0, 1.1), (1.0, 1.4), (1.0, 0.7))
@@ -62,22 +66,27 @@ def add_parser(subparsers: Any) -> None:
         '--feedback', action='store_true',
         help='compare open loop with corrections from samples instead: vibration and offset '
              'after moves with G up to 20 %% off, noise, delay and an unknown bias of the '
-             'sensor; takes minutes, writes no files, and takes only --seeds and --json')
+             'sensor; takes minutes, writes no files, and takes only --seeds, '
+             '--workers and --json')
     parser.add_argument(
         '--seeds', type=int, default=10, metavar='N',
         help='runs with different noise for --feedback (default 10)')
+    parser.add_argument(
+        '--workers', type=int, default=1, metavar='N', help='processes (default 1)')
     parser.add_argument('--json', action='store_true', help='print JSON in full precision')
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Study, print and write."""
+    start = _start(arguments.workers)
     if arguments.feedback:
-        return _feedback(arguments.seeds, as_json=arguments.json)
+        return _feedback(arguments.seeds, start, as_json=arguments.json)
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
     from hmsa_ros.core.parameters import NondimensionalParameters
+    from hmsa_ros.studies.executors import in_order
     from hmsa_ros.studies.robustness import candidates, Case, LARGEST, ORDERS, study
 
     material = NondimensionalParameters(arguments.zeta, arguments.j_lim, arguments.c1)
@@ -97,10 +106,11 @@ def run(arguments: argparse.Namespace) -> int:
             TextColumn('studying'), BarColumn(), MofNCompleteColumn(), console=console,
             transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task('', total=len(cases) * len(compared))
+        found = in_order(start, study, product(cases, compared))
         for case in cases:
             studies.append((case, []))
-            for candidate in compared:
-                studies[-1][1].append(study(case, candidate))
+            for _ in compared:
+                studies[-1][1].append(next(found))
                 progress.advance(task)
     files = _write(folder, studies)
     if arguments.json:
@@ -113,6 +123,15 @@ def run(arguments: argparse.Namespace) -> int:
     for path in files:
         print(path)
     return 0
+
+
+def _start(workers: int) -> 'Start':
+    """Return what makes the executor."""
+    from hmsa_ros.studies.executors import here, local_processes
+
+    if workers < 1:
+        raise BadInputError(f'--workers is {workers}: expected at least 1')
+    return here if workers == 1 else partial(local_processes, workers)
 
 
 def _write(folder: Path, studies: 'list[tuple[Case, list[Result]]]') -> list[Path]:
@@ -220,17 +239,16 @@ def _print_table(case: 'Case', results: 'list[Result]') -> None:
         console.print(f'note: {note}', highlight=False, soft_wrap=True)
 
 
-def _feedback(seeds: int, *, as_json: bool) -> int:
+def _feedback(seeds: int, start: 'Start', *, as_json: bool) -> int:
     """Compare open loop with corrections; rows are printed as they are worked out."""
     from dataclasses import asdict
 
-    from hmsa_ros.errors import BadInputError
     from hmsa_ros.studies.feedback import matrix
 
     if seeds < 1:
         raise BadInputError(f'--seeds is {seeds}: expected at least 1')
     if as_json:
-        print(json_text({'seeds': seeds, 'rows': [asdict(x) for x in matrix(seeds)]}))
+        print(json_text({'seeds': seeds, 'rows': [asdict(x) for x in matrix(seeds, start=start)]}))
         return 0
     print('peak-to-peak vibration (offset) in % of the step, root mean square: after the first '
           'move\n(1 to 1.4), a cycle and two cycles later, after the next move (to 1.1); what '
@@ -240,7 +258,7 @@ def _feedback(seeds: int, *, as_json: bool) -> int:
           'that of the chain, or, where the model\nis exact, above half of what noise alone '
           'shows.')
     before = ''
-    for row in matrix(seeds):
+    for row in matrix(seeds, start=start):
         if row.scenario != before:
             print(f'\n{row.scenario}\n{"G off":>6} {"strategy":<9} {"after the move":>16} '
                   f'{"a cycle later":>16} {"two cycles":>16} {"next move":>16} {"worst":>7} '

@@ -142,6 +142,7 @@ class _Picture:
                     f'the format of {path} is unknown: expected a name that ends in .png or .pdf')
         out: Path | None = arguments.out
         asked = bool(self._paths)
+        self._default = arguments.show is None
         if out is not None and _is_folder(out) and not asked:
             self._paths = [out / 'table.png', out / 'table.pdf']
         if not self._paths:
@@ -160,10 +161,12 @@ class _Picture:
         if self._shown is not None:
             self._shown.add(table)
 
-    def draw(self) -> list[Path]:
-        """Draw all rows; return the files."""
+    def draw(self, *, changed: bool = True) -> list[Path]:
+        """Draw all rows unless they are drawn already; return the files."""
         if self._shown is None or self._view is None:
             return []
+        if not changed and self._default and all(x.exists() for x in self._paths):
+            return self._paths
         from hmsa_ros.figures.sweeps import draw_sweep
 
         draw_sweep(self._paths, self._view, self._shown.columns, self._sweep.fixed)
@@ -300,7 +303,7 @@ def _plan_in_chunks(
         if len(chunks.found()) < chunks.count:
             return _part(outcome, chunks, folder)
         _report(sweep.size, chunks.merge(table, picture.add))
-        pictures = picture.draw()
+        pictures = picture.draw(changed=outcome.computed > 0)
     except KeyboardInterrupt:
         _say(f'{len(chunks.found()):,} of {chunks.count:,} chunks are in {folder}: go on with '
              '--resume')

@@ -1,8 +1,9 @@
 """Where the chunks of a study are computed: here, in local processes, or on a Dask cluster."""
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
-from contextlib import contextmanager, ExitStack
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
+from contextlib import AbstractContextManager, contextmanager, ExitStack
 import logging
 import multiprocessing
 from multiprocessing.connection import wait
@@ -10,9 +11,11 @@ import os
 from pathlib import Path
 import signal
 import threading
-from typing import Any
+from typing import Any, TypeVar
 
 from hmsa_ros.errors import BadInputError, HmsaError
+
+Result = TypeVar('Result')
 
 #: Seconds that a Dask scheduler has for its first answer.
 PATIENCE = 15
@@ -109,6 +112,48 @@ def dask(address: str, workers: int | None = None) -> Iterator[tuple[Executor, i
 def given(executor: Executor) -> Iterator[tuple[Executor, int]]:
     """Yield an executor that belongs to the caller, and how many chunks to submit ahead."""
     yield executor, AHEAD
+
+
+def in_order(
+        start: Callable[[], AbstractContextManager[tuple[Executor, int]]],
+        function: Callable[..., Result], tasks: Iterable[tuple[Any, ...]]) -> Iterator[Result]:
+    """
+    Yield what a function returns for each of many arguments, in their order.
+
+    Parameters
+    ----------
+    start : callable
+        Makes an executor, and says how many tasks to submit ahead.
+    function : callable
+        It must be possible to pickle it, its arguments and what it returns.
+    tasks : iterable of tuple
+        Arguments.
+
+    Yields
+    ------
+    object
+        What it returned.
+
+    Raises
+    ------
+    HmsaError
+        If a worker dies.
+
+    """
+    running: deque[Future[Result]] = deque()
+    try:
+        with start() as (executor, ahead):
+            for task in tasks:
+                with held_signals():
+                    running.append(executor.submit(function, *task))
+                if len(running) >= ahead:
+                    yield running.popleft().result()
+            while running:
+                yield running.popleft().result()
+    except BrokenExecutor as error:
+        raise HmsaError(
+            'a worker died: expected enough memory for all of them; take fewer (--workers)'
+        ) from error
 
 
 def cores() -> int:

@@ -8,7 +8,7 @@ an unknown bias. Whoever commands it has the nominal ones.
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from heapq import heappop, heappush
-from itertools import count
+from itertools import count, islice
 
 import numpy as np
 from scipy.special import ndtr
@@ -19,6 +19,8 @@ from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.estimation.correction import CAUTIOUS, Course
 from hmsa_ros.estimation.prior import TRACKED
 from hmsa_ros.studies.commanders import commander, LARGEST, REACTION
+from hmsa_ros.studies.engine import Start
+from hmsa_ros.studies.executors import here, in_order
 from hmsa_ros.studies.learning import carried_out, Learner
 from hmsa_ros.studies.linear import Weights
 
@@ -395,7 +397,7 @@ def rms(trials: Iterable[Sequence[Left]]) -> list[Left]:
 
 def matrix(
         seeds: int, scenarios: Sequence[Scenario] = SCENARIOS,
-        strategies: Sequence[Strategy] = STRATEGIES) -> Iterator[Row]:
+        strategies: Sequence[Strategy] = STRATEGIES, start: Start = here) -> Iterator[Row]:
     """
     Run all strategies in all scenarios.
 
@@ -407,6 +409,8 @@ def matrix(
         Actuators and sensors.
     strategies : sequence of Strategy
         To compare.
+    start : callable
+        Makes an executor, and says how many trials to submit ahead; default this process.
 
     Yields
     ------
@@ -414,22 +418,25 @@ def matrix(
         One after the other.
 
     """
-    for scenario in scenarios:
-        for errors in ERRORS:
-            limits = [allowed(scenario, x) for x in errors]
-            for strategy in strategies:
-                closed = strategy.kind != 'open'
-                trials = [
-                    [trial(scenario, strategy, error, seed)
-                     for seed in range(seeds if closed else 1)] for error in errors]
-                runs = [x for same in trials for x in same]
-                yield Row(
-                    scenario.name, strategy.name, max(errors), tuple(rms(runs)),
-                    tuple(max(x.vibration for x in column)
-                          for column in zip(*runs, strict=True)),
-                    all(x.vibration <= limit[0 if strategy.kind == 'learning' else i]
-                        for limit, same in zip(limits, trials, strict=True)
-                        for run in same for i, x in enumerate(run)) if closed else None)
+    rows = [(scenario, errors, strategy, [
+        (scenario, strategy, error, seed) for error in errors
+        for seed in range(1 if strategy.kind == 'open' else seeds)])
+        for scenario in scenarios for errors in ERRORS for strategy in strategies]
+    left = in_order(start, trial, (task for *_, tasks in rows for task in tasks))
+    limits: dict[tuple[str, tuple[float, ...]], list[list[float]]] = {}
+    for scenario, errors, strategy, tasks in rows:
+        key = scenario.name, errors
+        if key not in limits:
+            limits[key] = [allowed(scenario, x) for x in errors]
+        runs = list(islice(left, len(tasks)))
+        each = len(runs) // len(errors)
+        yield Row(
+            scenario.name, strategy.name, max(errors), tuple(rms(runs)),
+            tuple(max(x.vibration for x in column) for column in zip(*runs, strict=True)),
+            None if strategy.kind == 'open' else all(
+                x.vibration <= limit[0 if strategy.kind == 'learning' else i]
+                for place, limit in enumerate(limits[key])
+                for run in runs[place * each:(place + 1) * each] for i, x in enumerate(run)))
 
 
 def allowed(scenario: Scenario, error: float) -> list[float]:
