@@ -56,7 +56,7 @@ def compare(*, quick: bool = False, runs: int = RUNS) -> Sheet:
             ('shaped, repeated', True, 15)):
         for noise in (1e-3, 1e-4):
             for rate in (1000, 200, 60):
-                cell = _cell(levels_of(shaped, repeats), noise, rate, runs)
+                cell = _cell(levels_of(shaped, repeats), noise, rate, runs, len(rows))
                 good = bool(cell.failed == 0 and np.max(cell.ratios) <= ratio and least <= np.min(
                     cell.coverage) <= np.max(cell.coverage) <= most)
                 rows.append([
@@ -91,8 +91,9 @@ class _Cell:
     failed: int
 
 
-def _cell(levels: tuple[Array, Array], noise: float, rate: int, runs: int) -> _Cell:
-    """Identify runs of one kind."""
+def _cell(
+        levels: tuple[Array, Array], noise: float, rate: int, runs: int, place: int) -> _Cell:
+    """Identify runs of one kind; those of each place have noise of their own."""
     times = np.arange(int(DURATION * rate)) / rate
     values = values_of(BLOCK)
     blank = Recording(times, np.linspace(1.0, 1.5, len(times)), *levels)
@@ -102,7 +103,7 @@ def _cell(levels: tuple[Array, Array], noise: float, rate: int, runs: int) -> _C
     true = np.array([values[x] for x in DEFAULT_FREE])
     errors, inside, durations, failed = [], [], [], 0
     for seed in range(runs):
-        random = np.random.default_rng(seed)
+        random = np.random.default_rng((place, seed))
         stretch = exact.stretch + noise * random.standard_normal(len(times))
         start = _off(random)
         begin = perf_counter()

@@ -11,7 +11,7 @@ from hmsa_ros.core.model import Array
 from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification import diagnosis
-from hmsa_ros.identification.fit import Fit, fit, LEAST_SCALE, loss, robust_scale
+from hmsa_ros.identification.fit import Fit, fit, LEAST_SCALE, loss, moved, robust_scale
 from hmsa_ros.identification.noise import errors_of_stamps, hinted, whiteness, widening
 from hmsa_ros.identification.quantities import (
     check_free,
@@ -43,6 +43,8 @@ _FAR = 4.0
 _DOUBT = 0.05
 # As many fits at one optimum end the search.
 _ENOUGH = 2
+# Share of what is allowed from which on a deviation is looked at twice.
+_NEARLY_LOST = 0.3
 # Times that the errors of the stamps are estimated anew.
 _MOST_SPREADS = 3
 # Probability of residuals to be white below which no chance makes them look like this.
@@ -256,6 +258,8 @@ def _conclude(
     held, factors = (
         correlated * np.sqrt(np.maximum(x / np.diag(inverse) / deviation ** 2, 1.0))
         for x in (variance, variance + hint))
+    bent = _bent(recording, best, inverse, deviation, held, at_rest)
+    held, factors = bent * held, bent * factors
     covariance = inverse * deviation ** 2 * np.outer(factors, factors)
     weak = diagnosis.weakness(best, deviation, held)
     marks = diagnosis.signatures(recording, best, found, at_rest=at_rest)
@@ -311,6 +315,35 @@ def _blurred(
     missed = 0.5 * error * best.values['stretch_gain'] * (best.response.rate - after.rate)
     moved: Array = inverse @ (columns.T @ (best.root * missed))
     return moved ** 2
+
+
+def _bent(
+        recording: Recording, best: Fit, inverse: Array, deviation: float, held: Array,
+        at_rest: bool) -> Array:
+    """
+    Return by how much deviations are larger than the information at the optimum says.
+
+    Looked at where a parameter is nearly lost: two deviations off, the best fit of the others
+    has to be as much worse as those say.
+    """
+    std = np.sqrt(np.diag(inverse)) * deviation * held
+    limits, weights = diagnosis.allowed(best), best.root ** 2
+    base = float(weights @ best.residual ** 2)
+    factors: Array = np.ones(len(best.free))
+    for place in np.flatnonzero((std > _NEARLY_LOST * limits) & (std <= limits)):
+        name, largest = best.free[place], 1.0
+        others = tuple(x for x in best.free if x != name)
+        for change in (-2.0 * std[place], 2.0 * std[place]):
+            step = inverse[:, place] / inverse[place, place] * change
+            start = moved(best.values, best.free, step)
+            one = fit(recording, start, others, at_rest=at_rest, spread=best.spread) \
+                if others else None
+            if one is not None:
+                worse = (float(weights @ one.residual ** 2) - base) / deviation ** 2
+                largest = max(largest, 2.0 * held[place] / math.sqrt(max(worse, 1e-2)))
+        shared = inverse[:, place] ** 2 / inverse[place, place] / np.diag(inverse)
+        factors = np.maximum(factors, np.sqrt(1.0 + shared * (largest ** 2 - 1.0)))
+    return factors
 
 
 def _inverse(information: Array) -> Array:
