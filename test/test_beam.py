@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+import json
 import math
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 
 from benchmarks.beam_segments import Chain
+from hmsa_ros.cli import main
 from hmsa_ros.contract.actuator import actuator_from, parameters_of
 from hmsa_ros.contract.parameters import BLOCK
 from hmsa_ros.core import model
@@ -203,3 +205,38 @@ def test_other_modes_keep_little_of_a_two_step_move_on_a_chain_of_20_links(targe
     assert second.mean() == pytest.approx((1.0 + offset) * target, abs=0.004 * target)
     assert np.ptp(first) < 0.025 * target
     assert np.ptp(second) < 0.01 * target
+
+
+def test_identification_refuses_a_beam_in_a_sentence(tmp_path, capsys):
+    known = tmp_path / 'beam.yaml'
+    assert main(['init', '--beam', '--yes', '--flux-max', '10mT', '--out', str(known)]) == 0
+    data = tmp_path / 'data.csv'
+    data.write_text('time,stretch,flux_density\n0,0,0\n')
+    for words in (['identify', str(data)], ['excite', '--duration', '20']):
+        assert main([*words, '--params-file', str(known)]) == 2
+        assert 'has law beam: expected a block; a beam is not' in capsys.readouterr().err
+
+
+def test_a_parameter_file_of_a_beam_plans_its_deflection_to_both_sides(tmp_path, capsys):
+    file = tmp_path / 'beam.yaml'
+    words = ['init', '--beam', '--length', '25mm', '--thickness', '1mm', '--width', '5mm',
+             '--shear-modulus', '333333.3333333333', '--density', '2g/cm3', '--remanence', '0.1',
+             '--damping', '2e-4', '--flux-max', '10mT', '--out', str(file)]
+    assert main([*words, '--joint', 'tip']) == 0
+    told = capsys.readouterr()
+    assert 'coil holds deflections     -0.74295 to 0.74295' in told.out
+    assert 'lying, the beam sags by 0.46 of its length' in told.err
+    assert main(['plan', '-0.2:1', '0.3:1', '--params-file', str(file), '--json']) == 0
+    first, second = json.loads(capsys.readouterr().out)['segments']
+    beam = silicone()
+    plan = plan_two_step(0.0, -0.2, beam.nondimensional)
+    assert first['time_p'] == pytest.approx(plan.tau_p * beam.time_unit, rel=1e-8)
+    assert second['flux_density_1'] == pytest.approx(
+        float(model.elastic_force(0.3, beam.nondimensional)) * beam.flux_density_unit, rel=1e-9)
+    for wrong, said in (
+            (['--half-length', '5mm'], 'expected sizes of a beam'),
+            (['--youngs-modulus', '1MPa'], 'both --shear-modulus and --youngs-modulus')):
+        assert main([*words, *wrong, '--force']) == 2
+        assert said in capsys.readouterr().err
+    assert main(['init', '--length', '25mm', '--yes', '--out', str(tmp_path / 'x.yaml')]) == 2
+    assert 'expected --beam with it' in capsys.readouterr().err

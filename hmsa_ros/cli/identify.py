@@ -60,9 +60,10 @@ def run(arguments: argparse.Namespace) -> int:
 
     from hmsa_ros.identification.files import file_text, read_belief
     from hmsa_ros.identification.identify import identify, profile
-    from hmsa_ros.identification.quantities import DEFAULT_FREE
+    from hmsa_ros.identification.quantities import DEFAULT_FREE, refuse_beam
 
     belief = read_belief(arguments.params_file)
+    refuse_beam(belief.actuator.law)
     recording, belief = _read(arguments, belief)
     free = [x for x in arguments.free.split(',') if x] or DEFAULT_FREE
     found = identify(recording, free=free, actuator=belief.actuator, known=belief.others)

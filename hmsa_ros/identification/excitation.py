@@ -22,7 +22,13 @@ from hmsa_ros.core.sequence import plan_sequence
 from hmsa_ros.core.setpoint import Setpoint
 from hmsa_ros.core.status import RefusedError
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.quantities import check_free, DEFAULT_FREE, derivative, values_of
+from hmsa_ros.identification.quantities import (
+    check_free,
+    DEFAULT_FREE,
+    derivative,
+    refuse_beam,
+    values_of,
+)
 from hmsa_ros.identification.recording import Course
 from hmsa_ros.identification.response import respond
 
@@ -182,6 +188,7 @@ class Designer:
             rate: float = 1000.0, noise: float = 1e-3,
             free: Sequence[str] = DEFAULT_FREE) -> None:
         """Check duration and rate."""
+        refuse_beam(actuator.law)
         if actuator.law is not None:
             # Beyond the ends of a table nothing is known of the motion.
             least, most = (1.0 + _MARGIN * (x - 1.0) for x in actuator.law.limits)

@@ -78,6 +78,22 @@ DEFAULT_FREE = (
 GEOMETRY = ('half_length', 'half_thickness')
 
 
+def refuse_beam(law: Elastic | None) -> None:
+    """
+    Refuse a law whose parameters are not sought.
+
+    Raises
+    ------
+    BadInputError
+        If it is that of a beam.
+
+    """
+    if law is not None and law.rest == 0.0:
+        raise BadInputError(
+            f'the actuator has law {law.law}: expected a block; a beam is not identified: find '
+            'its modulus by the frequency of its ringing and its damping by the decay')
+
+
 def check_free(names: Iterable[str], law: Elastic | None = None) -> tuple[str, ...]:
     """
     Return the names of free parameters, checked.
@@ -106,9 +122,7 @@ def check_free(names: Iterable[str], law: Elastic | None = None) -> tuple[str, .
         raise BadInputError(
             f'free parameter {", ".join(map(repr, unknown)) or "missing"}: expected some of '
             f'{", ".join(QUANTITIES)}')
-    if law is not None and law.rest == 0.0:
-        raise BadInputError(
-            f'the actuator has law {law.law}: expected a block, a beam is not identified')
+    refuse_beam(law)
     if law is not None and 'chain_limit' in free:
         if free != DEFAULT_FREE:
             raise BadInputError(

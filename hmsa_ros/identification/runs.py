@@ -10,6 +10,7 @@ from hmsa_ros.core.model import Array
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification.quantities import refuse_beam
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.runs.bags import read_runs
 from hmsa_ros.runs.levels import in_force, without_repeats
@@ -52,6 +53,7 @@ def read_bag(
             'with --joint')
     run = runs[0]
     # A recorder gets the latched changes of before after the first new one.
+    refuse_beam((actuator or run.planner).law)
     levels = sorted(run.applied, key=lambda x: x.stamp) or in_force(
         (x,) for x in without_repeats(run.commands)[0])
     if not levels:
