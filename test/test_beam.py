@@ -233,6 +233,13 @@ def test_a_parameter_file_of_a_beam_plans_its_deflection_to_both_sides(tmp_path,
     assert first['time_p'] == pytest.approx(plan.tau_p * beam.time_unit, rel=1e-8)
     assert second['flux_density_1'] == pytest.approx(
         float(model.elastic_force(0.3, beam.nondimensional)) * beam.flux_density_unit, rel=1e-9)
+    assert main(['plan', '-0.2:1', '--params-file', str(file)]) == 0
+    assert 'deflection' in capsys.readouterr().out
+    # From rest, which is not stretch 1.
+    assert main(['sweep', '--params-file', str(file), '--target=-0.2']) == 0
+    start, target, status, *found = capsys.readouterr().out.splitlines()[1].split(',')
+    assert (start, target, status) == ('0.0', '-0.2', 'two_step')
+    assert float(found[1]) == pytest.approx(first['time_p'], rel=1e-8)
     for wrong, said in (
             (['--half-length', '5mm'], 'expected sizes of a beam'),
             (['--youngs-modulus', '1MPa'], 'both --shear-modulus and --youngs-modulus')):

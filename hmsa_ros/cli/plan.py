@@ -132,7 +132,7 @@ def _run_si(arguments: argparse.Namespace) -> int:
         _print_table(
             rows, ('stretch', 'span', 'flux_density_p', 'time_p', 'flux_density_1'),
             f'times in s, flux densities in T; c1 {group.c1:.6g}, zeta {group.zeta:.6g}, '
-            f'time unit {time:.6g} s')
+            f'time unit {time:.6g} s', group.coordinate)
         _print_reasons(segments)
     return 0
 
@@ -210,14 +210,14 @@ def _row(segment: 'Segment') -> dict[str, float | str | None]:
 
 
 def _print_table(
-        rows: Sequence[Mapping[str, float | str | None]], columns: Sequence[str], caption: str
-) -> None:
+        rows: Sequence[Mapping[str, float | str | None]], columns: Sequence[str], caption: str,
+        coordinate: str = 'stretch') -> None:
     from rich.console import Console
     from rich.table import Table
 
     table = Table(caption=caption)
     for name in columns:
-        table.add_column(name, justify='right')
+        table.add_column(coordinate if name == 'stretch' else name, justify='right')
     table.add_column('status')
     for row in rows:
         table.add_row(*(

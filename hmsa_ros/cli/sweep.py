@@ -25,7 +25,7 @@ _SMALL = 3.4
 _LARGE = 1_000_000
 # Column, option, and what it is.
 _AXES = (
-    ('start', '--start', 'initial stretch, at rest (default 1)'),
+    ('start', '--start', 'initial stretch, at rest (default 1; of a beam 0)'),
     ('target', '--target', 'stretch to come to rest at (default 1.1)'),
     ('zeta', '--zeta', 'nondimensional damping coefficient, at least 0 (default 0.2)'),
     ('j_lim', '--j-lim', 'chain limit of the Gent model, above 0 (default 5)'),

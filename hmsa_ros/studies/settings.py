@@ -8,6 +8,7 @@ of what a parameter file says.
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 import math
 import sys
 from typing import Any, ClassVar
@@ -19,6 +20,7 @@ from hmsa_ros.core.laws import LAWS
 from hmsa_ros.core.mismatch import Errors, Uncertainty
 from hmsa_ros.core.moves import Limits
 from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.core.scales import USUAL_MOVE
 from hmsa_ros.core.shapers.request import ERRORS
 from hmsa_ros.core.units import NANOSECONDS, Units
 
@@ -76,10 +78,6 @@ class System(ABC):
 
     Attributes
     ----------
-    columns : dict of str to float
-        Those that each row has, with the value of what is not given.
-    ranges : dict of str to tuple of float
-        Of all columns that a row may have.
     actual : dict of str to tuple of float
         Ranges of the columns in which the actuator differs from what is planned with.
     delivery : frozenset of str
@@ -91,11 +89,19 @@ class System(ABC):
 
     """
 
-    columns: ClassVar[Mapping[str, float]]
-    ranges: ClassVar[Mapping[str, Range]]
     actual: ClassVar[Mapping[str, Range]]
     delivery: ClassVar[frozenset[str]]
     roots: ClassVar[bool]
+
+    @property
+    @abstractmethod
+    def columns(self) -> Mapping[str, float]:
+        """Those that each row has, with the value of what is not given."""
+
+    @property
+    @abstractmethod
+    def ranges(self) -> Mapping[str, Range]:
+        """Of all columns that a row may have."""
 
     @property
     @abstractmethod
@@ -186,9 +192,6 @@ class InSI(System):
 
     """
 
-    columns = {'start': 1.0, 'target': 1.1}
-    ranges = {
-        'start': _POSITIVE, 'target': _POSITIVE, **_ranges(PLANNED), 'command_period': (0.0, 1e3)}
     actual = {
         f'{ACTUAL}{x.removeprefix(BLOCK_OF)}': y for x, y in _ranges(PLANNED).items()
         if x not in ('flux_density_min', 'flux_density_max')}
@@ -210,6 +213,21 @@ class InSI(System):
 
         """
         return cls({**values, **completed(values)}, errors)
+
+    @cached_property
+    def _rest(self) -> float:
+        return model_from(self.known, None, 0).material.rest
+
+    @property
+    def columns(self) -> Mapping[str, float]:
+        """Those that each row has: a move from rest, unless given."""
+        return {'start': self._rest, 'target': self._rest + USUAL_MOVE}
+
+    @property
+    def ranges(self) -> Mapping[str, Range]:
+        """Of all columns that a row may have; a beam bends to either side."""
+        place = _POSITIVE if self._rest else (-FINITE, FINITE)
+        return {'start': place, 'target': place, **_ranges(PLANNED), 'command_period': (0.0, 1e3)}
 
     @property
     def ideal(self) -> bool:
