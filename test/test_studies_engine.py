@@ -66,7 +66,8 @@ def chunk_files(folder):
 
 @pytest.mark.slow
 def test_two_workers_write_the_table_of_one_to_the_byte(run, tmp_path, expected):
-    assert run('--workers=1', '--out=a')[:2] == (0, 'a/table.parquet\n')
+    assert run('--workers=1', '--out=a')[:2] == (
+        0, 'a/table.parquet\na/table.png\na/table.pdf\n')
     assert (tmp_path / 'a' / 'table.parquet').read_bytes() == expected[0]
     status, out, err = run('--workers=2', '--out=b.csv')
     assert (status, out) == (0, 'b.csv\n')
@@ -74,7 +75,7 @@ def test_two_workers_write_the_table_of_one_to_the_byte(run, tmp_path, expected)
     assert (tmp_path / 'b.csv').read_bytes() == expected[1]
     assert sorted(x.name for x in tmp_path.iterdir()) == ['a', 'b.csv']
     assert sorted(x.name for x in (tmp_path / 'a').iterdir()) == [
-        'chunks', 'study.json', 'table.parquet']
+        'chunks', 'study.json', 'table.parquet', 'table.pdf', 'table.png']
 
 
 def test_shards_of_two_machines_merge_into_the_same_table(run, tmp_path, expected):
