@@ -147,14 +147,11 @@ def _map(figure: Figure, panel: Axes, axes: tuple[Axis, Axis], name: str, values
         wide = _wide(values)
         norm = (LogNorm if wide else Normalize)(low, high if high > low else low + 1e-12)
         mesh = panel.pcolormesh(
-            x, y, np.ma.masked_invalid(values), cmap='cividis', norm=norm, shading='nearest',
-            rasterized=True)
+            x, y, values, cmap='cividis', norm=norm, shading='nearest', rasterized=True)
         figure.colorbar(mesh, ax=panel, label=label_of(name), pad=0.02)
         if high > low:
             levels = np.geomspace(low, high, _CONTOURS + 2)[1:-1] if wide else _CONTOURS
-            lines = panel.contour(
-                x, y, np.ma.masked_invalid(values), levels=levels, colors='white',
-                linewidths=0.7)
+            lines = panel.contour(x, y, values, levels=levels, colors='white', linewidths=0.7)
             for drawn in (lines, *panel.clabel(lines, fontsize=7, fmt='%.3g')):
                 drawn.set(path_effects=[withStroke(linewidth=1.6, foreground='#404040')])
     style.finish(panel, label_of(axes[0].name), label_of(axes[1].name))
@@ -185,9 +182,10 @@ def _curves(panel: Axes, view: View, axis: Axis, name: str, values: Array) -> No
         panel.set_yscale('log')
     panel.set_xlim(x[0], x[-1])
     edges = np.concatenate([x[:1], 0.5 * (x[1:] + x[:-1]), x[-1:]])
+    missing = np.repeat(np.all(np.isnan(values), axis=(0, 2)), 2)
     panel.fill_between(
         np.repeat(edges, 2)[1:-1], 0.0, 1.0, transform=panel.get_xaxis_transform(),
-        where=np.repeat(np.all(np.isnan(values), axis=(0, 2)), 2), linewidth=0.0, **_HATCH)
+        where=missing.tolist(), linewidth=0.0, **_HATCH)
 
 
 def _shares(panel: Axes, view: View, name: str, values: Array) -> None:

@@ -251,7 +251,7 @@ def _conclude(
     correlated = widening(columns, weighted, inverse, found)
     _, variance = errors_of_stamps(best.jacobian, best.residual, best.response.rate)
     variance += _blurred(recording, best, deviation, columns, inverse, at_rest)
-    hint = np.zeros(len(best.free))
+    hint: Array = np.zeros(len(best.free))
     if not recording.earlier and not _DELAYS.intersection(best.free):
         hint = hinted(root * best.response.rate, columns, weighted, inverse, found)
     # A hint that becomes a proof rejects the model: it does not make a recording a weak one.

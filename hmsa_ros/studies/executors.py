@@ -165,13 +165,26 @@ def cores() -> int:
 
 @contextmanager
 def held_signals() -> Iterator[None]:
-    """Let SIGINT wait; processes that start meanwhile never get it."""
+    """Let signals wait; processes that start meanwhile never get SIGINT."""
     # Ctrl-C goes to all processes of a terminal; the one that started the others ends them.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    # A pool that is left half started cannot be shut down. The mask is this thread's alone: what
+    # another gets, Python answers in this one.
+    noted: list[int] = []
+    handlers = {
+        x: handler for x in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        if (handler := signal.getsignal(x)) is not None
+    } if threading.current_thread() is threading.main_thread() else {}
+    for number in handlers:
+        signal.signal(number, lambda x, _: noted.append(x))
     try:
         yield
     finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for x in noted[:1]:
+            signal.raise_signal(x)
 
 
 def _end_with_parent() -> None:

@@ -53,8 +53,9 @@ class Learner:
         self.stamps = [end + i * period
                        for i in range(count)]
         here = self._nominal(self.unknowns)
-        self._inverse: Array = np.linalg.pinv(np.column_stack([
-            (self._nominal(self.unknowns + _SMALL * row) - here) / _SMALL for row in np.eye(3)]))
+        slopes = np.column_stack([
+            (self._nominal(self.unknowns + _SMALL * row) - here) / _SMALL for row in np.eye(3)])
+        self._inverse: Array = np.linalg.pinv(slopes).astype(np.float64)
 
     def levels(self, unknowns: Array) -> tuple[tuple[int, float], ...]:
         """Return stamps in ns and levels in T."""

@@ -231,7 +231,7 @@ class Quadratic(Controller):
     """A linear quadratic regulator with the sum of errors, kept while levels are clipped."""
 
     _sum = 0.0
-    _gains = np.ones(1)
+    _gains: Array = np.ones(1)
 
     def _design(self, model: Linearised) -> None:
         n = len(model.b)
@@ -269,7 +269,8 @@ class Predictive(Controller):
         final = _regulator(model.a, model.b[:, None], weight, effort)[1]
         values, vectors = np.linalg.eigh(final)
         root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-        free, forced = np.eye(n), np.zeros((n, steps))
+        free = np.eye(n)
+        forced: Array = np.zeros((n, steps))
         rows, by = [], []
         for i in range(steps):
             forced = model.a @ forced

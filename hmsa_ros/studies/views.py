@@ -9,8 +9,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 import math
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hmsa_ros.core.model import Array
 from hmsa_ros.errors import BadInputError
@@ -50,7 +52,7 @@ class Axis:
     sampled: bool = False
 
     @classmethod
-    def of(cls, table: Mapping[str, np.ndarray], *, samples: bool) -> 'Axis':
+    def of(cls, table: Mapping[str, NDArray[Any]], *, samples: bool) -> 'Axis':
         """Return the axis of columns that vary together."""
         name = ', '.join(table)
         size = len(next(iter(table.values())))
@@ -170,7 +172,7 @@ class Shown:
         self.columns: dict[str, Array] = {name: np.full(size, math.nan) for name in names}
         self._done = 0
 
-    def add(self, table: Mapping[str, np.ndarray]) -> None:
+    def add(self, table: Mapping[str, NDArray[Any]]) -> None:
         """Add the next rows, from all their columns by name."""
         size = 0
         for name, column in self.columns.items():

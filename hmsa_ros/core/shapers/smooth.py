@@ -35,7 +35,7 @@ from hmsa_ros.errors import HmsaError
 # Points of a path, levels of a natural period, and how many there are at least and at most.
 _POINTS = 129
 _OF_EACH, _FEWEST, _MOST = 32, 16, 300
-_SHARES = np.linspace(0.0, 1.0, _POINTS)
+_SHARES: Array = np.linspace(0.0, 1.0, _POINTS).astype(np.float64)
 _LEFT = 1.0 - _SHARES
 # How far a path has faded from the motion as it would go on into the target, with derivatives.
 _FADED = _SHARES ** 4 * (35.0 - 84.0 * _SHARES + 70.0 * _SHARES ** 2 - 20.0 * _SHARES ** 3)
@@ -135,7 +135,7 @@ def _path(request: Request, holding: float, duration: float) -> _Path | None:
     """Return the levels of a path of some duration, None if it does not keep the limits."""
     material, delivery, limits = request.material, request.delivery, request.limits
     packed = material.packed
-    times = duration * _SHARES
+    times: Array = duration * _SHARES
     try:
         free, rate, change, field, followed = _free(request, times)
     except HmsaError:
