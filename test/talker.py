@@ -4,7 +4,8 @@ Publishes numbered std_msgs/Float64 messages from a process of its own.
     talker.py TOPIC COUNT [--rate HZ] [--best-effort] [--latched] [--depth N] [--first VALUE]
               [--wait SUBSCRIBERS]
 
-It waits for its subscribers, sends, prints "done" and stays until it is told to end.
+It waits for its subscribers, sends, prints "done" and stays until it is told to end. It keeps the
+last N messages for readers that missed some, or all.
 """
 
 import argparse
@@ -25,7 +26,8 @@ def main():
     parser.add_argument('--rate', type=float, default=1000.0)
     parser.add_argument('--best-effort', action='store_true')
     parser.add_argument('--latched', action='store_true')
-    parser.add_argument('--depth', type=int, default=1000)
+    # A reliable publisher says nothing again that it no longer keeps.
+    parser.add_argument('--depth', type=int)
     parser.add_argument('--first', type=float, default=0.0)
     parser.add_argument('--wait', type=int, default=1)
     options = parser.parse_args()
@@ -33,7 +35,7 @@ def main():
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = Node('talker', enable_rosout=False, start_parameter_services=False)
     publisher = node.create_publisher(Float64, options.topic, QoSProfile(
-        history=HistoryPolicy.KEEP_LAST, depth=options.depth,
+        history=HistoryPolicy.KEEP_LAST, depth=options.depth or options.count,
         reliability=ReliabilityPolicy.BEST_EFFORT if options.best_effort
         else ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if options.latched

@@ -53,6 +53,7 @@ def recorded_run(start, ros, tmp_path):
     return bag
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_a_recorded_run_comes_out_again(recorded_run, start, tmp_path):
     result, = verify(recorded_run)

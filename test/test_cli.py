@@ -190,6 +190,7 @@ def test_send_moves_several_joints_each_to_its_stretch_or_all_to_one(start, ros)
         assert 'expected one for all, or one per joint' in send.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_send_passes_on_why_the_planner_refuses(start):
     start.hmsa('planner')

@@ -76,6 +76,7 @@ def test_robustness_prints_a_table_and_names_its_files(run, tmp_path):
         assert (tmp_path / path).read_bytes().startswith(PNG if path[-3:] == 'png' else b'%PDF')
 
 
+@pytest.mark.slow
 def test_robustness_as_json_has_everything_in_full_precision(run):
     status, out, err = run(
         'robustness', '--move', '1:1.1', '--shapers', 'two_step,step', '--errors', 0.05, '--json')

@@ -19,6 +19,7 @@ def designed():
     return excite(BLOCK, Bounds(-0.1, 0.2), duration=1.0)
 
 
+@pytest.mark.slow
 def test_design_tells_three_times_as_much_as_plain_steps_of_the_duration(designed):
     assert designed.improvement >= 3.0
     assert designed.plain.std['shear_modulus'] < designed.paper.std['shear_modulus']

@@ -241,6 +241,7 @@ def test_one_in_a_hundred_outliers_moves_nothing_by_a_deviation():
         assert abs(x.value - before.parameters[name].value) < x.std, name
 
 
+@pytest.mark.slow
 def test_correlated_noise_widens_the_intervals_and_is_no_misfit():
     clean = recorded(noise=0.0)
     errors, plain = [], identify(recorded()).parameters['shear_modulus'].std
@@ -318,6 +319,7 @@ def test_ratios_alone_are_not_identifiable_and_said_to_be():
     assert np.isfinite(found.parameters['chain_limit'].value)
 
 
+@pytest.mark.slow
 def test_small_stretches_do_not_hold_the_chain_limit():
     found = identify(recorded((1.02, 1.0)))
     assert found.verdict == 'not_identifiable'
@@ -358,6 +360,7 @@ def test_block_without_limit_of_its_chains_is_identified():
     assert max(map(abs, relative(found).values())) < 4.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('modulus', 'damping'), [(1.88, 0.11), (7.7, 0.15)])
 def test_one_pass_at_sixty_frames_a_second_is_found_from_far_off(modulus, damping):
     # Three samples or so fall on each step, and it rings one and a half times between two.

@@ -299,6 +299,7 @@ def test_without_a_selection_every_topic_is_recorded(record, ros):
     assert counts['/diagnostics'] > 0
 
 
+@pytest.mark.slow
 def test_pause_and_resume(record, ros):
     recorder = record('record.start_paused:=true')
     publisher = ros.publisher(Float64, '/a')

@@ -140,6 +140,7 @@ def test_each_order_of_the_chain_forgives_more(small, large):
         assert worst[2] < 0.5 * worst[1]
 
 
+@pytest.mark.slow
 def test_steady_offset_is_no_residual(small):
     _, results = small
     result = results['robust, order 3']
@@ -148,6 +149,7 @@ def test_steady_offset_is_no_residual(small):
     assert 100.0 * offset > 100.0 * at(_, result, 'G', 0.1)
 
 
+@pytest.mark.slow
 def test_worst_in_the_box_holds_everywhere_in_the_box(large):
     case, results = large
     points = np.random.default_rng(7).uniform(-case.box, case.box, (100, 3)).tolist()

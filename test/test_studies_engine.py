@@ -78,6 +78,7 @@ def test_two_workers_write_the_table_of_one_to_the_byte(run, tmp_path, expected)
         'chunks', 'study.json', 'table.parquet', 'table.pdf', 'table.png']
 
 
+@pytest.mark.slow
 def test_shards_of_two_machines_merge_into_the_same_table(run, tmp_path, expected):
     # From 1 on one of them and in two folders, brought together afterwards.
     status, out, err = run('--workers=1', '--shard=1/2', '--out=one')
@@ -175,6 +176,7 @@ def test_interrupt_leaves_whole_chunks_and_nothing_else(tmp_path):
     assert all(chunks.sound(x) for x in found.values())
 
 
+@pytest.mark.slow
 def test_any_executor_computes_a_study(sweep, tmp_path, expected):
     with ThreadPoolExecutor(2) as executor:
         assert compute(sweep, tmp_path / 'study', executor).computed == CHUNKS

@@ -171,6 +171,7 @@ def test_samples_are_those_of_sobol_and_follow_from_number_and_seed_alone(run):
     assert len(digests) == 2
 
 
+@pytest.mark.slow
 def test_chunks_of_samples_shapers_and_laws_merge_to_the_table_of_one_process(run, tmp_path):
     pytest.importorskip('pyarrow')
     words = ('sweep', '--zeta', 'sobol:0.1:0.3', '--samples', 200, '--shaper', 'two_step,robust',
@@ -303,6 +304,7 @@ def test_samples_of_an_identification_are_actuators_and_the_plan_is_the_same(run
 # --- pictures
 
 
+@pytest.mark.slow
 def test_a_folder_gets_the_map_of_its_table_and_other_pictures_are_named(run, tmp_path):
     assert run('sweep', '--zeta', '0:3:7', '--j-lim', 'log:0.1:100:6', '--out', 'map',
                '--show', 'tau_p')[0] == 0
