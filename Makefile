@@ -105,7 +105,7 @@ $(VENV)/.tools: $(VENV)/.installed
 	@touch $@
 
 $(VENV)/.bench: $(VENV)/.installed
-	$(INSTALL) -e '.[bench]'
+	$(INSTALL) -e '.[bench,studies,cluster]'
 	@touch $@
 
 # Compiled now and cached, so that no command waits for it.
