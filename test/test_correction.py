@@ -165,12 +165,12 @@ def test_open_loop_in_the_study_leaves_what_the_study_of_shapers_says():
     from hmsa_ros.core.parameters import NondimensionalParameters
     from hmsa_ros.core.shapers import get_shaper
     from hmsa_ros.core.shapers.request import Request
-    from hmsa_ros.studies.residual import Errors, residual
+    from hmsa_ros.studies.residual import Actual, Errors
 
     material = NondimensionalParameters()
     move = get_shaper('two_step')(Request(State(1.0), 1.4, material))
     found = trial(SCENARIOS[0], Strategy('', 'two_step'), 0.2, 0)[0]
     assert found.vibration == pytest.approx(
-        residual(move, 1.0, 1.4, material, Errors(0.2), move.duration), rel=2e-3)
+        Actual.off(material, Errors(0.2)).residual(move, 1.0, 1.4, move.duration), rel=2e-3)
     # A cycle is two thirds of a period.
     assert 0.7 * found.vibration < found.motion < 1.01 * found.vibration

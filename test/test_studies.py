@@ -17,11 +17,10 @@ from hmsa_ros.core.status import Code
 from hmsa_ros.core.two_step import plan_two_step
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.figures.studies import draw_damped, draw_front, draw_robustness, draw_sampled
-from hmsa_ros.studies import robustness
 from hmsa_ros.studies.__main__ import main, pictures, tables
 from hmsa_ros.studies.axes import MOST_VALUES, parse_grid, read_cases
 from hmsa_ros.studies.damped import damped_study, settling_time
-from hmsa_ros.studies.residual import Actual, arrival_of, Errors, residual, response
+from hmsa_ros.studies.residual import Actual, arrival_of, Errors
 from hmsa_ros.studies.robustness import (
     Candidate,
     candidates,
@@ -95,11 +94,12 @@ def test_response_in_error_is_that_of_another_actuator_in_si_units(start, target
     later = np.linspace(0.0, 3.0 * tau_p, 31)
     expected = motion(last, middle, later[-1], later)[0]
     times = (tau_p + later) / model.time_unit
-    assert response(move, start, times, MATERIAL, errors) == pytest.approx(expected, abs=1e-8)
-    assert response(move, start, np.array([0.0]), MATERIAL, errors) == pytest.approx(begin)
-    assert Actual.off(MATERIAL, errors).rest(move) == pytest.approx(
+    plant = Actual.off(MATERIAL, errors)
+    assert plant.response(move, start, times) == pytest.approx(expected, abs=1e-8)
+    assert plant.response(move, start, np.array([0.0])) == pytest.approx(begin)
+    assert plant.rest(move) == pytest.approx(
         brentq(balance, 0.5, 2.0, args=(last,), xtol=1e-13))
-    peaks = residual(move, start, target, MATERIAL, errors, move.duration)
+    peaks = plant.residual(move, start, target, move.duration)
     fine = motion(last, middle, 4.0 * tau_p, np.linspace(0.0, 4.0 * tau_p, 4001))[0]
     assert peaks == pytest.approx(np.ptp(fine) / abs(target - start), rel=1e-3, abs=EXACT)
 
@@ -149,19 +149,23 @@ def test_steady_offset_is_no_residual(small):
     assert 100.0 * offset > 100.0 * at(_, result, 'G', 0.1)
 
 
+def left(result, case, errors):
+    """Return the residual of a result's move for some errors."""
+    return Actual.off(MATERIAL, errors).residual(
+        result.move, case.start, case.target, result.arrival)
+
+
 @pytest.mark.slow
 def test_worst_in_the_box_holds_everywhere_in_the_box(large):
     case, results = large
     points = np.random.default_rng(7).uniform(-case.box, case.box, (100, 3)).tolist()
     for result in results.values():
-        values = [residual(result.move, case.start, case.target, MATERIAL, Errors(*x),
-                           result.arrival) for x in points]
+        values = [left(result, case, Errors(*x)) for x in points]
         # Between the points of the grid it may be a little worse.
         assert max(values) <= 1.02 * result.worst.residual
         assert result.worst.residual >= max(
             result.nominal, *(x.residual for x in result.alone.values())) - 1e-15
-        assert residual(result.move, case.start, case.target, MATERIAL, result.worst.errors,
-                        result.arrival) == result.worst.residual
+        assert left(result, case, result.worst.errors) == result.worst.residual
 
 
 def test_worst_alone_is_on_the_curve_and_within_the_box():
@@ -198,13 +202,16 @@ def test_shapers_that_fall_back_or_refuse_say_so():
 @pytest.fixture
 def lost(monkeypatch):
     """Return a study in which the motion is lost wherever zeta is too large."""
-    def losing(move, start, target, material, errors, arrival):
-        if errors.zeta > 0.0:
-            raise HmsaError('the integration ran out of steps')
-        return residual(move, start, target, material, errors, arrival)
-
-    monkeypatch.setattr(robustness, 'residual', losing)
     case = Case(1.0, 1.1)
+    whole = Actual.residual
+
+    def losing(plant, *words):
+        stiffer = plant.load
+        if plant.material.zeta * math.sqrt(stiffer) > case.material.zeta * (1.0 + 1e-12):
+            raise HmsaError('the integration ran out of steps')
+        return whole(plant, *words)
+
+    monkeypatch.setattr(Actual, 'residual', losing)
     return case, study(case, Candidate('step'))
 
 

@@ -22,7 +22,7 @@ from hmsa_ros.core.two_step import plan_two_step_batch
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.runs.parameters import read_parameter_file, values_of
 from hmsa_ros.studies.axes import Belief, draw, NOTHING, parse_values, Spread
-from hmsa_ros.studies.residual import Errors, residual
+from hmsa_ros.studies.residual import Actual, Errors
 from hmsa_ros.studies.settings import InSI, Nondimensional
 from hmsa_ros.studies.sweep import Sweep
 
@@ -298,7 +298,7 @@ def test_samples_of_an_identification_are_actuators_and_the_plan_is_the_same(run
     move = two_step(Request(State(1.0), 1.1, model))
     # Times of levels in SI units are whole nanoseconds.
     assert float(row['residual']) == pytest.approx(
-        residual(move, 1.0, 1.1, model, errors, move.duration), abs=1e-6)
+        Actual.off(model, errors).residual(move, 1.0, 1.1, move.duration), abs=1e-6)
 
 
 # --- pictures

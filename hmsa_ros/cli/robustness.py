@@ -1,7 +1,6 @@
 """``hmsa robustness``: what each shaper leaves of a move when the model is in error."""
 
 import argparse
-from functools import partial
 from itertools import product
 import math
 from pathlib import Path
@@ -79,7 +78,9 @@ def add_parser(subparsers: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Study, print and write."""
-    start = _start(arguments.workers)
+    from hmsa_ros.studies.executors import local
+
+    start = local(arguments.workers)
     if arguments.feedback:
         return _feedback(arguments.seeds, start, as_json=arguments.json)
     from rich.console import Console
@@ -123,15 +124,6 @@ def run(arguments: argparse.Namespace) -> int:
     for path in files:
         print(path)
     return 0
-
-
-def _start(workers: int) -> 'Start':
-    """Return what makes the executor."""
-    from hmsa_ros.studies.executors import here, local_processes
-
-    if workers < 1:
-        raise BadInputError(f'--workers is {workers}: expected at least 1')
-    return here if workers == 1 else partial(local_processes, workers)
 
 
 def _write(folder: Path, studies: 'list[tuple[Case, list[Result]]]') -> list[Path]:

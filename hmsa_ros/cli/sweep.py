@@ -186,15 +186,18 @@ def _sweep(arguments: argparse.Namespace) -> 'Sweep':
         from hmsa_ros.contract.topics import PLANNER
         from hmsa_ros.core.shapers.request import ERRORS
         from hmsa_ros.identification.files import errors_of, read_belief
-        from hmsa_ros.runs.parameters import read_parameter_file, values_of
+        from hmsa_ros.runs.parameters import entries_of, read_parameter_file, values_of
 
-        system = InSI.of(values_of(
-            read_parameter_file(arguments.params_file), PLANNER, (*PLANNED, *VISCOELASTIC)),
-            errors_of(read_belief(arguments.params_file), ERRORS))
+        path = arguments.params_file
+        entries = entries_of(path)
+        known = read_belief(path, entries)
+        system = InSI.of(
+            values_of(read_parameter_file(path, entries), PLANNER, (*PLANNED, *VISCOELASTIC)),
+            errors_of(known, ERRORS))
         if arguments.identified:
             from hmsa_ros.studies.identified import belief_of
 
-            belief = belief_of(arguments.params_file)
+            belief = belief_of(known, path)
             if arguments.residual:
                 belief = replace(belief, names=tuple(
                     f'{ACTUAL}{x.removeprefix(BLOCK_OF)}' for x in belief.names))
@@ -331,13 +334,13 @@ def _places(out: Path) -> tuple[Path, Path]:
 
 def _engine(arguments: argparse.Namespace, *, small: bool) -> tuple['Start', int]:
     """Return what computes, and on how many cores as far as that is known."""
-    from hmsa_ros.studies.executors import cores, dask, here, local_processes
+    from hmsa_ros.studies.executors import cores, dask, local
 
     if arguments.dask is not None:
         return (partial(dask, arguments.dask, arguments.workers),
                 arguments.workers or (cores() if arguments.dask == 'local' else 1))
     workers = arguments.workers or (1 if small else cores())
-    return (here if workers == 1 else partial(local_processes, workers)), workers
+    return local(workers), workers
 
 
 def _estimate(sweep: 'Sweep', chunks: 'Chunks', cores: int, shard: tuple[int, int]) -> None:

@@ -16,7 +16,7 @@ from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.shapers.step import step
 from hmsa_ros.figures import style
 from hmsa_ros.studies.damped import DampedStudy, LIMITS, limits_of, SETTLED
-from hmsa_ros.studies.residual import Errors, response
+from hmsa_ros.studies.residual import Actual
 from hmsa_ros.studies.robustness import Candidate, Case, ORDERED, PARAMETERS, percent, Result
 from hmsa_ros.studies.sampled import ideal_move, PROMISED, rounded_move, SampledStudy, solved_move
 
@@ -207,7 +207,7 @@ def draw_sampled(path: str | Path, study: SampledStudy, *, period: float = 0.28)
         for move, look in looks:
             _levels(panels['command'], move, end, look)
             panels['response'].plot(
-                times, response(move, study.start, times, study.material, Errors()), **look)
+                times, Actual.off(study.material).response(move, study.start, times), **look)
         axes = panels['command']
         for number in range(int(1.6 * study.tau_p / size) + 1):
             axes.axvline(number * size, **style.TARGET)
@@ -272,7 +272,7 @@ def draw_damped(path: str | Path, study: DampedStudy, *, zeta: float = 4.0) -> N
             _levels(panels['command'], Move(move.code, tuple(
                 type(x)(x.time, x.load / holding) for x in move.levels), 0.0), end, look)
             panels['response'].plot(
-                times, response(move, study.start, times, material, Errors()), **look)
+                times, Actual.off(material).response(move, study.start, times), **look)
         axes = panels['command']
         axes.set_xlim(-0.02 * end, end)
         style.finish(axes, '', r'load $\beta/\beta_1$ [1]', 'b')

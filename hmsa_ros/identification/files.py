@@ -24,7 +24,7 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.known import Known, PREFIX
 from hmsa_ros.identification.quantities import actuator_of, QUANTITIES
 from hmsa_ros.identification.result import Identification
-from hmsa_ros.runs.parameters import entries_of, number_of, values_of
+from hmsa_ros.runs.parameters import Entries, entries_of, number_of, values_of
 
 # What coil and sensor have, by the name in parameter files.
 _OTHERS = {
@@ -68,7 +68,7 @@ class Belief:
         return default if value is None else value
 
 
-def read_belief(path: Path | None) -> Belief:
+def read_belief(path: Path | None, entries: Entries | None = None) -> Belief:
     """
     Read a parameter file.
 
@@ -76,6 +76,8 @@ def read_belief(path: Path | None) -> Belief:
     ----------
     path : Path, optional
         YAML as ROS 2 has it; without one everything has its default.
+    entries : list, optional
+        What is in it, if it was read before.
 
     Returns
     -------
@@ -89,8 +91,10 @@ def read_belief(path: Path | None) -> Belief:
 
     """
     # A node's own goes before what is meant for all, and the planner's before the plant's.
-    entries = [] if path is None else sorted(entries_of(path), key=lambda x: _RANKS.get(x[0], 0))
-    settings: dict[str, Any] = {name: value for _, name, value in entries}
+    if entries is None:
+        entries = [] if path is None else entries_of(path)
+    settings: dict[str, Any] = {
+        name: value for _, name, value in sorted(entries, key=lambda x: _RANKS.get(x[0], 0))}
     values = values_of({f'{PLANNER}.{x}': y for x, y in settings.items()}, PLANNER, BLOCK)
     others = {name: _number(path, key, settings[key])
               for name, key in _OTHERS.items() if key in settings}

@@ -26,6 +26,9 @@ from hmsa_ros.files import read_at_most
 _LARGEST_FILE = 1 << 20
 _DEEPEST = 32
 
+#: Node, dotted name and value of each parameter in a file; no node if all are meant.
+Entries = list[tuple[str, str, object]]
+
 
 def number_of(value: object) -> float | None:
     """Return a number as a float; None for anything else, NaN or a number too large."""
@@ -137,9 +140,10 @@ _NAMES = tuple(
     name for x in ACTUATOR for name in (x.name, f'mismatch.{x.name.partition(".")[2]}'))
 
 
-def read_parameter_file(path: str | Path) -> dict[str, object]:
+def read_parameter_file(
+        path: str | Path, entries: Entries | None = None) -> dict[str, object]:
     """
-    Read a YAML parameter file; return values of planner and plant by ``'node.name'``.
+    Read a YAML parameter file, or take its entries; return values by ``'node.name'``.
 
     Raises
     ------
@@ -147,7 +151,7 @@ def read_parameter_file(path: str | Path) -> dict[str, object]:
         If the file cannot be read or sets no parameter of the actuator.
 
     """
-    entries = entries_of(Path(path))
+    entries = entries_of(Path(path)) if entries is None else entries
     found: dict[str, object] = {}
     for node in (PLANNER, PLANT):
         # What is meant for all nodes comes first, so that a node's own goes before it.
@@ -189,7 +193,7 @@ def values_of(
     return values
 
 
-def entries_of(path: Path) -> list[tuple[str, str, object]]:
+def entries_of(path: Path) -> Entries:
     """
     Return node, dotted name and value of each parameter in a file; no node if all are meant.
 

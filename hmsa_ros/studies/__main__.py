@@ -20,7 +20,7 @@ from hmsa_ros.errors import BadInputError, complain, HmsaError
 from hmsa_ros.figures.studies import draw_damped, draw_front, draw_robustness, draw_sampled
 from hmsa_ros.figures.sweeps import draw_sweep
 from hmsa_ros.studies.damped import damped_study, DampedStudy, LIMITS
-from hmsa_ros.studies.residual import Errors, residual
+from hmsa_ros.studies.residual import Actual, Errors
 from hmsa_ros.studies.robustness import Candidate, candidates, Case, PARAMETERS, percent, study
 from hmsa_ros.studies.sampled import sampled_study
 from hmsa_ros.studies.sweep import parse_grid, Sweep
@@ -62,9 +62,8 @@ def single_error_table() -> Table:
             move = SHAPERS[candidate.shaper](Request(
                 State(start), target, MATERIAL, order=candidate.order))
             rows.append((f'{candidate.name}, {start:g} to {target:g}', *(
-                percent(residual(
-                    move, start, target, MATERIAL, Errors(**{PARAMETERS[name]: error}),
-                    move.duration))
+                percent(Actual.off(MATERIAL, Errors(**{PARAMETERS[name]: error})).residual(
+                    move, start, target, move.duration))
                 for name, error in cases)))
     return rows
 
@@ -78,7 +77,7 @@ def smooth_table() -> Table:
         name = f'{start:g} to {target:g}'
         rows.append((f'arrival, {name}', *(f'{x.duration:.3f}' for x in moves)))
         rows.append((f'G ±10 %, {name}', *(percent(max(
-            residual(x, start, target, MATERIAL, Errors(error), x.duration)
+            Actual.off(MATERIAL, Errors(error)).residual(x, start, target, x.duration)
             for error in (-0.1, 0.1))) for x in moves)))
     return rows
 

@@ -17,7 +17,7 @@ from hmsa_ros.core.shapers.minimum_time import minimum_time
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.shapers.step import step
 from hmsa_ros.errors import HmsaError
-from hmsa_ros.studies.residual import Errors, response
+from hmsa_ros.studies.residual import Actual
 
 #: Deviation from the target, as a share of the step, at which a motion counts as settled.
 SETTLED = 0.01
@@ -79,7 +79,7 @@ def settling_time(
     decay = frequency * (
         ratio if ratio < 1.0 else ratio - math.sqrt(ratio * ratio - 1.0))
     times = np.linspace(0.0, move.levels[-1].time + _DECADES / decay, _SAMPLES)
-    away = np.abs(response(move, start, times, material, Errors()) - target)
+    away = np.abs(Actual.off(material).response(move, start, times) - target)
     band = SETTLED * abs(target - start)
     outside = np.flatnonzero(away > band)
     if outside.size == 0:

@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, ExitStack
+from functools import partial
 import logging
 import multiprocessing
 from multiprocessing.connection import wait
@@ -54,6 +55,21 @@ def local_processes(workers: int) -> Iterator[tuple[Executor, int]]:
         for process in list((pool._processes or {}).values()):
             process.kill()
         pool.shutdown(cancel_futures=True)
+
+
+def local(workers: int) -> Callable[[], AbstractContextManager[tuple[Executor, int]]]:
+    """
+    Return what makes an executor of so many processes; of one, of this process.
+
+    Raises
+    ------
+    BadInputError
+        If there is none.
+
+    """
+    if workers < 1:
+        raise BadInputError(f'--workers is {workers}: expected at least 1')
+    return here if workers == 1 else partial(local_processes, workers)
 
 
 @contextmanager

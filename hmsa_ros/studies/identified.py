@@ -5,21 +5,23 @@ from pathlib import Path
 import numpy as np
 
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.files import read_belief
+from hmsa_ros.identification.files import Belief as Known
 from hmsa_ros.studies.axes import Belief
 
 # Identified names that are no parameters of the block by that name.
 _OTHERS = {'coil_time_constant': 'coil_time_constant', 'time_unit': 'actuator.density'}
 
 
-def belief_of(path: Path) -> Belief:
+def belief_of(found: Known, path: Path) -> Belief:
     """
     Return mean and covariance of what was identified, without what belongs to the sensor.
 
     Parameters
     ----------
+    found : Known
+        What is in a parameter file as ``hmsa identify --out`` writes it.
     path : Path
-        Parameter file as ``hmsa identify --out`` writes it.
+        Its name.
 
     Returns
     -------
@@ -29,10 +31,9 @@ def belief_of(path: Path) -> Belief:
     Raises
     ------
     BadInputError
-        If the file cannot be read, or has no covariance of the block.
+        If the file has no covariance of the block.
 
     """
-    found = read_belief(path)
     numbers, known = found.actuator.numbers, found.known
     means, names, places = [], [], []
     slopes = np.eye(len(known.names))

@@ -50,8 +50,7 @@ class Learner:
         self.unknowns = np.array([first, end - begin, last]) / self._scale
         self._least, self._most = (x * self.unknowns[1] for x in _RANGE)
         count = int(_SEEN * block.time_unit * NANOSECONDS / period)
-        self.stamps = [end + i * period
-                       for i in range(count)]
+        self.stamps = [end + i * period for i in range(count)]
         here = self._nominal(self.unknowns)
         slopes = np.column_stack([
             (self._nominal(self.unknowns + _SMALL * row) - here) / _SMALL for row in np.eye(3)])

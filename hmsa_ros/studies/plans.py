@@ -58,6 +58,11 @@ class Plans:
         self.time_p[rows] = plans.time_p
         self.load_1[rows] = plans.load_1
 
+    def put_one(self, row: int, planned: '_Planned') -> None:
+        """Put the plan of a row in its place."""
+        self.codes[row] = STATUS.index(planned.code)
+        self.load_p[row], self.time_p[row], self.load_1[row] = planned.numbers
+
 
 def by_batch(
         start: Array, target: Array, zeta: Array, j_lim: Array, c1: Array,
@@ -108,9 +113,8 @@ def by_settings(
     for row in np.flatnonzero(group == -1).tolist():
         setting = settings[which[row]]
         if setting is not None:
-            found = _planned(setting, float(start[row]), float(target[row]), str(shapers[row]))
-            plans.load_p[row], plans.time_p[row], plans.load_1[row] = found.numbers
-            plans.codes[row] = STATUS.index(found.code)
+            plans.put_one(row, _planned(
+                setting, float(start[row]), float(target[row]), str(shapers[row])))
     return plans
 
 
@@ -139,14 +143,10 @@ def carried_out(
 
     Parameters
     ----------
-    settings, actuals : sequence of Setting or None
-        All that occur, in pairs; None for one that is out of range.
-    which : ndarray of int64, shape (n,)
-        Which of them each row has.
-    start, target : ndarray, shape (n,)
-        Stretches.
-    shapers : ndarray of str, shape (n,)
-        Names.
+    settings, which, start, target, shapers
+        As those of `by_settings`.
+    actuals : sequence of Setting or None
+        The actuator for each of the settings; None for one that is out of range.
 
     Returns
     -------
@@ -172,8 +172,7 @@ def carried_out(
             made[key] = planned, math.nan if planned.move is None else arrival_of(
                 planned.move, begin, end, setting.material)
         planned, arrival = made[key]
-        plans.codes[row] = STATUS.index(planned.code)
-        plans.load_p[row], plans.time_p[row], plans.load_1[row] = planned.numbers
+        plans.put_one(row, planned)
         if planned.move is not None and actual is not None and begin != end:
             with suppress(HmsaError):
                 plant = Actual.of(setting, actual)

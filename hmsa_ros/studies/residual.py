@@ -24,13 +24,14 @@ from hmsa_ros.core.two_step import plan_two_step
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.studies.settings import Setting
 
-__all__ = ['Actual', 'arrival_of', 'Errors', 'residual', 'response']
+__all__ = ['Actual', 'arrival_of', 'Errors']
 
 # Peak-to-peak of a decaying motion is final after one period, or once it has died out.
 _PERIODS = 2.0
 _DECADES = 12.0
 # 150 samples a period miss 2e-4 of an extremum.
 _SAMPLES = 301
+_EXACT = Errors()
 
 
 def arrival_of(
@@ -72,7 +73,7 @@ class Actual:
     delivery: Delivery = IDEAL
 
     @classmethod
-    def off(cls, model: NondimensionalParameters, errors: Errors) -> 'Actual':
+    def off(cls, model: NondimensionalParameters, errors: Errors = _EXACT) -> 'Actual':
         """Return the actuator of a model in error."""
         return cls(model, errors.actual(model), 1.0 / errors.faster, errors.stiffer)
 
@@ -174,17 +175,3 @@ class Actual:
     def offset(self, move: Move, start: float, target: float) -> float:
         """Return how far beyond the target a move comes to rest, as a share of the step."""
         return (self.rest(move) - target) / (target - start)
-
-
-def response(
-        move: Move, start: float, times: Floats, material: NondimensionalParameters,
-        errors: Errors) -> Array:
-    """Sample the stretch of a model in error, as `Actual.response`."""
-    return Actual.off(material, errors).response(move, start, times)
-
-
-def residual(
-        move: Move, start: float, target: float, material: NondimensionalParameters,
-        errors: Errors, arrival: float) -> float:
-    """Return what a move leaves of a model in error, as `Actual.residual`."""
-    return Actual.off(material, errors).residual(move, start, target, arrival)

@@ -24,7 +24,7 @@ from hmsa_ros.core.simulation import check_stretch
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.files import replacing
-from hmsa_ros.studies.residual import Actual, arrival_of, Errors, residual
+from hmsa_ros.studies.residual import Actual, arrival_of, Errors
 
 #: Parameters in error: name for a person, name in `Errors`.
 PARAMETERS = {'G': 'shear_modulus', 'zeta': 'zeta', 'J_lim': 'j_lim'}
@@ -272,8 +272,8 @@ def study(case: Case, candidate: Candidate) -> Result:
 
     def left(errors: Errors) -> float:
         try:
-            return residual(
-                move, case.start, case.target, case.material, errors, arrival)
+            return Actual.off(case.material, errors).residual(
+                move, case.start, case.target, arrival)
         except BadInputError:
             raise
         except HmsaError:

@@ -18,7 +18,7 @@ from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.shapers.two_step import two_step
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.errors import HmsaError
-from hmsa_ros.studies.residual import Errors, residual
+from hmsa_ros.studies.residual import Actual
 
 #: Longest command period, as a share of tau_p, up to which the residual is to stay exact.
 PROMISED = 1.0 / 3.0
@@ -130,7 +130,7 @@ def sampled_study(
     def left(move: Move | None) -> float:
         if move is None:
             return math.nan
-        return residual(move, start, target, material, Errors(), move.duration)
+        return Actual.off(material).residual(move, start, target, move.duration)
 
     return SampledStudy(
         start, target, material, tau_p, periods,
