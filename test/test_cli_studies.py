@@ -17,8 +17,9 @@ import pytest
 from hmsa_ros.cli import main
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.figures import paper_data
-from hmsa_ros.studies import feedback, robustness
-from hmsa_ros.studies.executors import given, here
+from hmsa_ros.studies import matrix, robustness
+from hmsa_ros.studies.executors import given, here, in_order
+from hmsa_ros.studies.feedback import SCENARIOS, STRATEGIES, trial
 
 ROOT = Path(__file__).resolve().parent.parent
 PNG = b'\x89PNG\r\n\x1a\n'
@@ -98,6 +99,36 @@ def test_robustness_as_json_has_everything_in_full_precision(run):
     assert [Path(x).name for x in made['files']] == [
         'robustness.csv', 'robustness_1_to_1.1.png', 'robustness_1_to_1.1.pdf', 'front.png',
         'front.pdf']
+
+
+@pytest.mark.slow
+def test_robustness_in_chunks_is_the_same_whatever_computes_it(run, tmp_path):
+    pytest.importorskip('pyarrow')
+    words = ('robustness', '--move', '1:1.1', '--shapers', 'two_step,zv,step', '--errors', 0.05,
+             '--zeta', 2.0, '--json')
+    plain = json.loads(run(*words, '--out', 'plain')[1])
+    one = json.loads(run(*words, '--resume', '--out', 'one')[1])
+    assert one['moves'] == plain['moves']
+    assert one['files'] == [
+        'one/table.parquet', *(x.replace('plain/', 'one/') for x in plain['files'])]
+    for name in ('robustness.csv', 'front.png'):
+        assert (tmp_path / 'one' / name).read_bytes() == (tmp_path / 'plain' / name).read_bytes()
+    # Two shards on two processes, and a chunk that got lost.
+    table = (tmp_path / 'one' / 'table.parquet').read_bytes()
+    for shard in ('1/2', '2/2'):
+        status, out, err = run(*words, '--shard', shard, '--workers', 2, '--out', 'two')
+        assert (status, out == 'two\n') == (0, shard == '1/2')
+        assert ('1 of 3 are there' in err) is (shard == '1/2')
+    assert (tmp_path / 'two' / 'table.parquet').read_bytes() == table
+    chunks = sorted((tmp_path / 'two' / 'chunks').iterdir())
+    before = [x.stat().st_mtime_ns for x in chunks]
+    chunks[1].unlink()
+    (tmp_path / 'two' / 'table.parquet').unlink()
+    assert json.loads(run(*words, '--resume', '--out', 'two')[1])['moves'] == plain['moves']
+    assert (tmp_path / 'two' / 'table.parquet').read_bytes() == table
+    changed = [x.stat().st_mtime_ns != y for x, y in zip(chunks, before, strict=True)]
+    assert changed == [False, True, False]
+    assert 'another study' in run(*words, '--zeta', 0.3, '--resume', '--out', 'two')[2]
 
 
 def test_robustness_says_what_could_not_be_had(run):
@@ -269,9 +300,9 @@ def test_sweep_ends_quietly_when_its_reader_has_gone():
 
 
 def test_robustness_with_feedback_compares_open_loop_with_corrections(run, monkeypatch):
-    monkeypatch.setattr(feedback, 'ERRORS', ((-0.2, 0.2),))
-    monkeypatch.setattr(feedback.matrix, '__defaults__', (
-        feedback.SCENARIOS[1:2], feedback.STRATEGIES[1::5], here))
+    monkeypatch.setattr(matrix, 'ERRORS', ((-0.2, 0.2),))
+    monkeypatch.setattr(matrix.Matrix.__init__, '__defaults__', (
+        SCENARIOS[1:2], STRATEGIES[1::5]))
     status, out, err = run('robustness', '--feedback', '--seeds', 1, '--json')
     assert (status, err) == (0, '')
     rows = json.loads(out)['rows']
@@ -279,16 +310,20 @@ def test_robustness_with_feedback_compares_open_loop_with_corrections(run, monke
     chained, adapted = ([y['vibration'] + abs(y['offset']) for y in x['left']] for x in rows)
     assert min(chained) > 0.05
     assert max(adapted) < 0.001
-    status, out, err = run('robustness', '--feedback', '--seeds', 1)
+    words = 'robustness', '--feedback', '--seeds', 2
+    status, out, err = run(*words)
     assert (status, err) == (0, '')
     assert out.splitlines()[-1].startswith('  20 % adapt')
+    # In parts, what they print together is the same.
+    assert run(*words, '--shard', '2/2')[:2] == (0, 'feedback\n')
+    assert run(*words, '--shard', '1/2')[:2] == (0, f'{out}feedback/table.parquet\n')
 
 
 def test_trials_on_any_executor_make_the_same_matrix():
-    scenarios, strategies = feedback.SCENARIOS[:1], feedback.STRATEGIES[:2]
+    made = matrix.Matrix(2, SCENARIOS[:1], STRATEGIES[:2])
     with ThreadPoolExecutor(2) as executor:
-        found = list(feedback.matrix(2, scenarios, strategies, lambda: given(executor)))
-    assert found == list(feedback.matrix(2, scenarios, strategies))
+        found = list(made.rows(in_order(lambda: given(executor), trial, made.tasks)))
+    assert found == list(made.rows(in_order(here, trial, made.tasks)))
 
 
 def test_robustness_with_feedback_needs_a_seed(refused):

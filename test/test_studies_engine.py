@@ -238,7 +238,7 @@ def test_a_missing_dask_is_said_with_how_to_get_it(run, monkeypatch):
 
 def test_chunks_of_other_code_have_other_names(sweep, tmp_path, monkeypatch):
     package = tmp_path / 'hmsa_ros'
-    for name in ('core', 'studies', 'contract'):
+    for name in ('core', 'studies', 'contract', 'estimation', 'identification'):
         shutil.copytree(
             Path(chunk_module.__file__).parent.parent / name, package / name,
             ignore=shutil.ignore_patterns('__pycache__'))

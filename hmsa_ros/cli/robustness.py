@@ -1,16 +1,20 @@
 """``hmsa robustness``: what each shaper leaves of a move when the model is in error."""
 
 import argparse
+from collections.abc import Iterator
+from dataclasses import asdict
 from itertools import product
 import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
+from hmsa_ros.cli import chunked
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text, make_folder
 
 if TYPE_CHECKING:
     from hmsa_ros.studies.engine import Start
+    from hmsa_ros.studies.matrix import Row
     from hmsa_ros.studies.robustness import Case, Result
 
 _MOVES = ((1.0, 1.1), (1.0, 1.4), (1.0, 0.7))
@@ -59,36 +63,42 @@ def add_parser(subparsers: Any) -> None:
         '--c1', type=float, default=2.0, metavar='C',
         help='shape 2 H^2/L^2, above 0 (default 2)')
     parser.add_argument(
-        '--out', type=Path, default=Path('robustness'), metavar='DIR',
-        help='output folder, created if missing (default robustness)')
+        '--out', type=Path, metavar='DIR',
+        help='output folder, created if missing (default robustness; with --feedback feedback)')
     parser.add_argument(
         '--feedback', action='store_true',
         help='compare open loop with corrections from samples instead: vibration and offset '
              'after moves with G up to 20 %% off, noise, delay and an unknown bias of the '
-             'sensor; takes minutes, writes no files, and takes only --seeds, '
-             '--workers and --json')
+             'sensor; takes minutes; of the other options --seeds, --out, --json and those '
+             'below; writes files only with --out or --shard, --dask and --resume')
     parser.add_argument(
         '--seeds', type=int, default=10, metavar='N',
         help='runs with different noise for --feedback (default 10)')
-    parser.add_argument(
-        '--workers', type=int, default=1, metavar='N', help='processes (default 1)')
+    chunked.add_options(parser, workers='processes (default 1)')
     parser.add_argument('--json', action='store_true', help='print JSON in full precision')
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Study, print and write."""
-    from hmsa_ros.studies.executors import local
+    in_chunks = bool(chunked.asked(arguments))
+    start, _ = chunked.engine(arguments, 1)
+    return (_feedback if arguments.feedback else _shapers)(arguments, start, in_chunks)
 
-    start = local(arguments.workers)
-    if arguments.feedback:
-        return _feedback(arguments.seeds, start, as_json=arguments.json)
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
+def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> int:
+    """Compare the shapers."""
     from hmsa_ros.core.parameters import NondimensionalParameters
     from hmsa_ros.studies.executors import in_order
-    from hmsa_ros.studies.robustness import candidates, Case, LARGEST, ORDERS, study
+    from hmsa_ros.studies.robustness import (
+        candidates,
+        Case,
+        comparison,
+        LARGEST,
+        ORDERS,
+        result_of,
+        study,
+    )
 
     material = NondimensionalParameters(arguments.zeta, arguments.j_lim, arguments.c1)
     shapers = None
@@ -99,30 +109,41 @@ def run(arguments: argparse.Namespace) -> int:
         Case(start, target, material, box=arguments.errors,
              span=max(arguments.errors, min(2.0 * arguments.errors, LARGEST)))
         for start, target in dict.fromkeys(arguments.move)]
-    folder: Path = arguments.out
+    tasks = list(product(cases, compared))
+    folder: Path = arguments.out or Path('robustness')
+
+    def finish(results: 'list[Result]', *files: Path) -> int:
+        count = len(compared)
+        studies = [(x, results[i * count:(i + 1) * count]) for i, x in enumerate(cases)]
+        return _show(studies, [*files, *_write(folder, studies)], as_json=arguments.json)
+
+    if in_chunks:
+        table = folder / 'table.parquet'
+        return chunked.compute_chunks(
+            comparison(tasks), folder, arguments, start, 'studying',
+            lambda chunks, _: finish([
+                result_of(*task, row)
+                for task, row in zip(tasks, chunks.merge_rows(table), strict=True)], table))
     make_folder(folder)
-    studies: list[tuple[Case, list[Result]]] = []
-    console = Console(stderr=True)
-    with Progress(
-            TextColumn('studying'), BarColumn(), MofNCompleteColumn(), console=console,
-            transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task('', total=len(cases) * len(compared))
-        found = in_order(start, study, product(cases, compared))
-        for case in cases:
-            studies.append((case, []))
-            for _ in compared:
-                studies[-1][1].append(next(found))
-                progress.advance(task)
-    files = _write(folder, studies)
-    if arguments.json:
+    with chunked.progress('studying', len(tasks)) as advance:
+        found = []
+        for result in in_order(start, study, tasks):
+            found.append(result)
+            advance(1)
+    return finish(found)
+
+
+def _show(
+        studies: 'list[tuple[Case, list[Result]]]', files: list[Path], *, as_json: bool) -> int:
+    """Print the results and the names of the files."""
+    if as_json:
         print(json_text({
             'moves': [_record(case, results) for case, results in studies],
             'files': [str(path) for path in files]}))
         return 0
     for case, results in studies:
         _print_table(case, results)
-    for path in files:
-        print(path)
+    print(*files, sep='\n')
     return 0
 
 
@@ -231,16 +252,33 @@ def _print_table(case: 'Case', results: 'list[Result]') -> None:
         console.print(f'note: {note}', highlight=False, soft_wrap=True)
 
 
-def _feedback(seeds: int, start: 'Start', *, as_json: bool) -> int:
-    """Compare open loop with corrections; rows are printed as they are worked out."""
-    from dataclasses import asdict
+def _feedback(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> int:
+    """Compare open loop with corrections."""
+    from hmsa_ros.studies.executors import in_order
+    from hmsa_ros.studies.feedback import trial
+    from hmsa_ros.studies.matrix import left_of, Matrix
 
-    from hmsa_ros.studies.feedback import matrix
+    if arguments.seeds < 1:
+        raise BadInputError(f'--seeds is {arguments.seeds}: expected at least 1')
+    matrix = Matrix(arguments.seeds)
+    if not in_chunks and arguments.out is None:
+        return _show_matrix(
+            matrix.seeds, matrix.rows(in_order(start, trial, matrix.tasks)),
+            as_json=arguments.json)
+    folder = arguments.out or Path('feedback')
+    table = folder / 'table.parquet'
+    return chunked.compute_chunks(
+        matrix.study, folder, arguments, start, 'moving', lambda chunks, _: _show_matrix(
+            matrix.seeds, matrix.rows(map(left_of, chunks.merge_rows(table))),
+            as_json=arguments.json, table=table))
 
-    if seeds < 1:
-        raise BadInputError(f'--seeds is {seeds}: expected at least 1')
+
+def _show_matrix(
+        seeds: int, rows: 'Iterator[Row]', *, as_json: bool, table: Path | None = None) -> int:
+    """Print rows as they are worked out."""
     if as_json:
-        print(json_text({'seeds': seeds, 'rows': [asdict(x) for x in matrix(seeds, start=start)]}))
+        found = {'seeds': seeds, 'rows': [asdict(x) for x in rows]}
+        print(json_text(found if table is None else {**found, 'files': [str(table)]}))
         return 0
     print('peak-to-peak vibration (offset) in % of the step, root mean square: after the first '
           'move\n(1 to 1.4), a cycle and two cycles later, after the next move (to 1.1); what '
@@ -250,7 +288,7 @@ def _feedback(seeds: int, start: 'Start', *, as_json: bool) -> int:
           'that of the chain, or, where the model\nis exact, above half of what noise alone '
           'shows.')
     before = ''
-    for row in matrix(seeds, start=start):
+    for row in rows:
         if row.scenario != before:
             print(f'\n{row.scenario}\n{"G off":>6} {"strategy":<9} {"after the move":>16} '
                   f'{"a cycle later":>16} {"two cycles":>16} {"next move":>16} {"worst":>7} '
@@ -262,4 +300,6 @@ def _feedback(seeds: int, start: 'Start', *, as_json: bool) -> int:
         line = (f'{100.0 * row.error:>4g} % {row.strategy:<9} {cells} '
                 f'{100.0 * row.worst[0]:>7.3f} {verdict}')
         print(line.rstrip(), flush=True)
+    if table is not None:
+        print(table)
     return 0

@@ -2,20 +2,18 @@
 
 import argparse
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 import shutil
-import sys
 from typing import Any, TYPE_CHECKING
 
+from hmsa_ros.cli import chunked
 from hmsa_ros.errors import BadInputError
 
 if TYPE_CHECKING:
     from hmsa_ros.studies.chunks import Chunks
-    from hmsa_ros.studies.engine import Outcome, Start
+    from hmsa_ros.studies.engine import Outcome
     from hmsa_ros.studies.sweep import Sweep
     from hmsa_ros.studies.views import View
 
@@ -94,20 +92,8 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         '--show', metavar='COLUMN,...',
         help='columns to draw (default: duration and first level, or residual and offset)')
-    parser.add_argument(
-        '--workers', type=int, metavar='N',
-        help='processes; 1 computes in this one (default: one a core for large sweeps)')
-    parser.add_argument(
-        '--shard', metavar='I/N',
-        help='compute part I of N only, as a job of an array does; I from 0 to N-1 or from 1 to '
-             'N; needs --out')
-    parser.add_argument(
-        '--dask', metavar='ADDRESS',
-        help='compute on a Dask cluster: its address, its scheduler file (.json), or "local"; '
-             'all workers must see the folder of --out')
-    parser.add_argument(
-        '--resume', action='store_true',
-        help='keep the chunks of an earlier run that are there and whole')
+    chunked.add_options(parser, workers=(
+        'processes; 1 computes in this one (default: one a core for large sweeps)'))
     parser.set_defaults(run=run)
 
 
@@ -152,7 +138,7 @@ class _Picture:
         except BadInputError as error:
             if asked:
                 raise
-            _say(str(error))
+            chunked.say(str(error))
             return
         self._shown = Shown(names, sweep.size)
 
@@ -239,11 +225,7 @@ def _names(text: str | None) -> list[str]:
 
 def _in_chunks(sweep: 'Sweep', arguments: argparse.Namespace) -> bool:
     """Return whether chunks are kept; refuse options that do not fit."""
-    if arguments.workers is not None and arguments.workers < 1:
-        raise BadInputError(f'--workers is {arguments.workers}: expected at least 1')
-    if arguments.dask is not None and arguments.workers is not None and arguments.dask != 'local':
-        raise BadInputError('--workers and --dask ADDRESS: expected one of them')
-    asked = [f'--{x}' for x in ('workers', 'shard', 'dask', 'resume') if getattr(arguments, x)]
+    asked = [*(['--workers'] if arguments.workers is not None else []), *chunked.asked(arguments)]
     out: Path | None = arguments.out
     if out is None:
         if asked:
@@ -273,7 +255,8 @@ def _plan_at_once(sweep: 'Sweep', out: Path | None, picture: _Picture) -> int:
     from hmsa_ros.studies.tables import open_writer
 
     counts: Counter[str] = Counter()
-    with open_writer(out, sweep.columns) as write, _progress(sweep.size) as advance:
+    with open_writer(out, sweep.columns) as write, \
+            chunked.progress('planning', sweep.size) as advance:
         for block in sweep.blocks(Chunks.of(sweep, Path()).rows):
             write(block)
             picture.add(block.results)
@@ -289,32 +272,23 @@ def _plan_at_once(sweep: 'Sweep', out: Path | None, picture: _Picture) -> int:
 def _plan_in_chunks(
         sweep: 'Sweep', arguments: argparse.Namespace, picture: _Picture) -> int:
     from hmsa_ros.files import require_arrow
-    from hmsa_ros.studies.chunks import Chunks
-    from hmsa_ros.studies.engine import compute, parse_shard
+    from hmsa_ros.studies.executors import cores
 
     require_arrow()
-    shard = (0, 1) if arguments.shard is None else parse_shard(arguments.shard)
     table, folder = _places(arguments.out)
-    start, cores = _engine(arguments, small=sweep.size <= _SMALL * sweep.rate)
-    chunks = Chunks.of(sweep, folder)
-    _estimate(sweep, chunks, cores, shard)
-    try:
-        with _progress(-(-sweep.size // shard[1])) as advance:
-            outcome = compute(
-                sweep, folder, start, shard=shard, resume=arguments.resume, say=_say,
-                advance=advance)
-        if len(chunks.found()) < chunks.count:
-            return _part(outcome, chunks, folder)
+    small = sweep.size <= _SMALL * sweep.rate
+    start, known = chunked.engine(arguments, 1 if small else cores())
+    _estimate(sweep, folder, known, chunked.shard_of(arguments))
+
+    def finish(chunks: 'Chunks', outcome: 'Outcome') -> int:
         _report(sweep.size, chunks.merge(table, picture.add))
         pictures = picture.draw(changed=outcome.computed > 0)
-    except KeyboardInterrupt:
-        _say(f'{len(chunks.found()):,} of {chunks.count:,} chunks are in {folder}: go on with '
-             '--resume')
-        raise
-    if table.parent.resolve() != chunks.folder and arguments.shard is None:
-        shutil.rmtree(folder, ignore_errors=True)
-    print(table, *pictures, sep='\n')
-    return 0
+        if table.parent.resolve() != chunks.folder and arguments.shard is None:
+            shutil.rmtree(folder, ignore_errors=True)
+        print(table, *pictures, sep='\n')
+        return 0
+
+    return chunked.compute_chunks(sweep, folder, arguments, start, 'planning', finish)
 
 
 def _places(out: Path) -> tuple[Path, Path]:
@@ -332,27 +306,18 @@ def _places(out: Path) -> tuple[Path, Path]:
     return out, out.with_name(f'{out.name}.chunks')
 
 
-def _engine(arguments: argparse.Namespace, *, small: bool) -> tuple['Start', int]:
-    """Return what computes, and on how many cores as far as that is known."""
-    from hmsa_ros.studies.executors import cores, dask, local
-
-    if arguments.dask is not None:
-        return (partial(dask, arguments.dask, arguments.workers),
-                arguments.workers or (cores() if arguments.dask == 'local' else 1))
-    workers = arguments.workers or (1 if small else cores())
-    return local(workers), workers
-
-
-def _estimate(sweep: 'Sweep', chunks: 'Chunks', cores: int, shard: tuple[int, int]) -> None:
+def _estimate(sweep: 'Sweep', folder: Path, cores: int, shard: tuple[int, int]) -> None:
     """Say what a large sweep takes, and refuse one that the disk has no room for."""
+    from hmsa_ros.studies.chunks import Chunks
     from hmsa_ros.studies.sweep import ROW_BYTES
 
+    chunks = Chunks.of(sweep, folder)
     if sweep.size < _LARGE:
         return
     size = sweep.size * ROW_BYTES
     seconds = sweep.size / shard[1] / (sweep.rate * cores)
     time = f'{seconds / 3600:,.1f} h' if seconds > 3600 else f'{seconds / 60:.1f} min'
-    _say(f'{sweep.size:,} plans in {chunks.count:,} chunks of {chunks.rows:,}: about '
+    chunked.say(f'{sweep.size:,} plans in {chunks.count:,} chunks of {chunks.rows:,}: about '
          f'{size / 1e9:.3g} GB, the table as much again'
          f'{f"; part {shard[0] + 1} of {shard[1]}" if shard[1] > 1 else ""}; about {time} on '
          f'{cores} core{"s" if cores > 1 else ""}')
@@ -366,47 +331,7 @@ def _estimate(sweep: 'Sweep', chunks: 'Chunks', cores: int, shard: tuple[int, in
             f'{size / shard[1] / 1e9:.3g} GB for the chunks; take fewer points or another disk')
 
 
-def _part(outcome: 'Outcome', chunks: 'Chunks', folder: Path) -> int:
-    """Report a part of a study whose other parts are missing."""
-    _say(f'{outcome.computed:,} chunks computed, {outcome.kept:,} kept; '
-         f'{len(chunks.found()):,} of {chunks.count:,} are there, and the table is written when '
-         'all are')
-    print(folder)
-    return 0
-
-
 def _report(size: int, counts: Mapping[str, int]) -> None:
     words = ', '.join(
         f'{count:,} {status}' for status, count in Counter(counts).most_common())
-    _say(f'{size:,} plans: {words}')
-
-
-def _say(sentence: str) -> None:
-    print(sentence, file=sys.stderr)
-
-
-@contextmanager
-def _progress(total: int) -> Iterator[Callable[[int], None]]:
-    """Show rows done, rate and time left, on a terminal only."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        Task,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-    from rich.text import Text
-
-    class Rate(TextColumn):
-        def render(self, task: Task) -> Text:
-            return Text(f'{task.speed:,.0f}/s' if task.speed else '')
-
-    console = Console(stderr=True)
-    with Progress(
-            TextColumn('planning'), BarColumn(), MofNCompleteColumn(), Rate(''),
-            TimeRemainingColumn(), console=console, transient=True,
-            disable=not console.is_terminal) as progress:
-        task = progress.add_task('', total=total)
-        yield lambda rows: progress.advance(task, rows)
+    chunked.say(f'{size:,} plans: {words}')

@@ -237,6 +237,12 @@ class Chunks:
                     look(table)
         return counts
 
+    def merge_rows(self, path: Path) -> list[dict[str, Any]]:
+        """Write the whole table as `merge`, and return its rows."""
+        rows: list[dict[str, Any]] = []
+        self.merge(path, lambda table: rows.extend(table.to_pylist()))
+        return rows
+
     @property
     def _described(self) -> Path:
         return self.folder / 'study.json'
@@ -257,10 +263,10 @@ class Chunks:
 
 @cache
 def code() -> str:
-    """Return a hash of the package's version, and of the sources that plan and simulate."""
+    """Return a hash of the version, and of the sources that plan, simulate and estimate."""
     package = Path(__file__).resolve().parent.parent
     made = hashlib.sha256(__version__.encode())
-    for folder in ('contract', 'core', 'studies'):
+    for folder in ('contract', 'core', 'estimation', 'identification', 'studies'):
         for path in sorted((package / folder).rglob('*.py')):
             made.update(path.relative_to(package).as_posix().encode() + path.read_bytes())
     return made.hexdigest()

@@ -5,13 +5,12 @@ The actuator is simulated with its true parameters, and measured with noise, lat
 an unknown bias. Whoever commands it has the nominal ones.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from heapq import heappop, heappush
-from itertools import count, islice
+from itertools import count
 
 import numpy as np
-from scipy.special import ndtr
 
 from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.core.simulation import ActuatorSimulation
@@ -19,24 +18,18 @@ from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.estimation.correction import CAUTIOUS, Course
 from hmsa_ros.estimation.prior import TRACKED
 from hmsa_ros.studies.commanders import commander, LARGEST, REACTION
-from hmsa_ros.studies.engine import Start
-from hmsa_ros.studies.executors import here, in_order
 from hmsa_ros.studies.learning import carried_out, Learner
 from hmsa_ros.studies.linear import Weights
 
 #: Where a first move, and after it another one, go from stretch 1.
 TARGETS = (1.4, 1.1)
-#: Errors of the shear modulus that make a row together.
-ERRORS = ((0.0,), (-0.1, 0.1), (-0.2, 0.2))
 _BIAS = 1e-3
 # Samples before the first move, and points of a motion that is looked at.
 _BEFORE, _LOOK, _WATCHED = 50, 120, 40
 # A cycle, and after what time nothing moves, in nominal units of time.
-_CYCLE, _SETTLED = 1.45, 150.0
-# How much more than the chain leaves is no worse.
-_WORSE = 1.2
+CYCLE, _SETTLED = 1.45, 150.0
 # Cycles between the first move and the next one, and trials of a move that is learnt.
-_CYCLES, _TRIALS = 3, 4
+CYCLES, _TRIALS = 3, 4
 
 
 # Of some 100 tried, those with the least vibration and offset over G as known and 20 % off; others
@@ -136,40 +129,11 @@ class Strategy:
     kind: str = 'open'
 
 
-_CHAINED = Strategy('chained', 'robust', 2)
+CHAINED = Strategy('chained', 'robust', 2)
 STRATEGIES = (
-    Strategy('two-step', 'two_step'), _CHAINED, Strategy('ZVD', 'zvd'),
+    Strategy('two-step', 'two_step'), CHAINED, Strategy('ZVD', 'zvd'),
     Strategy('learning', 'two_step', kind='learning'), Strategy('LQR', 'two_step', kind='lqr'),
     Strategy('MPC', 'two_step', kind='mpc'), Strategy('adapt', 'two_step', kind='adapt'))
-
-
-@dataclass(frozen=True)
-class Row:
-    """
-    A strategy in a scenario, with errors of one size.
-
-    Attributes
-    ----------
-    scenario, strategy : str
-        Names.
-    error : float
-        Size of the error of G, as a share.
-    left : tuple of Left
-        Root mean square over both signs and all seeds: after the first move, a cycle later, two
-        cycles later, and after the next move; of learning, after each of four trials.
-    worst : tuple of float
-        Largest vibration of all.
-    no_worse : bool or None
-        Whether no run leaves more than `allowed`; None for open loop.
-
-    """
-
-    scenario: str
-    strategy: str
-    error: float
-    left: 'tuple[Left, ...]'
-    worst: tuple[float, ...]
-    no_worse: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -257,7 +221,7 @@ class _Trial:
         period = round(self._scenario.period * NANOSECONDS)
         left: list[Left] = []
         seen: list[list[float]] = []
-        cycle = round(_CYCLE * self._scenario.block.time_unit * NANOSECONDS)
+        cycle = round(CYCLE * self._scenario.block.time_unit * NANOSECONDS)
         self._at(period, 'sample')
         self._at(_BEFORE * period, 'move', self._targets[0])
         moves = 0
@@ -274,11 +238,11 @@ class _Trial:
             elif what == 'move':
                 self._stretch = self._course.target
                 self._take(self._commander.move(time, value, self._course), time)
-                for i in range(_CYCLES if moves == 0 else 1):
+                for i in range(CYCLES if moves == 0 else 1):
                     self._at(self._course.arrival + i * cycle, 'look')
                 moves += 1
                 if moves < len(self._targets):
-                    self._at(self._course.arrival + _CYCLES * cycle, 'move',
+                    self._at(self._course.arrival + CYCLES * cycle, 'move',
                              self._targets[moves])
                 else:
                     self._at(self._course.arrival + cycle, 'end')
@@ -374,100 +338,3 @@ def _learned(
         seen = np.array(list(carried_out(plants[1], levels, learner.stamps)))
         noise = scenario.noise * random.standard_normal(len(seen) + _BEFORE)
         learner.learn(seen + noise[_BEFORE:] - np.mean(noise[:_BEFORE]) - target)
-
-
-def rms(trials: Iterable[Sequence[Left]]) -> list[Left]:
-    """
-    Return the root mean square of trials.
-
-    Parameters
-    ----------
-    trials : iterable of sequence of Left
-        As `trial` returns them.
-
-    Returns
-    -------
-    list of Left
-        For each time that was looked at.
-
-    """
-    rows = np.array([[(x.vibration, x.offset, x.motion) for x in row] for row in trials])
-    return [Left(*x) for x in np.sqrt(np.mean(np.square(rows), axis=0)).tolist()]
-
-
-def matrix(
-        seeds: int, scenarios: Sequence[Scenario] = SCENARIOS,
-        strategies: Sequence[Strategy] = STRATEGIES, start: Start = here) -> Iterator[Row]:
-    """
-    Run all strategies in all scenarios.
-
-    Parameters
-    ----------
-    seeds : int
-        Of the noise, for each error; those without feedback do not depend on it.
-    scenarios : sequence of Scenario
-        Actuators and sensors.
-    strategies : sequence of Strategy
-        To compare.
-    start : callable
-        Makes an executor, and says how many trials to submit ahead; default this process.
-
-    Yields
-    ------
-    Row
-        One after the other.
-
-    """
-    rows = [(scenario, errors, strategy, [
-        (scenario, strategy, error, seed) for error in errors
-        for seed in range(1 if strategy.kind == 'open' else seeds)])
-        for scenario in scenarios for errors in ERRORS for strategy in strategies]
-    left = in_order(start, trial, (task for *_, tasks in rows for task in tasks))
-    limits: dict[tuple[str, tuple[float, ...]], list[list[float]]] = {}
-    for scenario, errors, strategy, tasks in rows:
-        key = scenario.name, errors
-        if key not in limits:
-            limits[key] = [allowed(scenario, x) for x in errors]
-        runs = list(islice(left, len(tasks)))
-        each = len(runs) // len(errors)
-        yield Row(
-            scenario.name, strategy.name, max(errors), tuple(rms(runs)),
-            tuple(max(x.vibration for x in column) for column in zip(*runs, strict=True)),
-            None if strategy.kind == 'open' else all(
-                x.vibration <= limit[0 if strategy.kind == 'learning' else i]
-                for place, limit in enumerate(limits[key])
-                for run in runs[place * each:(place + 1) * each] for i, x in enumerate(run)))
-
-
-def allowed(scenario: Scenario, error: float) -> list[float]:
-    """
-    Return the vibration up to which a strategy is no worse than open loop.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        Actuator and sensor.
-    error : float
-        Of the shear modulus, as a share.
-
-    Returns
-    -------
-    list of float
-        For each time that is looked at, as a share of the step: a fifth more than what the chain
-        of order 2 leaves, or, where nothing is wrong with the model, half of what noise alone
-        shows from peak to peak in the samples of a cycle.
-
-    """
-    if error or scenario.truth or scenario.coil_time_constant:
-        return [_WORSE * x.vibration for x in trial(scenario, _CHAINED, error, 0)]
-    count = _CYCLE * scenario.block.time_unit / scenario.period
-    steps = [float(x) for x in np.diff([1.0, *TARGETS])]
-    shown = scenario.noise * _range(count)
-    return [0.5 * shown / abs(x) for x in (*[steps[0]] * _CYCLES, *steps[1:])]
-
-
-def _range(count: float) -> float:
-    """Return the mean distance between the largest and the least of so many normal numbers."""
-    x = np.linspace(-8.0, 8.0, 4001)
-    below = ndtr(x)
-    return float(np.sum(1.0 - below ** count - (1.0 - below) ** count) * (x[1] - x[0]))

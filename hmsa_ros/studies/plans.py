@@ -143,7 +143,7 @@ def carried_out(
 
     Parameters
     ----------
-    settings, which, start, target, shapers
+    settings, which, start, target, shapers : sequence or ndarray
         As those of `by_settings`.
     actuals : sequence of Setting or None
         The actuator for each of the settings; None for one that is out of range.

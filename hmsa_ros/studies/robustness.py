@@ -6,17 +6,18 @@ shear modulus G, damping coefficient and J_lim are others, each alone and all to
 anywhere in a box.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 import csv
 from dataclasses import dataclass, field
 from itertools import product
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from hmsa_ros.core.model import Array
-from hmsa_ros.core.moves import Limits, Move, State
+from hmsa_ros.core.moves import Level, Limits, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.shapers import get_shaper, SHAPERS
 from hmsa_ros.core.shapers.request import Request
@@ -25,6 +26,7 @@ from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.files import replacing
 from hmsa_ros.studies.residual import Actual, arrival_of, Errors
+from hmsa_ros.studies.tasks import Tasks
 
 #: Parameters in error: name for a person, name in `Errors`.
 PARAMETERS = {'G': 'shear_modulus', 'zeta': 'zeta', 'J_lim': 'j_lim'}
@@ -265,9 +267,7 @@ def study(case: Case, candidate: Candidate) -> Result:
             State(case.start), case.target, case.material, case.limits, order=candidate.order,
             errors=(case.box, case.box, case.box)))
     except RefusedError as error:
-        nothing = Worst(math.nan, Errors())
-        return Result(
-            candidate, error.code, str(error), None, math.nan, math.nan, {}, {}, nothing)
+        return _refused(candidate, error.code, str(error))
     arrival = arrival_of(move, case.start, case.target, case.material)
 
     def left(errors: Errors) -> float:
@@ -280,20 +280,29 @@ def study(case: Case, candidate: Candidate) -> Result:
             # Too close to a limiting stretch to follow.
             return math.nan
 
-    grid = case.errors()
-    curves, alone = {}, {}
-    for name, attribute in PARAMETERS.items():
-        each = [Errors(**{attribute: float(x)}) for x in grid]
-        curve = np.array([left(errors) for errors in each])
-        curves[name] = curve
-        inside = np.abs(grid) <= case.box
-        alone[name] = _worst(
-            curve[inside], [x for x, there in zip(each, inside, strict=True) if there])
+    curves = {
+        name: np.array([left(Errors(**{attribute: x})) for x in case.errors().tolist()])
+        for name, attribute in PARAMETERS.items()}
     steps = np.linspace(-case.box, case.box, _BOX_POINTS).tolist()
     box = [Errors(*errors) for errors in product(steps, steps, steps)]
     return Result(
-        candidate, move.code, move.reason, move, arrival, left(Errors()), curves, alone,
-        _worst(np.array([left(errors) for errors in box]), box))
+        candidate, move.code, move.reason, move, arrival, left(Errors()), curves,
+        _alone(case, curves), _worst(np.array([left(errors) for errors in box]), box))
+
+
+def _refused(candidate: Candidate, code: Code, reason: str) -> Result:
+    return Result(
+        candidate, code, reason, None, math.nan, math.nan, {}, {}, Worst(math.nan, Errors()))
+
+
+def _alone(case: Case, curves: Mapping[str, Array]) -> dict[str, Worst]:
+    """Return the worst of each curve within the box."""
+    grid = case.errors()
+    inside = np.abs(grid) <= case.box
+    return {
+        name: _worst(curve[inside], [
+            Errors(**{PARAMETERS[name]: x}) for x in grid[inside].tolist()])
+        for name, curve in curves.items()}
 
 
 def _worst(residuals: Array, errors: Sequence[Errors]) -> Worst:
@@ -377,3 +386,58 @@ def _rows(case: Case, result: Result) -> Iterator[tuple[str | float, ...]]:
     for name, errors, value in points:
         offset = Actual.off(case.material, errors).offset(result.move, case.start, case.target)
         yield (*fixed, name, errors.shear_modulus, errors.zeta, errors.j_lim, value, offset)
+
+
+def comparison(tasks: Sequence[tuple[Case, Candidate]]) -> Tasks:
+    """
+    Return a study of shapers in cases, whose rows `result_of` reads.
+
+    Parameters
+    ----------
+    tasks : sequence of (Case, Candidate)
+        What to compare.
+
+    Returns
+    -------
+    Tasks
+        A row holds the command, and what it leaves: as a list at the errors of each parameter
+        (`Case.errors`), and at the worst in the box, with the errors there.
+
+    """
+    return Tasks(_row, tasks, {
+        **dict.fromkeys(('start', 'target', 'zeta', 'j_lim', 'c1', 'box', 'span'), 'double'),
+        'shaper': 'string', 'order': 'int64', 'status': 'string', 'reason': 'string',
+        'times': 'doubles', 'levels': 'doubles',
+        **dict.fromkeys(('duration', 'arrival', 'nominal'), 'double'),
+        **{f'residual_{x}': 'doubles' for x in PARAMETERS},
+        **{f'error_{x}': 'double' for x in PARAMETERS}, 'residual': 'double'}, (1, 100))
+
+
+def _row(case: Case, candidate: Candidate) -> dict[str, Any]:
+    found = study(case, candidate)
+    levels = () if found.move is None else found.move.levels
+    return {
+        'start': case.start, 'target': case.target, 'zeta': case.material.zeta,
+        'j_lim': case.material.j_lim, 'c1': case.material.c1, 'box': case.box,
+        'span': case.span, 'shaper': candidate.shaper, 'order': candidate.order,
+        'status': str(found.code), 'reason': found.reason,
+        'times': [x.time for x in levels], 'levels': [x.load for x in levels],
+        'duration': math.nan if found.move is None else found.move.duration,
+        'arrival': found.arrival, 'nominal': found.nominal,
+        **{f'residual_{x}': found.curves[x].tolist() if found.curves else []
+           for x in PARAMETERS},
+        **{f'error_{x}': getattr(found.worst.errors, y) for x, y in PARAMETERS.items()},
+        'residual': found.worst.residual}
+
+
+def result_of(case: Case, candidate: Candidate, row: Mapping[str, Any]) -> Result:
+    """Return what `study` did, out of the row of a table."""
+    code, reason = Code(row['status']), row['reason']
+    if not row['times']:
+        return _refused(candidate, code, reason)
+    levels = tuple(map(Level, row['times'], row['levels']))
+    curves = {x: np.array(row[f'residual_{x}'], dtype=np.float64) for x in PARAMETERS}
+    return Result(
+        candidate, code, reason, Move(code, levels, row['duration'], reason), row['arrival'],
+        row['nominal'], curves, _alone(case, curves), Worst(
+            row['residual'], Errors(*(row[f'error_{x}'] for x in PARAMETERS))))

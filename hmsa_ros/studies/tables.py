@@ -81,8 +81,8 @@ class ParquetWriter:
 def repeating(table: Any) -> list[str]:
     """Return the columns whose values repeat, which a dictionary makes smaller."""
     head = table.slice(0, 1000)
-    return [name for name in head.column_names
-            if len(head[name].unique()) <= max(1, head.num_rows // 2)]
+    return [x.name for x in head.schema if not x.type.num_fields
+            and len(head[x.name].unique()) <= max(1, head.num_rows // 2)]
 
 
 @contextmanager
