@@ -1,15 +1,26 @@
 """Law beam: its mode, statics and plans against equations written down anew."""
 
 from dataclasses import replace
-from functools import cache
 import json
 import math
 
+from beam_oracle import (
+    AREA,
+    BENDING,
+    DAMPING,
+    DENSITY,
+    follow,
+    LENGTH,
+    mode,
+    REMANENCE,
+    silicone,
+    THICKNESS,
+    WIDTH,
+    YOUNGS,
+)
 import numpy as np
 import pytest
-from scipy.integrate import solve_bvp, solve_ivp
-from scipy.interpolate import CubicSpline
-from scipy.optimize import brentq
+from scipy.integrate import solve_bvp
 
 from benchmarks.beam_segments import Chain
 from hmsa_ros.cli import main
@@ -18,7 +29,6 @@ from hmsa_ros.contract.parameters import BLOCK
 from hmsa_ros.core import model
 from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.laws import bending
-from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.simulation import ActuatorSimulation
 from hmsa_ros.core.status import Code
@@ -26,81 +36,11 @@ from hmsa_ros.core.two_step import plan_two_step
 from hmsa_ros.core.units import MU_0
 from hmsa_ros.errors import BadInputError
 
-# A strip of silicone with 20 % of magnetised powder, in SI.
-YOUNGS, LENGTH, WIDTH, THICKNESS, DENSITY, REMANENCE = 1e6, 0.025, 0.005, 0.001, 2000.0, 0.1
-DAMPING = 2e-4
-_AREA, _BENDING = WIDTH * THICKNESS, YOUNGS * WIDTH * THICKNESS ** 3 / 12.0
-
-
-def silicone(**changes: float) -> ActuatorParameters:
-    """Return the strip, with some parameters of another value."""
-    return actuator_from({x.name: x.default for x in BLOCK} | {
-        'law': 'beam', 'law.youngs_modulus': YOUNGS, 'law.width': WIDTH,
-        'actuator.half_length': LENGTH / 2, 'actuator.half_thickness': THICKNESS / 2,
-        'actuator.density': DENSITY, 'actuator.remanence': REMANENCE,
-        'actuator.damping_coefficient': DAMPING} | changes)
-
-
-@cache
-def _mode():
-    """Return nodes and weights of Simpson's rule along the beam, and the slope of its mode."""
-    root = brentq(lambda x: math.cos(x) * math.cosh(x) + 1.0, 1.5, 2.2, xtol=1e-15)
-    s = np.linspace(0.0, 1.0, 2001)
-    weights = np.full(2001, 2.0)
-    weights[1::2] = 4.0
-    weights[[0, -1]] = 1.0
-    x = root * s
-    ratio = (math.cosh(root) + math.cos(root)) / (math.sinh(root) + math.sin(root))
-    slope = np.sinh(x) + np.sin(x) - ratio * (np.cosh(x) - np.cos(x))
-    curved = root * (np.cosh(x) + np.cos(x) - ratio * (np.sinh(x) + np.sin(x)))
-    return s, weights / 6000.0, slope / slope[-1], curved / slope[-1], root
-
-
-def _up_to(values):
-    """Return the integral from the clamp to each node, by cubics through neighbours."""
-    s = _mode()[0]
-    return CubicSpline(s, values).antiderivative()(s)
-
-
-def _of_angle(q):
-    """Return kinetic mass, stiffness, lever of the field and deflection at an angle, in SI."""
-    _, w, f, curved, _ = _mode()
-    across, along = (_up_to(part(q * f) * f) for part in (np.cos, np.sin))
-    return (
-        DENSITY * _AREA * LENGTH ** 3 * (w @ (across ** 2 + along ** 2)),
-        _BENDING / LENGTH * (w @ curved ** 2),
-        REMANENCE / MU_0 * _AREA * LENGTH * (w @ (np.cos(q * f) * f)),
-        w @ np.sin(q * f))
-
-
-@cache
-def _series():
-    """Return mass, lever and deflection as Chebyshev series of the angle, and the stiffness."""
-    nodes = 1.6 * np.cos(np.pi * (np.arange(49) + 0.5) / 49)
-    values = np.array([_of_angle(x) for x in nodes])
-    return [np.polynomial.Chebyshev.fit(nodes, values[:, i], 40, domain=[-1.6, 1.6])
-            for i in (0, 2, 3)], values[0, 1]
-
-
-def follow(deflection, pieces):
-    """Return deflection and rate after pieces of (s, T), from rest, by the angle of the tip."""
-    (mass, lever, across), stiffness = _series()
-    by_angle = across.deriv()
-    change, damping = mass.deriv(), DAMPING * (LENGTH * by_angle(0.0)) ** 2
-    end = np.array([brentq(lambda q: across(q) - deflection, -1.5, 1.5, xtol=1e-15), 0.0])
-    for duration, flux in pieces:
-        end = solve_ivp(
-            lambda _, z, flux=flux: [z[1], (
-                flux * lever(z[0]) - stiffness * z[0] - damping * z[1]
-                - 0.5 * change(z[0]) * z[1] ** 2) / mass(z[0])],
-            (0.0, duration), end, method='DOP853', rtol=1e-12, atol=1e-13).y[:, -1]
-    return across(end[0]), by_angle(end[0]) * end[1]
-
 
 def test_the_first_frequency_is_that_of_euler_and_bernoulli():
     beam = silicone()
     frequency = model.natural_frequency(0.0, beam.nondimensional) / beam.time_unit
-    wanted = _mode()[4] ** 2 * math.sqrt(_BENDING / (DENSITY * _AREA * LENGTH ** 4))
+    wanted = mode()[4] ** 2 * math.sqrt(BENDING / (DENSITY * AREA * LENGTH ** 4))
     assert frequency == pytest.approx(wanted, rel=1e-10)
 
 
@@ -108,7 +48,7 @@ def test_the_first_frequency_is_that_of_euler_and_bernoulli():
 def test_a_field_holds_the_deflection_that_the_full_elastica_has_within_3_percent(deflection):
     beam = silicone()
     flux = float(model.elastic_force(deflection, beam.nondimensional)) * beam.flux_density_unit
-    force = REMANENCE * flux / MU_0 * _AREA * LENGTH ** 2 / _BENDING
+    force = REMANENCE * flux / MU_0 * AREA * LENGTH ** 2 / BENDING
     s = np.linspace(0.0, 1.0, 30)
     angle = float(bending.angle_of(deflection))
     solved = solve_bvp(
@@ -205,16 +145,6 @@ def test_other_modes_keep_little_of_a_two_step_move_on_a_chain_of_20_links(targe
     assert second.mean() == pytest.approx((1.0 + offset) * target, abs=0.004 * target)
     assert np.ptp(first) < 0.025 * target
     assert np.ptp(second) < 0.01 * target
-
-
-def test_identification_refuses_a_beam_in_a_sentence(tmp_path, capsys):
-    known = tmp_path / 'beam.yaml'
-    assert main(['init', '--beam', '--yes', '--flux-max', '10mT', '--out', str(known)]) == 0
-    data = tmp_path / 'data.csv'
-    data.write_text('time,stretch,flux_density\n0,0,0\n')
-    for words in (['identify', str(data)], ['excite', '--duration', '20']):
-        assert main([*words, '--params-file', str(known)]) == 2
-        assert 'has law beam: expected a block; a beam is not' in capsys.readouterr().err
 
 
 def test_a_parameter_file_of_a_beam_plans_its_deflection_to_both_sides(tmp_path, capsys):

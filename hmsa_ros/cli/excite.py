@@ -9,6 +9,7 @@ from typing import Any, TYPE_CHECKING
 from hmsa_ros.files import write_text
 
 if TYPE_CHECKING:
+    from hmsa_ros.core.parameters import ActuatorParameters
     from hmsa_ros.identification.excitation import Excitation, Program
 
 
@@ -32,11 +33,11 @@ def add_parser(subparsers: Any) -> None:
         '--free', default='', metavar='NAME,...', help='parameters to identify, as in hmsa '
                                                        'identify')
     parser.add_argument(
-        '--stretch-min', type=float, default=0.6, metavar='X', dest='stretch_min',
-        help='smallest stretch allowed (default 0.6)')
+        '--stretch-min', type=float, metavar='X', dest='stretch_min',
+        help='smallest stretch allowed (default 0.6; a deflection of -0.6 for a beam)')
     parser.add_argument(
-        '--stretch-max', type=float, default=2.0, metavar='X', dest='stretch_max',
-        help='largest stretch allowed (default 2)')
+        '--stretch-max', type=float, metavar='X', dest='stretch_max',
+        help='largest stretch allowed (default 2; a deflection of 0.6 for a beam)')
     parser.add_argument(
         '--rate', type=float, default=1000.0, metavar='HZ',
         help='sample rate of the sensor in Hz (default 1000)')
@@ -82,7 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
                 found.improvement), 'plain': _record(found.plain),
             'paper': _record(found.paper)}, indent=2, allow_nan=False))
         return 0
-    for line in table(found):
+    for line in table(found, belief.actuator):
         print(line)
     if arguments.out is not None:
         print(f'{arguments.out} written')
@@ -103,7 +104,7 @@ def _record(program: 'Program') -> dict[str, Any]:
         'ends_at_rest': program.ends_at_rest}
 
 
-def table(found: 'Excitation') -> list[str]:
+def table(found: 'Excitation', actuator: 'ActuatorParameters') -> list[str]:
     """
     Return the information in the sequences, a line each.
 
@@ -111,6 +112,8 @@ def table(found: 'Excitation') -> list[str]:
     ----------
     found : Excitation
         As designed.
+    actuator : ActuatorParameters
+        That they move.
 
     Returns
     -------
@@ -118,15 +121,18 @@ def table(found: 'Excitation') -> list[str]:
         Aligned.
 
     """
+    from hmsa_ros.identification.quantities import modulus_of
+
     programs = (found.best, found.plain, found.paper)
+    labels = {'shear_modulus': modulus_of(actuator.law)[0]}
     lines = [
-        f'{len(found.best.levels)} levels in {found.duration:.4g} s, stretch '
+        f'{len(found.best.levels)} levels in {found.duration:.4g} s, {actuator.coordinate.name} '
         f'{found.best.reach[0]:.3f} to {found.best.reach[1]:.3f}, '
         + ('at rest at the end' if found.best.ends_at_rest else 'still moving at the end'),
         f'{"standard deviation":<22}{"this":>12}{"plain steps":>14}{"paper":>12}']
     for name in found.best.std:
         cells = [_share(name, x.std[name]) for x in programs]
-        lines.append(f'{name:<22}{cells[0]:>12}{cells[1]:>14}{cells[2]:>12}')
+        lines.append(f'{labels.get(name, name):<22}{cells[0]:>12}{cells[1]:>14}{cells[2]:>12}')
     return [*lines, f'the worst parameter is {found.improvement:.1f} times as well known as '
             'after one pass of plain steps']
 

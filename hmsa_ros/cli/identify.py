@@ -60,10 +60,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     from hmsa_ros.identification.files import file_text, read_belief
     from hmsa_ros.identification.identify import identify, profile
-    from hmsa_ros.identification.quantities import DEFAULT_FREE, refuse_beam
+    from hmsa_ros.identification.quantities import DEFAULT_FREE
 
     belief = read_belief(arguments.params_file)
-    refuse_beam(belief.actuator.law)
     recording, belief = _read(arguments, belief)
     free = [x for x in arguments.free.split(',') if x] or DEFAULT_FREE
     found = identify(recording, free=free, actuator=belief.actuator, known=belief.others)
@@ -132,7 +131,9 @@ def _read(
     from hmsa_ros.identification.tables import read_csv
 
     slew = belief.number('slew_limit', 0.0) or math.inf
-    return read_csv(path, arguments.commands, slew_limit=slew), belief
+    return read_csv(
+        path, arguments.commands, slew_limit=slew,
+        coordinate=belief.actuator.coordinate), belief
 
 
 def table(found: 'Identification') -> list[str]:
@@ -151,8 +152,8 @@ def table(found: 'Identification') -> list[str]:
 
     """
     lines = [f'{"parameter":<22}{"value":>14}{"std":>11}{"95 % interval":>28}  unit']
-    for name in found.names:
-        x = found.parameters[name]
+    for key in found.names:
+        name, x = found.shown(key)
         if x.value != x.value:
             lines.append(f'{name:<22}{"not identifiable":>53}  {x.unit}')
             continue

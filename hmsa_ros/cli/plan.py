@@ -132,7 +132,7 @@ def _run_si(arguments: argparse.Namespace) -> int:
         _print_table(
             rows, ('stretch', 'span', 'flux_density_p', 'time_p', 'flux_density_1'),
             f'times in s, flux densities in T; c1 {group.c1:.6g}, zeta {group.zeta:.6g}, '
-            f'time unit {time:.6g} s', group.coordinate)
+            f'time unit {time:.6g} s', group.coordinate.name)
         _print_reasons(segments)
     return 0
 

@@ -15,6 +15,7 @@ import numpy as np
 from hmsa_ros.core import kernels, law
 from hmsa_ros.core.branches import Branches
 from hmsa_ros.core.creep import Creep
+from hmsa_ros.core.laws.coordinate import STRETCH
 from hmsa_ros.core.model import Array, Material, stretch_limits
 from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.core.schedule import CommandSchedule
@@ -41,7 +42,7 @@ def check_stretch(stretch: float, material: Material, name: str = 'stretch') -> 
     lower, upper = stretch_limits(material)
     if not lower < stretch < upper:
         elastic = getattr(material, 'law', None)
-        coordinate = getattr(material, 'coordinate', 'stretch')
+        coordinate = getattr(material, 'coordinate', STRETCH).name
         whose = f'J_lim {getattr(material, "j_lim", material):g}' if elastic is None \
             else f'law {elastic.law}'
         raise BadInputError(

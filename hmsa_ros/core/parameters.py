@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmsa_ros.core.creep import Creep
+from hmsa_ros.core.laws.coordinate import Coordinate, coordinate_of
 from hmsa_ros.core.laws.record import Elastic
 from hmsa_ros.core.units import MU_0
 from hmsa_ros.errors import BadInputError, excerpt
@@ -84,14 +85,14 @@ class NondimensionalParameters:
         _check(self)
 
     @property
-    def rest(self) -> float:
-        """Stretch at rest without a field; the deflection of a beam."""
-        return 1.0 if self.law is None else self.law.rest
+    def coordinate(self) -> Coordinate:
+        """What the position is: a stretch, or the deflection of a beam."""
+        return coordinate_of(self.law)
 
     @property
-    def coordinate(self) -> str:
-        """What the coordinate is called: stretch, or deflection of a beam."""
-        return 'stretch' if self.law is None else self.law.coordinate
+    def rest(self) -> float:
+        """Stretch at rest without a field; the deflection of a beam."""
+        return self.coordinate.rest
 
     @cached_property
     def packed(self) -> NDArray[np.float64]:
@@ -112,6 +113,48 @@ class NondimensionalParameters:
     def elastic(self) -> 'NondimensionalParameters':
         """The group without its branches."""
         return replace(self, creep=Creep())
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """
+    What sizes and law make of parameters in SI units, for a block and for a beam.
+
+    Attributes
+    ----------
+    half_length, half_thickness : float
+        In m, greater than 0.
+    law : Elastic, optional
+        That of a beam says more of its sizes.
+
+    """
+
+    half_length: float
+    half_thickness: float
+    law: Elastic | None = None
+
+    @property
+    def c1(self) -> float:
+        """Shape 2 H^2/L^2 of a block, or that of the block with the inertia of a beam."""
+        shape = None if self.law is None else self.law.shape
+        return shape or 2.0 * (self.half_thickness / self.half_length) ** 2
+
+    @property
+    def loaded(self) -> float:
+        """Area in m^2 that a force acts on: a face of a block, or the section of a beam."""
+        section = self.law.section if self.law is not None and self.law.section else 1.0
+        return 4.0 * section * self.half_length ** 2
+
+    @property
+    def damped(self) -> float:
+        """Damping coefficient of zeta 1 in m^2, in units of sqrt(rho G): 8 L H of a block."""
+        if self.law is not None and self.law.section:
+            return 1.25 * self.loaded
+        return 8.0 * self.half_length * self.half_thickness
+
+    def damping_unit(self, density: float, shear_modulus: float) -> float:
+        """Return the damping coefficient of zeta 1 in N s/m; units are SI."""
+        return self.damped * math.sqrt(density * shear_modulus)
 
 
 @dataclass(frozen=True)
@@ -216,9 +259,19 @@ class ActuatorParameters:
         return {x.name: getattr(self, x.name) for x in fields(self) if x.name not in _NO_NUMBERS}
 
     @property
+    def coordinate(self) -> Coordinate:
+        """What the position is: a stretch, or the deflection of a beam."""
+        return coordinate_of(self.law)
+
+    @property
     def rest(self) -> float:
         """Stretch at rest without a field; the deflection of a beam."""
-        return 1.0 if self.law is None else self.law.rest
+        return self.coordinate.rest
+
+    @property
+    def geometry(self) -> Geometry:
+        """What sizes and law make of parameters in SI units."""
+        return Geometry(self.half_length, self.half_thickness, self.law)
 
     @property
     def time_unit(self) -> float:
@@ -233,30 +286,20 @@ class ActuatorParameters:
     @property
     def damping_unit(self) -> float:
         """Damping coefficient in N s/m of zeta 1: 8 L H sqrt(rho G), or that of a beam's tip."""
-        return 8.0 * self._damped * math.sqrt(self.density * self.shear_modulus)
-
-    @property
-    def _damped(self) -> float:
-        """L H of a block in m^2, and what takes its place for a beam."""
-        if self.law is not None and self.law.section:
-            return 0.625 * self.law.section * self.half_length ** 2
-        return self.half_length * self.half_thickness
+        return self.geometry.damping_unit(self.density, self.shear_modulus)
 
     @property
     def load_per_newton(self) -> float:
         """Load of a force of 1 N on both faces of a block, or on the tip of a beam."""
-        section = self.law.section if self.law is not None and self.law.section else 1.0
-        return 1.0 / (4.0 * section * self.half_length ** 2 * self.shear_modulus)
+        return 1.0 / (self.geometry.loaded * self.shear_modulus)
 
     @cached_property
     def nondimensional(self) -> NondimensionalParameters:
         """The group that Eq. 11 depends on."""
-        shape = None if self.law is None else self.law.shape
         return NondimensionalParameters(
-            zeta=self.damping_coefficient / 8.0
-            / (self._damped * math.sqrt(self.density * self.shear_modulus)),
+            zeta=self.damping_coefficient / self.damping_unit,
             j_lim=self.chain_limit,
-            c1=shape or 2.0 * (self.half_thickness / self.half_length) ** 2,
+            c1=self.geometry.c1,
             law=self.law,
             creep=replace(self.creep, times=tuple(x / self.time_unit for x in self.creep.times)))
 

@@ -158,7 +158,7 @@ class Estimator:
         self.prior = prior
         self.options = options or Options()
         self.noise = self.options.noise or _FIRST_NOISE
-        self.screening = Screening(self.options.gate)
+        self.screening = Screening(self.options.gate, self.prior.coordinate)
         self.learning = self.options.learn
         # Covariance of the parameters while they stay as they are.
         self._fixed: Array | None = None
@@ -220,7 +220,7 @@ class Estimator:
         self.prior = prior or self.prior
         self._window = self._solution = self._fixed = None
         self._pending.clear()
-        self.screening = Screening(self.options.gate)
+        self.screening = Screening(self.options.gate, self.prior.coordinate)
 
     # -- out -----------------------------------------------------------------------------------
 
@@ -275,7 +275,7 @@ class Estimator:
         """
         window, found = self._window, self._solution
         if window is None:
-            window = self._new_window(time, 1.0)
+            window = self._new_window(time, self.prior.coordinate.rest)
             found = window.solve(window.mean, self._as_levels(), self.noise, window.begin)
         if found is None:
             return None

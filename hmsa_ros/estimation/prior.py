@@ -3,9 +3,11 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
+from typing import Any
 
 import numpy as np
 
+from hmsa_ros.core.laws.coordinate import Coordinate, coordinate_of
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.errors import BadInputError
@@ -39,8 +41,8 @@ class Prior:
 
     Attributes
     ----------
-    values : dict of str to float
-        Of all quantities.
+    values : dict of str to object
+        Of all quantities, and the law.
     free : tuple of str
         What is tracked.
     covariance : ndarray, shape (p, p)
@@ -51,7 +53,7 @@ class Prior:
 
     """
 
-    values: dict[str, float]
+    values: dict[str, Any]
     free: tuple[str, ...]
     covariance: Array
     spread: Array
@@ -99,9 +101,9 @@ class Prior:
         for name in free:
             deviation = (deviations or {}).get(name, DEVIATIONS[name])
             if name == 'constant_force' and not deviation:
-                deviation = _FORCE * 4.0 * actuator.half_length ** 2 * actuator.shear_modulus
+                deviation = _FORCE / actuator.load_per_newton
             if name == 'damping_coefficient':
-                deviation *= max(values[name], _damping(actuator))
+                deviation *= max(values[name], _LEAST_ZETA * actuator.damping_unit)
             elif name == 'chain_limit':
                 deviation *= max(1.0 / values[name], _LEAST_LIMIT)
             if not 0.0 < deviation < math.inf:
@@ -109,6 +111,11 @@ class Prior:
                     f'the deviation of {name} is {deviation:g}: expected a number above 0')
             size.append(deviation)
         return cls(values, free, np.diag(np.square(size)), np.array(size))
+
+    @property
+    def coordinate(self) -> Coordinate:
+        """What samples are."""
+        return coordinate_of(self.values['law'])
 
     def informed(self, known: Known) -> 'Prior':
         """
@@ -141,9 +148,3 @@ class Prior:
         return replace(
             self, values=values, covariance=covariance,
             spread=np.maximum(self.spread, np.sqrt(np.diag(covariance))))
-
-
-def _damping(actuator: ActuatorParameters) -> float:
-    """Return a damping coefficient in N s/m that is small for a block."""
-    return _LEAST_ZETA * 8.0 * actuator.half_length * actuator.half_thickness * math.sqrt(
-        actuator.density * actuator.shear_modulus)

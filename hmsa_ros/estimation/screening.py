@@ -1,9 +1,8 @@
 """Samples that cannot be right: no number, a frozen sensor, a jump."""
 
-import math
-
 import numpy as np
 
+from hmsa_ros.core.laws.coordinate import Coordinate, STRETCH
 from hmsa_ros.core.model import Array
 from hmsa_ros.estimation.motion import follow, Levels
 from hmsa_ros.estimation.window import Solution, Window
@@ -15,8 +14,6 @@ _FOUND = 12
 # So many equal values in a row, while motion of so many deviations is expected, come from a
 # sensor that is frozen.
 _EQUAL, _MOTION = 4, 8.0
-# A stretch beyond this is none.
-_LARGEST = 20.0
 
 
 class Screening:
@@ -27,6 +24,8 @@ class Screening:
     ----------
     gate : float
         Deviations of the innovation from which a sample is rejected.
+    coordinate : Coordinate
+        What samples are.
 
     Attributes
     ----------
@@ -38,17 +37,17 @@ class Screening:
 
     """
 
-    def __init__(self, gate: float) -> None:
+    def __init__(self, gate: float, coordinate: Coordinate = STRETCH) -> None:
         """Begin with a sensor that works."""
-        self._gate = gate
+        self._gate, self._conceivable = gate, coordinate.conceivable
         self.unreadable = self.repeated = self.late = self.rejected = self.frozen = 0
         self.trouble = ''
         self._in_a_row = self._fitted = 0
         self._last: list[tuple[float, float]] = []
 
     def readable(self, stretch: float) -> bool:
-        """Return whether a value can be a stretch."""
-        if math.isfinite(stretch) and 0.0 < stretch < _LARGEST:
+        """Return whether a value can be a stretch, or what the coordinate is."""
+        if self._conceivable[0] < stretch < self._conceivable[1]:
             return True
         self.unreadable += 1
         return False

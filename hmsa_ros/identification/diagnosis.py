@@ -6,11 +6,18 @@ import math
 
 import numpy as np
 
+from hmsa_ros.core import model
 from hmsa_ros.core.model import Array
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.fit import Fit
 from hmsa_ros.identification.noise import autocorrelation, inflation, Whiteness, whiteness
-from hmsa_ros.identification.quantities import QUANTITIES
+from hmsa_ros.identification.quantities import (
+    damping_unit,
+    geometry_of,
+    group_of,
+    modulus_of,
+    QUANTITIES,
+)
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.response import complete, respond
 from hmsa_ros.identification.result import Signature
@@ -38,12 +45,11 @@ def allowed(fit: Fit) -> Array:
     """Return the deviation of each free parameter's coordinate that still leaves a number."""
     values = fit.values
     unit = values['time_unit']
-    load = 4.0 * values['half_length'] ** 2 * values['shear_modulus']
-    per_zeta = 8.0 * values['half_length'] * values['half_thickness'] * math.sqrt(
-        values['density'] * values['shear_modulus'])
+    load = geometry_of(values).loaded * values['shear_modulus']
     limits = {
         'chain_limit': _RELATIVE / min(values['chain_limit'], 1e3),
-        'damping_coefficient': _RELATIVE * max(values['damping_coefficient'], 0.05 * per_zeta),
+        'damping_coefficient': _RELATIVE * max(
+            values['damping_coefficient'], 0.05 * damping_unit(values)),
         'stretch_bias': 0.05, 'stretch_gain': 0.1, 'sensor_latency': 0.5 * unit,
         'coil_time_constant': max(_RELATIVE * values['coil_time_constant'], 0.1 * unit),
         'constant_force': 0.1 * load, 'initial_stretch': 0.05, 'initial_rate': 0.5 / unit,
@@ -105,21 +111,21 @@ def weakness(fit: Fit, deviation: float, factors: Array) -> Weakness | None:
         if not set(names).intersection(fit.free[j] for j in chosen):
             continue
         if len(chosen) == 1:
-            sentences.append(f'{fit.free[chosen[0]]} hardly changes the recorded stretch')
+            sentences.append(f'{fit.free[chosen[0]]} hardly changes the recorded motion')
         else:
             share = 0.1 / _RELATIVE / max(relative[chosen[0]], 1e-12)
             words = ', '.join(
                 _change(fit, j, parts[j] * share, parts[chosen[0]]) for j in chosen)
             sentences.append(
                 f'{_listed([fit.free[j] for j in chosen])} are determined only in combination: '
-                f'{words} at the same time leaves the recorded stretch unchanged within the '
+                f'{words} at the same time leaves the recorded motion unchanged within the '
                 'noise')
     advice = list(dict.fromkeys(
         QUANTITIES[x].advice for x in names if QUANTITIES[x].advice))
     if {'shear_modulus', 'density', 'remanence'} <= set(fit.free) or (
             {'shear_modulus', 'time_unit', 'remanence'} <= set(fit.free)):
         advice = [QUANTITIES['density'].advice]
-    listed = '; '.join(sentences) or 'the recorded stretch hardly depends on them'
+    listed = '; '.join(sentences) or 'the recorded motion hardly depends on them'
     return Weakness(names, (
         f'{_listed(list(names))} cannot be identified from this recording: {listed}. Instead, '
         f'{"; or ".join(advice[:3])}; or leave out of --free what is known'))
@@ -297,9 +303,9 @@ def _second_mode(recording: Recording, fit: Fit) -> list[Signature]:
     chance = len(power) * math.exp(-len(power) * float(power[place]) / float(np.sum(power)))
     frequency = (place + 3) / (
         float(np.mean(np.diff(recording.time))) * len(recording.time))
-    own = math.sqrt(fit.values['shear_modulus'] / fit.values['density'] * 6.0 / (
-        1.0 + 2.0 * (fit.values['half_thickness'] / fit.values['half_length']) ** 2)
-        * 3.0) / fit.values['half_length'] / (2.0 * math.pi)
+    group = group_of(fit.values)
+    own = float(model.natural_frequency(group.rest, group)) / complete(
+        fit.values, fit.free)['time_unit'] / (2.0 * math.pi)
     apart = not 0.5 < frequency / own < 2.0
     return [Signature(
         f'a second mode at {frequency:.4g} Hz', share,
@@ -368,8 +374,11 @@ def check_plausible(recording: Recording, fit: Fit, unknown: Sequence[str] = ())
         If a free parameter has a value that no elastomer has.
 
     """
+    modulus, ratio = modulus_of(fit.values.get('law'))
     for name, (least, most, power) in _USUAL.items():
-        value = fit.values[name]
+        value, label = fit.values[name], name
+        if name == 'shear_modulus':
+            value, label = ratio * value, modulus
         if name not in fit.free or name in unknown or least <= value <= most:
             continue
         hint = next((
@@ -379,10 +388,10 @@ def check_plausible(recording: Recording, fit: Fit, unknown: Sequence[str] = ())
             hint = '; if flux densities are in mT, write "flux_density [mT]" in the header'
         unit = QUANTITIES[name].unit
         raise BadInputError(
-            f'{recording.label} moves as with a {name} of {value:.3g} {unit}, in samples '
+            f'{recording.label} moves as with a {label} of {value:.3g} {unit}, in samples '
             f'{float(np.median(np.diff(recording.time))):.3g} s apart: expected {least:g} to '
             f'{most:g} {unit}; check that times are in s, flux densities in T, and the size of '
-            f'the block in --params-file{hint}')
+            f'the actuator in --params-file{hint}')
 
 
 def misfit(
@@ -417,7 +426,7 @@ def misfit(
         return (
             f'no motion of the model is like the recorded one: {figures}, against a motion of '
             f'{motion:.3g} rms; are times in s and levels in tesla, of one clock and one run, and '
-            'is the block described by --params-file?')
+            'is the actuator described by --params-file?')
     if fit.scale < _NUMERICAL:
         return ''
     seen = [x for x in marks if x.found]

@@ -8,7 +8,7 @@ levels and dwells is repeated; levels and dwells are sought at random and improv
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
 
 import numpy as np
@@ -26,7 +26,6 @@ from hmsa_ros.identification.quantities import (
     check_free,
     DEFAULT_FREE,
     derivative,
-    refuse_beam,
     values_of,
 )
 from hmsa_ros.identification.recording import Course
@@ -42,9 +41,9 @@ _BEGIN = 0.2  # periods of rest before the first level
 _LAST = 3.0  # durations of a period that the last move and its rest take
 _SHORTEST = 3.0  # duration in periods that holds a sequence at all
 _MARGIN = 0.95  # of the way to the limits of the chains
-#: The paper's sequence, and a pass of plain steps; stretches.
-PAPER = (1.1, 1.2, 1.4)
-PLAIN = (1.1, 1.4, 1.0)
+#: The paper's sequence, and a pass of plain steps; from rest.
+PAPER = (0.1, 0.2, 0.4)
+PLAIN = (0.1, 0.4, 0.0)
 _WEIGHT = 4.0  # of the worst parameter against the volume
 _WINDOW = 30.0  # periods over which patterns are compared
 _REST = 1e-3  # deviation from rest at the end, stretch
@@ -61,8 +60,8 @@ class Bounds:
         In T.
     slew_limit : float
         In T/s; infinite for steps.
-    stretch_min, stretch_max : float
-        Of the whole motion.
+    stretch_min, stretch_max : float, optional
+        Of the whole motion; default 0.6 and 2, deflections of -0.6 and 0.6 for a beam.
 
     Raises
     ------
@@ -74,8 +73,8 @@ class Bounds:
     flux_density_min: float = -0.5
     flux_density_max: float = 0.5
     slew_limit: float = math.inf
-    stretch_min: float = 0.6
-    stretch_max: float = 2.0
+    stretch_min: float | None = None
+    stretch_max: float | None = None
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -83,13 +82,31 @@ class Bounds:
             raise BadInputError(
                 f'flux densities from {self.flux_density_min:g} to {self.flux_density_max:g} T: '
                 'expected a range with 0 T in it')
-        if not 0.0 < self.stretch_min < 1.0 < self.stretch_max < math.inf:
-            raise BadInputError(
-                f'stretches from {self.stretch_min:g} to {self.stretch_max:g}: expected a range '
-                'with 1 inside')
         if not self.slew_limit > 0.0:
             raise BadInputError(
                 f'slew limit is {self.slew_limit:g} T/s: expected a number above 0')
+
+    def of_motion(self, actuator: ActuatorParameters) -> tuple[float, float]:
+        """
+        Return the range of the motion of an actuator.
+
+        Raises
+        ------
+        BadInputError
+            If it does not hold rest.
+
+        """
+        what, rest = actuator.coordinate, actuator.rest
+        least = what.usual[0] if self.stretch_min is None else self.stretch_min
+        most = what.usual[1] if self.stretch_max is None else self.stretch_max
+        if not -math.inf < least < rest < most < math.inf:
+            raise BadInputError(
+                f'{what.plural} from {least:g} to {most:g}: expected a range with {rest:g} inside')
+        if actuator.law is None:
+            return least, most
+        # Beyond the ends of a table nothing is known of the motion.
+        ends = [rest + _MARGIN * (x - rest) for x in actuator.law.limits]
+        return max(least, ends[0]), min(most, ends[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +148,8 @@ class Excitation:
     duration : float
         In s.
     best, plain, paper : Program
-        The one to record, plain steps to 1.1, 1.4 and 1, and the paper's shaped sequence.
+        The one to record, plain steps to 0.1 and 0.4 from rest and back, and the paper's shaped
+        sequence.
 
     """
 
@@ -188,13 +206,7 @@ class Designer:
             rate: float = 1000.0, noise: float = 1e-3,
             free: Sequence[str] = DEFAULT_FREE) -> None:
         """Check duration and rate."""
-        refuse_beam(actuator.law)
-        if actuator.law is not None:
-            # Beyond the ends of a table nothing is known of the motion.
-            least, most = (1.0 + _MARGIN * (x - 1.0) for x in actuator.law.limits)
-            bounds = replace(
-                bounds, stretch_min=max(bounds.stretch_min, least),
-                stretch_max=min(bounds.stretch_max, most))
+        least, most = bounds.of_motion(actuator)
         self._actuator, self._bounds, self._noise = actuator, bounds, noise
         self._free = check_free(free, actuator.law)
         self._values = values_of(actuator)
@@ -223,9 +235,10 @@ class Designer:
         if math.isinf(upper):
             upper = 10.0
         unit = actuator.flux_density_unit
-        low = max(bounds.stretch_min, 1.0 - _MARGIN * (1.0 - lower))
-        high = min(bounds.stretch_max, 1.0 + _MARGIN * (upper - 1.0))
-        self.stretches = low, high
+        rest = self._group.rest
+        low = max(least, rest - _MARGIN * (rest - lower))
+        high = min(most, rest + _MARGIN * (upper - rest))
+        self._reach = least, most
         self._range = (
             max(bounds.flux_density_min, self._holding(low)),
             min(bounds.flux_density_max, self._holding(high)))
@@ -283,7 +296,7 @@ class Designer:
             loads = (self._bounds.flux_density_min / self._unit,
                      self._bounds.flux_density_max / self._unit)
             segment, = plan_sequence(
-                [Setpoint(1.0, math.inf)], self._group,
+                [Setpoint(self._group.rest, math.inf)], self._group,
                 start=State(float(state.stretch[-1]), float(state.rate[-1]) * time,
                             level / self._unit),
                 limits=Limits(*loads), delivery=Delivery(slew=slew))
@@ -308,20 +321,21 @@ class Designer:
         return np.array(times), np.array(levels)
 
     def _excess(self, level_times: Array, levels: Array) -> float:
-        """Return the largest motion from 1 as a share of what the limits of the stretch allow."""
+        """Return the largest motion from rest as a share of what its limits allow."""
         response = respond(
             self._course(self._dense, level_times, levels), self._values, (), rtol=1e-4)
         if response is None:
             return math.inf
+        rest, (low, high) = self._group.rest, self._reach
         return max(
-            (1.0 - float(np.min(response.stretch))) / (1.0 - self._bounds.stretch_min),
-            (float(np.max(response.stretch)) - 1.0) / (self._bounds.stretch_max - 1.0))
+            (rest - float(np.min(response.stretch))) / (rest - low),
+            (float(np.max(response.stretch)) - rest) / (high - rest))
 
     def _score(self, found: Program | None) -> float:
         """Return the information of a sequence inside the limits, with a rest at its end."""
         if found is None or not found.ends_at_rest:
             return -math.inf
-        low, high = self._bounds.stretch_min, self._bounds.stretch_max
+        low, high = self._reach
         over = max(low - found.reach[0], found.reach[1] - high)
         if over > 0.0:
             return -math.inf
@@ -383,9 +397,9 @@ class Designer:
         score, best, self.point = tried[0]
         if best is None or score == -math.inf:
             raise BadInputError(
-                f'no sequence keeps within stretches of {self._bounds.stretch_min:g} to '
-                f'{self._bounds.stretch_max:g} and ends at rest: expected wider limits or a '
-                'longer duration')
+                f'no sequence keeps within {self._actuator.coordinate.plural} of '
+                f'{self._reach[0]:g} to {self._reach[1]:g} and ends at rest: expected wider '
+                'limits or a longer duration')
         return best
 
     def _improved(
@@ -413,7 +427,7 @@ class Designer:
         span = self.duration / len(targets)
         times = np.append(0.0, span * (np.arange(len(targets)) + 1e-3))
         for share in np.linspace(1.0, 0.1, 19).tolist():
-            levels = np.append(0.0, [self._holding(1.0 + share * (x - 1.0)) for x in targets])
+            levels = np.append(0.0, [self._holding(self._group.rest + share * x) for x in targets])
             if np.all(np.isfinite(levels)) and self._excess(times, levels) <= 1.0:
                 return self.judge(times, levels)
         return None
@@ -423,7 +437,8 @@ class Designer:
         time = self._actuator.time_unit
         span = self.duration / len(PAPER)
         try:
-            segments = plan_sequence([Setpoint(x, span / time) for x in PAPER], self._group)
+            segments = plan_sequence(
+                [Setpoint(self._group.rest + x, span / time) for x in PAPER], self._group)
         except (RefusedError, BadInputError):
             return None
         rows = [(0.0, 0.0)] + [
@@ -473,6 +488,7 @@ def excite(
     designer = Designer(actuator, bounds, duration, rate=rate, noise=noise, free=free)
     best = designer.search()
     nothing = Program(
-        np.zeros(1), np.zeros(1), dict.fromkeys(best.std, math.inf), -math.inf, (1.0, 1.0), True)
+        np.zeros(1), np.zeros(1), dict.fromkeys(best.std, math.inf), -math.inf,
+        (actuator.rest, actuator.rest), True)
     return Excitation(
         duration, best, designer.plain() or nothing, designer.paper() or nothing)

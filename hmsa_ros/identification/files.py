@@ -184,7 +184,8 @@ def file_text(found: Identification, belief: Belief, run: str, now: datetime) ->
         f'# Parameters of an actuator, identified from {run}',
         f'# on {now.isoformat(" ", "seconds")} by hmsa identify.',
         f'# Verdict: {found.verdict}: {found.reason}.',
-        f'# Noise {found.noise_std:.3g} of stretch a sample, {found.samples} samples.',
+        f'# Noise {found.noise_std:.3g} of {found.recording.coordinate.name} a sample, '
+        f'{found.samples} samples.',
         *(f'# Note: {x}.' for x in found.warnings),
         '/**:', '  ros__parameters:']
     written: dict[str, Any] = {}
@@ -195,7 +196,9 @@ def file_text(found: Identification, belief: Belief, run: str, now: datetime) ->
         written[f'actuator.{name}'] = value
     for key, value in parameters_of(actuator).items():
         if key not in written:
-            lines.append(f'    {key}: {yaml_text(value)}')
+            scale = key == f'law.{found.shown("shear_modulus")[0]}'
+            lines.append(_line(key, value, found, 'shear_modulus') if scale
+                         else f'    {key}: {yaml_text(value)}')
             written[key] = value
     for name, key in {**_OTHERS, **_LISTS}.items():
         if name in found.names:
@@ -220,11 +223,13 @@ def known_lines(known: Known, joint: str = '') -> list[str]:
 
 def _line(key: str, value: Any, found: Identification, name: str) -> str:
     """Return the line of a value with its deviation and interval."""
-    estimate = found.parameters[name]
+    label, estimate = found.shown(name)
+    if not key.endswith(label):
+        label, estimate = name, found.parameters[name]
     if not estimate.free:
         return f'    {key}: {yaml_text(value)}  # not identified'
     unit = f' {QUANTITIES[name].unit}' if QUANTITIES[name].unit else ''
-    of = '' if key.endswith(name) or '.' in key and name in _LISTS else f'{name} '
+    of = '' if key.endswith(label) or '.' in key and name in _LISTS else f'{name} '
     return (
         f'    {key}: {yaml_text(value)}  # {of}standard deviation {estimate.std:.3g}{unit}, 95 % '
         f'interval {estimate.low:.6g} to {estimate.high:.6g}')

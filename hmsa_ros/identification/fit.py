@@ -9,6 +9,7 @@ from the residuals themselves. Under normal noise that costs 0.1 % of the accura
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import math
+from typing import Any
 
 import numpy as np
 
@@ -37,8 +38,8 @@ class Fit:
 
     Attributes
     ----------
-    values : dict of str to float
-        Of all quantities.
+    values : dict of str to object
+        Of all quantities, and the law.
     free : tuple of str
         Names of the columns of the Jacobian.
     response : Response
@@ -58,7 +59,7 @@ class Fit:
 
     """
 
-    values: dict[str, float]
+    values: dict[str, Any]
     free: tuple[str, ...]
     response: Response
     residual: Array

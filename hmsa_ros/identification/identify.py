@@ -19,6 +19,7 @@ from hmsa_ros.identification.quantities import (
     derivative,
     from_coordinate,
     GEOMETRY,
+    modulus_of,
     QUANTITIES,
     to_coordinate,
     values_of,
@@ -92,15 +93,21 @@ def identify(
         If the data or the names cannot be used, or the motion is that of no elastomer.
 
     """
+    actuator = actuator or paper_actuator()
     if isinstance(time, Recording):
         recording = time
+        if recording.coordinate != actuator.coordinate:
+            raise BadInputError(
+                f'{recording.label} has {recording.coordinate.plural}: expected '
+                f'{actuator.coordinate.plural}, as the law of the actuator has')
     else:
         if stretch is None or level_times is None or levels is None:
             raise BadInputError(
                 'stretch, level_times or levels is missing: expected all three beside time')
-        recording = as_recording(time, stretch, level_times, levels, slew_limit)
-    free = check_free(free, actuator.law if actuator else None)
-    values = complete(values_of(actuator or paper_actuator(), known), ())
+        recording = as_recording(
+            time, stretch, level_times, levels, slew_limit, actuator.coordinate)
+    free = check_free(free, actuator.law)
+    values = complete(values_of(actuator, known), ())
     if 'chain_limit' in free:
         # Endless chains are no start: the derivative by their inverse is taken of the limit.
         values['chain_limit'] = min(values['chain_limit'], 1e9)
@@ -178,8 +185,8 @@ def _search(
     if not found:
         raise BadInputError(
             f'no start value leads to a motion that {recording.label} could be compared with: '
-            'expected levels in T and a block as --params-file describes it; a level may be more '
-            'than the block can hold')
+            'expected levels in T and an actuator as --params-file describes it; a level may be '
+            'more than it can hold')
     best, agreed = _best(found)
     if not best.converged:
         best = fit(recording, best.values, free, at_rest=at_rest) or best
@@ -283,6 +290,8 @@ def _conclude(
             f'{deviation:.3g}')
     lost = set(best.free) if verdict == 'model_rejected' and distant else set(
         weak.names if weak else ())
+    # A beam's modulus is known as Young's.
+    reason = reason.replace('shear_modulus', modulus_of(best.values.get('law'))[0])
     parameters, matrix = _estimates(best, covariance, freedom, lost)
     outliers = int(np.count_nonzero(best.weights == 0.0))
     warnings = (*recording.notes, *_warnings(
@@ -412,7 +421,7 @@ def _warnings(
             'the residuals are not white: correlation widened the intervals by up to '
             f'{float(np.max(factors)):.3g} times')
     if recording.quantum:
-        found.append(f'the stretch comes in steps of {recording.quantum:.3g}')
+        found.append(f'the {recording.coordinate.name} comes in steps of {recording.quantum:.3g}')
     if _shaped(recording, best):
         found.append(
             'all moves are shaped so that nothing rings: they carry about a sixth of the '

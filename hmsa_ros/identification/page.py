@@ -52,8 +52,8 @@ def page(found: Identification) -> str:
         + '</div>', f'<ul class="notes">{notes}</ul>',
         '<section id="parameters"><h2>Parameters</h2>' + _parameters(found) + '</section>',
         '<section id="motion-section"><h2>Data and fit</h2>' + text(
-            'Above, the level of the field; below, the stretch: measured, and as the fitted '
-            'actuator moves.') + placed(figures[0]) + '</section>',
+            f'Above, the level of the field; below, the {found.recording.coordinate.name}: '
+            'measured, and as the fitted actuator moves.') + placed(figures[0]) + '</section>',
         '<section id="residual-section"><h2>Residuals</h2>' + text(
             'Measured less fitted. Nothing but noise should be left: no swing, no trend, no '
             'bursts at the changes of level.') + placed(figures[1]) + text(
@@ -79,7 +79,7 @@ def _axis(title: str, **more: Any) -> dict[str, Any]:
 
 
 def _motion(found: Identification) -> Figure:
-    """Return level, measured and fitted stretch over time."""
+    """Return level, measured and fitted motion over time."""
     size, unit = _unit(found)
     recording = found.recording
     time = recording.time / size
@@ -95,9 +95,10 @@ def _motion(found: Identification) -> Figure:
                line={'color': charts.VERMILION, 'width': 1.6}),
         _curve('level', level_times, levels, yaxis='y2',
                line={'color': charts.BLACK, 'width': 1.6, 'shape': 'hv'})]
-    return Figure('motion', 'Level, measured and fitted stretch over time', 520, data, {
+    what = recording.coordinate
+    return Figure('motion', f'Level, measured and fitted {what.name} over time', 520, data, {
         'xaxis': _axis(f'time [{unit}]', anchor='y', range=numbers([time[0], time[-1]])),
-        'yaxis': _axis('stretch λ [1]', domain=[0.0, 0.66]),
+        'yaxis': _axis(f'{what.name} {what.symbol} [1]', domain=[0.0, 0.66]),
         'yaxis2': _axis('flux density B [mT]', domain=[0.74, 1.0], anchor='x')})
 
 
@@ -151,7 +152,8 @@ def _correlation(found: Identification) -> Figure:
 
 def _parameters(found: Identification) -> str:
     rows: list[list[Cell | str]] = []
-    for name, x in found.parameters.items():
+    for key in found.parameters:
+        name, x = found.shown(key)
         if x.free:
             lost = math.isnan(x.value)
             rows.append([
@@ -179,11 +181,12 @@ def _pairs(found: Identification) -> str:
     if len(found.names) < 2:
         return text('There is one free parameter.')
     matrix = found.correlation
+    names = [found.shown(x)[0] for x in found.names]
     rows: list[list[Cell | str]] = [
         [name, *(cell(float(x), '.3f') for x in matrix[i])]
-        for i, name in enumerate(found.names)]
+        for i, name in enumerate(names)]
     words = '; '.join(f'{one} and {other} ({x:.3f})' for one, other, x in found.confounded())
     return text(
         f'The data hardly distinguish {words}.' if words else
         'No pair has a correlation of 0.95 or more.') + table(
-            'correlation-table', 'Correlation of the estimates.', ['', *found.names], rows)
+            'correlation-table', 'Correlation of the estimates.', ['', *names], rows)

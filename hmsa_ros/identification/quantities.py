@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from hmsa_ros.core.laws.record import Elastic
-from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
+from hmsa_ros.core.parameters import ActuatorParameters, Geometry, NondimensionalParameters
 from hmsa_ros.errors import BadInputError
 
 
@@ -41,8 +41,8 @@ class Quantity:
 
 _STEP = 'record plain steps that ring, at a rate above twice the frequency of the ringing'
 _SCALE = ('only ratios of shear_modulus, density and remanence act on the motion: measure one of '
-          'them (weigh the block for the density) and leave it out of --free')
-_CREEP = 'record rest at a large stretch for several times the time of the creep'
+          'them (weigh the actuator for the density) and leave it out of --free')
+_CREEP = 'record rest far from that without field for several times the time of the creep'
 #: By name; those of the actuator are named as its parameters are.
 QUANTITIES: dict[str, Quantity] = {
     'shear_modulus': Quantity('Pa', advice=_STEP),
@@ -65,7 +65,8 @@ QUANTITIES: dict[str, Quantity] = {
     'constant_force': Quantity(
         'N', 0.0, 'linear', -math.inf, advice='record rest at three or more levels of both '
         'signs'),
-    'initial_stretch': Quantity('', 1.0, advice='begin to record before the first step'),
+    'initial_stretch': Quantity(
+        '', scale='linear', least=-math.inf, advice='begin to record before the first step'),
     'initial_rate': Quantity(
         '1/s', 0.0, 'linear', -math.inf, advice='begin to record at rest'),
     'viscoelastic_ratio': Quantity('', 0.0, 'linear', advice=_CREEP),
@@ -78,22 +79,6 @@ DEFAULT_FREE = (
 GEOMETRY = ('half_length', 'half_thickness')
 
 
-def refuse_beam(law: Elastic | None) -> None:
-    """
-    Refuse a law whose parameters are not sought.
-
-    Raises
-    ------
-    BadInputError
-        If it is that of a beam.
-
-    """
-    if law is not None and law.rest == 0.0:
-        raise BadInputError(
-            f'the actuator has law {law.law}: expected a block; a beam is not identified: find '
-            'its modulus by the frequency of its ringing and its damping by the decay')
-
-
 def check_free(names: Iterable[str], law: Elastic | None = None) -> tuple[str, ...]:
     """
     Return the names of free parameters, checked.
@@ -101,7 +86,8 @@ def check_free(names: Iterable[str], law: Elastic | None = None) -> tuple[str, .
     Parameters
     ----------
     names : iterable of str
-        As asked for; ``actuator.`` before a name is dropped.
+        As asked for; ``actuator.`` or ``law.`` before a name is dropped. The modulus may have the
+        name that it has in the law.
     law : Elastic, optional
         In place of Gent: the chain limit is then not sought.
 
@@ -116,13 +102,15 @@ def check_free(names: Iterable[str], law: Elastic | None = None) -> tuple[str, .
         If a name is unknown, none is given, or two exclude each other.
 
     """
-    free = tuple(dict.fromkeys(x.strip().removeprefix('actuator.') for x in names))
+    alias = modulus_of(law)[0]
+    free = tuple(dict.fromkeys(
+        'shear_modulus' if x == alias else x
+        for x in (y.strip().removeprefix('actuator.').removeprefix('law.') for y in names)))
     unknown = [x for x in free if x not in QUANTITIES]
     if unknown or not free:
         raise BadInputError(
             f'free parameter {", ".join(map(repr, unknown)) or "missing"}: expected some of '
             f'{", ".join(QUANTITIES)}')
-    refuse_beam(law)
     if law is not None and 'chain_limit' in free:
         if free != DEFAULT_FREE:
             raise BadInputError(
@@ -161,7 +149,8 @@ def values_of(
 
     """
     values: dict[str, Any] = {name: x.default for name, x in QUANTITIES.items()}
-    values |= actuator.numbers | {'time_unit': actuator.time_unit, 'law': actuator.law}
+    values |= actuator.numbers | {
+        'time_unit': actuator.time_unit, 'law': actuator.law, 'initial_stretch': actuator.rest}
     for name, value in (others or {}).items():
         quantity = QUANTITIES.get(name)
         if quantity is None:
@@ -216,8 +205,26 @@ def group_of(
 
     """
     return NondimensionalParameters(
-        zeta, values['chain_limit'] if j_lim is None else j_lim,
-        2.0 * (values['half_thickness'] / values['half_length']) ** 2, values.get('law'))
+        zeta, values['chain_limit'] if j_lim is None else j_lim, geometry_of(values).c1,
+        values.get('law'))
+
+
+def modulus_of(law: Elastic | None) -> tuple[str, float]:
+    """Return what the stiffness is known by, and its ratio to the shear modulus: E of a beam."""
+    if law is None or not law.section:
+        return 'shear_modulus', 1.0
+    name, ratio = law.given[0]
+    return name.removeprefix('law.'), float(ratio)
+
+
+def geometry_of(values: Mapping[str, Any]) -> Geometry:
+    """Return what the sizes among some values, and the law, make of parameters in SI units."""
+    return Geometry(values['half_length'], values['half_thickness'], values.get('law'))
+
+
+def damping_unit(values: Mapping[str, Any]) -> float:
+    """Return the damping coefficient in N s/m of zeta 1, for values of all quantities."""
+    return geometry_of(values).damping_unit(values['density'], values['shear_modulus'])
 
 
 def to_coordinate(name: str, value: float) -> float:

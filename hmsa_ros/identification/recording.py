@@ -6,6 +6,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hmsa_ros.core.laws.coordinate import Coordinate, STRETCH
 from hmsa_ros.core.model import Array
 from hmsa_ros.errors import BadInputError
 
@@ -18,9 +19,9 @@ _TIMES_SCATTER = 6.0
 # this share of the whole range.
 _CLIPPED_SLOPE = 0.01
 _CLIPPED_SAMPLES = 3
-# What a stretch may be without field, and ever; the share of the samples on either side that may
-# be no stretch; and the largest flux density of a coil in T.
-_RESTS, _STRETCHES, _FEW, _STRONGEST = (0.6, 1.6), (0.15, 5.0), 0.02, 5.0
+# The share of the samples on either side that may be none, and the largest flux density of a coil
+# in T.
+_FEW, _STRONGEST = 0.02, 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +34,7 @@ class Recording:
     time : ndarray, shape (n,)
         Times of the samples in s, increasing; n of at least 12.
     stretch : ndarray, shape (n,)
-        Measured stretch.
+        Measured stretch, or deflection of a beam.
     level_times, levels : ndarray, shape (m,)
         Flux density in T in force from each time on, increasing in time; m of at least 1.
     slew_limit : float
@@ -45,6 +46,8 @@ class Recording:
         Name for people.
     notes : tuple of str
         What a reader should know, one sentence each.
+    coordinate : Coordinate
+        What the samples are.
 
     Raises
     ------
@@ -62,6 +65,7 @@ class Recording:
     earlier: float = 0.0
     label: str = 'recording'
     notes: tuple[str, ...] = ()
+    coordinate: Coordinate = STRETCH
 
     def __post_init__(self) -> None:
         """Check the arrays."""
@@ -119,37 +123,40 @@ class Recording:
             still = self._unmoved(jitter)
         if still:
             raise BadInputError(
-                f'the stretch of {self.label} stays within {spread:.3g}, scatter {jitter:.2g}: '
-                'expected a motion; was the coil on, and is it the column of the stretch?')
+                f'the {self.coordinate.name} of {self.label} stays within {spread:.3g}, scatter '
+                f'{jitter:.2g}: expected a motion; was the coil on, and is it the column of the '
+                f'{self.coordinate.name}?')
         clipped = self._clipped()
         if clipped:
             raise BadInputError(
-                f'the stretch of {self.label} is cut off {clipped} times at '
+                f'the {self.coordinate.name} of {self.label} is cut off {clipped} times at '
                 f'{np.min(self.stretch):.6g} or {np.max(self.stretch):.6g}: expected a sensor '
                 'within its range; the crests are lost, and a fit would be wrong without a sign')
 
     def _check_scale(self) -> None:
-        """Refuse what cannot be a stretch."""
+        """Refuse what the coordinate cannot be."""
         # A few samples may have lost the actuator.
         low, middle, high = np.quantile(self.stretch, (_FEW, 0.5, 1.0 - _FEW)).tolist()
         place = np.searchsorted(self.level_times, self.time, side='right').clip(1) - 1
         without = self.stretch[self.levels[place] == 0.0]
         seen = len(without) >= _CLIPPED_SAMPLES
         rest = float(np.median(without)) if seen else middle
-        least, most = _RESTS if seen else _STRETCHES
-        if least <= rest <= most and _STRETCHES[0] <= low and high <= _STRETCHES[1]:
+        what = self.coordinate
+        least, most = what.at_rest if seen else what.possible
+        if least <= rest <= most and what.possible[0] <= low and high <= what.possible[1]:
             return
-        strain = abs(rest) < 0.4 if seen else low < _STRETCHES[0]
-        looks = (
-            'strain in percent, divide it by 100 and add 1' if strain and high > _STRETCHES[1]
-            else 'strain, add 1' if strain
+        strain = abs(rest) < 0.4 if seen else low < what.possible[0]
+        looks = what.looks or (
+            'strain in percent, divide it by 100 and add 1' if strain and high > what.possible[1]
+            else 'strain, add 1; if it is the deflection of a beam, give its parameter file'
+            if strain
             else 'ten times the stretch, divide it by 10' if 6.0 < rest < 16.0
             else 'percent, divide it by 100' if 60.0 < rest < 160.0
             else 'a length, in mm perhaps, divide it by the length at rest')
         raise BadInputError(
-            f'{self.label} has stretches from {low:.4g} to {high:.4g}'
+            f'{self.label} has {what.plural} from {low:.4g} to {high:.4g}'
             + (f', {rest:.4g} without field' if seen else '')
-            + ': expected the length over the length at rest, around 1; if it is ' + looks)
+            + f': expected {what.meaning}; if it is ' + looks)
 
     def _unmoved(self, jitter: float) -> bool:
         """Whether nothing differs between the levels, nor from sample to sample but noise."""
@@ -273,9 +280,9 @@ def pieces(
 
 def as_recording(
         time: ArrayLike, stretch: ArrayLike, level_times: ArrayLike, levels: ArrayLike,
-        slew_limit: float = math.inf) -> Recording:
+        slew_limit: float = math.inf, coordinate: Coordinate = STRETCH) -> Recording:
     """Return a recording of arrays or lists."""
     return Recording(
         np.asarray(time, dtype=np.float64), np.asarray(stretch, dtype=np.float64),
         np.atleast_1d(np.asarray(level_times, dtype=np.float64)),
-        np.atleast_1d(np.asarray(levels, dtype=np.float64)), slew_limit)
+        np.atleast_1d(np.asarray(levels, dtype=np.float64)), slew_limit, coordinate=coordinate)

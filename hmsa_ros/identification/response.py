@@ -20,7 +20,7 @@ from hmsa_ros.core.model import Array
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.units import MU_0
 from hmsa_ros.identification import kernels
-from hmsa_ros.identification.quantities import derivative, group_of, QUANTITIES
+from hmsa_ros.identification.quantities import derivative, geometry_of, group_of, QUANTITIES
 from hmsa_ros.identification.recording import Course, pieces, Recording
 
 #: Relative tolerance of the integration: far below the noise of any sensor.
@@ -53,13 +53,13 @@ class Response:
 def _chain(
         values: Mapping[str, float], branches: int) -> tuple[Array, dict[str, dict[int, float]]]:
     """Return theta of the kernel and, by name, its derivatives by the parameters."""
-    length, thickness = values['half_length'], values['half_thickness']
-    inertia = values['density'] * length ** 2
+    geometry = geometry_of(values)
+    inertia = values['density'] * geometry.half_length ** 2
     a = values['shear_modulus'] / inertia
-    per_damping = thickness / (8.0 * length ** 2) / inertia
+    per_damping = 0.5 * geometry.c1 * geometry.half_length / geometry.damped / inertia
     d = per_damping * values['damping_coefficient']
     k = values['remanence'] / (MU_0 * inertia)
-    per_force = 1.0 / (4.0 * length ** 2 * inertia)
+    per_force = 1.0 / (geometry.loaded * inertia)
     f = per_force * values['constant_force']
     theta = np.zeros(kernels.FIRST_BRANCH + 2 * branches)
     theta[:kernels.FIRST_BRANCH] = (

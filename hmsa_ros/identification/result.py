@@ -1,14 +1,14 @@
 """What an identification has found, as one frozen record."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from typing import Any, Literal
 
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.identification.noise import Whiteness
-from hmsa_ros.identification.quantities import actuator_of
+from hmsa_ros.identification.quantities import actuator_of, modulus_of
 from hmsa_ros.identification.recording import Recording
 
 Verdict = Literal['identified', 'not_identifiable', 'model_rejected']
@@ -103,8 +103,8 @@ class Identification:
         What was looked for in the residuals.
     widened : float
         Largest factor by which correlation widened a deviation.
-    values : dict of str to float
-        Of all quantities at the optimum, whatever the verdict.
+    values : dict of str to object
+        Of all quantities, and the law, at the optimum, whatever the verdict.
     at_rest : bool
         Whether the motion began at rest.
     starts, agreed : int
@@ -130,7 +130,7 @@ class Identification:
     whiteness: Whiteness
     signatures: tuple[Signature, ...]
     widened: float
-    values: Mapping[str, float]
+    values: Mapping[str, Any]
     at_rest: bool
     starts: int
     agreed: int
@@ -139,6 +139,16 @@ class Identification:
     def actuator(self) -> ActuatorParameters:
         """The block at the optimum; trust it only if the verdict is ``identified``."""
         return actuator_of(self.values)
+
+    def shown(self, name: str) -> tuple[str, Estimate]:
+        """Return a parameter as readers know it: the modulus of a beam is Young's."""
+        label, ratio = modulus_of(self.values.get('law'))
+        found = self.parameters[name]
+        if name != 'shear_modulus' or label == name:
+            return name, found
+        return label, replace(
+            found, value=ratio * found.value, std=ratio * found.std, low=ratio * found.low,
+            high=ratio * found.high)
 
     @property
     def correlation(self) -> Array:
@@ -150,20 +160,22 @@ class Identification:
     def confounded(self) -> list[tuple[str, str, float]]:
         """Return pairs of parameters that the data hardly distinguish, with their correlation."""
         matrix = self.correlation
+        names = [self.shown(x)[0] for x in self.names]
         return [
-            (self.names[i], self.names[j], float(matrix[i, j]))
-            for i in range(len(self.names)) for j in range(i)
+            (names[i], names[j], float(matrix[i, j]))
+            for i in range(len(names)) for j in range(i)
             if abs(matrix[i, j]) >= CONFOUNDED]
 
     def record(self) -> dict[str, Any]:
         """Return it as ``hmsa identify --json`` prints it; what is no number is None."""
+        parameters = dict([self.shown('shear_modulus')]) | self.parameters
         return {
             'verdict': self.verdict, 'reason': self.reason, 'warnings': list(self.warnings),
             'parameters': {
                 name: {
                     'value': _number(x.value), 'std': _number(x.std), 'low': _number(x.low),
                     'high': _number(x.high), 'unit': x.unit, 'free': x.free}
-                for name, x in self.parameters.items()},
+                for name, x in parameters.items()},
             'names': list(self.names),
             'covariance': [[_number(x) for x in row] for row in self.covariance.tolist()],
             'noise_std': _number(self.noise_std), 'samples': self.samples,

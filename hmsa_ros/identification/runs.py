@@ -10,7 +10,6 @@ from hmsa_ros.core.model import Array
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.quantities import refuse_beam
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.runs.bags import read_runs
 from hmsa_ros.runs.levels import in_force, without_repeats
@@ -52,8 +51,8 @@ def read_bag(
             f'{path} has the actuators {", ".join(x.joint or x.label for x in runs)}: name one '
             'with --joint')
     run = runs[0]
+    block = actuator or run.planner
     # A recorder gets the latched changes of before after the first new one.
-    refuse_beam((actuator or run.planner).law)
     levels = sorted(run.applied, key=lambda x: x.stamp) or in_force(
         (x,) for x in without_repeats(run.commands)[0])
     if not levels:
@@ -72,8 +71,9 @@ def read_bag(
     return (
         Recording(
             (run.time - zero) / NANOSECONDS, run.stretch, stamps[keep], fields[keep],
-            slew or math.inf, 0.0, run.label, () if actuator is not None else _notes(run.notes)),
-        actuator or run.planner,
+            slew or math.inf, 0.0, run.label, () if actuator is not None else _notes(run.notes),
+            block.coordinate),
+        block,
         {'coil_time_constant': run.number('planner.coil_time_constant')})
 
 

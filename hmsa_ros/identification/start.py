@@ -16,7 +16,7 @@ import numpy as np
 from hmsa_ros.core import model
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.units import MU_0
-from hmsa_ros.identification.quantities import group_of
+from hmsa_ros.identification.quantities import damping_unit, group_of
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.response import respond
 
@@ -88,8 +88,9 @@ def static(
     best = (math.inf, math.nan, usual)
     for limit in limits:
         group = group_of(values, j_lim=limit)
-        lower, upper = model.stretch_limits(group)
-        if not lower * 1.002 < low <= high < upper * 0.998:
+        # Motion may go further than what can be held, but not where there is no force.
+        ends = group.rest + 1.002 * (np.array([low, high]) - group.rest)
+        if not np.all(np.isfinite(model.elastic_force(ends, group))):
             continue
         force = np.asarray(model.elastic_force(stretch, group))
         slope = float(fields @ force) / float(fields @ fields)
@@ -183,11 +184,9 @@ def starts(
         natural = math.hypot(frequency, decay)
         unit = float(model.natural_frequency(mean, material)) / natural
         candidate = _candidate(given, free, unit, found)
-        inertia = candidate['density'] * given['half_length'] ** 2
         if 'damping_coefficient' in free:
-            candidate['damping_coefficient'] = (
-                2.0 * float(model.mass(mean, material)) * decay * inertia * 8.0
-                * given['half_length'] ** 2 / given['half_thickness'])
+            candidate['damping_coefficient'] = decay / natural * damping_unit(candidate) * float(
+                model.critical_zeta(mean, material))
         if all(abs(math.log(x['time_unit'] / candidate['time_unit'])) > 0.02
                for x in candidates):
             candidates.append(candidate)
@@ -231,17 +230,16 @@ def scan(
     tried: list[tuple[float, float, dict[str, float]]] = []
     timed = {'shear_modulus', 'density', 'time_unit'}.intersection(free)
     factors = np.geomspace(1.0 / _SCAN_RANGE, _SCAN_RANGE, _SCAN_POINTS) if timed else (1.0,)
-    c1 = 2.0 * (values['half_thickness'] / values['half_length']) ** 2
+    group = group_of(values)
+    critical = float(model.critical_zeta(group.rest, group))
     for factor in factors:
         unit = max(float(factor) * values['time_unit'], shortest)
         candidate = _candidate(values, free, unit, found)
-        per_zeta = 8.0 * values['half_length'] * values['half_thickness'] * math.sqrt(
-            candidate['density'] * candidate['shear_modulus'])
         for decay in _SCAN_DECAYS if 'damping_coefficient' in free else (0.0,):
             if decay:
-                # The share of critical damping about rest, zeta_c = 4/c1 sqrt(m psi'').
-                candidate = candidate | {'damping_coefficient': per_zeta * decay * 4.0 / c1
-                                         * math.sqrt((1.0 + c1) / 2.0)}
+                # The share of critical damping about rest.
+                candidate = candidate | {
+                    'damping_coefficient': decay * critical * damping_unit(candidate)}
             response = respond(part, candidate, (), at_rest=at_rest, rtol=1e-5)
             if response is not None:
                 miss = float(np.mean(np.abs(part.stretch - response.stretch)))

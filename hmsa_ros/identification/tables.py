@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmsa_ros.columns import read_table, Table
+from hmsa_ros.core.laws.coordinate import Coordinate, STRETCH
 from hmsa_ros.core.model import Array
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.recording import Recording
@@ -70,7 +71,8 @@ def read_levels(path: Path) -> tuple[Array, Array, tuple[str, ...]]:
 
 
 def read_csv(
-        path: Path, commands: Path | None = None, *, slew_limit: float = math.inf) -> Recording:
+        path: Path, commands: Path | None = None, *, slew_limit: float = math.inf,
+        coordinate: Coordinate = STRETCH) -> Recording:
     """
     Read a recording from CSV.
 
@@ -83,6 +85,8 @@ def read_csv(
         With ``time`` and ``flux_density``: the level in force from that time on.
     slew_limit : float
         Rate in T/s at which the amplifier ramps.
+    coordinate : Coordinate
+        What the column ``stretch`` has.
 
     Returns
     -------
@@ -121,7 +125,7 @@ def read_csv(
     # From the first sample on: seconds of an epoch leave no digits for what happens between.
     return Recording(
         time - time[:1], stretch, times - time[:1], levels, slew_limit, earlier, str(path),
-        tuple(notes))
+        tuple(notes), coordinate)
 
 
 def _kept(path: Path, table: Table, notes: list[str]) -> NDArray[np.int64]:

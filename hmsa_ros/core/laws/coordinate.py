@@ -1,0 +1,56 @@
+"""What the position of an actuator is: the stretch of a block, or the deflection of a beam."""
+
+from dataclasses import dataclass
+
+from hmsa_ros.core.laws.record import Elastic
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """
+    What a position is, and which values it may have.
+
+    Attributes
+    ----------
+    name, plural, symbol : str
+        In sentences, and in the axes of figures.
+    meaning : str
+        What it is, and about which value.
+    rest : float
+        Without a field.
+    at_rest, possible, conceivable : tuple of float
+        What a sensor may show without a field, and usually, and what can be a position at all.
+    usual : tuple of float
+        Range of a motion that is not too large.
+    looks : str
+        What other values may be, and how to mend them; empty where the values tell.
+
+    """
+
+    name: str
+    plural: str
+    symbol: str
+    meaning: str
+    rest: float
+    at_rest: tuple[float, float]
+    possible: tuple[float, float]
+    conceivable: tuple[float, float]
+    usual: tuple[float, float]
+    looks: str = ''
+
+
+STRETCH = Coordinate(
+    'stretch', 'stretches', 'λ', 'the length over the length at rest, around 1', 1.0,
+    (0.6, 1.6), (0.15, 5.0), (0.0, 20.0), (0.6, 2.0))
+DEFLECTION = Coordinate(
+    'deflection', 'deflections', 'u',
+    'the deflection of the tip over the length of the beam, around 0', 0.0,
+    (-0.4, 0.4), (-1.2, 1.2), (-2.0, 2.0), (-0.6, 0.6),
+    'a length, in mm perhaps, divide it by that of the beam; if it is the angle of the tip, take '
+    'the deflection that goes with it')
+_KNOWN = {x.name: x for x in (STRETCH, DEFLECTION)}
+
+
+def coordinate_of(law: Elastic | None) -> Coordinate:
+    """Return what the position is under a law; None for Gent."""
+    return STRETCH if law is None else _KNOWN[law.coordinate]

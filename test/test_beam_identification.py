@@ -1,0 +1,142 @@
+"""Identification of a beam, against its equations integrated by SciPy."""
+
+from dataclasses import replace
+from functools import cache
+import json
+
+from beam_oracle import DAMPING, REMANENCE, sampled, silicone, YOUNGS
+import numpy as np
+import pytest
+
+from hmsa_ros.cli import main
+from hmsa_ros.core import model
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification import identify, Recording
+from hmsa_ros.identification.excitation import Bounds, excite
+from hmsa_ros.identification.files import read_belief
+from hmsa_ros.identification.quantities import derivative, values_of
+from hmsa_ros.identification.recording import Course
+from hmsa_ros.identification.response import respond
+
+BEAM = silicone()
+PERIOD = 2.0 * np.pi * BEAM.time_unit / float(
+    model.natural_frequency(0.0, BEAM.nondimensional))
+TRUE = {'shear_modulus': BEAM.shear_modulus, 'damping_coefficient': DAMPING,
+        'remanence': REMANENCE, 'stretch_bias': 0.0}
+#: As one would guess it.
+START = replace(
+    BEAM, shear_modulus=2.5 * BEAM.shear_modulus, damping_coefficient=0.4 * DAMPING,
+    remanence=0.07)
+LEVELS = np.array([0.0, *(BEAM.flux_density_unit * float(
+    model.elastic_force(x, BEAM.nondimensional)) for x in (0.2, -0.3, 0.4, 0.0))])
+LEVEL_TIMES = np.append(0.0, 0.1 + 4.0 * PERIOD * np.arange(4))
+TIMES = np.arange(0.0, LEVEL_TIMES[-1] + 4.0 * PERIOD, 0.01)
+
+
+@cache
+def motion():
+    """Return what a sensor without noise sees."""
+    return sampled(TIMES, LEVEL_TIMES, LEVELS)
+
+
+def seen(noise=1e-3, seed=0):
+    """Return what a camera sees."""
+    return motion() + noise * np.random.default_rng(seed).standard_normal(len(TIMES))
+
+
+@pytest.mark.parametrize(('name', 'change'), [
+    ('shear_modulus', 'modulus'), ('damping_coefficient', 'damping'),
+    ('remanence', 'remanence'), ('constant_force', 'force')])
+def test_derivatives_are_those_of_the_equation_of_the_angle(name, change):
+    short = slice(0, 90)
+    size, middle = (1e-6, 0.0) if change == 'force' else (1e-3, 1.0)
+    ends = [sampled(TIMES[short], LEVEL_TIMES[:2], LEVELS[:2], **{change: middle + x})
+            for x in (-size, size)]
+    values = values_of(BEAM)
+    found = respond(Course(TIMES[short], LEVEL_TIMES[:2], LEVELS[:2]), values, [name])
+    scale = 1.0 if change == 'force' else TRUE[name]
+    wanted = (ends[1] - ends[0]) / (2.0 * size) / scale * derivative(name, values[name])
+    assert found.jacobian[:, 0] == pytest.approx(
+        wanted, abs=3e-4 * np.max(np.abs(wanted)))
+
+
+def test_modulus_damping_remanence_and_bias_are_found_within_their_deviations():
+    found = identify(TIMES, seen() + 0.01, LEVEL_TIMES, LEVELS, actuator=START)
+    assert found.verdict == 'identified'
+    for name, value in (TRUE | {'stretch_bias': 0.01}).items():
+        estimate = found.parameters[name]
+        assert abs(estimate.value - value) < 4.0 * estimate.std
+        assert estimate.std < 1e-3 * max(value, 0.1)
+    assert found.shown('shear_modulus')[0] == 'youngs_modulus'
+    assert found.noise_std == pytest.approx(1e-3, rel=0.15)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(('every', 'noise'), [(1, 1e-3), (3, 5e-3)])
+def test_errors_of_many_runs_are_as_large_as_the_deviations_say(every, noise):
+    runs = [identify(TIMES[::every], seen(noise, seed)[::every], LEVEL_TIMES, LEVELS,
+                     actuator=START) for seed in range(60)]
+    off = np.array([[(x.parameters[name].value - value) / x.parameters[name].std
+                     for name, value in TRUE.items()] for x in runs])
+    assert all(x.verdict == 'identified' for x in runs)
+    assert np.all(np.sqrt(np.mean(off ** 2, axis=0)) < 1.3)
+    assert 0.91 < np.mean(np.abs(off) < 1.96) < 0.985
+
+
+def test_begin_in_motion_frees_the_initial_deflection():
+    late = slice(20, None)
+    found = identify(
+        TIMES[late], seen()[late], LEVEL_TIMES[1:], LEVELS[1:], actuator=START)
+    assert found.verdict == 'identified'
+    assert 'initial_stretch' in found.names
+    estimate = found.parameters['shear_modulus']
+    assert abs(estimate.value - BEAM.shear_modulus) < 4.0 * estimate.std
+
+
+def test_command_shows_the_modulus_of_young_and_writes_what_the_nodes_take(tmp_path, capsys):
+    known, data, levels, out, page = (
+        tmp_path / x for x in ('beam.yaml', 'camera.csv', 'levels.csv', 'found.yaml', 'page.html'))
+    assert main([
+        'init', '--beam', '--length', '25mm', '--thickness', '1mm', '--width', '5mm',
+        '--youngs-modulus', '2MPa', '--density', '2g/cm3', '--remanence', '0.08',
+        '--damping', '1e-4', '--flux-max', '10mT', '--out', str(known)]) == 0
+    for file, name, rows in ((data, 'stretch', (TIMES, seen())),
+                             (levels, 'flux_density', (LEVEL_TIMES, LEVELS))):
+        np.savetxt(file, np.transpose(rows), delimiter=',', header=f'time,{name}', comments='')
+    capsys.readouterr()
+    words = ['identify', str(data), '--commands', str(levels), '--params-file', str(known)]
+    assert main([*words, '--out', str(out), '--report', str(page)]) == 0
+    shown = capsys.readouterr().out
+    row = next(x for x in shown.splitlines() if x.startswith('youngs_modulus')).split()
+    assert float(row[1]) == pytest.approx(YOUNGS, abs=4.0 * float(row[2]))
+    assert 'shear_modulus' not in shown
+    assert 'measured and fitted deflection' in page.read_text()
+    belief = read_belief(out)
+    assert belief.actuator.shear_modulus == pytest.approx(BEAM.shear_modulus, rel=1e-3)
+    assert belief.known.names == tuple(TRUE)
+    free = 'youngs_modulus,damping_coefficient,remanence'
+    assert main([*words, '--free', free, '--json']) == 0
+    estimate = json.loads(capsys.readouterr().out)['parameters']['youngs_modulus']
+    assert estimate['low'] < estimate['value'] < estimate['high']
+    # Millimetres.
+    rows = np.transpose((TIMES, 25.0 * seen()))
+    np.savetxt(data, rows, delimiter=',', header='time,stretch', comments='')
+    assert main(words) == 2
+    assert 'expected the deflection of the tip over the length' in capsys.readouterr().err
+
+
+def test_a_recording_of_a_stretch_is_none_of_a_beam():
+    recording = Recording(TIMES, 1.0 + seen(), LEVEL_TIMES, LEVELS)
+    with pytest.raises(BadInputError, match='has stretches: expected deflections'):
+        identify(recording, actuator=BEAM)
+
+
+@pytest.mark.slow
+def test_a_sequence_to_record_bends_to_both_sides_within_the_limits_and_ends_at_rest():
+    found = excite(BEAM, Bounds(-0.01, 0.01, stretch_max=0.5), duration=2.5, rate=100.0)
+    times = np.linspace(0.0, 2.5, 2000)
+    deflection = sampled(times, found.best.level_times, found.best.levels)
+    assert -0.601 < np.min(deflection) < -0.1
+    assert 0.1 < np.max(deflection) < 0.501
+    assert deflection[times > 2.5 - 0.5 * PERIOD] == pytest.approx(0.0, abs=2e-3)
+    assert found.improvement > 1.2
