@@ -6,9 +6,11 @@ import math
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
+import numpy as np
 import pytest
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
+from scipy.stats import chi2
 from sensor_msgs.msg import JointState, MagneticField
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
@@ -18,6 +20,7 @@ from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.planner import Options, PlannedLevel, Planner
 from hmsa_ros.core.shapers.pace import Pace
 from hmsa_ros.errors import HmsaError
+from hmsa_ros.identification.files import errors_from
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import (
     from_command,
@@ -230,6 +233,31 @@ def test_options_of_the_parameters_are_those_of_the_core_plan(bench, arguments, 
     planner.check()
     if 'period' in options:
         assert not any(x.stamp % options['period'] for x in planner.expected)
+
+
+def test_minimax_takes_the_ellipsoid_of_an_identification_and_refuses_a_file_without(
+        bench, tmp_path):
+    path, block = tmp_path / 'block.yaml', paper_actuator()
+    covariance = np.array([[1.6e5, 4.0], [4.0, 4e-4]])
+    known = ('    identification.names: [shear_modulus, damping_coefficient]\n'
+             f'    identification.covariance: {covariance.ravel().tolist()}\n')
+    text = ('/**:\n  ros__parameters:\n    actuator.shear_modulus: 10000.0\n'
+            f'    actuator.damping_coefficient: {block.damping_coefficient}\n')
+    path.write_text(text + known)
+    planner = bench('-p', 'shaper:=minimax', '-p', f'minimax_file:={path}')
+    errors = errors_from(str(path), (0.1, 0.1, 0.1))
+    # Its outline in G and damping is that of the covariance, where 95 % are.
+    axes, values = np.array(errors.axes), [1e4, block.damping_coefficient]
+    assert (axes.T @ axes)[:2, :2] == pytest.approx(
+        chi2.ppf(0.95, 2) * covariance / np.outer(values, values), rel=1e-3)
+    planner.core.set_options(replace(planner.core.options, shaper='minimax', errors=errors))
+    planner.request(*SEQUENCE)
+    planner.run(END)
+    planner.check()
+    path.write_text(text)
+    result, = planner.ros.set_parameters('planner', [Parameter('minimax_file', value=str(path))])
+    assert not result.successful
+    assert 'no covariance of shear_modulus' in result.reason
 
 
 def test_future_stamp_keeps_the_running_plan_until_then(bench):

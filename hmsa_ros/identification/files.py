@@ -6,6 +6,7 @@ It is the YAML that planner and plant take. How well the parameters are known tr
 planner takes as the prior of its feedback.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 import math
@@ -19,7 +20,7 @@ from hmsa_ros.contract.parameters import BLOCK
 from hmsa_ros.contract.topics import PLANNER, PLANT
 from hmsa_ros.core.mismatch import Ellipsoid, Uncertainty
 from hmsa_ros.core.parameters import ActuatorParameters
-from hmsa_ros.core.shapers.request import LARGEST_ERROR
+from hmsa_ros.core.shapers.request import as_errors, LARGEST_ERROR
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.known import Known, PREFIX
 from hmsa_ros.identification.quantities import actuator_of, QUANTITIES
@@ -150,6 +151,39 @@ def errors_of(belief: Belief, others: tuple[float, float, float]) -> Uncertainty
     # The shortest of four is left out: it would double the cases.
     found = [math.sqrt(max(lengths[i], 0.0)) * axes[:, i] for i in (3, 2, 1)]
     return Ellipsoid(tuple((float(a), float(b), float(c), float(d)) for a, b, c, d in found))
+
+
+def errors_from(file: str, others: Sequence[float]) -> Uncertainty:
+    """
+    Return how far off a block may be, as the shaper minimax takes it, by a file if one is named.
+
+    Parameters
+    ----------
+    file : str
+        What ``hmsa identify --out`` wrote, read as `errors_of` does; empty for none.
+    others : sequence of float
+        Of G, damping coefficient and J_lim, for what the file does not know.
+
+    Returns
+    -------
+    tuple of float or Ellipsoid
+        Where the block may be.
+
+    Raises
+    ------
+    BadInputError
+        If a number is out of range, or the file cannot be read or has no covariance.
+
+    """
+    errors = as_errors(others)
+    if not file or isinstance(errors, Ellipsoid):
+        return errors
+    belief = read_belief(Path(file))
+    if not set(_MISMATCH) & set(belief.known.names):
+        raise BadInputError(
+            f'{file} has no covariance of {", ".join(_MISMATCH)}: expected a file that hmsa '
+            'identify --out wrote (minimax_file), or an empty name')
+    return errors_of(belief, errors)
 
 
 def _number(path: Path | None, name: str, value: object) -> float:

@@ -23,10 +23,11 @@ from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.sequence import SHORT_SPELL
 from hmsa_ros.core.shapers import SHAPERS
 from hmsa_ros.core.shapers.pace import LEAST_PERIODS, MOST_PERIODS, Pace
-from hmsa_ros.core.shapers.request import as_errors, ERRORS, LARGEST_ERROR
+from hmsa_ros.core.shapers.request import ERRORS, LARGEST_ERROR
 from hmsa_ros.core.timeline import Model
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification.files import errors_from
 from hmsa_ros.identification.known import Known
 from hmsa_ros.identification.quantities import check_free
 from hmsa_ros.nodes.joints import JointParameters, JOINTS
@@ -60,6 +61,11 @@ OWN = (
         'Errors of shear modulus, damping coefficient and chain limit, as shares, within which '
         'the shaper minimax leaves least vibration; it takes as long as robust.', '',
         0.0, LARGEST_ERROR, read_only=False, items=float),
+    ParameterSpec(
+        'minimax_file', '',
+        'What hmsa identify --out wrote: the shaper minimax plans for the ellipsoid of its '
+        'covariance, and minimax_errors count for what was not identified; empty for none.',
+        read_only=False),
     ParameterSpec(
         'smooth_periods', _OPTIONS.pace.periods,
         'Natural periods that a move of the shaper smooth takes at the least; it takes longer '
@@ -207,7 +213,8 @@ def options_from(values: Mapping[str, Any]) -> Options:
         period=0 if values['command_mode'] == 'continuous'
         else nanoseconds(values['command_period']),
         slew_limit=float(values['slew_limit']) or math.inf,
-        order=int(values['robust_order']), errors=as_errors(values['minimax_errors']),
+        order=int(values['robust_order']), errors=errors_from(
+            str(values['minimax_file']), values['minimax_errors']),
         coil_time_constant=float(values['coil_time_constant']),
         creep_tolerance=float(values['creep_tolerance']),
         pace=Pace(float(values['smooth_periods']), float(values['stretch_rate_max']) or math.inf))
