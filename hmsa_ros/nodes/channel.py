@@ -22,8 +22,8 @@ class JointChannel:
         """Create publisher and subscriptions; who is linked gives news of commands itself."""
         self._node, self._joint, self._runtime, self._serve = node, joint, runtime, serve
         self._tell_ignored = Seldom()
-        topic = interface.of_joint(interface.FLUX_DENSITY_COMMAND, joint, joints)
-        self._command = node.create_publisher(topic.type, topic.name, topic.qos)
+        self._command = interface.publisher(
+            node, interface.of_joint(interface.FLUX_DENSITY_COMMAND, joint, joints))
         topic = interface.of_joint(interface.SETPOINT, joint, joints)
         node.create_subscription(topic.type, topic.name, self._on_setpoint, topic.qos)
         self._applied = ''

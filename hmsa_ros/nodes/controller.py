@@ -89,8 +89,7 @@ class LinkedPlant(PlantNode):
         super().__init__()
         planner.plant = self
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        topic = interface.DIAGNOSTICS
-        self._of_loop = self.create_publisher(topic.type, topic.name, topic.qos)
+        self._of_loop = interface.publisher(self, interface.DIAGNOSTICS)
         self.keep(
             self.create_timer(TICK_SECONDS, self._cycle, clock=steady),
             self.create_timer(1.0, self._report, clock=steady), self._of_loop)

@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from hmsa_ros.contract import topics
@@ -15,8 +17,8 @@ from hmsa_ros.contract.topics import from_outside, NODES, PLANNER, PLANT, PLAYER
 from hmsa_ros.nodes.message_types import interface_class
 
 __all__ = [
-    'from_outside', 'LATCHED', 'NODES', 'of_joint', 'PLANNER', 'PLANT', 'PLAYER', 'RECORDER',
-    'Service', 'Topic']
+    'from_outside', 'LATCHED', 'NODES', 'of_joint', 'PLANNER', 'PLANT', 'PLAYER', 'publisher',
+    'RECORDER', 'Service', 'Topic']
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,11 @@ IS_PAUSED = _service(topics.IS_PAUSED)
 PLAY_NEXT = _service(topics.PLAY_NEXT)
 SNAPSHOT = _service(topics.SNAPSHOT)
 SPLIT_BAGFILE = _service(topics.SPLIT_BAGFILE)
+
+
+def publisher(node: Node, topic: Topic) -> Publisher:
+    """Return a node's publisher of a topic."""
+    return node.create_publisher(topic.type, topic.name, topic.qos)
 
 
 def of_joint(topic: Topic, joint: str, joints: Sequence[str]) -> Topic:

@@ -44,8 +44,7 @@ class StateMarkers:
             self, node: Node, values: JointParameters, pace: float,
             states: Callable[[], tuple[int, Sequence[State]]]) -> None:
         """Create the publisher, and the timer unless the rate is 0."""
-        topic = interface.MARKERS
-        self._publisher = node.create_publisher(topic.type, topic.name, topic.qos)
+        self._publisher = interface.publisher(node, interface.MARKERS)
         self._states = states
         rate: float = values[MARKER_RATE.name]
         lifetime = 0.0
@@ -67,8 +66,7 @@ class TargetMarkers:
 
     def __init__(self, node: Node, values: JointParameters) -> None:
         """Create the publisher."""
-        topic = interface.MARKERS
-        self._publisher = node.create_publisher(topic.type, topic.name, topic.qos)
+        self._publisher = interface.publisher(node, interface.MARKERS)
         self._scene = scene_from(values)
         self._shown: Any = None
 

@@ -99,8 +99,7 @@ class PlannerNode(ManagedNode):
         self._channels = {x: JointChannel(
             self, x, names, self._runtime, self._serve, linked=self.linked) for x in names}
         self._plan, self._status, self._estimate, self._diagnostics = (
-            self.create_publisher(x.type, x.name, x.qos)
-            for x in (
+            interface.publisher(self, x) for x in (
                 interface.PLAN, interface.STATUS, interface.ESTIMATE, interface.DIAGNOSTICS))
         self._targets = TargetMarkers(self, self._settings)
         self._publish: dict[type, Callable[..., None]] = {

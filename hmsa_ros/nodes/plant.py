@@ -133,9 +133,9 @@ class PlantNode(ManagedNode):
         self._measured = (start, monotonic_ns())
         self._clocks_warned = False
 
-        self._diagnostics = self._publisher(interface.DIAGNOSTICS)
+        self._diagnostics = interface.publisher(self, interface.DIAGNOSTICS)
         self._clock_publisher = (
-            self._publisher(interface.CLOCK_TOPIC) if self._authority else None)
+            interface.publisher(self, interface.CLOCK_TOPIC) if self._authority else None)
         scalars = values['publish_scalars']
         self._samples = SamplePublisher(
             self, values.names, scalars=scalars == 'always' or (
@@ -174,9 +174,6 @@ class PlantNode(ManagedNode):
     def close(self) -> None:
         """End with the process."""
         self.cleanup()
-
-    def _publisher(self, topic: interface.Topic):  # type: ignore[no-untyped-def]
-        return self.create_publisher(topic.type, topic.name, topic.qos)
 
     def _serve(self, service: interface.Service, callback: Callable[..., object]) -> None:
         self.create_service(service.type, service.name, callback)

@@ -92,11 +92,8 @@ class PlantJoint:
         self._tell_refused, self._tell_late, self._tell_force = Seldom(), Seldom(), Seldom()
         self.received = self.refused = self.late = self.latest = self.failed = 0
 
-        def publisher(topic: interface.Topic) -> Any:
-            placed = interface.of_joint(topic, self.name, names)
-            return node.create_publisher(placed.type, placed.name, placed.qos)
-
-        self._applied = publisher(interface.FLUX_DENSITY_APPLIED)
+        self._applied = interface.publisher(
+            node, interface.of_joint(interface.FLUX_DENSITY_APPLIED, self.name, names))
         self.commands = CommandInput(
             node, interface.of_joint(interface.FLUX_DENSITY_COMMAND, self.name, names),
             self._on_command, values['command_source'], companion)

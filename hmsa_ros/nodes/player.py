@@ -26,7 +26,6 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.parameter import Parameter
-from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Trigger
 
 from hmsa_ros.bag.limits import CHUNK_SIZE
@@ -253,8 +252,7 @@ class Player(ManagedNode):
                 f'{self._reader.path} reaches to {latest * 1e-9:.0f} s: expected less than '
                 f'{_LATEST_CLOCK // 10**9} s for /clock')
         # First of all, so that nodes that wait for it can get ready.
-        self._clock_publisher = self.create_publisher(
-            ClockMessage, interface.CLOCK_TOPIC.name, interface.CLOCK_TOPIC.qos)
+        self._clock_publisher = interface.publisher(self, interface.CLOCK_TOPIC)
         self._send_clock(self._excerpt.start)
         return ClockOut(self._send_clock, frequency, on_publish)
 
@@ -354,8 +352,7 @@ class Player(ManagedNode):
                 (interface.PLAY_NEXT, self._on_play_next),
                 (interface.STOP, self._on_stop)):
             self.create_service(Trigger, service.name, callback)
-        self._diagnostics = self.create_publisher(
-            interface.DIAGNOSTICS.type, interface.DIAGNOSTICS.name, interface.DIAGNOSTICS.qos)
+        self._diagnostics = interface.publisher(self, interface.DIAGNOSTICS)
         self.create_timer(
             DIAGNOSTICS_SECONDS, self._on_diagnostics,
             clock=Clock(clock_type=ClockType.STEADY_TIME))

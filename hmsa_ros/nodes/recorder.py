@@ -123,8 +123,7 @@ class Recorder(ManagedNode):
                 interface.profile(Quality(1000, reliable=False)))
             self._capture.add(self._sim_time, self._clock_subscription)
         self._capture.start()
-        self._diagnostics = self.create_publisher(
-            interface.DIAGNOSTICS.type, interface.DIAGNOSTICS.name, interface.DIAGNOSTICS.qos)
+        self._diagnostics = interface.publisher(self, interface.DIAGNOSTICS)
         for name, callback in (
                 (interface.PAUSE.name, lambda _, answer: self._set_paused(True, answer)),
                 (interface.RESUME.name, lambda _, answer: self._set_paused(False, answer)),

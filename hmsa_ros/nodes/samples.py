@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 import math
 from struct import Struct
-from typing import Any
 
 from rclpy.node import Node
 from rclpy.serialization import serialize_message
@@ -31,12 +30,9 @@ class SamplePublisher:
 
     def __init__(self, node: Node, names: Sequence[str], *, scalars: bool) -> None:
         """Create the publishers."""
-        def publisher(topic: interface.Topic) -> Any:
-            return node.create_publisher(topic.type, topic.name, topic.qos)
-
-        self._states = publisher(interface.JOINT_STATES)
+        self._states = interface.publisher(node, interface.JOINT_STATES)
         self._scalars = [
-            tuple(publisher(interface.of_joint(x, name, names))
+            tuple(interface.publisher(node, interface.of_joint(x, name, names))
                   for x in (interface.STRETCH, interface.STRETCH_RATE))
             for name in names] if scalars else []
         count = len(names)
