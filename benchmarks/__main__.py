@@ -9,7 +9,8 @@ Measure speed and accuracy.
 NAME is planner, plant, preemption, joints, controller, recorder, player or crash; without one all
 of these are run.
 Those of recorder, player and crash take some seven minutes together. faults injects faults into
-running nodes and fails if one is not answered as it should be; soak runs for hours;
+running nodes and fails if one is not answered as it should be; soak runs for hours; feedback
+moves actuators that are not as planned with, in real time, for some three minutes;
 identification fits thousands of simulated runs; studies kills the workers of a study; rates
 measures how many plans a second studies make, for some seven minutes.
 A page is a Markdown file with marks ``<!-- begin NAME -->`` and ``<!-- end NAME -->``, between
@@ -35,7 +36,7 @@ _WIDTH = 120
 NAMES = ('planner', 'plant', 'preemption', 'joints', 'controller', 'recorder', 'player',
          'crash')
 #: Not run unless asked for: they take long and need the machine for themselves.
-LONG = ('faults', 'soak', 'identification', 'studies', 'rates')
+LONG = ('faults', 'soak', 'feedback', 'identification', 'studies', 'rates')
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -132,7 +133,7 @@ def main(arguments: list[str] | None = None) -> int:
         from benchmarks import bench_studies
 
         add(bench_studies.rates(quick=options.quick))
-    for name in ('joints', 'controller', 'recorder', 'player', 'crash'):
+    for name in ('joints', 'controller', 'recorder', 'player', 'crash', 'feedback'):
         if name in names and _has_ros(name):
             sheet = importlib.import_module(f'benchmarks.bench_{name}').compare(
                 quick=options.quick)

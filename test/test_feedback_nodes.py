@@ -1,10 +1,15 @@
 """Planner and plant as processes, the plant with a G that is a fifth higher."""
 
+from dataclasses import replace
+import math
+
+import numpy as np
 import pytest
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 import yaml
 
+from benchmarks.bench_feedback import GRAPHS, judge, run
 from hmsa_ros.nodes import interface
 
 pytestmark = pytest.mark.ros
@@ -68,3 +73,33 @@ def test_a_planner_that_adapts_arrives_with_the_second_move_and_saves_what_it_le
     answer = ros.call(Trigger, 'planner/save_estimate')
     assert not answer.success
     assert 'feedback is off' in answer.message
+
+
+def test_moves_in_a_bag_are_judged_from_samples_and_levels_alone():
+    time = np.arange(0.0, 2.0, 1e-3)
+    # It rings at 50 Hz by 0.01 about 1.39.
+    omega = 100.0 * math.pi
+    samples = np.column_stack([
+        time, 1.391 + 0.005 * np.sin(omega * time), 0.005 * omega * np.cos(omega * time)])
+    levels = np.array([(1.1, 0.001), (1.25, 0.03), (1.256, 0.05)])
+    requests, late = np.array([(1.0, 1.4), (1.9, 1.0)]), np.array([(0.5, 2.0), (1.5, 5.0)])
+    found, = judge(dict(zip(
+        ('/joint_states', '/flux_density_applied', '/planner/setpoint', '/planner/status'),
+        (samples, levels, requests, late), strict=True)), 0.02)
+    assert found.vibration == pytest.approx(0.01 / 0.4, rel=0.03)
+    assert found.offset == pytest.approx(-0.01 / 0.4, rel=0.03)
+    assert (found.target, found.late) == (1.4, 3)
+
+
+@pytest.mark.slow
+def test_from_a_bag_the_move_after_a_correction_rests_where_open_loop_misses(
+        ros_domain_id, tmp_path, monkeypatch):
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(ros_domain_id))
+    # Commands far enough ahead for a busy machine.
+    found = run(replace(GRAPHS[1], lead=0.3, hold=1.2), 0.2, tmp_path, 1)
+    first, second = found['off']
+    assert first.offset == pytest.approx(-0.18, abs=0.01)
+    assert second.vibration > 0.1
+    first, second = found['adapt']
+    assert abs(first.offset) < 0.01
+    assert max(second.vibration, abs(second.offset)) < 0.01

@@ -1,0 +1,196 @@
+"""
+What feedback leaves of moves when G is not as planned with, through real nodes, from a bag.
+
+In real time the actuator moves from 1 to 1.4, to 1.1 and back, several times with feedback, which
+forgets what it has learnt in between, and then in open loop. rosbags reads what was recorded, and
+NumPy judges the samples.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+import tempfile
+from typing import Any
+
+import numpy as np
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import get_typestore, Stores
+
+from benchmarks.faults.rig import Rig
+from benchmarks.measure import ros_domain
+from benchmarks.reference import Actuator, two_step
+from benchmarks.sheet import Sheet
+from hmsa_ros.contract.actuator import parameters_of
+from hmsa_ros.nodes import interface
+from hmsa_ros.studies.feedback import Scenario, SCENARIOS, TARGETS
+
+#: Errors of G that make a row together, by their size.
+SIZES = ((0.1, (-0.1, 0.1)), (0.2, (-0.2, 0.2)))
+_SEEDS, _BIAS, _LIMIT = 3, 1e-3, 0.25
+# What feedback may leave of the next move.
+_LARGEST = 0.02
+# Of a move in open loop, until the first one is looked at, and the next one, which takes longer
+# where G is known to be lower; a cycle is in units of time.
+_FIRST, _NEXT, _CYCLE = 3.0, 1.25, 1.45
+# Share of the largest change of a move that begins it, and of a setpoint, from its end, at rest.
+_BEGINS, _RESTS = 0.25, 0.3
+_TOPICS = ('/joint_states', '/flux_density_applied', '/planner/setpoint', '/planner/status')
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Nodes in one process or in two, an actuator with its samples, and a setpoint's time in s."""
+
+    name: str
+    scenario: Scenario
+    together: bool
+    hold: float
+    lead: float
+    cautious: bool
+
+
+GRAPHS = (
+    Graph('controller, T 44 ms', SCENARIOS[2], True, 0.9, 0.005, True),
+    Graph('planner and plant, T 4.4 ms', SCENARIOS[0], False, 0.6, 0.05, False))
+
+
+@dataclass(frozen=True)
+class Seen:
+    """
+    A move, in shares of its step: vibration from its arrival on and a cycle later, and offset.
+
+    ``late`` counts commands that were sent after their stamp.
+    """
+
+    target: float
+    vibration: float
+    later: float
+    offset: float
+    late: int
+
+
+def run(
+        graph: Graph, error: float, folder: Path, seeds: int = _SEEDS) -> dict[str, list[Seen]]:
+    """Move with feedback, so many times, and without; return what a bag shows of both."""
+    bag, scenario = folder / 'bag', graph.scenario
+    plant: dict[str, object] = {
+        **parameters_of(scenario.block), 'mismatch.shear_modulus': 1.0 + error,
+        'publish_rate': 1.0 / scenario.period, 'measurement_delay': scenario.delay,
+        'stretch_noise': scenario.noise, 'stretch_bias': _BIAS}
+    planner: dict[str, object] = {
+        **parameters_of(scenario.block), 'flux_density_min': -_LIMIT, 'flux_density_max': _LIMIT,
+        'lead_time': graph.lead, 'feedback': 'adapt', 'feedback_cautious': graph.cautious}
+    with Rig(folder, ros_domain(), watch=False) as rig:
+        recorder = rig.start('recorder', {
+            'storage.uri': bag, 'record.topics': f'[{", ".join(_TOPICS)}]'})
+        if graph.together:
+            rig.start('controller', plant | planner)
+        else:
+            rig.start('plant', plant)
+            rig.start('planner', planner)
+        rig.ready(interface.PLANNER, interface.PLANT, interface.RECORDER)
+        for number in range(seeds + 1):
+            if number == seeds:
+                rig.set_parameters(interface.PLANNER, feedback='off')
+            else:
+                rig.call(interface.RESET_ESTIMATE, interface.PLANNER)
+            for target in (*TARGETS, 1.0):
+                rig.publish_setpoint(target)
+                rig.spin(graph.hold)
+        recorder.end()
+    found = judge(read(bag), scenario.block.time_unit)
+    place = len(TARGETS) * seeds
+    return {'off': found[place:], 'adapt': found[:place]}
+
+
+def read(bag: Path) -> dict[str, np.ndarray]:
+    """Return time in s and values by topic: of samples and levels by their stamps."""
+    rows: dict[str, list[tuple[float, ...]]] = {x: [] for x in _TOPICS}
+    with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        for connection, stamp, data in reader.messages():
+            message: Any = reader.deserialize(data, connection.msgtype)
+            time = message.header.stamp if hasattr(message, 'header') else None
+            rows[connection.topic].append((
+                1e-9 * stamp if time is None else time.sec + 1e-9 * time.nanosec,
+                *_values(connection.topic, message)))
+    return {x: np.array(sorted(found)) for x, found in rows.items()}
+
+
+def _values(topic: str, message: Any) -> tuple[float, ...]:
+    states, applied, setpoint, _ = _TOPICS
+    if topic == states:
+        return message.position[0], message.velocity[0]
+    if topic == applied:
+        return message.magnetic_field.z,
+    if topic == setpoint:
+        return message.data,
+    return float(next(x.value for x in message.values if x.key == 'late')),
+
+
+def judge(recorded: Mapping[str, np.ndarray], unit: float) -> list[Seen]:
+    """Return what is seen of all moves but those back; the unit of time is in s."""
+    samples, applied, requests, verdicts = (recorded[x] for x in _TOPICS)
+    found = []
+    previous = 1.0
+    for i, (asked, target) in enumerate(requests.tolist()):
+        start, previous = previous, target
+        if target == 1.0:
+            continue
+        end = requests[i + 1, 0]
+        near = applied[(applied[:, 0] >= asked) & (applied[:, 0] < end)]
+        before = applied[applied[:, 0] < asked, 1]
+        change = np.abs(np.diff(near[:, 1], prepend=before[-1] if len(before) else 0.0))
+        begin = near[np.argmax(change > _BEGINS * np.max(change)), 0]
+        tau = unit * float(two_step(start, target, Actuator())[1])
+        arrival = begin + (_FIRST if start == 1.0 else _NEXT) * tau
+        cycle = _CYCLE * unit
+        rest = samples[(samples[:, 0] > end - _RESTS * (end - asked)) & (samples[:, 0] < end), 1]
+        step = target - start
+        late = verdicts[np.searchsorted(verdicts[:, 0], (asked, end)) - 1, 1]
+        found.append(Seen(
+            target, _vibration(samples, arrival, cycle) / abs(step),
+            _vibration(samples, arrival + cycle, cycle) / abs(step),
+            (float(np.mean(rest)) - _BIAS - target) / step, round(late[1] - late[0])))
+    return found
+
+
+def _vibration(samples: np.ndarray, begin: float, span: float) -> float:
+    """Return how far the stretch goes from peak to peak: its rate, which has no noise, summed."""
+    time, _, rate = samples[(samples[:, 0] >= begin) & (samples[:, 0] <= begin + span)].T
+    moved = np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(time))
+    return float(np.ptp(np.append(0.0, moved)))
+
+
+def compare(*, quick: bool) -> Sheet:
+    """Run all, and show the root mean square over signs and repetitions beside open loop."""
+    rows: list[list[str]] = []
+    figures: dict[str, Any] = {}
+    passed = True
+    for graph in GRAPHS[:1] if quick else GRAPHS:
+        for size, errors in ((0.2, (0.2,)),) if quick else SIZES:
+            seen: dict[str, list[Seen]] = {'off': [], 'adapt': []}
+            for error in errors:
+                with tempfile.TemporaryDirectory() as folder:
+                    for feedback, moves in run(
+                            graph, error, Path(folder), 1 if quick else _SEEDS).items():
+                        seen[feedback] += moves
+            for feedback, moves in seen.items():
+                left = _left(moves)
+                name = f'{graph.name}: G {100.0 * size:.0f} % off, {feedback}'
+                figures[name] = {'moves': [vars(x) for x in moves], 'rms': left}
+                rows.append([
+                    name, str(len(moves) // len(TARGETS)), *(f'{100.0 * x:.3g}' for x in left),
+                    str(sum(x.late for x in moves))])
+                passed = passed and (feedback == 'off' or max(left[-2:]) < _LARGEST)
+    return Sheet(
+        'feedback', 'Moves through real nodes: vibration from peak to peak and offset, root mean '
+        'square, % of the step', (
+            '', 'runs', f'first move, from {_FIRST:g} tau_p', 'a cycle later', 'offset',
+            'next move', 'offset', 'late commands'), rows, figures, quick or passed)
+
+
+def _left(moves: Sequence[Seen]) -> list[float]:
+    first, after = ([x for x in moves if x.target == y] for y in TARGETS)
+    return [float(np.sqrt(np.mean(np.square(x)))) for x in (
+        [x.vibration for x in first], [x.later for x in first], [x.offset for x in first],
+        [x.vibration for x in after], [x.offset for x in after])]
