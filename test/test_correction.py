@@ -3,6 +3,7 @@
 from dataclasses import replace
 import math
 
+from beam_oracle import silicone
 import identification_oracle as oracle
 import numpy as np
 import pytest
@@ -12,7 +13,13 @@ from scipy.optimize import brentq
 from hmsa_ros.core.timeline import Options as PlannerOptions
 from hmsa_ros.estimation import Estimator, Options, Prior
 from hmsa_ros.estimation.correction import Corrector, Course, expect
-from hmsa_ros.studies.feedback import SCENARIOS, STRATEGIES, Strategy, trial
+from hmsa_ros.studies.feedback import (
+    scenario_of,
+    SCENARIOS,
+    STRATEGIES,
+    Strategy,
+    trial,
+)
 from hmsa_ros.studies.linear import Linearised
 
 TARGET, BEGIN, MS = 1.4, 50_000_000, 1_000_000
@@ -174,3 +181,13 @@ def test_open_loop_in_the_study_leaves_what_the_study_of_shapers_says():
         Actual.off(material, Errors(0.2)).residual(move, 1.0, 1.4, move.duration), rel=2e-3)
     # A cycle is two thirds of a period.
     assert 0.7 * found.vibration < found.motion < 1.01 * found.vibration
+
+
+def test_corrections_of_a_beam_leave_what_those_of_a_block_leave():
+    scenario = scenario_of(silicone())
+    adapt, = (x for x in STRATEGIES if x.kind == 'adapt')
+    alone = trial(scenario, Strategy('', 'two_step'), 0.1, 0)[0]
+    assert alone.vibration > 0.05
+    for left in trial(scenario, adapt, 0.1, 0):
+        assert left.vibration < 0.001
+        assert abs(left.offset) < 0.001

@@ -3,6 +3,7 @@
 from functools import partial
 import math
 
+from beam_oracle import silicone
 import numpy as np
 import pytest
 from test_runtime_measured import Loop, MS, START
@@ -244,3 +245,16 @@ def test_what_was_learnt_outlives_other_options_but_not_another_block():
     loop.runtime.change(
         Settings(takeover_timeout=0), {'a': given}, simultaneous=False)
     assert planner.model.actuator.shear_modulus == 1e4
+
+
+@pytest.mark.parametrize('factor', [0.9, 1.1])
+def test_adapting_corrects_the_moves_of_a_beam_to_both_sides(factor):
+    loop = Loop(factor, 1e-3, 200, 10 * MS, silicone(), 2 * MS, feedback='adapt')
+    truth = loop.run((0.4, 700 * MS), (-0.2, 700 * MS))
+    # The first move without a correction rests 7 % off and vibrates by 3 %.
+    for begin, target, step in ((500, 0.4, 0.4), (1200, -0.2, 0.6)):
+        vibration, offset = left(truth, begin, begin + 180, target, step)
+        assert vibration < 0.005
+        assert abs(offset) < 0.005
+    assert 'corrected' in codes(loop)
+    assert f'E about {100.0 * factor - 100.0:+.0f} %; plans use it' in estimates(loop)[-1].message

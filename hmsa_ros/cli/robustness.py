@@ -69,8 +69,13 @@ def add_parser(subparsers: Any) -> None:
         '--feedback', action='store_true',
         help='compare open loop with corrections from samples instead: vibration and offset '
              'after moves with G up to 20 %% off, noise, delay and an unknown bias of the '
-             'sensor; takes minutes; of the other options --seeds, --out, --json and those '
-             'below; writes files only with --out or --shard, --dask and --resume')
+             'sensor; takes minutes; of the other options --params-file, --seeds, --out, '
+             '--json and those below; writes files only with --out or --shard, --dask and '
+             '--resume')
+    parser.add_argument(
+        '--params-file', type=Path, metavar='YAML', dest='params_file',
+        help='actuator for --feedback, a beam perhaps, seen by a camera (default: blocks and '
+             'sensors of a list)')
     parser.add_argument(
         '--seeds', type=int, default=10, metavar='N',
         help='runs with different noise for --feedback (default 10)')
@@ -88,6 +93,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> int:
     """Compare the shapers."""
+    if arguments.params_file is not None:
+        raise BadInputError(
+            f'--params-file {arguments.params_file} is given without --feedback: expected --zeta, '
+            '--j-lim and --c1')
     from hmsa_ros.core.parameters import NondimensionalParameters
     from hmsa_ros.studies.executors import in_order
     from hmsa_ros.studies.robustness import (
@@ -254,13 +263,15 @@ def _print_table(case: 'Case', results: 'list[Result]') -> None:
 
 def _feedback(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> int:
     """Compare open loop with corrections."""
+    from hmsa_ros.identification.files import read_belief
     from hmsa_ros.studies.executors import in_order
-    from hmsa_ros.studies.feedback import trial
+    from hmsa_ros.studies.feedback import scenario_of, trial
     from hmsa_ros.studies.matrix import left_of, Matrix
 
     if arguments.seeds < 1:
         raise BadInputError(f'--seeds is {arguments.seeds}: expected at least 1')
-    matrix = Matrix(arguments.seeds)
+    matrix = Matrix(arguments.seeds) if arguments.params_file is None else Matrix(
+        arguments.seeds, [scenario_of(read_belief(arguments.params_file).actuator)])
     if not in_chunks and arguments.out is None:
         return _show_matrix(
             matrix.seeds, matrix.rows(in_order(start, trial, matrix.tasks)),
@@ -281,8 +292,8 @@ def _show_matrix(
         print(json_text(found if table is None else {**found, 'files': [str(table)]}))
         return 0
     print('peak-to-peak vibration (offset) in % of the step, root mean square: after the first '
-          'move\n(1 to 1.4), a cycle and two cycles later, after the next move (to 1.1); what '
-          'would be left\nif nothing was corrected from then on. LQR and MPC: as seen in the '
+          'move\n(0.4 from rest), a cycle and two cycles later, after the next move (to 0.1); what'
+          ' would be left\nif nothing was corrected from then on. LQR and MPC: as seen in the '
           'cycle that follows, the\nloop closed. Learning: after each of four trials of the first '
           'move. Worst: vibration after\nthe first move. No worse: no vibration above 1.2 times '
           'that of the chain, or, where the model\nis exact, above half of what noise alone '

@@ -2,9 +2,11 @@
 
 from collections.abc import Iterator, Mapping
 import math
+from typing import Any
 
 from hmsa_ros.estimation.estimator import Estimate
 from hmsa_ros.estimation.motion import rest
+from hmsa_ros.identification.quantities import modulus_of
 
 # A parameter is another one than the nominal from so many deviations and so large a share on.
 _SURE, _MATTERS = 3.0, 0.01
@@ -16,7 +18,8 @@ _PAIR, _HIDDEN, _UNKNOWN = ('stretch_bias', 'constant_force'), 0.9, 1e-3
 # Smaller steps have no percentage.
 _STEP = 0.01
 _NAMES = {
-    'shear_modulus': 'G', 'damping_coefficient': 'damping', 'remanence': 'Br',
+    'shear_modulus': 'G', 'youngs_modulus': 'E', 'damping_coefficient': 'damping',
+    'remanence': 'Br',
     'chain_limit': 'J_lim', 'density': 'density', 'stretch_gain': 'gain of the sensor',
     'time_unit': 'time unit'}
 _ABSOLUTE = {
@@ -25,7 +28,7 @@ _ABSOLUTE = {
     'stretch_bias': ('bias of the sensor', '', 1.0)}
 
 
-def differences(estimate: Estimate, nominal: Mapping[str, float]) -> list[str]:
+def differences(estimate: Estimate, nominal: Mapping[str, Any]) -> list[str]:
     """
     Return which parameters differ from what was known of them.
 
@@ -33,8 +36,8 @@ def differences(estimate: Estimate, nominal: Mapping[str, float]) -> list[str]:
     ----------
     estimate : Estimate
         What is believed.
-    nominal : mapping of str to float
-        Values of all quantities before.
+    nominal : mapping of str to object
+        Values of all quantities before, and the law.
 
     Returns
     -------
@@ -68,7 +71,7 @@ def confounded(estimate: Estimate) -> bool:
     return abs(together) > _HIDDEN and estimate.deviations[_PAIR[0]] > _UNKNOWN
 
 
-def _differences(estimate: Estimate, nominal: Mapping[str, float]) -> Iterator[str]:
+def _differences(estimate: Estimate, nominal: Mapping[str, Any]) -> Iterator[str]:
     hidden = _PAIR if confounded(estimate) else ()
     for name in estimate.free:
         if name in hidden:
@@ -82,11 +85,12 @@ def _differences(estimate: Estimate, nominal: Mapping[str, float]) -> Iterator[s
             if name != 'stretch_bias' or abs(change) > _MATTERS:
                 yield f'{label} about {factor * value:.2g} {unit}'.rstrip()
         elif before and abs(change / before) > _MATTERS:
-            yield f'{_NAMES[name]} about {100.0 * change / before:+.0f} %'
+            label = modulus_of(nominal['law'])[0] if name == 'shear_modulus' else name
+            yield f'{_NAMES[label]} about {100.0 * change / before:+.0f} %'
 
 
 def sentence(
-        estimate: Estimate, nominal: Mapping[str, float], holding: float, target: float,
+        estimate: Estimate, nominal: Mapping[str, Any], holding: float, target: float,
         start: float, amplitude: float, *, adapting: bool) -> str:
     """
     Return what is wrong, and what mends it.
@@ -95,8 +99,8 @@ def sentence(
     ----------
     estimate : Estimate
         What is believed.
-    nominal : mapping of str to float
-        Values of all quantities before.
+    nominal : mapping of str to object
+        Values of all quantities before, and the law.
     holding : float
         Level in T that holds the target, as planned.
     target, start : float

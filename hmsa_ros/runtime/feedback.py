@@ -92,7 +92,7 @@ class Feedback:
             self._joints = {
                 name: Joint(Estimator(self._prior(name, model), Options(
                     slew_limit=model.options.slew_limit,
-                    learn=not self._settings.feedback_frozen)))
+                    learn=not self._settings.feedback_frozen)), model.actuator.rest)
                 for name, model in self._nominal.items()}
 
     def change(self, settings: Settings, models: Mapping[str, Model]) -> Mapping[str, Model]:

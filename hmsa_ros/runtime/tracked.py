@@ -18,6 +18,8 @@ class Joint:
     ----------
     estimator : Estimator
         Of it.
+    start : float
+        Stretch before the setpoint under way.
     latest : Estimate or None
         Newest.
     newest : int
@@ -28,8 +30,6 @@ class Joint:
         Largest of the vibration since the last arrival.
     setpoint : tuple of int
         Number of the plan and place of the setpoint under way.
-    start : float
-        Stretch before that setpoint.
     fresh : bool
         Whether there are samples that have not been looked at.
     news : bool
@@ -38,13 +38,13 @@ class Joint:
     """
 
     estimator: Estimator
+    start: float
     latest: Estimate | None = None
     newest: int = 0
     next_update: int = 0
     next_tell: int = 0
     amplitude: float = 0.0
     setpoint: tuple[int, int] = (0, -1)
-    start: float = 1.0
     fresh: bool = False
     news: bool = False
 

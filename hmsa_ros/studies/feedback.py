@@ -21,8 +21,10 @@ from hmsa_ros.studies.commanders import commander, LARGEST, REACTION
 from hmsa_ros.studies.learning import carried_out, Learner
 from hmsa_ros.studies.linear import Weights
 
-#: Where a first move, and after it another one, go from stretch 1.
-TARGETS = (1.4, 1.1)
+#: How far from rest a first move, and after it another one, go.
+TARGETS = (0.4, 0.1)
+# Between two samples of a camera, in units of time.
+_INTERVAL = 0.114
 _BIAS = 1e-3
 # Samples before the first move, and points of a motion that is looked at.
 _BEFORE, _LOOK, _WATCHED = 50, 120, 40
@@ -53,6 +55,8 @@ class Scenario:
         Standard deviation of a sample of stretch.
     half_length : float
         In m: sets the unit of time, 4.4 ms for 0.01 m.
+    nominal : ActuatorParameters, optional
+        In place of the example block.
     truth : mapping of str to float
         Factors on parameters of the block besides the shear modulus.
     coil_time_constant : float
@@ -77,11 +81,17 @@ class Scenario:
     free: tuple[str, ...] = TRACKED
     longer: float = CAUTIOUS
     weights: Mapping[str, Weights] = field(default_factory=lambda: _WEIGHTS)
+    nominal: ActuatorParameters | None = None
+
+    @property
+    def targets(self) -> tuple[float, ...]:
+        """Where moves go."""
+        return tuple(self.block.rest + x for x in TARGETS)
 
     @property
     def block(self) -> ActuatorParameters:
         """Nominal."""
-        return ActuatorParameters.from_nondimensional(
+        return self.nominal or ActuatorParameters.from_nondimensional(
             NondimensionalParameters(), shear_modulus=1e4, density=1900.0,
             half_length=self.half_length, remanence=0.1)
 
@@ -91,6 +101,14 @@ class Scenario:
         return replace(
             block, shear_modulus=block.shear_modulus * (1.0 + error),
             **{name: x * getattr(block, name) for name, x in self.truth.items()})
+
+
+def scenario_of(actuator: ActuatorParameters) -> Scenario:
+    """Return the scenario of an actuator that a camera sees: some thirty samples a period."""
+    period = _INTERVAL * actuator.time_unit
+    return Scenario(
+        f'{1.0 / period:.3g} Hz, {2e3 * period:.3g} ms late, noise 1e-3, T '
+        f'{1e3 * actuator.time_unit:.3g} ms', period, 2.0 * period, 1e-3, nominal=actuator)
 
 
 #: The matrix: samples at 1 kHz that are 2 ms late, and a camera on a slower actuator.
@@ -204,10 +222,10 @@ class _Trial:
         self._commander = commander(scenario, strategy)
         self._plant = self._new_plant(0)
         self._random = np.random.default_rng(seed)
-        self._course = Course(((0, 0.0),), 0, 1.0)
+        self._stretch = scenario.block.rest
+        self._course = Course(((0, 0.0),), 0, self._stretch)
         self._events: list[tuple[int, int, str, float]] = []
         self._number = count()
-        self._stretch = 1.0
 
     def _new_plant(self, time: int) -> ActuatorSimulation:
         return ActuatorSimulation(
@@ -288,7 +306,7 @@ class _Trial:
 
 def trial(
         scenario: Scenario, strategy: Strategy, error: float, seed: int,
-        targets: Sequence[float] = TARGETS) -> list[Left]:
+        targets: Sequence[float] = ()) -> list[Left]:
     """
     Run moves once.
 
@@ -303,7 +321,7 @@ def trial(
     seed : int
         Of the noise.
     targets : sequence of float
-        Stretches to go to.
+        Stretches to go to; default those of the scenario.
 
     Returns
     -------
@@ -312,6 +330,7 @@ def trial(
         further move.
 
     """
+    targets = targets or scenario.targets
     if strategy.kind == 'learning':
         return list(_learned(scenario, strategy, error, seed, targets[0]))
     return _Trial(scenario, strategy, error, seed, targets).run()
@@ -322,7 +341,8 @@ def _learned(
         target: float) -> Iterator[Left]:
     """Yield what trials of the first move leave, each from rest with a sensor set to zero."""
     random, block = np.random.default_rng(seed), scenario.block
-    course = commander(scenario, strategy).move(0, target, Course(((0, 0.0),), 0, 1.0))
+    course = commander(scenario, strategy).move(
+        0, target, Course(((0, 0.0),), 0, block.rest))
     learner = Learner(
         block, course.levels, LARGEST * block.flux_density_unit,
         round(scenario.period * NANOSECONDS))
@@ -333,7 +353,7 @@ def _learned(
             for _ in range(2)]
         for stamp, level in levels:
             plants[0].command(stamp, level)
-        left = settle(plants[0], levels[-1][0], target, 1.0)
+        left = settle(plants[0], levels[-1][0], target, block.rest)
         yield replace(left, motion=left.vibration)
         seen = np.array(list(carried_out(plants[1], levels, learner.stamps)))
         noise = scenario.noise * random.standard_normal(len(seen) + _BEFORE)

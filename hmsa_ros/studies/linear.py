@@ -177,7 +177,7 @@ class Controller(ABC):
         self._period, self._delay = period, delay
         self._before: list[float] = []
         self._zero = 0.0
-        self._target, self._holding = 1.0, 0.0
+        self._target, self._holding = block.rest, 0.0
         self._model: Linearised | None = None
         self._x = np.zeros(3)
         self._sent: deque[float] = deque()
@@ -194,7 +194,7 @@ class Controller(ABC):
         """Go to a target and the level in T that holds it; return the level until a sample."""
         unit = self._block.flux_density_unit
         if self._model is None:
-            self._zero = float(np.mean(self._before)) - 1.0
+            self._zero = float(np.mean(self._before)) - self._block.rest
         model = self._model = Linearised.at(
             self._block, target, holding, self._period, self._delay)
         if not self._sent:

@@ -172,7 +172,7 @@ def allowed(scenario: Scenario, error: float) -> list[float]:
     if error or scenario.truth or scenario.coil_time_constant:
         return [_WORSE * x.vibration for x in trial(scenario, CHAINED, error, 0)]
     count = CYCLE * scenario.block.time_unit / scenario.period
-    steps = [float(x) for x in np.diff([1.0, *TARGETS])]
+    steps = [float(x) for x in np.diff([0.0, *TARGETS])]
     shown = scenario.noise * _range(count)
     return [0.5 * shown / abs(x) for x in (*[steps[0]] * CYCLES, *steps[1:])]
 
