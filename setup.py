@@ -80,7 +80,7 @@ EXTRAS_REQUIRE = {
     ],
 }
 
-NODES = ('planner', 'plant', 'recorder', 'player', 'controller')
+NODES = ('planner', 'plant', 'driver', 'recorder', 'player', 'controller')
 
 setup(
     name=PACKAGE,

@@ -29,6 +29,11 @@ def plant() -> int:
     return main(['plant', *sys.argv[1:]])
 
 
+def driver() -> int:
+    """Run ``hmsa driver``."""
+    return main(['driver', *sys.argv[1:]])
+
+
 def recorder() -> int:
     """Run ``hmsa recorder``."""
     return main(['recorder', *sys.argv[1:]])

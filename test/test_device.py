@@ -2,7 +2,9 @@
 
 from dataclasses import replace
 import math
+from time import monotonic_ns
 
+from conftest import wait_until
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -18,6 +20,7 @@ from hmsa_ros.device.sensor import Sensor, SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.device.transport import Transport
 from hmsa_ros.device.watchdog import Fallback, Watchdog
+from hmsa_ros.device.worker import HardwareWorker
 from hmsa_ros.errors import BadInputError
 
 ACTUATOR = paper_actuator()
@@ -455,3 +458,52 @@ def test_both_are_devices(make):
     (change,) = device.changes()
     assert (change.joint, change.level) == (0, 0.05)
     assert device.time == START + 2 * MS
+
+
+def test_a_worker_writes_each_level_at_its_stamp_and_switches_off_in_the_end():
+    bench = Bench()
+    device = HardwareDevice([HardwareJoint(bench, 0.5)], time=monotonic_ns(), period=MS)
+    worker = HardwareWorker(device, monotonic_ns)
+    begin = monotonic_ns()
+    stamps = [begin + 20 * MS, begin + 40 * MS]
+    for stamp, level in zip(stamps, (0.1, 0.2), strict=True):
+        worker.receive(0, stamp, level)
+    with pytest.raises(BadInputError, match='expected at most 0.5 T'):
+        worker.receive(0, begin + 60 * MS, 0.6)
+    wait_until(lambda: len(bench.writes) >= 3, 'both levels')
+    worker.close()
+    worker.close()
+    assert [level for _, level in bench.writes] == [0.0, 0.1, 0.2, 0.0]
+    assert all(now >= stamp for (now, _), stamp in zip(bench.writes[1:], stamps, strict=False))
+    assert [x.level for x in worker.changes()] == [0.0, 0.1, 0.2, 0.0]
+    times = [x.time for x in worker.samples()]
+    assert len(times) > 2
+    assert times == sorted(times)
+    assert worker.failure is None
+
+
+def test_a_worker_whose_hardware_breaks_switches_the_other_coils_off():
+    class Broken(Bench):
+        def write(self, level, now):
+            if self.writes:
+                raise OSError('no answer')
+            return super().write(level, now)
+
+    benches = [Broken(), Bench()]
+    worker = HardwareWorker(HardwareDevice(
+        [HardwareJoint(x, 0.5) for x in benches], time=monotonic_ns()), monotonic_ns)
+    worker.receive(1, 0, 0.3)
+    worker.receive(0, 0, 0.2)
+    wait_until(lambda: worker.failure is not None, 'the failure')
+    assert str(worker.failure) == (
+        "the hardware failed (OSError: 'no answer') and is switched off: mend it, then start the "
+        'driver again')
+    assert [level for _, level in benches[1].writes] == [0.0, 0.3, 0.0]
+    worker.close()
+
+
+def test_a_level_that_a_driver_gets_after_its_stamp_is_told():
+    bench, device = driver()
+    device.advance(START + 5 * MS)
+    device.receive(0, START + 2 * MS, 0.1)
+    assert [(x.kind, x.late) for x in device.notices()] == [(Kind.LATE, 3 * MS)]

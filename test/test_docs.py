@@ -208,38 +208,3 @@ def test_topics_and_services_are_those_that_the_nodes_have(start, ros, ros_env):
         assert of_ours(ros.node.get_publisher_names_and_types_by_node(name, '/')) <= sent
         assert of_ours(ros.node.get_subscriber_names_and_types_by_node(name, '/')) <= taken
         assert of_ours(ros.node.get_service_names_and_types_by_node(name, '/')) <= served
-
-
-@pytest.mark.slow
-@pytest.mark.ros
-def test_driver_of_the_tutorial_keeps_the_contract_of_a_driver(start, ros):
-    from hmsa_ros.nodes import interface
-    from hmsa_ros.nodes.conversions import from_time, to_command
-
-    applied = ros.collect(
-        interface.FLUX_DENSITY_APPLIED.type, interface.FLUX_DENSITY_APPLIED.name,
-        interface.FLUX_DENSITY_APPLIED.qos)
-    states = ros.collect(interface.JOINT_STATES.type, interface.JOINT_STATES.name)
-    driver = start.python(ROOT / 'docs' / 'tutorials' / 'coil_driver.py')
-    command = ros.publisher(
-        interface.FLUX_DENSITY_COMMAND.type, interface.FLUX_DENSITY_COMMAND.name,
-        interface.FLUX_DENSITY_COMMAND.qos)
-    ros.spin_until(lambda: applied and states, 'the level at the start')
-    assert applied[0].magnetic_field.z == 0.0
-
-    now = ros.node.get_clock().now().nanoseconds
-    stamps = [now + 400_000_000, now + 600_000_000]
-    command.publish(to_command(stamps[0], 0.01, 'coil'))
-    # Taken back by the one after it, which is stamped before it.
-    command.publish(to_command(now + 900_000_000, 0.5, 'coil'))
-    command.publish(to_command(stamps[1], 0.02, 'coil'))
-    command.publish(to_command(stamps[1] + 1, float('nan'), 'coil'))
-    # No word follows: the watchdog switches off.
-    ros.spin_until(lambda: len(applied) == 4, 'two levels, and the coil switched off')
-    assert [x.magnetic_field.z for x in applied] == [0.0, 0.01, 0.02, 0.0]
-    assert all(from_time(x.header.stamp) >= stamp
-               for x, stamp in zip(applied[1:], [*stamps, now + 10**9], strict=False))
-    assert states[-1].name == ['actuator']
-    assert driver.stop() == 0
-    assert 'command refused: flux density command (0, 0, nan) T' in driver.stderr
-    assert 'no command and no heartbeat for 1 s: the field goes to zero' in driver.stderr

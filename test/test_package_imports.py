@@ -72,7 +72,8 @@ def test_nodes_do_not_import_without_ros_so_the_blocking_works():
     assert 'ModuleNotFoundError: blocked: ' in result.stderr
 
 
-@pytest.mark.parametrize('node', ['planner', 'plant', 'recorder', 'player', 'controller'])
+@pytest.mark.parametrize(
+    'node', ['planner', 'plant', 'driver', 'recorder', 'player', 'controller'])
 def test_nodes_start_without_scipy_which_takes_longer_to_load_than_all_else(node):
     result = run(BLOCKED.format(blocked=('scipy',)) + f'import hmsa_ros.nodes.{node}')
     assert (result.returncode, result.stderr) == (0, '')

@@ -206,6 +206,8 @@ def test_policies_grant_exactly_what_the_nodes_do(tmp_path, start, ros):
         'plant', '--ros-args', '-p', 'publish_clock:=true', '-p', 'start_paused:=true')
     planner = start.hmsa(
         'planner', '--ros-args', *simulated, '-p', 'takeover_timeout:=60.0')
+    # There to be recorded, without a coil.
+    driver = start.hmsa('driver', '--ros-args', '-p', 'autostart:=false')
     force = ros.node.create_publisher(
         interface.DISTURBANCE_FORCE.type, '/disturbance_force', interface.DISTURBANCE_FORCE.qos)
     for topic in (interface.JOINT_TRAJECTORY, interface.SETPOINT):
@@ -229,7 +231,7 @@ def test_policies_grant_exactly_what_the_nodes_do(tmp_path, start, ros):
           'all that planner and plant may do')
     watch(ros, RUNNING, seen, nothing_left('recorder', without=later - {
         ('subscribe', '/clock')}), 'all that the recorder may do')
-    for process in (planner, plant, recorder):
+    for process in (planner, plant, recorder, driver):
         assert process.stop() == 0, process.output
     ros.node.destroy_publisher(force)
 
@@ -251,6 +253,16 @@ def test_policies_grant_exactly_what_the_nodes_do(tmp_path, start, ros):
     for name in RUNNING:
         assert seen[name] == enclave_of(name)
     assert seen['player'] == GRANTS['/hmsa/replay']
+
+
+@pytest.mark.ros
+def test_policies_grant_exactly_what_a_driver_does(start, ros):
+    seen: dict[str, set[Grant]] = {}
+    start.hmsa('driver', '--ros-args', '-p', 'hardware:=hardware:Bench',
+               PYTHONPATH=str(ROOT / 'docs' / 'tutorials'))
+    watch(ros, ['driver'], seen, lambda: seen.get('driver', set()) >= enclave_of('driver'),
+          'all that a driver may do')
+    assert seen['driver'] == enclave_of('driver')
 
 
 @pytest.mark.ros

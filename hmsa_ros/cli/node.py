@@ -1,4 +1,4 @@
-"""``hmsa planner`` and its like: run a node, or planner and plant in one process."""
+"""``hmsa planner`` and its like: run a node, or planner and device in one process."""
 
 import argparse
 from importlib import import_module
@@ -9,13 +9,15 @@ from hmsa_ros.ending import ENDING
 NODES = {
     'planner': 'plan shaped commands for setpoint sequences',
     'plant': 'simulate the actuator',
+    'driver': 'drive real hardware in the place of the plant',
     'recorder': 'record topics to a bag',
     'player': 'replay a bag',
-    'controller': 'planner and plant in one process and one loop',
+    'controller': 'planner and plant, or driver, in one process and one loop',
 }
 _EXAMPLES = {
     'planner': '-r __ns:=/left',
     'plant': '-p publish_rate:=500.0',
+    'driver': '-p hardware:=my_lab:Coil',
     'recorder': '-p storage.uri:=my_run -p record.all_topics:=true',
     'player': '-p storage.uri:=my_run',
     'controller': '--params-file actuator.yaml -p lead_time:=0.003',

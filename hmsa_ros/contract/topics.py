@@ -93,9 +93,10 @@ class Service:
 
 PLANNER = 'planner'
 PLANT = 'plant'
+DRIVER = 'driver'
 RECORDER = 'recorder'
 PLAYER = 'player'
-NODES = (PLANNER, PLANT, RECORDER, PLAYER)
+NODES = (PLANNER, PLANT, DRIVER, RECORDER, PLAYER)
 
 _FIELD = 'sensor_msgs/msg/MagneticField'
 _FLOAT = 'std_msgs/msg/Float64'
@@ -133,12 +134,12 @@ FLUX_DENSITY_COMMAND = Topic(
     'The shaped command: from its stamp on, which may be in the future, z is the flux density '
     'in tesla; x and y are 0. A message supersedes all earlier ones with the same or a later '
     'stamp.',
-    publishers=(PLANNER,), subscribers=(PLANT,))
+    publishers=(PLANNER,), subscribers=(PLANT, DRIVER))
 FLUX_DENSITY_APPLIED = Topic(
     'flux_density_applied', _FIELD, CHANGES,
     'The applied level: one message per change of level, stamped with the time at which it took '
     'effect; z is the level from then on, in tesla.',
-    publishers=(PLANT,), subscribers=(PLANNER,))
+    publishers=(PLANT, DRIVER), subscribers=(PLANNER,))
 DISTURBANCE_FORCE = Topic(
     'disturbance_force', 'geometry_msgs/msg/WrenchStamped', RELIABLE,
     'An unplanned force on the simulated actuator: from its stamp on (0: immediately) until the '
@@ -147,11 +148,13 @@ DISTURBANCE_FORCE = Topic(
 JOINT_STATES = Topic(
     'joint_states', 'sensor_msgs/msg/JointState', SAMPLES,
     'Samples of the actuator: position is stretch, velocity stretch rate in 1/s, effort the '
-    'applied flux density in tesla.', publishers=(PLANT,), subscribers=(PLANNER,))
+    'applied flux density in tesla.', publishers=(PLANT, DRIVER), subscribers=(PLANNER,))
 STRETCH = Topic(
-    'stretch', _FLOAT, SAMPLES, 'The stretch alone, for plotting and echo.', publishers=(PLANT,))
+    'stretch', _FLOAT, SAMPLES, 'The stretch alone, for plotting and echo.',
+    publishers=(PLANT, DRIVER))
 STRETCH_RATE = Topic(
-    'stretch_rate', _FLOAT, SAMPLES, 'The stretch rate alone, in 1/s.', publishers=(PLANT,))
+    'stretch_rate', _FLOAT, SAMPLES, 'The stretch rate alone, in 1/s.',
+    publishers=(PLANT, DRIVER))
 MARKERS = Topic(
     '~/markers', 'visualization_msgs/msg/MarkerArray', LATCHED,
     'Markers for a 3-D view. The plant publishes each deformed block, with arrows for its '

@@ -1,14 +1,17 @@
 """Real hardware as a device: levels written at their stamps, a watchdog, and samples."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 import math
-from typing import Protocol
+import os
+import sys
+from typing import cast, Protocol
 
 import numpy as np
 
 from hmsa_ros.core.schedule import CommandSchedule
-from hmsa_ros.device.protocol import Change, Kind, Notice, Outbox, Sample
+from hmsa_ros.device.protocol import Change, Kind, late_words, Notice, Outbox, Sample
 from hmsa_ros.device.watchdog import Fallback, Watchdog
 from hmsa_ros.errors import BadInputError
 
@@ -21,6 +24,58 @@ class Hardware(Protocol):
 
     def read(self, now: int) -> tuple[float, float]:
         """Return stretch and stretch rate in 1/s; NaN for what is not measured."""
+
+
+def load(text: str) -> Callable[[str], Hardware]:
+    """
+    Find what makes the hardware of a joint.
+
+    Parameters
+    ----------
+    text : str
+        ``'MODULE:NAME'`` of something that takes the name of a joint and returns its `Hardware`;
+        the module may be in the working directory.
+
+    Returns
+    -------
+    callable
+        It, with errors of what it does as `BadInputError`.
+
+    Raises
+    ------
+    BadInputError
+        If there is no such thing.
+
+    """
+    module, _, name = text.partition(':')
+    if not module or not name:
+        raise BadInputError(
+            f'hardware is {text!r}: expected MODULE:NAME of what makes the hardware of a joint, '
+            'as in hardware:=my_lab:Coil')
+    if os.getcwd() not in sys.path:
+        # The script of a command has its own folder there instead.
+        sys.path.append(os.getcwd())
+    try:
+        make = getattr(import_module(module), name)
+    except Exception as error:  # whatever a laboratory's module raises
+        raise BadInputError(
+            f'hardware {text!r} cannot be loaded ({type(error).__name__}: {error}): expected a '
+            'module that Python finds, or in the working directory, with that name in it'
+        ) from error
+
+    def made(joint: str) -> Hardware:
+        try:
+            found = make(joint)
+        except Exception as error:
+            raise BadInputError(
+                f'hardware {text!r} of joint {joint} does not start ({type(error).__name__}: '
+                f'{error}): expected it to take the name of a joint') from error
+        if not all(callable(getattr(found, x, None)) for x in ('write', 'read')):
+            raise BadInputError(
+                f'hardware {text!r} made a {type(found).__name__}: expected something with the '
+                'methods write and read')
+        return cast(Hardware, found)
+    return made
 
 
 @dataclass(frozen=True)
@@ -89,17 +144,41 @@ class HardwareDevice(Outbox):
         return self._time
 
     @property
+    def silent(self) -> list[int]:
+        """Joints that nobody commands any more."""
+        return [i for i, x in enumerate(self._watchdogs) if x.tripped]
+
+    @property
+    def trips(self) -> int:
+        """How often a joint fell silent."""
+        return sum(x.trips for x in self._watchdogs)
+
+    @property
+    def next_level(self) -> int | None:
+        """Stamp of the next level, in ns; None if there is none ahead."""
+        return min((x.next_stamp for x in self._schedules if x.next_stamp is not None),
+                   default=None)
+
+    @property
     def due(self) -> int | None:
         """When to advance it next, in ns; None for not before a command comes."""
-        times = [x.next_stamp for x in self._schedules]
-        times += [x.due(self._time) for x in self._watchdogs]
+        times = [self.next_level, *(x.due(self._time) for x in self._watchdogs)]
         if self._period:
             times.append(self._next_sample)
         return min((x for x in times if x is not None), default=None)
 
     def receive(self, joint: int, stamp: int, level: float) -> None:
         """
-        Take a level in T that applies from a stamp in ns on; a past one, or 0, at once.
+        Take a level, which is late if it is stamped before the last call of `advance`.
+
+        Parameters
+        ----------
+        joint : int
+            Its place.
+        stamp : int
+            Time in ns from which it applies; a past one, or 0, at once.
+        level : float
+            In T.
 
         Raises
         ------
@@ -110,8 +189,11 @@ class HardwareDevice(Outbox):
         limit = self._joints[joint].limit
         if not abs(level) <= limit:  # not a number is refused, too
             raise BadInputError(f'flux density is {level:g} T: expected at most {limit:g} T')
-        self._schedules[joint].insert(stamp, level)
+        changed = self._schedules[joint].insert(stamp, level)
         self._heard[joint] = True
+        late = self._time - stamp
+        if changed and stamp and late > 0:
+            self._notices.append(Notice(Kind.LATE, joint, late_words(late), late))
 
     def advance(self, time: int) -> None:
         """Write what is due at a time in ns, which is now, and read if that is due."""
@@ -143,13 +225,29 @@ class HardwareDevice(Outbox):
 
     def _write(self, i: int, level: float) -> None:
         if level != self._levels[i]:
-            self._levels[i] = level
+            # Not known while an error may leave it anywhere.
+            self._levels[i] = math.nan
             stamp = self._joints[i].hardware.write(level, self._time)
+            self._levels[i] = level
             self._changes.append(Change(i, stamp, level))
 
     def switch_off(self, time: int) -> None:
-        """Switch all coils off at a time in ns, which is now; nothing is ahead."""
+        """
+        Switch all coils off at a time in ns, which is now; nothing is ahead.
+
+        Raises
+        ------
+        Exception
+            What the hardware of one has raised, when the others are off.
+
+        """
         self._time = time
         self._schedules = [CommandSchedule(0.0) for _ in self._joints]
+        errors = []
         for i in range(len(self._joints)):
-            self._write(i, 0.0)
+            try:
+                self._write(i, 0.0)
+            except Exception as error:
+                errors.append(error)
+        if errors:
+            raise errors[0]

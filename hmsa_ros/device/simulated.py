@@ -7,7 +7,7 @@ from hmsa_ros.core.actuators import Actuators, Setup
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.simulation import too_large
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.device.protocol import Change, Kind, Notice, Outbox, Sample
+from hmsa_ros.device.protocol import Change, Kind, late_words, Notice, Outbox, Sample
 from hmsa_ros.device.sensor import Sensor, SensorErrors
 from hmsa_ros.device.transport import Transport
 from hmsa_ros.device.watchdog import Fallback, Watchdog
@@ -130,10 +130,7 @@ class SimulatedDevice(Outbox):
         if self._watchdogs[joint].feed(self.time):
             self._notices.append(Notice(Kind.HEARD, joint, 'commands have come back'))
         if late:
-            self._notices.append(Notice(
-                Kind.LATE, joint,
-                f'command arrived {late / 1e6:.3f} ms after the time it applies and was '
-                'applied at once: raise lead_time of the planner', late))
+            self._notices.append(Notice(Kind.LATE, joint, late_words(late), late))
 
     # -- time ----------------------------------------------------------------------------------
 

@@ -1,5 +1,5 @@
 """
-Planner and plant in one process, with one loop and no middleware between them.
+Planner and plant, or driver, in one process, with one loop and no middleware between them.
 
 Both nodes are there with their names, topics, services and parameters. Commands go to the device,
 and samples to the planner, within the cycle in which they are made; they are published as well.
@@ -13,8 +13,10 @@ from rclpy.node import Node
 
 from hmsa_ros.device.protocol import Change, Sample
 from hmsa_ros.nodes import conversions, interface
+from hmsa_ros.nodes.device_node import DeviceNode, TICK_SECONDS
+from hmsa_ros.nodes.driver import DriverNode, HARDWARE
 from hmsa_ros.nodes.planner import PlannerNode
-from hmsa_ros.nodes.plant import PlantNode, TICK_SECONDS
+from hmsa_ros.nodes.plant import PlantNode
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.runtime.cycles import Cycles
 from hmsa_ros.runtime.records import Send
@@ -27,9 +29,15 @@ class LinkedPlanner(PlannerNode):
 
     def __init__(self) -> None:
         """Begin without a plant."""
-        self.plant: LinkedPlant | None = None
+        self.plant: Linked | None = None
         self._last = 0
         super().__init__()
+
+    @property
+    def drives_hardware(self) -> bool:
+        """Whether parameters for all nodes of the process name hardware."""
+        given = self._parameter_overrides.get(HARDWARE.name)
+        return given is not None and bool(given.value)
 
     def serve(self) -> None:
         """Do what is due."""
@@ -70,7 +78,7 @@ class LinkedPlanner(PlannerNode):
     def _unheard(self) -> str:
         if self.plant is not None and self.plant.active:
             return ''
-        return 'the plant of this process is not active: activate it'
+        return 'the plant or driver of this process is not active: activate it'
 
     def _publish_command(self, command: Send) -> None:
         if self.plant is not None:
@@ -78,26 +86,21 @@ class LinkedPlanner(PlannerNode):
         super()._publish_command(command)
 
 
-class LinkedPlant(PlantNode):
-    """A plant that a planner in the same process commands."""
+class Linked(DeviceNode):
+    """A device that a planner in the same process commands; begins a class of such nodes."""
 
     def __init__(self, planner: LinkedPlanner) -> None:
         """Take a planner."""
         self._planner = planner
         self.companion = planner.get_name()
         self.cycles = Cycles(round(TICK_SECONDS * 1e9))
-        super().__init__()
+        super().__init__()  # type: ignore[call-arg]  # that of the node it is linked to
         planner.plant = self
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._of_loop = interface.publisher(self, interface.DIAGNOSTICS)
         self.keep(
             self.create_timer(TICK_SECONDS, self._cycle, clock=steady),
             self.create_timer(1.0, self._report, clock=steady), self._of_loop)
-
-    @property
-    def leading_time(self) -> int | None:
-        """Simulated time in ns, if this plant is the authority on it."""
-        return self._device.time if self._joints and self._authority else None
 
     def command(self, command: Send) -> None:
         """Obey a command of the planner."""
@@ -109,14 +112,8 @@ class LinkedPlant(PlantNode):
         """Let time run, and serve the planner."""
         with self.cycles:
             if self._joints:
-                self._on_tick()
+                self.on_tick()
             self._planner.serve()
-
-    def _sample(self) -> None:
-        super()._sample()
-        if self._authority:
-            # Simulated time may run far in one cycle.
-            self._planner.serve_if_due()
 
     def _publish_change(self, change: Change) -> None:
         self._planner.take_change(self._joints[change.joint].name, change)
@@ -135,14 +132,28 @@ class LinkedPlant(PlantNode):
                 'controller: loop', '', bytes([severity]), message, values)))
 
 
+class LinkedPlant(Linked, PlantNode):
+    """A plant that a planner in the same process commands."""
+
+    def _sample(self) -> None:
+        super()._sample()
+        if self.leading_time is not None:
+            # Simulated time may run far in one cycle.
+            self._planner.serve_if_due()
+
+
+class LinkedDriver(Linked, DriverNode):
+    """A driver of hardware that a planner in the same process commands."""
+
+
 def make() -> Sequence[Node]:
-    """Make the two nodes; from now on garbage is collected by the loop alone."""
+    """Make planner and plant, or driver; from now on garbage is collected by the loop alone."""
     planner = LinkedPlanner()
-    plant = LinkedPlant(planner)
+    device = LinkedDriver(planner) if planner.drives_hardware else LinkedPlant(planner)
     gc.disable()
-    return plant, planner
+    return device, planner
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run planner and plant in one process; return the exit status."""
+    """Run planner and plant, or driver, in one process; return the exit status."""
     return run(make, args)

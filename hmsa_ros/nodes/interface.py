@@ -13,12 +13,20 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from hmsa_ros.contract import topics
-from hmsa_ros.contract.topics import from_outside, NODES, PLANNER, PLANT, PLAYER, RECORDER
+from hmsa_ros.contract.topics import (
+    DRIVER,
+    from_outside,
+    NODES,
+    PLANNER,
+    PLANT,
+    PLAYER,
+    RECORDER,
+)
 from hmsa_ros.nodes.message_types import interface_class
 
 __all__ = [
-    'from_outside', 'LATCHED', 'NODES', 'of_joint', 'PLANNER', 'PLANT', 'PLAYER', 'publisher',
-    'RECORDER', 'Service', 'Topic']
+    'DRIVER', 'from_outside', 'LATCHED', 'NODES', 'of_joint', 'PLANNER', 'PLANT', 'PLAYER',
+    'publisher', 'RECORDER', 'Service', 'Topic']
 
 
 @dataclass(frozen=True)

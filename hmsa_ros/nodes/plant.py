@@ -15,17 +15,18 @@ from hmsa_ros.core.actuators import unheld
 from hmsa_ros.core.pacer import Pacer
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.core.warmup import warm_up
-from hmsa_ros.device.health import (
-    CommandHealth,
-    too_few_samples,
-)
-from hmsa_ros.device.protocol import Change, Sample
+from hmsa_ros.device.health import too_few_samples
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import conversions, interface
-from hmsa_ros.nodes.guard import COMMAND_SOURCES
+from hmsa_ros.nodes.device_node import (
+    COMMAND_SOURCE,
+    DeviceNode,
+    PUBLISH_SCALARS,
+    TICK_SECONDS,
+)
 from hmsa_ros.nodes.joints import declare_joints, JointParameters, JOINTS
-from hmsa_ros.nodes.managed import AUTOSTART, ManagedNode
+from hmsa_ros.nodes.managed import AUTOSTART
 from hmsa_ros.nodes.marker_publisher import (
     MARKER_FRAME,
     MARKER_RATE,
@@ -36,17 +37,13 @@ from hmsa_ros.nodes.markers import State
 from hmsa_ros.nodes.parameters import JOINT, ParameterSpec
 from hmsa_ros.nodes.plant_joint import joint_from, OWN, PlantJoint
 from hmsa_ros.nodes.runner import run
-from hmsa_ros.nodes.samples import SamplePublisher
 
 PARAMETERS = (
     AUTOSTART,
     *OWN,
     JOINT,
     JOINTS,
-    ParameterSpec(
-        'command_source', 'any',
-        'Publishers whose commands are obeyed: any, or only the first until it disappears.',
-        choices=COMMAND_SOURCES),
+    COMMAND_SOURCE,
     ParameterSpec(
         'command_delay', 0.0,
         'Simulated transport delay of commands.', 's', 0.0, 1e3),
@@ -57,10 +54,7 @@ PARAMETERS = (
     ParameterSpec(
         'seed', 0, 'Seed of the noise; the same seed gives the same run.', '', 0, 2**31 - 1),
     PUBLISH_RATE,
-    ParameterSpec(
-        'publish_scalars', 'auto',
-        'Whether to publish stretch and stretch_rate besides joint_states; auto: only for a '
-        'single joint.', choices=('auto', 'always', 'never')),
+    PUBLISH_SCALARS,
     ParameterSpec(
         'publish_clock', False,
         'Whether the plant publishes /clock as the source of simulated time; leave its own '
@@ -84,19 +78,13 @@ PARAMETERS = (
     MARKER_SCALE,
 )
 
-#: How often the time is looked at.
-TICK_SECONDS = 0.001
 # Of each tick, the share that samples may take; commands and services get the rest.
 _BUDGET_NS = 800_000
 _PAUSED_CLOCK_NS = 100_000_000
 
 
-class PlantNode(ManagedNode):
+class PlantNode(DeviceNode):
     """Advances a `SimulatedDevice` along a clock and publishes what comes of it."""
-
-    #: Name of a planner in the same process, which gives its commands directly; whoever links
-    #: them lets time run.
-    companion = ''
 
     def __init__(self) -> None:
         """Declare the parameters, and start if told to."""
@@ -104,7 +92,6 @@ class PlantNode(ManagedNode):
         self._values = declare_joints(
             self, [x for x in PARAMETERS if x is not AUTOSTART], OWN)
         self.add_on_set_parameters_callback(self._on_parameters)
-        self._joints: list[PlantJoint] = []
         self._pacer = Pacer(0, 1.0)
         self._clock_seen = 0
         self.autostart()
@@ -136,10 +123,7 @@ class PlantNode(ManagedNode):
         self._diagnostics = interface.publisher(self, interface.DIAGNOSTICS)
         self._clock_publisher = (
             interface.publisher(self, interface.CLOCK_TOPIC) if self._authority else None)
-        scalars = values['publish_scalars']
-        self._samples = SamplePublisher(
-            self, values.names, scalars=scalars == 'always' or (
-                scalars == 'auto' and len(values.names) == 1))
+        self._open_samples()
         self._joints = [
             PlantJoint(
                 self, self._device, i, values.names, values.of(x), self.companion)
@@ -154,7 +138,7 @@ class PlantNode(ManagedNode):
         # tick only looks at it.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         if not self.companion:
-            self.create_timer(TICK_SECONDS, self._on_tick, clock=steady)
+            self.create_timer(TICK_SECONDS, self.on_tick, clock=steady)
         self.create_timer(1.0, self._on_diagnostics, clock=steady)
 
     def activate(self) -> None:
@@ -164,16 +148,6 @@ class PlantNode(ManagedNode):
     def deactivate(self) -> None:
         """Hold time; commands on their way are lost."""
         self._device.drop_commands()
-
-    def cleanup(self) -> None:
-        """Close the inputs that no executor serves."""
-        for joint in self._joints:
-            joint.commands.close()
-        self._joints = []
-
-    def close(self) -> None:
-        """End with the process."""
-        self.cleanup()
 
     def _serve(self, service: interface.Service, callback: Callable[..., object]) -> None:
         self.create_service(service.type, service.name, callback)
@@ -185,7 +159,13 @@ class PlantNode(ManagedNode):
         """Whether time does not run."""
         return self._pacer.paused or not self.active
 
-    def _on_tick(self) -> None:
+    @property
+    def leading_time(self) -> int | None:
+        """Simulated time in ns, if this plant is the authority on it."""
+        return self._device.time if self._joints and self._authority else None
+
+    def on_tick(self) -> None:
+        """Let time run as far as it has come."""
         for joint in self._joints:
             joint.commands.poll()
         if self._authority:
@@ -230,23 +210,7 @@ class PlantNode(ManagedNode):
         self._publish_clock(monotonic_ns())
         self._publish_news()
 
-    # -- what is published ---------------------------------------------------------------------
-    # Every view of the state, markers among them, is published from here.
-
-    def _publish_news(self) -> None:
-        """Publish what has come of the device since the last time."""
-        for notice in self._device.notices():
-            self._joints[notice.joint].log(notice)
-        for change in self._device.changes():
-            self._publish_change(change)
-        for sample in self._device.samples():
-            self._publish_sample(sample)
-
-    def _publish_change(self, change: Change) -> None:
-        self._joints[change.joint].publish_applied(change)
-
-    def _publish_sample(self, sample: Sample) -> None:
-        self._samples.publish(sample)
+    # -- what else is published ----------------------------------------------------------------
 
     def _states(self) -> tuple[int, list[State]]:
         """Return the time and what the joints do, for who looks."""
@@ -320,28 +284,8 @@ class PlantNode(ManagedNode):
 
     def _on_diagnostics(self) -> None:
         self._diagnostics.publish(conversions.to_diagnostics(
-            int(self.get_clock().now().nanoseconds), self._status_of_commands(),
-            self._status_of_time()))
-
-    def _status_of_commands(self) -> DiagnosticStatus:
-        joints = self._joints
-        health = CommandHealth(
-            late=sum(x.late for x in joints),
-            refused=sum(x.refused + x.commands.unreadable for x in joints),
-            refused_source=sum(x.commands.refused for x in joints),
-            failed=sum(x.failed for x in joints),
-            silent=[joints[i].name for i in self._device.silent],
-            crowded=[x.name for x in joints if x.crowded()])
-        level, message = health.verdict()
-        return conversions.to_status(
-            f'{self.get_name()}: commands', ', '.join(x.name for x in joints),
-            bytes([level]), message,
-            {'received': sum(x.received for x in joints), 'late': health.late,
-             'refused': health.refused, 'refused_source': health.refused_source,
-             'failed': health.failed,
-             'largest_lateness_ms': f'{max(x.latest for x in joints) / 1e6:.3f}',
-             'timeouts': self._device.trips, 'silent': len(health.silent),
-             'time': f'{self._device.time / 1e9:.9f}', 'paused': self._pacer.paused})
+            int(self.get_clock().now().nanoseconds),
+            self._status_of_commands(paused=self._pacer.paused), self._status_of_time()))
 
     def _status_of_time(self) -> DiagnosticStatus:
         then, since = self._measured

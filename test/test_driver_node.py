@@ -1,0 +1,123 @@
+"""The driver node: hardware in the place of the plant, alone and in one process with a planner."""
+
+from pathlib import Path
+import sys
+
+import pytest
+
+from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.conversions import from_time, to_command
+
+TUTORIALS = Path(__file__).resolve().parent.parent / 'docs' / 'tutorials'
+BENCH = ('--ros-args', '-p', 'hardware:=hardware:Bench')
+SECOND = 1_000_000_000
+
+# Writes down what it is asked, and breaks when it is read for the hundredth time.
+BROKEN = """\
+class Coil:
+    def __init__(self, joint):
+        self.log = open(joint, 'a', buffering=1)
+        self.reads = 0
+
+    def write(self, level, now):
+        self.log.write(f'{level}\\n')
+        return now
+
+    def read(self, now):
+        self.reads += 1
+        if self.reads == 100:
+            raise OSError('the cable is out')
+        return 1.0, 0.0
+
+
+def nothing(joint):
+    return object()
+"""
+
+
+def field(ros):
+    """Return a list that fills with the levels that took effect."""
+    topic = interface.FLUX_DENSITY_APPLIED
+    return ros.collect(topic.type, topic.name, topic.qos)
+
+
+@pytest.mark.ros
+def test_driver_of_the_tutorial_keeps_the_contract_of_a_driver(start, ros):
+    applied = field(ros)
+    states = ros.collect(interface.JOINT_STATES.type, interface.JOINT_STATES.name)
+    driver = start.hmsa('driver', *BENCH, PYTHONPATH=str(TUTORIALS))
+    command = ros.publisher(
+        interface.FLUX_DENSITY_COMMAND.type, interface.FLUX_DENSITY_COMMAND.name,
+        interface.FLUX_DENSITY_COMMAND.qos)
+    ros.spin_until(lambda: applied and states, 'the level at the start')
+    assert applied[0].magnetic_field.z == 0.0
+
+    now = ros.node.get_clock().now().nanoseconds
+    stamps = [now + SECOND * 4 // 10, now + SECOND * 6 // 10]
+    command.publish(to_command(stamps[0], 0.01, 'coil'))
+    # Taken back by the one after it, which is stamped before it.
+    command.publish(to_command(now + SECOND * 9 // 10, 0.5, 'coil'))
+    command.publish(to_command(stamps[1], 0.02, 'coil'))
+    for bad in (float('nan'), 0.51):
+        command.publish(to_command(stamps[1] + 1, bad, 'coil'))
+    # No word follows: the watchdog switches off.
+    ros.spin_until(lambda: len(applied) == 4, 'two levels, and the coil switched off')
+    assert [x.magnetic_field.z for x in applied] == [0.0, 0.01, 0.02, 0.0]
+    assert all(from_time(x.header.stamp) >= stamp
+               for x, stamp in zip(applied[1:], [*stamps, now + SECOND], strict=False))
+    assert states[-1].name == ['actuator']
+    assert driver.stop() == 0
+    assert 'command refused, the previous one stays in force: flux density command (0, 0, nan)' \
+        in driver.stderr
+    assert 'no command and no heartbeat for 1 s: the field goes to zero' in driver.stderr
+
+
+@pytest.mark.ros
+def test_hardware_that_breaks_ends_the_driver_with_all_coils_switched_off(start, ros, tmp_path):
+    (tmp_path / 'lab.py').write_text(BROKEN)
+    applied = field(ros)
+    driver = start(
+        'sh', '-c', 'cd "$0" && exec "$@"', tmp_path, sys.executable, '-m', 'hmsa_ros',
+        'driver', '--ros-args', '-p', 'hardware:=lab:Coil', '-p', 'publish_rate:=20.0')
+    command = ros.publisher(
+        interface.FLUX_DENSITY_COMMAND.type, interface.FLUX_DENSITY_COMMAND.name,
+        interface.FLUX_DENSITY_COMMAND.qos)
+    ros.spin_until(lambda: applied, 'the level at the start')
+    command.publish(to_command(0, 0.25, 'coil'))
+    assert driver.wait() == 1
+    assert "the hardware failed (OSError: 'the cable is out') and is switched off" \
+        in driver.stderr
+    assert (tmp_path / 'actuator').read_text().split() == ['0.0', '0.25', '0.0']
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(('arguments', 'expected'), [
+    ((), "hardware is '': expected MODULE:NAME"),
+    (('hardware:=nowhere:Coil',), "hardware 'nowhere:Coil' cannot be loaded "
+                                  '(ModuleNotFoundError'),
+    (('hardware:=hardware:Coil',), "hardware 'hardware:Coil' cannot be loaded (AttributeError"),
+    (('hardware:=math:sqrt',), "hardware 'math:sqrt' of joint actuator does not start"),
+    (('hardware:=builtins:str',), 'expected something with the methods write and read'),
+    (('hardware:=hardware:Bench', 'use_sim_time:=true'), 'use_sim_time is true: expected false')])
+def test_hardware_that_cannot_be_had_refuses_the_start(start, arguments, expected):
+    given = [x for argument in arguments for x in ('-p', argument)]
+    driver = start.hmsa('driver', '--ros-args', *given, PYTHONPATH=str(TUTORIALS))
+    assert driver.wait() == 2
+    assert expected in driver.stderr
+    assert 'Traceback' not in driver.stderr
+
+
+@pytest.mark.ros
+def test_a_controller_with_hardware_moves_it_and_says_what_it_measured(start, ros):
+    applied = field(ros)
+    controller = start.hmsa(
+        'controller', *BENCH, '-p', 'vibration_tolerance:=1.0', PYTHONPATH=str(TUTORIALS))
+    send = start.hmsa('send', '1.1:0.3', '1.0:0.3', '--wait', '--timeout', '60')
+    assert send.wait() == 0, send.output
+    assert 'measured' in send.output
+    names = {x for x, _ in ros.node.get_node_names_and_namespaces()}
+    assert {'planner', 'driver'} <= names
+    assert 'plant' not in names
+    # The level at the start, and two for each move.
+    ros.spin_until(lambda: len(applied) >= 5, 'the levels of two moves')
+    assert controller.stop() == 0, controller.output
