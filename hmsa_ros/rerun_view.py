@@ -148,9 +148,14 @@ def _log_marker(recording: Any, root: str, marker: Any) -> None:
             vectors=[[end.x - start.x, end.y - start.y, end.z - start.z]],
             radii=[marker.scale.x / 2], colors=[colour]))
     elif marker.type == _TRIANGLES:
+        corners = np.array([
+            (position.x + p.x, position.y + p.y, position.z + p.z) for p in marker.points])
+        # Without normals nothing is shaded.
+        a, b, c = corners[0::3], corners[1::3], corners[2::3]
+        normals = np.cross(b - a, c - a)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
         recording.log(path, rr.Mesh3D(
-            vertex_positions=[
-                [position.x + p.x, position.y + p.y, position.z + p.z] for p in marker.points],
+            vertex_positions=corners, vertex_normals=np.repeat(normals, 3, axis=0),
             albedo_factor=colour))
     elif marker.type == _TEXT:
         recording.log(path, rr.Points3D(
@@ -178,6 +183,9 @@ def main(args: Sequence[str] | None = None) -> int:
             recording.spawn()
         show(given.bag, recording, given.namespace)
         recording.flush()
+        if given.save is not None:
+            # Only then does the file get its index.
+            recording.disconnect()
     except BadInputError as error:
         return complain(error, 2)
     except HmsaError as error:

@@ -125,6 +125,13 @@ def test_what_is_no_beam_is_refused_in_a_sentence(changes, message):
         silicone(**changes)
 
 
+def test_the_tangent_of_a_bent_beam_is_the_slope_of_its_centreline():
+    along, across = bending.centreline(0.4, 2001)
+    for i in (500, 1000, 1500):
+        slope = (across[i + 1] - across[i - 1]) / (along[i + 1] - along[i - 1])
+        assert math.tan(float(bending.tangent(0.4, i / 2000))) == pytest.approx(slope, abs=1e-6)
+
+
 def test_a_target_beyond_what_one_mode_describes_is_refused():
     with pytest.raises(BadInputError, match='a deflection between the limits -0.7862 and 0.7862'):
         ActuatorSimulation(silicone(), stretch=0.8)

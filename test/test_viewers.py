@@ -14,11 +14,15 @@ import sys
 from typing import Any
 from xml.etree import ElementTree
 
+from beam_oracle import silicone
+import numpy as np
 import pytest
 import yaml
 
 from hmsa_ros import rerun_view
+from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.markers import Block, Scene, State
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIG = ROOT / 'config'
@@ -288,3 +292,36 @@ def test_rerun_has_data_under_every_path_that_its_views_show(
 def test_bag_without_samples_is_refused_in_one_line(rerun_program, tmp_path, capfd):
     assert rerun_view.main([str(tmp_path), '--save', str(tmp_path / 'x.rrd')]) == 2
     assert capfd.readouterr().err.count('\n') == 1
+
+
+def test_a_bent_beam_is_a_shaded_mesh_in_rerun_at_its_place(tmp_path):
+    rerun = pytest.importorskip('rerun', reason='rerun-sdk is not installed')
+    from rerun.chunk import RrdReader
+
+    blocks = (Block.of(JOINT, silicone()), Block.of('other', paper_actuator()))
+    scene = Scene(blocks, 'coil', 2.0)
+    saved = tmp_path / 'beam.rrd'
+    recording = rerun.RecordingStream('test')
+    recording.save(saved)
+    shown = scene.states(0, [State(0.4, 0.001), State(1.0, 0.0)])
+    for marker in shown.markers:
+        rerun_view._log_marker(recording, '/markers', marker)
+    recording.disconnect()
+    found = {}
+    for chunk in RrdReader(saved).stream():
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names:
+            if str(chunk.entity_path) == f'/markers/{JOINT}/0' and 'Mesh3D' in name:
+                found[name.split(':')[1]] = np.array(batch.column(name).to_pylist()[0])
+    corners, normals = found['vertex_positions'], found['vertex_normals']
+    body = shown.markers[0]
+    wanted = np.array([(p.x, p.y, p.z) for p in body.points]) + [body.pose.position.x, 0.0, 0.0]
+    assert corners == pytest.approx(wanted, abs=1e-7)
+    # Half of the mesh from the pose on, the tip up by 0.4 of the length, at twice the size.
+    assert corners[:, 2].max() == pytest.approx(2.0 * 0.4 * 0.025, abs=2e-3)
+    assert np.linalg.norm(normals, axis=1) == pytest.approx(1.0, abs=1e-6)
+    # Outwards: they and the corners agree on the volume.
+    faces = corners.reshape(-1, 3, 3)
+    areas = np.linalg.norm(np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0]), axis=1)
+    volume = np.sum(areas * np.einsum('ij,ij->i', normals[::3], faces.mean(axis=1))) / 6.0
+    assert volume == pytest.approx(8.0 * 0.025 * 0.005 * 0.001, rel=0.02)

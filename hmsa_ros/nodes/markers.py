@@ -26,7 +26,7 @@ import numpy as np
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from hmsa_ros.core.laws.bending import centreline
+from hmsa_ros.core.laws.bending import centreline, tangent
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
@@ -40,7 +40,7 @@ ROW = 8
 PITCH = 6.0
 #: From the middle of a block to its field, in half lengths.
 BESIDE = 2.0
-# Along a beam, an odd number.
+# Along a beam.
 _STATIONS = 17
 
 # Okabe and Ito's palette: orange, blue, vermilion, grey. What is seen through is the material.
@@ -105,7 +105,7 @@ class Block:
             / actuator.half_thickness,
             per_tesla=2.0 * actuator.half_length / (3.0 * actuator.flux_density_unit))
 
-    def bent(self, deflection: float) -> tuple[list[tuple[float, float, float]], float, float]:
+    def bent(self, deflection: float) -> list[tuple[float, float, float]]:
         """
         Return a bent beam about the middle of the straight one.
 
@@ -116,14 +116,12 @@ class Block:
 
         Returns
         -------
-        points : list of (float, float, float)
+        list of (float, float, float)
             Corners of triangles in m, three for each.
-        x, z : float
-            Direction of the tangent in the middle.
 
         """
         along, across = (2.0 * self.half_length * x for x in centreline(deflection, _STATIONS))
-        angle = np.arctan2(np.gradient(across), np.gradient(along))
+        angle = tangent(deflection, np.linspace(0.0, 1.0, _STATIONS))
         x, z = along - self.half_length, across
         normal = self.half_thickness * np.stack([-np.sin(angle), np.cos(angle)])
         # Round the section: four corners at each station.
@@ -138,8 +136,7 @@ class Block:
                 points += [a[i], b[i], b[j], a[i], b[j], a[j]]
         for ring in (rings[0], rings[-1][::-1]):
             points += [ring[0], ring[1], ring[2], ring[0], ring[2], ring[3]]
-        middle = float(angle[_STATIONS // 2])
-        return points, math.cos(middle), math.sin(middle)
+        return points
 
     def size(self, stretch: float) -> tuple[float, float, float]:
         """Return 2 l, 2 l and 2 h in m at a stretch along z; the volume stays as it is."""
@@ -257,7 +254,7 @@ class Scene:
             marker.scale = Vector3(x=1.0, y=1.0, z=1.0)
             marker.points = [
                 Point(x=x * self.scale, y=y * self.scale, z=z * self.scale)
-                for x, y, z in block.bent(stretch)[0]]
+                for x, y, z in block.bent(stretch)]
             return marker
         size = block.size(stretch)
         marker = self._marker(stamp, block, number, Marker.CUBE, colour)
@@ -272,7 +269,8 @@ class Scene:
         """Return the arrow of a beam's magnetisation, along its middle."""
         marker = self._arrow(
             stamp, block, MAGNETISATION, place, block.half_length, _MAGNETISATION_COLOUR)
-        _, x, z = block.bent(deflection)
+        angle = float(tangent(deflection, 0.5))
+        x, z = math.cos(angle), math.sin(angle)
         along, across = centreline(deflection, 3)
         begin = Point(
             x=(place[0] + (2.0 * along[1] - 1.0 - 0.5 * x) * block.half_length) * self.scale,

@@ -103,15 +103,21 @@ def inertia_of_angle(angle: ArrayLike) -> Array:
     return made
 
 
+def tangent(deflected: float, share: ArrayLike) -> Array:
+    """Return the angle in rad by which a bent beam is turned at shares of its length."""
+    turned: Array = float(angle_of(deflected)) * slope(share)
+    return turned
+
+
 def centreline(deflected: float, points: int) -> tuple[Array, Array]:
     """Return places along and across the beam from clamp to tip, over its length."""
-    share = np.linspace(0.0, 1.0, points)
-    turned = float(angle_of(deflected)) * slope(share)
+    # At the points, and halfway between them.
+    turned = tangent(deflected, np.linspace(0.0, 1.0, 2 * points - 1))
+    ends, middle = turned[::2], turned[1::2]
     # Simpson's rule, from each point to the next.
-    middle = float(angle_of(deflected)) * slope(0.5 * (share[1:] + share[:-1]))
     sums = [
         np.append(0.0, np.cumsum(
-            (of(turned[1:]) + 4.0 * of(middle) + of(turned[:-1])) / (6.0 * (points - 1))))
+            (of(ends[1:]) + 4.0 * of(middle) + of(ends[:-1])) / (6.0 * (points - 1))))
         for of in (np.cos, np.sin)]
     return sums[0], sums[1]
 
