@@ -25,6 +25,7 @@ from benchmarks import contenders
 from benchmarks.measure import Contender, loosest, race, Report, Row, stopwatch
 from benchmarks.reference import Actuator, two_step
 from hmsa_ros.core import kernels, two_step_kernel
+from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.delivery import Delivery
 from hmsa_ros.core.moves import State
 from hmsa_ros.core.parameters import NondimensionalParameters
@@ -95,20 +96,20 @@ def _ours(reference: Reference) -> list[Contender]:
         for rtol in (1e-10, 1e-12)]
 
 
-def _shaped(reference: Reference, lag: float) -> Contender:
-    """Time the shaper, to which a lag of the coil is one more unknown."""
+def _shaped(reference: Reference, setting: str, lag: float, creep: Creep) -> Contender:
+    """Time the shaper, to which a lag of the coil is one more unknown, and a branch a state."""
+    material = replace(MATERIAL, creep=creep)
     requests = [
-        Request(State(start), target, MATERIAL, delivery=Delivery(lag=lag))
+        Request(State(start), target, material, delivery=Delivery(lag=lag))
         for start, target in MOVES]
 
     def loads() -> list[float]:
         return [shaper(x).levels[0].load for x in requests]
 
-    # The reference knows no lag.
-    error = reference.error(loads()) if lag == 0.0 else math.nan
+    # The reference knows neither.
+    error = reference.error(loads()) if lag == 0.0 and not creep else math.nan
     return Contender(
-        'shaper two_step', f'lag {lag:g}' if lag else 'no lag', stopwatch(loads, len(MOVES)),
-        error)
+        'shaper two_step', setting, stopwatch(loads, len(MOVES)), error)
 
 
 def _batches(reference: Reference, copies: int) -> list[Contender]:
@@ -173,7 +174,10 @@ def compare(*, quick: bool = False) -> Report:
     # Short batches find both cores free now and then, even on a busy machine.
     entries = _ours(reference) + _batches(reference, 20)
     ours = entries[0].error
-    entries += [_shaped(reference, lag) for lag in (0.0, 0.1)]
+    branch = Creep((0.1,), (2.0,))
+    entries += [_shaped(reference, *x) for x in (
+        ('no lag', 0.0, Creep()), ('lag 0.1', 0.1, Creep()), ('a branch', 0.0, branch),
+        ('lag 0.1 and a branch', 0.1, branch))]
     missing = []
     with tempfile.TemporaryDirectory() as folder:
         if contenders.compiler():

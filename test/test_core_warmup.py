@@ -7,8 +7,8 @@ import sys
 PROGRAM = """
 from dataclasses import replace
 import json
-from hmsa_ros.core import creep_kernel, creep_plan_kernel, kernels, lag_kernel, law
-from hmsa_ros.core import shooting_kernel, two_step_kernel
+from hmsa_ros.core import kernels, law, response_kernel
+from hmsa_ros.core import shooting_kernel, tail_kernel, two_step_kernel
 from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.planner import Options, Planner
@@ -18,7 +18,7 @@ from hmsa_ros.core.warmup import warm_up
 def signatures():
     return {
         name: len(kernel.signatures)
-        for module in (law, creep_kernel, creep_plan_kernel, kernels, lag_kernel,
+        for module in (law, kernels, response_kernel, tail_kernel,
                        shooting_kernel, two_step_kernel)
         for name, kernel in vars(module).items()
         if hasattr(kernel, 'signatures')}
@@ -32,7 +32,8 @@ for options in (
         {'period': millisecond, 'slew_limit': 100.0}, {'short_spell': 'continue'},
         {'coil_time_constant': 3e-4}, {'coil_time_constant': 3e-4, 'period': millisecond},
         {'creep': Creep((0.1, 0.2), (0.01, 0.1))},
-        {'creep': Creep((0.1,), (0.01,)), 'period': millisecond}):
+        {'creep': Creep((0.1,), (0.01,)), 'period': millisecond},
+        {'creep': Creep((0.1,), (0.01,)), 'coil_time_constant': 3e-4, 'slew_limit': 100.0}):
     block = replace(paper_actuator(), creep=options.pop('creep', Creep()))
     planner = Planner(block, Options(
         flux_density_min=-0.5, flux_density_max=0.5, lead_time=0, **options))

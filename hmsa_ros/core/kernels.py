@@ -327,38 +327,6 @@ def trajectory(
     return DONE
 
 
-@compiled()
-def respond(
-        l, v, durations, loads, slopes, d_durations, d_loads, material, rtol,  # noqa: E741
-        jacobian):
-    """
-    Follow a piecewise linear load and differentiate the end by two parameters.
-
-    Piece m lasts ``durations[m]`` and applies ``loads[m] + slopes[m] t``; ``d_durations`` and
-    ``d_loads`` (m, 2) are the derivatives by the parameters. ``jacobian`` (2, 2) takes the
-    derivatives of stretch (row 0) and rate (row 1). Returns status and state.
-    """
-    k = np.empty((STAGES, 4))
-    end_l, end_v = l, v
-    for j in range(2):
-        end_l, end_v = l, v
-        s = 0.0
-        r = 0.0
-        for m in range(durations.size):
-            status, end_l, end_v, s, r, _ = advance(
-                k, end_l, end_v, s, r, loads[m], slopes[m], d_loads[m, j], 0.0, durations[m],
-                material, rtol, 0.0)
-            if status != DONE:
-                return status, end_l, end_v
-            _, a, _, _ = _derivative(
-                end_l, end_v, 0.0, 0.0, loads[m] + slopes[m] * durations[m], 0.0, material, ANY)
-            s += end_v * d_durations[m, j]
-            r += a * d_durations[m, j]
-        jacobian[0, j] = s
-        jacobian[1, j] = r
-    return DONE, end_l, end_v
-
-
 # -- the plant ----------------------------------------------------------------------------------
 
 

@@ -134,7 +134,7 @@ def stack(materials: Any) -> Array:
 
 
 @compiled(inline=True)
-def _elastic(l, material, family):  # noqa: E741
+def elastic(l, material, family):  # noqa: E741
     """
     Return psi' and psi'' by the law of a family; NaN outside its limits.
 
@@ -179,11 +179,11 @@ def motion(l, v, beta, material, family):  # noqa: E741
     Return the acceleration and its derivatives by stretch, rate and load, Eq. 11.
 
     Outside the limits they are NaN, which makes a step control reject its step. ``family`` is as
-    for `_elastic`.
+    for `elastic`.
     """
     if family == BEAM or (family == ANY and material[KIND] == BEAM):
         return families.beam_motion(l, v, beta, material[DAMPING], material)
-    force, stiffness = _elastic(l, material, family)
+    force, stiffness = elastic(l, material, family)
     i_l = 1.0 / l
     l3 = l * l * l
     # 1/m, with -m'/2 = l^-4/4 and -m''/2 = -l^-5.
@@ -218,13 +218,13 @@ def damping(l, material):  # noqa: E741
 @compiled()
 def elastic_force(l, material):  # noqa: E741
     """Return the load that balances the stretch at rest, psi'(l)."""
-    return _elastic(l, material, ANY)[0]
+    return elastic(l, material, ANY)[0]
 
 
 @compiled()
 def elastic_stiffness(l, material):  # noqa: E741
     """Return psi''(l)."""
-    return _elastic(l, material, ANY)[1]
+    return elastic(l, material, ANY)[1]
 
 
 @compiled()
@@ -289,7 +289,7 @@ def equilibrium_stretch(beta, material):
         return rest
     l = 0.5 * (lower + upper)  # noqa: E741
     for _ in range(200):
-        force, stiffness = _elastic(l, material, ANY)
+        force, stiffness = elastic(l, material, ANY)
         value = force - beta
         if math.isnan(value):
             # Rounded onto a limit.
@@ -325,7 +325,7 @@ def acceleration_slopes(l, v, beta, material, slopes):  # noqa: E741
     each constant of the law, 1/J_lim for Gent, in the order of the packed material. With them
     and with `motion`, s'' = a_l s + a_v s' + slope gives the sensitivity of a trajectory.
     """
-    force, _ = _elastic(l, material, ANY)
+    force, _ = elastic(l, material, ANY)
     a, a_l, a_v, i_mass = motion(l, v, beta, material, ANY)
     slopes[BY_LOAD] = i_mass
     slopes[BY_MODULUS] = -force * i_mass

@@ -112,7 +112,7 @@ class NondimensionalParameters:
     @cached_property
     def elastic(self) -> 'NondimensionalParameters':
         """The group without its branches."""
-        return replace(self, creep=Creep())
+        return replace(self, creep=Creep()) if self.creep else self
 
 
 @dataclass(frozen=True)

@@ -136,7 +136,7 @@ def segments(
         raise BadInputError(
             f'short_spell is {short_spell!r}: expected one of {", ".join(SHORT_SPELL)}')
     shape = first or get_shaper(shaper)
-    creeping.check(material, delivery, shaper)
+    creeping.check(material, shaper)
     limits = limits or Limits()
     units = units or Units()
     state = start or State(material.rest)
@@ -215,7 +215,7 @@ def _follow_tail(
     """Return the state at a time after the arrival, where what branches do is known."""
     if move.duration > 0.0:
         parts, _ = ramps(
-            move.until(move.duration).levels, state.load, move.duration, delivery.slew)
+            move.until(move.duration).levels, state.ramps_from, move.duration, delivery.slew)
         _check_known(state, parts, move.duration, target, material, delivery.lag)
     place = bisect_right(move.levels, end, key=lambda x: x.time) - 1
     level = move.levels[place]

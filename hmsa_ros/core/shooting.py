@@ -11,6 +11,8 @@ come out of the integration.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,6 +25,9 @@ from hmsa_ros.core.simulation import followed_by
 
 if TYPE_CHECKING:
     from hmsa_ros.core.shapers.request import Request
+
+# Room for the last ramp before the grid goes on, in what a guess of it takes.
+_MORE = 1.25
 
 #: A command and the time at which it is at rest; None if there is none.
 Attempt = tuple[tuple[Level, ...], float] | None
@@ -50,28 +55,51 @@ class Template:
     @classmethod
     def of(cls, levels: Sequence[Level], unknowns: Sequence[tuple[str, int]]) -> 'Template':
         """Return the template of a guess, with unknowns ``('load', i)`` and ``('time', i)``."""
-        d_times = np.zeros((len(levels), len(unknowns)))
-        d_loads = np.zeros((len(levels), len(unknowns)))
-        for column, (kind, index) in enumerate(unknowns):
-            if kind == 'load':
-                d_loads[index, column] = 1.0
-            else:
-                d_times[index:, column] = 1.0
         return cls(
-            np.array([x.time for x in levels]), np.array([x.load for x in levels]), d_times,
-            d_loads)
+            np.array([x.time for x in levels]), np.array([x.load for x in levels]),
+            *_derivatives(len(levels), tuple(unknowns)))
 
 
-def solve(template: Template, request: 'Request', delivery: Delivery | None = None) -> Attempt:
-    """Solve a template for rest at the target; returns levels and time of rest, or None."""
+@lru_cache(maxsize=256)
+def _derivatives(count: int, unknowns: tuple[tuple[str, int], ...]) -> tuple[Array, Array]:
+    """Return the derivatives of times and loads, which nobody may change."""
+    d_times, d_loads = np.zeros((2, count, len(unknowns)))
+    for column, (kind, index) in enumerate(unknowns):
+        if kind == 'load':
+            d_loads[index, column] = 1.0
+        else:
+            d_times[index:, column] = 1.0
+    return d_times, d_loads
+
+
+def solve(
+        template: Template, request: 'Request', delivery: Delivery | None = None, *,
+        wait: float = 0.0) -> Attempt:
+    """
+    Solve a template for rest at the target; returns levels and time of rest, or None.
+
+    Where branches creep and the amplifier ramps, that is the time at which the last ramp ends,
+    or a while after the last level begins: at least ``wait``, and on a grid whole periods.
+    """
     delivery = delivery or request.delivery
     times, loads = template.times.copy(), template.loads.copy()
-    state = request.state
+    d_times, d_loads = template.d_times, template.d_loads
+    state, material = request.state, request.material
+    if material.creep and delivery.slew < math.inf:
+        # What the amplifier ramps to at last is where the tail begins.
+        d_times, d_loads = (np.pad(x, ((0, 0), (0, 1))) for x in (d_times, d_loads))
+        d_loads[-1, -1] = 1.0
+        if delivery.period > 0.0:
+            ramp = _MORE * delivery.ramp(loads[-1] - loads[-2] if len(loads) > 1 else 0.0)
+            wait = max(math.ceil(ramp / delivery.period), 1) * delivery.period
+        if wait > 0.0:
+            times, loads = np.append(times, times[-1] + wait), np.append(loads, loads[-1])
+            d_times, d_loads = (np.concatenate([x, x[-1:]]) for x in (d_times, d_loads))
     status, duration = shooting_kernel.solve(
-        times, loads, template.d_times, template.d_loads, float(state.stretch),
-        float(state.rate), float(request.field), float(request.load), float(request.target),
-        float(delivery.slew), float(delivery.lag), request.material.packed,
-        request.material.branches, np.array(followed_by(state, request.material)))
+        times, loads, d_times, d_loads, float(state.stretch), float(state.rate),
+        float(request.field), float(request.load), float(request.target), float(delivery.slew),
+        float(delivery.lag), material.packed, material.branches,
+        np.array(followed_by(state, material)))
     if status != shooting_kernel.SOLVED:
         return None
     levels = tuple(Level(t, x) for t, x in zip(times.tolist(), loads.tolist(), strict=True))

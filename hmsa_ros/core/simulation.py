@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hmsa_ros.core import creep_kernel, kernels, lag_kernel, law
+from hmsa_ros.core import kernels, law, response_kernel
 from hmsa_ros.core.actuators import Actuators, check_stretch, RTOL, Setup
 from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.delivery import Delivery, Piece, ramps
@@ -91,20 +91,15 @@ def simulate(
             'switches and times must not decrease, and no time may lie before the first switch')
     stretch = material.rest if stretch is None else stretch
     check_stretch(stretch, material)
-    if material.creep:
-        sampled = creeping_samples(
-            switches, loads, slope, times, State(stretch, rate, followed=tuple(followed)),
-            material, rtol)
-        return sampled[0], sampled[1]
-    out = np.empty((3, times.size))
-    if lag > 0.0:
-        status = lag_kernel.trajectory_late(
-            float(stretch), float(rate), float(loads[0] if math.isnan(field) else field),
-            switches, loads, slope, float(lag), times, material.packed, float(rtol), out)
-    else:
-        status = kernels.trajectory(
-            float(stretch), float(rate), switches, loads, slope, times, material.packed,
-            float(rtol), out[0], out[1])
+    if material.creep or lag > 0.0:
+        both = sampled(
+            switches, loads, slope, times, State(stretch, rate, field, followed=tuple(followed)),
+            material, rtol, lag)
+        return both[0], both[1]
+    out = np.empty((2, times.size))
+    status = kernels.trajectory(
+        float(stretch), float(rate), switches, loads, slope, times, material.packed, float(rtol),
+        out[0], out[1])
     if status != kernels.DONE:
         raise HmsaError(_STUCK)
     return out[0], out[1]
@@ -115,10 +110,8 @@ def follow(
         delivery: Delivery) -> State:
     """Return the state that levels lead to at a time after the last of them, without checks."""
     pieces, last = ramps(levels, state.ramps_from, end, delivery.slew)
-    if material.creep:
-        return _follow_creeping(pieces, last, state, end, material)
-    if delivery.lag > 0.0:
-        return _follow_late(pieces, last, state, end, material, delivery.lag)
+    if material.creep or delivery.lag > 0.0:
+        return _follow_slowly(pieces, last, state, end, material, delivery)
     stretch, rate = _endpoint(pieces, end, material, state.stretch, state.rate)
     return State(stretch, rate, last)
 
@@ -131,11 +124,11 @@ def followed_by(state: State, material: NondimensionalParameters) -> tuple[float
     return (float(law.elastic_force(state.stretch, material.packed)),) * count
 
 
-def creeping_samples(
+def sampled(
         switches: Array, loads: Array, slopes: Array, times: Array, state: State,
-        material: NondimensionalParameters, rtol: float) -> Array:
+        material: NondimensionalParameters, rtol: float, lag: float = 0.0) -> Array:
     """
-    Return samples of stretch, rate and what branches follow, shape (2 + n, m).
+    Return samples of stretch, rate, field and what branches follow, shape (3 + n, m).
 
     Raises
     ------
@@ -144,25 +137,31 @@ def creeping_samples(
 
     """
     branches = np.column_stack([material.branches, followed_by(state, material)])
-    out = np.empty((2 + len(branches), times.size))
-    status = creep_kernel.trajectory_creeping(
-        float(state.stretch), float(state.rate), switches, loads, slopes, times, material.packed,
-        branches, float(rtol), out)
+    out = np.empty((response_kernel.FOLLOWED + len(branches), times.size))
+    status = response_kernel.trajectory_late(
+        float(state.stretch), float(state.rate),
+        float(loads[0] if math.isnan(state.load) else state.load), switches, loads, slopes,
+        float(lag), times, material.packed, branches, float(rtol), out)
     if status != kernels.DONE:
         raise HmsaError(_STUCK)
     return out
 
 
-def _follow_creeping(
+def _follow_slowly(
         pieces: Sequence[Piece], last: float, state: State, end: float,
-        material: NondimensionalParameters) -> State:
+        material: NondimensionalParameters, delivery: Delivery) -> State:
     """Integrate until vibration has ended; from then on branches relax alone."""
     switches, loads, slopes = np.array(pieces).T.copy()
-    rings = min(end, max(pieces[-1][0], 0.0) + longest_motion(last, material))
-    stretch, rate, *followed = creeping_samples(
-        switches, loads, slopes, np.array([float(rings)]), state, material, RTOL)[:, 0].tolist()
+    rings, amplifier = end, last if delivery.lag > 0.0 else None
+    if material.creep:
+        rings = min(end, max(pieces[-1][0], 0.0) + longest_motion(last, material)
+                    + delivery.settling(0.0))
+    stretch, rate, field, *followed = sampled(
+        switches, loads, slopes, np.array([float(rings)]), state, material, RTOL,
+        delivery.lag)[:, 0].tolist()
     if rings == end:
-        return State(stretch, rate, last, followed=tuple(followed))
+        return State(
+            stretch, rate, last if amplifier is None else field, amplifier, tuple(followed))
     # Without inertia the elastic force is linear in what the branches follow, which follows it.
     ratios, speeds = material.branches.T
     share = ratios / (1.0 + np.sum(ratios))
@@ -171,22 +170,8 @@ def _follow_creeping(
     relaxed = last + np.real(vectors @ (left * np.exp(values * (end - rings))))
     force = last + float(share @ (relaxed - last))
     return State(
-        float(law.equilibrium_stretch(force, material.packed)), 0.0, last,
-        followed=tuple(relaxed.tolist()))
-
-
-def _follow_late(
-        pieces: Sequence[Piece], last: float, state: State, end: float,
-        material: NondimensionalParameters, lag: float) -> State:
-    switches, loads, slopes = np.array(pieces).T.copy()
-    out = np.empty((3, 1))
-    status = lag_kernel.trajectory_late(
-        float(state.stretch), float(state.rate), float(state.load), switches, loads, slopes, lag,
-        np.array([float(end)]), material.packed, RTOL, out)
-    if status != kernels.DONE:
-        raise HmsaError(_STUCK)
-    stretch, rate, field = out[:, 0].tolist()
-    return State(stretch, rate, field, last)
+        float(law.equilibrium_stretch(force, material.packed)), 0.0, last, amplifier,
+        tuple(relaxed.tolist()))
 
 
 def _endpoint(

@@ -14,6 +14,7 @@ from time import perf_counter
 
 import numpy as np
 
+from hmsa_ros.core import law
 from hmsa_ros.core.compiling import announced
 from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.parameters import paper_actuator
@@ -91,6 +92,8 @@ def _run(*, batch: bool) -> None:
         last = planner.stop(2 * _MILLISECOND).levels[-1]
         # As in a preview of several joints.
         last.sample((last.stamp, last.stamp + _MILLISECOND))
+    # Asked for only of an actuator at rest on its target.
+    law.elastic_stiffness(1.0, paper_actuator().nondimensional.packed)
     if batch:
         plan_two_step_batch(1.0, np.array([1.1, 1.2]))
 

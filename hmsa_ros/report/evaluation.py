@@ -25,7 +25,7 @@ from hmsa_ros.core.moves import Level as PlannedLoad
 from hmsa_ros.core.moves import State
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.residual import residual_vibration
-from hmsa_ros.core.simulation import creeping_samples, RTOL, simulate
+from hmsa_ros.core.simulation import RTOL, sampled, simulate
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.runs.levels import in_force, Level, without_repeats
@@ -434,11 +434,11 @@ def _predict(run: Run, plan: Sequence[Level]) -> tuple[Array, Array]:
         rate = point.rate * actuator.time_unit
         try:
             if creep:
-                rows = creeping_samples(
+                rows = sampled(
                     switches, loads, slopes, np.append(times, duration),
-                    State(point.stretch, rate, followed=followed), material, RTOL)
+                    State(point.stretch, rate, begun, followed=followed), material, RTOL, lag)
                 predicted[:, part] = rows[:2, :-1]
-                followed = tuple(rows[2:, -1].tolist())
+                followed = tuple(rows[3:, -1].tolist())
                 continue
             predicted[:, part] = simulate(
                 switches, loads, times, material, stretch=point.stretch, rate=rate,

@@ -6,16 +6,16 @@ without branches, while their stiffness grows. At arrival the branches still hol
 stay at rest the level has to follow it: psi'(l_d) + sum h_i exp(-t/tau_i), as a staircase.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 import math
 
 import numpy as np
 
-from hmsa_ros.core import creep_plan_kernel as kernel
 from hmsa_ros.core import law
+from hmsa_ros.core import tail_kernel as kernel
 from hmsa_ros.core.creep import Creep
-from hmsa_ros.core.creep_kernel import RATIO, SPEED
-from hmsa_ros.core.delivery import Delivery, IDEAL
+from hmsa_ros.core.delivery import IDEAL
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.moves import Level, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
@@ -26,41 +26,28 @@ from hmsa_ros.core.simulation import follow, followed_by
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.errors import BadInputError
 
-#: Shapers that know of creep, and those that know of it through ramps.
+#: Shapers that know of creep.
 SHAPERS = ('two_step', 'robust', 'smooth', 'step')
-RAMPED = ('smooth', 'step')
 # The least move that counts, and how much more a staircase may leave than is worked out.
 _LEAST_MOVE, _SURE = 1e-3, 1.25
-# Levels of a staircase at the most, how its vibration grows until it has no more, and how often
-# the way back is halved.
-_MOST, _COARSER, _HALVINGS = 300, 3.0, 5
+# Levels of a staircase at the most.
+_MOST = 300
 _SHORTEST_STRIDE = 0.03
 # Time for which a target is held at the least.
 _SHORTEST = 1e-9
 
 
-def check(material: NondimensionalParameters, delivery: Delivery, shaper: str) -> None:
+def check(material: NondimensionalParameters, shaper: str) -> None:
     """
-    Refuse what creep is not planned for yet.
+    Refuse what creep is not planned for.
 
     Raises
     ------
     BadInputError
-        If something creeps and the field lags, the shaper is another, or the amplifier ramps
-        and it is not one of `RAMPED`.
+        If something creeps and the shaper is another than `SHAPERS`.
 
     """
-    if not material.creep:
-        return
-    if delivery.lag > 0.0:
-        raise BadInputError(
-            'viscoelastic.ratio is set and so is coil_time_constant: expected 0 for one of them, '
-            'since creep is planned for a field that follows at once only')
-    if delivery.slew < np.inf and shaper in SHAPERS and shaper not in RAMPED:
-        raise BadInputError(
-            'viscoelastic.ratio is set and so is slew_limit: expected 0 for one of them, or the '
-            f'shaper smooth in place of {shaper}, which plans for creep and steps only')
-    if shaper not in SHAPERS:
+    if material.creep and shaper not in SHAPERS:
         raise BadInputError(
             f'shaper {shaper} does not know of viscoelastic.ratio: expected one of '
             + ', '.join(SHAPERS))
@@ -79,24 +66,32 @@ def carried(
     return found if np.all(np.isfinite(found)) else ()
 
 
+def _product(one: Sequence[float], other: Sequence[float]) -> float:
+    return sum(x * y for x, y in zip(one, other, strict=True))
+
+
 def two_levels(request: Request, plain: Move) -> Attempt:
     """Solve for level and duration with branches, given those without them."""
     material, state = request.material, request.state
-    ratios, speeds = material.branches.T
-    frequency = law.natural_frequency(request.target, material.packed)
+    branches = material.branches.tolist()
+    frequency = float(law.natural_frequency(request.target, material.packed))
     # How much of a branch a motion as fast as this feels.
-    felt = 1.0 / (1.0 + (speeds / frequency) ** 2)
+    felt = [1.0 / (1.0 + (speed / frequency) ** 2) for _, speed in branches]
     force = float(law.elastic_force(state.stretch, material.packed))
-    held = force - np.array(followed_by(state, material))
+    held = [force - x for x in followed_by(state, material)]
+
+    def grown(share: float) -> list[float]:
+        return [(1.0 + ratio) ** share - 1.0 for ratio, _ in branches]
 
     def stiffer(levels: tuple[Level, ...], share: float, aim: float) -> Attempt:
-        before, after = np.expm1(share * np.log1p(ratios)), np.expm1(aim * np.log1p(ratios))
-        stiffness = (1.0 + felt @ after) / (1.0 + felt @ before)
-        load = force + after @ held + stiffness * (levels[0].load - force - before @ held)
-        guess = (Level(0.0, float(load)),
-                 Level(levels[1].time / float(np.sqrt(stiffness)), levels[1].load))
+        before, after = grown(share), grown(aim)
+        stiffness = (1.0 + _product(felt, after)) / (1.0 + _product(felt, before))
+        load = force + _product(after, held) + stiffness * (
+            levels[0].load - force - _product(before, held))
+        guess = (Level(0.0, load),
+                 Level(levels[1].time / math.sqrt(stiffness), levels[1].load))
         there = request if aim == 1.0 else replace(request, material=replace(
-            material, creep=Creep(tuple(after.tolist()), tuple((1.0 / speeds).tolist()))))
+            material, creep=Creep(tuple(after), tuple(1.0 / x for _, x in branches))))
         return solve(Template.of(guess, [('load', 0), ('time', 1)]), there, IDEAL)
 
     return approach(plain.levels, stiffer, _SHORTEST_STRIDE)
@@ -126,13 +121,14 @@ def free_levels(request: Request) -> Move:
 
 def arrival(request: Request, found: Move) -> State:
     """Return the state to which a move leads, at rest at the target."""
-    end = replace(request.state, load=request.load)
+    end = replace(request.state, load=request.field)
     if found.duration > 0.0:
+        # The last level counts where it is ramped to.
         end = follow(
-            found.levels[:-1], end, found.duration, request.material, request.delivery)
+            found.until(found.duration).levels, end, found.duration, request.material,
+            request.delivery)
     return State(
-        request.target, 0.0, end.load,
-        followed=followed_by(end, request.material))
+        request.target, 0.0, end.load, end.amplifier, followed_by(end, request.material))
 
 
 def held(request: Request, found: Move, span: float) -> Move:
@@ -164,34 +160,38 @@ def held(request: Request, found: Move, span: float) -> Move:
         return found
     end = arrival(request, found)
     holding = float(law.elastic_force(request.target, material.packed))
-    branches = material.branches
-    excess = branches[:, RATIO] * (holding - np.array(end.followed))
+    ratios, speeds = material.branches.T
     step = max(abs(request.target - request.state.stretch), _LEAST_MOVE)
-    out, vibration = _staircase(
-        request, excess, max(span - found.duration, _SHORTEST), delivery.ripple / _SURE * step)
-    times, loads = out[:, kernel.TIME], holding + out[:, kernel.EXCESS]
-    late, more = _ramped(request, times, np.diff(loads, prepend=end.load))
-    vibration += more
-    # Not before the last level of the move, nor before its start.
-    before = found.levels[-2].time if len(found.levels) > 1 else found.duration
-    late[0] = min(late[0], 0.5 * (found.duration - before))
-    levels = tuple(
-        Level(delivery.rounded(x), y)
-        for x, y in zip((found.duration + times - late).tolist(), loads.tolist(), strict=True))
-    request.check(levels)
+    out = np.empty((_MOST, 5))
+    count, vibration = kernel.staircase(
+        ratios * (holding - np.array(end.followed)), material.branches, float(request.target),
+        material.packed, float(delivery.lag), float(delivery.period),
+        max(span - found.duration, _SHORTEST), delivery.ripple / _SURE * step, out)
+    times, excess, deviation, rates, fields = out[:count].T
+    loads = holding + excess
+    before = np.append(end.ramps_from, loads[:-1])
+    levels = found.until(found.duration).levels
+    late, more = _ramped(request, times, loads - before, found)
+    begins: Array = found.duration + times - late
+    if delivery.resolution > 0.0:
+        begins = np.rint(begins / delivery.resolution) * delivery.resolution
+    tail = tuple(map(Level, begins.tolist(), loads.tolist()))
+    request.check(tail)
     followed = holding - (holding - np.array(end.followed)) * np.exp(
-        -np.outer(times - late, branches[:, SPEED]))
-    deviation: Array = out[:, kernel.DEVIATION] - late * out[:, kernel.RATE]
-    tail = tuple(
-        State(x, v, load, None, tuple(by)) for x, v, load, by in zip(
-            (request.target + deviation).tolist(), out[:, kernel.RATE].tolist(),
-            [end.load, *loads[:-1].tolist()],
-            followed.tolist(), strict=True))
+        -np.outer(times - late, speeds))
+    field, amplifiers = before, [None] * count
+    if delivery.lag > 0.0:
+        field = holding + fields + late * (holding + fields - before) / delivery.lag
+        amplifiers = before.tolist()
+    states = map(
+        State, (request.target + deviation - late * rates).tolist(), rates.tolist(),
+        field.tolist(), amplifiers, map(tuple, followed.tolist()))
     return replace(
-        found, levels=found.levels[:-1] + levels, tail=tail, vibration=_SURE * vibration)
+        found, levels=levels + tail, tail=tuple(states), vibration=_SURE * (vibration + more))
 
 
-def _ramped(request: Request, times: Array, changes: Array) -> tuple[Array, float]:
+def _ramped(
+        request: Request, times: Array, changes: Array, found: Move) -> tuple[Array, float]:
     """Return how much sooner to command levels that are ramped to, and what ramps add."""
     delivery, packed = request.delivery, request.material.packed
     ramps: Array = np.abs(changes) / delivery.slew
@@ -201,33 +201,29 @@ def _ramped(request: Request, times: Array, changes: Array) -> tuple[Array, floa
             f'ramps of {request.units.slew_text(delivery.slew)} are too slow to follow creep at '
             f'stretch {request.target:g}: expected a larger slew limit')
     inertia = law.mass(request.target, packed)
-    if delivery.period == 0.0:
-        # In the middle of the ramp the step would have been: what is left is of second order.
-        return 0.5 * ramps, float(np.sum(np.abs(changes) * ramps ** 2) / (12.0 * inertia))
     frequency = law.natural_frequency(request.target, packed)
-    return 0.0 * ramps, float(np.sum(np.abs(changes) * ramps) / (inertia * frequency))
+    if delivery.period > 0.0:
+        return 0.0 * ramps, float(np.sum(np.abs(changes) * ramps) / (inertia * frequency))
+    # In the middle of the ramp the step would have been: what is left is of second order.
+    late = 0.5 * ramps
+    late[0], left = _first(request, found, float(changes[0]))
+    more = np.sum(np.abs(changes) * ramps ** 2) / 12.0 + np.abs(changes[0]) * left / frequency
+    return late, float(more / inertia)
 
 
-def _staircase(
-        request: Request, excess: Array, span: float, ripple: float) -> tuple[Array, float]:
-    """Return the levels that follow a tail, and their vibration: the wanted, or what they can."""
-    out = np.empty((_MOST, 4))
-
-    def levels(ripple: float) -> tuple[Array, float] | None:
-        count, vibration = kernel.staircase(
-            excess, request.material.branches, float(request.target), request.material.packed,
-            float(request.delivery.period), span, ripple, out)
-        return None if count < 0 else (out[:count].copy(), float(vibration))
-
-    found, fine, coarse = levels(ripple), ripple, ripple
-    while found is None:
-        fine, coarse = coarse, _COARSER * coarse
-        found = levels(coarse)
-    for _ in range(_HALVINGS if coarse > fine else 0):
-        middle = math.sqrt(fine * coarse)
-        better = levels(middle)
-        if better is None:
-            fine = middle
-        else:
-            found, coarse = better, middle
-    return found
+def _first(request: Request, found: Move, change: float) -> tuple[float, float]:
+    """Return how much sooner to change the level at arrival, and how much ramp is not made up."""
+    slew, ramp = request.delivery.slew, abs(change) / request.delivery.slew
+    levels = found.until(found.duration).levels
+    if not levels or math.isinf(slew):
+        return 0.0, ramp
+    last = levels[-1].load - (levels[-2].load if len(levels) > 1 else request.load)
+    still = found.duration - levels[-1].time - abs(last) / slew
+    if still > _SHORTEST:
+        late = min(0.5 * ramp, still)
+        return late, ramp - 2.0 * late
+    if last * change >= 0.0:
+        return 0.0, ramp
+    # The last ramp is turned round before its end: as much is missing of it as comes later.
+    late = min(ramp / (2.0 + math.sqrt(2.0)), abs(last) / slew)
+    return late, ((ramp - 2.0 * late) ** 2 - 2.0 * late * late) / ramp

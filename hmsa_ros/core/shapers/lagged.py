@@ -16,6 +16,7 @@ from hmsa_ros.core.delivery import Delivery
 from hmsa_ros.core.moves import Level, Limits, Move
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.shooting import approach, Attempt, on_time, solve, Template
+from hmsa_ros.core.simulation import followed_by
 from hmsa_ros.core.status import Code, RefusedError
 
 # Lengths of the settling push to try, in time constants of the lag. The first one passes the
@@ -33,14 +34,16 @@ _SHARES = (1.0, 0.5, 0.25, 0.1)
 _AT_REST = 1e-9
 
 
-def at_rest(request: Request, holding: float) -> bool:
-    """Return whether stretch, rate and field are those of the target, which a load holds."""
-    packed = request.material.packed
-    frequency = law.natural_frequency(request.target, packed)
-    stiffness = law.elastic_stiffness(request.target, packed)
+def at_rest(request: Request) -> bool:
+    """Return whether stretch, rate and field are those of the target."""
     state = request.state
-    return (abs(state.stretch - request.target) <= _AT_REST
-            and abs(state.rate) <= _AT_REST * frequency
+    if abs(state.stretch - request.target) > _AT_REST:
+        return False
+    holding = request.balance(followed_by(state, request.material))
+    packed = request.material.packed
+    frequency = float(law.natural_frequency(request.target, packed))
+    stiffness = float(law.elastic_stiffness(request.target, packed))
+    return (abs(state.rate) <= _AT_REST * frequency
             and max(abs(request.field - holding), abs(request.load - holding) * (
                 not math.isinf(request.delivery.slew))) <= _AT_REST * stiffness)
 
@@ -94,8 +97,9 @@ def _template(
         [('load', 0), ('load', 1), ('time', 1)])
     if not math.isinf(delivery.slew):
         slope = math.copysign(1.0 / delivery.slew, change)
-        template.d_times[2, 0] = -slope
-        template.d_times[2, 1] = slope
+        d_times = template.d_times.copy()
+        d_times[2, 0], d_times[2, 1] = -slope, slope
+        template = replace(template, d_times=d_times)
     return template
 
 

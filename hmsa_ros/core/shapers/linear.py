@@ -61,7 +61,7 @@ def ei(request: Request) -> Move:
 
 def _shaped(request: Request, weights: tuple[float, ...]) -> Move:
     """Shape the step with impulses half a damped period apart, decaying as the motion does."""
-    check(request.material, request.delivery, str(Code.LINEAR))
+    check(request.material, str(Code.LINEAR))
     holding = request.holding_load()
     material, target = request.material, request.target
     xi = material.zeta / law.critical_zeta(target, material.packed)

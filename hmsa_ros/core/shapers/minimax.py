@@ -18,7 +18,7 @@ import math
 
 import numpy as np
 
-from hmsa_ros.core import kernels, lag_kernel, law
+from hmsa_ros.core import kernels, law, response_kernel
 from hmsa_ros.core.delivery import ramps
 from hmsa_ros.core.mismatch import Ellipsoid, Errors
 from hmsa_ros.core.model import Array
@@ -79,7 +79,7 @@ def minimax(request: Request) -> Move:
 
     """
     as_errors(request.errors)
-    check(request.material, request.delivery, 'minimax')
+    check(request.material, 'minimax')
     state, packed = request.state, request.material.packed
     span = abs(request.target - state.stretch)
     held = float(law.elastic_force(state.stretch, packed))
@@ -166,9 +166,9 @@ def left(
             switches * x.faster, loads / x.stiffer, slopes / (x.stiffer * x.faster))
         end = np.array([arrival * x.faster])
         if delivery.lag > 0.0:
-            status = lag_kernel.trajectory_late(
+            status = response_kernel.trajectory_late(
                 x.stretch, x.rate, request.field / x.stiffer, *pieces, delivery.lag * x.faster,
-                end, x.packed, _RTOL, out)
+                end, x.packed, np.empty((0, 3)), _RTOL, out)
         else:
             status = kernels.trajectory(
                 x.stretch, x.rate, *pieces, end, x.packed, _RTOL, out[0], out[1])

@@ -62,7 +62,7 @@ def minimum_time(request: Request, reason: str = '') -> Move:
         If the elastomer creeps.
 
     """
-    check(request.material, request.delivery, 'minimum_time')
+    check(request.material, 'minimum_time')
     holding = request.holding_load()
     state, target = request.state, request.target
     frequency = _frequency(request)
@@ -87,7 +87,7 @@ def minimum_time(request: Request, reason: str = '') -> Move:
 
 def _late(request: Request, holding: float, frequency: float, reason: str) -> Move:
     """Push, brake and push again, so that the field arrives with the stretch."""
-    if at_rest(request, holding):
+    if at_rest(request):
         return Move(Code.HOLD, (Level(0.0, holding),), 0.0)
     if request.delivery.period > 0.0:
         found = fastest_on_grid(request, _bounds(request, holding, frequency))

@@ -114,6 +114,13 @@ class Request:
         self.limits.check(load, self.target, self.units)
         return load
 
+    def balance(self, followed: Sequence[float]) -> float:
+        """Return the load that keeps the target at rest where branches have followed forces."""
+        load = float(law.elastic_force(self.target, self.material.packed))
+        return load + float(sum(
+            ratio * (load - force) for (ratio, _), force in zip(
+                self.material.branches.tolist(), followed, strict=True)))
+
     def check(self, levels: Sequence[Level]) -> None:
         """Refuse levels outside the load limits with `Code.FLUX_LIMIT` and the value needed."""
         for level in levels:

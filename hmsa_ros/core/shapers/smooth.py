@@ -17,16 +17,15 @@ import numpy as np
 from hmsa_ros.core import law
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.moves import Level, Move
-from hmsa_ros.core.shapers.creeping import check
 from hmsa_ros.core.shapers.lagged import at_rest
 from hmsa_ros.core.shapers.pace import MOST_PERIODS
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.shooting import Attempt, solve, Template
 from hmsa_ros.core.simulation import (
-    creeping_samples,
     follow,
     followed_by,
     RTOL,
+    sampled,
     simulate,
 )
 from hmsa_ros.core.status import Code, RefusedError
@@ -71,13 +70,10 @@ def smooth(request: Request) -> Move:
     ------
     RefusedError
         If the target is out of range, or no path keeps the limits.
-    BadInputError
-        If the elastomer creeps and the field lags.
 
     """
-    check(request.material, request.delivery, 'smooth')
     holding = request.holding_load()
-    if _there(request, holding):
+    if _there(request):
         return Move(Code.HOLD, (Level(0.0, holding),), 0.0)
     packed = request.material.packed
     # Of the slower end: near a limit of the law, and where the force hardly rises, they differ.
@@ -94,10 +90,10 @@ def smooth(request: Request) -> Move:
     raise RefusedError(*_refusal(request))
 
 
-def _there(request: Request, holding: float) -> bool:
+def _there(request: Request) -> bool:
     """Return whether the target is held already, by whatever load creep needs."""
-    if not request.material.creep:
-        return at_rest(request, holding)
+    if not request.material.creep or request.delivery.lag > 0.0:
+        return at_rest(request)
     return request.state.stretch == request.target and request.state.rate == 0.0
 
 
@@ -172,32 +168,34 @@ def _free(
     """
     Return the motion under the level in force.
 
-    Stretch, rate, acceleration, the load left for the law, and what branches follow at first.
+    Stretch, rate, acceleration, field, and what branches follow at first.
     """
     material, state = request.material, request.state
     load, field = request.load, request.field
     followed = followed_by(state, material)
+    lag = request.delivery.lag
     loads: Array = np.full(_POINTS, load)
     start = np.zeros(1)
+    if lag > 0.0:
+        loads += (field - load) * np.exp(-times / lag)
+    pull = loads
     if material.creep:
-        rows = creeping_samples(
-            start, np.array([load]), start, times, state, material, RTOL)
+        rows = sampled(
+            start, np.array([load]), start, times, replace(state, load=field), material, RTOL,
+            lag)
         stretch, rate = rows[0].copy(), rows[1].copy()
         force = np.array([law.elastic_force(x, material.packed) for x in stretch.tolist()])
-        loads -= material.branches[:, 0] @ (force - rows[2:])
+        pull = loads - material.branches[:, 0] @ (force - rows[3:])
     elif state.rate == 0.0 and field == load == law.elastic_force(
             state.stretch, material.packed):
         nothing = np.zeros(_POINTS)
         return np.full(_POINTS, state.stretch), nothing, nothing, loads, followed
     else:
-        lag = request.delivery.lag
         stretch, rate = simulate(
             start, [load], times, material, stretch=state.stretch, rate=state.rate, lag=lag,
             field=field)
-        if lag > 0.0:
-            loads += (field - load) * np.exp(-times / lag)
     change = np.empty(_POINTS)
-    law.accelerations(stretch, rate, loads, material.packed, change)
+    law.accelerations(stretch, rate, pull, material.packed, change)
     return stretch, rate, change, loads, followed
 
 
@@ -245,10 +243,10 @@ def _delivered(request: Request, path: _Path, holding: float, period: float) -> 
     d_loads = np.zeros((count + 1, len(changes)))
     d_loads[:-1] = np.array(changes).T
     rounded = np.array([delivery.rounded(x) for x in times.tolist()])
-    loads = np.append(loads, holding)
-    found = None
-    if not (request.material.creep and delivery.slew < math.inf):
-        found = solve(Template(rounded, loads, np.zeros_like(d_loads), d_loads), request)
+    loads = np.append(loads, path.loads[-1] if request.material.creep else holding)
+    found = solve(
+        Template(rounded, loads, np.zeros_like(d_loads), d_loads), request,
+        wait=delivery.rounded(0.5 * each))
     return found or _settled(request, rounded, loads, d_loads)
 
 
@@ -256,7 +254,7 @@ def _settled(request: Request, times: Array, loads: Array, d_loads: Array) -> At
     """
     Solve for rest with differences.
 
-    For ramps where branches follow, and for moves so small that rounding counts.
+    For moves so small that rounding counts.
     """
     packed = request.material.packed
     state = replace(request.state, load=request.field)
@@ -273,7 +271,7 @@ def _settled(request: Request, times: Array, loads: Array, d_loads: Array) -> At
         end = follow(
             levels(factors)[:-1], state, float(times[-1]), request.material, request.delivery)
         misses = [end.stretch - request.target, end.rate / frequency,
-                  (end.load - loads[-1]) / stiffness]
+                  (end.load - request.balance(followed_by(end, request.material))) / stiffness]
         return np.array(misses[:len(factors)])
 
     factors: Array = np.zeros(d_loads.shape[1])

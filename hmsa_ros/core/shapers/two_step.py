@@ -8,9 +8,8 @@ import math
 import numpy as np
 
 from hmsa_ros.core import law
-from hmsa_ros.core.delivery import IDEAL
 from hmsa_ros.core.moves import Level, Limits, Move
-from hmsa_ros.core.shapers.creeping import check, free_levels, two_levels
+from hmsa_ros.core.shapers.creeping import free_levels, two_levels
 from hmsa_ros.core.shapers.lagged import at_rest, settle, three_levels
 from hmsa_ros.core.shapers.minimum_time import minimum_time
 from hmsa_ros.core.shapers.request import Request
@@ -25,6 +24,8 @@ _LONGEST_HOLD = 18
 # Ramps slower than this are refused without a search, which would take seconds.
 _MOST_HALF_PERIODS = 80
 _SHORTEST_STRIDE = 0.05
+# Codes of plans in whose place something else is done at once.
+_WITHOUT = (Code.HOLD, Code.TOO_DAMPED, Code.INDISTINGUISHABLE)
 # Ramps to begin the search for two swings with, in quarters of a period.
 _SWINGS = (0.3, 0.1, 0.7, 0.03, 1.2)
 
@@ -54,11 +55,8 @@ def two_step(request: Request) -> Move:
     RefusedError
         If the target lies outside the stretch limits, or no command within the load limits
         was found.
-    BadInputError
-        If the elastomer creeps and the amplifier ramps or the field lags.
 
     """
-    check(request.material, request.delivery, 'two_step')
     if request.delivery.lag > 0.0:
         return _late(request)
     if request.material.creep:
@@ -68,19 +66,8 @@ def two_step(request: Request) -> Move:
     plan = plan_two_step(
         state.stretch, target, material, rate=state.rate,
         load_limits=(request.limits.minimum, request.limits.maximum))
-    if plan.code is Code.HOLD:
-        return Move(Code.HOLD, (Level(0.0, holding),), 0.0)
-    if plan.code is Code.TOO_DAMPED:
-        return request.plain(
-            plan.code,
-            f'zeta {material.zeta:g} is too damped for the response to cross stretch '
-            f'{target:g}: no two-step command exists, the plain step approaches without '
-            'overshoot (shaper minimum_time arrives in finite time)')
-    if plan.code is Code.INDISTINGUISHABLE:
-        return request.plain(
-            plan.code,
-            f'zeta {material.zeta:g} is so close to critical damping at stretch {target:g} '
-            'that beta_p equals beta_1 to rounding: the plain step is used')
+    if plan.code in _WITHOUT:
+        return _without(request, plan.code, holding)
     inside = request.limits.minimum <= plan.beta_p <= request.limits.maximum
     if plan.code is not Code.TWO_STEP or not inside:
         if state.rate == 0.0:
@@ -94,24 +81,48 @@ def two_step(request: Request) -> Move:
     return _ramped(request, *ideal)
 
 
+def _without(request: Request, code: Code, holding: float) -> Move:
+    """Return what takes the place of two levels where there are none."""
+    zeta, target = request.material.zeta, request.target
+    if code is Code.HOLD:
+        return Move(code, (Level(0.0, holding),), 0.0)
+    if code is Code.TOO_DAMPED:
+        return request.plain(
+            code,
+            f'zeta {zeta:g} is too damped for the response to cross stretch {target:g}: no '
+            'two-step command exists, the plain step approaches without overshoot (shaper '
+            'minimum_time arrives in finite time)')
+    return request.plain(
+        code,
+        f'zeta {zeta:g} is so close to critical damping at stretch {target:g} that beta_p equals '
+        'beta_1 to rounding: the plain step is used')
+
+
+def _elastic(request: Request, holding: float) -> Move | None:
+    """Return a move of ideal hardware without branches and limits, None if there is none."""
+    state = request.state
+    plan = plan_two_step(state.stretch, request.target, request.material.elastic, rate=state.rate)
+    if plan.code in _WITHOUT:
+        return _without(request, plan.code, holding)
+    if plan.code is not Code.TWO_STEP:
+        return None
+    return Move(
+        plan.code, (Level(0.0, plan.beta_p), Level(plan.tau_p, holding)), plan.tau_p)
+
+
 def _creeping(request: Request) -> Move:
     """Have branches arrive wherever they do: what they hold then is followed afterwards."""
-    request.holding_load()
-    try:
-        move = two_step(replace(
-            request, material=request.material.elastic, delivery=IDEAL, limits=Limits()))
-    except RefusedError:
-        move = None
+    holding = request.holding_load()
+    move = _elastic(request, holding)
     if move is not None and (move.code is Code.HOLD or math.isinf(move.duration)):
         return move
-    found = None
-    if move is not None and move.code is Code.TWO_STEP:
-        found = two_levels(request, move)
-    if found is not None and request.delivery.period > 0.0:
+    found = None if move is None else two_levels(request, move)
+    if found is not None and request.delivery.ideal:
+        if request.keeps(found[0]):
+            return Move(Code.TWO_STEP, *found)
+    elif found is not None:
         with contextlib.suppress(RefusedError):
-            return _sampled(request, *found[0])
-    elif found is not None and request.keeps(found[0]):
-        return Move(Code.TWO_STEP, *found)
+            return (_sampled if request.delivery.period > 0.0 else _ramped)(request, *found[0])
     if found is not None and request.state.rate == 0.0:
         request.check(found[0])
     return free_levels(request)
@@ -120,15 +131,16 @@ def _creeping(request: Request) -> Move:
 def _late(request: Request) -> Move:
     """Have the field arrive with the stretch, by a level more."""
     holding = request.holding_load()
-    if at_rest(request, holding):
+    if at_rest(request):
         return Move(Code.HOLD, (Level(0.0, holding),), 0.0)
-    plain = replace(
-        request, delivery=replace(request.delivery, lag=0.0, period=0.0),
-        limits=Limits())
-    try:
-        move = two_step(plain)
-    except RefusedError:
-        move = None
+    move = None
+    if request.material.creep or request.delivery.slew < math.inf:
+        with contextlib.suppress(RefusedError):
+            move = two_step(replace(
+                request, delivery=replace(request.delivery, lag=0.0, period=0.0),
+                limits=Limits()))
+    else:
+        move = _elastic(request, holding)
     if move is not None and math.isinf(move.duration):
         return move
     if move is not None and move.code is Code.TWO_STEP:
@@ -252,6 +264,8 @@ def _no_single(request: Request) -> str:
 
 def _two_levels(request: Request, holding: float) -> Move:
     """Use two levels where one does not do, or one that is held for longer."""
+    if request.material.creep:
+        return free_levels(request)
     if request.delivery.period == 0.0 and math.isfinite(request.delivery.slew):
         # Sooner there than by waiting.
         found = _swings(request, holding)
