@@ -139,6 +139,23 @@ def test_robustness_says_what_could_not_be_had(run):
     assert 'arrival in brackets' in out
 
 
+def test_robustness_takes_the_actuator_of_a_file_with_its_law_and_its_coil(
+        run, refused, tmp_path):
+    file = tmp_path / 'own.yaml'
+    file.write_text('/**:\n  ros__parameters:\n    law: yeoh\n    law.c10: 5000.0\n'
+                    '    law.c20: 500.0\n    coil_time_constant: 0.0005\n')
+    status, out, _ = run(
+        'robustness', '--params-file', file, '--move', '1:1.3', '--shapers', 'two_step', '--json')
+    assert status == 0
+    found, = json.loads(out)['moves'][0]['shapers']
+    # Known, neither law nor lag leaves anything; and there is no chain limit to be in error.
+    assert found['residual'] < 1e-8
+    assert found['worst']['G']['residual'] > 0.05
+    assert list(found['curves']) == ['G', 'zeta']
+    assert 'both --params-file and --zeta' in refused(
+        'robustness', '--params-file', file, '--zeta', 0.1)
+
+
 @pytest.mark.parametrize(('words', 'message'), [
     (['--move', '1.4'], "'1.4': expected START:TARGET"),
     (['--move', 'a:b'], "'a:b'"),

@@ -142,7 +142,7 @@ def _learnt(rig: Rig) -> Seen:
     rig.let_pass(1.2)
     rig.fresh('planner')
     stamps, values = rig.samples(mark)
-    # What the plant tells of, since a level may be in force for less than a sample. The second
+    # What the plant reports, since a level may be in force for less than a sample. The second
     # change is the level that the heartbeat brought. What is planned then takes effect lead_time
     # later; left to itself, vibration would be a hundredth by that time.
     changes = [stamp for stamp, _ in rig.applied[told:]]

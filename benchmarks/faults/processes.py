@@ -86,7 +86,7 @@ def _planner_restarted(rig: Rig) -> Seen:
 @FAULTS.fault(
     'planner_stopped', 'planner stopped for 1 s in mid-sequence',
     'SIGSTOP, SIGCONT 1 s later; a setpoint every 0.4 s, command_timeout 0.5 s',
-    'the watchdog of the plant tells of it, commands sent late are counted, the rest is '
+    'the watchdog of the plant reports it, commands sent late are counted, the rest is '
     f're-planned: residual of the last move below {LIMIT:g}')
 def _planner_stopped(rig: Rig) -> Seen:
     rig.start('plant', {'command_timeout': _TIMEOUT, 'safe_flux': 'hold'})

@@ -2,7 +2,6 @@
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 import json
 import math
 from pathlib import Path
@@ -93,27 +92,33 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _run_si(arguments: argparse.Namespace) -> int:
-    """Plan in seconds and tesla for the actuator of a parameter file."""
-    from hmsa_ros.contract.actuator import model_from
-    from hmsa_ros.contract.parameters import CREEP_TOLERANCE, PLANNED, VISCOELASTIC
-    from hmsa_ros.contract.topics import PLANNER
-    from hmsa_ros.core.delivery import IDEAL
-    from hmsa_ros.core.sequence import plan_sequence
-    from hmsa_ros.core.setpoint import Setpoint
-    from hmsa_ros.core.shapers.pace import Pace
-    from hmsa_ros.runs.parameters import read_parameter_file, values_of
+def refuse_fixed(arguments: argparse.Namespace) -> None:
+    """
+    Refuse options that say otherwise than a parameter file.
 
+    Raises
+    ------
+    BadInputError
+        If there is one.
+
+    """
     fixed = [f'--{name.replace("_", "-")}' for name in ('zeta', 'j_lim', 'c1')
              if getattr(arguments, name) is not None]
     if fixed:
         raise BadInputError(
             f'both --params-file and {", ".join(fixed)} are given: expected only one of them, '
             'since the file sets these values')
-    model = model_from(values_of(
-        read_parameter_file(arguments.params_file), PLANNER,
-        # Nobody has to send these levels: unless the file says how fine, they are very fine.
-        (*PLANNED, *VISCOELASTIC, replace(CREEP_TOLERANCE, default=IDEAL.ripple))))
+
+
+def _run_si(arguments: argparse.Namespace) -> int:
+    """Plan in seconds and tesla for the actuator of a parameter file."""
+    from hmsa_ros.core.sequence import plan_sequence
+    from hmsa_ros.core.setpoint import Setpoint
+    from hmsa_ros.core.shapers.pace import Pace
+    from hmsa_ros.runs.model import model_of
+
+    refuse_fixed(arguments)
+    model = model_of(arguments.params_file)
     time, load = model.units.time, model.units.load
     segments = plan_sequence(
         [Setpoint(stretch, span / time)

@@ -3,21 +3,26 @@
 import argparse
 from collections.abc import Iterator
 from dataclasses import asdict
+from functools import partial
 from itertools import product
 import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli import chunked
+from hmsa_ros.cli.plan import refuse_fixed
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text, make_folder
 
 if TYPE_CHECKING:
+    from hmsa_ros.core.timeline import Model
     from hmsa_ros.studies.engine import Start
     from hmsa_ros.studies.matrix import Row
     from hmsa_ros.studies.robustness import Case, Result
 
 _MOVES = ((1.0, 1.1), (1.0, 1.4), (1.0, 0.7))
+# Of a beam, which rests at 0.
+_BENDS = ((0.0, 0.1), (0.0, 0.4))
 
 
 def _move(text: str) -> tuple[float, float]:
@@ -42,8 +47,9 @@ def add_parser(subparsers: Any) -> None:
                     'replaced.',
         epilog='example: hmsa robustness --move 1.0:1.4 1.2:0.8 --errors 0.05 --order 2 3 4')
     parser.add_argument(
-        '--move', nargs='+', type=_move, default=list(_MOVES), metavar='START:TARGET',
-        help='moves from one stretch at rest to another (default 1.0:1.1 1.0:1.4 1.0:0.7)')
+        '--move', nargs='+', type=_move, metavar='START:TARGET',
+        help='moves from one stretch at rest to another (default 1.0:1.1 1.0:1.4 1.0:0.7; of a '
+             'beam 0:0.1 0:0.4)')
     parser.add_argument(
         '--shapers', metavar='NAME,...', help='shapers, separated by commas (default all)')
     parser.add_argument(
@@ -54,13 +60,13 @@ def add_parser(subparsers: Any) -> None:
         '--order', nargs='+', type=int, metavar='N',
         help='orders of robust and minimax (default 2 3)')
     parser.add_argument(
-        '--zeta', type=float, default=0.2, metavar='Z',
+        '--zeta', type=float, metavar='Z',
         help='nominal nondimensional damping coefficient, at least 0 (default 0.2)')
     parser.add_argument(
-        '--j-lim', type=float, default=5.0, metavar='J',
+        '--j-lim', type=float, metavar='J',
         help='nominal chain limit of the Gent model, above 0 (default 5)')
     parser.add_argument(
-        '--c1', type=float, default=2.0, metavar='C',
+        '--c1', type=float, metavar='C',
         help='shape 2 H^2/L^2, above 0 (default 2)')
     parser.add_argument(
         '--out', type=Path, metavar='DIR',
@@ -74,8 +80,8 @@ def add_parser(subparsers: Any) -> None:
              '--resume')
     parser.add_argument(
         '--params-file', type=Path, metavar='YAML', dest='params_file',
-        help='actuator for --feedback, a beam perhaps, seen by a camera (default: blocks and '
-             'sensors of a list)')
+        help='actuator and coil in place of --zeta, --j-lim and --c1, of any law; with '
+             '--feedback seen by a camera (default: blocks and sensors of a list)')
     parser.add_argument(
         '--seeds', type=int, default=10, metavar='N',
         help='runs with different noise for --feedback (default 10)')
@@ -93,10 +99,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> int:
     """Compare the shapers."""
-    if arguments.params_file is not None:
-        raise BadInputError(
-            f'--params-file {arguments.params_file} is given without --feedback: expected --zeta, '
-            '--j-lim and --c1')
     from hmsa_ros.core.parameters import NondimensionalParameters
     from hmsa_ros.studies.executors import in_order
     from hmsa_ros.studies.robustness import (
@@ -109,15 +111,24 @@ def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> 
         study,
     )
 
-    material = NondimensionalParameters(arguments.zeta, arguments.j_lim, arguments.c1)
+    if arguments.params_file is None:
+        nominal = (0.2 if arguments.zeta is None else arguments.zeta,
+                   5.0 if arguments.j_lim is None else arguments.j_lim,
+                   2.0 if arguments.c1 is None else arguments.c1)
+        make = partial(Case, material=NondimensionalParameters(*nominal))
+    else:
+        model = _model(arguments)
+        make = partial(
+            Case, material=model.material, limits=model.limits, delivery=model.delivery)
     shapers = None
     if arguments.shapers is not None:
         shapers = [name.strip() for name in arguments.shapers.split(',')]
     compared = candidates(shapers, arguments.order or ORDERS)
     cases = [
-        Case(start, target, material, box=arguments.errors,
+        make(start, target, box=arguments.errors,
              span=max(arguments.errors, min(2.0 * arguments.errors, LARGEST)))
-        for start, target in dict.fromkeys(arguments.move)]
+        for start, target in dict.fromkeys(
+            arguments.move or (_MOVES if make.keywords['material'].rest else _BENDS))]
     tasks = list(product(cases, compared))
     folder: Path = arguments.out or Path('robustness')
 
@@ -140,6 +151,14 @@ def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> 
             found.append(result)
             advance(1)
     return finish(found)
+
+
+def _model(arguments: argparse.Namespace) -> 'Model':
+    """Return what the planner of the parameter file plans with."""
+    from hmsa_ros.runs.model import model_of
+
+    refuse_fixed(arguments)
+    return model_of(arguments.params_file)
 
 
 def _show(
@@ -221,22 +240,23 @@ def _print_table(case: 'Case', results: 'list[Result]') -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from hmsa_ros.studies.robustness import PARAMETERS, percent
+    from hmsa_ros.studies.robustness import percent
 
     error = f'{100.0 * case.box:g}'
     table = Table(
         box=SIMPLE_HEAD,
-        title=f'stretch {case.start:g} to {case.target:g}, nominal zeta '
-              f'{case.material.zeta:g}, J_lim {case.material.j_lim:g}, c1 {case.material.c1:g}',
-        caption='residual: peak-to-peak stretch after arrival in % of the step, without the '
-                f'steady offset; worst within {error} % of error, in the last column of all '
-                'three at once; arrival in L sqrt(rho/G)')
+        title=f'{case.material.coordinate.name} {case.start:g} to {case.target:g}, '
+              f'{case.nominal}',
+        caption=f'residual: peak-to-peak {case.material.coordinate.name} after arrival in % of '
+                f'the step, without the steady offset; worst within {error} % of error, in the '
+                'last column of all at once; arrival in '
+                + ('L sqrt(rho/G)' if case.material.law is None else 'units of time'))
     table.add_column('shaper', no_wrap=True)
-    for name in ('arrival', 'nominal', *PARAMETERS, 'all'):
+    for name in ('arrival', 'nominal', *case.parameters, 'all'):
         table.add_column(name, justify='right', no_wrap=True)
     for result in results:
         if result.move is None:
-            table.add_row(result.candidate.name, *'------')
+            table.add_row(result.candidate.name, *'---', *'-' * len(case.parameters))
             continue
         arrival = f'{result.arrival:.3f}'
         table.add_row(

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 import math
 
+from hmsa_ros.core.delivery import Delivery
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.errors import BadInputError
 
@@ -55,6 +56,11 @@ class Errors:
     def faster(self) -> float:
         """Return the model's unit of time in that of the actuator."""
         return math.sqrt(1.0 + self.shear_modulus)
+
+    def delivery(self, planned: Delivery) -> Delivery:
+        """Return how ramps and lag of the model are in the actuator's units."""
+        return Delivery(
+            slew=planned.slew / self.faster / self.stiffer, lag=planned.lag * self.faster)
 
     def actual(self, material: NondimensionalParameters) -> NondimensionalParameters:
         """Return the model's group for the actuator: zeta = c/8 sqrt(1/(L^2 H^2 rho G))."""

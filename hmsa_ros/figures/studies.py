@@ -17,7 +17,7 @@ from hmsa_ros.core.shapers.step import step
 from hmsa_ros.figures import style
 from hmsa_ros.studies.damped import DampedStudy, LIMITS, limits_of, SETTLED
 from hmsa_ros.studies.residual import Actual
-from hmsa_ros.studies.robustness import Candidate, Case, ORDERED, PARAMETERS, percent, Result
+from hmsa_ros.studies.robustness import Candidate, Case, ORDERED, percent, Result
 from hmsa_ros.studies.sampled import ideal_move, PROMISED, rounded_move, SampledStudy, solved_move
 
 # Residuals below this are drawn on it.
@@ -55,11 +55,12 @@ def draw_robustness(
     errors = 100.0 * case.errors()
     with style.picture(paths, 6.4) as figure:
         figure.suptitle(
-            rf'Residual vibration, $\lambda$ = {case.start:g} to {case.target:g}; nominal '
-            rf'$\zeta$ = {case.material.zeta:g}, $J_\mathrm{{lim}}$ = {case.material.j_lim:g}, '
-            f'$c_1$ = {case.material.c1:g}', fontsize=10)
-        panels = figure.subplot_mosaic([['G', 'zeta'], ['J_lim', 'box']])
-        for name, letter in zip(PARAMETERS, 'abc', strict=True):
+            f'Residual vibration, {case.material.coordinate.name} {case.start:g} to '
+            f'{case.target:g}; {_nominal(case)}', fontsize=10)
+        names = list(case.parameters)
+        panels = figure.subplot_mosaic(
+            [['G', 'zeta'], ['J_lim' if 'J_lim' in names else 'box', 'box']])
+        for name, letter in zip(names, 'abc', strict=False):
             axes = panels[name]
             for result, look in zip(shown, looks, strict=True):
                 axes.plot(
@@ -72,10 +73,18 @@ def draw_robustness(
             style.finish(
                 axes, f'error of {_SYMBOLS[name]} alone [%]', 'residual [% of the step]', letter)
             axes.yaxis.minorticks_off()
-        _bars(panels['box'], case, shown, looks)
+        _bars(panels['box'], case, shown, looks, 'abcd'[len(names)])
         figure.legend(
             *panels['G'].get_legend_handles_labels(), loc='outside lower center', ncols=2,
             columnspacing=1.8)
+
+
+def _nominal(case: Case) -> str:
+    """Return the model in a title."""
+    material = case.material
+    whose = rf'$J_\mathrm{{lim}}$ = {material.j_lim:g}' if material.law is None else (
+        f'law {material.law.law}')
+    return rf'nominal $\zeta$ = {material.zeta:.4g}, {whose}, $c_1$ = {material.c1:.4g}'
 
 
 def _looks(candidates: Sequence[Candidate]) -> list[dict[str, Any]]:
@@ -114,17 +123,20 @@ def draw_front(
                     label = '_nolegend_'
             panel.set_yscale('log')
             style.finish(
-                panel, r'arrival [$L\sqrt{\rho/G}$]',
+                panel, r'arrival [$L\sqrt{\rho/G}$]' if case.material.law is None
+                else 'arrival [units of time]',
                 'worst residual [% of the step]' if panel is axes[0] else '', '')
             panel.yaxis.minorticks_off()
             panel.set_title(
-                rf'$\lambda$ = {case.start:g} to {case.target:g}, $\pm${100.0 * case.box:g} %',
+                rf'{case.material.coordinate.name} {case.start:g} to {case.target:g}, '
+                rf'$\pm${100.0 * case.box:g} %',
                 fontsize=9)
         for panel in axes[len(studies):]:
             panel.set_axis_off()
         figure.legend(
             *axes[0].get_legend_handles_labels(), loc='outside lower center', ncols=4,
-            title='filled: G, zeta and J_lim off together; open: G alone', fontsize=8,
+            title=f'filled: {", ".join(studies[0][0].parameters)} off together; open: G alone',
+            fontsize=8,
             title_fontsize=8)
 
 
@@ -135,8 +147,8 @@ def _label(result: Result) -> str:
 
 
 def _bars(
-        axes: Axes, case: Case, results: Sequence[Result],
-        looks: Sequence[dict[str, Any]]) -> None:
+        axes: Axes, case: Case, results: Sequence[Result], looks: Sequence[dict[str, Any]],
+        letter: str) -> None:
     """Draw the worst in the box of all errors."""
     worst = np.array([x.worst.residual for x in results])
     lengths = 100.0 * np.nan_to_num(np.maximum(worst, _FLOOR), nan=_FLOOR)
@@ -153,7 +165,7 @@ def _bars(
     axes.set_yticks(places, [x.candidate.name for x in results])
     axes.set_ylim(len(results) - 0.4, -0.6)
     style.finish(
-        axes, rf'worst, all three within $\pm${100.0 * case.box:g} % [% of the step]', '', 'd')
+        axes, rf'worst, all within $\pm${100.0 * case.box:g} % [% of the step]', '', letter)
     axes.xaxis.minorticks_off()
     axes.yaxis.minorticks_off()
     axes.grid(visible=False, axis='y')

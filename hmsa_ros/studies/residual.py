@@ -73,9 +73,13 @@ class Actual:
     delivery: Delivery = IDEAL
 
     @classmethod
-    def off(cls, model: NondimensionalParameters, errors: Errors = _EXACT) -> 'Actual':
-        """Return the actuator of a model in error."""
-        return cls(model, errors.actual(model), 1.0 / errors.faster, errors.stiffer)
+    def off(
+            cls, model: NondimensionalParameters, errors: Errors = _EXACT,
+            delivery: Delivery = IDEAL) -> 'Actual':
+        """Return the actuator of a model in error, under a coil that is as the model has it."""
+        return cls(
+            model, errors.actual(model), 1.0 / errors.faster, errors.stiffer,
+            errors.delivery(delivery))
 
     @classmethod
     def of(cls, model: Setting, actual: Setting) -> 'Actual':

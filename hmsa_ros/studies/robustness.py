@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from hmsa_ros.core.delivery import Delivery, IDEAL
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.moves import Level, Limits, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
@@ -108,6 +109,8 @@ class Case:
         The model.
     limits : Limits
         Admissible loads, in the model's units.
+    delivery : Delivery
+        How commands reach the coil, in the model's units.
     box : float
         Half the width of the box of errors, above 0 to 0.9.
     span : float
@@ -124,6 +127,7 @@ class Case:
     target: float
     material: NondimensionalParameters = field(default_factory=NondimensionalParameters)
     limits: Limits = field(default_factory=Limits)
+    delivery: Delivery = IDEAL
     box: float = 0.1
     span: float = 0.2
 
@@ -139,6 +143,23 @@ class Case:
             raise BadInputError(
                 f'errors of up to {self.box:g} in the box and {self.span:g} in the curves: '
                 f'expected numbers above 0 to {LARGEST:g}, the first not the larger one')
+
+    @property
+    def parameters(self) -> dict[str, str]:
+        """Which of `PARAMETERS` the law of the model has."""
+        limited = self.material.law is None and math.isfinite(self.material.j_lim)
+        return {x: y for x, y in PARAMETERS.items() if y != 'j_lim' or limited}
+
+    @property
+    def nominal(self) -> str:
+        """The model in a line."""
+        material = self.material
+        whose = f'J_lim {material.j_lim:g}' if material.law is None else f'law {material.law.law}'
+        return f'nominal zeta {material.zeta:g}, {whose}, c1 {material.c1:g}'
+
+    def actual(self, errors: Errors) -> Actual:
+        """Return the actuator with errors."""
+        return Actual.off(self.material, errors, self.delivery)
 
     def errors(self) -> Array:
         """
@@ -264,16 +285,15 @@ def study(case: Case, candidate: Candidate) -> Result:
     """
     try:
         move = get_shaper(candidate.shaper)(Request(
-            State(case.start), case.target, case.material, case.limits, order=candidate.order,
-            errors=(case.box, case.box, case.box)))
+            State(case.start), case.target, case.material, case.limits, case.delivery,
+            candidate.order, errors=(case.box, case.box, case.box)))
     except RefusedError as error:
         return _refused(candidate, error.code, str(error))
     arrival = arrival_of(move, case.start, case.target, case.material)
 
     def left(errors: Errors) -> float:
         try:
-            return Actual.off(case.material, errors).residual(
-                move, case.start, case.target, arrival)
+            return case.actual(errors).residual(move, case.start, case.target, arrival)
         except BadInputError:
             raise
         except HmsaError:
@@ -282,9 +302,10 @@ def study(case: Case, candidate: Candidate) -> Result:
 
     curves = {
         name: np.array([left(Errors(**{attribute: x})) for x in case.errors().tolist()])
-        for name, attribute in PARAMETERS.items()}
+        for name, attribute in case.parameters.items()}
     steps = np.linspace(-case.box, case.box, _BOX_POINTS).tolist()
-    box = [Errors(*errors) for errors in product(steps, steps, steps)]
+    box = [Errors(*errors) for errors in product(
+        *(steps if x in curves else [0.0] for x in PARAMETERS))]
     return Result(
         candidate, move.code, move.reason, move, arrival, left(Errors()), curves,
         _alone(case, curves), _worst(np.array([left(errors) for errors in box]), box))
@@ -384,7 +405,7 @@ def _rows(case: Case, result: Result) -> Iterator[tuple[str | float, ...]]:
         for error, value in zip(case.errors().tolist(), curve.tolist(), strict=True)]
     points.append(('box', result.worst.errors, result.worst.residual))
     for name, errors, value in points:
-        offset = Actual.off(case.material, errors).offset(result.move, case.start, case.target)
+        offset = case.actual(errors).offset(result.move, case.start, case.target)
         yield (*fixed, name, errors.shear_modulus, errors.zeta, errors.j_lim, value, offset)
 
 
@@ -424,7 +445,7 @@ def _row(case: Case, candidate: Candidate) -> dict[str, Any]:
         'times': [x.time for x in levels], 'levels': [x.load for x in levels],
         'duration': math.nan if found.move is None else found.move.duration,
         'arrival': found.arrival, 'nominal': found.nominal,
-        **{f'residual_{x}': found.curves[x].tolist() if found.curves else []
+        **{f'residual_{x}': found.curves[x].tolist() if x in found.curves else []
            for x in PARAMETERS},
         **{f'error_{x}': getattr(found.worst.errors, y) for x, y in PARAMETERS.items()},
         'residual': found.worst.residual}
@@ -436,7 +457,7 @@ def result_of(case: Case, candidate: Candidate, row: Mapping[str, Any]) -> Resul
     if not row['times']:
         return _refused(candidate, code, reason)
     levels = tuple(map(Level, row['times'], row['levels']))
-    curves = {x: np.array(row[f'residual_{x}'], dtype=np.float64) for x in PARAMETERS}
+    curves = {x: np.array(row[f'residual_{x}'], dtype=np.float64) for x in case.parameters}
     return Result(
         candidate, code, reason, Move(code, levels, row['duration'], reason), row['arrival'],
         row['nominal'], curves, _alone(case, curves), Worst(

@@ -171,10 +171,9 @@ class Nondimensional(System):
         """Return the actuator of a row, its units in those of the model."""
         planned = self.setting(values)
         errors = Errors(**{x.removeprefix('error.'): values.get(x, 0.0) for x in self.actual})
-        time, load, delivery = 1.0 / errors.faster, errors.stiffer, planned.delivery
         return Setting(
-            errors.actual(planned.material), units=Units(time, load),
-            delivery=Delivery(slew=delivery.slew * time / load, lag=delivery.lag / time))
+            errors.actual(planned.material), units=Units(1.0 / errors.faster, errors.stiffer),
+            delivery=errors.delivery(planned.delivery))
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,37 @@
+"""What a parameter file plans with, without a node."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from hmsa_ros.contract.actuator import model_from
+from hmsa_ros.contract.parameters import CREEP_TOLERANCE, PLANNED, VISCOELASTIC
+from hmsa_ros.contract.topics import PLANNER
+from hmsa_ros.core.delivery import IDEAL
+from hmsa_ros.core.timeline import Model
+from hmsa_ros.runs.parameters import read_parameter_file, values_of
+
+
+def model_of(path: Path) -> Model:
+    """
+    Return what the planner of a parameter file plans with.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    Model
+        Its command period is none, and what may remain of creep the least, unless it is named.
+
+    Raises
+    ------
+    BadInputError
+        If the file cannot be read, or its values are out of range.
+
+    """
+    return model_from(values_of(
+        read_parameter_file(path), PLANNER,
+        # Nobody has to send these levels: unless the file says how fine, they are very fine.
+        (*PLANNED, *VISCOELASTIC, replace(CREEP_TOLERANCE, default=IDEAL.ripple))))
