@@ -36,10 +36,13 @@ def test_cycles_that_begin_late_are_counted_and_the_work_is_measured():
         now = round(begin * MS)
         with cycles:
             used += work
+        used += 3 * work
+        cycles.note_rest()
     severity, message, values = cycles.report()
     assert (severity, message) == (1, '1 of 5 cycles late')
     assert values['largest_lateness_ms'] == '1.500'
     assert (values['work_p50_us'], values['work_largest_us']) == ('10.0', '90.0')
+    assert (values['rest_p50_us'], values['rest_largest_us']) == ('30.0', '270.0')
     assert cycles.report()[:2] == (0, 'cycles in time')
 
 

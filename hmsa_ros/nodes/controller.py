@@ -2,10 +2,12 @@
 Planner and plant, or driver, in one process, with one loop and no middleware between them.
 
 Both nodes are there with their names, topics, services and parameters. Commands go to the device,
-and samples to the planner, within the cycle in which they are made; they are published as well.
+and samples to the planner, within the cycle in which they are made. What is published, judged and
+planned comes after it, while nothing else is due.
 """
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
 import gc
 
 from rclpy.clock import Clock, ClockType
@@ -19,7 +21,10 @@ from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.plant import PlantNode
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.runtime.cycles import Cycles
-from hmsa_ros.runtime.records import Send
+from hmsa_ros.runtime.records import Output, Send
+
+# Time in ns that must be left of a period to publish one more message, and how many wait at most.
+_ENOUGH, _CROWDED = 400_000, 50
 
 
 class LinkedPlanner(PlannerNode):
@@ -31,6 +36,7 @@ class LinkedPlanner(PlannerNode):
         """Begin without a plant."""
         self.plant: Linked | None = None
         self._last = 0
+        self._waiting: deque[Output] = deque()
         super().__init__()
 
     @property
@@ -39,9 +45,19 @@ class LinkedPlanner(PlannerNode):
         given = self._parameter_overrides.get(HARDWARE.name)
         return given is not None and bool(given.value)
 
-    def serve(self) -> None:
-        """Do what is due."""
+    def send(self) -> None:
+        """Give the plant the commands that are due."""
+        if self._channels:
+            self._take(self._runtime.send(self._now()))
+
+    def serve(self, left: Callable[[], bool]) -> None:
+        """Do what is due, and publish a message at least, others while there is time left."""
         self._serve()
+        while self._waiting:
+            output = self._waiting.popleft()
+            self._publish[type(output)](output)
+            if not left() and len(self._waiting) < _CROWDED:
+                return
 
     def serve_if_due(self) -> None:
         """Do what is due, if there is anything."""
@@ -80,10 +96,20 @@ class LinkedPlanner(PlannerNode):
             return ''
         return 'the plant or driver of this process is not active: activate it'
 
-    def _publish_command(self, command: Send) -> None:
-        if self.plant is not None:
-            self.plant.command(command)
-        super()._publish_command(command)
+    def cleanup(self) -> None:
+        """Publish what waits, and forget the plans."""
+        self.serve(lambda: True)
+        super().cleanup()
+
+    def _take(self, outputs: Iterable[Output]) -> None:
+        for output in outputs:
+            if isinstance(output, Send) and self.plant is not None:
+                self.plant.command(output)
+            self._waiting.append(output)
+        if self.plant is not None and self.plant.leading_time is not None:
+            # Simulated time may run far until the cycle ends.
+            super()._take(self._waiting)
+            self._waiting.clear()
 
 
 class Linked(DeviceNode):
@@ -94,6 +120,8 @@ class Linked(DeviceNode):
         self._planner = planner
         self.companion = planner.get_name()
         self.cycles = Cycles(round(TICK_SECONDS * 1e9))
+        # Whether what has come of the device is published after the cycle.
+        self._silent = False
         super().__init__()  # type: ignore[call-arg]  # that of the node it is linked to
         planner.plant = self
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -109,11 +137,22 @@ class Linked(DeviceNode):
                 joint.command(command.stamp, command.flux_density)
 
     def _cycle(self) -> None:
-        """Let time run, and serve the planner."""
+        """Let time run and send what is due; then publish, hear others and serve the planner."""
         with self.cycles:
+            self._silent = self.leading_time is None
             if self._joints:
-                self.on_tick()
-            self._planner.serve()
+                self._go_on()
+            self._planner.send()
+            self._silent = False
+        if self._joints:
+            self._hear()
+            self._publish_news()
+        self._planner.serve(lambda: self.cycles.left > _ENOUGH)
+        self.cycles.note_rest()
+
+    def _publish_news(self) -> None:
+        if not self._silent:
+            super()._publish_news()
 
     def _publish_change(self, change: Change) -> None:
         self._planner.take_change(self._joints[change.joint].name, change)

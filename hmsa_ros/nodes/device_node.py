@@ -31,10 +31,10 @@ TICK_SECONDS = 0.001
 
 class DeviceNode(ManagedNode):
     """
-    Publishes what comes of a device, in ``on_tick``, which a subclass has.
+    Publishes what comes of a device in ``on_tick``, as ``_go_on`` of a subclass has it.
 
     A planner in the same process may give its commands directly; ``companion`` is its name then,
-    and whoever links the two calls ``on_tick``.
+    and whoever links the two does what ``on_tick`` does.
     """
 
     companion = ''
@@ -42,9 +42,18 @@ class DeviceNode(ManagedNode):
     _device: Any
     _joints: Sequence[DeviceJoint] = ()
 
-    @abstractmethod
     def on_tick(self) -> None:
-        """Do what is due."""
+        """Take in the commands that have come, and do what is due."""
+        self._hear()
+        self._go_on()
+
+    def _hear(self) -> None:
+        for joint in self._joints:
+            joint.commands.poll()
+
+    @abstractmethod
+    def _go_on(self) -> None:
+        """Let the device go on, and publish what has come of it."""
 
     @property
     def leading_time(self) -> int | None:

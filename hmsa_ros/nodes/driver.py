@@ -103,10 +103,7 @@ class DriverNode(DeviceNode):
             self._device.close()
         super().cleanup()
 
-    def on_tick(self) -> None:
-        """Pass on what has come in, and publish what has come of the hardware."""
-        for joint in self._joints:
-            joint.commands.poll()
+    def _go_on(self) -> None:
         self._publish_news()
         if self._device.failure is not None:
             self.failure, self.finished = self._device.failure, True

@@ -1,6 +1,6 @@
 """Planner node: setpoints in, the shaped stream of stamped flux density commands out."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from itertools import zip_longest
 import math
@@ -35,6 +35,7 @@ from hmsa_ros.runtime.planner import PlannerRuntime
 from hmsa_ros.runtime.records import (
     EstimateChanged,
     Note,
+    Output,
     PlanChanged,
     Send,
     Severity,
@@ -215,8 +216,7 @@ class PlannerNode(ManagedNode):
         if not self._channels:
             # Cleaned up, and this was on its way.
             return
-        for output in self._runtime.tick(self._now()):
-            self._publish[type(output)](output)
+        self._take(self._runtime.tick(self._now()))
         if not self.linked:
             self._listen()
             self._pace()
@@ -248,6 +248,11 @@ class PlannerNode(ManagedNode):
             self._samples = None
 
     # -- out -----------------------------------------------------------------------------------
+
+    def _take(self, outputs: Iterable[Output]) -> None:
+        """Publish what the runtime has to say."""
+        for output in outputs:
+            self._publish[type(output)](output)
 
     def _publish_command(self, command: Send) -> None:
         self._channels[command.joint].send(command, self._settings['frame_id'])

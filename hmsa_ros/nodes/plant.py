@@ -164,10 +164,8 @@ class PlantNode(DeviceNode):
         """Simulated time in ns, if this plant is the authority on it."""
         return self._device.time if self._joints and self._authority else None
 
-    def on_tick(self) -> None:
+    def _go_on(self) -> None:
         """Let time run as far as it has come."""
-        for joint in self._joints:
-            joint.commands.poll()
         if self._authority:
             self._lead()
         else:
@@ -248,8 +246,7 @@ class PlantNode(DeviceNode):
         elif not self.active:
             response.message = f'the plant is {self.state}: expected it active'
         else:
-            for joint in self._joints:
-                joint.commands.poll()
+            self._hear()
             for _ in range(self._values['step_count']):
                 before = self._device.time
                 while self._device.time == before:

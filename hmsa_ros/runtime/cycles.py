@@ -1,8 +1,9 @@
-"""How a loop keeps time: its own work a cycle, and cycles that begin late."""
+"""How a loop keeps time: its own work a cycle, what follows it, and cycles that begin late."""
 
 from time import monotonic_ns, thread_time_ns
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hmsa_ros.runtime.records import Severity
 from hmsa_ros.runtime.slices import Clock
@@ -38,7 +39,8 @@ class Cycles:
         self.count = self.late = self.largest = 0
         self._period, self._steady, self._cpu = period, steady, cpu
         self._work = np.zeros(_REMEMBERED, dtype=np.int64)
-        self._due = self._begun = 0
+        self._rest = np.zeros(_REMEMBERED, dtype=np.int64)
+        self._due = self._begun = self._ended = 0
         self._reported = 0, 0
 
     def __enter__(self) -> None:
@@ -55,14 +57,24 @@ class Cycles:
 
     def __exit__(self, *_: object) -> None:
         """End it."""
-        self._work[self.count % _REMEMBERED] = self._cpu() - self._begun
+        self._ended = self._cpu()
+        self._work[self.count % _REMEMBERED] = self._ended - self._begun
         self.count += 1
 
-    def work(self, share: float) -> float:
-        """Return the work in us that a share of the last cycles do not exceed."""
-        if not self.count:
-            return 0.0
-        return float(np.quantile(self._work[:self.count], share)) / 1e3
+    @property
+    def left(self) -> int:
+        """Time in ns until the next cycle is due; below 0 if it is late."""
+        return self._due - self._steady()
+
+    def note_rest(self) -> None:
+        """Note that what follows the cycle that ended last has been done."""
+        self._rest[(self.count - 1) % _REMEMBERED] = self._cpu() - self._ended
+
+    def _figures(self, name: str, spent: NDArray[np.int64]) -> dict[str, object]:
+        """Return what half, 99 of 100 and all of the last cycles did not exceed, in us."""
+        seen = spent[:max(self.count, 1)]
+        return {f'{name}_{key}_us': f'{float(np.quantile(seen, x)) / 1e3:.1f}'
+                for key, x in (('p50', 0.5), ('p99', 0.99), ('largest', 1.0))}
 
     def report(self) -> tuple[Severity, str, dict[str, object]]:
         """Return how the loop fares: severity, a sentence and counters; since the last time."""
@@ -72,5 +84,4 @@ class Cycles:
         return Severity.WARN if late else Severity.OK, message, {
             'cycles': self.count, 'late': self.late,
             'largest_lateness_ms': f'{self.largest / 1e6:.3f}',
-            **{f'work_p{round(100 * x)}_us': f'{self.work(x):.1f}' for x in (0.5, 0.99)},
-            'work_largest_us': f'{self.work(1.0):.1f}'}
+            **self._figures('work', self._work), **self._figures('rest', self._rest)}

@@ -242,6 +242,11 @@ class PlannerRuntime:
             times.append(0)
         return min((x for x in times if x is not None), default=None)
 
+    def send(self, now: int) -> list[Output]:
+        """Return the commands that are due at a time in ns: of `tick`, what cannot wait."""
+        self._send(now)
+        return self._taken()
+
     def tick(self, now: int) -> list[Output]:
         """
         Do what is due, for a few milliseconds at the most.
@@ -258,15 +263,7 @@ class PlannerRuntime:
 
         """
         self._engage()
-        if self._takeover.engaged and self.active:
-            if self.settings.replan_late:
-                self._bulletin.outputs += self.following.drop_missed(
-                    now, self.settings.lateness_tolerance)
-            if self.following.astray:
-                # Before more of a plan is sent that does not hold.
-                self._work_on()
-            self._sending.send(now)
-            self._sending.beat(now, self.settings)
+        if self._send(now):
             self.feedback.update(now)
         self._work_on()
         if self._bulletin.preview_again is not None and now >= self._bulletin.preview_again:
@@ -276,6 +273,23 @@ class PlannerRuntime:
                             or self._bulletin.next_change is not None):
             self._bulletin.look_for_listeners()
             self._judge(now)
+        return self._taken()
+
+    def _send(self, now: int) -> bool:
+        """Send what is due, if commands are sent at all."""
+        if not (self._takeover.engaged and self.active):
+            return False
+        if self.settings.replan_late:
+            self._bulletin.outputs += self.following.drop_missed(
+                now, self.settings.lateness_tolerance)
+        if self.following.astray:
+            # Before more of a plan is sent that does not hold.
+            self._work_on()
+        self._sending.send(now)
+        self._sending.beat(now, self.settings)
+        return True
+
+    def _taken(self) -> list[Output]:
         outputs = self._bulletin.outputs.copy()
         self._bulletin.outputs.clear()
         return outputs
