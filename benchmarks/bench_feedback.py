@@ -22,8 +22,10 @@ from benchmarks.reference import Actuator, two_step
 from benchmarks.sheet import Sheet
 from hmsa_ros.contract.actuator import parameters_of
 from hmsa_ros.nodes import interface
-from hmsa_ros.studies.feedback import Scenario, SCENARIOS, TARGETS
+from hmsa_ros.studies.feedback import Scenario, SCENARIOS
 
+#: Stretches of a first move from 1, and of the next one.
+TARGETS = (1.4, 1.1)
 #: Errors of G that make a row together, by their size.
 SIZES = ((0.1, (-0.1, 0.1)), (0.2, (-0.2, 0.2)))
 _SEEDS, _BIAS, _LIMIT = 3, 1e-3, 0.25
