@@ -112,6 +112,10 @@ def test_time_is_simulated_if_the_plant_is():
     assert {name: x.parameters['use_sim_time'] for name, x in driver.items()} == {
         'recorder': False, 'planner': False}
     # 20,000 samples a second are for slow motion.
+    real = demo(hardware='my_lab:Coil')
+    assert set(real) == {'planner', 'driver', 'recorder'}
+    assert real['driver'].parameters == {'hardware': 'my_lab:Coil'}
+    assert not real['planner'].parameters['use_sim_time']
     wall = demo(use_sim_time='false')['plant']
     assert not wall.parameters['publish_clock']
     assert not wall.params_file

@@ -109,7 +109,8 @@ def _bag_name(prefix: str) -> str:
 
 
 def _start_demo(values: Mapping[str, str], share: Path) -> Started:
-    plant = values['plant'] == 'true'
+    hardware = values['hardware']
+    plant = values['plant'] == 'true' and not hardware
     simulated = plant if values['use_sim_time'] == 'auto' else values['use_sim_time'] == 'true'
     # On the wall clock the nodes' defaults are right; the file is for slow motion.
     file = values['params_file'] or (
@@ -118,6 +119,8 @@ def _start_demo(values: Mapping[str, str], share: Path) -> Started:
         'use_sim_time': simulated, 'storage.uri': values['bag'] or _bag_name('hmsa')}}
     if plant:
         parameters['plant'] = {'use_sim_time': False, 'publish_clock': simulated}
+    if hardware:
+        parameters['driver'] = {'hardware': hardware}
     parameters['planner'] = {'use_sim_time': simulated}
     return Started(_nodes(values, file, parameters), _rviz(values, share, simulated))
 
@@ -148,9 +151,12 @@ def _start_replay(values: Mapping[str, str], share: Path) -> Started:
         _nodes(values, values['params_file'], parameters), _rviz(values, share, True), 'player')
 
 
-#: Planner, simulated plant and recorder.
+#: Planner, simulated plant or driver, and recorder.
 DEMO = LaunchFile((
-    _flag('plant', 'Whether to simulate the plant; false for a driver of real hardware', 'true'),
+    _flag('plant', 'Whether to simulate the plant; false for a driver of your own', 'true'),
+    Argument(
+        'hardware', 'Real hardware in the place of the plant, as MODULE:NAME (parameter hardware '
+        'of the driver)'),
     Argument(
         'use_sim_time', 'Whether to use simulated time from /clock, which the plant publishes; '
         'auto: if the plant is simulated', 'auto', ('auto', *_YES_OR_NO)),
