@@ -19,7 +19,7 @@ import math
 import numpy as np
 
 from hmsa_ros.core import kernels, law, response_kernel
-from hmsa_ros.core.delivery import ramps
+from hmsa_ros.core.delivery import late, ramps
 from hmsa_ros.core.mismatch import Ellipsoid, Errors
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.moves import Level, Move, State
@@ -28,13 +28,14 @@ from hmsa_ros.core.shapers.request import as_errors, LARGEST_ERROR, Request
 from hmsa_ros.core.shapers.robust import robust
 from hmsa_ros.core.status import Code
 
-#: Least number of levels besides the one that holds the target, and how many a half period.
-LEVELS, OF_EACH = 6, 2
+#: Least number of levels besides the one that holds the target, of steps and of ramps, and how
+#: many a half period.
+LEVELS, RAMPED, OF_EACH = 8, 6, 2
 _RTOL = 1e-9
 # Of the range of the levels: the change by which the vibration is differentiated, and the widest
 # change of a first pass.
 _CHANGE, _STRIDE = 1e-5, 0.3
-_PASSES = 6
+_PASSES = 12
 # Of the range of the levels.
 _MARGIN = 1e-3
 # Vibration that is rounding.
@@ -44,10 +45,11 @@ _GAIN = 0.003
 _POWERS = (4, 32, 128)
 _NEWTON_PASSES = 8
 _LEAST_SHARE = 1e-3
-# Of the last level's lag: what is left of it then is below what is asked of the vibration.
-_LAGS = 7.0
+# Lengths of the push that settles a lagging field, in time constants, and how well it does.
+_PUSHES = (0.7, 1.0, 1.5, 2.2, 3.2, 4.6, 7.0)
+_SETTLED, _SECANTS = 1e-12, 8
 # Shorter than this share of the chain there is no use in it.
-_SHORTEST = 0.6
+_SHORTEST = 0.4
 # As a share of the move: from nearer to rest it is planned as from rest, and kept.
 _AT_REST = 1e-5
 _KEPT = 256
@@ -158,13 +160,13 @@ def left(
     """Return the vibration that is left of a command, (n, 2); infinite if it gets lost."""
     delivery = request.delivery
     rows, _ = ramps(levels, request.load, arrival, delivery.slew)
-    switches, loads, slopes = (np.array(x) for x in zip(*rows, strict=True))
+    faster, stiffer = np.array([(x.faster, x.stiffer) for x in cases]).T[:, :, np.newaxis]
+    switches, loads, slopes = np.array(rows).T
     found = np.empty((len(cases), 2))
     out = np.empty((3, 1))
-    for row, x in zip(found, cases, strict=True):
-        pieces = (
-            switches * x.faster, loads / x.stiffer, slopes / (x.stiffer * x.faster))
-        end = np.array([arrival * x.faster])
+    for row, x, end, *pieces in zip(
+            found, cases, arrival * faster, switches * faster, loads / stiffer,
+            slopes / (stiffer * faster), strict=True):
         if delivery.lag > 0.0:
             status = response_kernel.trajectory_late(
                 x.stretch, x.rate, request.field / x.stiffer, *pieces, delivery.lag * x.faster,
@@ -182,93 +184,179 @@ def left(
 
 def largest(vibration: Array) -> float:
     """Return the length of the longest vector of (n, 2), as peak to peak in shares of a move."""
-    return float(np.sqrt(np.max(np.sum(vibration * vibration, axis=1))))
+    return math.sqrt((vibration * vibration).sum(axis=1).max())
 
 
 def _designed(request: Request) -> Move:
     chain = robust(request)
     if chain.code not in (Code.ROBUST, Code.TWO_STEP):
         return chain
-    holding = chain.levels[-1].load
-    cases = _cases(request, holding)
-    end = chain.duration - request.delivery.ramp(holding - request.field) \
-        - _LAGS * request.delivery.lag
-    times = _times(request, end)
-    found = None
+    cases = _cases(request, chain.levels[-1].load)
     before = largest(left(request, cases, chain.levels, chain.duration))
-    if end >= _SHORTEST * chain.duration and len(times) > 2:
-        found = _search(request, cases, chain, times)
-    if found is None or not found[1] < before - _NOTHING:
+    found: tuple[tuple[Level, ...], float] = ((), math.inf)
+    for length in _PUSHES if request.delivery.lag > 0.0 else (0.0,):
+        frame = _frame(request, chain, length)
+        if frame is not None:
+            found = _search(request, cases, chain, frame)
+        if found[0]:
+            break
+    if not found[1] < before - _NOTHING:
         return replace(chain, reason=chain.reason or (
             f'no levels leave less than the chain of order {request.order}, which is used'))
     return Move(Code.MINIMAX, found[0], chain.duration)
 
 
-def _times(request: Request, end: float) -> list[float]:
-    """Return the times of levels up to the last one, on the grid if there is one."""
-    period = request.delivery.period
-    count = max(LEVELS, OF_EACH * request.order)
-    times = [*(end * i / count for i in range(count)), end]
-    if period > 0.0:
-        return [x * period for x in dict.fromkeys(math.floor(x / period + 1e-9) for x in times)]
-    return [request.delivery.rounded(x) for x in times]
+@dataclass(frozen=True)
+class _Frame:
+    """
+    Times of levels and of their end, what they may be, and the last levels.
+
+    Where a field lags, a push between the levels and the last one settles it: its time is the
+    last one of ``times``, and ``last`` that of the level that holds the target.
+    """
+
+    times: list[float]
+    last: float
+    low: Array
+    high: Array
+
+
+def _frame(request: Request, chain: Move, length: float) -> _Frame | None:
+    """Return the frame of a command as long as the chain, with a push of so many lags, or None."""
+    delivery, limits, holding = request.delivery, request.limits, chain.levels[-1].load
+    bounds = [request.field, *(x.load for x in chain.levels)]
+    low, high = max(min(bounds), limits.minimum), min(max(bounds), limits.maximum)
+    count = max(LEVELS if math.isinf(delivery.slew) else RAMPED, OF_EACH * request.order)
+    last = chain.duration - min(delivery.ramp(high - low), chain.duration / (count + 1))
+    grid = delivery.period
+    if grid > 0.0:
+        last = math.floor(last / grid + 1e-9) * grid
+    end = last
+    if delivery.lag > 0.0:
+        end -= max(length * delivery.lag + delivery.ramp(0.5 * (high - low)), grid)
+        if grid > 0.0:
+            end = math.floor(end / grid + 1e-9) * grid
+        # However far the field still is, the push that settles it keeps the limits.
+        share = 1.0 / math.expm1(length)
+        if not (limits.minimum <= holding - share * (high - holding)
+                and holding + share * (holding - low) <= limits.maximum):
+            return None
+    times = [end * i / count for i in range(count + 1)]
+    if grid > 0.0:
+        times = [x * grid for x in dict.fromkeys(math.floor(x / grid + 1e-9) for x in times)]
+    else:
+        times, last = [delivery.rounded(x) for x in times], delivery.rounded(last)
+    if end < _SHORTEST * chain.duration or len(times) < 3:
+        return None
+    # A level in between must not look like one that holds start or target.
+    margin = _MARGIN * (high - low)
+    least, most = np.full(len(times) - 1, low + margin), np.full(len(times) - 1, high - margin)
+    if delivery.slew < math.inf:
+        # So that the last ramp ends in time.
+        reach = delivery.slew * (chain.duration - np.array(times[1:]))
+        least, most = np.maximum(least, holding - reach), np.minimum(most, holding + reach)
+    return _Frame(times, last, least, most)
 
 
 def _search(
         request: Request, cases: Sequence[_Case], chain: Move,
-        times: Sequence[float]) -> tuple[tuple[Level, ...], float]:
+        frame: _Frame) -> tuple[tuple[Level, ...], float]:
     """Return levels, and the largest vibration that they leave in any case."""
-    holding = chain.levels[-1].load
-    bounds = [request.field, *(x.load for x in chain.levels)]
-    low = max(min(bounds), request.limits.minimum)
-    high = min(max(bounds), request.limits.maximum)
-    # A level in between must not look like one that holds start or target.
-    low, high = low + _MARGIN * (high - low), high - _MARGIN * (high - low)
-
-    def command(loads: Array) -> tuple[Level, ...]:
-        return tuple(
-            Level(t, x) for t, x in zip(times, [*loads.tolist(), holding], strict=True))
+    low, high = frame.low, frame.high
+    span = float(np.max(high - low))
 
     def vibration(loads: Array) -> Array:
-        return left(request, cases, command(loads), chain.duration)
+        levels = _command(request, chain, frame, loads)
+        return left(request, cases, levels, chain.duration) if levels else np.full(
+            (len(cases), 2), math.inf)
 
-    loads = np.clip(_means(chain, times), low, high)
-    now = vibration(loads)
-    stride = _STRIDE * (high - low)
-    change = _CHANGE * (high - low)
+    starts = [_reached(request, frame, np.clip(x, low, high)) for x in _starts(
+        request, chain, frame.times)]
+    now, loads = min(((vibration(x), x) for x in starts), key=lambda x: largest(x[0]))
+    stride, change = _STRIDE * span, _CHANGE * span
+    room = request.delivery.slew * np.diff(frame.times)
     slopes = np.empty((*now.shape, len(loads)))
     renew = True
     for _ in range(_PASSES):
         if not _NOTHING < largest(now) < math.inf:
             break
         if renew:
+            # A level that a ramp just reaches has an effect to one side alone.
+            way = loads - np.array([request.load, *loads[:-1]])
             for i in range(len(loads)):
-                nudged = loads.copy()
-                nudged[i] += change
-                slopes[:, :, i] = (vibration(nudged) - now) / change
+                nudged, by = loads.copy(), math.copysign(change, -way[i])
+                nudged[i] += by
+                slopes[:, :, i] = (vibration(nudged) - now) / by
             if not np.all(np.isfinite(slopes)):
                 break
+            full = np.abs(way) >= (1.0 - 1e-9) * room
         step = least_largest(
-            now, slopes, np.maximum(low - loads, -stride), np.minimum(high - loads, stride))
-        new = vibration(loads + step)
-        gain = 1.0 - largest(new) / largest(now)
-        renew = gain > 0.0
+            now, slopes, np.maximum(np.where(full & (way < 0.0), 0.0, low - loads), -stride),
+            np.minimum(np.where(full & (way > 0.0), 0.0, high - loads), stride))
+        if largest(now + slopes @ step) > (1.0 - _GAIN) * largest(now):
+            break
+        there = _reached(request, frame, loads + step)
+        new = vibration(there)
+        renew = largest(new) < largest(now)
         if renew:
-            loads, now = loads + step, new
-            if gain < _GAIN:
-                break
+            loads, now = there, new
         stride *= 1.5 if renew else 0.3
-    return command(loads), largest(now)
+    return _command(request, chain, frame, loads), largest(now)
 
 
-def _means(chain: Move, times: Sequence[float]) -> Array:
-    """Return the mean load of a chain between times."""
+def _reached(request: Request, frame: _Frame, loads: Array) -> Array:
+    """Return the loads that ramps reach, which make the same motion."""
+    slew = request.delivery.slew
+    if math.isinf(slew):
+        return loads
+    found, load = [], request.load
+    for level, span in zip(loads.tolist(), np.diff(frame.times).tolist(), strict=True):
+        load = min(max(level, load - slew * span), load + slew * span)
+        found.append(load)
+    return np.array(found)
+
+
+def _command(request: Request, chain: Move, frame: _Frame, loads: Array) -> tuple[Level, ...]:
+    """Return levels, the push that settles a lagging field, if one does, and the last level."""
+    last = Level(frame.last, chain.levels[-1].load)
+    levels = [Level(*x) for x in zip(frame.times, loads.tolist(), strict=False)]
+    delivery = request.delivery
+    if delivery.lag == 0.0:
+        return (*levels, last)
+
+    def off(push: float) -> float:
+        rows, _ = ramps(
+            [*levels, Level(frame.times[-1], push), last], request.load, chain.duration,
+            delivery.slew)
+        return late(rows, chain.duration, request.field, delivery.lag) - last.load
+
+    push, now = last.load, off(last.load)
+    slope = off(push + 1.0) - now
+    for _ in range(_SECANTS):
+        if not abs(now) > _SETTLED:
+            break
+        if slope == 0.0:
+            return ()
+        before, push = push, push - now / slope
+        then, now = now, off(push)
+        slope = (now - then) / (push - before)
+    kept = request.limits.minimum <= push <= request.limits.maximum and delivery.ramp(
+        push - last.load) <= chain.duration - last.time
+    return (*levels, Level(frame.times[-1], push), last) if kept and abs(now) < _NOTHING else ()
+
+
+def _starts(request: Request, chain: Move, times: Sequence[float]) -> list[Array]:
+    """Return the mean levels of a chain between times, and what its ramps reach at their ends."""
     ends = [*(x.time for x in chain.levels[1:]), math.inf]
-    means: Array = np.array([
+    found: list[Array] = [np.array([
         sum(level.load * max(0.0, min(end, until) - max(level.time, begin))
             for level, end in zip(chain.levels, ends, strict=True)) / (until - begin)
-        for begin, until in zip(times, times[1:], strict=False)])
-    return means
+        for begin, until in zip(times, times[1:], strict=False)])]
+    if request.delivery.slew < math.inf:
+        rows, _ = ramps(chain.levels, request.load, chain.duration, request.delivery.slew)
+        switches, loads, _ = zip(*rows, strict=True)
+        found.append(np.interp(times[1:], switches, loads))
+    return found
 
 
 def least_largest(now: Array, slopes: Array, low: Array, high: Array) -> Array:
@@ -291,23 +379,23 @@ def least_largest(now: Array, slopes: Array, low: Array, high: Array) -> Array:
 
     """
     x: Array = np.zeros(len(low))
-    best, least = x, largest(now)
+    best, least, vectors = x, largest(now), now
+    rows = slopes.reshape(-1, len(x))
     for power in _POWERS:
         for _ in range(_NEWTON_PASSES):
-            vectors = now + slopes @ x
-            length = np.sqrt(np.sum(vectors * vectors, axis=1)) + 1e-300
+            length = np.sqrt((vectors * vectors).sum(axis=1)) + 1e-300
             weight = (length / length.max()) ** (power - 2)
-            along = np.einsum('nci,nc->ni', slopes, vectors / length[:, np.newaxis])
-            gradient = (weight * length) @ along
-            curvature = np.einsum('n,nci,ncj->ij', weight, slopes, slopes) + (
+            along = (slopes * (vectors / length[:, np.newaxis])[:, :, np.newaxis]).sum(axis=1)
+            curvature = (rows.T * weight.repeat(2)) @ rows + (
                 power - 2) * (along.T * weight) @ along
-            curvature += (1e-10 * np.trace(curvature) + 1e-30) * np.eye(len(x))
-            step = _newton(gradient, curvature, low - x, high - x)
-            taken = _line(now, slopes, x, step, power, length)
-            if taken is None:
+            curvature.flat[::len(x) + 1] += 1e-10 * curvature.trace() + 1e-30
+            step = _newton((weight * length) @ along, curvature, low - x, high - x)
+            share = _share(vectors, (rows @ step).reshape(now.shape), power, length)
+            if share == 0.0:
                 break
-            x = taken
-        worst = largest(now + slopes @ x)
+            x = x + share * step
+            vectors = now + slopes @ x
+        worst = largest(vectors)
         if worst < least:
             best, least = x, worst
     return best
@@ -318,8 +406,9 @@ def _newton(gradient: Array, curvature: Array, low: Array, high: Array) -> Array
     free = ~((low >= 0.0) & (gradient > 0.0) | (high <= 0.0) & (gradient < 0.0))
     step = np.zeros(len(gradient))
     while free.any():
-        rest = gradient + curvature[:, ~free] @ step[~free]
-        step[free] = -np.linalg.solve(curvature[np.ix_(free, free)], rest[free])
+        step[free] = 0.0
+        rest = gradient + curvature @ step
+        step[free] = -np.linalg.solve(curvature[free][:, free], rest[free])
         beyond = free & ((step < low) | (step > high))
         if not beyond.any():
             break
@@ -328,18 +417,15 @@ def _newton(gradient: Array, curvature: Array, low: Array, high: Array) -> Array
     return step
 
 
-def _line(
-        now: Array, slopes: Array, x: Array, step: Array, power: int,
-        length: Array) -> Array | None:
-    """Return a place on the way of a step where the norm is less."""
+def _share(vectors: Array, change: Array, power: int, length: Array) -> float:
+    """Return the share of a step with which the norm is less; 0 for none."""
     top = length.max()
-    before = np.sum((length / top) ** power)
+    before = ((length / top) ** power).sum()
     share = 1.0
     while share > _LEAST_SHARE:
-        new: Array = x + share * step
-        vectors = now + slopes @ new
-        if np.sum((np.sum(vectors * vectors, axis=1) / top ** 2) ** (power // 2)) < (
+        new = vectors + share * change
+        if (((new * new).sum(axis=1) / top ** 2) ** (power // 2)).sum() < (
                 1.0 - 1e-4 * share) * before:
-            return new
+            return share
         share *= 0.5
-    return None
+    return 0.0
