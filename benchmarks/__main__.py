@@ -12,7 +12,8 @@ Those of recorder, player and crash take some seven minutes together. faults inj
 running nodes and fails if one is not answered as it should be; soak runs for hours; feedback
 moves actuators that are not as planned with, in real time, for some three minutes;
 identification fits thousands of simulated runs; studies kills the workers of a study; rates
-measures how many plans a second studies make, for some seven minutes.
+measures how many plans a second studies make, for some seven minutes; lockstep compares the kernel
+of batches with C.
 A page is a Markdown file with marks ``<!-- begin NAME -->`` and ``<!-- end NAME -->``, between
 which a table is put.
 """
@@ -36,7 +37,7 @@ _WIDTH = 120
 NAMES = ('planner', 'plant', 'preemption', 'joints', 'controller', 'recorder', 'player',
          'crash')
 #: Not run unless asked for: they take long and need the machine for themselves.
-LONG = ('faults', 'soak', 'feedback', 'identification', 'studies', 'rates')
+LONG = ('faults', 'soak', 'feedback', 'identification', 'studies', 'rates', 'lockstep')
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -133,6 +134,10 @@ def main(arguments: list[str] | None = None) -> int:
         from benchmarks import bench_studies
 
         add(bench_studies.rates(quick=options.quick))
+    if 'lockstep' in names:
+        from benchmarks import bench_studies
+
+        add(bench_studies.lockstep(quick=options.quick))
     for name in ('joints', 'controller', 'recorder', 'player', 'crash', 'feedback'):
         if name in names and _has_ros(name):
             sheet = importlib.import_module(f'benchmarks.bench_{name}').compare(

@@ -3,11 +3,13 @@ What studies lose when workers are killed, and what a cluster leaves of the kern
 
     python -m benchmarks studies [--quick]
     python -m benchmarks rates [--quick]
+    python -m benchmarks lockstep [--quick]
 
 A study runs on two processes. Twenty times, once some chunks are done, one of its workers is
 killed with SIGKILL; the table is compared with that of a run that nobody disturbs. The rates are
-those of the batch kernel alone on one core, of the same method in C with several moves in
-lock-step, and of studies on two processes and on a Dask cluster of two.
+those of the batch kernel alone on one core, and of studies on two processes and on a Dask cluster
+of two. Lock-step compares that kernel with itself, one move after the other, and with the same
+method in C, on one core.
 """
 
 from contextlib import suppress
@@ -19,15 +21,17 @@ import signal
 import subprocess
 import tempfile
 import threading
-from time import perf_counter, sleep
+from time import perf_counter, process_time, sleep
 
 import numba
 import numpy as np
 
 from benchmarks import contenders
 from benchmarks.sheet import Sheet
-from hmsa_ros.core.two_step import plan_two_step_batch
-from hmsa_ros.studies.chunks import Chunks
+from hmsa_ros.core.law import pack
+from hmsa_ros.core.lockstep_kernel import two_step_batch
+from hmsa_ros.core.two_step import HOLD_TOLERANCE, plan_two_step_batch, RTOL
+from hmsa_ros.studies.chunks import Chunks, LEAST_ROWS
 from hmsa_ros.studies.engine import compute
 from hmsa_ros.studies.executors import dask, local_processes
 from hmsa_ros.studies.sweep import parse_grid, Sweep
@@ -83,7 +87,7 @@ def compare(*, quick):
     """Kill workers at random; passed if nothing of the table is lost."""
     kills = 2 if quick else 20
     # More chunks than the kills can wait for.
-    sweep = grid(20_000 * (kills + 1) * _BETWEEN)
+    sweep = grid(LEAST_ROWS * (kills + 1) * _BETWEEN)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         tables = []
@@ -111,7 +115,7 @@ def compare(*, quick):
 
 
 def rates(*, quick):
-    """Compare plans a second: in lock-step in C, the kernel, two processes, a Dask cluster."""
+    """Compare plans a second: the kernel, two processes, a Dask cluster."""
     numba.set_num_threads(1)
     size = 2_000 if quick else 200_000
     zeta, j_lim = (np.resize(parse_grid(x, x), size) for x in ('0:1.5:1000', '4:9:997'))
@@ -122,11 +126,9 @@ def rates(*, quick):
         plan_two_step_batch(1.0, 1.1, zeta=zeta, j_lim=j_lim)
         return size / (perf_counter() - begin)
 
-    found = {'kernel, one core': kernel()}
+    found = {'kernel, one core': max(kernel() for _ in range(3))}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        for lanes in (1, 4, 8):
-            found[f'C, {lanes} moves in lock-step'] = _in_c(folder, lanes, zeta, j_lim)
         found['kernel, one core'] = max(kernel(), found['kernel, one core'])
         # As many as take some five minutes, at most 1e8.
         points = 200_000 if quick else min(
@@ -137,7 +139,7 @@ def rates(*, quick):
             begin, before = perf_counter(), _spent()
             with start() as (executor, _):
                 # Each worker loads the kernels.
-                compute(grid(160_000), folder / f'{words} first', executor)
+                compute(grid(8 * LEAST_ROWS), folder / f'{words} first', executor)
                 begin, before = perf_counter(), _spent()
                 compute(grid(rows), folder / words, executor)
                 taken = perf_counter() - begin
@@ -160,14 +162,66 @@ def _spent():
     return times.user + times.system
 
 
-def _in_c(folder, lanes, zeta, j_lim):
-    """Return the plans a second of lanes.c on one core."""
+def lockstep(*, quick):
+    """Compare moves in lock-step with one after the other, here and in C, by processor time."""
+    numba.set_num_threads(1)
+    size = 1000
+    zeta, j_lim = (np.resize(parse_grid(x, x), size) for x in ('0:1.5:1000', '4:9:997'))
+    moves = ''.join(
+        f'1 1.1 {x!r} {y!r} 2\n' for x, y in zip(zeta.tolist(), j_lim.tolist(), strict=True))
+    repeats = 1 if quick else 20
+    with tempfile.TemporaryDirectory() as name:
+        entries = {
+            'package, one move after the other': _kernel(zeta, j_lim, repeats, together=False),
+            'package, 8 moves in lock-step': _kernel(zeta, j_lim, repeats, together=True),
+            **{f'C, {words}': _in_c(Path(name), lanes, moves, repeats) for lanes, words in (
+                (1, 'one move after the other'), (4, '4 moves in lock-step'),
+                (8, '8 moves in lock-step'))}}
+        times = dict.fromkeys(entries, float('inf'))
+        loads = {}
+        for _ in range(1 if quick else 10):
+            for words, run in entries.items():
+                spent, loads[words] = run()
+                times[words] = min(times[words], spent)
+    first = next(iter(times))
+    apart = {x: float(np.max(np.abs(y / loads[first] - 1.0))) for x, y in loads.items()}
+    return Sheet(
+        'lockstep', f'Plans from 1 to 1.1 on one core; load average {os.getloadavg()[0]:.1f}',
+        ['by', 'time per plan', 'plans/s', 'ratio', 'beta_p differs by'],
+        [[x, f'{1e6 * y:.2f} us', f'{1.0 / y:,.0f}', f'{y / times[first]:.3f}',
+          f'{apart[x]:.0e}' if apart[x] else '-'] for x, y in times.items()],
+        {'times': times, 'apart': apart})
+
+
+def _kernel(zeta, j_lim, repeats, *, together):
+    """Return what times the kernel of batches: seconds of a core for a plan, and beta_p."""
+    rows = np.ones(zeta.size), np.zeros(zeta.size), np.full(zeta.size, 1.1)
+    material = pack(zeta, j_lim, np.full(zeta.size, 2.0))
+    results = np.empty((3, zeta.size))
+
+    def run():
+        begin = process_time()
+        for _ in range(repeats):
+            two_step_batch(
+                *rows, material, -np.inf, np.inf, RTOL, HOLD_TOLERANCE, zeta.size, together,
+                np.empty(zeta.size, np.int64), *results)
+        return (process_time() - begin) / repeats / zeta.size, results[0].copy()
+
+    run()
+    return run
+
+
+def _in_c(folder, lanes, moves, repeats):
+    """Return what times lanes.c in the same way."""
     program = contenders.compile_c(folder, f'lanes{lanes}', [
         f'-DLANES={lanes}', '-O3', '-march=native', '-mprefer-vector-width=512',
         '-fno-math-errno'], 'lanes.c')
-    moves = ''.join(
-        f'1 1.1 {x!r} {y!r} 2\n' for x, y in zip(zeta[:2000].tolist(), j_lim.tolist(),
-                                               strict=False))
-    done = subprocess.run(
-        [str(program), '1e-12', '20'], input=moves, capture_output=True, text=True, check=True)
-    return 1e9 / float(done.stdout.split()[-3])
+
+    def run():
+        done = subprocess.run(
+            [str(program), repr(RTOL), str(repeats)], input=moves, capture_output=True, text=True,
+            check=True)
+        *plans, times = done.stdout.splitlines()
+        return 1e-9 * float(times.split()[0]), np.array([float(x.split()[0]) for x in plans])
+
+    return run

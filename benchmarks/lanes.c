@@ -314,7 +314,7 @@ static void plan(int count, double rtol)
 static double now(void)
 {
     struct timespec t;
-    clock_gettime(CLOCK_MONOTONIC, &t);
+    clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &t);
     return 1e9 * t.tv_sec + t.tv_nsec;
 }
 

@@ -21,6 +21,8 @@ import numpy as np
 import pytest
 
 from hmsa_ros.core import kernels, two_step_kernel
+from hmsa_ros.core.law import gent_limits, pack
+from hmsa_ros.core.lockstep_kernel import two_step_batch
 from hmsa_ros.core.model import (
     critical_zeta,
     elastic_force,
@@ -29,7 +31,7 @@ from hmsa_ros.core.model import (
 )
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.status import Code
-from hmsa_ros.core.two_step import CODES, plan_two_step, plan_two_step_batch
+from hmsa_ros.core.two_step import CODES, plan_two_step, plan_two_step_batch, TwoStep
 from hmsa_ros.errors import BadInputError
 
 PAPER = NondimensionalParameters()
@@ -545,7 +547,8 @@ def assert_row_is_single(batch, rows, i):
         group(rows['zeta'][i], rows['j_lim'][i], rows['c1'][i]), rate=rows['rate'][i])
     assert CODES[int(batch.status[i])] is plan.code
     found = (batch.beta_p[i], batch.tau_p[i], batch.beta_1[i])
-    assert np.array_equal(found, (plan.beta_p, plan.tau_p, plan.beta_1), equal_nan=True)
+    assert found == pytest.approx(
+        (plan.beta_p, plan.tau_p, plan.beta_1), rel=1e-10, abs=1e-12, nan_ok=True)
 
 
 def test_a_batch_is_its_single_plans():
@@ -577,10 +580,80 @@ def test_bad_rows_carry_their_code_and_spoil_no_other():
             assert_row_is_single(batch, rows, i)
 
 
+def blocks_from_rest(count):
+    """Return moves of Gent blocks of all kinds, many of them out of the ordinary."""
+    random = np.random.default_rng(3)
+    j_lim = np.exp(random.uniform(-3.0, 5.0, count))
+    j_lim[::20] = math.inf
+    lower, upper = gent_limits(1.0 / j_lim)
+    upper = np.minimum(upper, 6.0)
+    start, target = (
+        lower + (upper - lower) * random.uniform(0.001, 0.999, count) for _ in range(2))
+    start[::2] = 1.0
+    target[::5] = start[::5] * (1.0 + 10.0 ** random.uniform(-9.0, -2.0, len(start[::5])))
+    target[3::10] = upper[3::10] - (upper[3::10] - 1.0) * 10.0 ** random.uniform(
+        -9.0, -1.0, len(upper[3::10]))
+    return (start, target, random.uniform(0.0, 4.0, count), j_lim,
+            np.exp(random.uniform(-3.0, 4.0, count)))
+
+
+def planned(rows, *, lockstep):
+    """Return the results of the kernel of batches, in lock-step or one move after the other."""
+    start, target, zeta, j_lim, c1 = rows
+    status, found = np.empty(len(start), np.int64), np.empty((3, len(start)))
+    two_step_batch(
+        start, np.zeros(len(start)), target, pack(zeta, j_lim, c1), *INFINITE, 1e-12, 1e-9, 64,
+        lockstep, status, *found)
+    return status, found
+
+
+def test_moves_in_lock_step_are_planned_as_one_after_the_other():
+    rows = blocks_from_rest(2000)
+    status, found = planned(rows, lockstep=True)
+    expected_status, expected = planned(rows, lockstep=False)
+    assert np.array_equal(status, expected_status)
+    assert len(set(status.tolist())) >= 4
+    two = status == two_step_kernel.TWO_STEP
+    assert np.array_equal(found[:, ~two], expected[:, ~two], equal_nan=True)
+    found, expected = found[:, two], expected[:, two]
+    # Rounding counts against a small move, and near critical damping against small differences
+    # of the loads.
+    rounding = 1e-15 / np.abs(rows[1] - rows[0])[two] + 1e-15 * (
+        1.0 + np.abs(expected[2])) / np.abs(expected[2] - expected[0])
+    assert np.all(np.abs(found - expected) <= (1e-11 + rounding) * (1.0 + np.abs(expected)))
+    # Most were planned in lock-step: the last bits differ.
+    assert np.mean(found[0] == expected[0]) < 0.5
+
+
+def test_the_plan_of_a_row_is_the_same_to_the_bit_in_any_batch():
+    rows = blocks_from_rest(600)
+    _, found = planned(rows, lockstep=True)
+    order = np.random.default_rng(1).permutation(600)
+    _, mixed = planned([x[order] for x in rows], lockstep=True)
+    assert mixed.tobytes() == found[:, order].tobytes()
+    for i in range(0, 600, 3):
+        alone = planned([x[i:i + 1] for x in rows], lockstep=True)[1]
+        assert alone.tobytes() == found[:, i:i + 1].tobytes()
+
+
+def test_plans_of_a_batch_end_at_rest_by_an_integration_of_its_own():
+    start, target, zeta, j_lim, _ = blocks_from_rest(400)
+    rows = np.flatnonzero((np.abs(target - start) > 0.05) & (j_lim > 0.5) & (j_lim < 50.0))[:12]
+    batch = plan_two_step_batch(start[rows], target[rows], zeta=zeta[rows], j_lim=j_lim[rows])
+    for i, row in enumerate(rows):
+        plan = TwoStep(
+            CODES[int(batch.status[i])], batch.beta_p[i], batch.tau_p[i], batch.beta_1[i], 0)
+        if plan.code is Code.TWO_STEP:
+            material = group(float(zeta[row]), float(j_lim[row]))
+            end = after_plan(start[row], 0.0, plan, material)
+            assert distance(end, target[row], material) < AT_REST * abs(target[row] - start[row])
+    assert np.mean(batch.status == two_step_kernel.TWO_STEP) > 0.4
+
+
 def test_batches_broadcast_their_arguments():
     batch = plan_two_step_batch([[1.0], [1.2]], [1.1, 1.3, 1.4], zeta=0.2)
     assert batch.status.shape == batch.beta_p.shape == (2, 3)
-    assert batch.beta_p[1, 2] == plan_two_step(1.2, 1.4, PAPER).beta_p
+    assert batch.beta_p[1, 2] == pytest.approx(plan_two_step(1.2, 1.4, PAPER).beta_p, rel=1e-11)
     assert plan_two_step_batch(1.0, 1.1).beta_p.shape == ()
     assert plan_two_step_batch(1.0, []).beta_p.shape == (0,)
     with pytest.raises(BadInputError, match='broadcast'):

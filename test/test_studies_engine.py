@@ -22,7 +22,7 @@ from hmsa_ros.studies.sweep import parse_grid, Sweep
 from hmsa_ros.studies.tables import open_writer
 
 #: Three chunks, the last one not full; some rows without a plan.
-AXES = {'zeta': '0:2:400', 'target': '1.1,1.2,3.0', 'j_lim': '4:9:40'}
+AXES = {'zeta': '0:2:400', 'target': '1.1,1.2,3.0', 'j_lim': '4:9:80'}
 WORDS = [f'--{name.replace("_", "-")}={text}' for name, text in AXES.items()]
 CHUNKS = 3
 
@@ -71,7 +71,7 @@ def test_two_workers_write_the_table_of_one_to_the_byte(run, tmp_path, expected)
     assert (tmp_path / 'a' / 'table.parquet').read_bytes() == expected[0]
     status, out, err = run('--workers=2', '--out=b.csv')
     assert (status, out) == (0, 'b.csv\n')
-    assert err.startswith('48,000 plans: 39,347 two_step, 8,400 out_of_range')
+    assert err.startswith('96,000 plans: 78,293 two_step, 17,200 out_of_range')
     assert (tmp_path / 'b.csv').read_bytes() == expected[1]
     assert sorted(x.name for x in tmp_path.iterdir()) == ['a', 'b.csv']
     assert sorted(x.name for x in (tmp_path / 'a').iterdir()) == [
@@ -166,8 +166,8 @@ def test_interrupt_leaves_whole_chunks_and_nothing_else(tmp_path):
     _, err = process.communicate()
     assert process.returncode == 128 + signal.SIGINT
     said, ended = err.splitlines()
-    assert said.startswith('2,000,000 plans in 100 chunks of 20,000: about 0.1 GB')
-    assert ended.endswith('of 100 chunks are in a: go on with --resume')
+    assert said.startswith('2,000,000 plans in 50 chunks of 40,000: about 0.1 GB')
+    assert ended.endswith('of 50 chunks are in a: go on with --resume')
     assert sorted(x.name for x in (tmp_path / 'a').iterdir()) == ['chunks', 'study.json']
     sweep = Sweep({'zeta': parse_grid('0:2:1000', 'zeta'), 'j_lim': parse_grid('1:9:2000', 'j')})
     chunks = Chunks.of(sweep, tmp_path / 'a')

@@ -27,8 +27,9 @@ import numpy as np
 # Fused multiply-add, but nothing that would treat NaN as impossible: it ends bad steps.
 _OPTIONS = {'error_model': 'numpy', 'fastmath': {'contract', 'nsz'}}
 _SOURCES = (
-    'compiling', 'dop853', 'kernels', 'law', 'laws/kernels', 'laws/record', 'response_kernel',
-    'shooting_kernel', 'tail_kernel', 'two_step_kernel', '../identification/kernels')
+    'compiling', 'dop853', 'kernels', 'law', 'laws/kernels', 'laws/record', 'lockstep_kernel',
+    'response_kernel', 'shooting_kernel', 'tail_kernel', 'two_step_kernel',
+    '../identification/kernels')
 _HERE = Path(__file__).resolve().parent
 _listeners: list[Callable[[str], object]] = []
 

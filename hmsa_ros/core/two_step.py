@@ -8,6 +8,7 @@ the load that holds the target, beta_1, takes over and nothing is left to oscill
 from dataclasses import dataclass
 import math
 
+import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -182,12 +183,17 @@ def plan_two_step_batch(
     columns = [np.array(a).ravel() for a in arrays]
     status = np.empty(columns[0].size, dtype=np.int64)
     results = [np.empty(status.size) for _ in range(3)]
+    # No single plan needs it, and it takes a moment to load.
+    from hmsa_ros.core.lockstep_kernel import two_step_batch
+
     each = _MOST_NUMBERS // (CONSTANTS + (1 if elastic is None else len(elastic.constants)))
     for begin in range(0, status.size, each):
         part = slice(begin, begin + each)
         start, rate, target, zeta, j_lim, c1 = (x[part] for x in columns)
-        kernel.two_step_batch(
+        # Enough parts for all cores, each long enough that its last moves do not matter.
+        size = min(max(target.size // (4 * numba.get_num_threads()), 64), 1024)
+        two_step_batch(
             start, rate, target, law.pack(zeta, j_lim, c1, elastic), float(load_limits[0]),
-            float(load_limits[1]), float(rtol), HOLD_TOLERANCE, status[part],
-            *(x[part] for x in results))
+            float(load_limits[1]), float(rtol), HOLD_TOLERANCE, size, True,
+            status[part], *(x[part] for x in results))
     return TwoStepBatch(status.reshape(shape), *(a.reshape(shape) for a in results))

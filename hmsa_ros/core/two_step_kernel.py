@@ -6,11 +6,7 @@ As in `hmsa_ros.core.kernels`, everything is nondimensional and nothing checks i
 
 import math
 
-from numba import prange
-import numpy as np
-
 from hmsa_ros.core.compiling import compiled
-from hmsa_ros.core.dop853 import STAGES
 from hmsa_ros.core.kernels import (
     DONE,
     first_step,
@@ -22,8 +18,6 @@ from hmsa_ros.core.kernels import (
     turning_point,
 )
 from hmsa_ros.core.law import (
-    at_rest,
-    C1,
     critical_zeta,
     damping,
     elastic_energy,
@@ -93,7 +87,7 @@ def crosses(k, l, v, target, material, rtol):  # noqa: E741
 
 
 @compiled()
-def _guess(l, v, target, direction, beta_1, material):  # noqa: E741
+def first_guess(l, v, target, direction, beta_1, material):  # noqa: E741
     """
     Return a first guess of ``direction * (beta_1 - beta_p)``.
 
@@ -118,6 +112,25 @@ def _guess(l, v, target, direction, beta_1, material):  # noqa: E741
 
 
 @compiled()
+def precision(target, move, beta_1, material, rtol):  # noqa: E741
+    """
+    Return how precise a search must be, for a move that is so long.
+
+    That is the tolerance of the last pass, the relative change of the load that ends it, the
+    tolerance of the first pass, and the least difference of loads that is not rounding.
+    """
+    lower, upper = material[LOWER], material[UPPER]
+    # Errors count against the move and the room that the limits leave.
+    size = 1.0 + target
+    rtol = max(min(rtol, 1e-10 * move / size), 1e-14)
+    enough = max(0.1 * math.sqrt(rtol), 1e-14 * size / move)
+    coarse = max(rtol, _COARSE * min(size, move, target - lower, upper - target) / size)
+    # A smaller difference of loads is rounding of the elastic force.
+    least = 1e-14 * (abs(beta_1) + abs(target) * elastic_stiffness(target, material))
+    return rtol, enough, coarse, least
+
+
+@compiled()
 def shoot(
         k, l, v, target, direction, beta_min, beta_max, material, rtol):  # noqa: E741
     """
@@ -136,13 +149,7 @@ def shoot(
     beta_1 = elastic_force(target, material)
     move = abs(target - l) + abs(v) / natural_frequency(target, material)
     lower, upper = material[LOWER], material[UPPER]
-    # Errors count against the move and the room that the limits leave.
-    size = 1.0 + target
-    rtol = max(min(rtol, 1e-10 * move / size), 1e-14)
-    enough = max(0.1 * math.sqrt(rtol), 1e-14 * size / move)
-    tolerance = max(rtol, _COARSE * min(size, move, target - lower, upper - target) / size)
-    # A smaller difference of loads is rounding of the elastic force.
-    least = 1e-14 * (abs(beta_1) + abs(target) * elastic_stiffness(target, material))
+    rtol, enough, tolerance, least = precision(target, move, beta_1, material, rtol)
     most = math.inf
     if v == 0.0:
         most = direction * (beta_1 - elastic_force(l, material))
@@ -153,7 +160,7 @@ def shoot(
         top = _FARTHEST * (1.0 + abs(beta_1))
     # From rest beta_p lies between the two holding loads: it is found there, inside or not.
     top = max(top, most) if most < math.inf else top
-    guess = _guess(l, v, target, direction, beta_1, material)
+    guess = first_guess(l, v, target, direction, beta_1, material)
     if not 0.0 < guess < min(most, top):
         guess = 0.5 * most if most < math.inf else 1.0
     low, high, d = 0.0, most, guess
@@ -261,24 +268,3 @@ def two_step(k, l, v, target, material, beta_min, beta_max, rtol, hold):  # noqa
     if status != TWO_STEP and other == TWO_STEP:
         return other, beta_q, tau_q, beta_1, passes
     return status, beta_p, tau_p, beta_1, passes
-
-
-@compiled(parallel=True)
-def two_step_batch(
-        start, rate, target, materials, beta_min, beta_max, rtol, hold, status,
-        beta_p, tau_p, beta_1):
-    """
-    Plan many moves over all cores; the last four arrays (n,) take the results.
-
-    ``materials`` has a row for each, or one for all.
-    """
-    for i in prange(start.size):
-        k = np.empty((STAGES, 4))
-        material = materials[min(np.int64(i), materials.shape[0] - 1)]
-        if not (material[ZETA] >= 0.0 and material[C1] > 0.0
-                and material[LOWER] < at_rest(material) < material[UPPER] and math.isfinite(
-                    material[ZETA] + material[C1] + start[i] + rate[i] + target[i])):
-            status[i], beta_p[i], tau_p[i], beta_1[i] = BAD_INPUT, math.nan, math.nan, math.nan
-            continue
-        status[i], beta_p[i], tau_p[i], beta_1[i], _ = two_step(
-            k, start[i], rate[i], target[i], material, beta_min, beta_max, rtol, hold)

@@ -27,7 +27,7 @@ from hmsa_ros.studies.tables import ArrowBlock, open_writer, repeating
 
 #: Rows of a chunk: a thousandth of the study, at least 0.1 s and at most some 100 MB of work; a
 #: study whose rows take longer says so itself (``chunk_rows``).
-SHARE, LEAST_ROWS, MOST_ROWS = 1000, 20_000, 500_000
+SHARE, LEAST_ROWS, MOST_ROWS = 1000, 40_000, 500_000
 
 _NAME = re.compile(r'(\d{7,})-([0-9a-f]{16})-([0-9a-f]{8})\.parquet')
 
@@ -168,7 +168,7 @@ class Chunks:
         made = io.BytesIO()
         parquet.write_table(
             table, made, row_group_size=max(1, table.num_rows), write_statistics=False,
-            use_dictionary=repeating(table))
+            use_dictionary=repeating(table), compression='lz4')
         content = made.getbuffer()
         name = f'{index:07d}-{self._hash(index)}-{zlib.crc32(content):08x}.parquet'
         part = beside / f'{name}.{uuid.uuid4().hex}.part'

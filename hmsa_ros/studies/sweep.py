@@ -33,7 +33,7 @@ __all__ = ['parse_grid', 'ROW_BYTES', 'Rows', 'Sweep']
 ROW_BYTES = 50
 # Roughly: rows a second and core of an idle machine, and rows of a chunk, least and most: by the
 # batch alone, by the batch after a block was made of each row, and one by one.
-_RATES = (150_000.0, 15_000.0, 3_000.0)
+_RATES = (400_000.0, 15_000.0, 3_000.0)
 _CHUNKS = ((LEAST_ROWS, MOST_ROWS), (5_000, 50_000), (500, 5_000))
 _LAW, _SHAPER = 'law', 'shaper'
 #: What a plan leaves when it is carried out.
