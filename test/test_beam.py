@@ -31,7 +31,7 @@ from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.laws import bending
 from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.simulation import ActuatorSimulation
-from hmsa_ros.core.status import Code
+from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.two_step import plan_two_step
 from hmsa_ros.core.units import MU_0
 from hmsa_ros.errors import BadInputError
@@ -123,6 +123,15 @@ def test_parameters_of_a_beam_give_the_same_beam_and_modulus_and_geometry_scale_
 def test_what_is_no_beam_is_refused_in_a_sentence(changes, message):
     with pytest.raises(BadInputError, match=message):
         silicone(**changes)
+
+
+@pytest.mark.parametrize(('points', 'message'), [
+    ([(0.9, 10 ** 9)], 'target deflection is 0.9: expected a deflection between'),
+    ([(0.75, 10 ** 9)], 'deflection 0.75 needs a flux density of 0.01052 T')])
+def test_refusals_speak_of_the_deflection(points, message):
+    planner = Planner(silicone(), Options(flux_density_min=-0.01, flux_density_max=0.01))
+    with pytest.raises(RefusedError, match=message):
+        planner.request(points, 0, 0)
 
 
 def test_the_tangent_of_a_bent_beam_is_the_slope_of_its_centreline():

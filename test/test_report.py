@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 
+from beam_oracle import silicone
 import numpy as np
 import plotly.graph_objects
 import pytest
@@ -18,6 +19,7 @@ from rosbags.typesys import get_typestore, Stores
 from hmsa_ros.bag.definitions import message_definition
 from hmsa_ros.bag.writer import BagWriter, Topic
 from hmsa_ros.cli import main
+from hmsa_ros.contract.actuator import parameters_of
 from hmsa_ros.contract.parameters import ACTUATOR_FIELDS
 from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.parameters import NondimensionalParameters, paper_actuator
@@ -328,6 +330,22 @@ def test_plain_steps_and_predictions_are_those_of_a_creeping_block_and_its_ramps
             steps.advance(time)
             worst = max(worst, abs(steps.stretch - stretch))
     assert worst < 1e-6
+
+
+def test_the_page_of_a_beam_speaks_of_its_deflection(tmp_path):
+    beam = silicone()
+    told = {f'{node}.{name}': json.dumps(value) for node in ('planner', 'plant')
+            for name, value in {'use_sim_time': False, **parameters_of(beam)}.items()}
+    part = one(tmp_path / 'bag', simulated(
+        [(0.3, 25.0), (-0.2, 25.0)], actuator=beam, period=5_000_000), **told)
+    assert [x.stretch for x in part.evaluation.results] == [0.3, -0.2]
+    assert max(x.residual for x in part.evaluation.results) < 1e-6
+    shown, _, _ = page([part]).partition('All parameters that were recorded')
+    shown = re.sub(r'<script.*?</script>|/stretch', '', shown, flags=re.DOTALL)
+    for words in ('deflection: recorded, predicted', 'target u [1]', 'least deflection',
+                  'critical zeta about deflection 0'):
+        assert words in shown
+    assert not re.search('stretch|J_lim|chain limit', shown)
 
 
 def test_without_the_requests_setpoints_are_told_by_the_levels_that_last(tmp_path, bag):

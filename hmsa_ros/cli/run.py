@@ -208,8 +208,8 @@ def _print(
         console.print(_level_table(levels))
     if measured:
         table = Table(box=SIMPLE, collapse_padding=True, pad_edge=False, caption=(
-            'measured after arrival: mean stretch, its distance from the target, and vibration '
-            'from peak to peak'))
+            'measured after arrival: mean, its distance from the target, and vibration from peak '
+            'to peak'))
         for name in ('target', 'reached', 'offset', 'residual', 'arrival ms'):
             table.add_column(name, justify='right', no_wrap=True)
         table.add_column('verdict', no_wrap=True)
@@ -235,7 +235,7 @@ def _level_table(levels: 'list[LevelResult]') -> 'Table':
     short = len(levels) - len(chosen)
     few = f'; {short} short ones left out' if short else ''
     table = Table(box=SIMPLE, collapse_padding=True, pad_edge=False, caption=(
-        'rest: stretch that the level holds by the parameters; then what was measured while it '
+        'rest: what the level holds by the parameters; then what was measured while it '
         f'was in force; the last row is the end{few}'))
     for name in ('level mT', 'times', 'in all ms', 'rest', 'mean', 'least', 'greatest'):
         table.add_column(name, justify='right', no_wrap=True)

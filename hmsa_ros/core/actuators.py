@@ -46,8 +46,8 @@ def check_stretch(stretch: float, material: Material, name: str = 'stretch') -> 
         whose = f'J_lim {getattr(material, "j_lim", material):g}' if elastic is None \
             else f'law {elastic.law}'
         raise BadInputError(
-            f'{name} is {stretch:g}: expected a {coordinate} between the limits {lower:.4f} and '
-            f'{upper:.4f} of {whose}')
+            f'{name.replace("stretch", coordinate)} is {stretch:g}: expected a {coordinate} '
+            f'between the limits {lower:.4f} and {upper:.4f} of {whose}')
 
 
 def unheld(material: NondimensionalParameters) -> str:

@@ -153,10 +153,11 @@ def draft_sequence(
         if abs(points[0][0] - here) > 1e-6:
             raise RefusedError(
                 Code.SPELL_TOO_SHORT,
-                f'the first point asks for stretch {points[0][0]:g} at time_from_start 0, the '
-                f'actuator is at {here:.6g}: expected enough time for the move')
+                f'the first point asks for {outset.model.units.coordinate} {points[0][0]:g} at '
+                f'time_from_start 0, the actuator is at {here:.6g}: expected enough time for the '
+                'move')
     if base + points[-1][1] <= begin:
-        raise _over(points, base, now)
+        raise _over(points, base, now, outset.model.units.coordinate)
     setpoints = []
     left = begin
     for number, (stretch, time) in enumerate(points):
@@ -165,8 +166,9 @@ def draft_sequence(
             if end == left:
                 raise RefusedError(
                     Code.SPELL_TOO_SHORT,
-                    f'stretch {stretch:g} begins and ends within one command period of '
-                    f'{outset.model.options.period / NANOSECONDS:g} s: expected a longer span')
+                    f'{outset.model.units.coordinate} {stretch:g} begins and ends within one '
+                    f'command period of {outset.model.options.period / NANOSECONDS:g} s: expected '
+                    'a longer span')
             setpoints.append(Setpoint(stretch, outset.model.time(end - left)))
             left = end
         if number % _CHECKED == _CHECKED - 1:
@@ -389,13 +391,14 @@ def _placed(
         segment.move.code, segment.move.reason, start, segment.move.vibration)
 
 
-def _over(points: Sequence[tuple[float, int]], base: int, now: int) -> RefusedError:
+def _over(
+        points: Sequence[tuple[float, int]], base: int, now: int, coordinate: str) -> RefusedError:
     """Return the refusal of a sequence that is over."""
     stretch, last = points[-1]
     if last == 0:
         return RefusedError(
             Code.SPELL_TOO_SHORT,
-            f'stretch {stretch:g} is due at time_from_start 0: expected time for the move')
+            f'{coordinate} {stretch:g} is due at time_from_start 0: expected time for the move')
     return RefusedError(
         Code.IN_THE_PAST,
         f'the sequence stamped {base / NANOSECONDS:.3f} s ends at '

@@ -138,5 +138,6 @@ class Limits:
         if not self.minimum <= load <= self.maximum:
             raise RefusedError(
                 Code.FLUX_LIMIT,
-                f'stretch {target:g} needs a flux density of {units.load_text(load)}: expected '
-                f'{units.load_text(self.minimum)} to {units.load_text(self.maximum)}')
+                f'{units.coordinate} {target:g} needs a flux density of '
+                f'{units.load_text(load)}: expected {units.load_text(self.minimum)} to '
+                f'{units.load_text(self.maximum)}')

@@ -162,6 +162,6 @@ def _check_motion(number: int, level: PlannedLevel, state: State, end: int | Non
         if not least < stretch < most:
             raise RefusedError(
                 Code.OUT_OF_RANGE,
-                f'level {number} of {level.flux_density:g} T takes the stretch to {stretch:.4g}: '
-                f'expected {least:.4g} to {most:.4g}, as the law of the block allows; lower '
-                'the levels, or correct the parameters of the block')
+                f'level {number} of {level.flux_density:g} T takes the '
+                f'{model.units.coordinate} to {stretch:.4g}: expected {least:.4g} to {most:.4g}, '
+                'as the law of the actuator allows; lower the levels, or correct its parameters')

@@ -157,8 +157,8 @@ def segments(
             if short_spell == 'refuse':
                 raise RefusedError(
                     Code.SPELL_TOO_SHORT,
-                    f'the move from stretch {state.stretch:.6g} to {setpoint.stretch:g} takes '
-                    f'{units.time_text(move.duration)}, its span is '
+                    f'the move from {units.coordinate} {state.stretch:.6g} to '
+                    f'{setpoint.stretch:g} takes {units.time_text(move.duration)}, its span is '
                     f'{units.time_text(setpoint.span)}: expected a span at least as long as the '
                     'move')
             move = _cut(move, setpoint, units, last=following is None)
@@ -179,8 +179,9 @@ def _cut(move: Move, setpoint: Setpoint, units: Units, *, last: bool) -> Move:
     return replace(
         move if last else move.until(setpoint.span), code=Code.SPELL_TOO_SHORT,
         duration=move.duration if last else math.inf,
-        reason=f'the span {units.time_text(setpoint.span)} ends before stretch '
-        f'{setpoint.stretch:g} is reached, which takes {units.time_text(move.duration)}')
+        reason=f'the span {units.time_text(setpoint.span)} ends before '
+        f'{units.coordinate} {setpoint.stretch:g} is reached, which takes '
+        f'{units.time_text(move.duration)}')
 
 
 def _rounded(move: Move, delivery: Delivery) -> Move:
@@ -243,6 +244,7 @@ def _check_known(
         if beyond * (widest - limit) > 0.0:
             raise RefusedError(
                 Code.OUT_OF_RANGE,
-                f'the move from stretch {state.stretch:.6g} to {target:g} swings to '
-                f'{widest:.4f}: expected a motion between the limits {elastic.limits[0]:.4f} and '
-                f'{elastic.limits[1]:.4f} of law {elastic.law}, beyond which nothing is known')
+                f'the move from {material.coordinate.name} {state.stretch:.6g} to {target:g} '
+                f'swings to {widest:.4f}: expected a motion between the limits '
+                f'{elastic.limits[0]:.4f} and {elastic.limits[1]:.4f} of law {elastic.law}, '
+                'beyond which nothing is known')

@@ -133,7 +133,7 @@ class Model:
         time, load = actuator.time_unit, actuator.flux_density_unit
         worked_out = {
             'material': actuator.nondimensional,
-            'units': Units(time, load, ' s', ' T'),
+            'units': Units(time, load, ' s', ' T', actuator.coordinate.name),
             'limits': Limits(options.flux_density_min / load, options.flux_density_max / load),
             'delivery': Delivery(
                 options.period / NANOSECONDS / time, options.slew_limit / load * time,

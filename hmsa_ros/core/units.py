@@ -19,6 +19,8 @@ class Units:
         Size of the nondimensional unit in the named unit.
     time_name, load_name : str
         With a leading space; empty for nondimensional values.
+    coordinate : str
+        What a position is called.
 
     """
 
@@ -26,6 +28,7 @@ class Units:
     load: float = 1.0
     time_name: str = ''
     load_name: str = ''
+    coordinate: str = 'stretch'
 
     def time_text(self, value: float) -> str:
         """Word a nondimensional time with four significant digits."""

@@ -204,10 +204,11 @@ def response(parts: Sequence[Part], unit: TimeUnit) -> Figure:
                     'symbol': 'diamond-open', 'size': _size(9, found.results),
                     'color': part.colour or BLACK}))
         data += _commands(part, unit)
+    what = parts[0].run.plant.coordinate
     return Figure(
-        'response', 'Flux density command and stretch over time', 560, _grouped(data), {
+        'response', f'Flux density command and {what.name} over time', 560, _grouped(data), {
             'xaxis': _axis(f'time from the first command [{unit.name}]', anchor='y'),
-            'yaxis': _axis('stretch λ [1]', domain=[0.0, 0.6]),
+            'yaxis': _axis(f'{what.name} {what.symbol} [1]', domain=[0.0, 0.6]),
             'yaxis2': _axis('flux density B [mT]', domain=[0.68, 1.0], anchor='x')})
 
 
@@ -279,10 +280,13 @@ def phase(parts: Sequence[Part]) -> tuple[Figure, float]:
         data.append(_curve(
             part, 'equilibrium', [found.start], [0.0], mode='markers',
             marker={'symbol': 'circle-open', 'size': 9, 'color': part.colour or BLACK}))
+    what = parts[0].run.plant.coordinate
+    name, symbol = what.name, what.symbol
     return Figure(
-        'phase', 'Stretch rate over stretch, with the equilibria', 480, _grouped(data), {
-            'xaxis': _axis('stretch λ [1]', range=_room(data, 'x')),
-            'yaxis': _axis('stretch rate dλ/dt [1/s]', range=_room(data, 'y'))}), shown
+        'phase', f'{name.capitalize()} rate over {name}, with the equilibria', 480,
+        _grouped(data), {
+            'xaxis': _axis(f'{name} {symbol} [1]', range=_room(data, 'x')),
+            'yaxis': _axis(f'{name} rate d{symbol}/dt [1/s]', range=_room(data, 'y'))}), shown
 
 
 def _room(data: Sequence[dict[str, Any]], key: str) -> list[float | None]:
@@ -447,10 +451,11 @@ def prediction(parts: Sequence[Part], unit: TimeUnit) -> Figure:
                 part, 'recorded', *decimate(unit.of(found.time), difference), width=1.2))
             if not part.colour:
                 data[-1]['name'] = 'recorded − predicted'
+    what = parts[0].run.plant.coordinate
     return Figure(
-        'prediction', 'Recorded minus predicted stretch over time', 300, _grouped(data), {
+        'prediction', f'Recorded minus predicted {what.name} over time', 300, _grouped(data), {
             'xaxis': _axis(f'time from the first command [{unit.name}]'),
-            'yaxis': _axis('recorded − planned λ [1]')})
+            'yaxis': _axis(f'recorded − planned {what.symbol} [1]')})
 
 
 def timings(parts: Sequence[Part], unit: TimeUnit) -> Figure:

@@ -63,18 +63,19 @@ def page(parts: Sequence[Part]) -> str:
     panels = charts.panels(parts)
     count = max(len(x.evaluation.results) for x in parts)
     planned = any(x.evaluation.plan for x in parts)
+    what = parts[0].run.plant.coordinate.name
     sections = [
         ('response-section', 'Command and response', text(
             'Above, the flux density commanded: a dot where the level switches. Below, the '
-            'stretch: recorded, predicted by the plan, and simulated for plain steps to the '
+            f'{what}: recorded, predicted by the plan, and simulated for plain steps to the '
             'levels that hold the targets. Drag to zoom, double-click to go back, click in the '
             'legend to hide.' + (
                 '' if len(parts) == 1 else ' What is simulated is hidden until its name is '
                 'clicked.')) + place(charts.response(parts, unit))),
         ('setpoints', 'Setpoints', _setpoints(parts)),
         ('phase-section', 'Phase plane', text(
-            'Stretch rate over stretch. Filled dots are the equilibria of the setpoints, the '
-            'open one is where the run starts.' + (
+            f'{what.capitalize()} rate over {what}. Filled dots are the equilibria of the '
+            'setpoints, the open one is where the run starts.' + (
                 '' if shown == 1.0 else f' Only the first {shown:.0%} of the longest curve is '
                 'drawn: what follows covers the same ground.')) + place(phase)),
     ]
@@ -96,7 +97,7 @@ def page(parts: Sequence[Part]) -> str:
         ]
     if planned:
         sections.append(('plan-section', 'Plan against run', text(
-            'The plan predicts stretch and rate from each change of level to the next; here is '
+            f'The plan predicts {what} and rate from each change of level to the next; here is '
             'how far the recording is from it.') + place(charts.prediction(parts, unit))
             + _plan(parts, unit)))
     sections += [
@@ -240,7 +241,7 @@ def _notes_of(part: Part) -> Iterable[str]:
     yield from part.run.notes
     if part.run.commands and not part.evaluation.results:
         yield ('No setpoint could be identified from the commands: none of them holds a '
-               'requested stretch or lasts a period of the actuator.')
+               f'requested {part.run.plant.coordinate.name} or lasts a period of the actuator.')
     if part.evaluation.results and not np.isfinite(part.evaluation.unshaped[0]).any():
         yield 'Plain steps cannot be simulated: the levels are too large to follow.'
     samples = period_of(part.run) / np.median(part.timing.interval) \
@@ -319,10 +320,11 @@ def _setpoints(parts: Sequence[Part]) -> str:
                 cell(x.arrival * 1e3, '.3f'), cell(x.end * 1e3, '.3f'), _percent(x.error),
                 _percent(x.residual) if x.moved else NOT_MOVED, _percent(x.residual_unshaped),
                 'plain step' if levels == 1 else f'{levels} levels'])
+    symbol = parts[0].run.plant.coordinate.symbol
     if not rows:
         return text('No setpoint was carried out while the samples were recorded.')
     header = [
-        'run', 'setpoint', 'target λ [1]', 'b_p [1]', 'tau_p [1]', 'b_1 [1]', 'begin [ms]',
+        'run', 'setpoint', f'target {symbol} [1]', 'b_p [1]', 'tau_p [1]', 'b_1 [1]', 'begin [ms]',
         'arrival [ms]', 'until [ms]', 'largest error [%]', 'residual [%]', 'plain steps [%]',
         'command']
     return table(
@@ -362,12 +364,15 @@ def _plan(parts: Sequence[Part], unit: TimeUnit) -> str:
                 cell(x.stretch, '.7f'), cell(x.recorded_stretch, '.7f'),
                 cell(x.rate, '.4g'), cell(x.recorded_rate, '.4g'),
                 cell(x.deviation, '.2e')])
+    what = parts[0].run.plant.coordinate
+    name, symbol = what.name, what.symbol
     return table(
-        'plan-table', 'Each change of level: flux density planned and commanded; stretch and '
+        'plan-table', f'Each change of level: flux density planned and commanded; {name} and '
         'rate of the first sample from then on; and the largest distance of the recorded from '
-        'the predicted stretch until the next change.',
-        ['run', f'time [{unit.name}]', 'B planned [mT]', 'B commanded [mT]', 'λ planned [1]',
-         'λ recorded [1]', 'rate planned [1/s]', 'rate recorded [1/s]', 'largest |Δλ| [1]'],
+        f'the predicted {name} until the next change.',
+        ['run', f'time [{unit.name}]', 'B planned [mT]', 'B commanded [mT]',
+         f'{symbol} planned [1]', f'{symbol} recorded [1]', 'rate planned [1/s]',
+         'rate recorded [1/s]', f'largest |Δ{symbol}| [1]'],
         rows[:_MOST_ROWS])
 
 
@@ -450,26 +455,30 @@ def _parameters(parts: Sequence[Part]) -> str:
         else:
             header += [f'{prefix}plant', f'{prefix}as planned']
             columns += [run.plant, run.planner]
+    gent = any(x.law is None for x in columns)
     rows: list[Row] = [
         [name.replace('_', ' '), (spec.unit or '1').replace('^3', '³'),
          *(cell(getattr(x, name)) for x in columns)]
-        for name, spec in zip(ACTUATOR_FIELDS, ACTUATOR, strict=True)]
+        for name, spec in zip(ACTUATOR_FIELDS, ACTUATOR, strict=True)
+        if name != 'chain_limit' or gent]
     laws = [parameters_of(x) for x in columns]
     rows += [
         [spec.name, spec.unit or '1', *(_given(x.get(spec.name)) for x in laws)]
         for spec in LAW if any(spec.name in x for x in laws)]
     groups = [x.nondimensional for x in columns]
+    name, rest = columns[0].coordinate.name, columns[0].rest
+    chains: list[Row] = [['J_lim', '1', *(cell(x.j_lim) for x in groups)]] if gent else []
     limits = [stretch_limits(x.nondimensional) for x in columns]
     rows += [
         ['zeta', '1', *(cell(x.zeta) for x in groups)],
-        ['critical zeta about stretch 1', '1', *(
+        [f'critical zeta about {name} {rest:g}', '1', *(
             cell(float(critical_zeta(x.rest, x))) for x in groups)],
-        ['J_lim', '1', *(cell(x.j_lim) for x in groups)],
+        *chains,
         ['c1', '1', *(cell(x.c1) for x in groups)],
         ['time unit', 'ms', *(cell(x.time_unit * 1e3) for x in columns)],
         ['flux density of load 1', 'mT', *(cell(x.flux_density_unit * 1e3) for x in columns)],
-        ['least stretch', '1', *(cell(x) for x, _ in limits)],
-        ['largest stretch', '1', *(cell(x) for _, x in limits)],
+        [f'least {name}', '1', *(cell(x) for x, _ in limits)],
+        [f'largest {name}', '1', *(cell(x) for _, x in limits)],
     ]
     words = '' if all(x.run.parameters_known for x in parts) else text(
         'Unknown: the bag does not contain the parameters; the example block of the paper is '
@@ -482,4 +491,4 @@ def _parameters(parts: Sequence[Part]) -> str:
             'recorded-table', 'As set on the nodes.', ['run', 'parameter', 'value'], recorded)
         + '</details>')
     return words + table(
-        'parameter-table', 'The block, and what follows from it.', header, rows) + more
+        'parameter-table', 'The actuator, and what follows from it.', header, rows) + more

@@ -55,9 +55,11 @@ def draw(path: Path, parts: Sequence[Part], kind: str) -> None:
             axes[key].set_xlim(begin, end if end > begin else begin + 1.0)
         axes['command'].tick_params(labelbottom=False)
         style.finish(axes['command'], '', 'flux density $B$ [mT]', 'a')
-        style.finish(axes['response'], f'time $t$ [{unit.name}]', r'stretch $\lambda$ [1]', 'b')
+        what = parts[0].run.plant.coordinate
+        position = f'{what.name} ${what.tex}$ [1]'
+        style.finish(axes['response'], f'time $t$ [{unit.name}]', position, 'b')
         style.finish(
-            axes['phase'], r'stretch $\lambda$ [1]', r'stretch rate $\dot{\lambda}$ [1/s]', 'c')
+            axes['phase'], position, rf'{what.name} rate $\dot{{{what.tex}}}$ [1/s]', 'c')
         for letter, i in zip('def', shown, strict=False):
             panel = axes[f'arrival{i}']
             style.finish(panel, 'time after arrival [ms]', 'distance [% of step]', letter)

@@ -181,7 +181,8 @@ class PlannerRuntime:
         self._bulletin.give(Verdict(
             Severity.WARN, 'clock_jumped',
             f'the clock jumped back by {back / NANOSECONDS:.3f} s: the plan is dropped, and the '
-            'actuator is assumed at its initial stretch unless joint_states shows otherwise'),
+            'actuator is assumed where it began, at initial_stretch, unless joint_states shows '
+            'otherwise'),
             log=True)
 
     def deactivate(self) -> None:

@@ -213,4 +213,4 @@ def _accepted(drafts: Mapping[str, Draft]) -> str:
     left = max((x.vibration for draft in drafts.values() for x in draft.segments), default=0.0)
     if left == 0.0:
         return 'accepted'
-    return f'accepted; levels that follow creep leave a vibration of up to {left:.1e} in stretch'
+    return f'accepted; levels that follow creep leave a vibration of up to {left:.1e}'

@@ -138,8 +138,8 @@ class Takeover:
             if name not in samples:
                 if observable:
                     notes.append(
-                        f'no sample of joint {name} on joint_states: it is assumed at rest at '
-                        'its initial stretch')
+                        f'no sample of joint {name} on joint_states: it is assumed at rest where '
+                        'it began (initial_stretch)')
                 continue
             x = samples[name]
             level = newest.get(name)

@@ -306,7 +306,7 @@ class PlannerClient:
         for stretch, span in setpoints:
             if np.size(stretch) not in (1, len(self._joints)):
                 raise BadInputError(
-                    f'{np.size(stretch)} stretches for {len(self._joints)} joints '
+                    f'{np.size(stretch)} values for {len(self._joints)} joints '
                     f'({", ".join(self._joints)}): expected one for all, or one per joint')
             end += span
             if end >= 2**31:

@@ -12,7 +12,7 @@ class Coordinate:
 
     Attributes
     ----------
-    name, plural, symbol : str
+    name, plural, symbol, tex : str
         In sentences, and in the axes of figures.
     meaning : str
         What it is, and about which value.
@@ -30,6 +30,7 @@ class Coordinate:
     name: str
     plural: str
     symbol: str
+    tex: str
     meaning: str
     rest: float
     at_rest: tuple[float, float]
@@ -40,10 +41,10 @@ class Coordinate:
 
 
 STRETCH = Coordinate(
-    'stretch', 'stretches', 'λ', 'the length over the length at rest, around 1', 1.0,
+    'stretch', 'stretches', 'λ', r'\lambda', 'the length over the length at rest, around 1', 1.0,
     (0.6, 1.6), (0.15, 5.0), (0.0, 20.0), (0.6, 2.0))
 DEFLECTION = Coordinate(
-    'deflection', 'deflections', 'u',
+    'deflection', 'deflections', 'u', 'u',
     'the deflection of the tip over the length of the beam, around 0', 0.0,
     (-0.4, 0.4), (-1.2, 1.2), (-2.0, 2.0), (-0.6, 0.6),
     'a length, in mm perhaps, divide it by that of the beam; if it is the angle of the tip, take '

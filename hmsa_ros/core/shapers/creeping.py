@@ -111,7 +111,7 @@ def free_levels(request: Request) -> Move:
     if found is None:
         raise RefusedError(
             Code.NO_TWO_STEP,
-            f'no two flux densities within the limits bring stretch {request.target:g} of this '
+            f'no two flux densities within the limits bring {request.named_target} of this '
             'creeping elastomer to rest: expected wider limits, a smaller move or several '
             'setpoints')
     return Move(Code.MINIMUM_TIME, *found, (
@@ -199,7 +199,7 @@ def _ramped(
         raise RefusedError(
             Code.SLEW_LIMIT,
             f'ramps of {request.units.slew_text(delivery.slew)} are too slow to follow creep at '
-            f'stretch {request.target:g}: expected a larger slew limit')
+            f'{request.named_target}: expected a larger slew limit')
     inertia = law.mass(request.target, packed)
     frequency = law.natural_frequency(request.target, packed)
     if delivery.period > 0.0:

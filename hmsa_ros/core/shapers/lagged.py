@@ -175,7 +175,7 @@ def _lengths(request: Request, holding: float, count: int) -> Iterator[float]:
 def _refusal(request: Request) -> tuple[Code, str]:
     units, delivery, limits = request.units, request.delivery, request.limits
     text = (f'no command for a coil time constant of {units.time_text(delivery.lag)} brings '
-            f'stretch {request.target:g} and the field to rest together within ')
+            f'{request.named_target} and the field to rest together within ')
     if not math.isinf(delivery.slew):
         return Code.SLEW_LIMIT, text + (
             f'ramps of {units.slew_text(delivery.slew)} and flux densities of '

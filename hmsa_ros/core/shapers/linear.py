@@ -68,8 +68,8 @@ def _shaped(request: Request, weights: tuple[float, ...]) -> Move:
     if xi >= 1.0:
         return request.plain(
             Code.TOO_DAMPED,
-            f'zeta {material.zeta:g} is above critical damping at stretch {target:g}: there is '
-            'no oscillation to shape for, the plain step is used')
+            f'zeta {material.zeta:g} is above critical damping at {request.named_target}: there '
+            'is no oscillation to shape for, the plain step is used')
     frequency = law.natural_frequency(target, material.packed)
     damped = math.sqrt(1.0 - xi * xi)
     half_period = math.pi / (frequency * damped)

@@ -80,9 +80,8 @@ def minimum_time(request: Request, reason: str = '') -> Move:
             return Move(Code.MINIMUM_TIME, *found, reason)
     raise RefusedError(
         Code.NOT_CONVERGED,
-        f'no command of two levels within the limits was found from stretch '
-        f'{state.stretch:.6g} at rate {state.rate / request.units.time:.4g} to rest at '
-        f'{target:g}')
+        f'no command of two levels within the limits was found from {request.named_state} to '
+        f'rest at {target:g}')
 
 
 def _late(request: Request, holding: float, frequency: float, reason: str) -> Move:
@@ -166,7 +165,7 @@ def _bounds(request: Request, holding: float, frequency: float) -> tuple[float, 
     if not least < holding < most:
         raise RefusedError(
             Code.FLUX_LIMIT,
-            f'stretch {request.target:g} is held by {request.units.load_text(holding)}, on the '
+            f'{request.named_target} is held by {request.units.load_text(holding)}, on the '
             'limit itself: expected limits with room on both sides to push and to brake')
     return least, most
 
@@ -232,7 +231,7 @@ def _durations(
     if direction * (ahead.stretch - target) < 0.0:
         raise RefusedError(
             Code.FLUX_LIMIT,
-            f'stretch {target:g} is not reached under {request.units.load_text(push)}: '
+            f'{request.named_target} is not reached under {request.units.load_text(push)}: '
             'expected wider flux density limits')
 
     def excess(time: float) -> float:

@@ -81,6 +81,17 @@ class Request:
     pace: Pace = PACE
 
     @property
+    def named_target(self) -> str:
+        """The target in a message, as in ``'stretch 1.4'``."""
+        return f'{self.units.coordinate} {self.target:g}'
+
+    @property
+    def named_state(self) -> str:
+        """The state in a message, as in ``'stretch 1.2 at rate 0.5'``."""
+        return (f'{self.units.coordinate} {self.state.stretch:.6g} at rate '
+                f'{self.state.rate / self.units.time:.4g}')
+
+    @property
     def load(self) -> float:
         """Output of the amplifier before the move."""
         return self.field if self.state.amplifier is None else self.state.amplifier

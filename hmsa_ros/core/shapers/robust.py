@@ -66,7 +66,7 @@ def robust(request: Request) -> Move:
 
 def _single(move: Move, request: Request, chain: Move) -> Move:
     return replace(move, reason=(
-        f'no chain of order {request.order} leads to stretch {request.target:g} ({chain.code}): '
+        f'no chain of order {request.order} leads to {request.named_target} ({chain.code}): '
         'a single two-step command is used'))
 
 

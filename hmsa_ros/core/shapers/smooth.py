@@ -293,7 +293,7 @@ def _refusal(request: Request) -> tuple[Code, str]:
     code = Code.FLUX_LIMIT if math.isinf(slew) else Code.SLEW_LIMIT
     ramps = '' if math.isinf(slew) else f', ramps of {units.slew_text(slew)}'
     return code, (
-        f'no smooth path of up to {MOST_PERIODS:g} natural periods leads to rest at stretch '
-        f'{request.target:g} within flux densities of {units.load_text(limits.minimum)} to '
-        f'{units.load_text(limits.maximum)}{ramps} and the largest stretch rate: expected wider '
+        f'no smooth path of up to {MOST_PERIODS:g} natural periods leads to rest at '
+        f'{request.named_target} within flux densities of {units.load_text(limits.minimum)} to '
+        f'{units.load_text(limits.maximum)}{ramps} and the largest rate: expected wider '
         'limits or a smaller move')

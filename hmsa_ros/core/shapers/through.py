@@ -44,6 +44,6 @@ def through(request: Request, duration: float) -> Move:
     if found is None or not request.keeps(found[0]):
         raise RefusedError(
             Code.NOT_CONVERGED,
-            f'no {count} levels of equal duration lead to stretch {request.target:g} in '
+            f'no {count} levels of equal duration lead to {request.named_target} in '
             f'{request.units.time_text(duration)}: expected more time')
     return Move(Code.MINIMUM_TIME, found[0], found[1])

@@ -83,19 +83,19 @@ def two_step(request: Request) -> Move:
 
 def _without(request: Request, code: Code, holding: float) -> Move:
     """Return what takes the place of two levels where there are none."""
-    zeta, target = request.material.zeta, request.target
+    zeta = request.material.zeta
     if code is Code.HOLD:
         return Move(code, (Level(0.0, holding),), 0.0)
     if code is Code.TOO_DAMPED:
         return request.plain(
             code,
-            f'zeta {zeta:g} is too damped for the response to cross stretch {target:g}: no '
+            f'zeta {zeta:g} is too damped for the response to cross {request.named_target}: no '
             'two-step command exists, the plain step approaches without overshoot (shaper '
             'minimum_time arrives in finite time)')
     return request.plain(
         code,
-        f'zeta {zeta:g} is so close to critical damping at stretch {target:g} that beta_p equals '
-        'beta_1 to rounding: the plain step is used')
+        f'zeta {zeta:g} is so close to critical damping at {request.named_target} that beta_p '
+        'equals beta_1 to rounding: the plain step is used')
 
 
 def _elastic(request: Request, holding: float) -> Move | None:
@@ -187,7 +187,7 @@ def _sampled(request: Request, first: Level, last: Level) -> Move:
     raise RefusedError(
         Code.NO_TWO_STEP,
         f'no command on a grid of {request.units.time_text(period)} within the limits brings '
-        f'stretch {request.target:g} to rest: expected a shorter command period (the ideal '
+        f'{request.named_target} to rest: expected a shorter command period (the ideal '
         f'move takes {request.units.time_text(tau_p)})')
 
 
@@ -232,8 +232,8 @@ def _ramped(request: Request, first: Level, last: Level) -> Move:
             return _two_levels(request, last.load)
     raise RefusedError(
         Code.SLEW_LIMIT,
-        f'no command through ramps of {request.units.slew_text(slew)} brings stretch '
-        f'{request.target:g} to rest: expected a slew limit of about '
+        f'no command through ramps of {request.units.slew_text(slew)} brings '
+        f'{request.named_target} to rest: expected a slew limit of about '
         f'{request.units.slew_text(abs(change) / last.time)}')
 
 
@@ -256,10 +256,8 @@ def _searched(request: Request, holding: float) -> Attempt:
 
 
 def _no_single(request: Request) -> str:
-    state = request.state
-    return (f'no single intermediate flux density within the limits leads from stretch '
-            f'{state.stretch:.6g} at rate {state.rate / request.units.time:.4g} to rest at '
-            f'{request.target:g}: two are used')
+    return ('no single intermediate flux density within the limits leads from '
+            f'{request.named_state} to rest at {request.target:g}: two are used')
 
 
 def _two_levels(request: Request, holding: float) -> Move:
