@@ -76,10 +76,25 @@ def solve(
         template: Template, request: 'Request', delivery: Delivery | None = None, *,
         wait: float = 0.0) -> Attempt:
     """
-    Solve a template for rest at the target; returns levels and time of rest, or None.
+    Solve a template for rest at the target.
 
-    Where branches creep and the amplifier ramps, that is the time at which the last ramp ends,
-    or a while after the last level begins: at least ``wait``, and on a grid whole periods.
+    Parameters
+    ----------
+    template : Template
+        Levels to begin with, and which of their numbers are free.
+    request : Request
+        The move.
+    delivery : Delivery, optional
+        How commands reach the coil; default as in the request.
+    wait : float
+        Where branches creep and the amplifier ramps: rest is when the last ramp ends, or at least
+        so long after the last level begins, and on a grid whole periods.
+
+    Returns
+    -------
+    Attempt
+        Levels and time of rest, or None.
+
     """
     delivery = delivery or request.delivery
     times, loads = template.times.copy(), template.loads.copy()
