@@ -14,7 +14,14 @@ from hmsa_ros.core.timeline import Model
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.files import read_belief
 from hmsa_ros.identification.known import Known
-from hmsa_ros.runtime.records import EstimateChanged, Send, Settings, Severity, StatusChanged
+from hmsa_ros.runtime.records import (
+    EstimateChanged,
+    Send,
+    Settings,
+    Severity,
+    StatusChanged,
+    Target,
+)
 from hmsa_ros.studies.feedback import SCENARIOS
 
 
@@ -97,6 +104,20 @@ def test_a_cautious_first_move_takes_longer_and_arrives_and_the_next_one_does_no
     # What was learnt changes the time of the move too: a softer block arrives later than the
     # nominal one, and at the nominal time it moves by 2 to 3 % of the step still.
     assert (second.arrival - second.since) / MS == pytest.approx(59.4 / math.sqrt(factor), abs=1)
+
+
+def test_a_cautious_move_takes_longer_the_more_is_estimated_and_the_more_noise_there_is():
+    block = SCENARIOS[2].block
+    for free, target, times in (
+            (SCENARIOS[2].free, 1.4, 3.0), (SCENARIOS[3].free, 1.4, 5.0),
+            (SCENARIOS[2].free, 1.1, 3.0 + math.log2(2.5))):
+        loop = Loop(1.0, 1e-3, 200, 10 * MS, block, 2 * MS, feedback='adapt',
+                    feedback_cautious=True, feedback_parameters=free)
+        loop.runtime.request(Target('a', target))
+        loop.runtime.tick(loop.now)
+        first = loop.runtime.group.planners['a'].plan.segments[-1]
+        tau = 58.8 if target > 1.2 else 57.4
+        assert (first.arrival - first.begin) / MS == pytest.approx(times * tau, rel=0.01)
 
 
 def test_an_actuator_that_was_identified_is_not_moved_with_caution():

@@ -29,11 +29,32 @@ from hmsa_ros.estimation.motion import follow, Levels, rest
 # A correction leaves at most this share of what the course in force leaves, in squares, and
 # gains at least this, as a share of the noise of a sample.
 _SHARE, _GAIN = 0.8, 0.02
+# Share of the step up to which noise is little.
+_QUIET = 0.004
 # Durations of a correction in half periods: the least with which a move still arrives in time, and
 # those tried where it does not.
 _LEAST, _TRIED = 0.15, (0.5, 1.0, 1.6)
-#: How much longer a move takes that is cautious.
-CAUTIOUS = 3.0
+
+def caution(count: int, noise: float) -> float:
+    """
+    Return how many times as long a cautious move takes.
+
+    Parameters
+    ----------
+    count : int
+        Parameters that are estimated: three times as long for three, five times for six.
+    noise : float
+        Of a sample, as a share of the step; each doubling of it above 0.4 % adds one more, up to
+        two.
+
+    Returns
+    -------
+    float
+        At least 3.
+
+    """
+    more = math.log2(max(noise, _QUIET) / _QUIET)
+    return max(3.0, 1.0 + 2.0 * count / 3.0) + min(more, 2.0)
 
 
 @dataclass(frozen=True)
@@ -157,12 +178,12 @@ class Corrector:
     def first(
             self, estimate: Estimate, target: float, in_force: float, *,
             shaper: str = 'two_step', order: int = 2,
-            tolerance: float = math.inf, longer: float = CAUTIOUS) -> Course:
+            tolerance: float = math.inf) -> Course:
         """
         Plan a move.
 
         Where it is expected to leave too much, its levels stay, since their early effect shows
-        what the actuator is, but it gets more time for corrections until rest.
+        what the actuator is, but it gets more time, by `caution`, for corrections until rest.
 
         Parameters
         ----------
@@ -178,8 +199,6 @@ class Corrector:
             Of the robust shaper.
         tolerance : float
             Share of the step from which on that is too much.
-        longer : float
-            How many times as long the move takes then.
 
         Returns
         -------
@@ -200,6 +219,7 @@ class Corrector:
         if math.isinf(tolerance) or expect(
                 estimate, found, self.options.slew_limit).size <= tolerance * step:
             return found
+        longer = caution(len(estimate.free), estimate.noise / max(step, estimate.noise))
         return replace(found, arrival=estimate.time + round(
             longer * (found.arrival - estimate.time)))
 

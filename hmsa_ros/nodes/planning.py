@@ -156,7 +156,9 @@ SPECS = (
     ParameterSpec(
         'feedback_cautious', _SETTINGS.feedback_cautious,
         'Whether a move with an actuator that is not well known takes three times as long in '
-        'feedback adapt, and is corrected until then.', read_only=False),
+        'feedback adapt (five times where six parameters are estimated, and up to two times more '
+        'where the noise is large beside the step), and is corrected until then.',
+        read_only=False),
     ParameterSpec(
         'feedback_trim', _SETTINGS.feedback_trim,
         'How far feedback adapt may change a level that holds a setpoint to make up for a '

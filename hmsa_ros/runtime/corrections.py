@@ -12,7 +12,7 @@ from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.timeline import Draft, Plan
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.estimation import Estimate
-from hmsa_ros.estimation.correction import CAUTIOUS, Course, expect
+from hmsa_ros.estimation.correction import caution, Course, expect
 from hmsa_ros.runtime.feedback import Feedback
 from hmsa_ros.runtime.records import Severity, Verdict
 from hmsa_ros.runtime.slices import Clock, in_time, Work
@@ -72,7 +72,8 @@ class Corrections:
         step = max(abs(segment.stretch - draft.levels[0].stretch), _LEAST_STEP)
         if expect(estimate, course, slew).size <= _WIDE * step:
             return draft
-        arrival = segment.begin + round(CAUTIOUS * (segment.arrival - segment.begin))
+        longer = caution(len(estimate.free), estimate.noise / step)
+        arrival = segment.begin + round(longer * (segment.arrival - segment.begin))
         if rest:
             arrival = max(min(arrival, rest[0].begin), segment.arrival)
         self._arrivals[name] = arrival

@@ -9,7 +9,7 @@ import numpy as np
 from hmsa_ros.core.timeline import Options as PlannerOptions
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.estimation import Estimate, Estimator, Options, Prior
-from hmsa_ros.estimation.correction import Corrector, Course
+from hmsa_ros.estimation.correction import caution, Corrector, Course
 from hmsa_ros.studies.linear import Controller, Predictive, Quadratic
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ class _Open:
     def __init__(self, scenario: 'Scenario', strategy: 'Strategy') -> None:
         block = scenario.block
         unit = block.flux_density_unit
-        self._strategy, self._longer = strategy, scenario.longer
+        self._strategy = strategy
         self._prior = Prior.nominal(block, scenario.free)
         self._corrector = Corrector(PlannerOptions(
             flux_density_min=-LARGEST * unit, flux_density_max=LARGEST * unit))
@@ -84,7 +84,7 @@ class _Open:
             tolerance: float = math.inf) -> Course:
         return self._corrector.first(
             estimate, target, course.holding, shaper=self._strategy.shaper,
-            order=self._strategy.order, tolerance=tolerance, longer=self._longer)
+            order=self._strategy.order, tolerance=tolerance)
 
     def move(self, time: int, target: float, course: Course) -> Course:
         nominal = Estimate(
@@ -134,6 +134,7 @@ class _Steady(_Open):
 
     def __init__(self, scenario: 'Scenario', strategy: 'Strategy') -> None:
         super().__init__(scenario, strategy)
+        self._noise = scenario.noise
         self._controller = _LINEAR[strategy.kind](
             scenario.block, LARGEST, round(scenario.period * NANOSECONDS),
             round(scenario.delay * NANOSECONDS) + REACTION, scenario.noise,
@@ -141,7 +142,9 @@ class _Steady(_Open):
 
     def move(self, time: int, target: float, course: Course) -> Course:
         planned = super().move(time, target, course)
-        arrival = time + round(self._longer * (planned.arrival - time))
+        longer = caution(
+            len(self._prior.free), self._noise / max(abs(target - course.target), 1e-9))
+        arrival = time + round(longer * (planned.arrival - time))
         level = self._controller.move(target, planned.holding)
         return Course(((time, level),), arrival, target)
 

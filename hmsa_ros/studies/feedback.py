@@ -15,7 +15,7 @@ import numpy as np
 from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.core.simulation import ActuatorSimulation
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.estimation.correction import CAUTIOUS, Course
+from hmsa_ros.estimation.correction import Course
 from hmsa_ros.estimation.prior import TRACKED
 from hmsa_ros.studies.commanders import commander, LARGEST, REACTION
 from hmsa_ros.studies.learning import carried_out, Learner
@@ -63,9 +63,6 @@ class Scenario:
         Of the coil in s, unknown to the model.
     free : tuple of str
         What is tracked.
-    longer : float
-        How many times as long a move takes that is expected to leave much, and that of a linear
-        controller.
     weights : mapping of str to Weights
         Of linear controllers, by kind.
 
@@ -79,7 +76,6 @@ class Scenario:
     truth: Mapping[str, float] = field(default_factory=dict)
     coil_time_constant: float = 0.0
     free: tuple[str, ...] = TRACKED
-    longer: float = CAUTIOUS
     weights: Mapping[str, Weights] = field(default_factory=lambda: _WEIGHTS)
     nominal: ActuatorParameters | None = None
 
@@ -120,7 +116,7 @@ SCENARIOS = (
         '1 kHz, 2 ms late, noise 1e-3; Br +5 %, lag 0.5 ms', 1e-3, 2e-3, 1e-3,
         truth={'remanence': 1.05}, coil_time_constant=5e-4,
         free=('shear_modulus', 'damping_coefficient', 'chain_limit', 'remanence',
-              'coil_time_constant', 'stretch_bias'), longer=5.0, weights=_CAREFUL))
+              'coil_time_constant', 'stretch_bias'), weights=_CAREFUL))
 
 
 @dataclass(frozen=True)
