@@ -4,15 +4,26 @@ from dataclasses import replace
 from functools import cache
 import json
 
-from beam_oracle import DAMPING, REMANENCE, sampled, silicone, YOUNGS
+from beam_oracle import (
+    DAMPING,
+    DENSITY,
+    LENGTH,
+    REMANENCE,
+    sampled,
+    silicone,
+    THICKNESS,
+    WIDTH,
+    YOUNGS,
+)
 import numpy as np
 import pytest
 
+from benchmarks.beam_segments import Chain
 from hmsa_ros.cli import main
 from hmsa_ros.core import model
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification import identify, Recording
-from hmsa_ros.identification.excitation import Bounds, excite
+from hmsa_ros.identification.excitation import Bounds, Designer, excite
 from hmsa_ros.identification.files import read_belief
 from hmsa_ros.identification.quantities import derivative, values_of
 from hmsa_ros.identification.recording import Course
@@ -129,6 +140,34 @@ def test_a_recording_of_a_stretch_is_none_of_a_beam():
     recording = Recording(TIMES, 1.0 + seen(), LEVEL_TIMES, LEVELS)
     with pytest.raises(BadInputError, match='has stretches: expected deflections'):
         identify(recording, actuator=BEAM)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(('noise', 'verdict'), [(1e-3, 'model_rejected'), (2e-2, 'identified')])
+def test_a_chain_of_links_is_found_within_percents_and_rejected_where_its_modes_show(
+        noise, verdict):
+    chain = Chain(16, LENGTH, WIDTH, THICKNESS, DENSITY, YOUNGS, REMANENCE, DAMPING)
+    times, deflection = chain.follow([(4.0 * PERIOD, x) for x in LEVELS[1:]], 120)
+    once = np.append(True, np.diff(times) > 1e-9)
+    noisy = deflection + noise * np.random.default_rng(0).standard_normal(len(times))
+    found = identify(
+        0.1 + times[once], noisy[once], LEVEL_TIMES, LEVELS, actuator=START)
+    assert found.verdict == verdict
+    for name, within in (
+            ('shear_modulus', 0.01), ('damping_coefficient', 0.05), ('remanence', 0.015)):
+        assert found.parameters[name].value == pytest.approx(TRUE[name], rel=within)
+
+
+def test_plain_steps_that_are_proposed_stay_within_the_limits_of_the_deflection():
+    designer = Designer(
+        BEAM, Bounds(-0.01, 0.01, stretch_max=0.5), 9.0 * PERIOD, rate=200.0)
+    plain, paper = designer.plain(), designer.paper()
+    assert plain.reach[0] < -0.02
+    assert 0.3 < plain.reach[1] <= 0.5
+    assert paper.reach == pytest.approx((0.0, 0.4), abs=1e-3)
+    times = np.linspace(0.0, 9.0 * PERIOD, 300)
+    deflection = sampled(times, plain.level_times, plain.levels)
+    assert np.max(deflection) == pytest.approx(plain.reach[1], abs=2e-3)
 
 
 @pytest.mark.slow
