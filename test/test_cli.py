@@ -100,15 +100,15 @@ def test_bad_input_is_answered_in_one_line_with_status_2(words, said, capsys):
 @pytest.mark.ros
 def test_send_reports_until_the_sequence_has_been_carried_out(start, ros):
     # Commands far enough ahead for a busy machine.
-    start.hmsa('planner', '--ros-args', '-p', 'lead_time:=0.5')
+    start.hmsa('planner', '--ros-args', '-p', 'lead_time:=2.0')
     # Nobody carries it out yet.
-    send = start.hmsa('send', '1.1:0.05', '--wait')
-    assert send.wait(30.0) == 1, send.output
+    send = start.hmsa('send', '1.1:0.05', '--wait', '--timeout', '200')
+    assert send.wait(300.0) == 1, send.output
     assert 'not carried out: nobody subscribes to /flux_density_command' in send.stderr
     start.hmsa('plant')
     ros.spin_until(lambda: ros.node.count_publishers('joint_states'), 'the plant')
-    send = start.hmsa('send', '1.0:0.5', '1.1:0.1', '1.2:0.1', '--wait')
-    assert send.wait(30.0) == 0, send.output
+    send = start.hmsa('send', '1.0:0.5', '1.1:0.1', '1.2:0.1', '--wait', '--timeout', '200')
+    assert send.wait(300.0) == 0, send.output
     assert 'accepted' in send.stdout
     assert 'done: at_rest, measured' in send.stdout
     assert 'setpoint 3 of 3' in send.stderr
@@ -151,9 +151,9 @@ def test_send_trusts_a_driver_that_publishes_samples_alone(start, ros):
 def test_send_fails_where_the_actuator_is_measured_to_miss_the_setpoint(start, ros):
     start.hmsa('plant', '--ros-args', '-p', 'mismatch.shear_modulus:=1.1')
     ros.spin_until(lambda: ros.node.count_publishers('joint_states'), 'the plant')
-    start.hmsa('planner', '--ros-args', '-p', 'lead_time:=0.5')
-    send = start.hmsa('send', '1.0:0.5', '1.4:0.5', '--wait', '--timeout', '30')
-    assert send.wait(60.0) == 1, send.output
+    start.hmsa('planner', '--ros-args', '-p', 'lead_time:=2.0')
+    send = start.hmsa('send', '1.0:0.5', '1.4:0.5', '--wait', '--timeout', '200')
+    assert send.wait(300.0) == 1, send.output
     found = re.search(
         r'setpoint 2 of 2: rests (\S+) \(\S+ %\) short of 1.4 and rings at (\S+) Hz, '
         r'(\S+) \(\S+ %\) peak to peak', send.stderr)
@@ -171,10 +171,10 @@ def test_send_moves_several_joints_each_to_its_stretch_or_all_to_one(start, ros)
     joints = ['--ros-args', '-p', 'joints:=[left, right]']
     start.hmsa('plant', *joints)
     ros.spin_until(lambda: ros.node.count_publishers('joint_states'), 'the plant')
-    start.hmsa('planner', *joints, '-p', 'lead_time:=0.5')
+    start.hmsa('planner', *joints, '-p', 'lead_time:=2.0')
     send = start.hmsa(
-        'send', '1.1,0.9:0.2', '1.2:0.2', '--joint', 'right,left', '--wait')
-    assert send.wait(30.0) == 0, send.output
+        'send', '1.1,0.9:0.2', '1.2:0.2', '--joint', 'right,left', '--wait', '--timeout', '200')
+    assert send.wait(300.0) == 0, send.output
     assert 'done: at_rest' in send.stdout
     ros.spin_until(lambda: plans, 'the plan')
     # At rest at the first setpoint, and at the second.
@@ -186,7 +186,7 @@ def test_send_moves_several_joints_each_to_its_stretch_or_all_to_one(start, ros)
     for count in ('1.1,1.2,1.3:1', '1.1,1.2:1'):
         names = 'left,right' if count.count(',') == 2 else 'left'
         send = start.hmsa('send', count, '--joint', names)
-        assert send.wait(30.0) == 2
+        assert send.wait(300.0) == 2
         assert 'expected one for all, or one per joint' in send.stderr
 
 

@@ -143,4 +143,5 @@ def test_a_plant_that_is_taken_away_is_missed_and_comes_back(start, ros):
     ros.spin_until(lambda: 'not active' not in statuses[-1].message, 'the plant')
     setpoint.publish(Float64(data=1.2))
     ros.spin_until(
-        lambda: statuses[-1].values[0].value in ('arrived', 'off_target'), 'the arrival')
+        lambda: statuses[-1].values[0].value in ('arrived', 'off_target', 'vibrating'),
+        'a verdict on what is measured')

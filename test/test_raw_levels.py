@@ -114,8 +114,13 @@ def test_a_run_of_levels_has_them_in_force_and_ends_at_rest(start, tmp_path):
         writer = csv.writer(text)
         writer.writerow(['time', 'flux_density'])
         writer.writerows(zip(designed.level_times, designed.levels, strict=True))
+    # Two seconds ahead on the wall, for a busy machine.
+    own = tmp_path / 'own.yaml'
+    own.write_text(
+        '/**:\n  ros__parameters:\n    actuator.shear_modulus: 10000.0\n'
+        '/**/planner:\n  ros__parameters:\n    lead_time: 0.35\n')
     run = start.hmsa('run', '--levels', str(file), '--simulate', '--report', '--out', str(out),
-                     '--json')
+                     '--json', '--params-file', str(own))
     assert run.wait(RUN_SECONDS) == 0, run.output
     result = json.loads(run.stdout)
     assert result['verdict'] == 'arrived'
