@@ -6,6 +6,7 @@ import identification_oracle as oracle
 import numpy as np
 import pytest
 
+from hmsa_ros.core.creep import Creep
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation import Estimator, Options, Prior
 from hmsa_ros.estimation.words import confounded, sentence
@@ -66,6 +67,29 @@ def test_modulus_damping_bias_and_state_are_found_within_their_deviations(factor
     # Twenty errors, in part of the same cause, in their own deviations.
     assert 0.4 < np.sqrt(np.mean(np.square(errors))) < 1.8
     assert np.max(np.abs(errors)) < 4.5
+
+
+@pytest.mark.parametrize(('coil', 'tau'), [(0.0, 0.01), (5e-4, 0.05)])
+def test_branches_that_are_given_are_followed_over_many_windows(coil, tau):
+    extras = oracle.Extras(coil=coil, ratio=0.1, time=tau)
+    block = replace(oracle.BLOCK, shear_modulus=9e3)
+    given = replace(oracle.BLOCK, creep=Creep((0.1,), (tau,)))
+    prior = Prior.nominal(given, ('shear_modulus', 'damping_coefficient'), others={
+        'coil_time_constant': coil})
+    end = SAMPLED[-1] + 2e-3
+    state = oracle.simulate(
+        np.append(SAMPLED, [end - 1e-5, end, end + 1e-5]), TIMES, LEVELS, block, extras)[-3:]
+    estimator, found = run(
+        measured(block, extras, noise=1e-5), prior=prior, options=Options(window=40))
+    assert estimator._window.begin + estimator._origin > 0
+    assert found.trusted
+    assert found.values['shear_modulus'] == pytest.approx(9e3, rel=1e-3)
+    assert found.stretch == pytest.approx(state[1], abs=5e-5)
+    assert found.actuator.creep == given.creep
+    # Without them it does not fit.
+    _, lost = run(measured(block, extras, noise=1e-5), ('shear_modulus', 'damping_coefficient'),
+                  Options(window=40))
+    assert abs(lost.values['shear_modulus'] - 9e3) > 20.0
 
 
 def test_remanence_and_coil_lag_are_found_beside_the_modulus():

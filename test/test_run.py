@@ -63,10 +63,10 @@ def test_a_plant_that_is_not_as_the_planner_thinks_fails_with_the_figures(start,
 
 
 @pytest.mark.slow
-def test_a_block_arrives_and_stays_though_it_creeps_and_not_where_feedback_would_not_know(
-        start, tmp_path):
+@pytest.mark.parametrize('feedback', ['off', 'adapt'])
+def test_a_block_arrives_and_stays_though_it_creeps(start, tmp_path, feedback):
     file = tmp_path / 'creeping.yaml'
-    file.write_text(CREEPING)
+    file.write_text(f'{CREEPING}    feedback: "{feedback}"\n')
     run = start.hmsa('run', '1.4:0.1', '1.1:0.2', '--simulate', '--params-file', str(file),
                      '--report', '--out', str(tmp_path / 'out'), '--json')
     assert run.wait(RUN_SECONDS) == 0, run.output
@@ -74,10 +74,6 @@ def test_a_block_arrives_and_stays_though_it_creeps_and_not_where_feedback_would
         # Unknown to the planner, creep leaves a fifth of the step.
         assert x['residual'] < 1e-3 * step
         assert abs(x['offset']) < 1e-3 * step
-    refused = start.hmsa('planner', '--ros-args', '--params-file', str(file), '-p',
-                         'feedback:=observe')
-    assert refused.wait(RUN_SECONDS) == 2, refused.output
-    assert 'expected feedback off, since estimates do not know of creep yet' in refused.stderr
 
 
 @pytest.mark.slow

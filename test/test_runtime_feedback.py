@@ -1,5 +1,6 @@
 """A planner that learns from samples: a simulated device, without ROS."""
 
+from dataclasses import replace
 from functools import partial
 import math
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from test_runtime_measured import Loop, MS, START
 
+from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.planner import Options
 from hmsa_ros.core.timeline import Model
@@ -79,6 +81,19 @@ def test_adapting_corrects_the_first_move_and_plans_the_second_with_what_was_lea
     assert 'corrected' in codes(loop)
     assert codes(loop)[-1] == 'arrived'
     assert 'plans use it' in estimates(loop)[-1].message
+
+
+@pytest.mark.parametrize('factor', [0.9, 1.1])
+def test_adapting_knows_the_creep_of_the_block(factor):
+    block = replace(paper_actuator(), creep=Creep((0.1, 0.1, 0.05), (0.002, 0.02, 0.2)))
+    loop = Loop(factor, 1e-3, delay=2 * MS, block=block, heartbeat_period=0, feedback='adapt')
+    truth = loop.run((1.4, 300 * MS), (1.1, 300 * MS))
+    assert max(map(abs, left(truth, 60, 80, 1.4, 0.4))) > 0.05
+    for begin, end, target, step in ((200, 300, 1.4, 0.4), (360, 400, 1.1, 0.3)):
+        assert max(map(abs, left(truth, begin, end, target, step))) < 2e-3
+    assert f'G about {"+" if factor > 1.0 else "-"}10 %; plans use it' in estimates(
+        loop)[-1].message
+    assert codes(loop)[-1] == 'arrived'
 
 
 @pytest.mark.parametrize('factor', [0.8, 1.2])

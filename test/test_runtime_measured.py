@@ -33,7 +33,9 @@ class Loop:
         real = replace(block, shear_modulus=block.shear_modulus * shear_modulus)
         self.now = START
         self.device = SimulatedDevice(
-            [SimulatedJoint(Setup(real, real.rest), errors=SensorErrors(stretch_noise=noise))],
+            [SimulatedJoint(
+                Setup(real, real.rest, creep=block.creep),
+                errors=SensorErrors(stretch_noise=noise))],
             period=1000 * MS // rate, time=START, measurement_delay=delay, seed=1)
         options = Options(flux_density_min=-0.5, flux_density_max=0.5, lead_time=lead)
         self.unheard = ''

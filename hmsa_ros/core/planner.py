@@ -70,9 +70,10 @@ class Planner(RunningPlan):
         """Start at rest."""
         super().__init__(
             Model(actuator, options), actuator.rest if stretch is None else stretch)
-        #: Returns stretch and rate in 1/s believed of a time in ns where samples show them; None
-        #: for what is predicted.
-        self.believed: Callable[[int], tuple[float, float] | None] = lambda time: None
+        #: Returns stretch, rate in 1/s and what branches follow, as samples show them of a time in
+        #: ns; None for what is predicted.
+        self.believed: Callable[
+            [int], tuple[float, float, tuple[float, ...]] | None] = lambda time: None
 
     @property
     def options(self) -> Options:
@@ -222,7 +223,8 @@ class Planner(RunningPlan):
         believed = self.believed(begin)
         if believed is not None:
             state = replace(
-                state, stretch=believed[0], rate=believed[1] * self.model.units.time)
+                state, stretch=believed[0], rate=believed[1] * self.model.units.time,
+                followed=believed[2] or state.followed)
         return Outset(self.plan, self.model, begin, state, self._history.stale)
 
     def soonest(self, now: int) -> int:

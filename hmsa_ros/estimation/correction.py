@@ -24,7 +24,7 @@ from hmsa_ros.core.timeline import Model, Options
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation.estimator import Estimate
-from hmsa_ros.estimation.motion import follow, Levels, rest
+from hmsa_ros.estimation.motion import follow, followed, Levels, rest
 
 # A correction leaves at most this share of what the course in force leaves, in squares, and
 # gains at least this, as a share of the noise of a sample.
@@ -70,17 +70,20 @@ class Course:
         Time in ns of rest at the target.
     target : float
         Stretch.
+    relaxed : float
+        Level in T that holds it once branches have relaxed; NaN for the last level.
 
     """
 
     levels: tuple[tuple[int, float], ...]
     arrival: int
     target: float
+    relaxed: float = math.nan
 
     @property
     def holding(self) -> float:
         """Level in T that is held at the end."""
-        return self.levels[-1][1]
+        return self.levels[-1][1] if math.isnan(self.relaxed) else self.relaxed
 
     def follows(self, other: 'Course', begin: int) -> 'Course':
         """Return this course after what another one does before a time in ns."""
@@ -263,7 +266,8 @@ class Corrector:
         load = in_force / units.load
         return Request(
             State(estimate.stretch, estimate.rate * units.time, load,
-                  load if model.delivery.lag > 0.0 else None),
+                  load if model.delivery.lag > 0.0 else None,
+                  followed(estimate.values, estimate.stretch)),
             target, model.material, model.limits, model.delivery, units=units,
             pace=model.pace)
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 import itertools
 import math
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from hmsa_ros.core.model import Array
 from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.estimation.motion import follow, Levels, rest
+from hmsa_ros.estimation.motion import behind, follow, Levels, rest
 from hmsa_ros.estimation.prior import Prior
 from hmsa_ros.estimation.screening import Screening
 from hmsa_ros.estimation.window import coordinates, Solution, Window
@@ -93,7 +94,7 @@ class Estimate:
     stretch, rate : float
         Of the block, the rate in 1/s.
     values : dict of str to float
-        Of all quantities.
+        Of all quantities; of branches that are given as `hmsa_ros.estimation.motion.follow` says.
     free : tuple of str
         Those that are tracked.
     deviations : dict of str to float
@@ -112,7 +113,7 @@ class Estimate:
     time: int
     stretch: float
     rate: float
-    values: dict[str, float]
+    values: dict[str, Any]
     free: tuple[str, ...]
     deviations: dict[str, float]
     covariance: Array
@@ -253,7 +254,7 @@ class Estimator:
             return None
         self._solution = found
         self._follow_noise(found)
-        estimate = self._estimate(time, found)
+        estimate = self._estimate(time, found, window)
         self._go_along(window, found, until)
         return estimate
 
@@ -285,7 +286,8 @@ class Estimator:
             np.array([max(self._seconds(time), window.begin)]))
         if motion is None:
             return None
-        return self._estimate(time, replace(found, motion=motion, residual=np.zeros(0)))
+        return self._estimate(
+            time, replace(found, motion=motion, residual=np.zeros(0)), window)
 
     def _new_window(self, stamp: int, shown: float) -> Window:
         """Return a window at rest under the level in force, or at what is shown if none is."""
@@ -343,8 +345,17 @@ class Estimator:
         self.noise = math.exp(
             (1.0 - gain) * math.log(self.noise) + gain * math.log(seen))
 
-    def _estimate(self, time: int, found: Solution) -> Estimate:
+    def _behind(self, found: Solution, window: Window, time: float) -> dict[str, Any]:
+        """Return the values of a solution with what branches have followed at a time in s."""
+        return {**found.values, 'behind': behind(
+            found.values, (float(found.z[-2]), float(found.z[-1])), self._as_levels(),
+            window.begin, time)}
+
+    def _estimate(self, time: int, found: Solution, window: Window) -> Estimate:
         state, covariance = found.at_end()
+        values = found.values
+        if 'creep' in values:
+            values = self._behind(found, window, max(self._seconds(time), window.begin))
         if self._fixed is not None:
             covariance[:-2, :-2] = self._fixed
         deviations = {
@@ -352,7 +363,7 @@ class Estimator:
             for i, name in enumerate(self.prior.free)}
         trouble = self.screening.trouble
         return Estimate(
-            time, float(state[-2]), float(state[-1]), found.values, self.prior.free, deviations,
+            time, float(state[-2]), float(state[-1]), values, self.prior.free, deviations,
             covariance, self.noise, not trouble, trouble)
 
     def _go_along(self, window: Window, found: Solution, until: float) -> None:
@@ -381,6 +392,9 @@ class Estimator:
         seconds = shift / NANOSECONDS
         moved = window.move_on(place, time, found, self.noise, drift)
         self._fix(moved, found)
+        if 'creep' in found.values:
+            found = replace(found, values=self._behind(found, window, time))
+            moved.values = {**moved.values, 'behind': found.values['behind']}
         moved.begin -= seconds
         moved.time = moved.time - seconds
         self._origin += shift

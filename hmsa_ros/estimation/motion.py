@@ -3,11 +3,12 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import math
+from typing import Any
 
 import numpy as np
 
 from hmsa_ros.core.delivery import late
-from hmsa_ros.core.law import natural_frequency
+from hmsa_ros.core.law import elastic_force, evaluate, FORCE, natural_frequency
 from hmsa_ros.core.model import Array
 from hmsa_ros.identification import kernels
 from hmsa_ros.identification.quantities import derivative
@@ -18,6 +19,10 @@ from hmsa_ros.identification.response import set_rest, Setup
 _RTOL = 1e-7
 # Time constants after which nothing is left of an earlier field.
 _FORGOTTEN = 40.0
+# Where the decay of a branch is interpolated, in its relaxation times, and how far apart in units
+# of time the motion is that a branch follows, and in how many points at the most.
+_NODES = -2.0 * np.log1p(-np.linspace(0.0, 1.0 - math.exp(-7.0), 40))
+_FINE, _MOST = 0.05, 4000
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +109,7 @@ class Motion:
 
 
 def follow(
-        values: Mapping[str, float], free: Sequence[str], state: tuple[float, float],
+        values: Mapping[str, Any], free: Sequence[str], state: tuple[float, float],
         levels: Levels, begin: float, times: Array) -> Motion | None:
     """
     Simulate a motion.
@@ -112,7 +117,9 @@ def follow(
     Parameters
     ----------
     values : mapping of str to float
-        Of all quantities, complete.
+        Of all quantities, complete; and where branches are given, how far what they have followed
+        is from the elastic force at the begin, in units of G, under the name ``behind``; default
+        relaxed.
     free : sequence of str
         By which to differentiate.
     state : (float, float)
@@ -147,6 +154,9 @@ def follow(
     elif math.isfinite(levels.slew_limit):
         field = heights[0] = levels.field(begin, 0.0)
     n = len(times)
+    if any(values.get('behind', ())) and n:
+        starts, heights, slopes, field = _relaxing(
+            values, theta, float(times[-1]) - begin, starts, heights, slopes, field)
     stretch, rate = np.empty(n), np.empty(n)
     raw, raw_rate = np.empty((n, inner + 2)), np.empty((n, inner + 2))
     if not kernels.respond(
@@ -158,11 +168,96 @@ def follow(
         np.hstack([raw_rate[:, :inner] @ setup.mixing, raw_rate[:, inner:]]))
 
 
+def _relaxing(
+        values: Mapping[str, Any], theta: Array, span: float, starts: Array, heights: Array,
+        slopes: Array, field: float) -> tuple[Array, Array, Array, float]:
+    """Return levels and field in T with the pull of branches that have not relaxed at first."""
+    # The response begins relaxed; what the branches follow more than that decays by itself.
+    creep, lag, begin = values['creep'], values['coil_time_constant'], float(starts[0])
+    after: Array = np.unique(np.clip(np.outer(creep.times, _NODES), 0.0, max(span, 0.0)))
+    strength = np.array(creep.ratios) * np.array(values['behind']) * (
+        theta[kernels.STIFFNESS] / theta[kernels.DRIVE])
+    pull = np.exp(-after[:, None] / np.array(creep.times)) @ strength
+    rises: Array = np.append(np.diff(pull) / np.diff(after), 0.0)
+    both = np.union1d(starts, begin + after)
+    i = np.searchsorted(starts, both, side='right') - 1
+    j = np.searchsorted(begin + after, both, side='right') - 1
+    return (
+        both, heights[i] + slopes[i] * (both - starts[i]) + pull[j]
+        + rises[j] * (both - begin - after[j] + lag), slopes[i] + rises[j], field + float(pull[0]))
+
+
+def behind(
+        values: Mapping[str, Any], state: tuple[float, float], levels: Levels, begin: float,
+        time: float) -> tuple[float, ...]:
+    """
+    Return how far what branches have followed is from the elastic force at a later time.
+
+    Parameters
+    ----------
+    values, state, levels, begin
+        As for `follow`.
+    time : float
+        In s, not before the begin.
+
+    Returns
+    -------
+    tuple of float
+        In units of G; empty where none are given.
+
+    """
+    creep = values.get('creep')
+    if not creep:
+        return ()
+    before = values.get('behind') or (0.0,) * len(creep.ratios)
+    span = time - begin
+    count = math.ceil(min(span / (_FINE * values['time_unit']), _MOST))
+    if count == 0:
+        return tuple(before)
+    times: Array = np.linspace(begin, time, count + 1).astype(np.float64)
+    motion = follow(values, (), state, levels, begin, times)
+    if motion is None:
+        return tuple(before)
+    force = np.empty(count + 1)
+    evaluate(FORCE, motion.stretch, Setup.of(values, ()).material, force)
+    step, found = span / count, []
+    left = span - step * np.arange(1, count + 1)
+    for tau, more in zip(creep.times, before, strict=True):
+        # Of a force that changes linearly over a step.
+        decay = math.exp(-step / tau)
+        mean = -math.expm1(-step / tau) * tau / step
+        taken = np.exp(-left / tau) @ (force[1:] * (1.0 - mean) + force[:-1] * (mean - decay))
+        found.append(float((force[0] + more) * math.exp(-span / tau) + taken - force[-1]))
+    return tuple(found)
+
+
+def followed(values: Mapping[str, Any], stretch: float) -> tuple[float, ...]:
+    """Return what branches have followed at a stretch, in units of G; empty if they relaxed."""
+    if not any(values.get('behind', ())):
+        return ()
+    force = float(elastic_force(stretch, Setup.of(values, ()).material))
+    return tuple(force + x for x in values['behind'])
+
+
+def held(
+        values: Mapping[str, Any], stretch: float, level: float
+) -> tuple[float, float, Array] | None:
+    """Return as `rest` where a level would hold the block with what its branches hold now."""
+    by = followed(values, stretch)
+    if not by:
+        return rest(values, (), level)
+    a, k, f = Setup.of(values, ()).theta[[kernels.STIFFNESS, kernels.DRIVE, kernels.FORCE]]
+    ratios = values['creep'].ratios
+    pull = k * level + f + a * sum(x * y for x, y in zip(ratios, by, strict=True))
+    found = rest(values, (), float((pull / (1.0 + sum(ratios)) - f) / k))
+    return found and (found[0], found[1] * math.sqrt(1.0 + sum(ratios)), found[2])
+
+
 def rest(
-        values: Mapping[str, float], free: Sequence[str], level: float
+        values: Mapping[str, Any], free: Sequence[str], level: float
 ) -> tuple[float, float, Array] | None:
     """
-    Return where a level holds the block.
+    Return where a level holds the block once its branches have relaxed.
 
     Parameters
     ----------

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.laws.coordinate import Coordinate, coordinate_of
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.parameters import ActuatorParameters
@@ -42,7 +43,7 @@ class Prior:
     Attributes
     ----------
     values : dict of str to object
-        Of all quantities, and the law.
+        Of all quantities, the law, and the branches of an elastomer that creeps.
     free : tuple of str
         What is tracked.
     covariance : ndarray, shape (p, p)
@@ -94,7 +95,11 @@ class Prior:
             raise BadInputError(
                 f'{", ".join(wrong)} cannot be tracked: expected some of '
                 + ', '.join(x for x in DEVIATIONS if x not in _NOT_TRACKED))
-        values = complete(values_of(actuator, others), free)
+        values: dict[str, Any] = complete(values_of(actuator, others), free)
+        held = [x for x in zip(
+            actuator.creep.ratios, actuator.creep.times, strict=True) if x[0] > 0.0]
+        if held:
+            values['creep'] = Creep(*map(tuple, zip(*held, strict=True)))
         if 'chain_limit' in free:
             values['chain_limit'] = min(values['chain_limit'], 1e9)
         size = []

@@ -11,6 +11,7 @@ along with the motion (C. V. Rao, J. B. Rawlings and D. Q. Mayne, IEEE Trans. Au
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import math
+from typing import Any
 
 import numpy as np
 
@@ -50,7 +51,7 @@ class Solution:
     """
 
     z: Array
-    values: dict[str, float]
+    values: dict[str, Any]
     motion: Motion
     residual: Array
     weights: Array
@@ -96,7 +97,7 @@ class Window:
 
     """
 
-    values: dict[str, float]
+    values: dict[str, Any]
     free: tuple[str, ...]
     mean: Array
     covariance: Array
@@ -105,7 +106,7 @@ class Window:
     time: Array
     stretch: Array
 
-    def values_at(self, z: Array) -> dict[str, float]:
+    def values_at(self, z: Array) -> dict[str, Any]:
         """Return the values of all quantities for coordinates."""
         found = dict(self.values)
         for name, x in zip(self.free, z.tolist(), strict=False):
@@ -175,7 +176,7 @@ class Window:
 
     def _simulate(
             self, z: Array, levels: Levels, times: Array, noise: float, prior: Array
-    ) -> tuple[dict[str, float], Motion, Array, Array, Array, float] | None:
+    ) -> tuple[dict[str, Any], Motion, Array, Array, Array, float] | None:
         values = self.values_at(z)
         motion = follow(
             values, self.free, (float(z[-2]), float(z[-1])), levels, self.begin,

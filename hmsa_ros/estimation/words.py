@@ -5,7 +5,7 @@ import math
 from typing import Any
 
 from hmsa_ros.estimation.estimator import Estimate
-from hmsa_ros.estimation.motion import rest
+from hmsa_ros.estimation.motion import held
 from hmsa_ros.identification.quantities import modulus_of
 
 # A parameter is another one than the nominal from so many deviations and so large a share on.
@@ -119,7 +119,7 @@ def sentence(
     if not estimate.trusted:
         return f'{estimate.trouble}: open loop until samples fit again'
     wrong = []
-    at = rest(estimate.values, (), holding)
+    at = held(estimate.values, estimate.stretch, holding)
     step = target - start
     if at is not None and abs(step) > _STEP:
         offset = (at[0] - target) / step

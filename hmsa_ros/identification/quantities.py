@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import math
 from typing import Any
 
+from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.laws.record import Elastic
 from hmsa_ros.core.parameters import ActuatorParameters, Geometry, NondimensionalParameters
 from hmsa_ros.errors import BadInputError
@@ -182,7 +183,8 @@ def actuator_of(values: Mapping[str, Any]) -> ActuatorParameters:
         shear_modulus=values['shear_modulus'], density=values['density'],
         half_length=values['half_length'], half_thickness=values['half_thickness'],
         remanence=values['remanence'], chain_limit=values['chain_limit'],
-        damping_coefficient=values['damping_coefficient'], law=values.get('law'))
+        damping_coefficient=values['damping_coefficient'], law=values.get('law'),
+        creep=values.get('creep', Creep()))
 
 
 def group_of(

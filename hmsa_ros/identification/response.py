@@ -4,10 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.law import (
     BY_CONSTANT,
     elastic_force,
@@ -78,7 +80,7 @@ def _chain(
         'chain_limit': {kernels.CONSTANT: -1.0 / values['chain_limit'] ** 2},
         'coil_time_constant': {kernels.LAG: 1.0},
         'initial_stretch': {kernels.STRETCH: 1.0}, 'initial_rate': {kernels.RATE: 1.0}}
-    if branches:
+    if branches == 1:
         theta[kernels.FIRST_BRANCH:] = values['viscoelastic_ratio'], values['viscoelastic_time']
         chain['viscoelastic_ratio'] = {kernels.FIRST_BRANCH: 1.0}
         chain['viscoelastic_time'] = {kernels.FIRST_BRANCH + 1: 1.0}
@@ -148,14 +150,15 @@ class Setup:
     mixing: Array
 
     @classmethod
-    def of(cls, values: Mapping[str, float], free: Sequence[str]) -> 'Setup':
+    def of(cls, values: Mapping[str, Any], free: Sequence[str]) -> 'Setup':
         """
         Work it out.
 
         Parameters
         ----------
         values : mapping of str to float
-            Of all quantities, as `complete` returns them.
+            Of all quantities, as `complete` returns them; Maxwell branches that are given under
+            the name ``creep``.
         free : sequence of str
             By which to differentiate.
 
@@ -165,8 +168,13 @@ class Setup:
             With arrays of its own.
 
         """
-        branches = int(values['viscoelastic_ratio'] > 0.0 or 'viscoelastic_ratio' in free)
+        given: Creep | None = values.get('creep')
+        branches = len(given.ratios) if given else int(
+            values['viscoelastic_ratio'] > 0.0 or 'viscoelastic_ratio' in free)
         theta, chain = _chain(values, branches)
+        if given:
+            theta[kernels.FIRST_BRANCH::2] = given.ratios
+            theta[kernels.FIRST_BRANCH + 1::2] = given.times
         if 'time_unit' in free and 'shear_modulus' in free:
             extra = values['density'] / values['shear_modulus']
             modulus = dict(chain['shear_modulus'])

@@ -18,7 +18,6 @@ from hmsa_ros.contract.parameters import (
     VISCOELASTIC,
 )
 from hmsa_ros.core.group import PlannerGroup
-from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.sequence import SHORT_SPELL
 from hmsa_ros.core.shapers import SHAPERS
@@ -270,7 +269,7 @@ def group_from(parameters: JointParameters) -> PlannerGroup:
     for name in parameters.names:
         values = parameters.of(name)
         planners[name] = _of(parameters, name, lambda values=values: Planner(
-            _block(parameters, values), options_from(values),
+            planned_from(values), options_from(values),
             stretch=values['initial_stretch']))
     return PlannerGroup(planners, simultaneous=parameters['simultaneous_arrival'])
 
@@ -302,18 +301,8 @@ def models_from(parameters: JointParameters, group: PlannerGroup) -> dict[str, M
         values = parameters.of(name)
         models[name] = _of(
             parameters, name, lambda values=values, planner=planner:
-            planner.checked_model(options_from(values), _block(parameters, values)))
+            planner.checked_model(options_from(values), planned_from(values)))
     return models
-
-
-def _block(parameters: JointParameters, values: Mapping[str, Any]) -> ActuatorParameters:
-    """Return the block of a joint; feedback knows of none that creeps."""
-    block = planned_from(values)
-    if block.creep and parameters['feedback'] != 'off':
-        raise BadInputError(
-            f"parameter feedback is {parameters['feedback']} and viscoelastic.ratio is set: "
-            'expected feedback off, since estimates do not know of creep yet')
-    return block
 
 
 def _of(parameters: JointParameters, name: str, make: Any) -> Any:

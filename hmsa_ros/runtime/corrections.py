@@ -9,7 +9,7 @@ from hmsa_ros.core.drafting import Steps
 from hmsa_ros.core.group import PlannerGroup
 from hmsa_ros.core.planner import Planner
 from hmsa_ros.core.status import Code, RefusedError
-from hmsa_ros.core.timeline import Draft, Plan
+from hmsa_ros.core.timeline import Draft, Model, Plan
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.estimation import Estimate
 from hmsa_ros.estimation.correction import caution, Course, expect
@@ -116,9 +116,8 @@ class Corrections:
 
     def _worthwhile(self, estimate: Estimate, planner: Planner) -> bool:
         """Return whether a plan is expected to leave more than it must."""
-        course, step = _course(planner.plan, estimate.time)
-        size = expect(estimate, course, planner.options.slew_limit).size
-        return size > _GAIN * step
+        course, gain = _course(planner.plan, estimate.time)
+        return expect(estimate, course, planner.options.slew_limit).size > gain
 
     def _correct(self, name: str, now: int) -> Steps[Mapping[str, Draft]]:
         """Plan the rest anew, if that is expected to leave less."""
@@ -133,14 +132,15 @@ class Corrections:
                 raise
             return {}
         estimate = None if draft is None else self._feedback.state(name, draft.begin)
-        if draft is None or estimate is None:
+        if draft is None or estimate is None or draft.missed:
+            # A correction leaves no setpoint out.
             return {}
         slew = planner.options.slew_limit
-        course, step = _course(planner.plan, draft.begin)
+        course, gain = _course(planner.plan, draft.begin)
         segment = draft.segments[0]
         before = expect(estimate, course, slew, segment.arrival or 0).size
         after = expect(estimate, _drafted(draft), slew).size
-        if after < min(math.sqrt(_SHARE) * before, before - _GAIN * step):
+        if after < min(math.sqrt(_SHARE) * before, before - gain):
             return {name: draft}
         return {}
 
@@ -187,11 +187,17 @@ def _drafted(draft: Draft) -> Course:
     return Course(
         tuple((x.stamp, x.flux_density) for x in draft.levels
               if not rest or x.stamp < rest[0].begin),
-        segment.arrival or draft.begin, segment.stretch)
+        segment.arrival or draft.begin, segment.stretch,
+        _relaxed(draft.levels[0].model, segment.stretch) if rest else math.nan)
+
+
+def _relaxed(model: Model, stretch: float) -> float:
+    """Return the level in T where a tail leads that the next setpoint cuts; NaN without creep."""
+    return model.holding(stretch) * model.units.load if model.material.creep else math.nan
 
 
 def _course(plan: Plan, begin: int) -> tuple[Course, float]:
-    """Return what is planned from a time in ns to the end of the setpoint then, and its step."""
+    """Return what is planned from a time in ns to its setpoint's end, and what counts then."""
     levels, place = plan.levels, max(plan.under_way(begin), 0)
     segment = plan.segments[place]
     end = plan.segments[place + 1].begin if place + 1 < len(plan.segments) else None
@@ -200,5 +206,6 @@ def _course(plan: Plan, begin: int) -> tuple[Course, float]:
     start = plan.segments[place - 1].stretch if place else levels[0].stretch
     return Course(
         tuple((x.stamp, x.flux_density) for x in kept),
-        segment.arrival or kept[-1].stamp, segment.stretch), max(
-            abs(segment.stretch - start), _LEAST_STEP)
+        segment.arrival or kept[-1].stamp, segment.stretch,
+        math.nan if end is None else _relaxed(kept[-1].model, segment.stretch)), max(
+            _GAIN * abs(segment.stretch - start), _GAIN * _LEAST_STEP, segment.vibration)

@@ -10,6 +10,7 @@ from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.estimation import Estimate, Estimator, Options, Prior
 from hmsa_ros.estimation.estimator import warm_up
+from hmsa_ros.estimation.motion import followed
 from hmsa_ros.estimation.words import differences
 from hmsa_ros.identification.known import Known
 from hmsa_ros.runtime.learnt import differs, learnt_model, save
@@ -256,13 +257,15 @@ class Feedback:
 
     # -- for plans -----------------------------------------------------------------------------
 
-    def _believed(self, name: str, time: int) -> tuple[float, float] | None:
-        """Return stretch and rate in 1/s at a time in ns; None for what is predicted."""
+    def _believed(
+            self, name: str, time: int) -> tuple[float, float, tuple[float, ...]] | None:
+        """Return what `hmsa_ros.core.planner.Planner` is to believe of a time in ns."""
         try:
             found = self.state(name, time)
         except HmsaError:
             return None
-        return None if found is None else (found.stretch, found.rate)
+        return None if found is None else (
+            found.stretch, found.rate, followed(found.values, found.stretch))
 
     def state(self, name: str, time: int) -> Estimate | None:
         """
@@ -288,6 +291,12 @@ class Feedback:
         if not latest.trusted or time - latest.time > (
                 _AHEAD * latest.values['time_unit'] * NANOSECONDS):
             return None
+        return self._predicted(name, joint, time)
+
+    def _predicted(self, name: str, joint: Joint, time: int) -> Estimate | None:
+        """Return what is believed of a time in ns under the plan in force by now."""
+        joint.estimator.set_levels(
+            [(x.stamp, x.flux_density) for x in self._group.planners[name].plan.levels])
         return joint.estimator.predict(time)
 
     def foreseen(self, name: str, time: int) -> Estimate | None:
@@ -295,9 +304,7 @@ class Feedback:
         joint = self._joints.get(name)
         if joint is None or joint.latest is not None:
             return self.state(name, time)
-        joint.estimator.set_levels(
-            [(x.stamp, x.flux_density) for x in self._group.planners[name].plan.levels])
-        return joint.estimator.predict(time)
+        return self._predicted(name, joint, time)
 
     @property
     def trim(self) -> float:

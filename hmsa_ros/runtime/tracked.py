@@ -5,7 +5,7 @@ import math
 
 from hmsa_ros.core.timeline import Plan
 from hmsa_ros.estimation import Estimate, Estimator
-from hmsa_ros.estimation.motion import rest
+from hmsa_ros.estimation.motion import held
 from hmsa_ros.estimation.words import sentence
 
 
@@ -67,7 +67,7 @@ class Joint:
         if segment is None or segment.arrival is None or found.time < segment.arrival:
             self.amplitude = 0.0
             return
-        at = rest(found.values, (), plan.level(found.time).flux_density)
+        at = held(found.values, found.stretch, plan.level(found.time).flux_density)
         if at is not None:
             self.amplitude = max(self.amplitude, math.hypot(
                 found.stretch - at[0], found.rate / at[1]))
