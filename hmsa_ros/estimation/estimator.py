@@ -169,8 +169,6 @@ class Estimator:
         self._window: Window | None = None
         self._solution: Solution | None = None
 
-    # -- in ------------------------------------------------------------------------------------
-
     def level(self, stamp: int, flux_density: float) -> None:
         """Take in a level in T from a stamp in ns on; it supersedes what comes at or after it."""
         place = bisect_left(self._levels, stamp, key=lambda x: x[0])
@@ -222,8 +220,6 @@ class Estimator:
         self._window = self._solution = self._fixed = None
         self._pending.clear()
         self.screening = Screening(self.options.gate, self.prior.coordinate)
-
-    # -- out -----------------------------------------------------------------------------------
 
     def update(self, time: int) -> Estimate | None:
         """
@@ -296,13 +292,6 @@ class Estimator:
         self._origin = stamp
         prior = self.prior
         mean = coordinates(prior.values, prior.free)
-        bounds = np.stack(
-            [mean - _BOUND * prior.spread, mean + _BOUND * prior.spread], axis=1)
-        for i, name in enumerate(prior.free):
-            if QUANTITIES[name].scale == 'linear':
-                bounds[i, 0] = max(bounds[i, 0], QUANTITIES[name].least)
-            elif QUANTITIES[name].scale == 'inverse':
-                bounds[i, 0] = max(bounds[i, 0], 0.2 * mean[i])
         self._fixed = None if self.learning else prior.covariance
         known = prior.covariance * (1.0 if self.learning else _FIXED)
         at = rest(prior.values, prior.free, self._in_force(stamp))
@@ -316,8 +305,8 @@ class Estimator:
         covariance[-2, -2] = by @ known @ by + off ** 2
         covariance[-1, -1] = (off * frequency) ** 2
         return Window(
-            dict(prior.values), prior.free, np.append(mean, [stretch, 0.0]), covariance, bounds,
-            0.0, np.zeros(0), np.zeros(0))
+            dict(prior.values), prior.free, np.append(mean, [stretch, 0.0]), covariance,
+            _bounds(prior, mean), 0.0, np.zeros(0), np.zeros(0))
 
     def _take(self, window: Window) -> None:
         """Take what waits into the window, as far as it fits the motion believed."""
@@ -416,8 +405,6 @@ class Estimator:
         window.covariance[:-2, :-2] = known * (1.0 if self.learning else _FIXED)
         self._fixed = None if self.learning else known
 
-    # -- time ----------------------------------------------------------------------------------
-
     def _seconds(self, stamp: int) -> float:
         return (stamp - self._origin) / NANOSECONDS
 
@@ -454,3 +441,14 @@ def warm_up() -> None:
     estimator.sample(0, 1.0)
     estimator.update(1_000_000)
     estimator.predict(2_000_000)
+
+
+def _bounds(prior: Prior, mean: Array) -> Array:
+    """Return the least and the largest coordinate of each parameter that is tracked."""
+    bounds: Array = np.stack([mean - _BOUND * prior.spread, mean + _BOUND * prior.spread], axis=1)
+    for i, name in enumerate(prior.free):
+        if QUANTITIES[name].scale == 'linear':
+            bounds[i, 0] = max(bounds[i, 0], QUANTITIES[name].least)
+        elif QUANTITIES[name].scale == 'inverse':
+            bounds[i, 0] = max(bounds[i, 0], 0.2 * mean[i])
+    return bounds

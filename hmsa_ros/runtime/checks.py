@@ -1,10 +1,38 @@
-"""Whether a request is for joints that a planner has, and not for too many setpoints."""
+"""Whether a planner can take a request: active, for its joints, not for too many setpoints."""
 
 from collections.abc import Sequence
 
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.errors import excerpt
 from hmsa_ros.runtime.records import Request, Settings, Target, Trajectory
+
+
+def check_ready(now: int, *, active: bool) -> None:
+    """
+    Check whether requests can be taken at all.
+
+    Parameters
+    ----------
+    now : int
+        Time in ns; 0 before simulated time has started.
+    active : bool
+        Whether the planner is.
+
+    Raises
+    ------
+    RefusedError
+        If they cannot.
+
+    """
+    if not active:
+        raise RefusedError(
+            Code.INACTIVE, 'the planner is inactive: expected it active (ros2 lifecycle set NODE '
+            'activate)')
+    if now == 0:
+        raise RefusedError(
+            Code.NO_TIME,
+            'simulated time has not started: expected messages on /clock (start the simulator, or '
+            'set use_sim_time to false)')
 
 
 def check_joints(request: Request, joints: Sequence[str], settings: Settings) -> None:

@@ -64,8 +64,6 @@ class Feedback:
         self.corrections = 0
         self.restart()
 
-    # -- settings ------------------------------------------------------------------------------
-
     @property
     def mode(self) -> str:
         """One of `MODES`."""
@@ -187,8 +185,6 @@ class Feedback:
             raise BadInputError(
                 'feedback is off and nothing is learnt: expected observe or adapt')
 
-    # -- in ------------------------------------------------------------------------------------
-
     def looks_at(self, stamp: int) -> bool:
         """Return whether a sample with a stamp in ns is of use."""
         return any(
@@ -214,8 +210,6 @@ class Feedback:
         joint.estimator.sample(stamp, stretch)
         joint.newest = max(joint.newest, min(stamp, self._clock()))
         joint.fresh = True
-
-    # -- out -----------------------------------------------------------------------------------
 
     @property
     def wake(self) -> int | None:
@@ -254,8 +248,6 @@ class Feedback:
         """Say in a sentence without its stop what is wrong with a joint at a time in ns."""
         return self._joints[name].words(
             self._group.planners[name].plan, now, adapting=self.mode == 'adapt')
-
-    # -- for plans -----------------------------------------------------------------------------
 
     def _believed(
             self, name: str, time: int) -> tuple[float, float, tuple[float, ...]] | None:

@@ -10,12 +10,12 @@ from collections.abc import Callable, Mapping
 from time import monotonic_ns
 
 from hmsa_ros.core.group import PlannerGroup
-from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.core.status import RefusedError
 from hmsa_ros.core.timeline import Model
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.runtime.bulletin import Bulletin
-from hmsa_ros.runtime.checks import check_joints
+from hmsa_ros.runtime.checks import check_joints, check_ready
 from hmsa_ros.runtime.corrections import Corrections
 from hmsa_ros.runtime.feedback import Feedback
 from hmsa_ros.runtime.following import Following
@@ -136,7 +136,8 @@ class PlannerRuntime:
 
         """
         try:
-            self._check(request)
+            check_ready(self._clock(), active=self.active)
+            check_joints(request, tuple(self.group.planners), self.settings)
         except RefusedError as error:
             return self.refuse(error, request)
         work = self._planning.add(request, engaged=self._takeover.engaged)
@@ -295,8 +296,6 @@ class PlannerRuntime:
         self._bulletin.outputs.clear()
         return outputs
 
-    # -- the state in force --------------------------------------------------------------------
-
     def _engage(self, *, begin: bool = False) -> None:
         """Go on from where the joints are, as soon as that is known."""
         engaged = self._takeover.engaged
@@ -307,8 +306,6 @@ class PlannerRuntime:
         if self._takeover.engaged and not engaged:
             self._sending.next_beat = self._clock() + self.settings.heartbeat_period
 
-    # -- planning ------------------------------------------------------------------------------
-
     def refuse(self, error: HmsaError, request: Request) -> Verdict:
         """Answer a request that cannot be read or carried out."""
         return self._planning.refuse(error, request)
@@ -316,20 +313,6 @@ class PlannerRuntime:
     def _work_on(self) -> None:
         if self._takeover.engaged:
             self._planning.work_on()
-
-    def _check(self, request: Request) -> None:
-        if not self.active:
-            raise RefusedError(
-                Code.INACTIVE, 'the planner is inactive: expected it active (ros2 lifecycle set '
-                'NODE activate)')
-        if self._clock() == 0:
-            raise RefusedError(
-                Code.NO_TIME,
-                'simulated time has not started: expected messages on /clock (start the '
-                'simulator, or set use_sim_time to false)')
-        check_joints(request, tuple(self.group.planners), self.settings)
-
-    # -- what comes of it ----------------------------------------------------------------------
 
     def _judge(self, now: int) -> None:
         """Judge arrivals by what was measured."""
@@ -344,8 +327,6 @@ class PlannerRuntime:
             found.append(finding)
         if found or not self._watch.open:
             self._bulletin.found(found)
-
-    # -- reports -------------------------------------------------------------------------------
 
     def report(self) -> tuple[Severity, str, dict[str, object]]:
         """Return how commands fare: severity, a sentence and counters."""
