@@ -360,12 +360,14 @@ class RosSide:
 
     def call(self, service_type: type[Any], name: str, request: Any = None) -> Any:
         """Call a service and return its response."""
+        from hmsa_ros.nodes.service_call import ServiceCall
         client = self.node.create_client(service_type, name)
         self.spin_until(client.service_is_ready, f'service {name}')
-        future = client.call_async(service_type.Request() if request is None else request)
-        self.spin_until(future.done, f'the answer of {name}')
+        call = ServiceCall(
+            client, service_type.Request() if request is None else request, patience=10.0)
+        response = self.spin_until(call.answer, f'the answer of {name}')
         self.node.destroy_client(client)
-        return future.result()
+        return response
 
     def set_parameters(self, node: str, values: Sequence[Any]) -> Any:
         """Set parameters of another node."""

@@ -33,7 +33,7 @@ def test_what_nobody_answers_is_asked_again(ros, make_ros):
 
     def asked() -> bool:
         asking.poll(found.append)
-        return asking._future is not None
+        return asking._call is not None
 
     ros.spin_until(asked, 'the question')
     ros.node.create_service(ListParameters, '/planner/list_parameters', answer_list)

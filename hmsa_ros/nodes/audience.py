@@ -1,7 +1,6 @@
 """Who is to receive what is sent, and whether they are all there."""
 
 from collections.abc import Mapping, Sequence
-from time import monotonic
 from typing import Any
 
 from lifecycle_msgs.msg import State
@@ -10,9 +9,7 @@ from rclpy.node import Node
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes.senders import listed
-
-# An answer that has not come by then does not come: it was sent before the way back was known.
-_PATIENCE_SECONDS = 1.0
+from hmsa_ros.nodes.service_call import ServiceCall
 
 
 class Audience:
@@ -35,13 +32,23 @@ class Audience:
         self._senders = senders
         self._topics = topics
         self._states = {
-            name: _Asked(node.create_client(GetState, f'{name}/get_state')) for name in nodes}
+            x: ServiceCall(node.create_client(GetState, f'{x}/get_state'), GetState.Request())
+            for x in nodes}
+        self._active: set[str] = set()
 
     def missing(self) -> list[str]:
         """Return in words who is not there yet, of those that must be."""
         return [
-            *(f'active node {name}' for name, x in self._states.items() if not x.active()),
+            *(f'active node {name}' for name in self._states if not self._has_been_active(name)),
             *(f'subscriber of {name}' for name in self._topics if not self._subscribed(name))]
+
+    def _has_been_active(self, name: str) -> bool:
+        """Return whether a managed node has said that it is active; ask until it has."""
+        if name not in self._active:
+            answer = self._states[name].answer()
+            if answer is not None and answer.current_state.id == State.PRIMARY_STATE_ACTIVE:
+                self._active.add(name)
+        return name in self._active
 
     def _subscribed(self, topic: str) -> bool:
         """Return whether somebody who counts subscribes to a topic."""
@@ -60,27 +67,3 @@ class Audience:
             return False
         return bool(self._topics or self._states) or all(
             x.get_subscription_count() for x in self._senders.values())
-
-
-class _Asked:
-    """The state of a managed node, asked for again until it is active."""
-
-    def __init__(self, client: Any) -> None:
-        self._client = client
-        self._future: Any = None
-        self._since = 0.0
-
-    def active(self) -> bool:
-        """Return whether the node has said that it is active."""
-        if self._future is not None and self._future.done():
-            answer = self._future.result()
-            if answer is not None and answer.current_state.id == State.PRIMARY_STATE_ACTIVE:
-                return True
-            self._future = None
-        late = monotonic() - self._since > _PATIENCE_SECONDS
-        if (self._future is None or late) and self._client.service_is_ready():
-            if self._future is not None:
-                self._client.remove_pending_request(self._future)
-            self._future = self._client.call_async(GetState.Request())
-            self._since = monotonic()
-        return False

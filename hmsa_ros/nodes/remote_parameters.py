@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable
 import json
-from time import monotonic
 from typing import Any
 
 from rcl_interfaces.srv import GetParameters, ListParameters
@@ -10,9 +9,7 @@ from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 
 from hmsa_ros.bag.experiment import parameter_key
-
-# An answer that has not come by then does not come: it was sent before the way back was known.
-_PATIENCE_SECONDS = 2.0
+from hmsa_ros.nodes.service_call import ServiceCall
 
 
 class RemoteParameters:
@@ -23,37 +20,27 @@ class RemoteParameters:
         self._name = name
         self._list = node.create_client(ListParameters, f'{name}/list_parameters')
         self._get = node.create_client(GetParameters, f'{name}/get_parameters')
-        self._future: Any = None
-        self._asked = 0.0
         self._names: list[str] = []
+        self._call: ServiceCall | None = None
         self._done = False
 
     def poll(self, note: Callable[[dict[str, str]], None]) -> None:
         """Take the next step towards the node's parameters, for ``note`` as custom data."""
-        if self._done:
+        if not self._list.service_is_ready():
             # Asked again when it comes back, perhaps with other parameters.
-            self._done = bool(self._list.service_is_ready())
-        elif self._future is None:
-            if self._list.service_is_ready() and self._get.service_is_ready():
-                self._ask(self._list, ListParameters.Request())
-        elif self._future.done():
-            answer, self._future = self._future.result(), None
-            if hasattr(answer, 'result'):
-                self._names = list(answer.result.names)
-                self._ask(self._get, GetParameters.Request(names=self._names))
-            else:
-                self._done = True
-                note(self.texts(zip(self._names, answer.values, strict=False)))
-        elif (not self._list.service_is_ready()
-                or monotonic() - self._asked > _PATIENCE_SECONDS):
-            # From the beginning, once it is there.
-            for client in (self._list, self._get):
-                client.remove_pending_request(self._future)
-            self._future = None
-
-    def _ask(self, client: Any, request: Any) -> None:
-        self._future = client.call_async(request)
-        self._asked = monotonic()
+            self._call, self._done = None, False
+        elif self._done:
+            return
+        elif self._call is None:
+            self._call = ServiceCall(self._list, ListParameters.Request())
+        elif (answer := self._call.answer()) is None:
+            return
+        elif hasattr(answer, 'result'):
+            self._names = list(answer.result.names)
+            self._call = ServiceCall(self._get, GetParameters.Request(names=self._names))
+        else:
+            self._call, self._done = None, True
+            note(self.texts(zip(self._names, answer.values, strict=False)))
 
     def texts(self, values: Iterable[tuple[str, Any]]) -> dict[str, str]:
         """Return parameters as custom data: keys of `parameter_key`, values as JSON."""

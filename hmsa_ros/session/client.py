@@ -20,6 +20,7 @@ from hmsa_ros.errors import BadInputError, HmsaError, printable
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.capture import decode, RawSubscription
 from hmsa_ros.nodes.conversions import to_trajectory, whole
+from hmsa_ros.nodes.service_call import ServiceCall
 from hmsa_ros.nodes.visitor import leave, visit
 from hmsa_ros.session import graph
 
@@ -399,22 +400,21 @@ class PlannerClient:
             Whether it says that it rests.
 
         """
-        stop = self.node.create_client(
-            interface.STOP.type, interface.from_outside(interface.STOP.name, interface.PLANNER))
+        stop = ServiceCall(
+            self.node.create_client(interface.STOP.type, interface.from_outside(
+                interface.STOP.name, interface.PLANNER)), Trigger.Request())
         begin = monotonic()
-        future = None
+        answer = None
         while monotonic() - begin < _STOP_SECONDS:
             self._executor.spin_once(timeout_sec=_SLICE_SECONDS)
-            if future is None:
-                # What was sent last may be on its way: the stop must come after it.
-                patient = monotonic() - begin < _GONE_SECONDS
-                if stop.service_is_ready() and (
-                        self._verdict.request == self._requested or not patient):
-                    future = stop.call_async(Trigger.Request())
-                elif not patient:
+            # What was sent last may be on its way: the stop must come after it.
+            patient = monotonic() - begin < _GONE_SECONDS
+            if answer is None and (self._verdict.request == self._requested or not patient):
+                answer = stop.answer()
+                if answer is None and not patient and not stop.ready:
                     return False
-            elif future.done() and self._verdict.state in ('at_rest', 'settling', 'idle'):
-                return bool(future.result().success)
+            if answer is not None and self._verdict.state in ('at_rest', 'settling', 'idle'):
+                return bool(answer.success)
         return False
 
 

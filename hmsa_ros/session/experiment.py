@@ -24,6 +24,7 @@ from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import from_time, whole
 from hmsa_ros.nodes.remote_parameters import RemoteParameters
+from hmsa_ros.nodes.service_call import ServiceCall
 from hmsa_ros.session.client import PlannerClient, Verdict
 from hmsa_ros.session.processes import NodeProcess, Session
 
@@ -395,8 +396,9 @@ class _Watch:
         """Let simulated time run."""
         self.client.spin_until(
             self._set_paused.service_is_ready, 'the plant offers no service to unpause it', each)
-        future = self._set_paused.call_async(SetBool.Request(data=False))
-        self.client.spin_until(future.done, 'the plant did not answer', each)
+        call = ServiceCall(self._set_paused, SetBool.Request(data=False))
+        self.client.spin_until(
+            lambda: call.answer() is not None, 'the plant did not answer', each)
         self.client.spin_until(lambda: self.now > 0.0, 'time does not begin to advance', each)
 
 

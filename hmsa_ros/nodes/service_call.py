@@ -1,0 +1,56 @@
+"""A call of a service whose answer may be lost, without waiting."""
+
+from time import monotonic
+from typing import Any
+
+
+class ServiceCall:
+    """
+    One request to a service, sent again while no answer comes.
+
+    A server answers a client that it has just discovered before the way back is known to all: the
+    answer is lost then, and its client would wait for ever. So a request must do no harm when it
+    is carried out twice.
+
+    Parameters
+    ----------
+    client : rclpy.client.Client
+        Its node must be served while `answer` is asked for.
+    request : object
+        The request.
+    patience : float
+        Time in s after which an answer counts as lost.
+
+    """
+
+    def __init__(self, client: Any, request: Any, patience: float = 2.0) -> None:
+        self._client = client
+        self._request = request
+        self._patience = patience
+        self._futures: list[Any] = []
+        self._sent = 0.0
+
+    @property
+    def ready(self) -> bool:
+        """Whether there is a server."""
+        return bool(self._client.service_is_ready())
+
+    def answer(self) -> Any:
+        """Return the response, or None as long as there is none; send what is due."""
+        for future in self._futures:
+            if future.done() and (response := future.result()) is not None:
+                self.drop()
+                return response
+        if not self.ready:
+            # Whoever was asked is gone: the next server is asked from the beginning.
+            self.drop()
+        elif not self._futures or monotonic() - self._sent > self._patience:
+            self._futures.append(self._client.call_async(self._request))
+            self._sent = monotonic()
+        return None
+
+    def drop(self) -> None:
+        """Forget what was sent; `answer` begins anew."""
+        for future in self._futures:
+            self._client.remove_pending_request(future)
+        self._futures.clear()
