@@ -74,11 +74,9 @@ def run(arguments: argparse.Namespace) -> int:
     from hmsa_ros.core.setpoint import Setpoint
     from hmsa_ros.core.shapers.pace import Pace
 
-    given = {name: value for name in ('zeta', 'j_lim', 'c1')
-             if (value := getattr(arguments, name)) is not None}
     segments = plan_sequence(
         [Setpoint(*x) for x in _possible(arguments.setpoints, 1.0)],
-        NondimensionalParameters(**given), start=_start(arguments, 1.0),
+        NondimensionalParameters(**given(arguments)), start=_start(arguments, 1.0),
         shaper=arguments.shaper or 'two_step', order=arguments.order, errors=_errors(arguments),
         pace=Pace(arguments.periods, arguments.max_rate))
     rows = [_row(segment) for segment in segments]
@@ -92,6 +90,12 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def given(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the nondimensional parameters that have options, as far as these are given."""
+    return {name: value for name in ('zeta', 'j_lim', 'c1')
+            if (value := getattr(arguments, name)) is not None}
+
+
 def refuse_fixed(arguments: argparse.Namespace) -> None:
     """
     Refuse options that say otherwise than a parameter file.
@@ -102,8 +106,7 @@ def refuse_fixed(arguments: argparse.Namespace) -> None:
         If there is one.
 
     """
-    fixed = [f'--{name.replace("_", "-")}' for name in ('zeta', 'j_lim', 'c1')
-             if getattr(arguments, name) is not None]
+    fixed = [f'--{name.replace("_", "-")}' for name in given(arguments)]
     if fixed:
         raise BadInputError(
             f'both --params-file and {", ".join(fixed)} are given: expected only one of them, '

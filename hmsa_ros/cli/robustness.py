@@ -3,19 +3,20 @@
 import argparse
 from collections.abc import Iterator
 from dataclasses import asdict
-from functools import partial
 from itertools import product
 import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli import chunked
-from hmsa_ros.cli.plan import refuse_fixed
+from hmsa_ros.cli.plan import given, refuse_fixed
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text, make_folder
 
 if TYPE_CHECKING:
-    from hmsa_ros.core.timeline import Model
+    from hmsa_ros.core.delivery import Delivery
+    from hmsa_ros.core.moves import Limits
+    from hmsa_ros.core.parameters import NondimensionalParameters
     from hmsa_ros.studies.engine import Start
     from hmsa_ros.studies.matrix import Row
     from hmsa_ros.studies.robustness import Case, Result
@@ -99,7 +100,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> int:
     """Compare the shapers."""
-    from hmsa_ros.core.parameters import NondimensionalParameters
     from hmsa_ros.studies.executors import in_order
     from hmsa_ros.studies.robustness import (
         candidates,
@@ -111,24 +111,16 @@ def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> 
         study,
     )
 
-    if arguments.params_file is None:
-        nominal = (0.2 if arguments.zeta is None else arguments.zeta,
-                   5.0 if arguments.j_lim is None else arguments.j_lim,
-                   2.0 if arguments.c1 is None else arguments.c1)
-        make = partial(Case, material=NondimensionalParameters(*nominal))
-    else:
-        model = _model(arguments)
-        make = partial(
-            Case, material=model.material, limits=model.limits, delivery=model.delivery)
+    material, limits, delivery = _nominal(arguments)
     shapers = None
     if arguments.shapers is not None:
         shapers = [name.strip() for name in arguments.shapers.split(',')]
     compared = candidates(shapers, arguments.order or ORDERS)
     cases = [
-        make(start, target, box=arguments.errors,
-             span=max(arguments.errors, min(2.0 * arguments.errors, LARGEST)))
+        Case(start, target, material, limits, delivery, arguments.errors,
+             max(arguments.errors, min(2.0 * arguments.errors, LARGEST)))
         for start, target in dict.fromkeys(
-            arguments.move or (_MOVES if make.keywords['material'].rest else _BENDS))]
+            arguments.move or (_MOVES if material.rest else _BENDS))]
     tasks = list(product(cases, compared))
     folder: Path = arguments.out or Path('robustness')
 
@@ -153,12 +145,19 @@ def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> 
     return finish(found)
 
 
-def _model(arguments: argparse.Namespace) -> 'Model':
-    """Return what the planner of the parameter file plans with."""
+def _nominal(
+        arguments: argparse.Namespace) -> 'tuple[NondimensionalParameters, Limits, Delivery]':
+    """Return what is planned with: of the options, or of the parameter file."""
+    from hmsa_ros.core.delivery import IDEAL
+    from hmsa_ros.core.moves import Limits
+    from hmsa_ros.core.parameters import NondimensionalParameters
     from hmsa_ros.runs.model import model_of
 
+    if arguments.params_file is None:
+        return NondimensionalParameters(**given(arguments)), Limits(), IDEAL
     refuse_fixed(arguments)
-    return model_of(arguments.params_file)
+    model = model_of(arguments.params_file)
+    return model.material, model.limits, model.delivery
 
 
 def _show(

@@ -11,8 +11,8 @@ from typing import cast, Protocol
 import numpy as np
 
 from hmsa_ros.core.schedule import CommandSchedule
-from hmsa_ros.device.protocol import Change, Kind, late_words, Notice, Outbox, Sample
-from hmsa_ros.device.watchdog import Fallback, Watchdog
+from hmsa_ros.device.protocol import Change, Sample
+from hmsa_ros.device.watchdog import Fallback, Watched
 from hmsa_ros.errors import BadInputError
 
 
@@ -109,7 +109,7 @@ class HardwareJoint:
             raise BadInputError(f'limit is {self.limit:g} T: expected a number above 0')
 
 
-class HardwareDevice(Outbox):
+class HardwareDevice(Watched):
     """
     Real actuators; a `Device`.
 
@@ -127,13 +127,12 @@ class HardwareDevice(Outbox):
     def __init__(
             self, joints: Sequence[HardwareJoint], *, time: int, period: int = 0) -> None:
         """Switch the coils off."""
-        super().__init__()
+        super().__init__(x.fallback for x in joints)
         self._joints = tuple(joints)
         self._time = time
         self._period = period
         self._next_sample = time
         self._schedules = [CommandSchedule(0.0) for _ in joints]
-        self._watchdogs = [Watchdog(x.fallback) for x in joints]
         self._heard = [False for _ in joints]
         self._levels = [math.nan for _ in joints]
         self.switch_off(time)
@@ -142,16 +141,6 @@ class HardwareDevice(Outbox):
     def time(self) -> int:
         """Time in ns that it has been advanced to."""
         return self._time
-
-    @property
-    def silent(self) -> list[int]:
-        """Joints that nobody commands any more."""
-        return [i for i, x in enumerate(self._watchdogs) if x.tripped]
-
-    @property
-    def trips(self) -> int:
-        """How often a joint fell silent."""
-        return sum(x.trips for x in self._watchdogs)
 
     @property
     def next_level(self) -> int | None:
@@ -193,7 +182,7 @@ class HardwareDevice(Outbox):
         self._heard[joint] = True
         late = self._time - stamp
         if changed and stamp and late > 0:
-            self._notices.append(Notice(Kind.LATE, joint, late_words(late), late))
+            self._note_late(joint, late)
 
     def advance(self, time: int) -> None:
         """Write what is due at a time in ns, which is now, and read if that is due."""
@@ -212,16 +201,12 @@ class HardwareDevice(Outbox):
 
     def _watch(self, i: int) -> None:
         """Obey the watchdog of a joint."""
-        watchdog, schedule = self._watchdogs[i], self._schedules[i]
+        schedule = self._schedules[i]
         if self._heard[i]:
             self._heard[i] = False
-            if watchdog.feed(self._time):
-                self._notices.append(Notice(Kind.HEARD, i, 'commands have come back'))
-        trips = watchdog.trips
-        for stamp, level in watchdog.watch(self._time, self._time, schedule.current):
+            self._feed(i, self._time)
+        for stamp, level in self._safe_levels(i, self._time, self._time, schedule.current):
             schedule.insert(stamp, level)
-        if watchdog.trips > trips:
-            self._notices.append(Notice(Kind.SILENT, i, watchdog.alarm))
 
     def _write(self, i: int, level: float) -> None:
         if level != self._levels[i]:

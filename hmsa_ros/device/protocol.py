@@ -41,12 +41,6 @@ class Notice(NamedTuple):
     late: int = 0
 
 
-def late_words(late: int) -> str:
-    """Return the text of a notice of a command that came some ns after its stamp."""
-    return (f'command arrived {late / 1e6:.3f} ms after the time it applies and was applied at '
-            'once: raise lead_time of the planner')
-
-
 class Device(Protocol):
     """
     Actuators with their amplifiers and sensors.

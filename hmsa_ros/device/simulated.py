@@ -7,10 +7,10 @@ from hmsa_ros.core.actuators import Actuators, Setup
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.simulation import too_large
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.device.protocol import Change, Kind, late_words, Notice, Outbox, Sample
+from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
 from hmsa_ros.device.sensor import Sensor, SensorErrors
 from hmsa_ros.device.transport import Transport
-from hmsa_ros.device.watchdog import Fallback, Watchdog
+from hmsa_ros.device.watchdog import Fallback, Watched
 
 # A gap of the clock that is not simulated through but skipped.
 _LARGEST_GAP_NS = 5 * NANOSECONDS
@@ -25,7 +25,7 @@ class SimulatedJoint:
     errors: SensorErrors = field(default_factory=SensorErrors)
 
 
-class SimulatedDevice(Outbox):
+class SimulatedDevice(Watched):
     """
     Simulated actuators; a `Device`.
 
@@ -57,11 +57,10 @@ class SimulatedDevice(Outbox):
             self, joints: Sequence[SimulatedJoint], *, period: int, time: int = 0,
             command_delay: int = 0, measurement_delay: int = 0, seed: int = 0) -> None:
         """Start at rest."""
-        super().__init__()
+        super().__init__(x.fallback for x in joints)
         self.period = period
         self.next_sample = time
         self._actuators = Actuators([x.setup for x in joints], time=time)
-        self._watchdogs = [Watchdog(x.fallback) for x in joints]
         self._sensor = Sensor([x.errors for x in joints], measurement_delay, seed)
         self._transit: Transport[tuple[int, int, float]] = Transport(command_delay)
         self._changes += [Change(i, time, self.level(i)) for i in range(len(joints))]
@@ -82,16 +81,6 @@ class SimulatedDevice(Outbox):
     def flux_density(self) -> Array:
         """Flux density on each joint in T."""
         return self._actuators.flux_density
-
-    @property
-    def silent(self) -> list[int]:
-        """Joints that nobody commands any more."""
-        return [i for i, x in enumerate(self._watchdogs) if x.tripped]
-
-    @property
-    def trips(self) -> int:
-        """How often a joint fell silent."""
-        return sum(x.trips for x in self._watchdogs)
 
     def level(self, joint: int) -> float:
         """Return the last level in T that took effect on a joint."""
@@ -127,10 +116,9 @@ class SimulatedDevice(Outbox):
 
     def _obey(self, joint: int, stamp: int, level: float) -> None:
         late = self._actuators.command(joint, stamp or self.time, level)
-        if self._watchdogs[joint].feed(self.time):
-            self._notices.append(Notice(Kind.HEARD, joint, 'commands have come back'))
+        self._feed(joint, self.time)
         if late:
-            self._notices.append(Notice(Kind.LATE, joint, late_words(late), late))
+            self._note_late(joint, late)
 
     # -- time ----------------------------------------------------------------------------------
 
@@ -151,12 +139,9 @@ class SimulatedDevice(Outbox):
         for known, command in self._transit.arrived(time):
             self._integrate(known)
             self._obey(*command)
-        for i, watchdog in enumerate(self._watchdogs):
-            trips = watchdog.trips
-            for stamp, level in watchdog.watch(self.time, time, self.level(i)):
+        for i in range(len(self._watchdogs)):
+            for stamp, level in self._safe_levels(i, self.time, time, self.level(i)):
                 self._actuators.command(i, stamp, level)
-            if watchdog.trips > trips:
-                self._notices.append(Notice(Kind.SILENT, i, watchdog.alarm))
         self._integrate(time)
 
     def _integrate(self, time: int) -> None:

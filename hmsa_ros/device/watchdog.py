@@ -1,10 +1,11 @@
 """Watchdog: what a coil does when nobody commands it any more."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 import math
 
 from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.device.protocol import Kind, Notice, Outbox
 from hmsa_ros.errors import BadInputError
 
 #: What to do: keep the last level, go to zero at once, or ramp to zero.
@@ -135,3 +136,42 @@ class Watchdog:
         """Wait for a first command again."""
         self._last = self._ramp = None
         self.tripped = False
+
+
+class Watched(Outbox):
+    """What devices have in common: a watchdog for each joint, and notices about commands."""
+
+    def __init__(self, fallbacks: Iterable[Fallback]) -> None:
+        """Start with the watchdogs unarmed."""
+        super().__init__()
+        self._watchdogs = [Watchdog(x) for x in fallbacks]
+
+    @property
+    def silent(self) -> list[int]:
+        """Joints that nobody commands any more."""
+        return [i for i, x in enumerate(self._watchdogs) if x.tripped]
+
+    @property
+    def trips(self) -> int:
+        """How often a joint fell silent."""
+        return sum(x.trips for x in self._watchdogs)
+
+    def _feed(self, joint: int, now: int) -> None:
+        """Take a sign of life at a time in ns."""
+        if self._watchdogs[joint].feed(now):
+            self._notices.append(Notice(Kind.HEARD, joint, 'commands have come back'))
+
+    def _safe_levels(
+            self, joint: int, now: int, until: int, level: float) -> Iterator[tuple[int, float]]:
+        """Yield stamps (ns) and levels (T) of the safe flux, and note that a joint fell silent."""
+        watchdog = self._watchdogs[joint]
+        trips = watchdog.trips
+        yield from watchdog.watch(now, until, level)
+        if watchdog.trips > trips:
+            self._notices.append(Notice(Kind.SILENT, joint, watchdog.alarm))
+
+    def _note_late(self, joint: int, late: int) -> None:
+        """Note that a command came some ns after its stamp."""
+        self._notices.append(Notice(
+            Kind.LATE, joint, f'command arrived {late / 1e6:.3f} ms after the time it applies and '
+            'was applied at once: raise lead_time of the planner', late))

@@ -120,8 +120,6 @@ class Linked(DeviceNode):
         self._planner = planner
         self.companion = planner.get_name()
         self.cycles = Cycles(round(TICK_SECONDS * 1e9))
-        # Whether what has come of the device is published after the cycle.
-        self._silent = False
         super().__init__()  # type: ignore[call-arg]  # that of the node it is linked to
         planner.plant = self
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -139,20 +137,14 @@ class Linked(DeviceNode):
     def _cycle(self) -> None:
         """Let time run and send what is due; then publish, hear others and serve the planner."""
         with self.cycles:
-            self._silent = self.leading_time is None
             if self._joints:
                 self._go_on()
             self._planner.send()
-            self._silent = False
         if self._joints:
             self._hear()
             self._publish_news()
         self._planner.serve(lambda: self.cycles.left > _ENOUGH)
         self.cycles.note_rest()
-
-    def _publish_news(self) -> None:
-        if not self._silent:
-            super()._publish_news()
 
     def _publish_change(self, change: Change) -> None:
         self._planner.take_change(self._joints[change.joint].name, change)
@@ -175,9 +167,10 @@ class LinkedPlant(Linked, PlantNode):
     """A plant that a planner in the same process commands."""
 
     def _sample(self) -> None:
-        super()._sample()
+        self._advance()
         if self.leading_time is not None:
-            # Simulated time may run far in one cycle.
+            # Simulated time may run far in one cycle, and the planner has to know each sample.
+            self._publish_news()
             self._planner.serve_if_due()
 
 

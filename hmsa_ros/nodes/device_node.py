@@ -31,7 +31,7 @@ TICK_SECONDS = 0.001
 
 class DeviceNode(ManagedNode):
     """
-    Publishes what comes of a device in ``on_tick``, as ``_go_on`` of a subclass has it.
+    Publishes what comes of a device in ``on_tick``; ``_go_on`` of a subclass lets it go on.
 
     A planner in the same process may give its commands directly; ``companion`` is its name then,
     and whoever links the two does what ``on_tick`` does.
@@ -43,9 +43,10 @@ class DeviceNode(ManagedNode):
     _joints: Sequence[DeviceJoint] = ()
 
     def on_tick(self) -> None:
-        """Take in the commands that have come, and do what is due."""
+        """Take in the commands that have come, do what is due, and publish what comes of it."""
         self._hear()
         self._go_on()
+        self._publish_news()
 
     def _hear(self) -> None:
         for joint in self._joints:
@@ -53,7 +54,7 @@ class DeviceNode(ManagedNode):
 
     @abstractmethod
     def _go_on(self) -> None:
-        """Let the device go on, and publish what has come of it."""
+        """Let the device go on to the present time."""
 
     @property
     def leading_time(self) -> int | None:

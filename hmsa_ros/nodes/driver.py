@@ -104,7 +104,6 @@ class DriverNode(DeviceNode):
         super().cleanup()
 
     def _go_on(self) -> None:
-        self._publish_news()
         if self._device.failure is not None:
             self.failure, self.finished = self._device.failure, True
 
@@ -125,18 +124,5 @@ def _make_device(values: JointParameters) -> HardwareDevice:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """
-    Run the driver node.
-
-    Parameters
-    ----------
-    args : sequence of str, optional
-        Command-line arguments; default ``sys.argv[1:]``.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    """
+    """Run the driver with the command line's arguments; return the exit status."""
     return run(DriverNode, args)

@@ -317,18 +317,5 @@ def _answered(response: Trigger.Response, work: Callable[[], str]) -> Trigger.Re
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """
-    Run the planner node.
-
-    Parameters
-    ----------
-    args : sequence of str, optional
-        Command-line arguments; default ``sys.argv[1:]``.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    """
+    """Run the planner with the command line's arguments; return the exit status."""
     return run(PlannerNode, args)

@@ -196,7 +196,6 @@ class PlantNode(DeviceNode):
         if jump:
             self.get_logger().warning(
                 _jump_in_words(jump, behind=behind), throttle_duration_sec=1.0)
-            self._publish_news()
         begin = monotonic_ns()
         while (self._device.next_sample <= now and not self._standing
                 and monotonic_ns() - begin < _BUDGET_NS):
@@ -204,9 +203,12 @@ class PlantNode(DeviceNode):
 
     def _sample(self) -> None:
         """Advance to the next sample and publish it."""
+        self._advance()
+        self._publish_news()
+
+    def _advance(self) -> None:
         self._device.advance(self._device.next_sample)
         self._publish_clock(monotonic_ns())
-        self._publish_news()
 
     # -- what else is published ----------------------------------------------------------------
 
@@ -368,18 +370,5 @@ def _jump_in_words(jump: int, *, behind: bool) -> str:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """
-    Run the plant node.
-
-    Parameters
-    ----------
-    args : sequence of str, optional
-        Command-line arguments; default ``sys.argv[1:]``.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    """
+    """Run the plant with the command line's arguments; return the exit status."""
     return run(PlantNode, args)
