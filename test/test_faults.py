@@ -18,10 +18,10 @@ MIB = 2**20
 
 
 @pytest.mark.ros
+@pytest.mark.slow
 @pytest.mark.xdist_group('loops')
 @pytest.mark.parametrize('fault', [
-    pytest.param(x, marks=[] if x.key == 'planner_restarted' else pytest.mark.slow, id=x.key)
-    for x in rows.FAULTS if x.key in rows.QUICK])
+    pytest.param(x, id=x.key) for x in rows.FAULTS if x.key in rows.QUICK])
 def test_fault_is_answered_as_expected(fault, ros_domain_id):
     seen = inject(fault, ros_domain_id).seen
     assert seen.met, f'expected {fault.expected}; seen {seen.text} ({seen.figure})'

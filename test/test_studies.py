@@ -104,15 +104,16 @@ def test_response_in_error_is_that_of_another_actuator_in_si_units(start, target
     assert peaks == pytest.approx(np.ptp(fine) / abs(target - start), rel=1e-3, abs=EXACT)
 
 
-def test_shapers_that_know_the_model_leave_nothing_without_errors(small, large):
-    for _, results in (small, large):
-        for name in ('two-step', 'robust, order 2', 'robust, order 3', 'minimum time'):
-            assert results[name].nominal < EXACT
-            assert results[name].reason == ''
-        for name in ('ZV', 'ZVD', 'EI'):
-            assert results[name].nominal > 1e-2
-            assert 'linear, designed at the target' in results[name].candidate.label
-        assert results['plain step'].nominal > 1.0
+@pytest.mark.parametrize('step', ['small', pytest.param('large', marks=pytest.mark.slow)])
+def test_shapers_that_know_the_model_leave_nothing_without_errors(step, request):
+    _, results = request.getfixturevalue(step)
+    for name in ('two-step', 'robust, order 2', 'robust, order 3', 'minimum time'):
+        assert results[name].nominal < EXACT
+        assert results[name].reason == ''
+    for name in ('ZV', 'ZVD', 'EI'):
+        assert results[name].nominal > 1e-2
+        assert 'linear, designed at the target' in results[name].candidate.label
+    assert results['plain step'].nominal > 1.0
 
 
 def test_two_step_leaves_one_percent_for_five_in_zeta_and_five_and_a_half_for_five_in_g(small):

@@ -98,6 +98,7 @@ def test_shards_of_two_machines_merge_into_the_same_table(run, tmp_path, expecte
     assert (tmp_path / 'both.parquet').read_bytes() == expected[0]
 
 
+@pytest.mark.slow
 def test_resume_computes_what_is_missing_or_damaged_and_nothing_else(run, tmp_path, expected):
     run('--workers=1', '--out=a')
     missing, damaged, kept = chunk_files(tmp_path / 'a')
