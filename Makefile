@@ -41,9 +41,9 @@ test: tools ## run the gate: ruff, then mypy and all tests but the slow ones, in
 	$(PYTEST) -m 'not slow' $(ARGS)
 
 .PHONY: full
-full: tools ## run the gate with the slow tests too, as before a release
+full: tools ## run the gate with the slow tests too and random examples, as before a release
 	$(BIN)/python -m ruff check .
-	$(PYTEST) $(ARGS)
+	$(PYTEST) --hypothesis-profile full $(ARGS)
 
 .PHONY: check
 check: tools ## run what needs no nodes of the gate: ruff, mypy, tests of the rest

@@ -40,12 +40,16 @@ def pytest_configure(config: pytest.Config) -> None:
             'ignore:module .sre_:DeprecationWarning',  # lark, imported by rosidl_parser
     ):
         config.addinivalue_line('filterwarnings', warning)
-    # A deadline for an example would be a measure of this machine's speed.
-    settings.register_profile(
-        'gate', deadline=None, suppress_health_check=[HealthCheck.too_slow],
-        # To explain an example, Python's lines are traced: integrations take minutes then.
-        phases=[x for x in Phase if x is not Phase.explain])
-    settings.load_profile('gate')
+    # The gate takes the same examples each time, so that it tells of the change alone; those of
+    # `make full` are new each time.
+    for name, same in (('gate', True), ('full', False)):
+        settings.register_profile(
+            name, derandomize=same,
+            # A deadline for an example would be a measure of this machine's speed.
+            deadline=None, suppress_health_check=[HealthCheck.too_slow],
+            # To explain an example, Python's lines are traced: integrations take minutes then.
+            phases=[x for x in Phase if x is not Phase.explain])
+    settings.load_profile(config.getoption('--hypothesis-profile') or 'gate')
 
 
 # Tests that are tried once more if they fail, and why. Each holds a whole run on the wall clock to
