@@ -139,6 +139,19 @@ def test_robustness_says_what_could_not_be_had(run):
     assert 'arrival in brackets' in out
 
 
+@pytest.mark.slow
+def test_robustness_of_what_creeps_compares_the_shapers_that_know_of_it(run, tmp_path):
+    (tmp_path / 'creep.yaml').write_text(
+        '/**:\n  ros__parameters:\n    actuator.shear_modulus: 10000.0\n'
+        '    viscoelastic.ratio: 0.2\n    viscoelastic.time: 0.05\n')
+    status, out, err = run(
+        'robustness', '--params-file', 'creep.yaml', '--move', '1:1.2', '--order', 2, '--json')
+    assert (status, err) == (0, '')
+    found = {x['shaper']: x for x in json.loads(out)['moves'][0]['shapers']}
+    assert set(found) == {'two_step', 'robust', 'smooth', 'step'}
+    assert max(found[x]['residual'] for x in ('two_step', 'robust', 'smooth')) < 1e-4
+
+
 def test_robustness_takes_the_actuator_of_a_file_with_its_law_and_its_coil(
         run, refused, tmp_path):
     file = tmp_path / 'own.yaml'

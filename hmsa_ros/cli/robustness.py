@@ -52,7 +52,9 @@ def add_parser(subparsers: Any) -> None:
         help='moves from one stretch at rest to another (default 1.0:1.1 1.0:1.4 1.0:0.7; of a '
              'beam 0:0.1 0:0.4)')
     parser.add_argument(
-        '--shapers', metavar='NAME,...', help='shapers, separated by commas (default all)')
+        '--shapers', metavar='NAME,...',
+        help='shapers, separated by commas (default all, or all that know of the creep of the '
+             'parameter file)')
     parser.add_argument(
         '--errors', type=float, default=0.1, metavar='E',
         help='largest error in the table and the box, as a share (default 0.1); the curves go '
@@ -100,6 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> int:
     """Compare the shapers."""
+    from hmsa_ros.core.shapers import creeping
     from hmsa_ros.studies.executors import in_order
     from hmsa_ros.studies.robustness import (
         candidates,
@@ -112,9 +115,9 @@ def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> 
     )
 
     material, limits, delivery = _nominal(arguments)
-    shapers = None
+    shapers = creeping.SHAPERS if material.creep else None
     if arguments.shapers is not None:
-        shapers = [name.strip() for name in arguments.shapers.split(',')]
+        shapers = tuple(name.strip() for name in arguments.shapers.split(','))
     compared = candidates(shapers, arguments.order or ORDERS)
     cases = [
         Case(start, target, material, limits, delivery, arguments.errors,

@@ -66,8 +66,10 @@ class Errors:
         """Return the model's group for the actuator: zeta = c/8 sqrt(1/(L^2 H^2 rho G))."""
         return replace(
             material,
-            zeta=material.zeta * (1.0 + self.zeta) / math.sqrt(1.0 + self.shear_modulus),
-            j_lim=material.j_lim * (1.0 + self.j_lim))
+            zeta=material.zeta * (1.0 + self.zeta) / self.faster,
+            j_lim=material.j_lim * (1.0 + self.j_lim),
+            creep=replace(
+                material.creep, times=tuple(x * self.faster for x in material.creep.times)))
 
 
 #: Errors of G, damping coefficient, J_lim and remanence.

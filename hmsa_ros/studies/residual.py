@@ -21,7 +21,6 @@ from hmsa_ros.core.residual import residual_vibration
 from hmsa_ros.core.simulation import simulate
 from hmsa_ros.core.status import Code
 from hmsa_ros.core.two_step import plan_two_step
-from hmsa_ros.errors import HmsaError
 from hmsa_ros.studies.settings import Setting
 
 __all__ = ['Actual', 'arrival_of', 'Errors']
@@ -120,8 +119,6 @@ class Actual:
         rows, _ = ramps(
             [x for x in levels if x.time <= end] or levels[:1], held, end, self.delivery.slew)
         switches, loads, slopes = np.array(rows).T
-        if self.material.creep and self.delivery.lag > 0.0:
-            raise HmsaError('creep behind a coil that lags: expected one of them')
         stretch, _ = simulate(
             switches, loads, times / self.time, self.material, slopes=slopes,
             stretch=float(equilibrium_stretch(held, self.material)), lag=self.delivery.lag,

@@ -21,6 +21,7 @@ from hmsa_ros.core.model import Array
 from hmsa_ros.core.moves import Level, Limits, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.shapers import get_shaper, SHAPERS
+from hmsa_ros.core.shapers.creeping import held
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.simulation import check_stretch
 from hmsa_ros.core.status import Code, RefusedError
@@ -284,9 +285,10 @@ def study(case: Case, candidate: Candidate) -> Result:
 
     """
     try:
-        move = get_shaper(candidate.shaper)(Request(
+        request = Request(
             State(case.start), case.target, case.material, case.limits, case.delivery,
-            candidate.order, errors=(case.box, case.box, case.box)))
+            candidate.order, errors=(case.box, case.box, case.box))
+        move = held(request, get_shaper(candidate.shaper)(request), math.inf)
     except RefusedError as error:
         return _refused(candidate, error.code, str(error))
     arrival = arrival_of(move, case.start, case.target, case.material)
