@@ -7,7 +7,7 @@ arrows here. `blueprint` says what is shown where.
 """
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import os
 from pathlib import Path
 import sys
@@ -17,7 +17,9 @@ import numpy as np
 
 from hmsa_ros.bag.reader import BagReader, read_messages
 from hmsa_ros.contract import topics
+from hmsa_ros.core.laws.coordinate import STRETCH
 from hmsa_ros.errors import BadInputError, complain, HmsaError
+from hmsa_ros.runs.parameters import actuators, recorded
 
 APPLICATION = 'hmsa_ros'
 JOINT_STATES = topics.JOINT_STATES.name
@@ -43,17 +45,17 @@ def _rerun() -> Any:
     return rerun
 
 
-def views(namespace: str = '') -> dict[str, str]:
-    """Return the entity path of each view by its title."""
+def views(namespace: str = '', coordinate: str = STRETCH.name) -> dict[str, str]:
+    """Return the entity path of each view by its title, which names what a position is."""
     root = '/' + namespace.strip('/') if namespace.strip('/') else ''
     return {
-        'Stretch': f'{root}/{JOINT_STATES}/position',
-        'Stretch rate (1/s)': f'{root}/{JOINT_STATES}/velocity',
+        coordinate.capitalize(): f'{root}/{JOINT_STATES}/position',
+        f'{coordinate.capitalize()} rate (1/s)': f'{root}/{JOINT_STATES}/velocity',
         'Flux density (T)': f'{root}/{JOINT_STATES}/effort',
         'Actuators': f'{root}/markers'}
 
 
-def blueprint(namespace: str = '') -> Any:
+def blueprint(namespace: str = '', coordinate: str = STRETCH.name) -> Any:
     """
     Return the layout of the viewer: the actuators on the left, their curves on the right.
 
@@ -61,6 +63,8 @@ def blueprint(namespace: str = '') -> Any:
     ----------
     namespace : str
         Namespace of the nodes.
+    coordinate : str
+        What a position is called, ``'stretch'`` or ``'deflection'``.
 
     Returns
     -------
@@ -74,7 +78,7 @@ def blueprint(namespace: str = '') -> Any:
 
     """
     rrb = _rerun().blueprint
-    *curves, (title, path) = views(namespace).items()
+    *curves, (title, path) = views(namespace, coordinate).items()
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Spatial3DView(origin=path, name=title),
@@ -113,7 +117,7 @@ def show(bag: str | os.PathLike[str], recording: Any, namespace: str = '') -> No
         raise BadInputError(
             f'{os.fspath(bag)} has no topic {root}/{JOINT_STATES}: expected the namespace of '
             'the nodes in --namespace')
-    recording.send_blueprint(blueprint(namespace))
+    recording.send_blueprint(blueprint(namespace, _coordinate(reader.custom_data, root)))
     for file in reader.files:
         recording.log_file_from_path(file)
     markers = [topic for name in MARKERS if (topic := f'{root}/{name}') in found]
@@ -121,6 +125,15 @@ def show(bag: str | os.PathLike[str], recording: Any, namespace: str = '') -> No
         recording.set_time(TIMELINE, timestamp=np.datetime64(message.log_time_ns, 'ns'))
         for marker in message.message.markers:
             _log_marker(recording, views(namespace)['Actuators'], marker)
+
+
+def _coordinate(custom_data: Mapping[str, str], root: str) -> str:
+    """Return what the positions in a namespace are called, as the recorded parameters say."""
+    parameters = recorded(custom_data, root)
+    joints = next((x for node in (topics.PLANT, topics.PLANNER)
+                   if isinstance(x := parameters.get(f'{node}.joints'), list) and x), [''])
+    names = {actuators(parameters, {}, str(x))[0].coordinate.name for x in joints}
+    return names.pop() if len(names) == 1 else 'position'
 
 
 def _log_marker(recording: Any, root: str, marker: Any) -> None:

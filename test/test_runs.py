@@ -6,11 +6,13 @@ import json
 import math
 from pathlib import Path
 
+from beam_oracle import silicone
 import numpy as np
 import pytest
 
 from hmsa_ros.bag.info import BagSummary
 from hmsa_ros.cli import main
+from hmsa_ros.contract.actuator import parameters_of
 from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.simulation import ActuatorSimulation
@@ -95,6 +97,23 @@ def test_notes_say_that_a_plant_creeps_or_that_nobody_could_creep_so():
         'plant.one.viscoelastic.ratio': [0.1], 'plant.one.viscoelastic.time': [0.05]})
     assert 'creep cannot be used: viscoelastic.ratio has 2 values' in notes({
         **TOLD, 'plant.viscoelastic.time': 0.05})
+
+
+def test_the_file_of_a_beam_for_the_recording_of_a_block_and_the_reverse_are_refused():
+    def told(actuator):
+        return {f'plant.{name}': value for name, value in parameters_of(actuator).items()}
+
+    block, beam = told(paper_actuator()), told(silicone())
+    assert [actuators(x, {}, '')[0].coordinate.name for x in (block, beam)] == [
+        'stretch', 'deflection']
+    with pytest.raises(BadInputError, match='file has deflections, that of the plant in the bag '
+                                            'stretches: expected the file of the recorded'):
+        actuators(block, beam, '')
+    with pytest.raises(BadInputError, match='file has stretches, that of the plant in the bag '):
+        actuators(beam, block, '')
+    with pytest.raises(BadInputError, match='first sample of run is not of the actuator that the '
+                                            'parameters describe: deflection is 1: .*-0.7862'):
+        verify_run(replace(moved(), plant=silicone()))
 
 
 def test_a_level_that_was_in_force_already_is_no_command_without_effect():

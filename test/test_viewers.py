@@ -20,6 +20,7 @@ import pytest
 import yaml
 
 from hmsa_ros import rerun_view
+from hmsa_ros.contract.actuator import parameters_of
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.markers import Block, Scene, State
@@ -236,6 +237,24 @@ def test_rerun_view_names_topics_that_there_are():
         topic, _, fields = path.rpartition('/')
         field(known[topic].type, f'{fields}[0]')
     assert rerun_view.views('left')['Stretch'] == '/left/joint_states/position'
+    assert list(rerun_view.views(coordinate='deflection'))[:2] == [
+        'Deflection', 'Deflection rate (1/s)']
+
+
+def test_rerun_names_the_position_as_the_recorded_law_does():
+    def named(*actuators, space='', joints=''):
+        told = {f'{space}/plant.use_sim_time': 'false', f'{space}/plant.joints': joints} | {
+            f'{space}/plant.{joint}{name}': json.dumps(value)
+            for joint, actuator in zip(('one.', 'two.') if joints else ('',), actuators,
+                                       strict=True)
+            for name, value in parameters_of(actuator).items()}
+        return rerun_view._coordinate(told, space)
+
+    assert (named(paper_actuator()), rerun_view._coordinate({}, '')) == ('stretch', 'stretch')
+    assert named(silicone(), space='/left') == 'deflection'
+    both = '["one", "two"]'
+    assert named(silicone(), silicone(), joints=both) == 'deflection'
+    assert named(paper_actuator(), silicone(), joints=both) == 'position'
 
 
 def test_without_rerun_it_is_asked_for_in_one_line(tmp_path, capfd, monkeypatch):

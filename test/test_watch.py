@@ -38,7 +38,7 @@ def history(values, span=10.0):
 def joint(name='actuator', stretch=1.1, target=1.2):
     return Joint(
         name, history(np.linspace(1.0, stretch, 1000)), history(np.full(1000, target)),
-        stretch, 0.5, 0.0345, target, 0.065)
+        stretch, 0.5, 0.0345, target, 0.065, 'stretch')
 
 
 def scene(*joints):
@@ -150,6 +150,10 @@ def test_many_joints_have_a_line_each_and_the_rest_is_counted():
     shown = [x for x in lines if x.startswith('joint_')]
     assert f'and {64 - len(shown)} more: name some with --joint' in lines
     assert shown[5].split()[:3] == ['joint_5', '1.05000', '1.20000']
+    seen.joints[3].coordinate = 'deflection'
+    mixed = Screen(10.0).lines(seen, 80, 24)
+    assert [x[1].plain.split()[1] for x in (mixed, Screen(10.0).lines(
+        replace(seen, joints=seen.joints[3:4] * 20), 80, 24))] == ['position', 'deflection']
     assert len(shown) > 10
 
 
@@ -274,7 +278,8 @@ def test_each_joint_has_its_own_target_command_and_history(ros, ros_env, wait_un
             ('right/flux_density_command', MagneticField, 100))}
     publish['planner/status'](status(
         'planner: request', DiagnosticStatus.OK, 'left, right', state='moving', stretch='',
-        left__stretch='1.1', right__stretch='0.9', setpoint='1', setpoints='2'))
+        left__stretch='1.1', right__stretch='0.9', right__coordinate='deflection', setpoint='1',
+        setpoints='2'))
     seen = []
     with Listener(span=10.0) as listener:
         def there():
@@ -299,7 +304,8 @@ def test_each_joint_has_its_own_target_command_and_history(ros, ros_env, wait_un
         wait_until(there)
         left, right = seen[-1].joints
         assert (left.name, left.target, left.flux_density) == ('left', 1.1, 0.01)
-        assert (right.name, right.target, right.stretch) == ('right', 0.9, 0.95)
+        assert (right.name, right.target, right.stretch, right.coordinate) == (
+            'right', 0.9, 0.95, 'deflection')
         assert (left.rate, np.isnan(right.rate)) == (0.5, True)
         assert (np.isnan(left.commanded), right.commanded) == (True, -0.02)
         report, = seen[-1].reports

@@ -38,16 +38,17 @@ def add_parser(subparsers: Any) -> None:
         '--out', metavar='DIR', required=True, help='folder of the new bag; must not exist')
     recover.set_defaults(run=run, action=_recover)
     verify = actions.add_parser(
-        'verify', help='integrate the recorded commands and compare with the recorded stretch',
+        'verify', help='integrate the recorded commands and compare with the recorded motion',
         description='Integrate the recorded commands with the recorded parameters and print '
-                    'the largest difference from the recorded stretch. The exit status is 1 if '
+                    'the largest difference from the recorded motion. The exit status is 1 if '
                     'it is larger than the tolerance, if the bag is damaged, or if a command '
                     'was never applied.',
         epilog='example: hmsa bag verify hmsa_demo/run --tolerance 1e-6')
     verify.add_argument('bag', metavar='BAG', help='folder of a bag, or an .mcap file')
     verify.add_argument(
         '--tolerance', type=float, default=1e-9, metavar='D',
-        help='largest difference in stretch that passes (default %(default)g)')
+        help='largest difference of the stretch, or of the deflection of a beam, that passes '
+             '(default %(default)g)')
     verify.add_argument(
         '--params-file', type=Path, metavar='YAML',
         help='parameter file (YAML) of the actuator, for a bag without its parameters')
@@ -112,11 +113,12 @@ def _verify(arguments: argparse.Namespace) -> int:
             'passed': passed, 'tolerance': arguments.tolerance, 'problems': problems,
             'actuators': [asdict(result) for result in results]}))
     else:
-        for result in results:
+        for recorded, result in zip(runs, results, strict=True):
             print(printable(
                 f'{result.states}: {result.sample_count} samples, {result.command_count} '
                 f'commands of {result.commands} ({result.late_count} late), largest difference '
-                f'of the stretch {result.largest_difference:.3g} at {result.where:.6f} s'
+                f'of the {recorded.plant.coordinate.name} {result.largest_difference:.3g} at '
+                f'{result.where:.6f} s'
                 + (f'; {result.note}' if result.note else '')))
     return 0 if passed else 1
 

@@ -28,7 +28,8 @@ def add_parser(subparsers: Any) -> None:
         epilog='example: hmsa plan 1.10:10 1.20:10 1.40:10 --json')
     parser.add_argument(
         'setpoints', nargs='+', type=setpoint, metavar='STRETCH:SPAN',
-        help='stretch to come to rest at, and how long this setpoint lasts (move plus hold)')
+        help='stretch, or deflection of a beam, to come to rest at, and how long this setpoint '
+             'lasts (move plus hold)')
     parser.add_argument(
         '--start', type=float, metavar='S',
         help='initial stretch, at rest (default 1; 0 for the deflection of a beam)')

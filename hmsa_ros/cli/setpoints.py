@@ -12,9 +12,9 @@ def add_sequence(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that say what to send: setpoints, or a file of levels."""
     parser.add_argument(
         'setpoints', nargs='*', type=setpoint_of_joints, metavar='STRETCH:SECONDS',
-        help='stretch to come to rest at, and how long this setpoint lasts in s (move plus '
-             'hold); with several joints, one stretch for all or one per joint, as in '
-             '1.10,1.20:2')
+        help='stretch, or deflection of a beam, to come to rest at, and how long this setpoint '
+             'lasts in s (move plus hold); with several joints, one for all or one per joint, as '
+             'in 1.10,1.20:2')
     parser.add_argument(
         '--levels', type=Path, metavar='CSV',
         help='in place of setpoints: CSV of time, flux_density, as hmsa excite writes it. The '

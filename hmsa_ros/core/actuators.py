@@ -72,8 +72,8 @@ def unheld(material: NondimensionalParameters) -> str:
             ('below', 'above'), stretch_limits(material), material.law.limits, strict=True)
         if limit != end]
     return sides and (
-        f'no field holds stretches {" and ".join(sides)}, where law {material.law.law} has a '
-        'falling force') or ''
+        f'no field holds {material.coordinate.plural} {" and ".join(sides)}, where law '
+        f'{material.law.law} has a falling force') or ''
 
 
 @dataclass(frozen=True)

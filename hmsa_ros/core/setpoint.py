@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 import math
 
+from hmsa_ros.core.laws.coordinate import DEFLECTION, STRETCH
 from hmsa_ros.errors import BadInputError
 
 
@@ -11,7 +12,8 @@ def impossible(stretch: float, rest: float) -> str:
     if math.isfinite(stretch) and (stretch > 0.0 or rest == 0.0):
         return ''
     more = ' greater than 0' if rest else ''
-    return f'stretch is {stretch:g}: expected a finite number{more}'
+    name = (STRETCH if rest else DEFLECTION).name
+    return f'{name} is {stretch:g}: expected a finite number{more}'
 
 
 @dataclass(frozen=True)

@@ -78,6 +78,11 @@ class SimulatedDevice(Watched):
         return self._actuators.stretch
 
     @property
+    def coordinates(self) -> list[str]:
+        """What the position of each joint is called."""
+        return [x.actuator.coordinate.name for x in self._actuators.setups]
+
+    @property
     def flux_density(self) -> Array:
         """Flux density on each joint in T."""
         return self._actuators.flux_density

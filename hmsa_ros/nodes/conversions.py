@@ -157,12 +157,18 @@ def to_planner_status(status: 'StatusChanged') -> DiagnosticStatus:
         found = status.findings.get(name)
         of_each = {**vars(of_joint), **({} if found is None else found.figures)}
         values |= {f'{prefix}{key}': value for key, value in of_each.items()}
+    values |= of_joints('coordinate', status.coordinates)
     severity, message = int(verdict.severity), verdict.message
     if status.unheard:
         values['unheard'] = status.unheard
         severity, message = max(severity, 1), f'{message}; but {status.unheard}'
     return to_status(
         'planner: request', ', '.join(each), bytes([severity]), message, values)
+
+
+def of_joints(key: str, by_joint: Mapping[str, object]) -> dict[str, object]:
+    """Return a value of each joint by its key in a status, which names one of several."""
+    return {f'{name}.{key}' if len(by_joint) > 1 else key: x for name, x in by_joint.items()}
 
 
 def to_status(

@@ -232,7 +232,7 @@ class PlantNode(DeviceNode):
             rate = values['reset_rate']
             self._device.restart(i, values['reset_stretch'] or None, rate)
             how = f'at rate {rate:g}/s' if rate else 'at rest'
-            where.append(f'{how} at stretch {self._device.stretch[i]:g}')
+            where.append(f'{how} at {self._device.coordinates[i]} {self._device.stretch[i]:g}')
         self._device.drop_commands()
         self._publish_news()
         response.success = True
@@ -284,7 +284,10 @@ class PlantNode(DeviceNode):
     def _on_diagnostics(self) -> None:
         self._diagnostics.publish(conversions.to_diagnostics(
             int(self.get_clock().now().nanoseconds),
-            self._status_of_commands(paused=self._pacer.paused), self._status_of_time()))
+            self._status_of_commands(paused=self._pacer.paused, **conversions.of_joints(
+                'coordinate', dict(zip(
+                    (x.name for x in self._joints), self._device.coordinates, strict=True)))),
+            self._status_of_time()))
 
     def _status_of_time(self) -> DiagnosticStatus:
         then, since = self._measured

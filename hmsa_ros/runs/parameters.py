@@ -74,7 +74,15 @@ def named_joint(parameters: Mapping[str, object]) -> str:
 def actuators(
         parameters: Mapping[str, object], given: Mapping[str, object], joint: str
 ) -> tuple[ActuatorParameters, ActuatorParameters, bool, list[str]]:
-    """Return the block of the plant and of the planner, whether they are known, and notes."""
+    """
+    Return the block of the plant and of the planner, whether they are known, and notes.
+
+    Raises
+    ------
+    BadInputError
+        If the parameters given are of an actuator whose position is another quantity.
+
+    """
     # What is given in a parameter file is what the block really is. The example block is taken
     # where nothing is known.
     found: dict[str, ActuatorParameters] = {}
@@ -89,8 +97,14 @@ def actuators(
             except BadInputError as error:
                 notes.append(f'The parameters of the {node} in the bag cannot be used: {error}.')
     if given:
-        found[PLANT] = actuator_from(
-            values_of({}, PLANT, ACTUATOR) | _own(given, joint, PLANT, BLOCK))
+        own = actuator_from(values_of({}, PLANT, ACTUATOR) | _own(given, joint, PLANT, BLOCK))
+        for node, other in found.items():
+            if other.coordinate != own.coordinate:
+                raise BadInputError(
+                    f'the actuator of the parameter file has {own.coordinate.plural}, that of the '
+                    f'{node} in the bag {other.coordinate.plural}: expected the file of the '
+                    'recorded actuator; leave out --params-file to use the parameters in the bag')
+        found[PLANT] = own
     if not found:
         notes.append(
             "The recording does not contain the actuator's parameters: those of the example "

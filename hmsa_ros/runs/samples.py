@@ -116,7 +116,8 @@ class SampleReader:
             parts.append((times[:, 0], times[:, 1], *picked))
         if not parts:
             raise BadInputError(
-                f'{where} holds no position of joint {joint!r}: expected the stretch')
+                f'{where} holds no position of joint {joint!r}: expected the stretch, '
+                'or the deflection of a beam')
         logged, stamps, stretch, rate, flux_density = (
             np.concatenate(x) for x in zip(*parts, strict=True))
         order = np.argsort(logged, kind='stable')

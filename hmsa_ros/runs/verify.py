@@ -54,7 +54,7 @@ class Verification:
         Commands that came after their stamp, so that the moment of their effect is not known;
         none where the plant reported it.
     largest_difference : float
-        Of the stretch, dimensionless.
+        Of the stretch, or of a beam's deflection; dimensionless.
     where : float
         Time of it after the first sample, in seconds.
     note : str
@@ -246,8 +246,13 @@ def _start(run: Run, first: int, creep: Creep) -> 'ActuatorSimulation':
     if math.isnan(field):
         before = [x.flux_density for x in run.levels if x.stamp <= stamp]
         field = before[-1] if before else 0.0
-    simulation.set_state(
-        float(run.stretch[first]), float(run.rate[first]), field, past[-1] if past else None)
+    try:
+        simulation.set_state(
+            float(run.stretch[first]), float(run.rate[first]), field, past[-1] if past else None)
+    except BadInputError as error:
+        raise BadInputError(
+            f'the first sample of {run.path} is not of the actuator that the parameters describe: '
+            f'{error}; name the parameter file of the recorded one with --params-file') from error
     return simulation
 
 

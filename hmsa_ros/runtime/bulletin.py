@@ -89,7 +89,8 @@ class Bulletin:
         self.outputs.append(StatusChanged(
             self.verdict, progress, each, self._group.number, self._following.lateness.count,
             self._following.replanned, self._watch.findings, self._watch.worst, watching,
-            self.unheard))
+            self.unheard,
+            {name: x.model.units.coordinate for name, x in self._group.planners.items()}))
 
     def tell_progress(self, now: int) -> None:
         """Tell it, if there is any by a time in ns."""

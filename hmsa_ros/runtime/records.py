@@ -222,6 +222,8 @@ class StatusChanged:
         Whether setpoints that have begun are still to be judged.
     unheard : str
         Why nobody carries out commands; empty where somebody does.
+    coordinates : mapping of str to str
+        By joint, what its position is called.
 
     """
 
@@ -235,6 +237,7 @@ class StatusChanged:
     worst: Finding | None = None
     watching: bool = False
     unheard: str = ''
+    coordinates: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

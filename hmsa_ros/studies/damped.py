@@ -87,7 +87,7 @@ def settling_time(
     last = int(outside[-1])
     if last + 1 == times.size:
         raise HmsaError(
-            f'the move from stretch {start:g} to {target:g} has not settled in '
+            f'the move from {material.coordinate.name} {start:g} to {target:g} has not settled in '
             f'{times[-1]:.4g}: expected a command that leads there')
     share = (away[last] - band) / (away[last] - away[last + 1])
     return float(times[last] + share * (times[last + 1] - times[last]))

@@ -140,8 +140,8 @@ def _motion(
             np.array([time / NANOSECONDS]))
         if motion is None:
             raise HmsaError(
-                f'the motion about stretch {target:g} cannot be followed: expected a target away '
-                'from the limit of the chains')
+                f'the motion about {block.coordinate.name} {target:g} cannot be followed: '
+                'expected a target away from the limits of the law')
         ends.append((motion, scale * [motion.stretch[0], motion.rate[0]]))
     (one, low), (other, high) = ends
     by = 0.5 * sum(

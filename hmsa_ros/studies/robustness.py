@@ -138,8 +138,9 @@ class Case:
         check_stretch(self.target, self.material, 'target stretch')
         if abs(self.target - self.start) < 1e-6:
             raise BadInputError(
-                f'the move from stretch {self.start:g} to {self.target:g} is none: expected '
-                'two stretches that differ')
+                f'the move from {self.material.coordinate.name} {self.start:g} to '
+                f'{self.target:g} is none: expected two {self.material.coordinate.plural} that '
+                'differ')
         if not 0.0 < self.box <= self.span <= LARGEST:
             raise BadInputError(
                 f'errors of up to {self.box:g} in the box and {self.span:g} in the curves: '

@@ -72,8 +72,8 @@ def ideal_move(start: float, target: float, material: NondimensionalParameters) 
     move = two_step(Request(State(start), target, material))
     if move.code is not Code.TWO_STEP:
         raise HmsaError(
-            f'there is no two-step command from stretch {start:g} to {target:g} at zeta '
-            f'{material.zeta:g} ({move.code}): expected another move')
+            f'there is no two-step command from {material.coordinate.name} {start:g} to '
+            f'{target:g} at zeta {material.zeta:g} ({move.code}): expected another move')
     return move
 
 

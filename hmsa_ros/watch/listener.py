@@ -6,7 +6,7 @@ so that a thousand samples a second wake nobody up.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
 from time import monotonic
@@ -17,6 +17,7 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 
 from hmsa_ros.contract.topics import Quality
+from hmsa_ros.core.laws.coordinate import COORDINATES
 from hmsa_ros.core.schedule import CommandSchedule
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError, printable
@@ -94,6 +95,7 @@ class Listener:
         self._heard: dict[tuple[str, str, str], tuple[float, Report]] = {}
         self._request: RequestState | None = None
         self._targets: dict[str, float] = {}
+        self._coordinates: dict[str, str] = {}
         self._planned_joints: tuple[str, ...] = ()
         self._plan_span: tuple[int, int] | None = None
         self._begin = self._looked = monotonic()
@@ -134,6 +136,7 @@ class Listener:
         self._take_reports(now)
         for name, joint in self._joints.items():
             joint.target = self._targets.get(name, math.nan)
+            joint.coordinate = self._coordinates.get(name, joint.coordinate)
             if math.isfinite(joint.target):
                 joint.targets.put(self._looked, now, np.array([joint.target]))
         self._looked = now
@@ -172,6 +175,7 @@ class Listener:
         for message in self._status.new():
             values = {printable(x.key): printable(x.value) for x in message.values}
             # One joint has no name there; of several each has its own.
+            self._name_coordinates(message.hardware_id, values)
             self._targets = {
                 key.rpartition('.')[0] or printable(message.hardware_id): _number(value)
                 for key, value in values.items() if key.rpartition('.')[2] == 'stretch'}
@@ -246,6 +250,9 @@ class Listener:
                 # A robot's diagnostics are of many other things.
                 if name not in interface.NODES and status.hardware_id not in self._joints:
                     continue
+                self._name_coordinates(
+                    status.hardware_id,
+                    {printable(x.key): printable(x.value) for x in status.values})
                 counts = {printable(x.key): whole(x.value) for x in status.values
                           if '.' not in x.key and x.value.isdigit()}
                 self._heard[name, status.name, status.hardware_id] = now, Report(
@@ -253,6 +260,13 @@ class Listener:
         self._heard = {
             key: (when, report) for key, (when, report) in self._heard.items()
             if now - when <= _FORGET_SECONDS}
+
+    def _name_coordinates(self, joint: str, values: Mapping[str, str]) -> None:
+        """Note what the positions of joints are called, from a status; one joint has no name."""
+        for key, value in values.items():
+            name, _, last = key.rpartition('.')
+            if last == 'coordinate' and value in COORDINATES:
+                self._coordinates[name or printable(joint)] = value
 
     def _reports(self, now: float) -> list[Report]:
         """Return what each node says: the worst of its reports, and all of its counters."""

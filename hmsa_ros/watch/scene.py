@@ -62,6 +62,8 @@ class Joint:
     ----------
     name : str
         Of the joint.
+    coordinate : str
+        What its position is called, as far as known.
     stretch, rate, flux_density : float
         Newest sample; the rate in 1/s, the flux density in force in T. NaN if not known.
     target : float
@@ -81,6 +83,7 @@ class Joint:
     flux_density: float = math.nan
     target: float = math.nan
     commanded: float = math.nan
+    coordinate: str = 'position'
 
 
 @dataclass

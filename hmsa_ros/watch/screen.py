@@ -23,6 +23,8 @@ _GUTTER = 10
 _TEXT_ROWS, _CHART_ROWS, _MOST_CHART_ROWS = 2, 3, 24
 # What is around the lines of a table: its head, and how many joints are not shown.
 _ENDS = 2
+# Of a position and its name in a table.
+_WIDE = 10
 # Smallest range of a chart's axis.
 _LEAST_RANGE = 1e-3
 _MOST_REPORTS = 4
@@ -117,7 +119,7 @@ class Screen:
 
     def _joint(self, joint: Joint, now: float, width: int, rows: int) -> list[Text]:
         first = Text(f'{joint.name}  ', style='bold')
-        first.append(f'stretch {number(joint.stretch)}', style=_VALUE)
+        first.append(f'{joint.coordinate} {number(joint.stretch)}', style=_VALUE)
         first.append(f'  target {number(joint.target)}', style=_TARGET)
         first.append(f'  off {_off(joint)}', style='not bold')
         first.append(f'  rate {number(joint.rate, "+.3f")} 1/s', style='not bold')
@@ -146,8 +148,10 @@ class Screen:
     def _table(self, scene: Scene, width: int, room: int) -> list[Text]:
         """Return a line for each joint, with a chart of one row at its end."""
         wide = min(max(len(x.name) for x in scene.joints), 16)
+        names = {x.coordinate for x in scene.joints}
+        name = names.pop() if len(names) == 1 else 'position'
         lines = [Text(
-            f'{"joint":<{wide}} {"stretch":>8} {"target":>8} {"off":>8} {"flux density":>13}',
+            f'{"joint":<{wide}} {name:>{_WIDE}} {"target":>8} {"off":>8} {"flux density":>13}',
             style=_SOFT)]
         if room <= _ENDS:
             # Too small for more than the joints themselves.
@@ -157,7 +161,7 @@ class Screen:
             shown = shown[:max(room - len(lines) - 1, 0)]
         for joint in shown:
             line = Text(f'{joint.name[:wide]:<{wide}} ')
-            line.append(f'{number(joint.stretch):>8}', style=_VALUE)
+            line.append(f'{number(joint.stretch):>{_WIDE}}', style=_VALUE)
             line.append(f' {number(joint.target):>8}', style=_TARGET)
             line.append(f' {_off(joint):>8} {_millitesla(joint.flux_density):>13} ')
             across = (width - cell_len(line.plain)) * dots(self._unicode)[0]

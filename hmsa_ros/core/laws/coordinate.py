@@ -49,9 +49,9 @@ DEFLECTION = Coordinate(
     (-0.4, 0.4), (-1.2, 1.2), (-2.0, 2.0), (-0.6, 0.6),
     'a length, in mm perhaps, divide it by that of the beam; if it is the angle of the tip, take '
     'the deflection that goes with it')
-_KNOWN = {x.name: x for x in (STRETCH, DEFLECTION)}
+COORDINATES = {x.name: x for x in (STRETCH, DEFLECTION)}
 
 
 def coordinate_of(law: Elastic | None) -> Coordinate:
     """Return what the position is under a law; None for Gent."""
-    return STRETCH if law is None else _KNOWN[law.coordinate]
+    return STRETCH if law is None else COORDINATES[law.coordinate]
