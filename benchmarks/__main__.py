@@ -3,6 +3,7 @@ Measure speed and accuracy.
 
     python -m benchmarks [NAME ...] [--quick] [--runs N] [--json FILE] [--page FILE]
     python -m benchmarks faults [--only KEY ...] [--quick] [--json FILE] [--page FILE]
+    python -m benchmarks rates [--minutes M] [--quick]
     python -m benchmarks soak [--hours H] [--minutes M] [--factor F] [--rate HZ]
                              [--picture FILE] [--quick]
 
@@ -60,7 +61,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument('--hours', type=float, default=8.0,
                         help='soak: simulated time (default 8)')
     parser.add_argument('--minutes', type=float, default=float('inf'),
-                        help='soak: time on the wall for the part with processes, at most')
+                        help='soak: time on the wall for the part with processes, at most; rates: '
+                             'roughly, of all')
     parser.add_argument('--factor', type=float, default=None,
                         help='soak: real-time factor asked for, 0 for as fast as it can')
     parser.add_argument('--rate', type=float, default=1000.0,
@@ -133,7 +135,7 @@ def main(arguments: list[str] | None = None) -> int:
     if 'rates' in names:
         from benchmarks import bench_studies
 
-        add(bench_studies.rates(quick=options.quick))
+        add(bench_studies.rates(quick=options.quick, minutes=options.minutes))
     if 'lockstep' in names:
         from benchmarks import bench_studies
 

@@ -2,7 +2,7 @@
 What studies lose when workers are killed, and what a cluster leaves of the kernel's rate.
 
     python -m benchmarks studies [--quick]
-    python -m benchmarks rates [--quick]
+    python -m benchmarks rates [--minutes M] [--quick]
     python -m benchmarks lockstep [--quick]
 
 A study runs on two processes. Twenty times, once some chunks are done, one of its workers is
@@ -13,6 +13,7 @@ method in C, on one core.
 """
 
 from contextlib import suppress
+import math
 import multiprocessing
 import os
 from pathlib import Path
@@ -114,7 +115,7 @@ def compare(*, quick):
         same and killer.killed == kills and again <= WORKERS * kills)
 
 
-def rates(*, quick):
+def rates(*, quick, minutes=math.inf):
     """Compare plans a second: the kernel alone on all cores, processes, a Dask cluster."""
     with dask('local', WORKERS):
         # Whether it is installed shows now, and not after minutes.
@@ -124,8 +125,9 @@ def rates(*, quick):
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         found['kernel'] = _together(size)
-        # As many as take some five minutes, at most 1e8.
-        points = 400_000 if quick else min(100_000, int(found['kernel'] * 0.28)) * 1000
+        # As many as take some five minutes, at most 1e8; all but the processes take 100 s.
+        seconds = min(280.0, max(60.0 * minutes - 100.0, 1.0))
+        points = 400_000 if quick else min(100_000, int(found['kernel'] * seconds / 1000.0)) * 1000
         for words, start, rows in (
                 ('processes', lambda: local_processes(WORKERS), points),
                 ('Dask', lambda: dask('local', WORKERS), min(points, 20_000_000))):

@@ -192,6 +192,18 @@ def test_a_dask_cluster_writes_the_same_table(run, tmp_path, expected):
     assert (tmp_path / 'a.parquet').read_bytes() == expected[0]
 
 
+@pytest.mark.slow
+def test_a_local_dask_cluster_leaves_the_cores_to_the_kernels():
+    pytest.importorskip('distributed')
+    dask = pytest.importorskip('dask')
+    before = dask.config.get('distributed.worker.profile.enabled')
+    with executors.dask('local', 1) as (executor, _):
+        get = dask.config.get
+        assert executor.submit(get, 'distributed.worker.profile.enabled').result() is False
+        assert int(executor.submit(os.getenv, 'MALLOC_TRIM_THRESHOLD_').result()) > 1e9
+    assert get('distributed.worker.profile.enabled') is before
+
+
 @pytest.mark.parametrize(('text', 'part'), [
     ('0/4', (0, 4)), ('3/4', (3, 4)), ('4/4', (0, 4)), ('1/1', (0, 1))])
 def test_shards_are_numbered_from_0_or_from_1(text, part):
