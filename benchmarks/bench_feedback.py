@@ -27,13 +27,18 @@ from hmsa_ros.studies.feedback import Scenario, SCENARIOS
 #: Stretches of a first move from 1, and of the next one.
 TARGETS = (1.4, 1.1)
 #: Errors of G that make a row together, by their size.
-SIZES = ((0.1, (-0.1, 0.1)), (0.2, (-0.2, 0.2)))
+SIZES = ((0.0, (0.0,)), (0.1, (-0.1, 0.1)), (0.2, (-0.2, 0.2)))
 _SEEDS, _BIAS, _LIMIT = 3, 1e-3, 0.25
 # What feedback may leave of the next move.
 _LARGEST = 0.02
-# Of a move in open loop, until the first one is looked at, and the next one, which takes longer
-# where G is known to be lower; a cycle is in units of time.
-_FIRST, _NEXT, _CYCLE = 3.0, 1.25, 1.45
+# Of a move in open loop, until the first one is looked at, and the next one, cautious or not,
+# which takes longer where G is known to be lower; a cycle is in units of time.
+_FIRST, _NEXT, _CYCLE = 3.0, {True: 3.4, False: 1.25}, 1.45
+# What a cautious move may be expected to leave.
+_TOLERANCE = 3e-4
+# How much longer than the others the move back lasts, until nothing rings, and samples at rest
+# before the next first move, as in the study.
+_BACK, _BEFORE = 1.5, 50
 # Share of the largest change of a move that begins it, and of a setpoint, from its end, at rest.
 _BEGINS, _RESTS = 0.25, 0.3
 _TOPICS = ('/joint_states', '/flux_density_applied', '/planner/setpoint', '/planner/status')
@@ -81,7 +86,8 @@ def run(
         'stretch_noise': scenario.noise, 'stretch_bias': _BIAS}
     planner: dict[str, object] = {
         **parameters_of(scenario.block), 'flux_density_min': -_LIMIT, 'flux_density_max': _LIMIT,
-        'lead_time': graph.lead, 'feedback': 'adapt', 'feedback_cautious': graph.cautious}
+        'lead_time': graph.lead, 'feedback': 'adapt', 'feedback_cautious': graph.cautious,
+        'feedback_tolerance': _TOLERANCE}
     with Rig(folder, ros_domain(), watch=False) as rig:
         recorder = rig.start('recorder', {
             'storage.uri': bag, 'record.topics': f'[{", ".join(_TOPICS)}]'})
@@ -96,11 +102,12 @@ def run(
                 rig.set_parameters(interface.PLANNER, feedback='off')
             else:
                 rig.call(interface.RESET_ESTIMATE, interface.PLANNER)
+            rig.spin(_BEFORE * scenario.period)
             for target in (*TARGETS, 1.0):
                 rig.publish_setpoint(target)
-                rig.spin(graph.hold)
+                rig.spin(graph.hold * (_BACK if target == 1.0 else 1.0))
         recorder.end()
-    found = judge(read(bag), scenario.block.time_unit)
+    found = judge(read(bag), scenario.block.time_unit, cautious=graph.cautious)
     place = len(TARGETS) * seeds
     return {'off': found[place:], 'adapt': found[:place]}
 
@@ -129,7 +136,8 @@ def _values(topic: str, message: Any) -> tuple[float, ...]:
     return float(next(x.value for x in message.values if x.key == 'late')),
 
 
-def judge(recorded: Mapping[str, np.ndarray], unit: float) -> list[Seen]:
+def judge(
+        recorded: Mapping[str, np.ndarray], unit: float, *, cautious: bool = False) -> list[Seen]:
     """Return what is seen of all moves but those back; the unit of time is in s."""
     samples, applied, requests, verdicts = (recorded[x] for x in _TOPICS)
     found = []
@@ -144,7 +152,7 @@ def judge(recorded: Mapping[str, np.ndarray], unit: float) -> list[Seen]:
         change = np.abs(np.diff(near[:, 1], prepend=before[-1] if len(before) else 0.0))
         begin = near[np.argmax(change > _BEGINS * np.max(change)), 0]
         tau = unit * float(two_step(start, target, Actuator())[1])
-        arrival = begin + (_FIRST if start == 1.0 else _NEXT) * tau
+        arrival = begin + (_FIRST if start == 1.0 else _NEXT[cautious]) * tau
         cycle = _CYCLE * unit
         rest = samples[(samples[:, 0] > end - _RESTS * (end - asked)) & (samples[:, 0] < end), 1]
         step = target - start

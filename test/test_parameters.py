@@ -44,7 +44,7 @@ DIMENSIONLESS = {
     'smooth_periods', 'stretch_bias', 'stretch_gain', 'stretch_noise', 'viscoelastic.ratio',
     # Each number of them has its own unit.
     'identification.values', 'identification.covariance',
-    'arrival_tolerance', 'stretch_tolerance', 'vibration_tolerance',
+    'arrival_tolerance', 'feedback_tolerance', 'stretch_tolerance', 'vibration_tolerance',
     *(f'mismatch.{x.name.partition(".")[2]}' for x in ACTUATOR)}
 TYPES = {
     bool: ParameterType.PARAMETER_BOOL, int: ParameterType.PARAMETER_INTEGER,

@@ -26,6 +26,8 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation.estimator import Estimate
 from hmsa_ros.estimation.motion import follow, followed, Levels, rest
 
+#: A move that is expected to leave more than this share of its step is given more time.
+TOLERANCE = 5e-3
 # A correction leaves at most this share of what the course in force leaves, in squares, and
 # gains at least this, as a share of the noise of a sample.
 _SHARE, _GAIN = 0.8, 0.02
@@ -158,6 +160,41 @@ def expect(
         math.sqrt(float(misses @ misses) + max(spread, 0.0)))
 
 
+def patience(
+        estimate: Estimate, course: Course, step: float, slew_limit: float = math.inf,
+        tolerance: float = TOLERANCE) -> float:
+    """
+    Return how many times as long a move is to take: 1, or `caution` where it may leave too much.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        At the begin of the move.
+    course : Course
+        As planned.
+    step : float
+        Change of stretch, above 0.
+    slew_limit : float
+        Of the amplifier in T/s; infinite for steps.
+    tolerance : float
+        Share of the step from which on that is too much.
+
+    Returns
+    -------
+    float
+        At least 1.
+
+    """
+    if expect(estimate, course, slew_limit).size <= tolerance * step:
+        return 1.0
+    return caution(len(estimate.free), estimate.noise / step)
+
+
+def worthwhile(before: float, after: float, noise: float, least: float = 0.0) -> bool:
+    """Return whether a correction leaves less enough: sizes of `expect`, the least gain."""
+    return after < min(math.sqrt(_SHARE) * before, before - max(_GAIN * noise, least))
+
+
 class Corrector:
     """
     Plans courses from estimates.
@@ -218,11 +255,11 @@ class Corrector:
         move = get_shaper(shaper)(replace(
             self._request(model, estimate, target, in_force), order=order))
         found = _placed(move, model, estimate.time, target)
-        step = abs(target - estimate.stretch)
-        if math.isinf(tolerance) or expect(
-                estimate, found, self.options.slew_limit).size <= tolerance * step:
+        if math.isinf(tolerance):
             return found
-        longer = caution(len(estimate.free), estimate.noise / max(step, estimate.noise))
+        longer = patience(
+            estimate, found, max(abs(target - estimate.stretch), estimate.noise),
+            self.options.slew_limit, tolerance)
         return replace(found, arrival=estimate.time + round(
             longer * (found.arrival - estimate.time)))
 
@@ -256,7 +293,7 @@ class Corrector:
             whole = found.follows(course, estimate.time)
             size = expect(estimate, whole, slew).size
             now = expect(estimate, course, slew, whole.arrival).size
-            if size < min(least, math.sqrt(_SHARE) * now, now - _GAIN * estimate.noise):
+            if size < least and worthwhile(now, size, estimate.noise):
                 best, least = whole, math.sqrt(_SHARE) * size
         return best
 

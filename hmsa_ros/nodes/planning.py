@@ -159,6 +159,11 @@ SPECS = (
         'where the noise is large beside the step), and is corrected until then.',
         read_only=False),
     ParameterSpec(
+        'feedback_tolerance', _SETTINGS.feedback_tolerance,
+        'Share of its step that a move may be expected to leave, as amplitude of its vibration '
+        'and offset together, before feedback_cautious gives it more time: the less, the more '
+        'moves take longer.', '', 0.0, 1.0, read_only=False),
+    ParameterSpec(
         'feedback_trim', _SETTINGS.feedback_trim,
         'How far feedback adapt may change a level that holds a setpoint to make up for a '
         'constant force, in small moves one after the other; constant_force must be among '
@@ -236,6 +241,7 @@ def settings_from(values: JointParameters) -> Settings:
         feedback=str(values['feedback']),
         feedback_parameters=check_free(values['feedback_parameters']),
         feedback_cautious=bool(values['feedback_cautious']),
+        feedback_tolerance=float(values['feedback_tolerance']),
         feedback_trim=float(values['feedback_trim']),
         feedback_frozen=bool(values['feedback_frozen']),
         feedback_file=str(values['feedback_file']),

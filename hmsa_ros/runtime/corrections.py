@@ -12,18 +12,17 @@ from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.timeline import Draft, Model, Plan
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.estimation import Estimate
-from hmsa_ros.estimation.correction import caution, Course, expect
+from hmsa_ros.estimation.correction import Course, expect, patience, worthwhile
 from hmsa_ros.runtime.feedback import Feedback
 from hmsa_ros.runtime.records import Severity, Verdict
 from hmsa_ros.runtime.slices import Clock, in_time, Work
 from hmsa_ros.runtime.trimming import trimmed
 
-# A correction leaves at most this share of what the plan leaves, in squares, and gains this share
-# of the step.
-_SHARE, _GAIN = 0.5, 5e-4
-# A move that is expected to leave more than this share of the step is not well known, and units of
-# time before its end from which on it is not corrected any more.
-_WIDE, _SHORTEST = 5e-3, 0.3
+# A correction gains at least this share of the step, less while a move has time for corrections:
+# what rests is not to be moved for little.
+_GAIN, _LITTLE = 5e-4, 5e-5
+# Units of time before its end from which on a move is not corrected any more.
+_SHORTEST = 0.3
 # A step that is smaller counts as this one.
 _LEAST_STEP = 0.1
 
@@ -62,17 +61,15 @@ class Corrections:
 
     def _slowly(self, name: str, draft: Draft) -> Draft:
         segment, *rest = draft.segments
-        model = self._group.planners[name].model
         estimate = self._feedback.foreseen(name, draft.begin)
-        if (estimate is None or segment.arrival is None or segment.code is Code.LEVELS
-                or model.material.creep):
+        if estimate is None or segment.arrival is None or segment.code is Code.LEVELS:
             return draft
-        course = _drafted(draft)
-        slew = model.options.slew_limit
-        step = max(abs(segment.stretch - draft.levels[0].stretch), _LEAST_STEP)
-        if expect(estimate, course, slew).size <= _WIDE * step:
+        longer = patience(
+            estimate, _drafted(draft),
+            max(abs(segment.stretch - draft.levels[0].stretch), _LEAST_STEP),
+            self._group.planners[name].options.slew_limit, self._feedback.tolerance)
+        if longer == 1.0:
             return draft
-        longer = caution(len(estimate.free), estimate.noise / step)
         arrival = segment.begin + round(longer * (segment.arrival - segment.begin))
         if rest:
             arrival = max(min(arrival, rest[0].begin), segment.arrival)
@@ -103,7 +100,7 @@ class Corrections:
             level = trimmed(planner, estimate, self._feedback.trim)
             if level is not None:
                 steps = partial(self._trim, name, level)
-            elif self._worthwhile(estimate, planner):
+            elif self._worthwhile(estimate, planner, self._arrival(name, now)):
                 steps = partial(self._correct, name)
             else:
                 continue
@@ -114,17 +111,20 @@ class Corrections:
         """Hold by another level in T."""
         return {name: (yield from self._group.planners[name].draft_trim(now, level))}
 
-    def _worthwhile(self, estimate: Estimate, planner: Planner) -> bool:
+    def _arrival(self, name: str, now: int) -> int:
+        """Return the time in ns of rest of a move that has time for corrections; 0 without one."""
+        planner, arrival = self._group.planners[name], self._arrivals.get(name, 0)
+        left = arrival - planner.soonest(now)
+        return arrival if left >= _SHORTEST * planner.model.units.time * NANOSECONDS else 0
+
+    def _worthwhile(self, estimate: Estimate, planner: Planner, arrival: int) -> bool:
         """Return whether a plan is expected to leave more than it must."""
-        course, gain = _course(planner.plan, estimate.time)
+        course, gain = _course(planner.plan, estimate.time, _LITTLE if arrival else _GAIN)
         return expect(estimate, course, planner.options.slew_limit).size > gain
 
     def _correct(self, name: str, now: int) -> Steps[Mapping[str, Draft]]:
         """Plan the rest anew, if that is expected to leave less."""
-        planner = self._group.planners[name]
-        arrival = self._arrivals.get(name, 0)
-        if arrival - planner.soonest(now) < _SHORTEST * planner.model.units.time * NANOSECONDS:
-            arrival = 0
+        planner, arrival = self._group.planners[name], self._arrival(name, now)
         try:
             draft = yield from planner.draft_resumption(now, arrival or None)
         except RefusedError:
@@ -136,13 +136,11 @@ class Corrections:
             # A correction leaves no setpoint out.
             return {}
         slew = planner.options.slew_limit
-        course, gain = _course(planner.plan, draft.begin)
+        course, gain = _course(planner.plan, draft.begin, _LITTLE if arrival else _GAIN)
         segment = draft.segments[0]
         before = expect(estimate, course, slew, segment.arrival or 0).size
         after = expect(estimate, _drafted(draft), slew).size
-        if after < min(math.sqrt(_SHARE) * before, before - gain):
-            return {name: draft}
-        return {}
+        return {name: draft} if worthwhile(before, after, estimate.noise, gain) else {}
 
     def take(self, drafts: Mapping[str, Draft], now: int, request: str) -> Verdict | None:
         """
@@ -196,7 +194,7 @@ def _relaxed(model: Model, stretch: float) -> float:
     return model.holding(stretch) * model.units.load if model.material.creep else math.nan
 
 
-def _course(plan: Plan, begin: int) -> tuple[Course, float]:
+def _course(plan: Plan, begin: int, gain: float) -> tuple[Course, float]:
     """Return what is planned from a time in ns to its setpoint's end, and what counts then."""
     levels, place = plan.levels, max(plan.under_way(begin), 0)
     segment = plan.segments[place]
@@ -208,4 +206,4 @@ def _course(plan: Plan, begin: int) -> tuple[Course, float]:
         tuple((x.stamp, x.flux_density) for x in kept),
         segment.arrival or kept[-1].stamp, segment.stretch,
         math.nan if end is None else _relaxed(kept[-1].model, segment.stretch)), max(
-            _GAIN * abs(segment.stretch - start), _GAIN * _LEAST_STEP, segment.vibration)
+            gain * abs(segment.stretch - start), gain * _LEAST_STEP, segment.vibration)

@@ -308,6 +308,11 @@ class Feedback:
         """Whether moves with actuators that are not well known are to take longer."""
         return self.mode == 'adapt' and self._settings.feedback_cautious
 
+    @property
+    def tolerance(self) -> float:
+        """Share of its step that a move may be expected to leave without taking longer."""
+        return self._settings.feedback_tolerance
+
     def news(self) -> Iterator[tuple[str, Planner]]:
         """
         Learn from the latest estimates.

@@ -18,7 +18,7 @@ from hmsa_ros.identification.known import Known
 from hmsa_ros.identification.quantities import derivative, QUANTITIES
 
 # A model is another one from this share of a parameter, and this many of its deviations, on.
-_NEWS, _SURE = 1e-3, 2.0
+_NEWS, _SURE = 1e-3, 0.5
 # Parameters of planner and plant besides those of the block.
 _OTHERS = ('coil_time_constant', 'stretch_bias', 'stretch_gain')
 

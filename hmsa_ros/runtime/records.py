@@ -7,6 +7,7 @@ from enum import IntEnum
 from hmsa_ros.core.group import Progress
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.estimation.correction import TOLERANCE
 from hmsa_ros.estimation.prior import TRACKED
 from hmsa_ros.identification.known import Known
 from hmsa_ros.runtime.measured import Finding, Tolerances
@@ -41,7 +42,9 @@ class Settings:
     feedback_parameters : tuple of str
         What is estimated besides the state.
     feedback_cautious : bool
-        Whether a first move takes longer where it is expected to leave much.
+        Whether a move takes longer where it is expected to leave much.
+    feedback_tolerance : float
+        Share of its step from which on that is much.
     feedback_trim : float
         Largest change in T of a holding level against an estimated constant force; 0 for none.
     feedback_frozen : bool
@@ -69,6 +72,7 @@ class Settings:
     feedback: str = 'off'
     feedback_parameters: tuple[str, ...] = TRACKED
     feedback_cautious: bool = False
+    feedback_tolerance: float = TOLERANCE
     feedback_trim: float = 0.0
     feedback_frozen: bool = False
     feedback_file: str = ''
