@@ -22,8 +22,8 @@ Result = TypeVar('Result')
 PATIENCE = 15
 #: Chunks that wait at a Dask cluster: they are small there, and it grows by what waits.
 AHEAD = 1000
-# A cluster on this machine shares its cores with the kernels. As Dask sets itself up, watching
-# itself a hundred times a second and giving each freed page back takes a fifth of them.
+# A cluster on this machine shares its cores with the kernels. As Dask sets itself up, it watches
+# itself a hundred times a second, and its workers give each freed page back.
 _QUIET = {
     'distributed.worker.profile.enabled': False,
     'distributed.admin.tick.interval': '1s',
