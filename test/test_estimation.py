@@ -9,6 +9,7 @@ import pytest
 from hmsa_ros.core.creep import Creep
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation import Estimator, Options, Prior
+from hmsa_ros.estimation.motion import follow, Levels
 from hmsa_ros.estimation.words import confounded, sentence
 from hmsa_ros.identification.files import read_belief
 
@@ -90,6 +91,22 @@ def test_branches_that_are_given_are_followed_over_many_windows(coil, tau):
     _, lost = run(measured(block, extras, noise=1e-5), ('shear_modulus', 'damping_coefficient'),
                   Options(window=40))
     assert abs(lost.values['shear_modulus'] - 9e3) > 20.0
+
+
+@pytest.mark.parametrize('tau', [1e-5, 1e-4])
+def test_derivatives_keep_right_while_a_fast_branch_has_nothing_more_to_do(tau):
+    block = replace(oracle.BLOCK, creep=Creep((0.3,), (tau,)))
+    values, unit = Prior.nominal(block).values, block.flux_density_unit
+    levels = Levels(np.array([0.0, 0.02]), np.array([0.5, 0.2]) * unit)
+    times = np.linspace(0.0, 0.5, 101)
+
+    def motion(free=(), factor=1.0):
+        modulus = factor * values['shear_modulus']
+        return follow(
+            {**values, 'shear_modulus': modulus}, free, (1.0, 0.0), levels, 0.0, times)
+
+    differences = (motion(factor=1.0001).stretch - motion(factor=0.9999).stretch) / 2e-4
+    assert motion(('shear_modulus',)).by[:, 0] == pytest.approx(differences, abs=1e-5)
 
 
 def test_remanence_and_coil_lag_are_found_beside_the_modulus():

@@ -44,6 +44,8 @@ _SMOOTH = 0.45
 # Largest phase of a step where there are derivatives: they ring on when the motion is over, and
 # the error that is controlled is that of the motion alone.
 _LONGEST = 1.0
+# And in times of the fastest branch: beyond some six the derivatives would grow without an end.
+_RELAXED = 4.0
 # Stages and, in the last row, the solution.
 _TABLEAU = np.vstack([MATRIX, WEIGHTS[None, :]])
 # Columns that are added at once; the state is filled up to a multiple of them.
@@ -228,7 +230,9 @@ def _follow(
     fresh = True
     material[law.DAMPING] = theta[DAMPING] / unit[2]
     fastest = math.sqrt(theta[STIFFNESS] / mass(at_rest(material), material))
-    h = 0.2 / fastest
+    h, relaxed = 0.2 / fastest, math.inf
+    for b in range(n - 2):
+        relaxed = min(relaxed, _RELAXED * theta[FIRST_BRANCH + 2 * b + 1])
     for _ in range(_MAX_STEPS + _STEPS_PER_SAMPLE * times.size):
         if fresh:
             now, now_lag = _field(
@@ -254,7 +258,7 @@ def _follow(
         smooth = _SMOOTH * per_phase
         target = min(limit, times[i] if times[i] - t >= smooth else t + smooth)
         if count:
-            h = min(h, _LONGEST * per_phase)
+            h = min(h, _LONGEST * per_phase, relaxed)
         step = min(h, target - t)
         error = _step(
             k, y, new, n, count, t - begins[piece], step, drive, theta, unit, material,
