@@ -27,6 +27,7 @@ from hmsa_ros.cli import main
 from hmsa_ros.contract.actuator import actuator_from, parameters_of
 from hmsa_ros.contract.parameters import BLOCK
 from hmsa_ros.core import model
+from hmsa_ros.core.actuators import check_stretch
 from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.laws import bending
 from hmsa_ros.core.planner import Options, Planner
@@ -132,6 +133,8 @@ def test_refusals_speak_of_the_deflection(points, message):
     planner = Planner(silicone(), Options(flux_density_min=-0.01, flux_density_max=0.01))
     with pytest.raises(RefusedError, match=message):
         planner.request(points, 0, 0)
+    with pytest.raises(BadInputError, match='^reset_stretch is 0.9: expected a deflection'):
+        check_stretch(0.9, silicone().nondimensional, 'reset_stretch')
 
 
 def test_the_tangent_of_a_bent_beam_is_the_slope_of_its_centreline():

@@ -9,6 +9,7 @@ numbers of another, and one alone moves bit for bit as it does among others.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 import math
+import re
 
 import numpy as np
 
@@ -45,8 +46,10 @@ def check_stretch(stretch: float, material: Material, name: str = 'stretch') -> 
         coordinate = getattr(material, 'coordinate', STRETCH).name
         whose = f'J_lim {getattr(material, "j_lim", material):g}' if elastic is None \
             else f'law {elastic.law}'
+        # Parameters keep their names.
+        called = re.sub(r'\bstretch\b', coordinate, name)
         raise BadInputError(
-            f'{name.replace("stretch", coordinate)} is {stretch:g}: expected a {coordinate} '
+            f'{called} is {stretch:g}: expected a {coordinate} '
             f'between the limits {lower:.4f} and {upper:.4f} of {whose}')
 
 
