@@ -63,6 +63,7 @@ EXTRAS_REQUIRE = {
     ],
     # Studies on a Dask cluster.
     'cluster': [
+        'dask>=2024.1',
         'distributed>=2024.1',
         'pyarrow>=14.0',
     ],

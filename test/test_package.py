@@ -31,7 +31,7 @@ WITHOUT_KEY = {'plotly', 'pyte', 'ruff', 'types-PyYAML'}
 # Requirements whose module has another name.
 MODULES = {'PyYAML': 'yaml', 'mcap-ros2-support': 'mcap_ros2'}
 # What only a part of the package needs.
-OPTIONAL = {'distributed', 'pyarrow'}
+OPTIONAL = {'dask', 'distributed', 'pyarrow'}
 # What the package asks for in one line where it is missing: a viewer is the user's choice.
 BESIDE = {'rerun'}
 # Needed to install, or to be launched, not to be imported.
