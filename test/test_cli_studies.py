@@ -167,6 +167,8 @@ def test_robustness_takes_the_actuator_of_a_file_with_its_law_and_its_coil(
     assert list(found['curves']) == ['G', 'zeta']
     assert 'both --params-file and --zeta' in refused(
         'robustness', '--params-file', file, '--zeta', 0.1)
+    assert 'coil_time_constant 0.0005: expected 0 with --feedback' in refused(
+        'robustness', '--feedback', '--params-file', file)
 
 
 @pytest.mark.parametrize(('words', 'message'), [

@@ -292,8 +292,18 @@ def _feedback(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) ->
 
     if arguments.seeds < 1:
         raise BadInputError(f'--seeds is {arguments.seeds}: expected at least 1')
-    matrix = Matrix(arguments.seeds) if arguments.params_file is None else Matrix(
-        arguments.seeds, [scenario_of(read_belief(arguments.params_file).actuator)])
+    matrix = Matrix(arguments.seeds)
+    if arguments.params_file is not None:
+        belief = read_belief(arguments.params_file)
+        for key, name in (
+                ('coil_time_constant', 'coil_time_constant'),
+                ('viscoelastic_ratio', 'viscoelastic.ratio')):
+            if belief.others.get(key):
+                raise BadInputError(
+                    f'{arguments.params_file} gives {name} {belief.others[key]:g}: expected 0 '
+                    'with --feedback, which compares actuators without coil lag and creep; leave '
+                    'it out of the file')
+        matrix = Matrix(arguments.seeds, [scenario_of(belief.actuator)])
     if not in_chunks and arguments.out is None:
         return _show_matrix(
             matrix.seeds, matrix.rows(in_order(start, trial, matrix.tasks)),

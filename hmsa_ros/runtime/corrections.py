@@ -55,7 +55,7 @@ class Corrections:
         Their levels stay: the early effect of these shows what the actuator is.
         """
         self._arrivals = {x: y for x, y in self._arrivals.items() if x not in drafts}
-        if not self._feedback.cautious:
+        if math.isinf(self._feedback.tolerance):
             return drafts
         return {name: self._slowly(name, draft) for name, draft in drafts.items()}
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from functools import partial
+import math
 
 from hmsa_ros.core.group import PlannerGroup
 from hmsa_ros.core.planner import Planner
@@ -304,14 +305,10 @@ class Feedback:
         return self._settings.feedback_trim if self.mode == 'adapt' else 0.0
 
     @property
-    def cautious(self) -> bool:
-        """Whether moves with actuators that are not well known are to take longer."""
-        return self.mode == 'adapt' and self._settings.feedback_cautious
-
-    @property
     def tolerance(self) -> float:
         """Share of its step that a move may be expected to leave without taking longer."""
-        return self._settings.feedback_tolerance
+        cautious = self.mode == 'adapt' and self._settings.feedback_cautious
+        return self._settings.feedback_tolerance if cautious else math.inf
 
     def news(self) -> Iterator[tuple[str, Planner]]:
         """
