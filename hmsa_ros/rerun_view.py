@@ -17,7 +17,7 @@ import numpy as np
 
 from hmsa_ros.bag.reader import BagReader, read_messages
 from hmsa_ros.contract import topics
-from hmsa_ros.core.laws.coordinate import STRETCH
+from hmsa_ros.core.laws.coordinate import shared_name, STRETCH
 from hmsa_ros.errors import BadInputError, complain, HmsaError
 from hmsa_ros.runs.parameters import actuators, recorded
 
@@ -132,8 +132,7 @@ def _coordinate(custom_data: Mapping[str, str], root: str) -> str:
     parameters = recorded(custom_data, root)
     joints = next((x for node in (topics.PLANT, topics.PLANNER)
                    if isinstance(x := parameters.get(f'{node}.joints'), list) and x), [''])
-    names = {actuators(parameters, {}, str(x))[0].coordinate.name for x in joints}
-    return names.pop() if len(names) == 1 else 'position'
+    return shared_name(actuators(parameters, {}, str(x))[0].coordinate.name for x in joints)
 
 
 def _log_marker(recording: Any, root: str, marker: Any) -> None:

@@ -40,8 +40,8 @@ def pytest_configure(config: pytest.Config) -> None:
             'ignore:module .sre_:DeprecationWarning',  # lark, imported by rosidl_parser
     ):
         config.addinivalue_line('filterwarnings', warning)
-    # The gate takes the same examples each time, so that it tells of the change alone; those of
-    # `make full` are new each time.
+    # The gate uses the same examples in each run, so a failure comes from the change; `make full`
+    # draws new ones.
     for name, same in (('gate', True), ('full', False)):
         settings.register_profile(
             name, derandomize=same,

@@ -191,7 +191,7 @@ def patience(
 
 
 def worthwhile(before: float, after: float, noise: float, least: float = 0.0) -> bool:
-    """Return whether a correction leaves less enough: sizes of `expect`, the least gain."""
+    """Return whether a correction leaves enough less: sizes of `expect`, and the least gain."""
     return after < min(math.sqrt(_SHARE) * before, before - max(_GAIN * noise, least))
 
 

@@ -39,17 +39,17 @@ class ServiceCall:
         """Return the response, or None as long as there is none; send what is due."""
         for future in self._futures:
             if future.done() and (response := future.result()) is not None:
-                self.drop()
+                self._drop()
                 return response
         if not self.ready:
             # Whoever was asked is gone: the next server is asked from the beginning.
-            self.drop()
+            self._drop()
         elif not self._futures or monotonic() - self._sent > self._patience:
             self._futures.append(self._client.call_async(self._request))
             self._sent = monotonic()
         return None
 
-    def drop(self) -> None:
+    def _drop(self) -> None:
         """Forget what was sent; `answer` begins anew."""
         for future in self._futures:
             self._client.remove_pending_request(future)

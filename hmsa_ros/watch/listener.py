@@ -250,11 +250,10 @@ class Listener:
                 # A robot's diagnostics are of many other things.
                 if name not in interface.NODES and status.hardware_id not in self._joints:
                     continue
-                self._name_coordinates(
-                    status.hardware_id,
-                    {printable(x.key): printable(x.value) for x in status.values})
-                counts = {printable(x.key): whole(x.value) for x in status.values
-                          if '.' not in x.key and x.value.isdigit()}
+                values = {printable(x.key): printable(x.value) for x in status.values}
+                self._name_coordinates(status.hardware_id, values)
+                counts = {key: whole(value) for key, value in values.items()
+                          if '.' not in key and value.isdigit()}
                 self._heard[name, status.name, status.hardware_id] = now, Report(
                     name, status.level[0], printable(status.message), counts)
         self._heard = {

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from hmsa_ros.core.laws.coordinate import POSITION
 from hmsa_ros.core.model import Array
 
 #: What diagnostics and verdicts call their levels.
@@ -83,7 +84,7 @@ class Joint:
     flux_density: float = math.nan
     target: float = math.nan
     commanded: float = math.nan
-    coordinate: str = 'position'
+    coordinate: str = POSITION
 
 
 @dataclass

@@ -8,6 +8,7 @@ import numpy as np
 from rich.cells import cell_len
 from rich.text import Text
 
+from hmsa_ros.core.laws.coordinate import shared_name
 from hmsa_ros.core.model import Array
 from hmsa_ros.watch.chart import dots, limits, strip
 from hmsa_ros.watch.scene import Joint, LEVELS, Report, Scene
@@ -148,8 +149,7 @@ class Screen:
     def _table(self, scene: Scene, width: int, room: int) -> list[Text]:
         """Return a line for each joint, with a chart of one row at its end."""
         wide = min(max(len(x.name) for x in scene.joints), 16)
-        names = {x.coordinate for x in scene.joints}
-        name = names.pop() if len(names) == 1 else 'position'
+        name = shared_name(x.coordinate for x in scene.joints)
         lines = [Text(
             f'{"joint":<{wide}} {name:>{_WIDE}} {"target":>8} {"off":>8} {"flux density":>13}',
             style=_SOFT)]

@@ -1,5 +1,6 @@
 """What the position of an actuator is: the stretch of a block, or the deflection of a beam."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from hmsa_ros.core.laws.record import Elastic
@@ -49,7 +50,15 @@ DEFLECTION = Coordinate(
     (-0.4, 0.4), (-1.2, 1.2), (-2.0, 2.0), (-0.6, 0.6),
     'a length, in mm perhaps, divide it by that of the beam; if it is the angle of the tip, take '
     'the deflection that goes with it')
+#: What a position is called where nothing more is known.
+POSITION = 'position'
 COORDINATES = {x.name: x for x in (STRETCH, DEFLECTION)}
+
+
+def shared_name(names: Iterable[str]) -> str:
+    """Return what positions of several actuators are called together."""
+    found = set(names)
+    return found.pop() if len(found) == 1 else POSITION
 
 
 def coordinate_of(law: Elastic | None) -> Coordinate:
