@@ -544,7 +544,8 @@ def test_plan_is_dropped_when_the_wall_clock_is_set_back(ros, serve):
     statuses = ros.collect(interface.STATUS.type, 'planner/status', interface.STATUS.qos)
     setpoints = ros.publisher(Float64, 'planner/setpoint', interface.SETPOINT.qos)
     setpoints.publish(Float64(data=1.1))
-    ros.spin_until(lambda: planner._runtime._takeover.engaged, 'the plan')
+    ros.spin_until(
+        lambda: statuses and statuses[-1].values[0].value == 'accepted', 'the plan')
     # As if the last reading had been ten seconds ahead of this one.
     planner._steps._offset += 10**10
     ros.spin_until(

@@ -49,6 +49,8 @@ class Rig:
         self.steady = 0
         # What each look at a clock takes.
         self.effort = 0
+        # Before which reading the clock is set back, and by how much.
+        self.set_back_at = None
         self.observable = True
         self.unheard = ''
         self.group = PlannerGroup({
@@ -67,6 +69,13 @@ class Rig:
         self.hold_back = False
 
     def clock(self):
+        if self.set_back_at is not None:
+            readings, back = self.set_back_at
+            self.set_back_at = readings - 1, back
+            if readings == 0:
+                self.set_back_at = None
+                self.now -= back
+                self.runtime.clock_set_back(back)
         return self.now
 
     def look(self):
@@ -603,3 +612,19 @@ def test_clock_that_is_set_back_drops_the_plan_and_tells_so_once():
     assert rig.runtime.wake is None
     assert rig.runtime.request(Target('a', 1.1)).code == 'accepted'
     assert rig.planner.plan.levels[0].stretch == 1.0
+
+
+@pytest.mark.parametrize('reading', range(4))
+def test_a_request_is_planned_again_where_the_clock_is_set_back_meanwhile(reading):
+    rig = Rig()
+    rig.runtime.request(Target('a', 1.1))
+    rig.run(START + 300 * MS)
+    before = len(rig.sent)
+    rig.set_back_at = reading, START
+    assert rig.runtime.request(Target('a', 1.2)).code == 'accepted'
+    assert rig.set_back_at is None
+    rig.run(rig.now + 100 * MS)
+    assert rig.codes()[-4:].count('clock_jumped') == 1
+    # Of the old plan nothing is left, and the new one is for the time that has begun.
+    assert rig.planner.plan.levels[0].stretch == 1.0
+    assert all(x.stamp < START for _, x in rig.sent[before:])

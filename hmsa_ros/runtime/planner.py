@@ -94,6 +94,7 @@ class PlannerRuntime:
             group, self.following, Corrections(group, self.feedback, clock), self._bulletin,
             clock, steady, lambda: self._sending.send(clock()))
         self._last_jump: int | None = None
+        self._set_back = 0
 
     @property
     def verdict(self) -> Verdict:
@@ -140,6 +141,7 @@ class PlannerRuntime:
             check_joints(request, tuple(self.group.planners), self.settings)
         except RefusedError as error:
             return self.refuse(error, request)
+        self._begin_anew()
         work = self._planning.add(request, engaged=self._takeover.engaged)
         self._engage(begin=True)
         self._work_on()
@@ -147,6 +149,9 @@ class PlannerRuntime:
                and not isinstance(request, Trajectory)):
             # Short work, which whoever asks wants to be done.
             self._work_on()
+        if self._set_back:
+            # While it was planned, for times that are not to come.
+            return self.request(request)
         return _WAITING if work in self._planning else self.verdict
 
     def applied(self, joint: str, stamp: int, flux_density: float) -> None:
@@ -167,8 +172,20 @@ class PlannerRuntime:
         self.feedback.add(joint, stamp, stretch)
 
     def clock_set_back(self, back: int) -> None:
-        """Begin anew where the clock was set back by some ns; the state in force is read again."""
+        """
+        Take in that the clock was set back by some ns: the state in force is read again.
+
+        The clock may find this out when it is read in the middle of planning, so the plans are
+        dropped when that is done.
+        """
         self.clock_jumps += 1
+        self._set_back = max(self._set_back, back)
+
+    def _begin_anew(self) -> None:
+        """Drop the plans if the clock was set back, and report it."""
+        back, self._set_back = self._set_back, 0
+        if not back:
+            return
         self.group.restart()
         self.following.restart()
         self._planning.clear()
@@ -188,6 +205,7 @@ class PlannerRuntime:
 
     def deactivate(self) -> None:
         """Come to rest, for which all commands are sent now, and take no more requests."""
+        self._begin_anew()
         self.active = False
         # What is seen before the joints have come to rest is not where they are later.
         self._takeover.drop()
@@ -230,7 +248,8 @@ class PlannerRuntime:
     @property
     def wake(self) -> int | None:
         """Time in ns at which there is something to do next; None for never, 0 for now."""
-        if self._planning or self._takeover.waiting or self._bulletin.outputs:
+        if (self._set_back or self._planning or self._takeover.waiting
+                or self._bulletin.outputs):
             return 0
         if not self._takeover.engaged:
             return None
@@ -246,6 +265,7 @@ class PlannerRuntime:
 
     def send(self, now: int) -> list[Output]:
         """Return the commands that are due at a time in ns: of `tick`, what cannot wait."""
+        self._begin_anew()
         self._send(now)
         return self._taken()
 
@@ -264,6 +284,7 @@ class PlannerRuntime:
             To be passed on in this order.
 
         """
+        self._begin_anew()
         self._engage()
         if self._send(now):
             self.feedback.update(now)
@@ -275,6 +296,7 @@ class PlannerRuntime:
                             or self._bulletin.next_change is not None):
             self._bulletin.look_for_listeners()
             self._judge(now)
+        self._begin_anew()
         return self._taken()
 
     def _send(self, now: int) -> bool:
