@@ -86,10 +86,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         status: int = arguments.run(arguments)
         sys.stdout.flush()
         return status
-    except BadInputError as error:
-        return complain(error, 2)
     except HmsaError as error:
-        return complain(error, 1)
+        return complain(error, 2 if isinstance(error, BadInputError) else 1)
     except KeyboardInterrupt:
         return ENDING.status
     except BrokenPipeError:

@@ -12,7 +12,8 @@ from hmsa_ros.errors import BadInputError
 
 if TYPE_CHECKING:
     from hmsa_ros.studies.chunks import Chunks, Study
-    from hmsa_ros.studies.engine import Outcome, Start
+    from hmsa_ros.studies.engine import Outcome
+    from hmsa_ros.studies.executors import Start
 
 
 def add_options(parser: Any, *, workers: str) -> None:
@@ -67,30 +68,7 @@ def shard_of(arguments: argparse.Namespace) -> tuple[int, int]:
 def compute_chunks(
         study: 'Study', folder: Path, arguments: argparse.Namespace, start: 'Start', words: str,
         finish: 'Callable[[Chunks, Outcome], int]') -> int:
-    """
-    Compute what is asked for of a study, and finish it if all chunks are there.
-
-    Parameters
-    ----------
-    study : Study
-        What to compute.
-    folder : Path
-        Where its chunks go.
-    arguments : argparse.Namespace
-        Of the command.
-    start : callable
-        Makes the executor.
-    words : str
-        Shown with the progress.
-    finish : callable
-        Writes and prints the results; returns the exit status.
-
-    Returns
-    -------
-    int
-        The exit status.
-
-    """
+    """Compute what is asked for of a study, and `finish` it if all chunks are there."""
     from hmsa_ros.files import require_arrow
     from hmsa_ros.studies.chunks import Chunks
     from hmsa_ros.studies.engine import compute

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hmsa_ros.core.delivery import Delivery
     from hmsa_ros.core.moves import Limits
     from hmsa_ros.core.parameters import NondimensionalParameters
-    from hmsa_ros.studies.engine import Start
+    from hmsa_ros.studies.executors import Start
     from hmsa_ros.studies.matrix import Row
     from hmsa_ros.studies.robustness import Case, Result
 

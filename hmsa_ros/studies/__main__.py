@@ -151,10 +151,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             print()
         for path in pictures(arguments.out):
             print(path)
-    except BadInputError as error:
-        return complain(error, 2)
     except HmsaError as error:
-        return complain(error, 1)
+        return complain(error, 2 if isinstance(error, BadInputError) else 1)
     return 0
 
 

@@ -30,17 +30,7 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Spread:
-    """
-    What a column is drawn from.
-
-    Attributes
-    ----------
-    normal : bool
-        Normal, else uniform.
-    first, second : float
-        Mean and standard deviation, or both ends.
-
-    """
+    """What a column is drawn from: normal by mean and deviation, or uniform between two ends."""
 
     normal: bool
     first: float
@@ -49,19 +39,7 @@ class Spread:
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """
-    Columns that are normal together.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Of p columns.
-    mean : ndarray, shape (p,)
-        Their means.
-    covariance : ndarray, shape (p, p)
-        Of them.
-
-    """
+    """Columns that are normal together, with their means (p,) and covariance (p, p)."""
 
     names: tuple[str, ...]
     mean: Array
@@ -119,17 +97,13 @@ def parse_grid(text: str, column: str) -> Array:
 
 def _part(part: str, text: str, column: str) -> Array:
     """Read one value or one grid."""
-    words = part.split(':')
-    spacing = np.geomspace if words[0] == 'log' else np.linspace
-    numbers = words[1:] if words[0] == 'log' else words
+    logarithmic = part.startswith('log:')
     try:
-        if len(words) == 1:
-            return np.array([float(words[0])])
-        first, last = float(numbers[0]), float(numbers[1])
-        points = int(numbers[2])
-        if len(numbers) != 3:
-            raise ValueError(part)
-    except (ValueError, IndexError):
+        if ':' not in part:
+            return np.array([float(part)])
+        low, high, count = part.removeprefix('log:').split(':')
+        first, last, points = float(low), float(high), int(count)
+    except ValueError:
         raise BadInputError(f'{column} is {text!r}: expected {_GRID}') from None
     if points < 2:
         raise BadInputError(f'{column} of {text!r} has {points} points: expected at least 2')
@@ -137,29 +111,17 @@ def _part(part: str, text: str, column: str) -> Array:
         raise _too_many(column, points)
     if not math.isfinite(first) or not math.isfinite(last):
         raise BadInputError(f'{column} is {text!r}: expected finite ends of the grid')
-    if words[0] == 'log' and not (first > 0.0 and last > 0.0):
+    if logarithmic and not (first > 0.0 and last > 0.0):
         raise BadInputError(
             f'{column} is {text!r}: expected ends greater than 0 for a logarithmic grid')
     with np.errstate(all='ignore'):
+        spacing = np.geomspace if logarithmic else np.linspace
         return np.asarray(spacing(first, last, points), dtype=np.float64)
 
 
 def read_cases(path: Path, columns: Collection[str]) -> dict[str, Array]:
     """
-    Read a table of cases.
-
-    Parameters
-    ----------
-    path : Path
-        CSV file with a header.
-    columns : collection of str
-        Names that columns may have.
-
-    Returns
-    -------
-    dict of str to ndarray, shape (n,)
-        Columns by name. Numbers are taken as they are, those out of range and NaN too: the
-        plan of such a row says so.
+    Read a CSV of cases with some of the columns, numbers out of range and NaN as they are.
 
     Raises
     ------
@@ -217,23 +179,7 @@ def _case(cells: Sequence[str], names: Sequence[str], where: str) -> list[float]
 def draw(
         spreads: Mapping[str, Spread], belief: Belief, count: int, seed: int) -> dict[str, Array]:
     """
-    Draw samples.
-
-    Parameters
-    ----------
-    spreads : mapping of str to Spread
-        Columns that are independent of each other.
-    belief : Belief
-        Columns that are not.
-    count : int
-        How many, at least 1; the first so many of a sequence, so that more go on with it.
-    seed : int
-        Of the scrambling, at least 0.
-
-    Returns
-    -------
-    dict of str to ndarray, shape (count,)
-        Columns, the same for the same arguments on every machine.
+    Draw the first samples of a sequence, by column; the same on every machine.
 
     Raises
     ------

@@ -6,6 +6,7 @@ computes it, and a checksum of the content. So a folder says which chunks there 
 they are whole, and nobody has to keep a list.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -23,7 +24,7 @@ import zlib
 from hmsa_ros import __version__
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.files import make_folder, require_arrow, write_text
-from hmsa_ros.studies.tables import ArrowBlock, open_writer, repeating
+from hmsa_ros.studies.tables import open_writer, repeating
 
 #: Rows of a chunk: a thousandth of the study, at least 0.1 s and at most some 100 MB of work; a
 #: study whose rows take longer says so itself (``chunk_rows``).
@@ -94,12 +95,12 @@ class Chunks:
 
     def check(self) -> None:
         """
-        Find out whether the folder is that of the same study; nothing is written.
+        Refuse the folder of something else; nothing is written.
 
         Raises
         ------
         BadInputError
-            If it belongs to something else.
+            If it is one.
 
         """
         described = self._described
@@ -119,15 +120,7 @@ class Chunks:
                 'folder or that of this study; name another with --out')
 
     def prepare(self) -> None:
-        """
-        Make the folder, unless it is there.
-
-        Raises
-        ------
-        BadInputError
-            If it belongs to something else, or cannot be made.
-
-        """
+        """Make the folder, unless it is there or belongs to something else."""
         self.check()
         make_folder(self.folder / 'chunks')
         if not self._described.exists():
@@ -220,22 +213,20 @@ class Chunks:
         dict of str to int
             Counts by status.
 
-        Raises
-        ------
-        HmsaError
-            If a chunk is missing or damaged, or the table cannot be written.
-
         """
-        counts: dict[str, int] = {}
+        counts: Counter[str] = Counter()
         tables = self.tables()
         first = next(tables)
         with open_writer(path, first.column_names) as write:
             for table in chain([first], tables):
-                write(ArrowBlock(table))
-                add_counts(counts, table)
+                write(table)
+                if 'status' in table.column_names:
+                    counts.update({
+                        x['values']: x['counts']
+                        for x in table['status'].value_counts().to_pylist()})
                 if look is not None:
                     look(table)
-        return counts
+        return dict(counts)
 
     def merge_rows(self, path: Path) -> list[dict[str, Any]]:
         """Write the whole table as `merge`, and return its rows."""
@@ -270,10 +261,3 @@ def code() -> str:
         for path in sorted((package / folder).rglob('*.py')):
             made.update(path.relative_to(package).as_posix().encode() + path.read_bytes())
     return made.hexdigest()
-
-
-def add_counts(counts: dict[str, int], table: Any) -> None:
-    """Add how often each status occurs in a table of pyarrow, if it has that column."""
-    if 'status' in table.column_names:
-        for entry in table['status'].value_counts().to_pylist():
-            counts[entry['values']] = counts.get(entry['values'], 0) + entry['counts']

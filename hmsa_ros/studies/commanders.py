@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 import math
-from typing import Protocol, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,53 +22,10 @@ _TOLERANCE = 3e-5
 _LINEAR: dict[str, type[Controller]] = {'lqr': Quadratic, 'mpc': Predictive}
 
 
-class Commander(Protocol):
-    """
-    Commands one actuator.
+class Commander:
+    """Commands one actuator; this one plans with the nominal parameters and learns nothing."""
 
-    Attributes
-    ----------
-    steadily : bool
-        Whether a level follows each sample; else a course is carried out until another one.
-
-    """
-
-    steadily: bool
-
-    def move(self, time: int, target: float, course: Course) -> Course:
-        """Return the course to a target from a time in ns on, and from another course."""
-
-    def seen(self, stamp: int, stretch: float, begin: int, course: Course) -> Course | None:
-        """Take in a sample; return a better course that differs from a time in ns on, if any."""
-
-
-def commander(scenario: 'Scenario', strategy: 'Strategy') -> Commander:
-    """
-    Return who carries out a strategy.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        Nominal actuator, and sensor.
-    strategy : Strategy
-        Not ``learning``, which is repeated trials in open loop.
-
-    Returns
-    -------
-    Commander
-        Before the first sample.
-
-    """
-    if strategy.kind == 'adapt':
-        return _Adapting(scenario, strategy)
-    if strategy.kind in _LINEAR:
-        return _Steady(scenario, strategy)
-    return _Open(scenario, strategy)
-
-
-class _Open:
-    """Plans with the nominal parameters."""
-
+    #: Whether a level follows each sample; else a course is carried out until another one.
     steadily = False
 
     def __init__(self, scenario: 'Scenario', strategy: 'Strategy') -> None:
@@ -87,16 +44,18 @@ class _Open:
             order=self._strategy.order, tolerance=tolerance)
 
     def move(self, time: int, target: float, course: Course) -> Course:
+        """Return the course to a target from a time in ns on, and from another course."""
         nominal = Estimate(
             time, course.target, 0.0, self._prior.values, self._prior.free, {},
             np.zeros((0, 0)), 0.0, True, '')
         return self._first(nominal, target, course)
 
     def seen(self, stamp: int, stretch: float, begin: int, course: Course) -> Course | None:
+        """Take in a sample; return a better course that differs from a time in ns on, if any."""
         return None
 
 
-class _Adapting(_Open):
+class _Adapting(Commander):
     """Corrects moves and plans them with what it has learnt."""
 
     def __init__(self, scenario: 'Scenario', strategy: 'Strategy') -> None:
@@ -127,7 +86,7 @@ class _Adapting(_Open):
         return course
 
 
-class _Steady(_Open):
+class _Steady(Commander):
     """Commands a level after each sample, and has as long as a move that is cautious."""
 
     steadily = True
@@ -152,3 +111,9 @@ class _Steady(_Open):
         level = self._controller.seen(stretch)
         return None if level is None else replace(
             course, levels=(course.levels[-1], (begin, level)))
+
+
+def commander(scenario: 'Scenario', strategy: 'Strategy') -> Commander:
+    """Return who carries out a strategy; ``learning`` is repeated trials in open loop."""
+    kinds = {'adapt': _Adapting, 'lqr': _Steady, 'mpc': _Steady}
+    return kinds.get(strategy.kind, Commander)(scenario, strategy)

@@ -6,18 +6,17 @@ which pushes and brakes within the load limits, arrives in finite time.
 """
 
 from dataclasses import dataclass
-import math
 
 import numpy as np
 
-from hmsa_ros.core.model import Array, critical_zeta, elastic_force, Floats, natural_frequency
+from hmsa_ros.core.model import Array, elastic_force, Floats
 from hmsa_ros.core.moves import Limits, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.shapers.minimum_time import minimum_time
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.shapers.step import step
 from hmsa_ros.errors import HmsaError
-from hmsa_ros.studies.residual import Actual
+from hmsa_ros.studies.residual import Actual, ringing
 
 #: Deviation from the target, as a share of the step, at which a motion counts as settled.
 SETTLED = 0.01
@@ -30,30 +29,14 @@ _SAMPLES = 6001
 
 @dataclass(frozen=True)
 class DampedStudy:
-    """
-    Times over zeta.
-
-    Attributes
-    ----------
-    start, target : float
-        Stretches at rest.
-    zetas : ndarray, shape (n,)
-        Damping coefficients.
-    step : ndarray, shape (n,)
-        Settling time of the plain step.
-    arrival : ndarray, shape (m, n)
-        Time at which the minimum-time command is at rest at the target, for each of `LIMITS`.
-    settled : ndarray, shape (m, n)
-        Its settling time.
-
-    """
+    """Times of a move between stretches at rest, over zeta (n,)."""
 
     start: float
     target: float
     zetas: Array
-    step: Array
-    arrival: Array
-    settled: Array
+    step: Array  # (n,), settling time of the plain step
+    arrival: Array  # (m, n), of the minimum-time command under each of LIMITS
+    settled: Array  # (m, n), its settling time
 
 
 def limits_of(target: float, material: NondimensionalParameters, number: int) -> Limits:
@@ -74,10 +57,7 @@ def settling_time(
         If it has not settled in the time in which small motion dies out.
 
     """
-    frequency = float(natural_frequency(target, material))
-    ratio = material.zeta / float(critical_zeta(target, material))
-    decay = frequency * (
-        ratio if ratio < 1.0 else ratio - math.sqrt(ratio * ratio - 1.0))
+    _, decay = ringing(target, material)
     times = np.linspace(0.0, move.levels[-1].time + _DECADES / decay, _SAMPLES)
     away = np.abs(Actual.off(material).response(move, start, times) - target)
     band = SETTLED * abs(target - start)

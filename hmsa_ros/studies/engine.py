@@ -2,7 +2,7 @@
 The engine of studies: computes the chunks of a study on any `concurrent.futures.Executor`.
 
 A task is a number and a folder; the worker reads the study there, once, and writes the chunk
-there. So tasks are small, nothing but counts comes back, and the table does not depend on where
+there. So tasks are small, nothing comes back, and the table does not depend on where
 or in which order its chunks were computed.
 """
 
@@ -10,8 +10,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, FIRST_COMPLETED, Future
 from concurrent.futures import wait as wait_for
-from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 import pickle
@@ -20,11 +19,9 @@ from typing import cast
 import uuid
 
 from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.studies.chunks import add_counts, Chunks, Study
-from hmsa_ros.studies.executors import given, held_signals, here
+from hmsa_ros.studies.chunks import Chunks, Study
+from hmsa_ros.studies.executors import given, held_signals, here, Start
 
-#: Makes an executor, and says how many chunks to submit ahead.
-Start = Callable[[], AbstractContextManager[tuple[Executor, int]]]
 #: Called with a sentence.
 Say = Callable[[str], object]
 #: A pool that loses workers so often without finishing a chunk is not started again.
@@ -35,44 +32,15 @@ PATIENCE = 10.0
 
 @dataclass
 class Outcome:
-    """
-    What a call of `compute` has done.
+    """How many chunks of its shard a call of `compute` has kept and computed."""
 
-    Attributes
-    ----------
-    total : int
-        Chunks of the study.
-    mine : int
-        Those of the shard.
-    kept : int
-        Those of the shard that were there.
-    computed : int
-        Those computed now.
-    counts : dict of str to int
-        How often each status occurs in what was computed.
-
-    """
-
-    total: int
-    mine: int
     kept: int = 0
     computed: int = 0
-    counts: dict[str, int] = field(default_factory=dict)
 
 
 def parse_shard(text: str) -> tuple[int, int]:
     """
-    Read ``I/N``, a part of an array job: I from 0 to N - 1, or from 1 to N; N is the same as 0.
-
-    Parameters
-    ----------
-    text : str
-        What to read.
-
-    Returns
-    -------
-    tuple of int
-        The part, from 0, and how many parts there are.
+    Read ``I/N``, part I of N from 0 or from 1 on; return the part, from 0, and the parts.
 
     Raises
     ------
@@ -128,12 +96,10 @@ def compute(
     """
     chunks = Chunks.of(study, folder)
     chunks.check()
-    todo = list(range(chunks.count))[shard[0]::shard[1]]
-    outcome = Outcome(chunks.count, len(todo))
-    if resume:
-        found = chunks.found()
-        todo = [x for x in todo if not (x in found and chunks.sound(found[x]))]
-        outcome.kept = outcome.mine - len(todo)
+    mine = list(range(chunks.count))[shard[0]::shard[1]]
+    found = chunks.found() if resume else {}
+    todo = [x for x in mine if not (x in found and chunks.sound(found[x]))]
+    outcome = Outcome(len(mine) - len(todo))
     start = (lambda: given(executor)) if isinstance(executor, Executor) else executor
     scratch = chunks.folder / f'.run-{uuid.uuid4().hex}'
     try:
@@ -169,14 +135,10 @@ def _study(path: Path) -> tuple[Study, Chunks]:
             'share, under the same path') from None
 
 
-def _work(scratch: str, index: int) -> dict[str, int]:
-    """Compute a chunk; return how often each status occurs in it."""
+def _work(scratch: str, index: int) -> None:
+    """Compute a chunk."""
     study, chunks = _study(Path(scratch) / 'study')
-    table = study.table(*chunks.span(index))
-    chunks.write(index, table, Path(scratch))
-    counts: dict[str, int] = {}
-    add_counts(counts, table)
-    return counts
+    chunks.write(index, study.table(*chunks.span(index)), Path(scratch))
 
 
 def _compute(
@@ -186,7 +148,7 @@ def _compute(
     losses = 0
     while waiting:
         before = outcome.computed
-        running: dict[Future[dict[str, int]], int] = {}
+        running: dict[Future[None], int] = {}
         try:
             # Nothing is written before there is something that computes.
             with start() as (executor, ahead):
@@ -206,7 +168,7 @@ def _compute(
 
 
 def _feed(
-        chunks: Chunks, waiting: deque[int], running: dict[Future[dict[str, int]], int],
+        chunks: Chunks, waiting: deque[int], running: dict[Future[None], int],
         executor: Executor, ahead: int, scratch: Path, outcome: Outcome,
         advance: Callable[[int], object]) -> None:
     """Keep an executor busy until nothing waits or runs."""
@@ -223,7 +185,7 @@ def _feed(
         for future in done:
             index = running[future]
             try:
-                found = future.result()
+                future.result()
             except BrokenExecutor as error:
                 broken = error
                 continue
@@ -236,8 +198,6 @@ def _feed(
                     '--resume') from error
             del running[future]
             outcome.computed += 1
-            for name, count in found.items():
-                outcome.counts[name] = outcome.counts.get(name, 0) + count
             begin, end = chunks.span(index)
             advance(end - begin)
         if broken is not None:

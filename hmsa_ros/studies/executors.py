@@ -17,6 +17,8 @@ from typing import Any, TypeVar
 from hmsa_ros.errors import BadInputError, HmsaError
 
 Result = TypeVar('Result')
+#: Makes an executor, and says how many tasks to submit ahead.
+Start = Callable[[], AbstractContextManager[tuple[Executor, int]]]
 
 #: Seconds that a Dask scheduler has for its first answer.
 PATIENCE = 15
@@ -66,38 +68,15 @@ def local_processes(workers: int) -> Iterator[tuple[Executor, int]]:
         pool.shutdown(cancel_futures=True)
 
 
-def local(workers: int) -> Callable[[], AbstractContextManager[tuple[Executor, int]]]:
-    """
-    Return what makes an executor of so many processes; of one, of this process.
-
-    Raises
-    ------
-    BadInputError
-        If there is none.
-
-    """
-    if workers < 1:
-        raise BadInputError(f'--workers is {workers}: expected at least 1')
+def local(workers: int) -> Start:
+    """Return what makes an executor of so many processes; of one, of this process."""
     return here if workers == 1 else partial(local_processes, workers)
 
 
 @contextmanager
 def dask(address: str, workers: int | None = None) -> Iterator[tuple[Executor, int]]:
     """
-    Yield an executor of a Dask cluster, and how many chunks to submit ahead.
-
-    Parameters
-    ----------
-    address : str
-        ``local`` for a cluster on this machine, a scheduler's address as in
-        ``tcp://node:8786``, or its scheduler file, ending in .json.
-    workers : int, optional
-        Processes of a local cluster; default: one a core.
-
-    Yields
-    ------
-    tuple of Executor and int
-        The executor, and how many chunks to submit ahead.
+    Yield an executor of a Dask cluster (``local``, address or scheduler file), as `here` does.
 
     Raises
     ------
@@ -143,24 +122,10 @@ def given(executor: Executor) -> Iterator[tuple[Executor, int]]:
 
 
 def in_order(
-        start: Callable[[], AbstractContextManager[tuple[Executor, int]]],
-        function: Callable[..., Result], tasks: Iterable[tuple[Any, ...]]) -> Iterator[Result]:
+        start: Start, function: Callable[..., Result],
+        tasks: Iterable[tuple[Any, ...]]) -> Iterator[Result]:
     """
     Yield what a function returns for each of many arguments, in their order.
-
-    Parameters
-    ----------
-    start : callable
-        Makes an executor, and says how many tasks to submit ahead.
-    function : callable
-        It must be possible to pickle it, its arguments and what it returns.
-    tasks : iterable of tuple
-        Arguments.
-
-    Yields
-    ------
-    object
-        What it returned.
 
     Raises
     ------

@@ -42,42 +42,18 @@ _CAREFUL = {'lqr': Weights(0.3, 0.3, 1.0), 'mpc': Weights(1.0, 0.03, wander=0.03
 
 @dataclass(frozen=True)
 class Scenario:
-    """
-    Actuator and sensor.
-
-    Attributes
-    ----------
-    name : str
-        For people.
-    period, delay : float
-        Between two samples, and until one is there, in s.
-    noise : float
-        Standard deviation of a sample of stretch.
-    half_length : float
-        In m: sets the unit of time, 4.4 ms for 0.01 m.
-    nominal : ActuatorParameters, optional
-        In place of the example block.
-    truth : mapping of str to float
-        Factors on parameters of the block besides the shear modulus.
-    coil_time_constant : float
-        Of the coil in s, unknown to the model.
-    free : tuple of str
-        What is tracked.
-    weights : mapping of str to Weights
-        Of linear controllers, by kind.
-
-    """
+    """Actuator and sensor; times in s."""
 
     name: str
-    period: float
-    delay: float
-    noise: float
-    half_length: float = 0.01
-    truth: Mapping[str, float] = field(default_factory=dict)
-    coil_time_constant: float = 0.0
+    period: float  # between two samples
+    delay: float  # until a sample is there
+    noise: float  # standard deviation of a sample of stretch
+    half_length: float = 0.01  # m; sets the unit of time, 4.4 ms for 0.01 m
+    truth: Mapping[str, float] = field(default_factory=dict)  # factors beside that of G
+    coil_time_constant: float = 0.0  # unknown to the model
     free: tuple[str, ...] = TRACKED
     weights: Mapping[str, Weights] = field(default_factory=lambda: _WEIGHTS)
-    nominal: ActuatorParameters | None = None
+    nominal: ActuatorParameters | None = None  # in place of the example block
 
     @property
     def targets(self) -> tuple[float, ...]:
@@ -121,25 +97,13 @@ SCENARIOS = (
 
 @dataclass(frozen=True)
 class Strategy:
-    """
-    How moves are planned.
-
-    Attributes
-    ----------
-    name : str
-        For people.
-    shaper, order : str, int
-        Shaper of all moves, and order of the robust one.
-    kind : str
-        What samples do: ``open`` for nothing, ``adapt`` for corrections of moves that take longer
-        where much is expected to be left, ``lqr`` and ``mpc`` for a level after each, ``learning``
-        for another trial of the first move.
-
-    """
+    """How moves are planned."""
 
     name: str
     shaper: str
     order: int = 1
+    # What samples do: nothing; 'adapt' corrects moves that take longer where much is expected to
+    # be left; 'lqr' and 'mpc' set a level after each; 'learning' tries the first move again.
     kind: str = 'open'
 
 
@@ -152,22 +116,12 @@ STRATEGIES = (
 
 @dataclass(frozen=True)
 class Left:
-    """
-    What would be left if the course in force were carried to its end from a time on.
+    """What would be left if the course in force were carried to its end, as shares of the step."""
 
-    Attributes
-    ----------
-    vibration, offset : float
-        Peak to peak, and rest less target, as shares of the step; of a controller that commands
-        a level after each sample, as seen in the cycle that follows.
-    motion : float
-        Peak to peak in the cycle that follows, in which the loop stays closed.
-
-    """
-
-    vibration: float
-    offset: float
-    motion: float = 0.0
+    # Of a controller that commands a level after each sample, as seen in the cycle that follows.
+    vibration: float  # peak to peak
+    offset: float  # rest less target
+    motion: float = 0.0  # peak to peak in the cycle that follows, in which the loop stays closed
 
     def watched(self, seen: Sequence[float], *, steadily: bool) -> 'Left':
         """Return it with what was seen in the cycle that follows, as shares of the step."""
@@ -178,24 +132,7 @@ class Left:
 
 
 def settle(plant: ActuatorSimulation, end: int, target: float, before: float) -> Left:
-    """
-    Return what is left if nothing is commanded any more.
-
-    Parameters
-    ----------
-    plant : ActuatorSimulation
-        With what is planned.
-    end : int
-        Time in ns of the arrival.
-    target, before : float
-        Stretch, and the one that the move began at.
-
-    Returns
-    -------
-    Left
-        Over the four units of time that follow, and at rest.
-
-    """
+    """Return what is left in four units of time from an arrival in ns on, and at rest."""
     unit = plant.actuator.time_unit * NANOSECONDS
     seen = []
     for i in range(_LOOK):

@@ -14,19 +14,7 @@ _OTHERS = {'coil_time_constant': 'coil_time_constant', 'time_unit': 'actuator.de
 
 def belief_of(found: Known, path: Path) -> Belief:
     """
-    Return mean and covariance of what was identified, without what belongs to the sensor.
-
-    Parameters
-    ----------
-    found : Known
-        What is in a parameter file as ``hmsa identify --out`` writes it.
-    path : Path
-        Its name.
-
-    Returns
-    -------
-    Belief
-        Of columns in SI units; a unit of time becomes the density that gives it.
+    Return what a file says of the block, in SI units; a unit of time becomes a density.
 
     Raises
     ------

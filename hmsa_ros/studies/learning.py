@@ -22,21 +22,7 @@ _RANGE = (0.3, 2.0)
 
 
 class Learner:
-    """
-    Learns two levels.
-
-    Parameters
-    ----------
-    block : ActuatorParameters
-        Nominal.
-    levels : tuple of (int, float)
-        First and last level: stamps in ns and T.
-    largest : float
-        Largest level in T.
-    period : int
-        Of the samples in ns.
-
-    """
+    """Learns two levels, in ns and T, of a nominal block from samples every `period` in ns."""
 
     def __init__(
             self, block: ActuatorParameters, levels: tuple[tuple[int, float], ...],

@@ -31,24 +31,12 @@ _HORIZON = 6.0
 
 @dataclass(frozen=True)
 class Weights:
-    """
-    How eager a controller is; the error weighs 1.
+    """How eager a controller is; the error weighs 1."""
 
-    Attributes
-    ----------
-    rate, effort : float
-        Of the rate by units of time, and of the level.
-    integral : float
-        Of the sum of errors over a unit of time, of a regulator alone.
-    wander : float
-        How far a load that acts besides the level may wander in a unit of time.
-
-    """
-
-    rate: float
-    effort: float
-    integral: float = 0.0
-    wander: float = 0.1
+    rate: float  # by units of time
+    effort: float  # of the level
+    integral: float = 0.0  # of the sum of errors over a unit of time, of a regulator alone
+    wander: float = 0.1  # of a load that acts besides the level, in a unit of time
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,29 +61,7 @@ class Linearised:
     def at(
             cls, block: ActuatorParameters, target: float, holding: float, period: int,
             delay: int) -> 'Linearised':
-        """
-        Linearise.
-
-        Parameters
-        ----------
-        block : ActuatorParameters
-            To be controlled.
-        target, holding : float
-            Stretch, and level in T that holds it.
-        period, delay : int
-            Of the samples, and from a sample to the level that depends on it, in ns.
-
-        Returns
-        -------
-        Linearised
-            With as many levels on their way as the delay has periods, and one.
-
-        Raises
-        ------
-        HmsaError
-            If the motion about the target cannot be followed.
-
-        """
+        """Linearise about a target that a level in T holds; delay of levels and period in ns."""
         whole, late = divmod(delay, period)
         by, left = _motion(block, target, holding, period)
         _, before = _motion(block, target, holding, late)

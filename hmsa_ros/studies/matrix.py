@@ -34,69 +34,29 @@ _LEFT = ('vibration', 'offset', 'motion')
 
 @dataclass(frozen=True)
 class Row:
-    """
-    A strategy in a scenario, with errors of one size.
-
-    Attributes
-    ----------
-    scenario, strategy : str
-        Names.
-    error : float
-        Size of the error of G, as a share.
-    left : tuple of Left
-        Root mean square over both signs and all seeds: after the first move, a cycle later, two
-        cycles later, and after the next move; of learning, after each of four trials.
-    worst : tuple of float
-        Largest vibration of all.
-    no_worse : bool or None
-        Whether no run leaves more than `allowed`; None for open loop.
-
-    """
+    """A strategy in a scenario, with errors of one size."""
 
     scenario: str
     strategy: str
-    error: float
+    error: float  # of G, as a share
+    # Root mean square over both signs and all seeds: after the first move, a cycle later, two
+    # cycles later, and after the next move; of learning, after each of four trials.
     left: 'tuple[Left, ...]'
-    worst: tuple[float, ...]
-    no_worse: bool | None = None
+    worst: tuple[float, ...]  # largest vibration of all
+    no_worse: bool | None = None  # whether no run leaves more than `allowed`; None for open loop
 
 
 def rms(trials: Iterable[Sequence[Left]]) -> list[Left]:
-    """
-    Return the root mean square of trials.
-
-    Parameters
-    ----------
-    trials : iterable of sequence of Left
-        As `trial` returns them.
-
-    Returns
-    -------
-    list of Left
-        For each time that was looked at.
-
-    """
+    """Return the root mean square of trials, for each time that was looked at."""
     rows = np.array([[(x.vibration, x.offset, x.motion) for x in row] for row in trials])
     return [Left(*x) for x in np.sqrt(np.mean(np.square(rows), axis=0)).tolist()]
 
 
 @dataclass(frozen=True)
 class Matrix:
-    """
-    All strategies in all scenarios.
+    """All strategies in all scenarios."""
 
-    Attributes
-    ----------
-    seeds : int
-        Of the noise, for each error; those without feedback do not depend on it.
-    scenarios : sequence of Scenario
-        Actuators and sensors.
-    strategies : sequence of Strategy
-        To compare.
-
-    """
-
-    seeds: int
+    seeds: int  # of the noise, for each error, on which open loop does not depend
     scenarios: Sequence[Scenario] = SCENARIOS
     strategies: Sequence[Strategy] = STRATEGIES
 
@@ -151,24 +111,9 @@ def left_of(row: Mapping[str, Any]) -> list[Left]:
 
 
 def allowed(scenario: Scenario, error: float) -> list[float]:
-    """
-    Return the vibration up to which a strategy is no worse than open loop.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        Actuator and sensor.
-    error : float
-        Of the shear modulus, as a share.
-
-    Returns
-    -------
-    list of float
-        For each time that is looked at, as a share of the step: a fifth more than what the chain
-        of order 2 leaves, or, where nothing is wrong with the model, half of what noise alone
-        shows from peak to peak in the samples of a cycle.
-
-    """
+    """Return the vibration, at each time, up to which a strategy is no worse than open loop."""
+    # A fifth more than what the chain of order 2 leaves, or, where nothing is wrong with the
+    # model, half of what noise alone shows from peak to peak in the samples of a cycle.
     if error or scenario.truth or scenario.coil_time_constant:
         return [_WORSE * x.vibration for x in trial(scenario, CHAINED, error, 0)]
     count = CYCLE * scenario.block.time_unit / scenario.period

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hmsa_ros.core import law
 from hmsa_ros.core.laws.record import Elastic
@@ -29,39 +29,22 @@ _TWO_STEP, _LIMIT, _BAD = (
 
 @dataclass(frozen=True)
 class Plans:
-    """
-    Plans of n rows, nondimensional.
+    """Plans of n rows, nondimensional; NaN where there is no such level or duration."""
 
-    Attributes
-    ----------
-    codes : ndarray of int64, shape (n,)
-        Places in `STATUS`.
-    load_p, time_p, load_1 : ndarray, shape (n,)
-        First level, duration and last level; NaN where there is none.
-
-    """
-
-    codes: NDArray[np.int64]
-    load_p: Array
-    time_p: Array
-    load_1: Array
+    codes: NDArray[np.int64]  # (n,), places in STATUS
+    numbers: Array  # (3, n): first level, duration and last level
 
     @classmethod
     def none(cls, size: int) -> 'Plans':
         """Return rows that cannot be planned."""
-        return cls(np.full(size, _BAD), *(np.full(size, math.nan) for _ in range(3)))
+        return cls(np.full(size, _BAD), np.full((3, size), math.nan))
 
-    def put(self, rows: NDArray[np.int64], plans: 'Plans') -> None:
-        """Put the plans of some rows in their places."""
-        self.codes[rows] = plans.codes
-        self.load_p[rows] = plans.load_p
-        self.time_p[rows] = plans.time_p
-        self.load_1[rows] = plans.load_1
-
-    def put_one(self, row: int, planned: '_Planned') -> None:
-        """Put the plan of a row in its place."""
-        self.codes[row] = STATUS.index(planned.code)
-        self.load_p[row], self.time_p[row], self.load_1[row] = planned.numbers
+    def put(
+            self, rows: NDArray[np.int64] | int, codes: NDArray[np.int64] | int,
+            numbers: ArrayLike) -> None:
+        """Put plans in the places of their rows."""
+        self.codes[rows] = codes
+        self.numbers[:, rows] = numbers
 
 
 def by_batch(
@@ -70,32 +53,13 @@ def by_batch(
     """Return two-step plans from rest on ideal hardware without limits."""
     found = plan_two_step_batch(
         start, target, zeta=zeta, j_lim=j_lim, c1=c1, elastic=elastic)
-    return Plans(_PLACES[found.status], found.beta_p, found.tau_p, found.beta_1)
+    return Plans(_PLACES[found.status], np.array([found.beta_p, found.tau_p, found.beta_1]))
 
 
 def by_settings(
         settings: Sequence[Setting | None], which: NDArray[np.int64], start: Array,
         target: Array, shapers: NDArray[np.str_]) -> Plans:
-    """
-    Return plans from rest, each with a setting of its own.
-
-    Parameters
-    ----------
-    settings : sequence of Setting or None
-        All that occur; None for one that is out of range.
-    which : ndarray of int64, shape (n,)
-        Which of them each row has.
-    start, target : ndarray, shape (n,)
-        Stretches.
-    shapers : ndarray of str, shape (n,)
-        Names.
-
-    Returns
-    -------
-    Plans
-        As `hmsa_ros.core.sequence.plan_sequence` makes them.
-
-    """
+    """Return plans from rest; each row has the setting at `which`, None if out of range."""
     plans = Plans.none(len(which))
     # Laws by place: comparing tables would take longer than planning.
     laws: dict[Elastic | None, int] = {}
@@ -108,13 +72,14 @@ def by_settings(
     for elastic, number in laws.items():
         rows = np.flatnonzero(group == number)
         if len(rows):
-            plans.put(rows, _limited(
-                [settings[x] for x in which[rows]], start[rows], target[rows], elastic))
+            found = _limited(
+                [settings[x] for x in which[rows]], start[rows], target[rows], elastic)
+            plans.put(rows, found.codes, found.numbers)
     for row in np.flatnonzero(group == -1).tolist():
         setting = settings[which[row]]
         if setting is not None:
-            plans.put_one(row, _planned(
-                setting, float(start[row]), float(target[row]), str(shapers[row])))
+            planned = _planned(setting, float(start[row]), float(target[row]), str(shapers[row]))
+            plans.put(row, STATUS.index(planned.code), planned.numbers)
     return plans
 
 
@@ -127,10 +92,11 @@ def _limited(
         for x in settings if x is not None]).T
     zeta, j_lim, c1, least, most = given
     plans = by_batch(start, target, zeta, j_lim, c1, elastic)
-    outside = (plans.load_1 < least) | (plans.load_1 > most)
-    outside |= (plans.codes == _TWO_STEP) & ((plans.load_p < least) | (plans.load_p > most))
+    first, _, last = plans.numbers
+    outside = (last < least) | (last > most)
+    outside |= (plans.codes == _TWO_STEP) & ((first < least) | (first > most))
     plans.codes[outside] = _LIMIT
-    plans.load_p[outside] = plans.time_p[outside] = math.nan
+    plans.numbers[:2, outside] = math.nan
     return plans
 
 
@@ -138,25 +104,7 @@ def carried_out(
         settings: Sequence[Setting | None], actuals: Sequence[Setting | None],
         which: NDArray[np.int64], start: Array, target: Array,
         shapers: NDArray[np.str_]) -> tuple[Plans, Array, Array]:
-    """
-    Plan rows, and carry the plans out on actuators that may be others.
-
-    Parameters
-    ----------
-    settings, which, start, target, shapers : sequence or ndarray
-        As those of `by_settings`.
-    actuals : sequence of Setting or None
-        The actuator for each of the settings; None for one that is out of range.
-
-    Returns
-    -------
-    plans : Plans
-        As `by_settings`.
-    residual, offset : ndarray, shape (n,)
-        Vibration after arrival, and how far beyond the target the actuator rests, as shares of
-        the step; NaN where there is no plan, no move, or a motion that cannot be followed.
-
-    """
+    """Return plans, and vibration and offset that they leave on `actuals`, shares of the step."""
     plans = Plans.none(len(which))
     left = np.full((2, len(which)), math.nan)
     # Rows that differ in the actuator alone have one plan.
@@ -172,7 +120,7 @@ def carried_out(
             made[key] = planned, math.nan if planned.move is None else arrival_of(
                 planned.move, begin, end, setting.material)
         planned, arrival = made[key]
-        plans.put_one(row, planned)
+        plans.put(row, STATUS.index(planned.code), planned.numbers)
         if planned.move is not None and actual is not None and begin != end:
             with suppress(HmsaError):
                 plant = Actual.of(setting, actual)

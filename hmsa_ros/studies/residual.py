@@ -47,29 +47,24 @@ def arrival_of(
     return math.pi / float(natural_frequency(target, material))
 
 
+def ringing(stretch: float, material: NondimensionalParameters) -> tuple[float, float]:
+    """Return the period (infinite if there is none) and the decay of small motion about rest."""
+    frequency = float(natural_frequency(stretch, material))
+    ratio = material.zeta / float(critical_zeta(stretch, material))
+    if ratio < 1.0:
+        return 2.0 * math.pi / (frequency * math.sqrt(1.0 - ratio * ratio)), frequency * ratio
+    return math.inf, frequency * (ratio - math.sqrt(ratio * ratio - 1.0))
+
+
 @dataclass(frozen=True)
 class Actual:
-    """
-    An actuator that carries out moves planned with a model that may be another.
-
-    Stretches, times and loads of moves and results are the model's.
-
-    Attributes
-    ----------
-    model, material : NondimensionalParameters
-        Of the model and of the actuator, each in units of its own.
-    time, load : float
-        The actuator's units in those of the model.
-    delivery : Delivery
-        How commands reach its coil, in its own units; commands are those of the move.
-
-    """
+    """An actuator that carries out moves planned with, and in the units of, another model."""
 
     model: NondimensionalParameters
-    material: NondimensionalParameters
-    time: float = 1.0
+    material: NondimensionalParameters  # of the actuator, in its own units
+    time: float = 1.0  # the actuator's units in those of the model
     load: float = 1.0
-    delivery: Delivery = IDEAL
+    delivery: Delivery = IDEAL  # in the actuator's units; commands are those of the move
 
     @classmethod
     def off(
@@ -88,31 +83,7 @@ class Actual:
             actual.units.load / model.units.load, actual.delivery)
 
     def response(self, move: Move, start: float, times: Floats) -> Array:
-        """
-        Sample the stretch from rest where the model's load for the start really holds it.
-
-        Parameters
-        ----------
-        move : Move
-            The command.
-        start : float
-            Stretch at rest from which it was planned.
-        times : ndarray, shape (n,)
-            Not decreasing, at least 0.
-
-        Returns
-        -------
-        ndarray, shape (n,)
-            Stretch.
-
-        Raises
-        ------
-        BadInputError
-            If an argument is out of range.
-        HmsaError
-            If the motion cannot be followed.
-
-        """
+        """Sample the stretch from rest where the model's load for the start really holds it."""
         held = float(elastic_force(start, self.model)) / self.load
         end = float(times[-1]) / self.time
         levels = [Level(x.time / self.time, x.load / self.load) for x in move.levels]
@@ -130,43 +101,10 @@ class Actual:
         return float(equilibrium_stretch(move.levels[-1].load / self.load, self.material))
 
     def residual(self, move: Move, start: float, target: float, arrival: float) -> float:
-        """
-        Return the peak-to-peak stretch after arrival as a share of the commanded step.
-
-        A steady offset, from a load that holds another stretch than the model says, is no
-        vibration and does not count.
-
-        Parameters
-        ----------
-        move : Move
-            The command.
-        start, target : float
-            Stretches that it was planned for, at rest at the start; not equal.
-        arrival : float
-            Time from which it counts.
-
-        Returns
-        -------
-        float
-            A share, not percent.
-
-        Raises
-        ------
-        BadInputError
-            If an argument is out of range.
-        HmsaError
-            If the motion cannot be followed.
-
-        """
-        end = self.rest(move)
-        frequency = float(natural_frequency(end, self.material))
-        ratio = self.material.zeta / float(critical_zeta(end, self.material))
-        if ratio < 1.0:
-            period = 2.0 * math.pi / (frequency * math.sqrt(1.0 - ratio * ratio))
-            decay = frequency * ratio
-        else:
-            period = math.inf
-            decay = frequency * (ratio - math.sqrt(ratio * ratio - 1.0))
+        """Return the peak-to-peak stretch after arrival as a share of the commanded step."""
+        # A steady offset, from a load that holds another stretch than the model says, is no
+        # vibration and does not count.
+        period, decay = ringing(self.rest(move), self.material)
         horizon = min(_PERIODS * period, _DECADES / decay if decay > 0.0 else math.inf)
         times = arrival + np.linspace(0.0, horizon * self.time, _SAMPLES)
         return residual_vibration(

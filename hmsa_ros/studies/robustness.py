@@ -52,25 +52,10 @@ _LINEAR = ('zv', 'zvd', 'ei')
 
 @dataclass(frozen=True)
 class Candidate:
-    """
-    A shaper to be compared.
-
-    Attributes
-    ----------
-    shaper : str
-        One of `SHAPERS`.
-    order : int
-        Of those in `ORDERED`, 1 to `MOST_ORDER`; without meaning for the others.
-
-    Raises
-    ------
-    BadInputError
-        If there is no such shaper or the order is out of range.
-
-    """
+    """A shaper to be compared."""
 
     shaper: str
-    order: int = 2
+    order: int = 2  # of those in ORDERED
 
     def __post_init__(self) -> None:
         """Check both."""
@@ -99,38 +84,15 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Case:
-    """
-    What is studied.
-
-    Attributes
-    ----------
-    start, target : float
-        Stretches at rest, inside the limits and apart.
-    material : NondimensionalParameters
-        The model.
-    limits : Limits
-        Admissible loads, in the model's units.
-    delivery : Delivery
-        How commands reach the coil, in the model's units.
-    box : float
-        Half the width of the box of errors, above 0 to 0.9.
-    span : float
-        Largest error in the curves, at least ``box``, to 0.9.
-
-    Raises
-    ------
-    BadInputError
-        If a value is out of range.
-
-    """
+    """A move between stretches at rest, its model, and errors of it; in the model's units."""
 
     start: float
     target: float
     material: NondimensionalParameters = field(default_factory=NondimensionalParameters)
     limits: Limits = field(default_factory=Limits)
     delivery: Delivery = IDEAL
-    box: float = 0.1
-    span: float = 0.2
+    box: float = 0.1  # half the width of the box of errors, above 0
+    span: float = 0.2  # largest error in the curves, at least that of the box
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -164,15 +126,7 @@ class Case:
         return Actual.off(self.material, errors, self.delivery)
 
     def errors(self) -> Array:
-        """
-        Return the errors of one parameter in the curves.
-
-        Returns
-        -------
-        ndarray, shape (n,)
-            Increasing, from -span to span, with 0 and both edges of the box.
-
-        """
+        """Return the errors of one parameter in the curves, with 0 and both edges of the box."""
         grid = np.linspace(-self.span, self.span, _POINTS)
         grid[_POINTS // 2] = 0.0
         edges = np.array([-self.box, self.box])
@@ -182,85 +136,31 @@ class Case:
 
 @dataclass(frozen=True)
 class Worst:
-    """
-    The largest residual among errors.
+    """The largest residual among errors, and where."""
 
-    Attributes
-    ----------
-    residual : float
-        Peak-to-peak as a share of the step; NaN if a motion could not be followed.
-    errors : Errors
-        Where.
-
-    """
-
-    residual: float
+    residual: float  # as a share of the step; NaN if a motion could not be followed
     errors: Errors
 
 
 @dataclass(frozen=True)
 class Result:
-    """
-    One shaper in one case.
-
-    Attributes
-    ----------
-    candidate : Candidate
-        Which shaper.
-    code : Code
-        What it answered; another one than its own where it fell back or refused.
-    reason : str
-        Why it did; empty if it did not.
-    move : Move or None
-        The command; None if refused. What follows is empty then, and the numbers NaN.
-    arrival : float
-        Time from which the residual counts, nominal.
-    nominal : float
-        Residual without errors.
-    curves : dict of str to ndarray
-        For each of `PARAMETERS`, the residual at `Case.errors` of it alone.
-    alone : dict of str to Worst
-        For each of `PARAMETERS`, the worst with it alone in error, up to the box's edges.
-    worst : Worst
-        In the box of all three.
-
-    """
+    """One shaper in one case."""
 
     candidate: Candidate
-    code: Code
-    reason: str
-    move: Move | None
-    arrival: float
-    nominal: float
-    curves: dict[str, Array]
-    alone: dict[str, Worst]
-    worst: Worst
+    code: Code  # another one than the shaper's own where it fell back or refused
+    reason: str  # why it did
+    move: Move | None  # None if refused; what follows is empty then, and the numbers NaN
+    arrival: float  # time from which the residual counts, nominal
+    nominal: float  # residual without errors
+    curves: dict[str, Array]  # by parameter: residual at `Case.errors` of it alone
+    alone: dict[str, Worst]  # by parameter: the worst of it alone, up to the box's edges
+    worst: Worst  # in the box of all three
 
 
 def candidates(
         shapers: Sequence[str] | None = None,
         orders: Sequence[int] = ORDERS) -> tuple[Candidate, ...]:
-    """
-    Return the shapers to compare.
-
-    Parameters
-    ----------
-    shapers : sequence of str, optional
-        Names; default all.
-    orders : sequence of int
-        Those in `ORDERED` enter once with each.
-
-    Returns
-    -------
-    tuple of Candidate
-        Each once, in the order given.
-
-    Raises
-    ------
-    BadInputError
-        If there is no such shaper or an order is out of range.
-
-    """
+    """Return the shapers to compare, each once, those in `ORDERED` with each order."""
     found = [
         Candidate(name, order)
         for name in (SHAPERS if shapers is None else shapers)
@@ -269,22 +169,7 @@ def candidates(
 
 
 def study(case: Case, candidate: Candidate) -> Result:
-    """
-    Plan a move with the nominal parameters and carry it out with others.
-
-    Parameters
-    ----------
-    case : Case
-        Move, model and errors.
-    candidate : Candidate
-        The shaper.
-
-    Returns
-    -------
-    Result
-        Also where the shaper refuses.
-
-    """
+    """Plan a move with the nominal parameters and carry it out with others."""
     try:
         request = Request(
             State(case.start), case.target, case.material, case.limits, case.delivery,
@@ -336,20 +221,7 @@ def _worst(residuals: Array, errors: Sequence[Errors]) -> Worst:
 
 
 def percent(share: float) -> str:
-    """
-    Word a residual.
-
-    Parameters
-    ----------
-    share : float
-        Residual; NaN where a motion could not be followed.
-
-    Returns
-    -------
-    str
-        In percent, without the sign.
-
-    """
+    """Word a residual in percent, without the sign; NaN where a motion could not be followed."""
     if math.isnan(share):
         return '?'
     if share < 1e-8:
@@ -360,32 +232,15 @@ def percent(share: float) -> str:
     return f'{value:.{1 if value >= 1.0 else 2 if value >= 0.1 else 3}f}'
 
 
+# What was varied is a parameter, or 'box' for the worst in the box; residual and offset, how far
+# beyond the target the actuator comes to rest, are shares of the step.
 _COLUMNS = (
     'start', 'target', 'zeta', 'j_lim', 'c1', 'shaper', 'order', 'status', 'varied',
     'error_G', 'error_zeta', 'error_J_lim', 'residual', 'offset')
 
 
 def write_csv(path: Path, studies: Sequence[tuple[Case, Sequence[Result]]]) -> None:
-    """
-    Write all residuals, one a row, in full double precision.
-
-    ``varied`` names the parameter that is in error, or is ``box`` for the worst in the box.
-    ``residual`` and ``offset`` are shares of the step; the offset is how far beyond the target
-    the actuator comes to rest.
-
-    Parameters
-    ----------
-    path : Path
-        File to write; an existing file is replaced.
-    studies : sequence of (Case, sequence of Result)
-        What was studied.
-
-    Raises
-    ------
-    BadInputError
-        If it cannot be written.
-
-    """
+    """Write all residuals, one a row, in full double precision; an old file is replaced."""
     with replacing(path) as beside, beside.open('w', newline='', encoding='utf-8') as file:
         writer = csv.writer(file, lineterminator='\n')
         writer.writerow(_COLUMNS)
@@ -413,21 +268,7 @@ def _rows(case: Case, result: Result) -> Iterator[tuple[str | float, ...]]:
 
 
 def comparison(tasks: Sequence[tuple[Case, Candidate]]) -> Tasks:
-    """
-    Return a study of shapers in cases, whose rows `result_of` reads.
-
-    Parameters
-    ----------
-    tasks : sequence of (Case, Candidate)
-        What to compare.
-
-    Returns
-    -------
-    Tasks
-        A row holds the command, and what it leaves: as a list at the errors of each parameter
-        (`Case.errors`), and at the worst in the box, with the errors there.
-
-    """
+    """Return a study of shapers in cases, whose rows `result_of` reads."""
     return Tasks(_row, tasks, {
         **dict.fromkeys(('start', 'target', 'zeta', 'j_lim', 'c1', 'box', 'span'), 'double'),
         'shaper': 'string', 'order': 'int64', 'status': 'string', 'reason': 'string',

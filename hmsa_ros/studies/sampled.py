@@ -26,36 +26,17 @@ PROMISED = 1.0 / 3.0
 
 @dataclass(frozen=True)
 class SampledStudy:
-    """
-    Residuals over the command period.
-
-    Attributes
-    ----------
-    start, target : float
-        Stretches at rest.
-    material : NondimensionalParameters
-        zeta, J_lim and c1.
-    tau_p : float
-        Of the ideal command.
-    periods : ndarray, shape (n,)
-        Command periods as shares of tau_p.
-    solved : ndarray, shape (n,)
-        Residual of the command solved on the grid; NaN where there is none.
-    rounded : ndarray, shape (n,)
-        Residual of the ideal command with its switch on the nearest point of the grid.
-    bound : ndarray, shape (n,)
-        The worse of the ideal command with its switch half a period early and late: what
-        rounding can do where the period is not tuned to tau_p.
-
-    """
+    """Residuals of a move between stretches at rest, over the command period."""
 
     start: float
     target: float
     material: NondimensionalParameters
-    tau_p: float
-    periods: Floats
-    solved: Array
-    rounded: Array
+    tau_p: float  # of the ideal command
+    periods: Floats  # as shares of tau_p
+    solved: Array  # of the command solved on the grid; NaN where there is none
+    rounded: Array  # of the ideal command with its switch on the nearest point of the grid
+    # The worse of the ideal command with its switch half a period early and late: what rounding
+    # can do where the period is not tuned to tau_p.
     bound: Array
 
 
@@ -77,15 +58,15 @@ def ideal_move(start: float, target: float, material: NondimensionalParameters) 
     return move
 
 
-def switched_at(move: Move, time: float) -> Move:
+def rounded_move(move: Move, period: float) -> Move:
+    """Return a two-step command switched at the nearest point of a grid after its start."""
+    return _switched_at(move, max(1, round(move.duration / period)) * period)
+
+
+def _switched_at(move: Move, time: float) -> Move:
     """Return a two-step command with another time of its switch, which is its duration."""
     first, last = move.levels
     return Move(move.code, (first, Level(time, last.load)), time)
-
-
-def rounded_move(move: Move, period: float) -> Move:
-    """Return a two-step command switched at the nearest point of a grid after its start."""
-    return switched_at(move, max(1, round(move.duration / period)) * period)
 
 
 def solved_move(
@@ -101,29 +82,7 @@ def solved_move(
 def sampled_study(
         start: float, target: float, material: NondimensionalParameters,
         periods: Floats) -> SampledStudy:
-    """
-    Compute residuals over the command period.
-
-    Parameters
-    ----------
-    start, target : float
-        Stretches at rest.
-    material : NondimensionalParameters
-        zeta, J_lim and c1.
-    periods : ndarray, shape (n,)
-        Command periods as shares of tau_p, greater than 0.
-
-    Returns
-    -------
-    SampledStudy
-        The residuals.
-
-    Raises
-    ------
-    HmsaError
-        If there is no two-step command.
-
-    """
+    """Compute residuals over the command period, in shares of tau_p."""
     ideal = ideal_move(start, target, material)
     tau_p = ideal.duration
 
@@ -136,5 +95,5 @@ def sampled_study(
         start, target, material, tau_p, periods,
         np.array([left(solved_move(start, target, material, x * tau_p)) for x in periods]),
         np.array([left(rounded_move(ideal, x * tau_p)) for x in periods]),
-        np.array([max(left(switched_at(ideal, (1.0 + sign * 0.5 * x) * tau_p))
+        np.array([max(left(_switched_at(ideal, (1.0 + sign * 0.5 * x) * tau_p))
                       for sign in (-1.0, 1.0)) for x in periods]))

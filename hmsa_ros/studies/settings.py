@@ -5,13 +5,12 @@ Nondimensional columns make a block at once. Those in SI units are parameters of
 of what a parameter file says.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 import math
 import sys
-from typing import Any, ClassVar
+from typing import Any
 
 from hmsa_ros.contract.actuator import completed, model_from
 from hmsa_ros.contract.parameters import LAW, ParameterSpec, PLANNED
@@ -47,112 +46,36 @@ def _ranges(specs: tuple[ParameterSpec, ...]) -> dict[str, Range]:
 
 @dataclass(frozen=True)
 class Setting:
-    """
-    A block, and how commands reach it, as in `hmsa_ros.core.timeline.Model`.
-
-    Attributes
-    ----------
-    material : NondimensionalParameters
-        Of the block.
-    limits : Limits
-        Of the load.
-    delivery : Delivery
-        How commands reach the coil.
-    units : Units
-        Sizes of the nondimensional units.
-    errors : tuple of float or Ellipsoid
-        For which minimax plans.
-
-    """
+    """A block, and how commands reach it, as in `hmsa_ros.core.timeline.Model`."""
 
     material: NondimensionalParameters
     limits: Limits = field(default_factory=Limits)
     delivery: Delivery = field(default_factory=Delivery)
     units: Units = field(default_factory=Units)
-    errors: Uncertainty = ERRORS
-
-
-class System(ABC):
-    """
-    A system of units.
-
-    Attributes
-    ----------
-    actual : dict of str to tuple of float
-        Ranges of the columns in which the actuator differs from what is planned with.
-    delivery : frozenset of str
-        Columns with which hardware is not ideal.
-    ideal : bool
-        Whether it is without them.
-    roots : bool
-        Whether results are beta and b, else tesla.
-
-    """
-
-    actual: ClassVar[Mapping[str, Range]]
-    delivery: ClassVar[frozenset[str]]
-    roots: ClassVar[bool]
-
-    @property
-    @abstractmethod
-    def columns(self) -> Mapping[str, float]:
-        """Those that each row has, with the value of what is not given."""
-
-    @property
-    @abstractmethod
-    def ranges(self) -> Mapping[str, Range]:
-        """Of all columns that a row may have."""
-
-    @property
-    @abstractmethod
-    def ideal(self) -> bool:
-        """Whether commands apply at any time and at once, unless columns say otherwise."""
-
-    @abstractmethod
-    def setting(self, values: Mapping[str, Any]) -> Setting:
-        """
-        Return what a row is planned with; the name of its law is under ``law``.
-
-        Raises
-        ------
-        BadInputError
-            If a value is out of range.
-
-        """
-
-    @abstractmethod
-    def carried(self, values: Mapping[str, Any]) -> Setting:
-        """
-        Return the actuator that carries out the plan of a row.
-
-        Raises
-        ------
-        BadInputError
-            If a value is out of range.
-
-        """
+    errors: Uncertainty = ERRORS  # for which minimax plans
 
 
 @dataclass(frozen=True)
-class Nondimensional(System):
+class Nondimensional:
     """The paper's units."""
 
+    #: Columns that each row has, with the value of what is not given.
     columns = {'start': 1.0, 'target': 1.1, 'zeta': 0.2, 'j_lim': 5.0, 'c1': 2.0}
+    #: Of all columns that a row may have.
     ranges = {
         'start': _POSITIVE, 'target': _POSITIVE, 'zeta': (0.0, FINITE),
         'j_lim': (_POSITIVE[0], _INF), 'c1': _POSITIVE, 'load_min': (-_INF, _INF),
         'load_max': (-_INF, _INF), 'period': (0.0, FINITE), 'slew': (_POSITIVE[0], _INF),
         'lag': (0.0, FINITE), **_ranges(LAW)}
+    #: Ranges of the columns in which the actuator differs from what is planned with.
     actual = {
         'error.shear_modulus': (-1.0, FINITE), 'error.zeta': (-1.0, FINITE),
         'error.j_lim': (-1.0, FINITE), 'error.remanence': (-1.0, FINITE)}
+    #: Columns with which hardware is not ideal, and whether it is without them.
     delivery = frozenset({'period', 'slew', 'lag'})
+    ideal = True
+    #: Whether results are beta and b, else tesla.
     roots = True
-
-    @property
-    def ideal(self) -> bool:
-        """Whether commands apply at any time and at once."""
-        return True
 
     def setting(self, values: Mapping[str, Any]) -> Setting:
         """Return what a row is planned with; only the ratios of a law's constants count."""
@@ -177,19 +100,8 @@ class Nondimensional(System):
 
 
 @dataclass(frozen=True)
-class InSI(System):
-    """
-    Seconds, tesla and the parameters of the nodes.
-
-    Attributes
-    ----------
-    known : dict of str to object
-        Values of `hmsa_ros.contract.parameters.PLANNED` and of creep, and points of a law that
-        were in a file.
-    errors : tuple of float or Ellipsoid
-        For which minimax plans.
-
-    """
+class InSI:
+    """Seconds, tesla and the parameters of the nodes; otherwise as `Nondimensional`."""
 
     actual = {
         f'{ACTUAL}{x.removeprefix(BLOCK_OF)}': y for x, y in _ranges(PLANNED).items()
@@ -197,20 +109,12 @@ class InSI(System):
     delivery = frozenset({'command_period', 'slew_limit', 'coil_time_constant'})
     roots = False
 
-    known: Mapping[str, Any]
-    errors: Uncertainty = ERRORS
+    known: Mapping[str, Any]  # of PLANNED and of creep, and points of a law from a file
+    errors: Uncertainty = ERRORS  # for which minimax plans
 
     @classmethod
     def of(cls, values: Mapping[str, Any], errors: Uncertainty = ERRORS) -> 'InSI':
-        """
-        Return the system of parameters.
-
-        Raises
-        ------
-        BadInputError
-            If they name a file that cannot be used.
-
-        """
+        """Return the system of parameters, with the points of the file that they name."""
         return cls({**values, **completed(values)}, errors)
 
     @cached_property
@@ -249,3 +153,6 @@ class InSI(System):
                  if x.startswith(ACTUAL)}
         planned = {x: y for x, y in values.items() if not x.startswith(ACTUAL)}
         return self.setting({**planned, **given})
+
+
+System = Nondimensional | InSI

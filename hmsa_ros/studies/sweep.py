@@ -46,33 +46,21 @@ Places = tuple[NDArray[np.int64], ...]
 
 @dataclass(frozen=True)
 class Rows:
-    """
-    Rows of a sweep, planned.
-
-    Attributes
-    ----------
-    inputs : dict of str to ndarray, shape (n,)
-        Columns that were given, in order.
-    codes : ndarray of int64, shape (n,)
-        Places in `hmsa_ros.studies.plans.STATUS`.
-    results : dict of str to ndarray, shape (n,)
-        Columns of numbers, in order; NaN where there is no such number.
-
-    """
+    """Rows of a sweep, planned: columns by name, in order."""
 
     inputs: dict[str, Column]
-    codes: NDArray[np.int64]
-    results: dict[str, Array]
+    codes: NDArray[np.int64]  # places in STATUS
+    results: dict[str, Array]  # NaN where there is no such number
 
     @property
     def status(self) -> NDArray[np.str_]:
         """Return the code of each row."""
         return _STATUS[self.codes]
 
-    def lists(self) -> list[list[Any]]:
-        """Return the columns as lists."""
-        return [*(x.tolist() for x in self.inputs.values()), self.status.tolist(),
-                *(x.tolist() for x in self.results.values())]
+    def to_pydict(self) -> dict[str, list[Any]]:
+        """Return the columns as lists, as a table of pyarrow does."""
+        columns = {**self.inputs, 'status': self.status, **self.results}
+        return {name: x.tolist() for name, x in columns.items()}
 
     def arrow(self) -> Any:
         """Return the columns as a table of pyarrow."""
@@ -179,15 +167,7 @@ class Sweep:
         return ('tau_p', 'beta_p') if self._system.roots else ('time_p', 'flux_density_p')
 
     def view(self) -> View:
-        """
-        Return how the sweep is drawn.
-
-        Raises
-        ------
-        BadInputError
-            If there is no picture of it.
-
-        """
+        """Return how the sweep is drawn; it is refused where there is no picture of it."""
         return View.of([
             Axis.of(axis, samples=i == self._sampled) for i, axis in enumerate(self._axes)
             if self._shape[i] > 1])
@@ -257,14 +237,15 @@ class Sweep:
             self, plans: Plans, time: Array | float, load: Array | float,
             *left: Array) -> dict[str, Array]:
         """Return the columns of numbers, for units of time and load."""
-        more = dict(zip(_LEFT, left or (plans.time_p,) * 2, strict=True)) if self._carried else {}
+        first, duration, last = plans.numbers
+        more = dict(zip(_LEFT, left or (duration,) * 2, strict=True)) if self._carried else {}
         if self._system.roots:
             return {
-                'beta_p': plans.load_p, 'b_p': signed_root(plans.load_p), 'tau_p': plans.time_p,
-                'beta_1': plans.load_1, 'b_1': signed_root(plans.load_1), **more}
+                'beta_p': first, 'b_p': signed_root(first), 'tau_p': duration,
+                'beta_1': last, 'b_1': signed_root(last), **more}
         return {
-            'flux_density_p': plans.load_p * load, 'time_p': plans.time_p * time,
-            'flux_density_1': plans.load_1 * load, **more}
+            'flux_density_p': first * load, 'time_p': duration * time,
+            'flux_density_1': last * load, **more}
 
     def table(self, begin: int, end: int) -> Any:
         """Plan rows from one number up to another on one core; return a table of pyarrow."""

@@ -1,11 +1,10 @@
 """Tables of studies, written a block at a time, as CSV or Parquet."""
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, ExitStack
 import csv
 from pathlib import Path
 import sys
-from types import TracebackType
 from typing import Any, Protocol, TextIO
 
 from hmsa_ros.errors import BadInputError
@@ -13,69 +12,10 @@ from hmsa_ros.files import replacing, require_arrow
 
 
 class Block(Protocol):
-    """Some rows of a table."""
+    """Some rows: a table of pyarrow, or what ``arrow()`` makes one of."""
 
-    def lists(self) -> list[list[Any]]:
+    def to_pydict(self) -> Mapping[str, list[Any]]:
         """Return the columns as lists."""
-
-    def arrow(self) -> Any:
-        """Return the columns as a table of pyarrow."""
-
-
-class ArrowBlock:
-    """Rows that are a table of pyarrow already."""
-
-    def __init__(self, table: Any) -> None:
-        self._table = table
-
-    def lists(self) -> list[list[Any]]:
-        """Return the columns as lists."""
-        return [x.to_pylist() for x in self._table.columns]
-
-    def arrow(self) -> Any:
-        """Return the table."""
-        return self._table
-
-
-class CsvWriter:
-    """Writes blocks as CSV, numbers in full double precision."""
-
-    def __init__(self, file: TextIO, columns: Sequence[str]) -> None:
-        """Write the header."""
-        self._writer = csv.writer(file, lineterminator='\n')
-        self._writer.writerow(columns)
-
-    def write(self, block: Block) -> None:
-        """Write a block of rows."""
-        self._writer.writerows(zip(*block.lists(), strict=True))
-
-
-class ParquetWriter:
-    """Writes blocks as Parquet, a row group each, through pyarrow."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._writer: Any = None
-
-    def __enter__(self) -> 'ParquetWriter':
-        """Return the writer."""
-        return self
-
-    def __exit__(
-            self, kind: type[BaseException] | None, error: BaseException | None,
-            trace: TracebackType | None) -> None:
-        """Write the footer."""
-        if self._writer is not None:
-            self._writer.close()
-
-    def write(self, block: Block) -> None:
-        """Write a block of rows."""
-        table = block.arrow()
-        if self._writer is None:
-            _, parquet = require_arrow()
-            self._writer = parquet.ParquetWriter(
-                self._path, table.schema, use_dictionary=repeating(table))
-        self._writer.write_table(table, row_group_size=max(1, table.num_rows))
 
 
 def repeating(table: Any) -> list[str]:
@@ -89,20 +29,7 @@ def repeating(table: Any) -> list[str]:
 def open_writer(
         path: Path | None, columns: Sequence[str]) -> Iterator[Callable[[Block], None]]:
     """
-    Open what the blocks of a study are written to.
-
-    Parameters
-    ----------
-    path : Path or None
-        A file that ends in .csv or .parquet, None for standard output. A file of that name is
-        replaced when all is written, and left alone otherwise.
-    columns : sequence of str
-        Names of the columns.
-
-    Yields
-    ------
-    callable
-        Writes a `Block`.
+    Yield what writes blocks to a file (.csv or .parquet), replaced at the end, or to stdout.
 
     Raises
     ------
@@ -111,7 +38,7 @@ def open_writer(
 
     """
     if path is None:
-        yield CsvWriter(sys.stdout, columns).write
+        yield _csv_writer(sys.stdout, columns)
         sys.stdout.flush()
         return
     kind = path.suffix.lower()
@@ -122,10 +49,32 @@ def open_writer(
         raise BadInputError(f'{path} is a folder: expected the name of a file')
     if kind == '.parquet':
         require_arrow()
-    with replacing(path) as beside:
+    with replacing(path) as beside, ExitStack() as stack:
         if kind == '.csv':
-            with beside.open('w', newline='', encoding='utf-8') as file:
-                yield CsvWriter(file, columns).write
+            yield _csv_writer(
+                stack.enter_context(beside.open('w', newline='', encoding='utf-8')), columns)
         else:
-            with ParquetWriter(beside) as writer:
-                yield writer.write
+            yield _parquet_writer(beside, stack)
+
+
+def _csv_writer(file: TextIO, columns: Sequence[str]) -> Callable[[Block], None]:
+    """Return what writes blocks as CSV, numbers in full double precision, below a header."""
+    writer = csv.writer(file, lineterminator='\n')
+    writer.writerow(columns)
+    return lambda block: writer.writerows(zip(*block.to_pydict().values(), strict=True))
+
+
+def _parquet_writer(path: Path, stack: ExitStack) -> Callable[[Block], None]:
+    """Return what writes blocks as Parquet, a row group each; the stack writes the footer."""
+    arrow, parquet = require_arrow()
+    writer: Any = None
+
+    def write(block: Any) -> None:
+        nonlocal writer
+        table = block if isinstance(block, arrow.Table) else block.arrow()
+        if writer is None:
+            writer = stack.enter_context(parquet.ParquetWriter(
+                path, table.schema, use_dictionary=repeating(table)))
+        writer.write_table(table, row_group_size=max(1, table.num_rows))
+
+    return write

@@ -27,28 +27,12 @@ _FEW = 5
 
 @dataclass(frozen=True, eq=False)
 class Axis:
-    """
-    One axis of a sweep that has more than one value.
+    """One axis of a sweep that has more than one value."""
 
-    Attributes
-    ----------
-    name : str
-        Of its column; of all its columns, for a table.
-    size : int
-        How many values.
-    values : ndarray, shape (size,), optional
-        Of a column of numbers.
-    labels : tuple of str
-        Of values without an order; empty for samples and for more than are drawn.
-    sampled : bool
-        Whether they are samples.
-
-    """
-
-    name: str
+    name: str  # of its column, or of all columns of a table
     size: int
-    values: Array | None = None
-    labels: tuple[str, ...] = ()
+    values: Array | None = None  # of a column of numbers
+    labels: tuple[str, ...] = ()  # of a few values without an order that are no samples
     sampled: bool = False
 
     @classmethod
@@ -77,36 +61,19 @@ class Axis:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """
-    How the rows of a sweep are drawn.
-
-    Attributes
-    ----------
-    x, y : Axis or None
-        Axes of the picture; without ``y`` they are curves, without both the samples' shares.
-    labels : tuple of str
-        Of each curve or map.
-    samples : int
-        How many are drawn at each point; 1 for none.
-
-    """
+    """How rows of a sweep are drawn: a map over x and y, curves over x, or shares of samples."""
 
     x: Axis | None
     y: Axis | None
-    labels: tuple[str, ...]
-    samples: int
+    labels: tuple[str, ...]  # of each curve or map
+    samples: int  # at each point; 1 for none
     _sizes: tuple[int, ...]
     _order: tuple[int, ...]
 
     @classmethod
     def of(cls, axes: Sequence[Axis]) -> 'View':
         """
-        Choose a view.
-
-        Parameters
-        ----------
-        axes : sequence of Axis
-            Those of a sweep with more than one value, in order.
+        Choose a view of the axes with more than one value, in order.
 
         Raises
         ------
