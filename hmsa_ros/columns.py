@@ -33,23 +33,11 @@ _HEADER = re.compile(r'\s*([A-Za-z_µ ]+?)\s*(?:[\[(/]\s*([^\])]*?)\s*[\])]?)?\s
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """
-    Columns of a CSV file.
+    """Columns of a CSV file by name."""
 
-    Attributes
-    ----------
-    columns : dict of str to ndarray
-        By name, in SI; NaN where a cell was empty or no number.
-    lines : ndarray
-        Number of each row's line.
-    notes : tuple of str
-        What was converted.
-
-    """
-
-    columns: dict[str, Array]
-    lines: Array
-    notes: tuple[str, ...]
+    columns: dict[str, Array]  # in SI; NaN where a cell was empty or no number
+    lines: Array  # number of each row's line
+    notes: tuple[str, ...]  # what was converted
 
 
 def _text(path: Path, kind: str) -> str:
@@ -77,29 +65,11 @@ def _encoding(content: bytes) -> str:
 
 def read_table(path: Path, wanted: tuple[str, ...], *, kind: str = 'a CSV') -> Table:
     """
-    Read columns of a CSV file.
+    Read the wanted columns of a CSV file, in SI.
 
-    Separators are found out; so are units behind a name, as in ``flux_density [mT]``.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    wanted : tuple of str
-        Names of columns.
-    kind : str
-        What is expected, for the messages.
-
-    Returns
-    -------
-    Table
-        In SI.
-
-    Raises
-    ------
-    BadInputError
-        If the file cannot be read, has no header, or a column is missing.
-
+    Separators are found out; so are units behind a name, as in ``flux_density [mT]``. Messages say
+    that ``kind`` was expected. Raises `BadInputError` if the file cannot be read, has no header,
+    or a column is missing.
     """
     rows = [(i, x) for i, x in enumerate(_text(path, kind).splitlines(), 1)
             if x.strip() and not x.lstrip().startswith('#')]

@@ -19,17 +19,7 @@ _LAST_SECONDS = 10
 
 
 class Ending:
-    """
-    Whether a signal has asked this process to end.
-
-    Attributes
-    ----------
-    asked : bool
-        Whether one has.
-    status : int
-        Exit status that shells expect then.
-
-    """
+    """Whether a signal `asked` this process to end, and the exit `status` that shells expect."""
 
     def __init__(self) -> None:
         """Leave signals as they are."""

@@ -16,23 +16,10 @@ from hmsa_ros.errors import BadInputError
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """
-    Write a file beside its name and rename it once it is complete.
+    Yield a file beside a name, to be renamed once it is complete; if writing fails, the old stays.
 
-    Parameters
-    ----------
-    path : Path
-        What is to be written or replaced; a link is followed, a device written to directly.
-
-    Yields
-    ------
-    Path
-        To write to. It is removed if writing fails, and the old file stays.
-
-    Raises
-    ------
-    BadInputError
-        If the file cannot be written, or is a link to nothing.
-
+    A link is followed, a device written to directly. Raises `BadInputError` if the file cannot be
+    written, or is a link to nothing.
     """
     try:
         if path.is_symlink() and not path.exists():
@@ -62,15 +49,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """
-    Make the folder that a command writes to, unless it exists.
-
-    Raises
-    ------
-    BadInputError
-        If it cannot be made.
-
-    """
+    """Make the folder that a command writes to, unless it exists, or raise `BadInputError`."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -93,31 +72,7 @@ def _known(value: object) -> object:
 
 
 def read_at_most(path: Path, size: int, expected: str) -> bytes:
-    """
-    Return the content of a file.
-
-    Parameters
-    ----------
-    path : Path
-        The file; a device, which has neither size nor end, is read as far as allowed.
-    size : int
-        Bytes that it may have.
-    expected : str
-        What it should be, for the message.
-
-    Returns
-    -------
-    bytes
-        All of it.
-
-    Raises
-    ------
-    BadInputError
-        If it is larger.
-    OSError
-        If it cannot be read.
-
-    """
+    """Return the content, of a device as far as allowed; raise `BadInputError` if it is larger."""
     with path.open('rb') as file:
         content = file.read(size + 1)
     if len(content) > size:
@@ -126,15 +81,7 @@ def read_at_most(path: Path, size: int, expected: str) -> bytes:
 
 
 def require_arrow() -> tuple[Any, Any]:
-    """
-    Return the modules ``pyarrow`` and ``pyarrow.parquet``.
-
-    Raises
-    ------
-    BadInputError
-        If pyarrow is not installed.
-
-    """
+    """Return ``pyarrow`` and ``pyarrow.parquet``; raise `BadInputError` if not installed."""
     try:
         import pyarrow
         from pyarrow import parquet

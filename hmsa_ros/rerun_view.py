@@ -90,26 +90,7 @@ def blueprint(namespace: str = '', coordinate: str = STRETCH.name) -> Any:
 
 
 def show(bag: str | os.PathLike[str], recording: Any, namespace: str = '') -> None:
-    """
-    Log a bag and the blueprint to a recording of Rerun.
-
-    Parameters
-    ----------
-    bag : path
-        Folder of the bag.
-    recording : rerun.RecordingStream
-        What to log to.
-    namespace : str
-        Namespace of the nodes.
-
-    Raises
-    ------
-    BagError
-        If the bag cannot be read.
-    BadInputError
-        If it has no samples of the actuators in that namespace.
-
-    """
+    """Log a bag and the blueprint; raise `BadInputError` without samples in that namespace."""
     root = '/' + namespace.strip('/') if namespace.strip('/') else ''
     reader = BagReader(bag)
     found = set(reader.topics)

@@ -45,15 +45,7 @@ class Contents:
             if (known.name, known.type) == (topic.name, topic.type)), None)
 
     def check_room(self) -> None:
-        """
-        Refuse one topic more than MCAP can number.
-
-        Raises
-        ------
-        BagError
-            If there are as many as that.
-
-        """
+        """Refuse one topic more than MCAP can number, by a `BagError`."""
         if len(self.topics) >= MAX_CHANNELS:
             raise BagError(f'a bag cannot have more than {MAX_CHANNELS} topics')
 

@@ -44,15 +44,7 @@ class TopicInfo:
 
 
 def make_decoder(info: TopicInfo) -> Callable[[bytes], Any]:
-    """
-    Return what decodes a topic's payloads; it raises `BagError` where one does not fit.
-
-    Raises
-    ------
-    BagError
-        If the bag has no definition that can be read.
-
-    """
+    """Return what decodes a topic's payloads; both raise `BagError` where it cannot be done."""
     from mcap.records import Schema
     from mcap_ros2.decoder import DecoderFactory
     # A decoder of its own: the library keeps decoders by schema number, which differs between

@@ -71,15 +71,7 @@ def _dependencies(type_name: str, text: str) -> list[str]:
 
 @cache
 def message_definition(type_name: str) -> tuple[str, str]:
-    """
-    Return ``'ros2msg'`` and the text of a type like ``'std_msgs/msg/String'`` with all it needs.
-
-    Raises
-    ------
-    BagError
-        If the definition of the type or of a dependency is not installed.
-
-    """
+    """Return ``'ros2msg'`` and the text of a type and all it needs, or raise `BagError`."""
     seen = {'/'.join(_split(type_name))}
 
     def sections(name: str) -> Iterator[str]:

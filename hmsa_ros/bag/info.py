@@ -14,68 +14,30 @@ from hmsa_ros.errors import BagError, printable
 
 @dataclass(frozen=True)
 class TopicSummary:
-    """
-    One topic in figures.
-
-    Attributes
-    ----------
-    name, type : str
-        Topic and message type.
-    count : int
-        Messages in the bag.
-    rate : float or None
-        Messages a second over the length of the bag; None where that is not defined.
-    lost : int or None
-        Messages known to be lost; None if the recorder did not count.
-    reliability, durability : str
-        Of the publishers, several separated by a slash; empty if unknown.
-
-    """
+    """One topic in figures."""
 
     name: str
     type: str
     count: int
-    rate: float | None
-    lost: int | None
-    reliability: str
+    rate: float | None  # a second over the length of the bag; None where that is not defined
+    lost: int | None  # None if the recorder did not count
+    reliability: str  # of the publishers, several separated by a slash; empty if unknown
     durability: str
 
 
 @dataclass(frozen=True)
 class BagSummary:
-    """
-    A bag in figures.
+    """A bag in figures."""
 
-    Attributes
-    ----------
-    path : str
-        As given.
-    files : tuple of (str, int)
-        Name and size in bytes of each file.
-    start_ns, end_ns : int or None
-        First and last log time; None without a message.
-    topics : tuple of TopicSummary
-        In order of name.
-    parameters : mapping of str to str
-        Parameters of the recorded nodes, values as JSON.
-    custom_data : mapping of str to str
-        Everything else that was stored with the bag.
-    complete : bool
-        Whether every file was closed by its writer.
-    problems : tuple of str
-        What could not be read, one sentence each.
-
-    """
-
-    path: str
-    files: tuple[tuple[str, int], ...]
-    start_ns: int | None
+    path: str  # as given
+    files: tuple[tuple[str, int], ...]  # name and size in bytes
+    start_ns: int | None  # first log time; None without a message
     end_ns: int | None
-    topics: tuple[TopicSummary, ...]
-    parameters: Mapping[str, str]
-    custom_data: Mapping[str, str]
-    complete: bool
-    problems: tuple[str, ...]
+    topics: tuple[TopicSummary, ...]  # in order of name
+    parameters: Mapping[str, str]  # of the recorded nodes, values as JSON
+    custom_data: Mapping[str, str]  # everything else that was stored with the bag
+    complete: bool  # whether every file was closed by its writer
+    problems: tuple[str, ...]  # what could not be read, one sentence each
 
     @property
     def duration(self) -> float:
@@ -99,27 +61,7 @@ class BagSummary:
 def summarize(
         path: str | os.PathLike[str], *,
         max_chunk_size: int = limits.CHUNK_SIZE) -> BagSummary:
-    """
-    Read a bag's figures.
-
-    Parameters
-    ----------
-    path : path
-        Folder of a bag, or one ``.mcap`` file.
-    max_chunk_size : int
-        As for `BagReader`.
-
-    Returns
-    -------
-    BagSummary
-        In figures.
-
-    Raises
-    ------
-    BadInputError
-        If there is no bag.
-
-    """
+    """Read a bag's figures, as `BagReader` does; raise `BadInputError` if there is none."""
     reader = BagReader(path, max_chunk_size=max_chunk_size)
     # First of all: it finds out what is damaged.
     counts = reader.counts()

@@ -34,30 +34,16 @@ class Problems:
 
 @dataclass(frozen=True)
 class Block:
-    """
-    A chunk, or a run of messages outside chunks, in the file of a number.
+    """A chunk, or a run of messages outside chunks, and where its stored bytes lie."""
 
-    Attributes
-    ----------
-    file, offset, length : int
-        Number of the file, and where the stored bytes lie.
-    size, crc : int
-        Length and CRC-32 of the content; 0 for no CRC.
-    compression : str
-        As for `records.decompress`.
-    start, end : int
-        Lowest and highest log time.
-
-    """
-
-    file: int
+    file: int  # number of the file
     offset: int
     length: int
-    size: int
-    start: int
-    end: int
-    compression: str = ''
-    crc: int = 0
+    size: int  # of the content
+    start: int  # lowest log time
+    end: int  # highest log time
+    compression: str = ''  # ``''``, ``'lz4'`` or ``'zstd'``
+    crc: int = 0  # CRC-32 of the content; 0 for none
 
     def content(self, descriptor: int) -> bytes:
         """Return the content, or raise `BagError` if it is damaged."""
@@ -68,45 +54,21 @@ class Block:
 
 @dataclass
 class ScannedFile:
-    """
-    What a file holds.
-
-    Attributes
-    ----------
-    path, number, size : Path, int, int
-        The file, its place in the bag, and its length in bytes.
-    schemas, channels : dict
-        Records by their id.
-    blocks : list of Block
-        Its parts with messages, in their order.
-    metadata : dict of str to dict
-        Metadata records by name.
-    complete : bool
-        Whether it was closed by its writer.
-    damaged : bool
-        Whether something in it does not agree with the rest.
-    counted : bool
-        Whether `counts` were counted, and not only read.
-    counts : dict of int to int
-        Messages by channel.
-    data_end, data_crc : int
-        Where the data end, and their CRC-32; 0 if there is none.
-
-    """
+    """What a file holds; records by their id, metadata records by name."""
 
     path: Path
-    number: int
-    size: int
-    complete: bool = False
-    damaged: bool = False
-    counted: bool = False
+    number: int  # its place in the bag
+    size: int  # in bytes
+    complete: bool = False  # whether it was closed by its writer
+    damaged: bool = False  # whether something in it does not agree with the rest
+    counted: bool = False  # whether `counts` were counted, and not only read
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
-    blocks: list[Block] = field(default_factory=list)
+    blocks: list[Block] = field(default_factory=list)  # its parts with messages, in their order
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
-    counts: dict[int, int] = field(default_factory=dict)
+    counts: dict[int, int] = field(default_factory=dict)  # messages by channel
     data_end: int = 0
-    data_crc: int = 0
+    data_crc: int = 0  # CRC-32 of the data; 0 for none
 
 
 class Intake:
@@ -132,29 +94,13 @@ class Intake:
             file.blocks.append(block)
 
     def check_size(self, size: int, what: str) -> None:
-        """
-        Refuse what is larger (in bytes) than the memory it may take.
-
-        Raises
-        ------
-        BagError
-            If it is.
-
-        """
+        """Raise `BagError` for what is larger, in bytes, than the memory it may take."""
         if size > self._max_chunk_size:
             raise BagError(f'a {what} of {size} bytes is larger than the {self._max_chunk_size} '
                            'bytes allowed')
 
     def take(self, file: ScannedFile, record: McapRecord) -> None:
-        """
-        Take in a schema, a channel or metadata, also for the file where it was found.
-
-        Raises
-        ------
-        BagError
-            If it is larger than is allowed.
-
-        """
+        """Take in a schema, channel or metadata, or raise `BagError` if it is too large."""
         if isinstance(record, Schema):
             if self._is_new(file, file.schemas, record):
                 self._keep(len(record.data))

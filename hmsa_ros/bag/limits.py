@@ -53,15 +53,7 @@ _Loader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 
 def load_json(text: str) -> Any:
-    """
-    Return the lists, maps and scalars of a JSON text from a bag; numbers are finite.
-
-    Raises
-    ------
-    BagError
-        If it is no JSON, is nested too deep, or has a number that is not finite or too long.
-
-    """
+    """Return what a JSON text holds; raise `BagError` unless all its numbers are finite."""
     def number(digits: str) -> float:
         value = float(digits)
         if not math.isfinite(value):
@@ -76,22 +68,14 @@ def load_json(text: str) -> Any:
 
 
 def load_yaml(text: str) -> Any:
-    """
-    Return the lists, maps and scalars of a YAML text from a bag.
-
-    Raises
-    ------
-    BagError
-        If it is not YAML, is too large, is nested too deep, or uses anchors: with them a few
-        lines unfold to more than fits into any memory.
-
-    """
+    """Return what a YAML text holds; raise `BagError` if it is none, too large, or has anchors."""
     if len(text) > YAML_SIZE:
         raise BagError(f'it has {len(text)} characters, expected at most {YAML_SIZE}')
     nodes = depth = 0
     try:
         for event in yaml.parse(text, Loader=_Loader):
             if isinstance(event, yaml.AliasEvent):
+                # With these a few lines unfold to more than fits into any memory.
                 raise BagError('it uses YAML anchors, expected plain YAML')
             if isinstance(event, yaml.NodeEvent):
                 nodes += 1

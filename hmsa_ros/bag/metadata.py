@@ -22,29 +22,13 @@ _Dumper: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 
 @dataclass(frozen=True)
 class TopicMetadata:
-    """
-    One recorded topic.
-
-    Attributes
-    ----------
-    name, type : str
-        Topic and message type.
-    serialization_format : str
-        ``'cdr'``.
-    profiles : tuple of hmsa_ros.bag.qos.Qos
-        What the publishers offered.
-    type_hash : str
-        RIHS01 hash, empty if unknown.
-    message_count : int
-        At least 0.
-
-    """
+    """One recorded topic."""
 
     name: str
     type: str
     serialization_format: str = 'cdr'
-    profiles: tuple[qos.Qos, ...] = ()
-    type_hash: str = ''
+    profiles: tuple[qos.Qos, ...] = ()  # what the publishers offered
+    type_hash: str = ''  # RIHS01 hash, empty if unknown
     message_count: int = 0
 
 
@@ -60,42 +44,19 @@ class FileMetadata:
 
 @dataclass(frozen=True)
 class BagMetadata:
-    """
-    What ``metadata.yaml`` says of a bag.
+    """What ``metadata.yaml`` says of a bag."""
 
-    Attributes
-    ----------
-    start_ns, duration_ns : int
-        First log time and length in nanoseconds; `NO_TIME` and 0 without a message.
-    message_count : int
-        At least 0.
-    topics : tuple of TopicMetadata
-        Recorded topics.
-    files : tuple of FileMetadata
-        Files in order of writing.
-    custom_data : mapping of str to str
-        What the user and the recorder noted.
-    ros_distro : str
-        Name of the distribution that wrote it.
-    version : int
-        Of the file's layout.
-    storage : str
-        Storage plugin, ``'mcap'``.
-    compression_format, compression_mode : str
-        Of rosbag2's own compression; empty for none. MCAP's chunk compression is not told here.
-
-    """
-
-    start_ns: int = NO_TIME
+    start_ns: int = NO_TIME  # first log time; `NO_TIME` without a message
     duration_ns: int = 0
     message_count: int = 0
     topics: tuple[TopicMetadata, ...] = ()
-    files: tuple[FileMetadata, ...] = ()
+    files: tuple[FileMetadata, ...] = ()  # in order of writing
+    # What the user and the recorder noted.
     custom_data: Mapping[str, str] = field(default_factory=dict)
-    ros_distro: str = 'jazzy'
-    version: int = VERSION
+    ros_distro: str = 'jazzy'  # that wrote it
+    version: int = VERSION  # of the file's layout
     storage: str = 'mcap'
-    compression_format: str = ''
+    compression_format: str = ''  # rosbag2's own, none if empty; MCAP's of chunks is not told here
     compression_mode: str = ''
 
 
@@ -157,15 +118,7 @@ def write(folder: Path, metadata: BagMetadata) -> None:
 
 
 def read(path: Path) -> BagMetadata:
-    """
-    Read a metadata file of version 1 to 9; what an older one does not say has its default.
-
-    Raises
-    ------
-    BagError
-        If it cannot be read.
-
-    """
+    """Read a file of version 1 to 9, with defaults for what it lacks, or raise `BagError`."""
     try:
         # A stranger's bag may have anything under this name: a pipe, a device, a link to one.
         if not path.is_file():
@@ -187,15 +140,7 @@ def read(path: Path) -> BagMetadata:
 
 
 def from_map(content: Any, source: str) -> BagMetadata:
-    """
-    Read metadata from plain maps without the outer key; ``source`` names them in messages.
-
-    Raises
-    ------
-    BagError
-        If a key that every version has is missing or has the wrong form.
-
-    """
+    """Read maps without the outer key, or raise a `BagError` that names their source."""
     try:
         version = int(content['version'])
         if version > VERSION:

@@ -197,15 +197,7 @@ class OutputFile:
         os.close(self._stream.descriptor)
 
     def check_still_there(self) -> None:
-        """
-        Refuse to go on in a file that was removed: what is written there is lost.
-
-        Raises
-        ------
-        FileNotFoundError
-            If it is not in its place.
-
-        """
+        """Raise `FileNotFoundError` if the file was removed: what is written is lost."""
         try:
             there = os.stat(self.path)
         except OSError as error:

@@ -111,15 +111,7 @@ def to_yaml(profiles: Iterable[Qos]) -> str:
 
 
 def from_stored(value: Any) -> tuple[Qos, ...]:
-    """
-    Read profiles from a YAML text or from a newer metadata file's list; empty for None.
-
-    Raises
-    ------
-    BagError
-        If it is neither.
-
-    """
+    """Read profiles from YAML or a newer file's list, none from None, or raise `BagError`."""
     try:
         items = limits.load_yaml(value) if isinstance(value, str) else value
         return tuple(_from_map(item) for item in items or ())

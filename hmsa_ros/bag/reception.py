@@ -16,37 +16,17 @@ _BEHIND_SECONDS = 1.0
 
 @dataclass
 class RecordedTopic:
-    """
-    A topic being recorded: its subscription and what is known of its publishers.
-
-    Attributes
-    ----------
-    name, type : str
-        Topic and message type.
-    number : int
-        Of the topic in the bag.
-    qos : object
-        With which it is subscribed to.
-    offered : tuple of hmsa_ros.bag.qos.Qos
-        What its publishers offer.
-    publishers : int
-        How many there were at the last look.
-    last : dict of bytes to int
-        Last sequence number by publisher.
-    received, missed : int
-        Messages taken, and gaps in the sequence numbers.
-
-    """
+    """A topic being recorded: its subscription and what is known of its publishers."""
 
     name: str
     type: str
-    number: int
-    qos: Any
-    offered: tuple[Qos, ...]
-    publishers: int = 0
-    last: dict[bytes, int] = field(default_factory=dict)
+    number: int  # of the topic in the bag
+    qos: Any  # with which it is subscribed to
+    offered: tuple[Qos, ...]  # by its publishers
+    publishers: int = 0  # at the last look
+    last: dict[bytes, int] = field(default_factory=dict)  # sequence number by publisher
     received: int = 0
-    missed: int = 0
+    missed: int = 0  # gaps in the sequence numbers
 
     def take(
             self, messages: Iterable[tuple[int, int, int, bytes, bytes]],

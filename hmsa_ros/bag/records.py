@@ -88,15 +88,7 @@ class _Content(ReadDataStream):
         self._fields = 0
 
     def read(self, length: int) -> bytes:
-        """
-        Return the next bytes.
-
-        Raises
-        ------
-        BagError
-            If there are not so many, or too many fields.
-
-        """
+        """Return the next bytes; raise `BagError` beyond the end, or for too many fields."""
         self._fields += 1
         if self._fields > 4 * limits.MAP_ENTRIES:
             raise BagError(
@@ -110,15 +102,7 @@ class _Content(ReadDataStream):
 
 
 def parse(kind: type[_Record], content: bytes) -> _Record:
-    """
-    Read a record by the mcap package's class; bytes that are not UTF-8 become their codes.
-
-    Raises
-    ------
-    BagError
-        If the content is not that of such a record.
-
-    """
+    """Read a record by the mcap package's class, or raise `BagError`; not UTF-8 becomes codes."""
     what = kind.__name__.lower()
     stream = _Content(content, what)
     try:
@@ -159,15 +143,7 @@ def read_chunk_head(data: bytes, length: int) -> ChunkHead:
 
 
 def decompress(data: bytes, compression: str, size: int) -> bytes:
-    """
-    Return a chunk's content of ``size`` bytes, stored as ``''``, ``'lz4'`` or ``'zstd'``.
-
-    Raises
-    ------
-    BagError
-        If the data are damaged or the compression is unknown.
-
-    """
+    """Return the ``size`` bytes of a chunk's content, or raise `BagError` if damaged."""
     if not compression:
         content = data
     elif compression == 'zstd':
@@ -209,15 +185,7 @@ def checked(content: bytes, crc: int) -> bytes:
 
 
 def split(content: bytes) -> Iterator[tuple[int, int, int]]:
-    """
-    Yield opcode, start and end of the content of each record in a chunk or summary.
-
-    Raises
-    ------
-    BagError
-        At a record that is not whole.
-
-    """
+    """Yield opcode, start and end of each content; raise `BagError` where a record is cut."""
     offset, size = 0, len(content)
     prefix_size, unpack = PREFIX.size, PREFIX.unpack_from
     while offset < size:
@@ -232,15 +200,7 @@ def split(content: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def read_exactly(descriptor: int, length: int, offset: int) -> bytes:
-    """
-    Return so many bytes of a file from an offset on.
-
-    Raises
-    ------
-    BagError
-        If it has become shorter.
-
-    """
+    """Return so many bytes from an offset on; raise `BagError` if the file has not as many."""
     data = os.pread(descriptor, length, offset)
     while len(data) < length:
         more = os.pread(descriptor, length - len(data), offset + len(data))

@@ -16,15 +16,7 @@ _CRC_BYTES = 2**20
 
 
 def scan(intake: Intake, path: Path, number: int) -> ScannedFile:
-    """
-    Find out what a file holds; limits and problems are the intake's.
-
-    Raises
-    ------
-    BadInputError
-        If it is no MCAP file.
-
-    """
+    """Find out what a file holds; raise `BadInputError` if it is no MCAP file."""
     try:
         with path.open('rb') as stream:
             size = os.fstat(stream.fileno()).st_size

@@ -18,30 +18,13 @@ Message = tuple[int, int, int, int, bytes]
 
 @dataclass(frozen=True)
 class Limits:
-    """
-    When to flush, when to split and how much to keep in memory.
+    """When to flush, when to split and how much to keep in memory."""
 
-    Attributes
-    ----------
-    flush_period : float
-        Seconds after which at the latest a message is with the operating system; above 0.
-    max_size : int
-        Size in bytes at which a file is split; 0 for never, else at least 1024.
-    max_duration_ns : int
-        Time span at which a file is split, in nanoseconds; 0 for never.
-    cache_size : int
-        Bytes of queued messages at which new ones are counted as lost; at least 1.
-    snapshot_ns : int
-        In nanoseconds: above 0, messages are kept in memory for this long and only written
-        when a snapshot is asked for.
-
-    """
-
-    flush_period: float = 0.5
-    max_size: int = 0
-    max_duration_ns: int = 0
-    cache_size: int = 100 * 2**20
-    snapshot_ns: int = 0
+    flush_period: float = 0.5  # s after which the operating system has a message at the latest
+    max_size: int = 0  # bytes at which a file is split; 0 for never, else at least 1024
+    max_duration_ns: int = 0  # time span at which a file is split; 0 for never
+    cache_size: int = 100 * 2**20  # bytes of queued messages at which new ones are counted as lost
+    snapshot_ns: int = 0  # above 0, messages are kept for so long, written for a snapshot
 
     def __post_init__(self) -> None:
         if not self.flush_period > 0.0:
@@ -120,15 +103,7 @@ class Sink:
             self._release(given_back)
 
     def snapshot(self) -> str:
-        """
-        Write the messages kept in memory and return in words what was written.
-
-        Raises
-        ------
-        BagError
-            If every message is recorded.
-
-        """
+        """Write what is kept, and say what; raise `BagError` if every message is recorded."""
         if not self._limits.snapshot_ns:
             raise BagError('there is no snapshot to take: every message is recorded; expected '
                            'snapshot mode')

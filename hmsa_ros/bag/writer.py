@@ -179,18 +179,7 @@ class BagWriter:
                 self._write_chunk()
 
     def note(self, values: Mapping[str, str]) -> None:
-        """
-        Add to the custom data, in ``metadata.yaml`` and in the file.
-
-        In the file they come at the end in any case, and at once as long as such records are a
-        small part of it. What could not be written is tried again when the file is closed.
-
-        Parameters
-        ----------
-        values : mapping of str to str
-            To add.
-
-        """
+        """Add to the custom data: in ``metadata.yaml``, and in the file at once or at its end."""
         self._contents.note(values)
         file = self._file
         if file is not None:
@@ -349,15 +338,7 @@ def _check_room(folder: Path, size: int) -> None:
 
 
 def parse_custom_data(pairs: Iterable[str]) -> dict[str, str]:
-    """
-    Read ``key=value`` pairs, such as ``'actuator=A3'``; empty strings are skipped.
-
-    Raises
-    ------
-    BadInputError
-        If one has no ``=`` or no key, or a key comes twice.
-
-    """
+    """Read pairs like ``'actuator=A3'``; raise `BadInputError` for one that is none, or twice."""
     values: dict[str, str] = {}
     for pair in itertools.filterfalse(lambda text: not text, pairs):
         key, equals, value = pair.partition('=')

@@ -31,29 +31,13 @@ _CASES: tuple[dict[str, Any], ...] = (
 
 @dataclass(frozen=True)
 class PaperFigure:
-    """
-    A figure of the paper.
-
-    Attributes
-    ----------
-    number : int
-        As in the paper.
-    title : str
-        What it shows.
-    compute : callable
-        Its data from the number of samples (or points of a sweep).
-    draw : callable
-        Draws the data.
-    height : float
-        Of the picture in inches.
-
-    """
+    """A figure of the paper."""
 
     number: int
-    title: str
-    compute: Callable[[int], Data]
+    title: str  # what it shows
+    compute: Callable[[int], Data]  # its data from the number of samples, or points of a sweep
     draw: Callable[[Figure, Any], None]
-    height: float
+    height: float  # in inches
 
     @property
     def default_points(self) -> int:
@@ -63,31 +47,7 @@ class PaperFigure:
 
 
 def write_figure(figure: PaperFigure, folder: Path, *, points: int | None = None) -> list[Path]:
-    """
-    Compute a figure and write it as PNG and CSV.
-
-    Parameters
-    ----------
-    figure : PaperFigure
-        One of `FIGURES`.
-    folder : Path
-        Existing folder; files of the same name are replaced.
-    points : int, optional
-        Samples a run, or points of a sweep; default `PaperFigure.default_points`.
-
-    Returns
-    -------
-    list of Path
-        The PNG and the CSV.
-
-    Raises
-    ------
-    BadInputError
-        If a file cannot be written.
-    HmsaError
-        If the computation fails.
-
-    """
+    """Write PNG and CSV, with so many samples or points of a sweep, and return their paths."""
     image = folder / f'figure_{figure.number:02d}.png'
     table = image.with_suffix('.csv')
     data = figure.compute(points or figure.default_points)

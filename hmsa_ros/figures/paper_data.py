@@ -51,33 +51,15 @@ _FASTER = 5
 
 @dataclass(frozen=True)
 class Run:
-    """
-    A response of the actuator.
+    """A response of the actuator."""
 
-    Attributes
-    ----------
-    name : str
-        What sets it apart from the other runs of its figure, for instance ``zeta 0.02``.
-    command : str
-        ``shaped``, ``unshaped`` or ``b_p alone``.
-    material : NondimensionalParameters
-        zeta, J_lim and c1.
-    targets : tuple of float
-        Setpoints.
-    switches, loads : ndarray, shape (m,)
-        Times at which a level of the load begins, and the level beta.
-    time, stretch, rate : ndarray, shape (n,)
-        Samples; every switch is among them.
-
-    """
-
-    name: str
-    command: str
+    name: str  # what sets it apart in its figure, for instance ``zeta 0.02``
+    command: str  # ``shaped``, ``unshaped`` or ``b_p alone``
     material: NondimensionalParameters
     targets: tuple[float, ...]
-    switches: Array
-    loads: Array
-    time: Array
+    switches: Array  # times at which a level of the load begins
+    loads: Array  # the levels beta
+    time: Array  # every switch is among them
     stretch: Array
     rate: Array
 
@@ -95,33 +77,17 @@ class Run:
 
 @dataclass(frozen=True)
 class Sweep:
-    """
-    The first move of a sequence over a parameter.
-
-    Attributes
-    ----------
-    start, target : float
-        The move.
-    zeta, j_lim : ndarray, shape (n,)
-        One varies, the other is constant.
-    status : tuple of str, length n
-        Verdict on each plan, ``two_step`` where there is one.
-    tau_p, beta_p, beta_1 : ndarray, shape (n,)
-        The plan; NaN where there is none.
-    critical : float
-        Linearised critical zeta at the target; NaN where zeta is not what varies.
-
-    """
+    """The first move of a sequence over a parameter: zeta or j_lim varies."""
 
     start: float
     target: float
     zeta: Array
     j_lim: Array
-    status: tuple[str, ...]
-    tau_p: Array
+    status: tuple[str, ...]  # ``two_step`` where there is a plan
+    tau_p: Array  # NaN without a plan, as the loads
     beta_p: Array
     beta_1: Array
-    critical: float
+    critical: float  # linearised critical zeta at the target; NaN where zeta does not vary
 
 
 Data = tuple[Run, ...] | Sweep
@@ -132,7 +98,7 @@ def respond(
         commands: Sequence[str] = ('shaped', 'unshaped'), span: float = SPAN,
         samples: int = SAMPLES, faster: int = 1) -> tuple[Run, ...]:
     """
-    Compute the responses to a sequence that starts at rest.
+    Compute the responses, one a command, to a sequence of spans that starts at rest.
 
     Parameters
     ----------
@@ -155,11 +121,6 @@ def respond(
     -------
     tuple of Run
         One a command.
-
-    Raises
-    ------
-    HmsaError
-        If a target cannot be had.
 
     """
     setpoints = [Setpoint(x, span) for x in targets]

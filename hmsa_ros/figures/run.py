@@ -21,17 +21,12 @@ def draw_run(
     ----------
     path : str or Path
         File to write; an existing file is replaced.
-    time : array_like, shape (n,)
-        Times of the samples in s, increasing; 0 is the start of the sequence.
-    stretch, rate : array_like, shape (n,)
-        Recorded stretch, and stretch rate in 1/s.
-    command_time : array_like, shape (m,)
-        Times in s from which the commands apply, not decreasing.
-    command : array_like, shape (m,)
-        Signed flux densities in T.
-    unshaped : tuple of array_like
-        Stretch, and stretch rate in 1/s, of the response to plain steps at the same times as
-        the samples.
+    time, stretch, rate : array_like, shape (n,)
+        Samples, in s and 1/s; times increase, 0 is the start of the sequence.
+    command_time, command : array_like, shape (m,)
+        Times in s from which the commands apply, not decreasing, and flux densities in T.
+    unshaped : tuple of array_like, shape (n,)
+        Stretch and rate of the response to plain steps at the times of the samples.
     targets : sequence of tuple of float
         (stretch, begin, arrival, end) of each setpoint, times in s.
     title : str
@@ -40,8 +35,7 @@ def draw_run(
     Raises
     ------
     BadInputError
-        If the arrays' shapes do not match, there is nothing to draw, or the file cannot be
-        written.
+        If shapes do not match, there is nothing to draw, or the file cannot be written.
 
     """
     time, stretch, rate, plain_stretch, plain_rate, command_time, command = (

@@ -54,7 +54,7 @@ def draw_sweep(
         paths: Sequence[Path], view: View, columns: Mapping[str, Array],
         fixed: Mapping[str, float] | None = None) -> None:
     """
-    Draw the columns of a sweep.
+    Draw the columns of a sweep, all rows of each; a panel or column of panels each.
 
     Parameters
     ----------
@@ -63,14 +63,9 @@ def draw_sweep(
     view : View
         How.
     columns : mapping of str to ndarray, shape (n,)
-        All rows of each column, NaN where there is no plan; a panel or column of panels each.
+        NaN where there is no plan.
     fixed : mapping of str to float, optional
         What all rows have in common, for the title.
-
-    Raises
-    ------
-    BadInputError
-        If a file cannot be written.
 
     """
     values = {name: _scale(name) * view.arranged(x) for name, x in columns.items()}

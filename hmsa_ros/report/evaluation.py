@@ -47,31 +47,13 @@ _MOVED = 0.1
 
 @dataclass(frozen=True)
 class Move:
-    """
-    One setpoint, as it was commanded.
+    """One setpoint, as it was commanded; stamps in ns."""
 
-    Attributes
-    ----------
-    stretch : float
-        Target.
-    begin, arrival, end : int
-        Stamps in ns: of the first command, of planned rest at the target, and until when the
-        target was held.
-    flux_densities : tuple of float
-        Commanded levels in T, the last one holds the target.
-
-    Raises
-    ------
-    BadInputError
-        If the times are not in order or there is no level.
-
-    """
-
-    stretch: float
-    begin: int
-    arrival: int
-    end: int
-    flux_densities: tuple[float, ...]
+    stretch: float  # target
+    begin: int  # of the first command
+    arrival: int  # of planned rest at the target
+    end: int  # until when the target was held
+    flux_densities: tuple[float, ...]  # levels in T, the last one holds the target
 
     def __post_init__(self) -> None:
         """Check the order."""
@@ -185,12 +167,12 @@ def evaluate(run: Run, moves: Sequence[Move] | None = None) -> Evaluation:
 def find_moves(
         run: Run, levels: Sequence[Level], plan: Sequence[Level]) -> list[Move]:
     """
-    Find the setpoints of a run from its commands.
+    Find the setpoints of a run from its commands, in order.
 
-    A setpoint is reached with the level that holds it: the one whose equilibrium is a stretch that
-    was asked for, or at which the plan is at rest at one (with what feedback has learnt, levels
-    have another equilibrium). Where neither finds a setpoint, a level that lasts for a period
-    of the actuator holds one.
+    A setpoint is reached with the level that holds it: the one whose equilibrium is a stretch
+    that was asked for, or at which the plan is at rest at one (with what feedback has learnt,
+    levels have another equilibrium). Where neither finds a setpoint, a level that lasts for a
+    period of the actuator holds one. Those not finished when the recording ended are left out.
 
     Parameters
     ----------
@@ -202,7 +184,7 @@ def find_moves(
     Returns
     -------
     list of Move
-        In order; those not finished when the recording ended are left out.
+        In order of time.
 
     """
     last = int(run.time[-1])
@@ -451,32 +433,16 @@ def _predict(run: Run, plan: Sequence[Level]) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class PlanPoint:
-    """
-    A change of level in the plan, and what was recorded there.
+    """A change of level in the plan, and what was recorded there; NaN for what is not."""
 
-    Attributes
-    ----------
-    time : float
-        In s of the run.
-    planned, commanded : float
-        Flux density in T; NaN if no command has this stamp.
-    stretch, rate : float
-        Predicted for the first sample from then on; the rate in 1/s. NaN if there is none.
-    recorded_stretch, recorded_rate : float
-        That sample.
-    deviation : float
-        Largest distance of the recorded from the predicted stretch until the next point.
-
-    """
-
-    time: float
-    planned: float
-    commanded: float
-    stretch: float
-    rate: float
-    recorded_stretch: float
+    time: float  # in s of the run
+    planned: float  # flux density in T
+    commanded: float  # with the same stamp, in T
+    stretch: float  # predicted for the first sample from then on
+    rate: float  # likewise, in 1/s
+    recorded_stretch: float  # that sample
     recorded_rate: float
-    deviation: float
+    deviation: float  # largest of the recorded from the predicted stretch until the next
 
 
 def plan_points(run: Run, evaluation: Evaluation) -> list[PlanPoint]:

@@ -18,43 +18,21 @@ _SAME_CLOCK = 60.0
 
 @dataclass(frozen=True)
 class Timing:
-    """
-    When commands and samples came.
+    """When commands and samples came; all arrays are in s."""
 
-    Attributes
-    ----------
-    commands : tuple of Level
-        Those that change something, in the order received.
-    repeats : int
-        How many commands changed nothing.
-    lead : ndarray, shape (m,)
-        How far ahead of its stamp each command was recorded, in s; below 0 for a late one.
-        Empty if the recorder kept another clock than the stamps.
-    lateness : ndarray, shape (k,)
-        How long after its stamp each change of level took effect, in s, by what the plant or the
-        driver reported; NaN for one that it did not report. Empty if it reported none.
-    delay : ndarray, shape (n,)
-        How long after its stamp each sample was recorded, in s; empty likewise.
-    interval : ndarray, shape (n - 1,)
-        Between the stamps of two samples, in s.
-    arrival_interval : ndarray, shape (n - 1,)
-        Between the times at which they were recorded, in s.
-    missing : int
-        Samples that gaps in the stamps have room for.
-    unapplied : int
-        Changes of level that were due and did not take effect as reported.
-
-    """
-
-    commands: tuple[Level, ...]
-    repeats: int
+    commands: tuple[Level, ...]  # those that change something, in the order received
+    repeats: int  # how many commands changed nothing
+    # How far ahead of its stamp each command was recorded; below 0 for a late one. Empty if the
+    # recorder kept another clock than the stamps.
     lead: Array
+    # How long after its stamp each change of level took effect, as the plant or the driver
+    # reported; NaN for one that it did not report. Empty if it reported none.
     lateness: Array
-    delay: Array
-    interval: Array
-    arrival_interval: Array
-    missing: int
-    unapplied: int
+    delay: Array  # how long after its stamp each sample was recorded; empty as lead is
+    interval: Array  # between the stamps of two samples
+    arrival_interval: Array  # between the times at which they were recorded
+    missing: int  # samples that gaps in the stamps have room for
+    unapplied: int  # changes of level that were due and did not take effect as reported
 
     @property
     def late(self) -> int:

@@ -16,27 +16,13 @@ _ROUNDED_STAMP = 1000
 
 @dataclass(frozen=True)
 class Level:
-    """
-    A command, or a change of level in a plan.
+    """A command, or a change of level in a plan."""
 
-    Attributes
-    ----------
-    stamp : int
-        Time in ns from which it applies.
-    flux_density : float
-        In T.
-    sent : int
-        Time in ns at which it was recorded.
-    stretch, rate : float
-        Predicted at the stamp, the rate in 1/s; NaN for a command.
-
-    """
-
-    stamp: int
-    flux_density: float
-    sent: int
-    stretch: float = math.nan
-    rate: float = math.nan
+    stamp: int  # time in ns from which it applies
+    flux_density: float  # in T
+    sent: int  # time in ns at which it was recorded
+    stretch: float = math.nan  # predicted at the stamp; NaN for a command
+    rate: float = math.nan  # likewise, in 1/s
 
 
 def in_force(messages: Iterable[Sequence[Level]]) -> tuple[Level, ...]:
@@ -60,22 +46,9 @@ def lateness_of(
     """
     Return how long after its stamp each command took effect, and how many never did.
 
-    Parameters
-    ----------
-    commands : sequence of Level
-        As `without_repeats` returns them.
-    applied : sequence of Level
-        What took effect; empty if nobody reported it.
-    last : int
-        End of the recording in ns: what was due later is not missed.
-
-    Returns
-    -------
-    lateness : ndarray, shape (m,)
-        In s, one a command; NaN for one that never took effect. Empty without ``applied``.
-    unapplied : int
-        Changes of level that were due, not superseded, and never took effect.
-
+    The lateness is in s, one for each command as `without_repeats` returns them: NaN for one that
+    never took effect, empty if nobody reported what took effect. The number is of the changes of
+    level that were due before ``last`` (ns), not superseded, and never took effect.
     """
     if not applied:
         return np.empty(0), 0

@@ -12,25 +12,7 @@ from hmsa_ros.runs.parameters import read_parameter_file, values_of
 
 
 def model_of(path: Path) -> Model:
-    """
-    Return what the planner of a parameter file plans with.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    Model
-        Its command period is none, and what may remain of creep the least, unless it is named.
-
-    Raises
-    ------
-    BadInputError
-        If the file cannot be read, or its values are out of range.
-
-    """
+    """Return what the planner of a file plans with, or raise `BadInputError`."""
     return model_from(values_of(
         read_parameter_file(path), PLANNER,
         # Nobody has to send these levels: unless the file says how fine, they are very fine.

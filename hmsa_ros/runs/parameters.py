@@ -77,11 +77,8 @@ def actuators(
     """
     Return the block of the plant and of the planner, whether they are known, and notes.
 
-    Raises
-    ------
-    BadInputError
-        If the parameters given are of an actuator whose position is another quantity.
-
+    Raises `BadInputError` if the parameters given are of an actuator whose position is another
+    quantity.
     """
     # What is given in a parameter file is what the block really is. The example block is taken
     # where nothing is known.
@@ -128,15 +125,7 @@ def actuators(
 
 
 def creep_of(parameters: Mapping[str, object], joint: str, node: str = PLANT) -> Creep:
-    """
-    Return the Maxwell branches of the plant of a run, or those that its planner knows.
-
-    Raises
-    ------
-    BadInputError
-        If these are none that an elastomer can have.
-
-    """
+    """Return the Maxwell branches of the plant of a run, or those that its planner knows."""
     return creep_from(_own(parameters, joint, node, VISCOELASTIC))
 
 
@@ -159,11 +148,7 @@ def read_parameter_file(
     """
     Read a YAML parameter file, or take its entries; return values by ``'node.name'``.
 
-    Raises
-    ------
-    BadInputError
-        If the file cannot be read or sets no parameter of the actuator.
-
+    Raises `BadInputError` if the file cannot be read or sets no parameter of the actuator.
     """
     entries = entries_of(Path(path)) if entries is None else entries
     found: dict[str, object] = {}
@@ -185,11 +170,7 @@ def values_of(
     """
     Return a node's values by name: what is set as ``'node.name'``, else the default.
 
-    Raises
-    ------
-    BadInputError
-        If a value is of another type or out of range.
-
+    Raises `BadInputError` if a value is of another type or out of range.
     """
     values = {}
     for spec in specs:
@@ -208,15 +189,7 @@ def values_of(
 
 
 def entries_of(path: Path) -> Entries:
-    """
-    Return node, dotted name and value of each parameter in a file; no node if all are meant.
-
-    Raises
-    ------
-    BadInputError
-        If the file cannot be read.
-
-    """
+    """Return the parameters in a file, or raise `BadInputError` if it cannot be read."""
     try:
         content = read_at_most(path, _LARGEST_FILE, 'a parameter file of at most that')
         document = _load(content.decode('utf-8'))

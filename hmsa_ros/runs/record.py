@@ -20,49 +20,24 @@ Times = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class RecordedRequest:
-    """
-    A request to the planner.
+    """A request to the planner."""
 
-    Attributes
-    ----------
-    sent : int
-        Time in ns at which it was recorded.
-    stamp : int
-        Start of the sequence in ns; 0 for at once.
-    points : tuple of (float, int or None)
-        Stretch, and time in ns from the start until which it lasts; None for a setpoint that
-        is held until the next.
-
-    """
-
-    sent: int
-    stamp: int
+    sent: int  # time in ns at which it was recorded
+    stamp: int  # start of the sequence in ns; 0 for at once
+    # Stretch, and time in ns from the start until which it lasts; None for a setpoint that is held
+    # until the next.
     points: tuple[tuple[float, int | None], ...]
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """
-    What the planner said of a request.
+    """What the planner said of a request."""
 
-    Attributes
-    ----------
-    sent : int
-        Time in ns at which it was recorded.
-    level : str
-        ``'ok'``, ``'warning'`` or ``'error'``.
-    code, message : str
-        As published.
-    stretch : float
-        Target of the setpoint under way; NaN if there is none.
-
-    """
-
-    sent: int
-    level: str
+    sent: int  # time in ns at which it was recorded
+    level: str  # ``'ok'``, ``'warning'`` or ``'error'``
     code: str
     message: str
-    stretch: float
+    stretch: float  # target of the setpoint under way; NaN if there is none
 
 
 @dataclass(frozen=True, eq=False)

@@ -92,11 +92,7 @@ class SampleReader:
         """
         Return a joint's samples in order; another joint will do unless ``required``.
 
-        Raises
-        ------
-        BadInputError
-            If there is no such joint, or none of its samples can be used.
-
+        Raises `BadInputError` if there is no such joint, or none of its samples can be used.
         """
         if not self._columns:
             raise BadInputError(f'{where} holds no message: expected samples of the actuator')
@@ -191,29 +187,15 @@ class _Layout:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """
-    Samples of one actuator.
+    """Samples of one actuator, of one length."""
 
-    Attributes
-    ----------
-    time, logged : ndarray of int64, shape (n,)
-        Stamps in ns, increasing, and when they were recorded.
-    stretch, rate, flux_density : ndarray, shape (n,)
-        Finite stretch, rate in 1/s, flux density in T or NaN.
-    left_out : int
-        How many could not be used.
-    notes : tuple of str
-        What a reader should know.
-
-    """
-
-    time: Times
-    logged: Times
-    stretch: Array
-    rate: Array
-    flux_density: Array
-    left_out: int
-    notes: tuple[str, ...]
+    time: Times  # stamps in ns, increasing
+    logged: Times  # when they were recorded, in ns
+    stretch: Array  # finite
+    rate: Array  # in 1/s
+    flux_density: Array  # in T, or NaN
+    left_out: int  # how many could not be used
+    notes: tuple[str, ...]  # what a reader should know
 
 
 def tidy(
@@ -222,27 +204,9 @@ def tidy(
     """
     Leave out what cannot be a motion, sort by stamp and complete the rate.
 
-    Parameters
-    ----------
-    where : str
-        What is read, for the messages.
-    stamps, logged : ndarray of int64, shape (n,)
-        In ns, in the order recorded.
-    stretch, rate, flux_density : ndarray, shape (n,)
-        As recorded; NaN for what was not.
-    left_out : int
-        How many were left out before.
-
-    Returns
-    -------
-    Samples
-        In order.
-
-    Raises
-    ------
-    BadInputError
-        If no stretch is a finite number.
-
+    Arrays are in the order recorded, stamps in ns, with NaN for what was not; ``left_out`` says
+    how many were left out before, ``where`` names what is read in messages. Raises
+    `BadInputError` if no stretch is a finite number.
     """
     notes = []
     if not stamps.any():

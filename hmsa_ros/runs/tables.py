@@ -19,19 +19,10 @@ SUFFIXES = ('.csv', '.parquet')
 
 def samples_of(run: Run) -> dict[str, Array]:
     """
-    Return the samples of a run.
+    Return the samples of a run by the name of their column.
 
-    Parameters
-    ----------
-    run : Run
-        As read.
-
-    Returns
-    -------
-    dict of str to ndarray, shape (n,)
-        ``time`` in s from the first sample, ``stretch``, ``stretch_rate`` in 1/s and
-        ``flux_density`` in T: measured, else the level in force, else NaN.
-
+    ``time`` in s from the first sample, ``stretch``, ``stretch_rate`` in 1/s and ``flux_density``
+    in T: measured, else the level in force, else NaN.
     """
     field = run.flux_density
     levels = run.levels
@@ -45,19 +36,10 @@ def samples_of(run: Run) -> dict[str, Array]:
 
 def levels_of(run: Run) -> dict[str, Array]:
     """
-    Return the levels that drove a run.
+    Return the levels that drove a run by the name of their column.
 
-    Parameters
-    ----------
-    run : Run
-        As read.
-
-    Returns
-    -------
-    dict of str to ndarray, shape (m,)
-        ``time`` in s from the first sample and ``flux_density`` in T, in force from then on:
-        applied, else commanded, else as measured.
-
+    ``time`` in s from the first sample and ``flux_density`` in T, in force from then on: applied,
+    else commanded, else as measured.
     """
     stamps = np.array([x.stamp for x in run.levels], dtype=np.int64)
     return {'time': _seconds(run, stamps),
@@ -70,20 +52,10 @@ def _seconds(run: Run, stamps: NDArray[np.int64]) -> Array:
 
 def write_table(path: Path, columns: Mapping[str, Array]) -> None:
     """
-    Write columns as CSV or Parquet, in full double precision.
+    Write columns as CSV or Parquet, by the ending of the name, in full double precision.
 
-    Parameters
-    ----------
-    path : Path
-        Ending in .csv or .parquet; an existing file is replaced.
-    columns : mapping of str to ndarray
-        Of one length; NaN is left empty in CSV.
-
-    Raises
-    ------
-    BadInputError
-        If the name ends otherwise, pyarrow is missing, or the file cannot be written.
-
+    NaN is left empty in CSV. Raises `BadInputError` if the name ends otherwise, pyarrow is
+    missing, or the file cannot be written.
     """
     kind = path.suffix.lower()
     if kind not in SUFFIXES:

@@ -27,11 +27,7 @@ def topics_by_joint(reader: BagReader) -> dict[str, dict[str, dict[str, str]]]:
     """
     Return topics by namespace, joint (empty for the only one) and role.
 
-    Raises
-    ------
-    BadInputError
-        If there are no joint states, or commands in other namespaces only.
-
+    Raises `BadInputError` if there are no joint states, or commands in other namespaces only.
     """
     names: dict[str, list[tuple[str, str]]] = {role: [] for role in TYPES}
     for topic in reader.topics.values():

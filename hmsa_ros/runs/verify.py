@@ -41,41 +41,20 @@ _AT_REST = 1e-6
 
 @dataclass(frozen=True)
 class Verification:
-    """
-    Recorded against integrated motion.
+    """Recorded against integrated motion."""
 
-    Attributes
-    ----------
-    states, commands : str
-        The topics compared.
-    sample_count, command_count : int
-        Messages compared and applied.
-    late_count : int
-        Commands that came after their stamp, so that the moment of their effect is not known;
-        none where the plant reported it.
-    largest_difference : float
-        Of the stretch, or of a beam's deflection; dimensionless.
-    where : float
-        Time of it after the first sample, in seconds.
-    note : str
-        What a reader should know: losses, noise, what was left out.
-    left_out : int
-        Messages that could not be used, since they are not what their topic is for.
-    unapplied_count : int
-        Changes of level that were commanded and never took effect, as the plant reported.
-
-    """
-
-    states: str
+    states: str  # the topics compared
     commands: str
-    sample_count: int
+    sample_count: int  # messages compared and applied
     command_count: int
+    # Commands that came after their stamp, so that the moment of their effect is not known; none
+    # where the plant reported it.
     late_count: int
-    largest_difference: float
-    where: float
-    note: str = ''
-    left_out: int = 0
-    unapplied_count: int = 0
+    largest_difference: float  # of the stretch, or of a beam's deflection; dimensionless
+    where: float  # time of it after the first sample, in s
+    note: str = ''  # losses, noise, what was left out
+    left_out: int = 0  # messages that are not what their topic is for
+    unapplied_count: int = 0  # changes of level that never took effect, as reported
 
 
 def verify(
@@ -115,23 +94,8 @@ def verify_run(run: Run) -> Verification:
     """
     Integrate what drove one actuator and compare with its samples.
 
-    Parameters
-    ----------
-    run : Run
-        With commands or applied levels, and parameters.
-
-    Returns
-    -------
-    Verification
-        The largest difference, and what may explain it.
-
-    Raises
-    ------
-    BadInputError
-        If there is nothing to integrate, the actuator is not known, or there are several runs.
-    HmsaError
-        If the integration does not get through.
-
+    Raises `BadInputError` if there is nothing to integrate, the actuator is not known, or there
+    are several runs, `HmsaError` if the integration does not get through.
     """
     if run.summary is not None and len(run.summary.files) > 1 and (
             jumps := run.summary.custom_data.get('time_jumps', '0')) != '0':
