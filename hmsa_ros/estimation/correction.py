@@ -39,21 +39,10 @@ _LEAST, _TRIED = 0.15, (0.5, 1.0, 1.6)
 
 def caution(count: int, noise: float) -> float:
     """
-    Return how many times as long a cautious move takes.
+    Return how many times as long a cautious move takes, by the number of estimated parameters.
 
-    Parameters
-    ----------
-    count : int
-        Parameters that are estimated: three times as long for three, five times for six.
-    noise : float
-        Of a sample, as a share of the step; each doubling of it above 0.4 % adds one more, up to
-        two.
-
-    Returns
-    -------
-    float
-        At least 3.
-
+    Three times as long for three, five times for six; each doubling of the noise of a sample above
+    0.4 % of the step adds one more, up to two.
     """
     more = math.log2(max(noise, _QUIET) / _QUIET)
     return max(3.0, 1.0 + 2.0 * count / 3.0) + min(more, 2.0)
@@ -61,26 +50,13 @@ def caution(count: int, noise: float) -> float:
 
 @dataclass(frozen=True)
 class Course:
-    """
-    Levels to a target.
+    """Levels to a target."""
 
-    Attributes
-    ----------
-    levels : tuple of (int, float)
-        Stamp in ns and level in T, by time; the last one holds.
-    arrival : int
-        Time in ns of rest at the target.
-    target : float
-        Stretch.
-    relaxed : float
-        Level in T that holds it once branches have relaxed; NaN for the last level.
-
-    """
-
+    # Stamp in ns and level in T, by time; the last one holds.
     levels: tuple[tuple[int, float], ...]
-    arrival: int
-    target: float
-    relaxed: float = math.nan
+    arrival: int  # time in ns of rest at the target
+    target: float  # stretch
+    relaxed: float = math.nan  # level in T that holds it once branches have relaxed; NaN: the last
 
     @property
     def holding(self) -> float:
@@ -95,45 +71,21 @@ class Course:
 
 @dataclass(frozen=True)
 class Expectation:
-    """
-    What is expected to be left at the end of a course.
+    """What is expected to be left at the end of a course."""
 
-    Attributes
-    ----------
-    amplitude, offset : float
-        Of the most probable motion: of the vibration, and of the rest from the target.
-    size : float
-        Root of the expected square of both together.
-
-    """
-
-    amplitude: float
-    offset: float
-    size: float
+    amplitude: float  # of the vibration in the most probable motion
+    offset: float  # of its rest from the target
+    size: float  # root of the expected square of both together
 
 
 def expect(
         estimate: Estimate, course: Course, slew_limit: float = math.inf,
         until: int = 0) -> Expectation:
     """
-    Return what a course is expected to leave.
+    Return what a course is expected to leave; infinite where the motion cannot be followed.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        State and parameters at a time from which on the course may still be changed.
-    course : Course
-        With the level in force then.
-    slew_limit : float
-        Of the amplifier in T/s; infinite for steps.
-    until : int
-        Time in ns at which it counts, if the course ends sooner: vibration decays meanwhile.
-
-    Returns
-    -------
-    Expectation
-        Infinite where the motion cannot be followed.
-
+    The estimate is of a time from which on the course may still be changed; the course has the
+    level in force then. If it ends before `until`, in ns, that counts: vibration decays meanwhile.
     """
     nothing = Expectation(math.inf, math.inf, math.inf)
     begin = estimate.time
@@ -166,24 +118,8 @@ def patience(
     """
     Return how many times as long a move is to take: 1, or `caution` where it may leave too much.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        At the begin of the move.
-    course : Course
-        As planned.
-    step : float
-        Change of stretch, above 0.
-    slew_limit : float
-        Of the amplifier in T/s; infinite for steps.
-    tolerance : float
-        Share of the step from which on that is too much.
-
-    Returns
-    -------
-    float
-        At least 1.
-
+    The estimate is of the begin of the move, the step its change of stretch, above 0, and the
+    tolerance the share of the step from which on that is too much.
     """
     if expect(estimate, course, slew_limit).size <= tolerance * step:
         return 1.0
@@ -196,18 +132,9 @@ def worthwhile(before: float, after: float, noise: float, least: float = 0.0) ->
 
 
 class Corrector:
-    """
-    Plans courses from estimates.
-
-    Parameters
-    ----------
-    options : Options
-        Limits and properties of coil and amplifier; an estimated lag takes the place of theirs.
-
-    """
+    """Plans courses from estimates; an estimated lag takes the place of that in the options."""
 
     def __init__(self, options: Options) -> None:
-        """Begin with no model."""
         self.options = options
 
     def model(self, estimate: Estimate) -> Model:
@@ -220,36 +147,11 @@ class Corrector:
             shaper: str = 'two_step', order: int = 2,
             tolerance: float = math.inf) -> Course:
         """
-        Plan a move.
+        Plan a move from the level in force, in T, to a stretch; refuse one that cannot be reached.
 
-        Where it is expected to leave too much, its levels stay, since their early effect shows
-        what the actuator is, but it gets more time, by `caution`, for corrections until rest.
-
-        Parameters
-        ----------
-        estimate : Estimate
-            At the begin of the move.
-        target : float
-            Stretch.
-        in_force : float
-            Level in T before.
-        shaper : str
-            Name.
-        order : int
-            Of the robust shaper.
-        tolerance : float
-            Share of the step from which on that is too much.
-
-        Returns
-        -------
-        Course
-            From the begin on.
-
-        Raises
-        ------
-        RefusedError
-            If the target cannot be reached.
-
+        Where it is expected to leave more than a share of the step, its levels stay, since their
+        early effect shows what the actuator is, but it gets more time, by `caution`, for
+        corrections until rest.
         """
         model = self.model(estimate)
         move = get_shaper(shaper)(replace(
@@ -265,20 +167,10 @@ class Corrector:
 
     def correct(self, estimate: Estimate, course: Course) -> Course | None:
         """
-        Plan what is left of a move anew, where that is expected to leave less.
+        Plan what is left of a move anew, where that is expected to leave less; else None.
 
-        Parameters
-        ----------
-        estimate : Estimate
-            At the time from which on levels may be changed.
-        course : Course
-            In force.
-
-        Returns
-        -------
-        Course or None
-            With the levels before; None where the course in force is to be kept.
-
+        The estimate is of the time from which on levels may be changed; those of the course in
+        force before that time stay.
         """
         if not estimate.trusted:
             return None

@@ -42,40 +42,16 @@ _KEPT, _LONGEST, _FEWEST = 0.5, 200.0, 20
 
 @dataclass(frozen=True)
 class Options:
-    """
-    How to estimate.
+    """How to estimate."""
 
-    Attributes
-    ----------
-    window : int
-        Largest number of samples in the horizon, at least 10.
-    noise : float
-        Standard deviation of a sample of stretch; 0 to estimate it.
-    learn : bool
-        Whether parameters are estimated from the first sample on; else the state alone.
-    gate : float
-        Deviations of the innovation from which a sample is rejected.
-    drift : float
-        Share of the prior's spread that a parameter may wander in a second.
-    slew_limit : float
-        Of the amplifier in T/s; infinite for steps.
-
-    Raises
-    ------
-    BadInputError
-        If a value is out of range.
-
-    """
-
-    window: int = 120
-    noise: float = 0.0
-    learn: bool = True
-    gate: float = 6.0
-    drift: float = 0.003
-    slew_limit: float = math.inf
+    window: int = 120  # largest number of samples in the horizon
+    noise: float = 0.0  # standard deviation of a sample of stretch; 0 to estimate it
+    learn: bool = True  # estimate parameters from the first sample on; else the state alone
+    gate: float = 6.0  # deviations of the innovation from which a sample is rejected
+    drift: float = 0.003  # share of the prior's spread that a parameter may wander in a second
+    slew_limit: float = math.inf  # of the amplifier in T/s; infinite for steps
 
     def __post_init__(self) -> None:
-        """Check the values."""
         for name, least in (('window', 10), ('noise', 0.0), ('gate', 1.0), ('drift', 0.0)):
             if not least <= getattr(self, name) < math.inf:
                 raise BadInputError(
@@ -84,42 +60,19 @@ class Options:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """
-    What is believed at a time.
+    """What is believed at a time."""
 
-    Attributes
-    ----------
-    time : int
-        In ns.
-    stretch, rate : float
-        Of the block, the rate in 1/s.
-    values : dict of str to float
-        Of all quantities; of branches that are given as `hmsa_ros.estimation.motion.follow` says.
-    free : tuple of str
-        Those that are tracked.
-    deviations : dict of str to float
-        Standard deviations of these, in SI.
-    covariance : ndarray, shape (p + 2, p + 2)
-        Of the coordinates of these, of stretch and of rate.
-    noise : float
-        Standard deviation of a sample.
-    trusted : bool
-        Whether it may be acted upon.
-    trouble : str
-        Why not; empty if it may.
-
-    """
-
-    time: int
+    time: int  # in ns
     stretch: float
-    rate: float
+    rate: float  # of the block in 1/s
+    # Of all quantities; see `hmsa_ros.estimation.motion.follow` for branches.
     values: dict[str, Any]
-    free: tuple[str, ...]
-    deviations: dict[str, float]
-    covariance: Array
-    noise: float
-    trusted: bool
-    trouble: str
+    free: tuple[str, ...]  # those that are tracked
+    deviations: dict[str, float]  # standard ones of these, in SI
+    covariance: Array  # of the coordinates of these, of stretch and of rate
+    noise: float  # standard deviation of a sample
+    trusted: bool  # whether it may be acted upon
+    trouble: str  # why not; empty if it may
 
     @property
     def actuator(self) -> ActuatorParameters:
@@ -128,38 +81,14 @@ class Estimate:
 
 
 class Estimator:
-    """
-    Tracks one actuator.
-
-    Parameters
-    ----------
-    prior : Prior
-        What is known before.
-    options : Options, optional
-        How to estimate.
-
-    Attributes
-    ----------
-    prior : Prior
-        As given.
-    options : Options
-        As given.
-    noise : float
-        Standard deviation of a sample, as far as it is known.
-    screening : Screening
-        What was rejected, and why.
-    learning : bool
-        Whether parameters are estimated; else they stay as they are from the next update on,
-        and the state alone is followed.
-
-    """
+    """Tracks one actuator."""
 
     def __init__(self, prior: Prior, options: Options | None = None) -> None:
-        """Begin with no sample and no field."""
         self.prior = prior
         self.options = options or Options()
         self.noise = self.options.noise or _FIRST_NOISE
         self.screening = Screening(self.options.gate, self.prior.coordinate)
+        # Else parameters stay as they are from the next update on.
         self.learning = self.options.learn
         # Covariance of the parameters while they stay as they are.
         self._fixed: Array | None = None
@@ -180,22 +109,7 @@ class Estimator:
         self._levels = [x for x in self._levels if x[0] < first] + list(levels)
 
     def sample(self, stamp: int, stretch: float) -> bool:
-        """
-        Take in a sample; it counts at the next `update`.
-
-        Parameters
-        ----------
-        stamp : int
-            Time in ns at which it was taken.
-        stretch : float
-            Measured.
-
-        Returns
-        -------
-        bool
-            Whether it can count.
-
-        """
+        """Take in a stretch measured at a stamp in ns; return whether it can count."""
         if not self.screening.readable(stretch):
             return False
         if self._window is not None and stamp < self._origin + round(
@@ -223,18 +137,9 @@ class Estimator:
 
     def update(self, time: int) -> Estimate | None:
         """
-        Take samples into account and predict.
+        Take samples into account, and predict the state at a time in ns.
 
-        Parameters
-        ----------
-        time : int
-            In ns: for when the state is wanted; levels until then have been taken in.
-
-        Returns
-        -------
-        Estimate or None
-            None before the first sample.
-
+        Levels until then have been taken in. None before the first sample.
         """
         if self._window is None and not self._pending:
             return None
@@ -256,19 +161,11 @@ class Estimator:
 
     def predict(self, time: int) -> Estimate | None:
         """
-        Return what is believed of a time ahead, without taking in anything.
+        Return what is believed of a time in ns ahead, without taking in anything.
 
-        Parameters
-        ----------
-        time : int
-            In ns, not before that of the last `update`; levels until then have been taken in.
-
-        Returns
-        -------
-        Estimate or None
-            Before the first update what the prior says of rest; None if the motion cannot be
-            followed.
-
+        It is not before that of the last `update`, and levels until then have been taken in.
+        Before the first update it is what the prior says of rest. None if the motion cannot be
+        followed.
         """
         window, found = self._window, self._solution
         if window is None:

@@ -27,21 +27,11 @@ _FINE, _MOST = 0.05, 4000
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """
-    What the amplifier is told, over time.
+    """What the amplifier is told, over time."""
 
-    Attributes
-    ----------
-    times, values : ndarray, shape (m,)
-        In s, increasing, and in T.
-    slew_limit : float
-        Rate in T/s at which the amplifier ramps; infinite for steps.
-
-    """
-
-    times: Array
-    values: Array
-    slew_limit: float = math.inf
+    times: Array  # in s, increasing, shape (m,)
+    values: Array  # in T, shape (m,)
+    slew_limit: float = math.inf  # rate in T/s at which the amplifier ramps; infinite for steps
 
     def field(self, time: float, lag: float) -> float:
         """Return the field in T at a time in s behind a lag in s."""
@@ -58,44 +48,16 @@ class Levels:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """
-    A simulated motion.
+    """A simulated motion of the block."""
 
-    Attributes
-    ----------
-    stretch, rate : ndarray, shape (n,)
-        Of the block, the rate in 1/s.
-    by, rate_by : ndarray, shape (n, p + 2)
-        Derivatives of both by the coordinates of the free parameters and by stretch and rate at
-        the begin; 0 for parameters of the sensor.
-
-    """
-
-    stretch: Array
-    rate: Array
-    by: Array
+    stretch: Array  # shape (n,)
+    rate: Array  # in 1/s, shape (n,)
+    by: Array  # by the coordinates of the free parameters, and by stretch and rate at the begin
     rate_by: Array
 
     def measured(
             self, values: Mapping[str, float], free: Sequence[str]) -> tuple[Array, Array]:
-        """
-        Return what the sensor shows.
-
-        Parameters
-        ----------
-        values : mapping of str to float
-            Of all quantities.
-        free : sequence of str
-            As simulated.
-
-        Returns
-        -------
-        stretch : ndarray, shape (n,)
-            Measured.
-        by : ndarray, shape (n, p + 2)
-            Its derivatives.
-
-        """
+        """Return what the sensor shows, shape (n,), and its derivatives, shape (n, p + 2)."""
         gain = values['stretch_gain']
         by = gain * self.by
         for j, name in enumerate(free):
@@ -112,30 +74,11 @@ def follow(
         values: Mapping[str, Any], free: Sequence[str], state: tuple[float, float],
         levels: Levels, begin: float, times: Array) -> Motion | None:
     """
-    Simulate a motion.
+    Simulate a motion from stretch and rate (1/s) at a begin in s to times not before it.
 
-    Parameters
-    ----------
-    values : mapping of str to float
-        Of all quantities, complete; and where branches are given, how far what they have followed
-        is from the elastic force at the begin, in units of G, under the name ``behind``; default
-        relaxed.
-    free : sequence of str
-        By which to differentiate.
-    state : (float, float)
-        Stretch, and rate in 1/s, at the begin.
-    levels : Levels
-        Those before the begin count where the field lags.
-    begin : float
-        In s.
-    times : ndarray, shape (n,)
-        In s, not decreasing, from the begin on.
-
-    Returns
-    -------
-    Motion or None
-        None if it meets the limits of the chains.
-
+    Where ``creep`` is among the values, ``behind`` says how far what its branches have followed is
+    from the elastic force at the begin, in units of G; without it they have relaxed. Levels before
+    the begin count where the field lags. None if the motion meets the limits of the chains.
     """
     setup = Setup.of(values, free)
     theta = setup.theta
@@ -191,20 +134,9 @@ def behind(
         values: Mapping[str, Any], state: tuple[float, float], levels: Levels, begin: float,
         time: float) -> tuple[float, ...]:
     """
-    Return how far what branches have followed is from the elastic force at a later time.
+    Return how far what branches have followed is from the elastic force at a later time in s.
 
-    Parameters
-    ----------
-    values, state, levels, begin
-        As for `follow`.
-    time : float
-        In s, not before the begin.
-
-    Returns
-    -------
-    tuple of float
-        In units of G; empty where none are given.
-
+    It is in units of G, and empty where there are none; the rest is as for `follow`.
     """
     creep = values.get('creep')
     if not creep:
@@ -257,23 +189,10 @@ def rest(
         values: Mapping[str, Any], free: Sequence[str], level: float
 ) -> tuple[float, float, Array] | None:
     """
-    Return where a level holds the block once its branches have relaxed.
+    Return where a level in T holds the block once its branches have relaxed; None if nowhere.
 
-    Parameters
-    ----------
-    values : mapping of str to float
-        Of all quantities, complete.
-    free : sequence of str
-        By which to differentiate.
-    level : float
-        In T.
-
-    Returns
-    -------
-    (float, float, ndarray), or None
-        Stretch, natural frequency there in 1/s, and derivatives of the stretch by the coordinates
-        of the free parameters, shape (p,); None if nothing holds it.
-
+    That is the stretch, the natural frequency there in 1/s, and the derivatives of the stretch by
+    the coordinates of the free parameters, shape (p,).
     """
     setup = Setup.of(values, free)
     start = np.zeros(len(setup.wanted))

@@ -37,26 +37,14 @@ TRACKED = ('shear_modulus', 'damping_coefficient', 'stretch_bias')
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """
-    Values and how far each may be off.
+    """Values and how far each may be off."""
 
-    Attributes
-    ----------
-    values : dict of str to object
-        Of all quantities, the law, and the branches of an elastomer that creeps.
-    free : tuple of str
-        What is tracked.
-    covariance : ndarray, shape (p, p)
-        Of the coordinates of these.
-    spread : ndarray, shape (p,)
-        Deviations of the coordinates of a block that was never identified: they bound how far
-        an estimate may go, and how fast, since a block changes after its identification.
-
-    """
-
+    # Of all quantities, the law, and the branches of an elastomer that creeps.
     values: dict[str, Any]
-    free: tuple[str, ...]
-    covariance: Array
+    free: tuple[str, ...]  # what is tracked
+    covariance: Array  # of the coordinates of these, shape (p, p)
+    # Deviations of the coordinates of a block that was never identified, shape (p,); they bound
+    # how far an estimate may go, and how fast, since a block changes after its identification.
     spread: Array
 
     @classmethod
@@ -67,21 +55,8 @@ class Prior:
         """
         Return what is known of a block that was never identified.
 
-        Parameters
-        ----------
-        actuator : ActuatorParameters
-            Nominal.
-        free : sequence of str
-            What is tracked.
-        others : mapping of str to float, optional
-            Of coil and sensor, where they are not the defaults.
-        deviations : mapping of str to float, optional
-            In place of some of `DEVIATIONS`.
-
-        Returns
-        -------
-        Prior
-            Without correlation.
+        Others are values of coil and sensor that are not the defaults, and deviations replace some
+        of `DEVIATIONS`.
 
         Raises
         ------
@@ -124,19 +99,9 @@ class Prior:
 
     def informed(self, known: Known) -> 'Prior':
         """
-        Return the prior of a block that was identified.
+        Return the prior of a block that was identified; as before for what was not.
 
-        Parameters
-        ----------
-        known : Known
-            How well parameters are known; those of the block and the coil have the values of
-            this prior.
-
-        Returns
-        -------
-        Prior
-            As before for what was not identified.
-
+        Parameters of block and coil keep the values of this prior.
         """
         values = dict(self.values)
         for name in _SENSED:

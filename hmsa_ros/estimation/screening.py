@@ -18,30 +18,17 @@ _EQUAL, _MOTION = 4, 8.0
 
 class Screening:
     """
-    Rejects samples, and says what is wrong with the sensor.
+    Rejects samples from so many deviations of the innovation on, and says what is wrong.
 
-    Parameters
-    ----------
-    gate : float
-        Deviations of the innovation from which a sample is rejected.
-    coordinate : Coordinate
-        What samples are.
-
-    Attributes
-    ----------
-    unreadable, repeated, late, rejected, frozen : int
-        How many were no number, came twice, came after their time was over, did not fit, or
-        repeated a value while the actuator moved.
-    trouble : str
-        Why nothing should be built on samples; empty if nothing speaks against it.
+    Counts are those of values that are no number, came twice, came after their time was over, did
+    not fit, or were repeated while the actuator moved.
 
     """
 
     def __init__(self, gate: float, coordinate: Coordinate = STRETCH) -> None:
-        """Begin with a sensor that works."""
         self._gate, self._conceivable = gate, coordinate.conceivable
         self.unreadable = self.repeated = self.late = self.rejected = self.frozen = 0
-        self.trouble = ''
+        self.trouble = ''  # why nothing should be built on samples
         self._in_a_row = self._fitted = 0
         self._last: list[tuple[float, float]] = []
 
@@ -56,26 +43,9 @@ class Screening:
             self, window: Window, found: Solution, levels: Levels, times: Array,
             stretch: Array, noise: float) -> Array:
         """
-        Return which samples fit the motion believed.
+        Return which samples fit the motion believed, shape (n,).
 
-        Parameters
-        ----------
-        window : Window
-            Without them.
-        found : Solution
-            Of the window.
-        levels : Levels
-            In force.
-        times, stretch : ndarray, shape (n,)
-            The samples, in s by increasing time.
-        noise : float
-            Standard deviation of a sample.
-
-        Returns
-        -------
-        ndarray of bool, shape (n,)
-            True for those that count.
-
+        Their times are in s, increasing; the window does not have them yet.
         """
         kept = np.ones(len(times), dtype=bool)
         motion = follow(

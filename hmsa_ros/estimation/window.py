@@ -30,32 +30,14 @@ _STRIDE = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """
-    The most probable motion.
+    """The most probable motion."""
 
-    Attributes
-    ----------
-    z : ndarray, shape (q,)
-        Coordinates, stretch and rate at the begin.
-    values : dict of str to float
-        Of all quantities.
-    motion : Motion
-        At the samples, and at the time asked for last.
-    residual : ndarray, shape (n,)
-        Measured less simulated.
-    weights : ndarray, shape (n,)
-        How far each counts, 0 to 1.
-    covariance : ndarray, shape (q, q)
-        Of ``z``.
-
-    """
-
-    z: Array
-    values: dict[str, Any]
-    motion: Motion
-    residual: Array
-    weights: Array
-    covariance: Array
+    z: Array  # coordinates, stretch and rate at the begin, shape (q,)
+    values: dict[str, Any]  # of all quantities
+    motion: Motion  # at the samples, and at the time asked for last
+    residual: Array  # measured less simulated, shape (n,)
+    weights: Array  # how far each counts, 0 to 1
+    covariance: Array  # of z
 
     def at_end(self) -> tuple[Array, Array]:
         """Return coordinates, stretch and rate at the time asked for, and their covariance."""
@@ -75,35 +57,15 @@ def transport(motion: Motion, place: int) -> Array:
 
 @dataclass(eq=False)
 class Window:
-    """
-    Samples, and what is known besides them; times in s from the same instant.
+    """Samples, and what is known besides them; times in s from the same instant."""
 
-    Attributes
-    ----------
-    values : dict of str to float
-        Of all quantities; those not free stay.
-    free : tuple of str
-        What is sought.
-    mean : ndarray, shape (q,)
-        Prior.
-    covariance : ndarray, shape (q, q)
-        Of the prior.
-    bounds : ndarray, shape (p, 2)
-        Coordinates are kept in them.
-    begin : float
-        Time of the stretch and rate that are sought.
-    time, stretch : ndarray, shape (n,)
-        Samples, from the begin on.
-
-    """
-
-    values: dict[str, Any]
-    free: tuple[str, ...]
-    mean: Array
-    covariance: Array
-    bounds: Array
-    begin: float
-    time: Array
+    values: dict[str, Any]  # of all quantities; those not free stay
+    free: tuple[str, ...]  # what is sought
+    mean: Array  # of the prior, shape (q,)
+    covariance: Array  # of the prior, shape (q, q)
+    bounds: Array  # coordinates are kept in them, shape (p, 2)
+    begin: float  # time of the stretch and rate that are sought
+    time: Array  # of the samples, from the begin on
     stretch: Array
 
     def values_at(self, z: Array) -> dict[str, Any]:
@@ -115,24 +77,10 @@ class Window:
 
     def solve(self, z: Array, levels: Levels, noise: float, until: float) -> Solution | None:
         """
-        Seek the most probable motion.
+        Seek the most probable motion from coordinates on; None if none can be followed from there.
 
-        Parameters
-        ----------
-        z : ndarray, shape (q,)
-            Where to begin the search.
-        levels : Levels
-            In force.
-        noise : float
-            Standard deviation of a sample.
-        until : float
-            Time up to which the motion is wanted, not before the last sample.
-
-        Returns
-        -------
-        Solution or None
-            None if no motion can be followed from there.
-
+        The noise is the standard deviation of a sample. The motion is wanted until a time that is
+        not before the last sample.
         """
         prior: Array = np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
         times = np.append(self.time, until)
@@ -198,26 +146,10 @@ class Window:
             self, count: int, begin: float, solution: Solution, noise: float,
             drift: Array) -> 'Window':
         """
-        Return the window from a later sample on.
+        Return the window without the first samples, and with a prior that knows them.
 
-        Parameters
-        ----------
-        count : int
-            Samples that leave it.
-        begin : float
-            Of the new one: time of the next sample, or the time asked for last.
-        solution : Solution
-            Of the whole window.
-        noise : float
-            Standard deviation of a sample.
-        drift : ndarray, shape (q,)
-            Variance that parameters and state gain on the way.
-
-        Returns
-        -------
-        Window
-            With a prior that knows the samples that have left.
-
+        It begins at the time of the next sample, or at the time asked for last. The drift is the
+        variance that parameters and state gain on the way, shape (q,).
         """
         _, by = solution.motion.measured(solution.values, self.free)
         by, weights = by[:count], solution.weights[:count, None]

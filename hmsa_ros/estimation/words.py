@@ -29,40 +29,12 @@ _ABSOLUTE = {
 
 
 def differences(estimate: Estimate, nominal: Mapping[str, Any]) -> list[str]:
-    """
-    Return which parameters differ from what was known of them.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        What is believed.
-    nominal : mapping of str to object
-        Values of all quantities before, and the law.
-
-    Returns
-    -------
-    list of str
-        Such as ``G about +20 %``.
-
-    """
+    """Return which parameters differ from what was known of them, such as ``G about +20 %``."""
     return list(_differences(estimate, nominal))
 
 
 def confounded(estimate: Estimate) -> bool:
-    """
-    Return whether a bias of the sensor and a constant force cannot be told apart yet.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        What is believed.
-
-    Returns
-    -------
-    bool
-        False where not both are tracked.
-
-    """
+    """Return whether a tracked bias of the sensor and a constant force look alike as yet."""
     if not set(_PAIR) <= set(estimate.free):
         return False
     i, j = (estimate.free.index(x) for x in _PAIR)
@@ -93,28 +65,9 @@ def sentence(
         estimate: Estimate, nominal: Mapping[str, Any], holding: float, target: float,
         start: float, amplitude: float, *, adapting: bool) -> str:
     """
-    Return what is wrong, and what mends it.
+    Return what is wrong, and what mends it, in a sentence without its stop.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        What is believed.
-    nominal : mapping of str to object
-        Values of all quantities before, and the law.
-    holding : float
-        Level in T that holds the target, as planned.
-    target, start : float
-        Stretch to rest at, and the one before.
-    amplitude : float
-        Of the vibration about the rest.
-    adapting : bool
-        Whether plans use the estimate.
-
-    Returns
-    -------
-    str
-        One sentence without its stop.
-
+    The level in T holds the target as planned; the amplitude is that of the vibration about rest.
     """
     if not estimate.trusted:
         return f'{estimate.trouble}: open loop until samples fit again'

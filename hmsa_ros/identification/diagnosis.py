@@ -59,40 +59,17 @@ def allowed(fit: Fit) -> Array:
 
 @dataclass(frozen=True)
 class Weakness:
-    """
-    Parameters, or a combination of them, that the data do not hold.
+    """Parameters, or a combination of them, that the data do not hold."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Parameters without a number.
-    words : str
-        What is not held, and what to record instead.
-
-    """
-
-    names: tuple[str, ...]
-    words: str
+    names: tuple[str, ...]  # parameters without a number
+    words: str  # what is not held, and what to record instead
 
 
 def weakness(fit: Fit, deviation: float, factors: Array) -> Weakness | None:
     """
-    Return what the data do not hold.
+    Return what the data do not hold; None if every number can be given.
 
-    Parameters
-    ----------
-    fit : Fit
-        The optimum.
-    deviation : float
-        Standard deviation of a sample.
-    factors : ndarray, shape (p,)
-        By which correlation widens the deviations.
-
-    Returns
-    -------
-    Weakness or None
-        None if every number can be given.
-
+    The deviation is that of a sample; correlation widens those of the parameters by the factors.
     """
     limits = allowed(fit)
     scaled = limits / np.maximum(factors, 1.0) / deviation
@@ -203,27 +180,10 @@ def signatures(
         recording: Recording, fit: Fit, found: Whiteness, *, at_rest: bool
 ) -> tuple[Signature, ...]:
     """
-    Look in the residuals for what the model leaves out.
+    Look in the residuals for what the model leaves out; the largest comes first.
 
-    Each candidate is a direction; what the free parameters could do of it is taken off first.
-    Its size is held against the noise that would be left without it.
-
-    Parameters
-    ----------
-    recording : Recording
-        What was measured.
-    fit : Fit
-        The optimum.
-    found : Whiteness
-        Of the residuals.
-    at_rest : bool
-        Whether the motion began at rest.
-
-    Returns
-    -------
-    tuple of Signature
-        The largest first.
-
+    Each candidate is a direction; what the free parameters could do of it is taken off first. Its
+    size is held against the noise that would be left without it.
     """
     root = fit.root
     known = np.hstack([fit.response.jacobian, fit.response.by_switch])
@@ -359,15 +319,6 @@ def check_plausible(recording: Recording, fit: Fit, unknown: Sequence[str] = ())
     """
     Refuse what can only come from data in other units.
 
-    Parameters
-    ----------
-    recording : Recording
-        What was measured.
-    fit : Fit
-        The optimum.
-    unknown : sequence of str
-        Free parameters without a number.
-
     Raises
     ------
     BadInputError
@@ -397,26 +348,7 @@ def check_plausible(recording: Recording, fit: Fit, unknown: Sequence[str] = ())
 def misfit(
         recording: Recording, fit: Fit, found: Whiteness, marks: Sequence[Signature]
 ) -> str:
-    """
-    Return why the model is rejected, empty if it is not.
-
-    Parameters
-    ----------
-    recording : Recording
-        What was measured.
-    fit : Fit
-        The optimum.
-    found : Whiteness
-        Of the residuals.
-    marks : sequence of Signature
-        What was looked for.
-
-    Returns
-    -------
-    str
-        A sentence with the figures.
-
-    """
+    """Return why the model is rejected, with the figures; empty if it is not."""
     motion = float(np.std(recording.stretch))
     figures = (
         f'residuals of {fit.scale:.3g} with an autocorrelation of '

@@ -51,33 +51,16 @@ _REST = 1e-3  # deviation from rest at the end, stretch
 
 @dataclass(frozen=True)
 class Bounds:
-    """
-    What a sequence has to keep within.
+    """What a sequence has to keep within."""
 
-    Attributes
-    ----------
-    flux_density_min, flux_density_max : float
-        In T.
-    slew_limit : float
-        In T/s; infinite for steps.
-    stretch_min, stretch_max : float, optional
-        Of the whole motion; default 0.6 and 2, deflections of -0.6 and 0.6 for a beam.
-
-    Raises
-    ------
-    BadInputError
-        If a range is empty or does not hold rest.
-
-    """
-
-    flux_density_min: float = -0.5
-    flux_density_max: float = 0.5
-    slew_limit: float = math.inf
+    flux_density_min: float = -0.5  # in T
+    flux_density_max: float = 0.5  # in T
+    slew_limit: float = math.inf  # in T/s; infinite for steps
+    # Of the whole motion; default 0.6, a deflection of -0.6 for a beam.
     stretch_min: float | None = None
-    stretch_max: float | None = None
+    stretch_max: float | None = None  # default 2, or 0.6
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         if not self.flux_density_min <= 0.0 < self.flux_density_max < math.inf:
             raise BadInputError(
                 f'flux densities from {self.flux_density_min:g} to {self.flux_density_max:g} T: '
@@ -111,52 +94,24 @@ class Bounds:
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """
-    A sequence of levels and the information in it.
+    """A sequence of levels and the information in it."""
 
-    Attributes
-    ----------
-    level_times, levels : ndarray, shape (m,)
-        Flux density in T from each time in s on.
-    std : dict of str to float
-        Standard deviation that its recording leaves, by name; relative but for those that may
-        be 0.
-    information : float
-        Logarithm of the determinant of the information matrix; minus infinity if singular.
-    reach : tuple of float
-        Least and largest stretch.
-    ends_at_rest : bool
-        Whether nothing moves at the end.
-
-    """
-
-    level_times: Array
-    levels: Array
-    std: dict[str, float]
-    information: float
-    reach: tuple[float, float]
-    ends_at_rest: bool
+    level_times: Array  # in s
+    levels: Array  # flux density in T from each time on
+    std: dict[str, float]  # that its recording leaves, relative but for what may be 0
+    information: float  # logarithm of the determinant of the information matrix
+    reach: tuple[float, float]  # least and largest stretch
+    ends_at_rest: bool  # whether nothing moves at the end
 
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """
-    The sequence to record, beside others of the same duration.
+    """The sequence to record, beside others of the same duration."""
 
-    Attributes
-    ----------
-    duration : float
-        In s.
-    best, plain, paper : Program
-        The one to record, plain steps to 0.1 and 0.4 from rest and back, and the paper's shaped
-        sequence.
-
-    """
-
-    duration: float
+    duration: float  # in s
     best: Program
-    plain: Program
-    paper: Program
+    plain: Program  # steps to 0.1 and 0.4 from rest and back
+    paper: Program  # the paper's shaped sequence
 
     @property
     def improvement(self) -> float:
@@ -179,25 +134,8 @@ class Designer:
     """
     Searches sequences for one actuator.
 
-    Parameters
-    ----------
-    actuator : ActuatorParameters
-        The block as far as it is known.
-    bounds : Bounds
-        What to keep within.
-    duration : float
-        Of the sequence in s.
-    rate : float
-        Samples per second.
-    noise : float
-        Standard deviation of a sample.
-    free : sequence of str
-        What shall be found.
-
-    Raises
-    ------
-    BadInputError
-        If the duration holds no sequence, or a number is out of range.
+    The duration is in s, the rate in samples per second, and the noise the standard deviation of a
+    sample. A duration that holds no sequence is refused.
 
     """
 
@@ -205,7 +143,6 @@ class Designer:
             self, actuator: ActuatorParameters, bounds: Bounds, duration: float, *,
             rate: float = 1000.0, noise: float = 1e-3,
             free: Sequence[str] = DEFAULT_FREE) -> None:
-        """Check duration and rate."""
         least, most = bounds.of_motion(actuator)
         self._actuator, self._bounds, self._noise = actuator, bounds, noise
         self._free = check_free(free, actuator.law)
@@ -453,33 +390,11 @@ def excite(
         duration: float | None = None, rate: float = 1000.0, noise: float = 1e-3,
         free: Sequence[str] = DEFAULT_FREE) -> Excitation:
     """
-    Design the sequence to record for identification.
+    Design the sequence to record for identification, beside plain steps and the paper's.
 
-    Parameters
-    ----------
-    actuator : ActuatorParameters
-        The block as far as it is known.
-    bounds : Bounds, optional
-        Of coil and stretch.
-    duration : float, optional
-        In s; default 180 periods of the block.
-    rate : float
-        Samples per second.
-    noise : float
-        Standard deviation of a sample.
-    free : sequence of str
-        What shall be found.
-
-    Returns
-    -------
-    Excitation
-        The sequence, beside plain steps and the paper's.
-
-    Raises
-    ------
-    BadInputError
-        If no sequence is possible, or a number is out of range.
-
+    The actuator is given as far as it is known, the duration in s (default 180 periods of the
+    block), the rate in samples per second, and the noise as the standard deviation of a sample.
+    Bounds or numbers that allow no sequence are refused.
     """
     bounds = bounds or Bounds()
     if duration is None:

@@ -42,25 +42,11 @@ _RANKS = {'': 1, PLANT: 2, PLANNER: 3}
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """
-    What a parameter file says of an actuator and of how well it is known.
-
-    Attributes
-    ----------
-    actuator : ActuatorParameters
-        The block.
-    others : dict of str to float
-        Of coil and sensor.
-    settings : dict of str to object
-        All parameters in the file, by dotted name.
-    known : Known
-        How well parameters are known.
-
-    """
+    """What a parameter file says of an actuator and of how well it is known."""
 
     actuator: ActuatorParameters
-    others: dict[str, float]
-    settings: dict[str, Any]
+    others: dict[str, float]  # of coil and sensor
+    settings: dict[str, Any]  # all parameters in the file, by dotted name
     known: Known
 
     def number(self, name: str, default: float) -> float:
@@ -120,20 +106,9 @@ def errors_of(belief: Belief, others: tuple[float, float, float]) -> Uncertainty
     """
     Return how far off the block may be, as the shaper minimax takes it.
 
-    Parameters
-    ----------
-    belief : Belief
-        As read.
-    others : tuple of float
-        Of G, damping coefficient and J_lim, for what was not identified.
-
-    Returns
-    -------
-    tuple of float or Ellipsoid
-        Where the block is with a probability of 95 %, in shares of its values: the ellipsoid of
-        G, damping coefficient, J_lim and remanence by their covariance, or intervals if no
-        two of them were identified.
-
+    Where the block is with a probability of 95 %, in shares of its values: the ellipsoid of G,
+    damping coefficient, J_lim and remanence by their covariance, or intervals if no two of them
+    were identified. Others are those of the first three, for what was not identified.
     """
     sizes = [*others, 0.0]
     covariance = np.diag(np.square(sizes))
@@ -155,19 +130,7 @@ def errors_of(belief: Belief, others: tuple[float, float, float]) -> Uncertainty
 
 def errors_from(file: str, others: Sequence[float]) -> Uncertainty:
     """
-    Return how far off a block may be, as the shaper minimax takes it, by a file if one is named.
-
-    Parameters
-    ----------
-    file : str
-        What ``hmsa identify --out`` wrote, read as `errors_of` does; empty for none.
-    others : sequence of float
-        Of G, damping coefficient and J_lim, for what the file does not know.
-
-    Returns
-    -------
-    tuple of float or Ellipsoid
-        Where the block may be.
+    Return `errors_of` of what ``hmsa identify --out`` wrote, or the others for no file.
 
     Raises
     ------
@@ -195,24 +158,9 @@ def _number(path: Path | None, name: str, value: object) -> float:
 
 def file_text(found: Identification, belief: Belief, run: str, now: datetime) -> str:
     """
-    Return the parameter file of an identification.
+    Return the parameter file of an identification; the run is what was recorded, for comments.
 
-    Parameters
-    ----------
-    found : Identification
-        What was found.
-    belief : Belief
-        What was known before: settings of it that were not identified are kept.
-    run : str
-        What was recorded, for the comments.
-    now : datetime
-        Date of the identification.
-
-    Returns
-    -------
-    str
-        YAML as ROS 2 has it.
-
+    Settings of the belief that were not identified are kept.
     """
     lines = [
         f'# Parameters of an actuator, identified from {run}',

@@ -33,41 +33,18 @@ LEAST_SCALE = 3.0 * _NUMERICAL
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """
-    A minimum that was found.
+    """A minimum that was found."""
 
-    Attributes
-    ----------
-    values : dict of str to object
-        Of all quantities, and the law.
-    free : tuple of str
-        Names of the columns of the Jacobian.
-    response : Response
-        Of the values.
-    residual, weights : ndarray, shape (n,)
-        Measured less simulated stretch, and how far each counts, 0 to 1.
-    scale : float
-        Robust standard deviation of the residuals.
-    converged : bool
-        Whether the last step was small against the standard deviations.
-    passes : int
-        Simulations that it took.
-    spread : ndarray, shape (n,)
-        Deviation of each sample over that of one at rest.
-    prior : float
-        Information on each uncertain switch besides the samples, for a noise of 1.
-
-    """
-
-    values: dict[str, Any]
-    free: tuple[str, ...]
+    values: dict[str, Any]  # of all quantities, and the law
+    free: tuple[str, ...]  # columns of the Jacobian
     response: Response
-    residual: Array
-    weights: Array
-    scale: float
-    converged: bool
-    passes: int
-    spread: Array
+    residual: Array  # measured less simulated stretch, shape (n,)
+    weights: Array  # how far each sample counts, 0 to 1
+    scale: float  # robust standard deviation of the residuals
+    converged: bool  # whether the last step was small against the standard deviations
+    passes: int  # simulations that it took
+    spread: Array  # deviation of each sample over that of one at rest
+    # Information on each uncertain switch besides the samples, for a noise of 1.
     prior: float = 0.0
 
     @property
@@ -140,28 +117,9 @@ def fit(
         at_rest: bool = True, most: int = _MAX_PASSES, spread: Array | None = None
 ) -> Fit | None:
     """
-    Descend from start values to a minimum.
+    Descend from start values of all quantities to a minimum; None if they cannot be followed.
 
-    Parameters
-    ----------
-    recording : Recording
-        What was measured.
-    values : mapping of str to float
-        Start, of all quantities.
-    free : sequence of str
-        What is sought.
-    at_rest : bool
-        Whether the motion begins at rest.
-    most : int
-        Simulations at most.
-    spread : ndarray, shape (n,), optional
-        Deviation of each sample over that of one at rest; all alike without it.
-
-    Returns
-    -------
-    Fit or None
-        None if the motion of the start cannot be followed.
-
+    The spread is the deviation of each sample over that of one at rest; all alike without it.
     """
     return _Search(recording, tuple(free), at_rest, most, spread).run(values)
 

@@ -22,31 +22,13 @@ def _nothing() -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """
-    Values and their covariance, in SI.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Parameters; empty if nothing was identified.
-    values : tuple of float
-        Of these, in the same order; empty if they are only known from elsewhere.
-    covariance : ndarray, shape (p, p)
-        Of the values.
-
-    Raises
-    ------
-    BadInputError
-        If the sizes do not match, a number is not finite, or the covariance is none.
-
-    """
+    """Values of parameters and their covariance, in SI; empty if nothing was identified."""
 
     names: tuple[str, ...] = ()
-    values: tuple[float, ...] = ()
-    covariance: Array = field(default_factory=_nothing)
+    values: tuple[float, ...] = ()  # empty if they are only known from elsewhere
+    covariance: Array = field(default_factory=_nothing)  # shape (p, p)
 
     def __post_init__(self) -> None:
-        """Check that it is a covariance of these values."""
         matrix, size = self.covariance, len(self.names)
         if matrix.shape != (size, size) or not np.all(np.isfinite(matrix)):
             raise BadInputError(

@@ -30,24 +30,11 @@ _MEDIAN = 0.455
 
 @dataclass(frozen=True, eq=False)
 class Whiteness:
-    """
-    How the residuals hang together.
+    """How the residuals hang together."""
 
-    Attributes
-    ----------
-    autocorrelation : ndarray, shape (k,)
-        From lag 0 on, over samples.
-    p_value : float
-        Probability of as much correlation in white residuals (Ljung and Box, Biometrika 65
-        (1978) 297).
-    window : int
-        Lags that matter; 0 where the residuals are white.
-
-    """
-
-    autocorrelation: Array
-    p_value: float
-    window: int
+    autocorrelation: Array  # from lag 0 on, over samples
+    p_value: float  # of as much in white noise (Ljung and Box, Biometrika 65 (1978) 297)
+    window: int  # lags that matter; 0 where the residuals are white
 
     @property
     def white(self) -> bool:
@@ -65,20 +52,7 @@ def autocorrelation(values: Array) -> Array:
 
 
 def whiteness(residual: Array) -> Whiteness:
-    """
-    Test residuals for correlation.
-
-    Parameters
-    ----------
-    residual : ndarray, shape (n,)
-        Weighted.
-
-    Returns
-    -------
-    Whiteness
-        With the lags that matter.
-
-    """
+    """Test weighted residuals for correlation."""
     # Slow to load, and no use to a planner that estimates.
     from scipy.special import chdtrc
 
@@ -108,22 +82,8 @@ def errors_of_stamps(jacobian: Array, residual: Array, rate: Array) -> tuple[Arr
     is says the restricted likelihood of a linear model (H. D. Patterson and R. Thompson,
     Biometrika 58 (1971) 545); beforehand, exact stamps are as likely as all errors together.
 
-    Parameters
-    ----------
-    jacobian : ndarray, shape (n, p)
-        Of a fit, by the coordinates.
-    residual : ndarray, shape (n,)
-        Of the fit, few of them outliers.
-    rate : ndarray, shape (n,)
-        Of the stretch.
-
-    Returns
-    -------
-    spread : ndarray, shape (n,)
-        Deviation of each sample over that of one at rest; all 1 where exact stamps are likelier.
-    variance : ndarray, shape (p,)
-        Of the coordinates, with what is not known of the ratio.
-
+    Returned are the deviation of each sample over that of one at rest, all 1 where exact stamps
+    are likelier, and the variance of the coordinates, with what is not known of the ratio.
     """
     fastest = float(np.max(np.abs(rate), initial=0.0))
     largest = np.append(0.0, _LARGEST_SPREADS if fastest > 0.0 else [])
@@ -161,24 +121,9 @@ def _surprise(residual: Array, spread: Array) -> float:
 
 def widening(jacobian: Array, residual: Array, inverse: Array, found: Whiteness) -> Array:
     """
-    Return by how much correlation widens the deviations.
+    Return by how much correlation widens the deviations, factors of at least 1, shape (p,).
 
-    Parameters
-    ----------
-    jacobian : ndarray, shape (n, p)
-        Weighted.
-    residual : ndarray, shape (n,)
-        Weighted.
-    inverse : ndarray, shape (p, p)
-        Inverse of the information for a noise of 1.
-    found : Whiteness
-        Of the residuals.
-
-    Returns
-    -------
-    ndarray, shape (p,)
-        Factors of at least 1.
-
+    Jacobian and residual are weighted; the inverse is that of the information for a noise of 1.
     """
     count = jacobian.shape[1]
     if found.white:
@@ -204,19 +149,8 @@ def hinted(
 
     An effect outside the model moves the estimates. How far it would is known from the residuals,
     as far as it shows there; the interval is widened to hold the estimates with and without it.
-
-    Parameters
-    ----------
-    column : ndarray, shape (n,)
-        Effect on the samples, weighted.
-    jacobian, residual, inverse, found
-        As for `widening`.
-
-    Returns
-    -------
-    ndarray, shape (p,)
-        To be added to the variances of the coordinates.
-
+    The column is its effect on the samples, weighted; the rest is as for `widening`. What is
+    returned is to be added to the variances of the coordinates.
     """
     moved = inverse @ (jacobian.T @ column)
     rest = column - jacobian @ moved

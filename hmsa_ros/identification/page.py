@@ -24,20 +24,7 @@ _HEADINGS = {
 
 
 def page(found: Identification) -> str:
-    """
-    Return the page of an identification.
-
-    Parameters
-    ----------
-    found : Identification
-        What was found.
-
-    Returns
-    -------
-    str
-        HTML.
-
-    """
+    """Return the HTML page of an identification."""
     figures = [_motion(found), _residuals(found), _correlation(found)]
     label = found.recording.label
     tiles = [

@@ -13,31 +13,15 @@ from hmsa_ros.errors import BadInputError
 
 @dataclass(frozen=True)
 class Quantity:
-    """
-    One parameter of actuator, coil or sensor.
+    """One parameter of actuator, coil or sensor."""
 
-    Attributes
-    ----------
-    unit : str
-        In plain text; empty for a dimensionless value.
-    default : float
-        Where neither a file nor a caller gives one; NaN for what the actuator always has.
-    scale : {'log', 'inverse', 'linear'}
-        Coordinate of the search: positive values by their logarithm, the chain limit by its
-        inverse, which is 0 for chains without a limit.
-    least, most : float
-        Admissible values.
-    advice : str
-        What to record, or to measure, where the data do not hold it.
-
-    """
-
-    unit: str
-    default: float = math.nan
+    unit: str  # in plain text
+    default: float = math.nan  # without a file or a caller's; NaN for what the actuator always has
+    # Coordinate of the search: 'log', 'inverse' (0 for chains without a limit) or 'linear'.
     scale: str = 'log'
-    least: float = 0.0
-    most: float = math.inf
-    advice: str = ''
+    least: float = 0.0  # admissible
+    most: float = math.inf  # admissible
+    advice: str = ''  # what to record, or to measure, where the data do not hold it
 
 
 _STEP = 'record plain steps that ring, at a rate above twice the frequency of the ringing'
@@ -82,20 +66,10 @@ GEOMETRY = ('half_length', 'half_thickness')
 
 def check_free(names: Iterable[str], law: Elastic | None = None) -> tuple[str, ...]:
     """
-    Return the names of free parameters, checked.
+    Return the names of free parameters, each once.
 
-    Parameters
-    ----------
-    names : iterable of str
-        As asked for; ``actuator.`` or ``law.`` before a name is dropped. The modulus may have the
-        name that it has in the law.
-    law : Elastic, optional
-        In place of Gent: the chain limit is then not sought.
-
-    Returns
-    -------
-    tuple of str
-        Each once.
+    ``actuator.`` or ``law.`` before a name is dropped, and the modulus may have the name that it
+    has in the law. With a law in place of Gent the chain limit is not sought.
 
     Raises
     ------
@@ -129,19 +103,9 @@ def values_of(
         actuator: ActuatorParameters, others: Mapping[str, float] | None = None
 ) -> dict[str, Any]:
     """
-    Return values of all quantities, and the law under the name ``law``.
+    Return values of all quantities, geometry included, and the law under the name ``law``.
 
-    Parameters
-    ----------
-    actuator : ActuatorParameters
-        The block.
-    others : mapping of str to float, optional
-        Of coil and sensor, where they are not the defaults.
-
-    Returns
-    -------
-    dict of str to float
-        By name, geometry included.
+    Others are those of coil and sensor that are not the defaults.
 
     Raises
     ------
@@ -165,20 +129,7 @@ def values_of(
 
 
 def actuator_of(values: Mapping[str, Any]) -> ActuatorParameters:
-    """
-    Return the block of some values.
-
-    Parameters
-    ----------
-    values : mapping of str to float
-        As `values_of` returns them.
-
-    Returns
-    -------
-    ActuatorParameters
-        In SI units.
-
-    """
+    """Return the block of values as `values_of` returns them."""
     return ActuatorParameters(
         shear_modulus=values['shear_modulus'], density=values['density'],
         half_length=values['half_length'], half_thickness=values['half_thickness'],
@@ -190,22 +141,7 @@ def actuator_of(values: Mapping[str, Any]) -> ActuatorParameters:
 def group_of(
         values: Mapping[str, Any], *, zeta: float = 0.0, j_lim: float | None = None
 ) -> NondimensionalParameters:
-    """
-    Return the nondimensional group of some values.
-
-    Parameters
-    ----------
-    values : mapping of str to float
-        As `values_of` returns them.
-    zeta, j_lim : float, optional
-        In place of those of the values; zeta is 0 unless given.
-
-    Returns
-    -------
-    NondimensionalParameters
-        With the law.
-
-    """
+    """Return the nondimensional group of values as `values_of` returns them, and the law."""
     return NondimensionalParameters(
         zeta, values['chain_limit'] if j_lim is None else j_lim, geometry_of(values).c1,
         values.get('law'))

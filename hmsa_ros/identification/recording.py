@@ -211,12 +211,7 @@ class Course:
     """
     What may be recorded: samples to come, not checked, as a search makes thousands.
 
-    Attributes
-    ----------
-    time : ndarray, shape (n,)
-        Times of the samples in s, increasing.
-    level_times, levels, slew_limit
-        As of a `Recording`.
+    The fields are those of a `Recording`.
 
     """
 
@@ -236,22 +231,11 @@ def pieces(
         times: Array, levels: Array, slew: float, begin: float
 ) -> tuple[Array, Array, Array]:
     """
-    Return the amplifier's level as pieces of lines.
+    Return the amplifier's level in T as pieces of lines: begins, values and slopes.
 
-    Parameters
-    ----------
-    times, levels : ndarray, shape (m,)
-        Commanded levels in T from each time on.
-    slew : float
-        Rate of the ramps in T/s; infinite for steps.
-    begin : float
-        Time in s of the begin: the level in force then has been reached.
-
-    Returns
-    -------
-    begins, values, slopes : ndarray, shape (k,)
-        The level is ``values + slopes (t - begins)`` from each of ``begins`` on.
-
+    From each of the begins on it is ``values + slopes (t - begins)``. The level in force at the
+    given begin, in s, has been reached; from there the amplifier ramps by a slew rate in T/s,
+    infinite for steps.
     """
     first = max(int(np.searchsorted(times, begin, side='right')) - 1, 0)
     level = float(levels[first])

@@ -32,24 +32,13 @@ _SENSOR = ('stretch_bias', 'stretch_gain', 'sensor_latency')
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """
-    What the sensor would have shown.
+    """What the sensor would have shown."""
 
-    Attributes
-    ----------
-    stretch, rate : ndarray, shape (n,)
-        Measured stretch, and rate of the block in 1/s.
-    jacobian : ndarray, shape (n, p)
-        Derivatives of the measured stretch by the coordinates of the free parameters.
-    by_switch : ndarray, shape (n, u)
-        Derivatives by the uncertain times of switches.
-
-    """
-
-    stretch: Array
-    rate: Array
+    stretch: Array  # measured, shape (n,)
+    rate: Array  # of the block in 1/s
+    # Of the measured stretch by the coordinates of the free parameters, shape (n, p).
     jacobian: Array
-    by_switch: Array
+    by_switch: Array  # by the uncertain times of switches, shape (n, u)
 
 
 def _chain(
@@ -94,18 +83,7 @@ def complete(values: Mapping[str, float], free: Sequence[str]) -> dict[str, floa
     """
     Return values in which the density and the time unit agree.
 
-    Parameters
-    ----------
-    values : mapping of str to float
-        Of all quantities.
-    free : sequence of str
-        Where the time unit is free the density follows from it, else the other way round.
-
-    Returns
-    -------
-    dict of str to float
-        Of all quantities.
-
+    Where the time unit is free the density follows from it, else the other way round.
     """
     done = dict(values)
     if 'time_unit' in free:
@@ -125,48 +103,22 @@ def _packed(group: NondimensionalParameters) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """
-    What the kernel needs of values, and how its derivatives make those by free parameters.
+    """What the kernel needs of values, and how its derivatives make those by free parameters."""
 
-    Attributes
-    ----------
-    theta : ndarray
-        As the kernel names its places.
-    material : ndarray
-        The packed law.
-    branches : int
-        Of creep.
-    wanted : ndarray, shape (w,)
-        Places in ``theta``, or of constants of the law, by which to differentiate.
-    mixing : ndarray, shape (w, p)
-        Derivatives of these by the coordinates of the free parameters; 0 for those of the sensor.
-
-    """
-
-    theta: Array
-    material: Array
-    branches: int
+    theta: Array  # as the kernel names its places
+    material: Array  # the packed law
+    branches: int  # of creep
+    # Places in theta, or of constants of the law, by which to differentiate, shape (w,).
     wanted: NDArray[np.int64]
+    # Derivatives of these by the coordinates of the free parameters; 0 for the sensor's.
     mixing: Array
 
     @classmethod
     def of(cls, values: Mapping[str, Any], free: Sequence[str]) -> 'Setup':
         """
-        Work it out.
+        Work it out for values as `complete` returns them, with arrays of its own.
 
-        Parameters
-        ----------
-        values : mapping of str to float
-            Of all quantities, as `complete` returns them; Maxwell branches that are given under
-            the name ``creep``.
-        free : sequence of str
-            By which to differentiate.
-
-        Returns
-        -------
-        Setup
-            With arrays of its own.
-
+        Maxwell branches may be given under the name ``creep``.
         """
         given: Creep | None = values.get('creep')
         branches = len(given.ratios) if given else int(
@@ -199,30 +151,11 @@ def respond(
         at_rest: bool = True, rtol: float = RTOL, shifts: Array | None = None
 ) -> Response | None:
     """
-    Simulate what the sensor would have shown.
+    Simulate what the sensor would have shown; None if the motion meets the limits of the chains.
 
-    Parameters
-    ----------
-    recording : Recording or Course
-        Its levels and the times of its samples.
-    values : mapping of str to float
-        Of all quantities.
-    free : sequence of str
-        By which to differentiate.
-    at_rest : bool
-        Whether the motion begins at rest at its first level; else with ``initial_stretch`` and
-        ``initial_rate`` at the first sample.
-    rtol : float
-        Relative tolerance.
-    shifts : ndarray, shape (u,), optional
-        By how much in s the uncertain switches are later than recorded; default half of what
-        they may be earlier.
-
-    Returns
-    -------
-    Response or None
-        None if the motion meets the limits of the chains, where it cannot be followed.
-
+    The motion begins at rest at its first level, or else with ``initial_stretch`` and
+    ``initial_rate`` at the first sample. Shifts, shape (u,), say by how much in s the uncertain
+    switches are later than recorded; by default half of what they may be earlier.
     """
     values = complete(values, free)
     setup = Setup.of(values, free)
@@ -268,22 +201,10 @@ def set_rest(
         theta: Array, material: Array, level: float, wanted: NDArray[np.int64], start: Array
 ) -> bool:
     """
-    Begin at the rest of a level.
+    Begin at the rest of a level in T; return whether there is one.
 
-    Parameters
-    ----------
-    theta, material, wanted : ndarray
-        As `Setup` has them; stretch and rate in ``theta`` are set.
-    level : float
-        Flux density in T.
-    start : ndarray, shape (w,)
-        Takes the derivatives of the stretch by what is wanted.
-
-    Returns
-    -------
-    bool
-        Whether there is one.
-
+    Stretch and rate are set in ``theta``, and in ``start``, shape (w,), the derivatives of the
+    stretch by what is wanted.
     """
     a, k, f = theta[[kernels.STIFFNESS, kernels.DRIVE, kernels.FORCE]]
     rest = equilibrium_stretch((k * level + f) / a, material)

@@ -19,25 +19,10 @@ def read_bag(
         path: Path, *, joint: str = '', actuator: ActuatorParameters | None = None
 ) -> tuple[Recording, ActuatorParameters, dict[str, float]]:
     """
-    Read the recording of one actuator from a bag.
+    Read the recording of one actuator from a bag: a folder, or an ``.mcap`` file.
 
-    Parameters
-    ----------
-    path : Path
-        Folder of a bag, or an ``.mcap`` file.
-    joint : str
-        Name of the actuator; not needed where there is one.
-    actuator : ActuatorParameters, optional
-        The block, if the bag does not contain it.
-
-    Returns
-    -------
-    recording : Recording
-        Times count from the first sample.
-    actuator : ActuatorParameters
-        As given, or as the planner took it to be.
-    known : dict of str to float
-        What the planner knew of the coil.
+    Returned are the recording, with times from the first sample on, the actuator as given or as
+    the planner took it to be, and what the planner knew of the coil.
 
     Raises
     ------

@@ -36,22 +36,11 @@ _SHORTEST = 0.02  # time unit in intervals of the samples
 
 @dataclass(frozen=True)
 class Static:
-    """
-    What the levels at rest say.
+    """What the levels at rest say."""
 
-    Attributes
-    ----------
-    per_tesla : float
-        Load psi' that a flux density of 1 T holds, Br/(mu0 G); NaN if nothing came to rest.
-    chain_limit : float
-        The best of a few.
-    rests : tuple of (float, float, float)
-        Begin of the level in s, flux density in T, mean stretch at its end.
-
-    """
-
-    per_tesla: float
-    chain_limit: float
+    per_tesla: float  # load psi' that 1 T holds, Br/(mu0 G); NaN if nothing came to rest
+    chain_limit: float  # the best of a few
+    # Begin of the level in s, flux density in T, mean stretch at its end.
     rests: tuple[tuple[float, float, float], ...]
 
 
@@ -153,24 +142,7 @@ def _oscillations(t: Array, y: Array) -> list[tuple[float, float, float]]:
 def starts(
         recording: Recording, values: Mapping[str, float], free: Sequence[str]
 ) -> list[dict[str, float]]:
-    """
-    Return start values, the likeliest first; the values given come last.
-
-    Parameters
-    ----------
-    recording : Recording
-        What was measured.
-    values : mapping of str to float
-        What is known, of all quantities.
-    free : sequence of str
-        What is sought.
-
-    Returns
-    -------
-    list of dict
-        At least one.
-
-    """
+    """Return start values, the likeliest first; the values given come last."""
     given = dict(values)
     if 'stretch_gain' in free:
         given['stretch_gain'] = 1.0
@@ -200,23 +172,6 @@ def scan(
     Return start values by trying time units and dampings on the first of the data.
 
     That finds them where nothing rings, or where the samples are too few to see it.
-
-    Parameters
-    ----------
-    recording : Recording
-        What was measured.
-    values : mapping of str to float
-        What is known, of all quantities.
-    free : sequence of str
-        What is sought.
-    at_rest : bool
-        Whether the motion begins at rest.
-
-    Returns
-    -------
-    list of dict
-        The best few.
-
     """
     found = static(recording, values, free)
     first = _SCAN_SAMPLES

@@ -30,19 +30,9 @@ _BETTER = 0.5
 
 def read_levels(path: Path) -> tuple[Array, Array, tuple[str, ...]]:
     """
-    Read the levels of the field from CSV.
+    Read the levels of the field from CSV: times in s, flux densities in T, and notes.
 
-    Parameters
-    ----------
-    path : Path
-        With the columns ``time`` (s) and ``flux_density`` (T).
-
-    Returns
-    -------
-    times, levels : ndarray, shape (m,)
-        Flux density in T from each time in s on, increasing.
-    notes : tuple of str
-        What was converted.
+    The columns are ``time`` (s) and ``flux_density`` (T); each level holds from its time on.
 
     Raises
     ------
@@ -74,24 +64,10 @@ def read_csv(
         path: Path, commands: Path | None = None, *, slew_limit: float = math.inf,
         coordinate: Coordinate = STRETCH) -> Recording:
     """
-    Read a recording from CSV.
+    Read a recording from CSV, with notes on what was left out.
 
-    Parameters
-    ----------
-    path : Path
-        With the columns ``time`` (s) and ``stretch``, and ``flux_density`` (T) where there is
-        no other file with the levels.
-    commands : Path, optional
-        With ``time`` and ``flux_density``: the level in force from that time on.
-    slew_limit : float
-        Rate in T/s at which the amplifier ramps.
-    coordinate : Coordinate
-        What the column ``stretch`` has.
-
-    Returns
-    -------
-    Recording
-        With notes on what was left out.
+    It has the columns ``time`` (s) and ``stretch``, and ``flux_density`` (T) where there is no
+    other file with the levels; that has ``time`` and ``flux_density``, in force from that time on.
 
     Raises
     ------

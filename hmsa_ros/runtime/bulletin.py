@@ -25,46 +25,18 @@ _LOOK = 200_000_000
 
 
 class Bulletin:
-    """
-    Outputs that wait to be passed on.
-
-    Parameters
-    ----------
-    group : PlannerGroup
-        The joints.
-    following : Following
-        Counts what comes late.
-    watch : Watch
-        Knows what was measured.
-    clock, steady : callable
-        Return the present time in ns.
-    unheard : callable
-        Returns why nobody carries out commands; empty where somebody does.
-
-    Attributes
-    ----------
-    verdict : Verdict
-        The latest.
-    unheard : str
-        Why nobody carries out commands; empty where somebody does.
-    outputs : list of Output
-        To be passed on in this order.
-    preview_again : int or None
-        Time in ns from which the next part of a long plan is to be shown.
-
-    """
+    """Verdicts, progress, previews and notes that wait to be passed on."""
 
     def __init__(
             self, group: PlannerGroup, following: Following, watch: Watch, clock: Clock,
             steady: Clock, unheard: Callable[[], str]) -> None:
-        """Say that there is no request yet."""
         self._group, self._following, self._watch = group, following, watch
         self._clock, self._steady, self._look = clock, steady, unheard
         self._look_again = 0
-        self.unheard = ''
+        self.unheard = ''  # why nobody carries out commands; empty where somebody does
         self.verdict = Verdict(Severity.OK, 'none', 'no request yet')
         self.outputs: list[Output] = []
-        self.preview_again: int | None = None
+        self.preview_again: int | None = None  # time in ns of the next part of a long plan
         self._told: tuple[Progress, Mapping[str, Progress], bool] | None = None
         # What progress follows from, and until when it stays as it is.
         self._segments: list[tuple[PlannedSegment, ...]] = []
@@ -93,7 +65,7 @@ class Bulletin:
             {name: x.model.units.coordinate for name, x in self._group.planners.items()}))
 
     def tell_progress(self, now: int) -> None:
-        """Tell it, if there is any by a time in ns."""
+        """Tell progress, if there is any by a time in ns."""
         if not self._unchanged(now) and self._state() != self._told:
             self.tell()
 

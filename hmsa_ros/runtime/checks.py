@@ -9,14 +9,7 @@ from hmsa_ros.runtime.records import Request, Settings, Target, Trajectory
 
 def check_ready(now: int, *, active: bool) -> None:
     """
-    Check whether requests can be taken at all.
-
-    Parameters
-    ----------
-    now : int
-        Time in ns; 0 before simulated time has started.
-    active : bool
-        Whether the planner is.
+    Check whether requests can be taken at all, at a time in ns.
 
     Raises
     ------
@@ -38,15 +31,6 @@ def check_ready(now: int, *, active: bool) -> None:
 def check_joints(request: Request, joints: Sequence[str], settings: Settings) -> None:
     """
     Check whom a request is for.
-
-    Parameters
-    ----------
-    request : Request
-        Of any kind.
-    joints : sequence of str
-        All there are.
-    settings : Settings
-        What is allowed.
 
     Raises
     ------

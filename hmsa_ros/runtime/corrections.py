@@ -28,22 +28,9 @@ _LEAST_STEP = 0.1
 
 
 class Corrections:
-    """
-    Corrects plans where that is expected to leave less.
-
-    Parameters
-    ----------
-    group : PlannerGroup
-        The joints.
-    feedback : Feedback
-        Knows the joints' states.
-    clock : callable
-        Returns the present time in ns.
-
-    """
+    """Corrects plans where that is expected to leave less."""
 
     def __init__(self, group: PlannerGroup, feedback: Feedback, clock: Clock) -> None:
-        """Begin with nothing corrected."""
         self._group, self._feedback, self._clock = group, feedback, clock
         # Times in ns at which moves that take longer are at rest.
         self._arrivals: dict[str, int] = {}
@@ -77,20 +64,7 @@ class Corrections:
         return replace(draft, segments=(replace(segment, arrival=arrival), *rest))
 
     def due(self, now: int) -> Iterator[Work]:
-        """
-        Yield what may be worth correcting.
-
-        Parameters
-        ----------
-        now : int
-            Time in ns, with nothing else waiting to be planned.
-
-        Yields
-        ------
-        Work
-            Its result is for `take`.
-
-        """
+        """Yield what may be worth correcting by a time in ns; the results are for `take`."""
         for name, planner in self._feedback.news():
             if not planner.plan.segments or _as_sent(planner, now):
                 continue
@@ -143,24 +117,7 @@ class Corrections:
         return {name: draft} if worthwhile(before, after, estimate.noise, gain) else {}
 
     def take(self, drafts: Mapping[str, Draft], now: int, request: str) -> Verdict | None:
-        """
-        Take a correction.
-
-        Parameters
-        ----------
-        drafts : mapping of str to Draft
-            As worked out; empty where the plan is to be kept.
-        now : int
-            Time in ns that they are made for.
-        request : str
-            Name of the request that is carried out.
-
-        Returns
-        -------
-        Verdict or None
-            None if nothing changes.
-
-        """
+        """Take a correction worked out for a time in ns; None where nothing changes."""
         for name, draft in drafts.items():
             words = self._feedback.words(name, self._clock())
             self._group.planners[name].take(draft, now)

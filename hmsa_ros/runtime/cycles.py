@@ -13,29 +13,11 @@ _REMEMBERED = 4096
 
 
 class Cycles:
-    """
-    Measures the cycles of a loop; a context manager around each.
-
-    Parameters
-    ----------
-    period : int
-        Between two cycles, in ns.
-    steady, cpu : callable
-        Return a steady time, and the processor time of the loop's thread, in ns.
-
-    Attributes
-    ----------
-    count, late : int
-        Cycles, and those that began later than a period after their time.
-    largest : int
-        Largest lateness in ns.
-
-    """
+    """Measures the cycles of a loop, a context manager around each; all times are in ns."""
 
     def __init__(
             self, period: int, *, steady: Clock = monotonic_ns,
             cpu: Clock = thread_time_ns) -> None:
-        """Begin with none."""
         self.count = self.late = self.largest = 0
         self._period, self._steady, self._cpu = period, steady, cpu
         self._work = np.zeros(_REMEMBERED, dtype=np.int64)
@@ -44,7 +26,6 @@ class Cycles:
         self._reported = 0, 0
 
     def __enter__(self) -> None:
-        """Begin a cycle."""
         now = self._steady()
         lateness = now - self._due if self.count else 0
         if lateness > self._period:
@@ -56,14 +37,13 @@ class Cycles:
         self._begun = self._cpu()
 
     def __exit__(self, *_: object) -> None:
-        """End it."""
         self._ended = self._cpu()
         self._work[self.count % _REMEMBERED] = self._ended - self._begun
         self.count += 1
 
     @property
     def left(self) -> int:
-        """Time in ns until the next cycle is due; below 0 if it is late."""
+        """Time until the next cycle is due; below 0 if it is late."""
         return self._due - self._steady()
 
     def note_rest(self) -> None:

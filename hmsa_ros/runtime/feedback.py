@@ -33,36 +33,16 @@ _AHEAD = 100.0
 
 
 class Feedback:
-    """
-    Estimates from samples, reports what is wrong, and learns what to plan with.
-
-    Parameters
-    ----------
-    group : PlannerGroup
-        The joints.
-    settings : Settings
-        Mode, and what is estimated.
-    outputs : list of Output
-        Where estimates are appended.
-    clock : callable
-        Returns the present time in ns.
-
-    Attributes
-    ----------
-    corrections : int
-        Plans that were corrected.
-
-    """
+    """Estimates from samples, reports what is wrong, and learns what to plan with."""
 
     def __init__(
             self, group: PlannerGroup, settings: Settings, outputs: list[Output],
             clock: Clock) -> None:
-        """Begin with nothing seen."""
         self._group, self._outputs, self._clock = group, outputs, clock
         self._settings = settings
         self._joints: dict[str, Joint] = {}
         self._nominal: dict[str, Model] = {}
-        self.corrections = 0
+        self.corrections = 0  # plans that were corrected
         self.restart()
 
     @property
@@ -97,20 +77,9 @@ class Feedback:
 
     def change(self, settings: Settings, models: Mapping[str, Model]) -> Mapping[str, Model]:
         """
-        Take other settings.
+        Take other settings and models as given; return the models to plan with.
 
-        Parameters
-        ----------
-        settings : Settings
-            From now on.
-        models : mapping of str to Model
-            As given, by joint.
-
-        Returns
-        -------
-        mapping of str to Model
-            To plan with: with what was learnt, as long as block and coil are given as before.
-
+        What was learnt stays in them, as long as block and coil are given as before.
         """
         same = settings.feedback_parameters == self._settings.feedback_parameters and (
             (settings.feedback == 'off') is not self.on) and all(
@@ -143,39 +112,13 @@ class Feedback:
             model, estimate, self._group.planners[name].plan.levels[-1].stretch)
 
     def reset(self) -> str:
-        """
-        Forget what was learnt; say so.
-
-        Raises
-        ------
-        BadInputError
-            If nothing is learnt at all.
-
-        """
+        """Forget what was learnt and say so; refused where nothing is learnt at all."""
         self._check_on()
         self.restart()
         return 'what was learnt is forgotten: plans use the parameters as given'
 
     def save(self, *, by_joint: bool) -> str:
-        """
-        Write what was learnt to the file of the settings; say so.
-
-        Parameters
-        ----------
-        by_joint : bool
-            Whether joints have parameters of their own.
-
-        Returns
-        -------
-        str
-            What was written.
-
-        Raises
-        ------
-        BadInputError
-            If nothing was learnt yet, or it cannot be written.
-
-        """
+        """Write what was learnt to the file of the settings and say so; refused without any."""
         self._check_on()
         return save(
             self._settings.feedback_file,
@@ -261,22 +204,7 @@ class Feedback:
             found.stretch, found.rate, followed(found.values, found.stretch))
 
     def state(self, name: str, time: int) -> Estimate | None:
-        """
-        Return what plans may begin from.
-
-        Parameters
-        ----------
-        name : str
-            Of the joint.
-        time : int
-            In ns.
-
-        Returns
-        -------
-        Estimate or None
-            None where predictions count.
-
-        """
+        """Return what plans may begin from at a time in ns; None where predictions count."""
         joint = self._joints.get(name)
         if joint is None or self.mode != 'adapt' or joint.latest is None:
             return None
@@ -311,17 +239,7 @@ class Feedback:
         return self._settings.feedback_tolerance if cautious else math.inf
 
     def news(self) -> Iterator[tuple[str, Planner]]:
-        """
-        Learn from the latest estimates.
-
-        Yields
-        ------
-        str
-            Joint whose estimate is trusted, and has not been held against the plan yet.
-        Planner
-            Of that joint; it plans with what was learnt from now on.
-
-        """
+        """Learn from new estimates that are trusted, and yield their joints and planners."""
         if self.mode != 'adapt':
             return
         for name, joint in self._joints.items():

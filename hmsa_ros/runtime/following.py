@@ -17,7 +17,6 @@ class Seldom:
     """Says at most once a second that it is time to report something again."""
 
     def __init__(self) -> None:
-        """Begin with a first time at once."""
         self._next = 0
 
     def __call__(self) -> bool:
@@ -30,37 +29,16 @@ class Seldom:
 
 
 class Following:
-    """
-    Holds what takes effect against the plans.
-
-    Parameters
-    ----------
-    group : PlannerGroup
-        The joints.
-
-    Attributes
-    ----------
-    lateness : Lateness
-        Of commands.
-    newest : dict of str to (int, float)
-        By joint: stamp in ns and level in T of the newest change that took effect.
-    astray : set of str
-        Joints whose plan reality has left.
-    given_up : list of str
-        Joints whose plan stays as it is, though left, for `give_up` to report.
-    replanned : int
-        Plans made anew.
-
-    """
+    """Holds what takes effect against the plans."""
 
     def __init__(self, group: PlannerGroup) -> None:
-        """Begin with nothing heard."""
         self._group = group
         self.lateness = Lateness()
+        # Stamp in ns and level in T of the newest change that took effect.
         self.newest: dict[str, tuple[int, float]] = {}
-        self.astray: set[str] = set()
-        self.given_up: list[str] = []
-        self.replanned = 0
+        self.astray: set[str] = set()  # joints whose plan reality has left
+        self.given_up: list[str] = []  # those whose plan stays as it is all the same
+        self.replanned = 0  # plans made anew
         # Joints that may have left their plan, and the stamp of what was not heard of.
         self._suspected: dict[str, int] = {}
         self._found: dict[str, Resumption] = {}
@@ -155,26 +133,7 @@ class Following:
     def resume(
             self, work: Work, drafts: Mapping[str, Draft], now: int,
             request: str) -> Verdict | None:
-        """
-        Take a plan that has been made anew.
-
-        Parameters
-        ----------
-        work : Work
-            That made it.
-        drafts : mapping of str to Draft
-            What it made.
-        now : int
-            Time in ns that it is made for.
-        request : str
-            Name of the request that is carried out.
-
-        Returns
-        -------
-        Verdict or None
-            None if nothing was left to do.
-
-        """
+        """Take a plan made anew for a time in ns; None if nothing was left to do."""
         name, = work.joints
         found = self._found.pop(name)
         self.astray.discard(name)

@@ -27,25 +27,15 @@ class Lateness:
     """
     Counts late commands and finds what they have in common.
 
-    A command that arrives late is the later the later it was sent. One that a driver applies
-    late is as late as any other, however far ahead of its stamp it was sent.
-
-    Attributes
-    ----------
-    count : int
-        Late commands.
-    largest : int
-        How late the latest was, in ns.
-    earliest : int
-        How long before its stamp a command took effect, in ns.
+    A command that arrives late is the later the later it was sent. One that a driver applies late
+    is as late as any other, however far ahead of its stamp it was sent.
 
     """
 
     def __init__(self) -> None:
-        """Begin with none."""
         self.count = 0
-        self.largest = 0
-        self.earliest = 0
+        self.largest = 0  # how late the latest was, in ns
+        self.earliest = 0  # how long before its stamp a command took effect, in ns
         self._sent: dict[str, dict[int, int]] = {}
         # How late, and how long ahead of its stamp it was sent, in ns.
         self._recent: deque[tuple[int, int]] = deque(maxlen=_RECENT)
@@ -59,19 +49,7 @@ class Lateness:
             del sent[next(iter(sent))]
 
     def note(self, late: int, joint: str, stamp: int) -> None:
-        """
-        Count a late command.
-
-        Parameters
-        ----------
-        late : int
-            By how many ns.
-        joint : str
-            Whose it is.
-        stamp : int
-            Time in ns at which it was to take effect.
-
-        """
+        """Count a command of a joint that took effect so many ns after its stamp."""
         self.count += 1
         self.largest = max(self.largest, late)
         sent = self._sent.get(joint, {}).get(stamp)
@@ -102,20 +80,7 @@ class Lateness:
         return 'commands are repeatedly lost, or overridden by somebody else,'
 
     def advice(self, lead_time: int) -> str:
-        """
-        Return what helps.
-
-        Parameters
-        ----------
-        lead_time : int
-            How far ahead commands are sent, in ns.
-
-        Returns
-        -------
-        str
-            The rest of a sentence.
-
-        """
+        """Return what helps, the rest of a sentence; commands are sent `lead_time` ns ahead."""
         if not self.largest and self.earliest:
             return (
                 'let the driver apply commands at their stamps, or raise lateness_tolerance to '

@@ -56,22 +56,7 @@ def known_of(estimate: Estimate) -> Known:
 
 
 def file_text(estimates: Mapping[str, Estimate], now: datetime) -> str:
-    """
-    Return a parameter file with what was learnt.
-
-    Parameters
-    ----------
-    estimates : mapping of str to Estimate
-        By joint; the name is empty where parameters are those of all joints.
-    now : datetime
-        Date of it.
-
-    Returns
-    -------
-    str
-        YAML as planner and plant take it, with what the planner needs to go on.
-
-    """
+    """Return a parameter file with what was learnt by joint; '' names all joints."""
     lines = [
         f'# What feedback learnt of an actuator until {now.isoformat(" ", "seconds")}.',
         '# Planner and plant take it after their own parameter file.',
@@ -91,21 +76,7 @@ def file_text(estimates: Mapping[str, Estimate], now: datetime) -> str:
 
 def save(file: str, estimates: Mapping[str, Estimate | None], *, by_joint: bool) -> str:
     """
-    Write what was learnt; say so.
-
-    Parameters
-    ----------
-    file : str
-        Where to.
-    estimates : mapping of str to Estimate or None
-        By joint; None without samples.
-    by_joint : bool
-        Whether joints have parameters of their own.
-
-    Returns
-    -------
-    str
-        What was written.
+    Write what was learnt by joint, and say so.
 
     Raises
     ------

@@ -41,28 +41,14 @@ _NO_STEP = 1e-4
 
 @dataclass(frozen=True)
 class Expected:
-    """
-    What is known of a setpoint before it is measured.
+    """What is known of a setpoint before it is measured."""
 
-    Attributes
-    ----------
-    target, start : float
-        Stretch to rest at, and the one before.
-    frequency, decay : float
-        Of vibration about the target by the model, in rad/s and 1/s.
-    joint : str
-        Whose it is.
-    setpoint, setpoints : int
-        Which one of the request, from 1, and how many there are.
-
-    """
-
-    target: float
-    start: float
-    frequency: float
-    decay: float = 0.0
+    target: float  # stretch to rest at
+    start: float  # stretch of the setpoint before
+    frequency: float  # of vibration about the target by the model, in rad/s
+    decay: float = 0.0  # of the same, in 1/s
     joint: str = ''
-    setpoint: int = 1
+    setpoint: int = 1  # which one of the request, from 1
     setpoints: int = 1
 
     @property
@@ -77,59 +63,27 @@ class Expected:
 
 @dataclass(frozen=True)
 class Tolerances:
-    """
-    What counts as having arrived.
+    """What counts as having arrived."""
 
-    Attributes
-    ----------
-    arrival, vibration : float
-        Largest offset and largest vibration, peak to peak, as a share of the step.
-    stretch : float
-        Either may be this large in any case, for small steps.
-
-    """
-
-    arrival: float = 0.02
-    vibration: float = 0.02
-    stretch: float = 1e-3
+    arrival: float = 0.02  # largest offset as a share of the step
+    vibration: float = 0.02  # largest vibration from peak to peak as a share of the step
+    stretch: float = 1e-3  # either may be this large in any case, for small steps
 
 
 @dataclass(frozen=True)
 class Finding:
-    """
-    What was measured at a setpoint; figures that cannot be told are not numbers.
+    """What was measured at a setpoint; figures that cannot be told are not numbers."""
 
-    Attributes
-    ----------
-    code : Code
-        One of `CODES`.
-    message : str
-        One sentence.
-    expected : Expected
-        The setpoint.
-    samples : int
-        How many were judged.
-    offset, vibration : float
-        Mean stretch less the target, and the vibration peak to peak.
-    offset_std, vibration_std : float
-        Standard deviations of the two.
-    frequency : float
-        Of the vibration in Hz.
-    noise : float
-        Standard deviation of the samples.
-
-    """
-
-    code: Code
+    code: Code  # one of `CODES`
     message: str
     expected: Expected
     samples: int = 0
-    offset: float = math.nan
-    vibration: float = math.nan
+    offset: float = math.nan  # mean stretch less the target
+    vibration: float = math.nan  # peak to peak
     offset_std: float = math.nan
     vibration_std: float = math.nan
-    frequency: float = math.nan
-    noise: float = math.nan
+    frequency: float = math.nan  # of the vibration in Hz
+    noise: float = math.nan  # standard deviation of a sample
 
     @property
     def figures(self) -> dict[str, object]:
@@ -158,27 +112,10 @@ def judge(
         time: Array, stretch: Array, expected: Expected,
         tolerances: Tolerances = Tolerances()) -> Finding:  # noqa: B008
     """
-    Judge samples of a setpoint that is held.
+    Judge samples of a setpoint that is held; times are in s since the arrival, increasing.
 
-    An offset and a decaying sinusoid are fitted; what is left is the noise. Samples that are
-    too rare to show the vibration are fitted alike near the frequency of the model.
-
-    Parameters
-    ----------
-    time : ndarray
-        Of each sample in s since the arrival, increasing.
-    stretch : ndarray
-        Measured, finite.
-    expected : Expected
-        The setpoint.
-    tolerances : Tolerances
-        What counts as having arrived.
-
-    Returns
-    -------
-    Finding
-        ``unobserved`` where the samples are too few.
-
+    An offset and a decaying sinusoid are fitted; what is left is the noise. Samples that are too
+    rare to show the vibration are fitted alike near the frequency of the model.
     """
     count = len(time)
     if count < _FEWEST or (time[-1] - time[0]) * expected.frequency < 2 * math.pi * _SHORTEST:

@@ -44,32 +44,10 @@ class PlannerRuntime:
     """
     Plans requests in slices, sends commands in time and follows their effects.
 
-    Parameters
-    ----------
-    group : PlannerGroup
-        The joints.
-    settings : Settings
-        How to deal with time.
-    clock : callable
-        Returns the present time in ns: the clock of the stamps and of `tick`.
-    steady : callable
-        Returns a steady time in ns, by which patience and the length of a slice are measured.
-    observable : callable
-        Returns whether somebody may give samples: the first request waits for them then.
-    unheard : callable
-        Returns why nobody carries out commands; empty where somebody does. The first request
-        waits for that.
-
-    Attributes
-    ----------
-    active : bool
-        Whether requests are taken.
-    following : Following
-        What really happened, and the counters of it.
-    feedback : Feedback
-        What samples say of the joints.
-    clock_jumps : int
-        Counter.
+    Two clocks return ns: `clock` the time of the stamps and of `tick`, `steady` the one that
+    patience and the length of a slice are measured by. `observable` returns whether somebody may
+    give samples, and `unheard` why nobody carries out commands (empty where somebody does): the
+    first request waits for both.
 
     """
 
@@ -78,7 +56,6 @@ class PlannerRuntime:
             steady: Clock = monotonic_ns,
             observable: Callable[[], bool] = lambda: True,
             unheard: Callable[[], str] = str) -> None:
-        """Begin at rest, inactive, and report it."""
         self.group = group
         self.settings = settings
         self.active = False
@@ -120,21 +97,11 @@ class PlannerRuntime:
 
     def request(self, request: Request) -> Verdict:
         """
-        Take a request.
+        Take a request, and work it out at once as far as a slice goes.
 
-        One that replaces everything from now on is planned before those that wait, and they
-        are dropped if it can be carried out.
-
-        Parameters
-        ----------
-        request : Request
-            Worked out at once as far as a slice goes.
-
-        Returns
-        -------
-        Verdict
-            The latest one; the code is ``waiting`` if it is not this request's yet.
-
+        One that replaces everything from now on is planned before those that wait, and they are
+        dropped if it can be carried out. The verdict is ``waiting`` if it is not this request's
+        yet.
         """
         try:
             check_ready(self._clock(), active=self.active)
@@ -270,20 +237,7 @@ class PlannerRuntime:
         return self._taken()
 
     def tick(self, now: int) -> list[Output]:
-        """
-        Do what is due, for a few milliseconds at the most.
-
-        Parameters
-        ----------
-        now : int
-            Time in ns.
-
-        Returns
-        -------
-        list of Output
-            To be passed on in this order.
-
-        """
+        """Do what is due at a time in ns, for some ms at most; return what to pass on."""
         self._begin_anew()
         self._engage()
         if self._send(now):

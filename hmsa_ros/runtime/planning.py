@@ -20,35 +20,11 @@ _FREED = 2_000
 
 
 class Planning:
-    """
-    Plans what waits in slices, and answers.
-
-    Parameters
-    ----------
-    group : PlannerGroup
-        The joints.
-    following : Following
-        Knows plans that are to be made anew.
-    corrections : Corrections
-        Knows plans that may be worth correcting.
-    bulletin : Bulletin
-        Takes the answers.
-    clock, steady : callable
-        Return the present time in ns.
-    send : callable
-        Sends the commands that are due by now.
-
-    Attributes
-    ----------
-    refused : int
-        Requests that were.
-
-    """
+    """Plans what waits in slices, and answers."""
 
     def __init__(
             self, group: PlannerGroup, following: Following, corrections: Corrections,
             bulletin: Bulletin, clock: Clock, steady: Clock, send: Callable[[], None]) -> None:
-        """Begin with nothing to do."""
         self._group, self._following, self._bulletin = group, following, bulletin
         self._corrections = corrections
         self._clock, self._steady, self._send = clock, steady, send
@@ -58,11 +34,9 @@ class Planning:
         self.refused = 0
 
     def __bool__(self) -> bool:
-        """Return whether there is something to do."""
         return bool(self._queue or self._leftovers)
 
     def __contains__(self, work: Work) -> bool:
-        """Return whether a piece of work still waits."""
         return work in self._queue
 
     def clear(self) -> None:
@@ -71,22 +45,7 @@ class Planning:
         self._leftovers.clear()
 
     def add(self, request: Request, *, engaged: bool) -> Work:
-        """
-        Take a request; one that replaces all that waits is planned before it.
-
-        Parameters
-        ----------
-        request : Request
-            Checked.
-        engaged : bool
-            Whether it is known where the joints are.
-
-        Returns
-        -------
-        Work
-            That waits now.
-
-        """
+        """Take a checked request; one that replaces all that waits comes first once engaged."""
         work = work_on(request, self._group, self._clock)
         if engaged and work.replaces(self._queue):
             self._queue.appendleft(work)

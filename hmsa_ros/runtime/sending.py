@@ -9,33 +9,13 @@ _FAR = 2**62
 
 
 class Sending:
-    """
-    Hands out the commands of plans.
-
-    Parameters
-    ----------
-    group : PlannerGroup
-        The joints.
-    following : Following
-        Is told what is sent.
-    outputs : list of Output
-        Where commands are appended.
-
-    Attributes
-    ----------
-    sent, heartbeats : int
-        Counters.
-    next_beat : int
-        Time in ns of the next sign of life.
-
-    """
+    """Hands out the commands of plans."""
 
     def __init__(
             self, group: PlannerGroup, following: Following, outputs: list[Output]) -> None:
-        """Begin with nothing sent."""
         self._group, self._following, self._outputs = group, following, outputs
         self.sent = self.heartbeats = 0
-        self.next_beat = 0
+        self.next_beat = 0  # time in ns of the next sign of life
 
     def send(self, now: int, *, everything: bool = False) -> None:
         """Send what is due at a time in ns, or everything that is planned."""

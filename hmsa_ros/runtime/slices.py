@@ -19,29 +19,14 @@ _MARGIN = 3
 
 @dataclass(eq=False)
 class Work:
-    """
-    A request, or a plan to be made anew, that is being worked out.
+    """A request, or a plan to be made anew, that is being worked out."""
 
-    Attributes
-    ----------
-    joints : frozenset of str
-        Whose plans it changes.
-    steps : generator
-        Pauses after each bounded piece; returns drafts by joint and the time in ns they are for.
-    request : Request or None
-        None for a plan that is made anew.
-    number : int
-        Grows from one to the next.
-    corrects : bool
-        Whether it is a correction from samples.
-
-    """
-
-    joints: frozenset[str]
+    joints: frozenset[str]  # whose plans it changes
+    # Pause after each bounded piece; return drafts by joint and the time in ns they are for.
     steps: Steps[tuple[Mapping[str, Draft], int]]
-    request: Request | None = None
-    number: int = field(default_factory=count().__next__)
-    corrects: bool = False
+    request: Request | None = None  # None for a plan that is made anew
+    number: int = field(default_factory=count().__next__)  # grows from one to the next
+    corrects: bool = False  # from samples
 
     @property
     def postponed(self) -> bool:
@@ -55,24 +40,7 @@ class Work:
 
 
 def work_on(request: Request, group: PlannerGroup, clock: Clock) -> Work:
-    """
-    Return the work that a request makes.
-
-    Parameters
-    ----------
-    request : Request
-        Of joints that the group has.
-    group : PlannerGroup
-        Works it out.
-    clock : Clock
-        Of the stamps.
-
-    Returns
-    -------
-    Work
-        Its steps return the drafts by joint.
-
-    """
+    """Return the work that a request of joints of a group makes."""
     if isinstance(request, Trajectory):
         return Work(
             frozenset(request.joints), _trajectory(request, group, clock), request)
@@ -106,28 +74,10 @@ def in_time(
         joints: frozenset[str], clock: Clock,
         size: int = 1) -> Steps[tuple[Mapping[str, Draft], int]]:
     """
-    Plan for a time that has not come yet when the plan is ready.
+    Plan for a time in ns that has not come yet when the plan is ready, and return it too.
 
-    Parameters
-    ----------
-    make : callable
-        Works out drafts for a time in ns.
-    group : PlannerGroup
-        For which.
-    joints : frozenset of str
-        Whose plans count: if what is going to happen changes meanwhile, it begins anew.
-    clock : Clock
-        Of the stamps.
-    size : int
-        About how many pauses it makes.
-
-    Returns
-    -------
-    drafts : mapping of str to Draft
-        As made.
-    now : int
-        Time in ns that they are made for.
-
+    If what is going to happen to the joints changes meanwhile, it begins anew. The size is about
+    how many pauses it makes.
     """
     planners = [group.planners[x] for x in sorted(joints)]
     lead = planners[0].options.lead_time

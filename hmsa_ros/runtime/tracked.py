@@ -11,42 +11,18 @@ from hmsa_ros.estimation.words import sentence
 
 @dataclass(eq=False)
 class Joint:
-    """
-    What is known of one joint.
-
-    Attributes
-    ----------
-    estimator : Estimator
-        Of it.
-    start : float
-        Stretch before the setpoint under way.
-    latest : Estimate or None
-        Newest.
-    newest : int
-        Time in ns of the newest sample.
-    next_update, next_tell : int
-        Times in ns at which to look at samples, and to tell the estimate.
-    amplitude : float
-        Largest of the vibration since the last arrival.
-    setpoint : tuple of int
-        Number of the plan and place of the setpoint under way.
-    fresh : bool
-        Whether there are samples that have not been looked at.
-    news : bool
-        Whether the latest estimate has not been held against the plan yet.
-
-    """
+    """What is known of one joint; times in ns."""
 
     estimator: Estimator
-    start: float
+    start: float  # stretch before the setpoint under way
     latest: Estimate | None = None
-    newest: int = 0
-    next_update: int = 0
-    next_tell: int = 0
-    amplitude: float = 0.0
-    setpoint: tuple[int, int] = (0, -1)
-    fresh: bool = False
-    news: bool = False
+    newest: int = 0  # time of the newest sample
+    next_update: int = 0  # when to look at samples
+    next_tell: int = 0  # when to tell the estimate
+    amplitude: float = 0.0  # largest of the vibration since the last arrival
+    setpoint: tuple[int, int] = (0, -1)  # number of the plan, and place of the setpoint under way
+    fresh: bool = False  # whether there are samples that have not been looked at
+    news: bool = False  # whether the latest estimate has not been held against the plan yet
 
     def note_start(self, plan: Plan, now: int) -> None:
         """Remember where the joint was before the setpoint under way at a time in ns."""

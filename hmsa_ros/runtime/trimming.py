@@ -16,23 +16,11 @@ _SURE, _LEAST = 3.0, 1e-4
 
 def trimmed(planner: Planner, estimate: Estimate, bound: float) -> float | None:
     """
-    Return the level in T to hold a setpoint by.
+    Return the level in T to hold a setpoint by, at most a bound in T off that of the model.
 
-    Parameters
-    ----------
-    planner : Planner
-        With the plan in force.
-    estimate : Estimate
-        Of the time from which on levels may be changed.
-    bound : float
-        Largest change in T against the level that the model holds the setpoint by.
-
-    Returns
-    -------
-    float or None
-        None where the level in force is to be kept: on the way, within what is not known of the
-        rest, at the bound, or where no constant force is tracked.
-
+    The estimate is of the time from which on levels may be changed. None where the level in force
+    is to be kept: on the way, within what is not known of the rest, at the bound, or where no
+    constant force is tracked.
     """
     plan, model = planner.plan, planner.model
     place = plan.under_way(estimate.time)

@@ -84,20 +84,9 @@ class _Joint:
 
 
 class Watch:
-    """
-    Looks at samples after each arrival, and judges them.
-
-    Parameters
-    ----------
-    group : PlannerGroup
-        The joints.
-    steady : callable
-        Returns a steady time in ns.
-
-    """
+    """Looks at samples after each arrival, and judges them."""
 
     def __init__(self, group: PlannerGroup, steady: Clock) -> None:
-        """Begin with nothing to look at."""
         self._group, self._steady = group, steady
         self._joints: dict[str, _Joint] = {}
         # Reading a clock for each sample of each joint would take longer than all else.
@@ -221,24 +210,7 @@ class Watch:
                 window.add(stamp, stretch, self._now)
 
     def judge(self, now: int, tolerances: Tolerances, *, observable: bool) -> Finding | None:
-        """
-        Judge one setpoint, if one can be judged by now.
-
-        Parameters
-        ----------
-        now : int
-            Time in ns.
-        tolerances : Tolerances
-            What counts as having arrived.
-        observable : bool
-            Whether somebody gives samples.
-
-        Returns
-        -------
-        Finding or None
-            One that changes what is known.
-
-        """
+        """Judge one setpoint, if one can be judged by a time in ns and changes what is known."""
         self._now = now
         for joint in self._joints.values():
             for window in list(joint.windows):
