@@ -56,27 +56,7 @@ def views(namespace: str = '', coordinate: str = STRETCH.name) -> dict[str, str]
 
 
 def blueprint(namespace: str = '', coordinate: str = STRETCH.name) -> Any:
-    """
-    Return the layout of the viewer: the actuators on the left, their curves on the right.
-
-    Parameters
-    ----------
-    namespace : str
-        Namespace of the nodes.
-    coordinate : str
-        What a position is called, ``'stretch'`` or ``'deflection'``.
-
-    Returns
-    -------
-    rerun.blueprint.Blueprint
-        For `rerun.send_blueprint`.
-
-    Raises
-    ------
-    BadInputError
-        If rerun-sdk is not installed.
-
-    """
+    """Return the layout of the viewer: the actuators on the left, their curves on the right."""
     rrb = _rerun().blueprint
     *curves, (title, path) = views(namespace, coordinate).items()
     return rrb.Blueprint(

@@ -22,7 +22,7 @@ from hmsa_ros.bag import limits, metadata, qos
 from hmsa_ros.bag.definitions import message_definition, type_hash
 from hmsa_ros.bag.info import summarize, to_json, to_text
 from hmsa_ros.bag.reader import BagReader, read_messages
-from hmsa_ros.bag.records import MAGIC, read_chunk_head
+from hmsa_ros.bag.records import Block, MAGIC, PREFIX
 from hmsa_ros.bag.recover import recover
 from hmsa_ros.bag.writer import BagWriter, Topic
 from hmsa_ros.cli import main
@@ -211,8 +211,8 @@ def test_no_records_in_any_order_make_the_reader_fail(tmp_path, data):
         opcode, piece = original[i]
         if opcode == Opcode.CHUNK and data.draw(strategies.booleans()):
             # Compressed anew, so that what is wrong in it is found by nothing but reading.
-            head = read_chunk_head(piece, len(piece))
-            inner = bytearray(piece[head.data_offset:])
+            stored = Block.of_chunk(0, -PREFIX.size, piece, len(piece))
+            inner = bytearray(piece[stored.offset:])
             for _ in range(data.draw(strategies.integers(0, 3))):
                 inner[data.draw(strategies.integers(0, len(inner) - 1))] = data.draw(
                     strategies.integers(0, 255))

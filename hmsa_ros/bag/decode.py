@@ -16,31 +16,15 @@ _NESTED = re.compile(r'^\s*(?:[A-Z]\w*|\w+/[\w/]+)\s*\[', re.MULTILINE)
 
 @dataclass(frozen=True)
 class TopicInfo:
-    """
-    A topic of a bag.
-
-    Attributes
-    ----------
-    name, type : str
-        Topic and message type; the type is empty if the bag does not have it.
-    encoding : str
-        Of the messages, ``'cdr'``.
-    definition_encoding, definition : str
-        Message definition with its dependencies; empty if the bag has none.
-    profiles : tuple of hmsa_ros.bag.qos.Qos
-        What the publishers offered.
-    type_hash : str
-        RIHS01 hash, empty if unknown.
-
-    """
+    """A topic of a bag."""
 
     name: str
-    type: str
-    encoding: str = 'cdr'
+    type: str  # empty if the bag does not have it
+    encoding: str = 'cdr'  # of the messages
     definition_encoding: str = ''
-    definition: str = ''
-    profiles: tuple[qos.Qos, ...] = ()
-    type_hash: str = ''
+    definition: str = ''  # with its dependencies; empty if the bag has none
+    profiles: tuple[qos.Qos, ...] = ()  # what the publishers offered
+    type_hash: str = ''  # RIHS01 hash, empty if unknown
 
 
 def make_decoder(info: TopicInfo) -> Callable[[bytes], Any]:

@@ -21,15 +21,7 @@ class Folder:
         self.metadata: metadata.BagMetadata | None = None
 
     def find(self) -> list[Path]:
-        """
-        Return the files of the bag in order, at least one.
-
-        Raises
-        ------
-        BadInputError
-            If there is none.
-
-        """
+        """Return the files of the bag in order, or raise `BadInputError` if there is none."""
         path = self._path
         try:
             if path.is_file():

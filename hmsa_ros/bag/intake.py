@@ -7,7 +7,8 @@ from typing import TypeVar
 
 from mcap.records import Channel, McapRecord, Metadata, Schema
 
-from hmsa_ros.bag import limits, records
+from hmsa_ros.bag import limits
+from hmsa_ros.bag.records import Block
 from hmsa_ros.errors import BagError, printable
 
 _Declared = TypeVar('_Declared', Schema, Channel)
@@ -30,26 +31,6 @@ class Problems:
         self.sentences.append(
             printable(sentence) if len(self._known) <= limits.PROBLEMS
             else 'further problems are not listed')
-
-
-@dataclass(frozen=True)
-class Block:
-    """A chunk, or a run of messages outside chunks, and where its stored bytes lie."""
-
-    file: int  # number of the file
-    offset: int
-    length: int
-    size: int  # of the content
-    start: int  # lowest log time
-    end: int  # highest log time
-    compression: str = ''  # ``''``, ``'lz4'`` or ``'zstd'``
-    crc: int = 0  # CRC-32 of the content; 0 for none
-
-    def content(self, descriptor: int) -> bytes:
-        """Return the content, or raise `BagError` if it is damaged."""
-        stored = records.read_exactly(descriptor, self.length, self.offset)
-        return records.checked(
-            records.decompress(stored, self.compression, self.size), self.crc)
 
 
 @dataclass
@@ -140,10 +121,3 @@ class Intake:
             raise BagError(f'schemas, channels and metadata are larger than '
                            f'{limits.KEPT_SIZE} bytes')
         self._kept += size
-
-
-def block_at(number: int, offset: int, head: records.ChunkHead) -> Block:
-    """Return the chunk whose record begins at a place."""
-    return Block(
-        number, offset + records.PREFIX.size + head.data_offset, head.data_length, head.size,
-        head.start, head.end, head.compression, head.crc)

@@ -48,30 +48,14 @@ PRESETS: Mapping[str, Preset] = {
 
 @dataclass(frozen=True)
 class Topic:
-    """
-    A topic to be written.
+    """A topic to be written."""
 
-    Attributes
-    ----------
-    name, type : str
-        For example ``'/joint_states'`` and ``'sensor_msgs/msg/JointState'``.
-    definition : str
-        Message definition with its dependencies; empty if not known.
-    definition_encoding : str
-        ``'ros2msg'`` or ``'ros2idl'``; empty if not known.
-    profiles : tuple of hmsa_ros.bag.qos.Qos
-        What the publishers offer.
-    type_hash : str
-        RIHS01 hash, empty if not known.
-
-    """
-
-    name: str
-    type: str
-    definition: str = ''
-    definition_encoding: str = 'ros2msg'
-    profiles: tuple[qos.Qos, ...] = ()
-    type_hash: str = ''
+    name: str  # for example ``'/joint_states'``
+    type: str  # for example ``'sensor_msgs/msg/JointState'``
+    definition: str = ''  # with its dependencies; empty if not known
+    definition_encoding: str = 'ros2msg'  # or ``'ros2idl'``, empty
+    profiles: tuple[qos.Qos, ...] = ()  # what the publishers offer
+    type_hash: str = ''  # RIHS01 hash, empty if not known
 
     def __post_init__(self) -> None:
         if not self.name:

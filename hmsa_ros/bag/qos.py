@@ -26,29 +26,15 @@ LATER = 'offered_qos_profiles.'
 
 @dataclass(frozen=True)
 class Qos:
-    """
-    One offered profile.
+    """One offered profile; durations in ns, `INFINITE_NS` for none."""
 
-    Attributes
-    ----------
-    history, reliability, durability, liveliness : str
-        One of `HISTORIES`, `RELIABILITIES`, `DURABILITIES`, `LIVELINESSES`.
-    depth : int
-        Queue depth, at least 0; 0 where it was not discovered.
-    deadline_ns, lifespan_ns, lease_ns : int
-        Durations in nanoseconds, at least 0; `INFINITE_NS` for none.
-    avoid_ros_namespace_conventions : bool
-        As in rmw.
-
-    """
-
-    history: str = 'unknown'
-    depth: int = 0
-    reliability: str = 'reliable'
-    durability: str = 'volatile'
+    history: str = 'unknown'  # one of `HISTORIES`
+    depth: int = 0  # 0 where it was not discovered
+    reliability: str = 'reliable'  # one of `RELIABILITIES`
+    durability: str = 'volatile'  # one of `DURABILITIES`
     deadline_ns: int = INFINITE_NS
     lifespan_ns: int = INFINITE_NS
-    liveliness: str = 'automatic'
+    liveliness: str = 'automatic'  # one of `LIVELINESSES`
     lease_ns: int = INFINITE_NS
     avoid_ros_namespace_conventions: bool = False
 

@@ -26,9 +26,10 @@ from typing import Any, NamedTuple
 from hmsa_ros.bag import limits, metadata
 from hmsa_ros.bag.decode import make_decoder, TopicInfo
 from hmsa_ros.bag.folder import Folder
-from hmsa_ros.bag.intake import Block, Intake, Problems, ScannedFile
+from hmsa_ros.bag.intake import Intake, Problems, ScannedFile
 from hmsa_ros.bag.merge import Cursor, merge, Message
 from hmsa_ros.bag.output import EXPERIMENT
+from hmsa_ros.bag.records import Block
 from hmsa_ros.bag.scan import check_data, scan
 from hmsa_ros.bag.topics import Topics
 from hmsa_ros.errors import BadInputError, BagError

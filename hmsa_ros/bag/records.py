@@ -54,28 +54,40 @@ _CLASSES: dict[int, type[Any]] = {
 
 
 @dataclass(frozen=True)
-class ChunkHead:
-    """
-    What a chunk says of itself before its data.
+class Block:
+    """A chunk, or a run of messages outside chunks, and where its stored bytes lie."""
 
-    Attributes
-    ----------
-    start, end, size, crc : int
-        Log times, length and CRC-32 of the content before compression; 0 for no CRC.
-    compression : str
-        ``''``, ``'lz4'`` or ``'zstd'``.
-    data_offset, data_length : int
-        Where the compressed content lies within the record's content.
+    file: int  # number of the file
+    offset: int
+    length: int
+    size: int  # of the content
+    start: int  # lowest log time
+    end: int  # highest log time
+    compression: str = ''  # ``''``, ``'lz4'`` or ``'zstd'``
+    crc: int = 0  # CRC-32 of the content; 0 for none
 
-    """
+    @classmethod
+    def of_chunk(cls, file: int, offset: int, head: bytes, length: int) -> 'Block':
+        """Read what a chunk record of a length says before its data, or raise `BagError`."""
+        try:
+            start, end, size, crc, name = _CHUNK_HEAD.unpack_from(head)
+            begin = _CHUNK_HEAD.size + name + 8
+            compression = head[_CHUNK_HEAD.size:begin - 8].decode()
+            stored, = struct.unpack_from('<Q', head, begin - 8)
+        except (struct.error, UnicodeDecodeError) as error:
+            raise BagError('a chunk record ends early') from error
+        if begin + stored != length:
+            raise BagError(f'a chunk record has {length} bytes: it says {begin + stored}')
+        return cls(
+            file, offset + PREFIX.size + begin, stored, size, start, end, compression, crc)
 
-    start: int
-    end: int
-    size: int
-    crc: int
-    compression: str
-    data_offset: int
-    data_length: int
+    def content(self, descriptor: int) -> bytes:
+        """Return the content, or raise `BagError` if it is damaged."""
+        content = decompress(
+            read_exactly(descriptor, self.length, self.offset), self.compression, self.size)
+        if self.crc and zlib.crc32(content) != self.crc:
+            raise BagError('a chunk is damaged (its CRC differs)')
+        return content
 
 
 class _Content(ReadDataStream):
@@ -120,28 +132,6 @@ def parse_any(opcode: int, content: bytes) -> McapRecord | None:
     return None if kind is None else parse(kind, content)
 
 
-def read_chunk_head(data: bytes, length: int) -> ChunkHead:
-    """
-    Return the head of a chunk record, checked against the length in bytes of its content.
-
-    Raises
-    ------
-    BagError
-        If it is no chunk.
-
-    """
-    try:
-        start, end, size, crc, name = _CHUNK_HEAD.unpack_from(data)
-        offset = _CHUNK_HEAD.size + name + 8
-        compression = data[_CHUNK_HEAD.size:offset - 8].decode()
-        data_length, = struct.unpack_from('<Q', data, offset - 8)
-    except (struct.error, UnicodeDecodeError) as error:
-        raise BagError('a chunk record ends early') from error
-    if offset + data_length != length:
-        raise BagError(f'a chunk record has {length} bytes: it says {offset + data_length}')
-    return ChunkHead(start, end, size, crc, compression, offset, data_length)
-
-
 def decompress(data: bytes, compression: str, size: int) -> bytes:
     """Return the ``size`` bytes of a chunk's content, or raise `BagError` if damaged."""
     if not compression:
@@ -166,21 +156,6 @@ def decompress(data: bytes, compression: str, size: int) -> bytes:
         raise BagError(f'a chunk is compressed with {compression!r}: expected lz4 or zstd')
     if len(content) != size:
         raise BagError(f'a chunk has {len(content)} bytes of content: it says {size}')
-    return content
-
-
-def checked(content: bytes, crc: int) -> bytes:
-    """
-    Return a chunk's uncompressed content if its CRC-32 is as it should be; 0 for none.
-
-    Raises
-    ------
-    BagError
-        If its CRC is another.
-
-    """
-    if crc and zlib.crc32(content) != crc:
-        raise BagError('a chunk is damaged (its CRC differs)')
     return content
 
 

@@ -22,31 +22,7 @@ class Recovered:
 def recover(
         path: str | os.PathLike[str], out: str | os.PathLike[str], *,
         max_chunk_size: int = limits.CHUNK_SIZE) -> Recovered:
-    """
-    Write everything that can be read of a bag to a new one, and check that by reading it.
-
-    Parameters
-    ----------
-    path : path
-        Folder of a bag, or one ``.mcap`` file.
-    out : path
-        Folder of the new bag; must not exist.
-    max_chunk_size : int
-        As for `BagReader`.
-
-    Returns
-    -------
-    Recovered
-        What it holds.
-
-    Raises
-    ------
-    BadInputError
-        If there is no bag, or the new one cannot be made.
-    BagError
-        If it cannot be written, or does not read back the same.
-
-    """
+    """Write all that can be read of a bag to a new one; raise `BagError` unless it reads back."""
     reader = BagReader(path, max_chunk_size=max_chunk_size)
     try:
         with BagWriter(out, custom_data=reader.custom_data) as writer:

@@ -13,8 +13,8 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, DataEnd, Footer, Metadata, MetadataIndex, Statistics
 
 from hmsa_ros.bag import limits, records
-from hmsa_ros.bag.intake import Block, block_at, Intake, ScannedFile
-from hmsa_ros.bag.records import MAGIC, PREFIX
+from hmsa_ros.bag.intake import Intake, ScannedFile
+from hmsa_ros.bag.records import Block, MAGIC, PREFIX
 from hmsa_ros.errors import BagError
 
 _FOOTER_SIZE = PREFIX.size + 20
@@ -92,20 +92,17 @@ def _find_chunks(
             raise BagError(f'a chunk at byte {offset} overlaps with something else')
         before = after
         head = os.pread(descriptor, PREFIX.size + records.CHUNK_HEAD_SIZE, offset)
-        content = head[PREFIX.size:]
-        start, crc = offset + PREFIX.size + 40 + len(index.compression.encode()), 0
-        if len(content) >= 28:
-            crc, = struct.unpack_from('<I', content, 24)
+        content, length = head[PREFIX.size:], index.chunk_length - PREFIX.size
+        crc = struct.unpack_from('<I', content, 24)[0] if len(content) >= 28 else 0
+        block = Block(
+            file.number, offset + PREFIX.size + 40 + len(index.compression.encode()),
+            index.compressed_size, index.uncompressed_size, index.message_start_time,
+            index.message_end_time, index.compression, crc)
         try:
-            found = records.read_chunk_head(content, index.chunk_length - PREFIX.size)
+            found = Block.of_chunk(file.number, offset, content, length)
         except BagError:
             found = None
-        block = Block(
-            file.number, start, index.compressed_size, index.uncompressed_size,
-            index.message_start_time, index.message_end_time, index.compression, crc)
-        if found is None or head[:PREFIX.size] != PREFIX.pack(
-                Opcode.CHUNK, index.chunk_length - PREFIX.size) or block != block_at(
-                file.number, offset, found):
+        if block != found or not head.startswith(PREFIX.pack(Opcode.CHUNK, length)):
             intake.problem(file, f' is damaged at byte {offset}: the chunk there is not as '
                                'the index says, and is read as that says')
         intake.add_block(file, block, offset)

@@ -9,8 +9,8 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Footer, McapRecord, Schema, Statistics
 
 from hmsa_ros.bag import limits, records
-from hmsa_ros.bag.intake import Block, block_at, Intake, ScannedFile
-from hmsa_ros.bag.records import MAGIC, PREFIX
+from hmsa_ros.bag.intake import Intake, ScannedFile
+from hmsa_ros.bag.records import Block, MAGIC, PREFIX
 from hmsa_ros.errors import BagError
 
 # Messages outside chunks are grouped, so that they are handled like chunks.
@@ -86,8 +86,7 @@ def _read_record(intake: Intake, descriptor: int, file: ScannedFile, offset: int
     opcode, length = PREFIX.unpack_from(head)
     content = head[PREFIX.size:]
     if opcode == Opcode.CHUNK:
-        block = block_at(file.number, offset, records.read_chunk_head(content, length))
-        intake.add_block(file, block, offset)
+        intake.add_block(file, Block.of_chunk(file.number, offset, content, length), offset)
     elif opcode == Opcode.MESSAGE_INDEX:
         if length < 6 or struct.unpack_from('<I', content, 2)[0] != length - 6:
             raise BagError('a message index record ends early')

@@ -97,32 +97,7 @@ def respond(
         name: str, targets: Sequence[float], material: NondimensionalParameters, *,
         commands: Sequence[str] = ('shaped', 'unshaped'), span: float = SPAN,
         samples: int = SAMPLES, faster: int = 1) -> tuple[Run, ...]:
-    """
-    Compute the responses, one a command, to a sequence of spans that starts at rest.
-
-    Parameters
-    ----------
-    name : str
-        Name of the runs.
-    targets : sequence of float
-        Stretches, each lasting ``span``.
-    material : NondimensionalParameters
-        zeta, J_lim and c1.
-    commands : sequence of str
-        Any of ``shaped``, ``unshaped`` and ``b_p alone``.
-    span : float
-        In nondimensional time.
-    samples : int
-        Evenly spaced samples a run, at least 2.
-    faster : int
-        How many times denser the samples of the last setpoint are, at least 1.
-
-    Returns
-    -------
-    tuple of Run
-        One a command.
-
-    """
+    """Compute the response to targets, each for a span, that starts at rest; a run a command."""
     setpoints = [Setpoint(x, span) for x in targets]
     runs = []
     for command in commands:

@@ -53,21 +53,7 @@ _DECADES = 30.0
 def draw_sweep(
         paths: Sequence[Path], view: View, columns: Mapping[str, Array],
         fixed: Mapping[str, float] | None = None) -> None:
-    """
-    Draw the columns of a sweep, all rows of each; a panel or column of panels each.
-
-    Parameters
-    ----------
-    paths : sequence of Path
-        Files to write, PNG or PDF by their names.
-    view : View
-        How.
-    columns : mapping of str to ndarray, shape (n,)
-        NaN where there is no plan.
-    fixed : mapping of str to float, optional
-        What all rows have in common, for the title.
-
-    """
+    """Draw a sweep's columns, NaN where there is no plan, titled by what is fixed; PNG or PDF."""
     values = {name: _scale(name) * view.arranged(x) for name, x in columns.items()}
     rows = len(view.labels) if view.y else 1
     with style.picture(paths, 1.1 + 2.6 * rows) as figure:

@@ -166,27 +166,11 @@ def evaluate(run: Run, moves: Sequence[Move] | None = None) -> Evaluation:
 
 def find_moves(
         run: Run, levels: Sequence[Level], plan: Sequence[Level]) -> list[Move]:
-    """
-    Find the setpoints of a run from its commands, in order.
-
-    A setpoint is reached with the level that holds it: the one whose equilibrium is a stretch
-    that was asked for, or at which the plan is at rest at one (with what feedback has learnt,
-    levels have another equilibrium). Where neither finds a setpoint, a level that lasts for a
-    period of the actuator holds one. Those not finished when the recording ended are left out.
-
-    Parameters
-    ----------
-    run : Run
-        As read from a bag.
-    levels, plan : sequence of Level
-        As `in_force` returns them.
-
-    Returns
-    -------
-    list of Move
-        In order of time.
-
-    """
+    """Find the setpoints that the commands of a run reached before the recording ended."""
+    # A setpoint is reached with the level that holds it: the one whose equilibrium is a stretch
+    # that was asked for, or at which the plan is at rest at one (with what feedback has learnt,
+    # levels have another equilibrium). Where neither finds a setpoint, a level that lasts for a
+    # period of the actuator holds one.
     last = int(run.time[-1])
     asked = _asked(run)
     unit = run.planner.flux_density_unit

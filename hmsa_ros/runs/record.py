@@ -42,80 +42,33 @@ class Verdict:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """
-    What is known of one actuator in one run.
+    """What is known of one actuator in one run; tuples are in the order recorded."""
 
-    Attributes
-    ----------
-    label : str
-        Name for people.
-    joint : str
-        Name of the actuator in the joint states; empty if it is not known.
-    path : Path
-        The bag or table.
-    time : ndarray of int64, shape (n,)
-        Stamps of the samples in ns, increasing; n of at least 1.
-    logged : ndarray of int64, shape (n,)
-        When they were recorded, in ns.
-    stretch, rate, flux_density : ndarray, shape (n,)
-        Samples; the rate in 1/s, from the stretch if it was not recorded; the flux density in
-        T, NaN if it was not recorded.
-    commands : tuple of Level
-        In the order they were recorded.
-    applied : tuple of Level
-        Changes of the field that took effect, as the plant or the driver reported them.
-    forces : tuple of (int, int, float)
-        Disturbing forces in the order they were recorded: recorded at, stamp (ns), newton.
-    plans : tuple of tuple of Level
-        Plans in the order they were recorded.
-    requests : tuple of RecordedRequest
-        In the order they were recorded.
-    verdicts : tuple of Verdict
-        In the order they were recorded, each once.
-    parameters : mapping of str to object
-        Parameters of the nodes, by ``'node.name'``.
-    plant, planner : ActuatorParameters
-        The block as it was, and as the planner took it to be.
-    parameters_known : bool
-        Whether the recording or the caller names the block; else it is the example block.
-    left_out : int
-        Messages or rows that could not be used.
-    notes : tuple of str
-        What a reader should know, one sentence each.
-    topics : mapping of str to str
-        Topic of each role (`hmsa_ros.runs.topics`) in the bag.
-    summary : BagSummary or None
-        The bag in figures; None for a table.
-
-    Raises
-    ------
-    BadInputError
-        If there is no sample, shapes differ or time does not increase.
-
-    """
-
-    label: str
-    joint: str
-    path: Path
-    time: Times
-    logged: Times
-    stretch: Array
-    rate: Array
-    flux_density: Array
+    label: str  # name for people
+    joint: str  # name in the joint states; empty if it is not known
+    path: Path  # the bag or table
+    time: Times  # shape (n,), n of at least 1: stamps in ns, increasing
+    logged: Times  # shape (n,): when the samples were recorded, in ns
+    stretch: Array  # shape (n,)
+    rate: Array  # shape (n,): in 1/s, from the stretch if it was not recorded
+    flux_density: Array  # shape (n,): in T, NaN if it was not recorded
     commands: tuple[Level, ...] = ()
-    applied: tuple[Level, ...] = ()
-    forces: tuple[tuple[int, int, float], ...] = ()
+    applied: tuple[Level, ...] = ()  # changes of the field that took effect, as reported
+    forces: tuple[tuple[int, int, float], ...] = ()  # recorded at, stamp (ns), newton
     plans: tuple[tuple[Level, ...], ...] = ()
     requests: tuple[RecordedRequest, ...] = ()
-    verdicts: tuple[Verdict, ...] = ()
+    verdicts: tuple[Verdict, ...] = ()  # each once
+    # Of the nodes, by ``'node.name'``
     parameters: Mapping[str, object] = field(default_factory=dict)
-    plant: ActuatorParameters = field(default_factory=paper_actuator)
+    plant: ActuatorParameters = field(default_factory=paper_actuator)  # as it was
+    # As the planner took it to be
     planner: ActuatorParameters = field(default_factory=paper_actuator)
-    parameters_known: bool = False
-    left_out: int = 0
-    notes: tuple[str, ...] = ()
+    parameters_known: bool = False  # else it is the example block
+    left_out: int = 0  # messages or rows that could not be used
+    notes: tuple[str, ...] = ()  # what a reader should know, one sentence each
+    # Of each role (`hmsa_ros.runs.topics`)
     topics: Mapping[str, str] = field(default_factory=dict)
-    summary: BagSummary | None = None
+    summary: BagSummary | None = None  # None for a table
 
     def __post_init__(self) -> None:
         """Check the arrays."""

@@ -61,30 +61,9 @@ def verify(
         path: str | os.PathLike[str], *, parameters: Mapping[str, object] | None = None,
         max_chunk_size: int = limits.CHUNK_SIZE) -> list[Verification]:
     """
-    Integrate the recorded commands of a bag and compare with the recorded stretch.
+    Integrate the recorded commands of a bag; compare each actuator with its recorded stretch.
 
-    Parameters
-    ----------
-    path : path
-        Folder of a bag, or one ``.mcap`` file.
-    parameters : mapping of str to object, optional
-        As for `hmsa_ros.runs.bags.read_runs`.
-    max_chunk_size : int
-        As for `BagReader`.
-
-    Returns
-    -------
-    list of Verification
-        One for each actuator in the bag.
-
-    Raises
-    ------
-    BadInputError
-        If the bag has no commands with the response to them, the actuator's parameters are not
-        known, or it holds several runs after each other.
-    HmsaError
-        If the integration does not get through.
-
+    Arguments and errors are those of `read_runs` and of `verify_run`.
     """
     return [verify_run(run) for run in read_runs(
         Path(path), parameters=parameters, max_chunk_size=max_chunk_size)]
