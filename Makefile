@@ -14,7 +14,7 @@ INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet -c c
 
 # The environment brings its own ROS: one that the calling shell has sourced is set aside, and
 # what it selects (middleware, profiles, security) with it.
-unexport PYTHONPATH PYTHONHOME PYTHONWARNINGS
+unexport PYTHONPATH PYTHONHOME PYTHONWARNINGS PYTHONDONTWRITEBYTECODE
 unexport AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH LD_LIBRARY_PATH
 unexport ROS_DISTRO ROS_VERSION ROS_PYTHON_VERSION ROS_LOCALHOST_ONLY ROS_STATIC_PEERS
 unexport ROS_DISCOVERY_SERVER ROS_SECURITY_ENABLE ROS_SECURITY_STRATEGY ROS_SECURITY_KEYSTORE
@@ -110,7 +110,7 @@ $(VENV)/.bench: $(VENV)/.installed
 
 # Compiled now and cached, so that no command waits for it.
 $(VENV)/.kernels: $(VENV)/.installed $(wildcard hmsa_ros/core/*.py hmsa_ros/identification/kernels.py)
-	$(BIN)/python -m hmsa_ros.core.warmup
+	$(BIN)/python -m hmsa_ros.warmup
 	@touch $@
 
 # An environment whose Python does not start (moved, or its base removed) is made anew too.

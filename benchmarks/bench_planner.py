@@ -306,7 +306,7 @@ def start_up(*, quick: bool = False) -> Report:
         for name, code, part in (
                 ('without cache: the first plan', ['-c', _FIRST], 3),
                 ('without cache: all kernels, with the warm-up command',
-                 ['-m', 'hmsa_ros.core.warmup'], 0)):
+                 ['-m', 'hmsa_ros.warmup'], 0)):
             with tempfile.TemporaryDirectory() as cache:
                 time = _process(code, cache)[part]
             rows.append(Row(name, '', time, time))

@@ -1,6 +1,7 @@
 """Measurements of an actuator, simulated by SciPy alone, for what identifies it."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 import math
 
 import numpy as np
@@ -45,7 +46,15 @@ def steps(targets, span, repeats=1, begin=0.02):
 def simulate(times, level_times, levels, block: ActuatorParameters = BLOCK,
              extras: Extras | None = None):
     """Return the measured stretch, without noise."""
-    x = extras or Extras()
+    arrays = (np.asarray(a, dtype=float).tobytes() for a in (times, level_times, levels))
+    return _simulated(*arrays, block, extras or Extras()).copy()
+
+
+@lru_cache(maxsize=16)
+def _simulated(times: bytes, level_times: bytes, levels: bytes, block: ActuatorParameters,
+               x: Extras):
+    """Do what `simulate` does once for all tests that ask for the same, since it takes long."""
+    times, level_times, levels = (np.frombuffer(a) for a in (times, level_times, levels))
     inertia = block.density * block.half_length ** 2
     c1 = 2.0 * (block.half_thickness / block.half_length) ** 2
     modulus = block.shear_modulus

@@ -1,15 +1,12 @@
 """
-Compile and cache the kernels: ``python -m hmsa_ros.core.warmup``.
+Compile or load what plans and simulates, before the first request.
 
 The first use after an installation compiles for some seconds, and the first use in a process
-loads for some tenths of one. Set-up commands run this module, and a planner calls `warm_up`
-before it takes requests.
+loads for some tenths of one.
 """
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
-import sys
 from time import perf_counter
 
 import numpy as np
@@ -102,14 +99,3 @@ def _simulate(creep: Creep) -> None:
     plant = ActuatorSimulation(paper_actuator(), creep=creep)
     plant.command(0, 0.01)
     plant.advance(_MILLISECOND)
-
-
-def main() -> int:
-    """Compile what the package uses, say so, and return 0."""
-    say = partial(print, flush=True)
-    print(f'loaded the numerical kernels in {warm_up(say, batch=True, creep=True):.1f} s')
-    return 0
-
-
-if __name__ == '__main__':
-    sys.exit(main())
