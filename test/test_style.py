@@ -2,11 +2,10 @@
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 import re
 import sys
-
-import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = sorted((ROOT / 'hmsa_ros').rglob('*.py'))
@@ -23,17 +22,17 @@ def name_of(path: Path) -> str:
     return str(path.relative_to(ROOT))
 
 
-def functions(path: Path) -> list[Function]:
-    """Return all functions in a file."""
-    return [node for node in ast.walk(ast.parse(path.read_text(encoding='utf-8')))
-            if isinstance(node, Function)]
+@cache
+def tree(path: Path) -> ast.Module:
+    """Return a file's syntax tree."""
+    return ast.parse(path.read_text(encoding='utf-8'))
 
 
 def public_functions(path: Path) -> Iterator[Function]:
     """Walk the functions and methods that a user of a module can call."""
-    pending: list[ast.stmt] = ast.parse(path.read_text(encoding='utf-8')).body
+    pending: list[ast.stmt] = tree(path).body
     while pending:
-        node = pending.pop()
+        node, *pending = pending
         if isinstance(node, ast.ClassDef):
             pending = [*pending, *node.body]
         elif isinstance(node, Function) and not node.name.startswith('_'):
@@ -52,44 +51,39 @@ def own_nodes(function: Function) -> Iterator[ast.AST]:
             pending += ast.iter_child_nodes(node)
 
 
-@pytest.mark.parametrize('path', TESTS, ids=name_of)
-def test_names_of_tests_are_sentences(path):
-    tests = [function.name for function in functions(path)
-             if function.name.startswith('test_')]
-    assert tests
-    assert [name for name in tests
+def test_names_of_tests_are_sentences():
+    names = {path: [x.name for x in ast.walk(tree(path))
+                    if isinstance(x, Function) and x.name.startswith('test_')] for path in TESTS}
+    assert [name_of(path) for path in TESTS if not names[path]] == []
+    assert [(name_of(path), name) for path in TESTS for name in names[path]
             if len(name.removeprefix('test_').split('_')) < SHORTEST_SENTENCE] == []
 
 
-@pytest.mark.parametrize('path', TESTS, ids=name_of)
-def test_modules_of_tests_say_what_they_test(path):
-    assert ast.get_docstring(ast.parse(path.read_text(encoding='utf-8')))
+def test_modules_of_tests_say_what_they_test():
+    assert [name_of(path) for path in TESTS if not ast.get_docstring(tree(path))] == []
 
 
-@pytest.mark.parametrize('path', PACKAGE, ids=name_of)
-def test_package_raises_errors_and_does_not_assert(path):
-    tree = ast.parse(path.read_text(encoding='utf-8'))
-    assert [node.lineno for node in ast.walk(tree) if isinstance(node, ast.Assert)] == []
+def test_package_raises_errors_and_does_not_assert():
+    assert [(name_of(path), node.lineno) for path in PACKAGE for node in ast.walk(tree(path))
+            if isinstance(node, ast.Assert)] == []
 
 
-@pytest.mark.parametrize('path', PACKAGE, ids=name_of)
-def test_module_does_not_shadow_the_standard_library(path):
-    assert path.stem in {'__init__', '__main__'} or path.stem not in sys.stdlib_module_names
+def test_module_does_not_shadow_the_standard_library():
+    assert [name_of(path) for path in PACKAGE if path.stem not in {'__init__', '__main__'}
+            and path.stem in sys.stdlib_module_names] == []
 
 
-@pytest.mark.parametrize('path', PACKAGE, ids=name_of)
-def test_public_function_that_raises_says_so(path):
+def test_public_function_that_raises_says_so():
     silent = [
-        function.name for function in public_functions(path)
+        (name_of(path), function.name) for path in PACKAGE for function in public_functions(path)
         if any(isinstance(node, ast.Raise) and node.exc is not None
                for node in own_nodes(function))
         and not RAISES.search(ast.get_docstring(function) or '')]
     assert silent == []
 
 
-@pytest.mark.parametrize('path', TESTS, ids=name_of)
-def test_tests_wait_on_conditions_and_do_not_sleep(path):
+def test_tests_wait_on_conditions_and_do_not_sleep():
     sleeps = [
-        node.lineno for node in ast.walk(ast.parse(path.read_text(encoding='utf-8')))
+        (name_of(path), node.lineno) for path in TESTS for node in ast.walk(tree(path))
         if isinstance(node, ast.Call) and ast.unparse(node.func) in {'time.sleep', 'sleep'}]
     assert sleeps == []
