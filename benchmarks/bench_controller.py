@@ -6,8 +6,8 @@ import tempfile
 from benchmarks.faults.rig import Rig
 from benchmarks.measure import ros_domain
 from benchmarks.sheet import Sheet
+from hmsa_ros.contract import topics
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import to_trajectory
 
 #: Work of a cycle that 99 of 100 are promised to stay below, in us.
@@ -23,7 +23,7 @@ def _run(seconds: float, *, moves: bool, readers: bool, folder: Path) -> dict[st
     """Return the newest figures of the loop, with the lateness of these seconds alone."""
     with Rig(folder, ros_domain(), watch=readers) as rig:
         rig.start('controller', {'lead_time': _LEAD})
-        rig.ready(interface.PLANNER)
+        rig.ready(topics.PLANNER)
         rig.spin_until(lambda: _LOOP in rig.diagnostics, 'diagnostics of the loop')
         # The start is forgotten: more cycles than the loop remembers.
         rig.spin(5.0)

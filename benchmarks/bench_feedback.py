@@ -20,8 +20,8 @@ from benchmarks.faults.rig import Rig
 from benchmarks.measure import ros_domain
 from benchmarks.reference import Actuator, two_step
 from benchmarks.sheet import Sheet
+from hmsa_ros.contract import topics
 from hmsa_ros.contract.actuator import parameters_of
-from hmsa_ros.nodes import interface
 from hmsa_ros.studies.feedback import Scenario, SCENARIOS
 
 #: Stretches of a first move from 1, and of the next one.
@@ -96,12 +96,12 @@ def run(
         else:
             rig.start('plant', plant)
             rig.start('planner', planner)
-        rig.ready(interface.PLANNER, interface.PLANT, interface.RECORDER)
+        rig.ready(topics.PLANNER, topics.PLANT, topics.RECORDER)
         for number in range(seeds + 1):
             if number == seeds:
-                rig.set_parameters(interface.PLANNER, feedback='off')
+                rig.set_parameters(topics.PLANNER, feedback='off')
             else:
-                rig.call(interface.RESET_ESTIMATE, interface.PLANNER)
+                rig.call(topics.RESET_ESTIMATE, topics.PLANNER)
             rig.spin(_BEFORE * scenario.period)
             for target in (*TARGETS, 1.0):
                 rig.publish_setpoint(target)

@@ -1,6 +1,7 @@
 """How many joints one plant and planner serve at a rate, and how many pairs side by side."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 import os
 from pathlib import Path
 import tempfile
@@ -8,15 +9,15 @@ from time import monotonic, sleep
 
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
-from rclpy.qos import QoSProfile
 
 from benchmarks.faults.rig import Child, Rig
 from benchmarks.measure import ros_domain
 from benchmarks.sheet import Sheet
+from hmsa_ros.contract import topics
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.nodes import interface
-from hmsa_ros.nodes.capture import Capture, RawSubscription, Taken
+from hmsa_ros.nodes.capture import Capture, Taken
 from hmsa_ros.nodes.conversions import stamp_of, to_trajectory
 
 #: Joints of one plant and planner, by the rate of samples in Hz.
@@ -44,16 +45,12 @@ class _Watch:
         self.behind: list[float] = []
         self.late = 0
         self.refusal = ''
-        topic = interface.JOINT_STATES
         # Stamped as they arrive and not decoded: what this process does later does not count.
         self._capture = Capture(rig.node, self._take)
-        self._capture.add(None, RawSubscription(
-            rig.node, topic.type, f'{space}/{topic.name}', QoSProfile(depth=5000)))
+        self._capture.add(None, interface.listen(rig.node, replace(
+            topics.JOINT_STATES, name=f'{space}/{topics.JOINT_STATES.name}')))
         self._capture.start()
-        topic = interface.STATUS
-        rig.node.create_subscription(
-            topic.type, f'{space}/{interface.from_outside(topic.name, interface.PLANNER)}',
-            self._judge, topic.qos)
+        interface.subscribe(rig.node, topics.STATUS, self._judge, f'{space}/{topics.PLANNER}')
 
     def close(self) -> None:
         """End the thread that receives."""
@@ -89,9 +86,9 @@ def _run(
         rig.spin_until(
             lambda: all(x.behind for x in watches), 'samples of all plants', _PATIENCE)
         trajectories = [
-            rig.node.create_publisher(
-                interface.JOINT_TRAJECTORY.type, f'/pair_{k}/planner/joint_trajectory',
-                interface.JOINT_TRAJECTORY.qos) for k in range(spaces)]
+            interface.publisher(
+                rig.node, topics.JOINT_TRAJECTORY, f'/pair_{k}/{topics.PLANNER}')
+            for k in range(spaces)]
         rig.spin_until(
             lambda: all(x.get_subscription_count() for x in trajectories), 'the planners',
             _PATIENCE)

@@ -76,7 +76,9 @@ def round_trip(count: int) -> Row:
     """Time a setpoint's way to the planner process and its command's way back."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
+    from std_msgs.msg import Float64
 
+    from hmsa_ros.contract import topics
     from hmsa_ros.nodes import interface
 
     planner = subprocess.Popen([sys.executable, '-m', 'hmsa_ros', 'planner'])
@@ -86,13 +88,9 @@ def round_trip(count: int) -> Row:
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         received: list[float] = []
-        command = interface.FLUX_DENSITY_COMMAND
-        node.create_subscription(
-            command.type, command.name, lambda _: received.append(perf_counter()), command.qos)
-        setpoint = interface.SETPOINT
-        publisher = node.create_publisher(
-            setpoint.type, interface.from_outside(setpoint.name, interface.PLANNER),
-            setpoint.qos)
+        command = topics.FLUX_DENSITY_COMMAND
+        interface.subscribe(node, command, lambda _: received.append(perf_counter()))
+        publisher = interface.publisher(node, topics.SETPOINT, topics.PLANNER)
         deadline = monotonic() + 30.0
         while publisher.get_subscription_count() == 0 or not node.count_publishers(command.name):
             executor.spin_once(timeout_sec=0.05)
@@ -102,7 +100,7 @@ def round_trip(count: int) -> Row:
         for i in range(count):
             received.clear()
             begin = perf_counter()
-            publisher.publish(setpoint.type(data=float(_TARGETS[i % _TARGETS.size])))
+            publisher.publish(Float64(data=float(_TARGETS[i % _TARGETS.size])))
             deadline = monotonic() + 5.0
             while not received and monotonic() < deadline:
                 executor.spin_once(timeout_sec=0.05)

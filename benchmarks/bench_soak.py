@@ -542,7 +542,8 @@ class Soak:
 
     def _request(self) -> None:
         """Ask for something that makes sense, often before the last move is over."""
-        from hmsa_ros.nodes import interface
+        from std_srvs.srv import Trigger
+
         from hmsa_ros.nodes.conversions import to_trajectory
 
         dice = self._dice
@@ -558,24 +559,25 @@ class Soak:
                 points.append((dice.uniform(0.7, 1.6), round(end * _NANOSECONDS)))
             self.rig.publish_trajectory(to_trajectory(points, 'actuator'))
         else:
-            self._call(interface.STOP.type, '/planner/stop', interface.STOP.type.Request())
+            self._call(Trigger, '/planner/stop', Trigger.Request())
 
     def _rubbish(self, *, calm: bool) -> None:
         """Send garbage; in calm cycles only where it cannot reach the plant or what is checked."""
         from benchmarks.faults import garbage
-        from hmsa_ros.nodes import interface
+        from hmsa_ros.contract import topics
+        from hmsa_ros.nodes.message_types import interface_class
 
-        topics = [
+        inputs = [
             x for x in self._topics
-            if not calm or x[0] in (interface.SETPOINT, interface.JOINT_TRAJECTORY)]
+            if not calm or x[0] in (topics.SETPOINT, topics.JOINT_TRAJECTORY)]
         if not calm and self._dice.random() < 0.95:
             # A little of it goes a long way: each message is a jump of time.
-            topics = [x for x in topics if x[0] != interface.CLOCK_TOPIC]
-        topic, publisher = self._dice.choice(topics)
+            inputs = [x for x in inputs if x[0] != topics.CLOCK_TOPIC]
+        topic, publisher = self._dice.choice(inputs)
         made = garbage.message if self._dice.random() < 0.5 else garbage.encoding
         # What the middleware itself does not take never arrives.
         with suppress(Exception):
-            publisher.publish(made(topic.type, self._dice))
+            publisher.publish(made(interface_class(topic.type), self._dice))
         self.result.garbage += 1
 
     def _act_calmly(self) -> None:
@@ -587,9 +589,9 @@ class Soak:
     def _act_roughly(self) -> None:
         from rcl_interfaces.srv import SetParameters
         from rclpy.parameter import Parameter
+        from std_srvs.srv import SetBool
 
         from benchmarks.faults.inputs import wild_request
-        from hmsa_ros.nodes import interface
         from hmsa_ros.nodes.message_types import interface_class
 
         choice = self._dice.random()
@@ -609,8 +611,7 @@ class Soak:
                 self._call(kind, name, wild_request(kind, name, self._dice))
         else:
             # One of the calls above may have paused or slowed it, and nothing would go on.
-            self._call(interface.SET_PAUSED.type, '/plant/set_paused',
-                       interface.SET_PAUSED.type.Request(data=False))
+            self._call(SetBool, '/plant/set_paused', SetBool.Request(data=False))
             self._call(SetParameters, '/plant/set_parameters', SetParameters.Request(parameters=[
                 Parameter('real_time_factor', value=self._factor).to_parameter_msg()]))
 
@@ -634,7 +635,9 @@ class Soak:
 
     def _put_right(self) -> None:
         """Undo what garbage may have set."""
-        from hmsa_ros.nodes import interface
+        from std_srvs.srv import SetBool
+
+        from hmsa_ros.contract import topics
 
         self._publish_inputs()
         rig = self.rig
@@ -642,14 +645,14 @@ class Soak:
         self._looked = 0.0
         self._look()
         rig.ready(*self._children)
-        rig.call(interface.SET_PAUSED, 'plant', interface.SET_PAUSED.type.Request(data=False))
+        rig.call(topics.SET_PAUSED, 'plant', SetBool.Request(data=False))
         rig.set_parameters(
             'plant', use_sim_time=False, real_time_factor=self._factor, step_count=1,
             reset_stretch=0.0, reset_rate=0.0)
         rig.set_parameters(
             'planner', use_sim_time=True, flux_density_min=-0.5, flux_density_max=0.5,
             shaper='two_step', short_spell='continue', robust_order=2)
-        rig.call(interface.RESET, 'plant')
+        rig.call(topics.RESET, 'plant')
         self._pass(2.0 * self._lead)
         rig.publish_setpoint(1.0)
         self._pass(2.0 * self._lead)

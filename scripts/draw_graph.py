@@ -1,5 +1,5 @@
 """
-Draw docs/images/graph.svg, the graph of nodes and topics, from hmsa_ros.nodes.interface.
+Draw docs/images/graph.svg, the graph of nodes and topics, from hmsa_ros.contract.topics.
 
 Used by ``make graph``. With ``--check`` nothing is written; the exit status is 1 if the file is
 not what would be drawn.
@@ -68,27 +68,27 @@ class Drawing:
 
 def draw() -> str:
     """Return the graph as SVG."""
-    from hmsa_ros.nodes import interface
-    from hmsa_ros.nodes.interface import PLANNER, PLANT, PLAYER, RECORDER
+    from hmsa_ros.contract import topics
+    from hmsa_ros.contract.topics import PLANNER, PLANT, PLAYER, RECORDER
 
-    topics = [x for x in vars(interface).values() if isinstance(x, interface.Topic)]
-    own = [x for x in topics if not x.name.startswith('/')]
-    absolute = [x.name for x in topics if x.name.startswith('/')]
+    declared = [x for x in vars(topics).values() if isinstance(x, topics.Topic)]
+    own = [x for x in declared if not x.name.startswith('/')]
+    absolute = [x.name for x in declared if x.name.startswith('/')]
 
     def between(sender: str, taker: str) -> list[str]:
-        return [interface.from_outside(x.name, sender) for x in own
+        return [topics.from_outside(x.name, sender) for x in own
                 if sender in x.publishers and taker in x.subscribers]
 
     def open_ended(sender: str) -> list[str]:
-        return [interface.from_outside(x.name, sender) for x in own
+        return [topics.from_outside(x.name, sender) for x in own
                 if sender in x.publishers and not {PLANNER, PLANT} & set(x.subscribers)]
 
     def services(node: str) -> str:
-        return ', '.join(x.name.removeprefix('~/') for x in vars(interface).values()
-                         if isinstance(x, interface.Service) and node in x.meaning)
+        return ', '.join(x.name.removeprefix('~/') for x in vars(topics).values()
+                         if isinstance(x, topics.Service) and node in x.meaning)
 
     def from_you(taker: str) -> list[str]:
-        return [interface.from_outside(x.name, taker) for x in own
+        return [topics.from_outside(x.name, taker) for x in own
                 if taker in x.subscribers and not x.publishers]
 
     requests = from_you(PLANNER)
@@ -165,7 +165,7 @@ def main(words: Sequence[str]) -> int:
     if '--check' not in words:
         FILE.write_text(drawn, encoding='utf-8')
     elif not FILE.exists() or FILE.read_text(encoding='utf-8') != drawn:
-        print(f'{FILE} is not what hmsa_ros.nodes.interface says: expected it drawn anew, '
+        print(f'{FILE} is not what hmsa_ros.contract.topics says: expected it drawn anew, '
               'run make graph', file=sys.stderr)
         return 1
     return 0

@@ -99,6 +99,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             bool(item.get_closest_marker('ros'))))
 
 
+def bound(kind: Any, qos: Any = 1000) -> tuple[Any, Any]:
+    """Return message class and profile; types and qualities may be those of the contract."""
+    from hmsa_ros.nodes import interface
+    from hmsa_ros.nodes.message_types import interface_class
+    return (interface_class(kind) if isinstance(kind, str) else kind,
+            interface.profile(qos) if isinstance(qos, interface.Quality) else qos)
+
+
 def wait_until(
         condition: Callable[[], Any], what: str = 'the condition',
         seconds: float = WAIT_SECONDS) -> Any:
@@ -336,13 +344,15 @@ class RosSide:
             self.executor.spin_once(SPIN_SECONDS)
         return result
 
-    def collect(self, message_type: type[Any], topic: str, qos: Any = 1000) -> list[Any]:
+    def collect(
+            self, message_type: type[Any] | str, topic: str, qos: Any = 1000) -> list[Any]:
         """
         Subscribe and return the list that received messages are appended to.
 
         A node that `Served` runs knows of the subscription then: what it publishes from here on
         arrives, were it a single message.
         """
+        message_type, qos = bound(message_type, qos)
         messages: list[Any] = []
         before = {x: x.get_subscription_count() for x in Served.publishers()}
         name = self.node.create_subscription(
@@ -353,18 +363,20 @@ class RosSide:
         return messages
 
     def publisher(
-            self, message_type: type[Any], topic: str, qos: Any = 1000,
+            self, message_type: type[Any] | str, topic: str, qos: Any = 1000,
             subscribers: int = 1) -> Any:
         """Return a publisher that already has so many subscribers."""
+        message_type, qos = bound(message_type, qos)
         publisher = self.node.create_publisher(message_type, topic, qos)
         self.spin_until(
             lambda: publisher.get_subscription_count() >= subscribers,
             f'{subscribers} subscribers of {topic}')
         return publisher
 
-    def call(self, service_type: type[Any], name: str, request: Any = None) -> Any:
+    def call(self, service_type: type[Any] | str, name: str, request: Any = None) -> Any:
         """Call a service and return its response."""
         from hmsa_ros.nodes.service_call import ServiceCall
+        service_type, _ = bound(service_type)
         client = self.node.create_client(service_type, name)
         self.spin_until(client.service_is_ready, f'service {name}')
         call = ServiceCall(

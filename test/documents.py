@@ -433,9 +433,9 @@ def declared(node: str) -> dict[str, Any]:
 
 
 def _nodes() -> tuple[str, ...]:
-    from hmsa_ros.nodes import interface
+    from hmsa_ros.contract import topics
 
-    return interface.NODES
+    return topics.NODES
 
 
 def _require(condition: object, sentence: str) -> None:
@@ -471,15 +471,15 @@ def _check_parameter(name: str, nodes: Iterable[str]) -> None:
              f'parameter {name!r} is not declared by {" or ".join(nodes)}')
 
 
-def _topic_names() -> dict[str, type]:
+def _topic_names() -> dict[str, str]:
     """Return each topic as it is named from outside without a namespace, with its type."""
-    from hmsa_ros.nodes import interface
+    from hmsa_ros.contract import topics
 
-    found: dict[str, type] = {}
-    for topic in vars(interface).values():
-        if isinstance(topic, interface.Topic):
+    found: dict[str, str] = {}
+    for topic in vars(topics).values():
+        if isinstance(topic, topics.Topic):
             for node in (*topic.publishers, *topic.subscribers):
-                name = interface.from_outside(topic.name, node)
+                name = topics.from_outside(topic.name, node)
                 found[name if name.startswith('/') else '/' + name] = topic.type
     return found
 
@@ -558,24 +558,24 @@ def _check_launch(name: str, rest: list[str]) -> None:
 
 def _check_message(kind: str, words: list[str]) -> None:
     """Require that a payload fits the type, and the type the topic or service."""
-    from hmsa_ros.nodes import interface
+    from hmsa_ros.contract import topics
 
     name, type_name = words[:2]
     package, group, cls = type_name.split('/')
     message = getattr(import_module(f'{package}.{group}'), cls)
     if kind == 'topic':
-        topics = _topic_names()
-        known: str | None = _known_name(name, topics)
+        types = _topic_names()
+        known: str | None = _known_name(name, types)
         _require(known, f'no topic {name!r}')
-        _require(topics[str(known)] is message,
-                 f'{name} has type {topics[str(known)].__name__}, not {type_name}')
+        _require(types[str(known)] == type_name,
+                 f'{name} has type {types[str(known)]}, not {type_name}')
     else:
         services = {
-            interface.from_outside(x.name, node): x.type for x in vars(interface).values()
-            if isinstance(x, interface.Service) for node in x.meaning}
+            topics.from_outside(x.name, node): x.type for x in vars(topics).values()
+            if isinstance(x, topics.Service) for node in x.meaning}
         known = _known_name(name, services)
         _require(known, f'no service {name!r}')
-        _require(services[str(known)] is message, f'{name} does not have type {type_name}')
+        _require(services[str(known)] == type_name, f'{name} does not have type {type_name}')
         message = message.Request
     if len(words) > 2:
         _fill(message(), yaml.safe_load(words[2]))

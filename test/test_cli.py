@@ -129,18 +129,18 @@ def test_send_is_patient_in_simulated_time_that_is_slower_than_the_wall(start, r
 @pytest.mark.slow
 @pytest.mark.ros
 def test_send_trusts_a_driver_that_publishes_samples_alone(start, ros):
+    from hmsa_ros.contract import topics
     from hmsa_ros.nodes import interface
 
     ros.collect(
-        interface.FLUX_DENSITY_COMMAND.type, 'flux_density_command',
-        interface.FLUX_DENSITY_COMMAND.qos)
+        topics.FLUX_DENSITY_COMMAND.type, 'flux_density_command',
+        topics.FLUX_DENSITY_COMMAND.qos)
     start.hmsa('planner', '--ros-args', '-p', 'lead_time:=0.5')
     ros.spin_until(lambda: ros.node.count_publishers('flux_density_command'), 'the planner')
     send = start.hmsa('send', '1.1:0.1', '--wait')
     assert send.wait(30.0) == 1, send.output
     assert 'nobody reports levels that take effect' in send.stderr
-    ros.node.create_publisher(
-        interface.JOINT_STATES.type, 'joint_states', interface.JOINT_STATES.qos)
+    interface.publisher(ros.node, topics.JOINT_STATES)
     send = start.hmsa('send', '1.2:0.1', '--wait')
     assert send.wait(30.0) == 0, send.output
     assert 'done: at_rest, predicted, not measured' in send.stdout
@@ -165,9 +165,9 @@ def test_send_fails_where_the_actuator_is_measured_to_miss_the_setpoint(start, r
 @pytest.mark.slow
 @pytest.mark.ros
 def test_send_moves_several_joints_each_to_its_stretch_or_all_to_one(start, ros):
-    from hmsa_ros.nodes import interface
+    from hmsa_ros.contract import topics
 
-    plans = ros.collect(interface.PLAN.type, 'planner/plan', interface.PLAN.qos)
+    plans = ros.collect(topics.PLAN.type, 'planner/plan', topics.PLAN.qos)
     joints = ['--ros-args', '-p', 'joints:=[left, right]']
     start.hmsa('plant', *joints)
     ros.spin_until(lambda: ros.node.count_publishers('joint_states'), 'the plant')

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from std_msgs.msg import Float64
 
-from hmsa_ros.nodes import conversions, interface
+from hmsa_ros.contract import topics
+from hmsa_ros.nodes import conversions
 from hmsa_ros.runtime.cycles import Cycles
 
 MS = 1_000_000
@@ -94,10 +95,10 @@ def test_a_plant_that_is_not_as_planned_fails_and_commands_of_others_are_obeyed(
     file = tmp_path / 'own.yaml'
     file.write_text(PARAMETERS.format(mismatch=1.1))
     diagnostics = ros.collect(
-        interface.DIAGNOSTICS.type, '/diagnostics', interface.DIAGNOSTICS.qos)
+        topics.DIAGNOSTICS.type, '/diagnostics', topics.DIAGNOSTICS.qos)
     applied = ros.collect(
-        interface.FLUX_DENSITY_APPLIED.type, 'flux_density_applied',
-        interface.FLUX_DENSITY_APPLIED.qos)
+        topics.FLUX_DENSITY_APPLIED.type, 'flux_density_applied',
+        topics.FLUX_DENSITY_APPLIED.qos)
     start.hmsa('controller', '--ros-args', '--params-file', str(file))
     send = start.hmsa('send', '1.4:0.3', '--wait')
     assert send.wait(60.0) == 1, send.output
@@ -116,7 +117,7 @@ def test_a_plant_that_is_not_as_planned_fails_and_commands_of_others_are_obeyed(
     received = int(newest('plant: commands')['received'])
     assert abs(received - int(sent['sent']) - int(sent['heartbeats'])) <= 10
     assert int(newest('controller: loop')['cycles']) > 0
-    topic = interface.FLUX_DENSITY_COMMAND
+    topic = topics.FLUX_DENSITY_COMMAND
     ros.publisher(topic.type, 'flux_density_command', topic.qos).publish(
         conversions.to_command(0, -0.0125, ''))
     ros.spin_until(
@@ -126,9 +127,9 @@ def test_a_plant_that_is_not_as_planned_fails_and_commands_of_others_are_obeyed(
 @pytest.mark.slow
 @pytest.mark.ros
 def test_a_plant_that_is_taken_away_is_missed_and_comes_back(start, ros):
-    statuses = ros.collect(interface.STATUS.type, 'planner/status', interface.STATUS.qos)
+    statuses = ros.collect(topics.STATUS.type, 'planner/status', topics.STATUS.qos)
     start.hmsa('controller', '--ros-args', '-p', 'lead_time:=0.5')
-    setpoint = ros.publisher(Float64, 'planner/setpoint', interface.SETPOINT.qos)
+    setpoint = ros.publisher(Float64, 'planner/setpoint', topics.SETPOINT.qos)
 
     def plant(*transitions):
         for x in transitions:

@@ -14,8 +14,8 @@ from hmsa_ros.core.actuators import Setup
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.simulation import ActuatorSimulation
 from hmsa_ros.device.hardware import HardwareDevice, HardwareJoint
-from hmsa_ros.device.health import CommandHealth, enough_samples, too_few_samples
-from hmsa_ros.device.protocol import Device, Kind, Sample
+from hmsa_ros.device.health import enough_samples, judge_commands, too_few_samples
+from hmsa_ros.device.protocol import Kind, Sample
 from hmsa_ros.device.sensor import Sensor, SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.device.transport import Transport
@@ -333,14 +333,12 @@ def test_a_sample_rate_too_low_for_the_actuator_is_told():
 
 
 def test_the_verdict_on_commands_names_what_is_wrong():
-    good = CommandHealth(0, 0, 0, 0, [], [])
-    assert good.verdict() == (0, 'commands in time')
-    assert replace(good, late=2, refused=1, refused_source=3).verdict() == (
+    assert judge_commands() == (0, 'commands in time')
+    assert judge_commands(late=2, refused=1, refused_source=3) == (
         1, '2 commands late, 4 refused')
-    names = [f'joint_{i}' for i in range(6)]
-    assert replace(good, crowded=names).verdict() == (
+    assert judge_commands(crowded=[f'joint_{i}' for i in range(6)]) == (
         1, 'several publishers command joint_0, joint_1, joint_2, joint_3 and 2 more')
-    assert replace(good, failed=1, silent=['a']).verdict() == (
+    assert judge_commands(failed=1, silent=['a']) == (
         2, '1 times started again after a load too large to follow; no command and no '
            'heartbeat for a')
 
@@ -452,7 +450,7 @@ def test_a_driver_reads_its_sensor_on_a_grid():
 
 @pytest.mark.parametrize('make', [plant, lambda: driver()[1]])
 def test_both_are_devices(make):
-    device: Device = make()
+    device = make()
     device.receive(0, START + MS, 0.05)
     device.advance(START + 2 * MS)
     (change,) = device.changes()

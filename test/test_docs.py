@@ -174,21 +174,21 @@ def test_a_block_cannot_be_left_out(language, marker, reason):
 
 @pytest.mark.ros
 def test_topics_and_services_are_those_that_the_nodes_have(start, ros, ros_env):
-    from hmsa_ros.nodes import interface
+    from hmsa_ros.contract import topics
 
     # By parameter only, or only while it is needed.
     sometimes = {'/clock', '/planner/markers', '/plant/markers'}
-    topics = [x for x in vars(interface).values() if isinstance(x, interface.Topic)]
-    services = [x for x in vars(interface).values() if isinstance(x, interface.Service)]
+    declared = [x for x in vars(topics).values() if isinstance(x, topics.Topic)]
+    services = [x for x in vars(topics).values() if isinstance(x, topics.Service)]
 
     def full(name: str, node: str) -> str:
-        return '/' + interface.from_outside(name, node).lstrip('/')
+        return '/' + topics.from_outside(name, node).lstrip('/')
 
-    for name in (interface.PLANNER, interface.PLANT):
+    for name in (topics.PLANNER, topics.PLANT):
         start.hmsa(name)
-    for name in (interface.PLANNER, interface.PLANT):
-        sent = {full(x.name, name) for x in topics if name in x.publishers}
-        taken = {full(x.name, name) for x in topics if name in x.subscribers}
+    for name in (topics.PLANNER, topics.PLANT):
+        sent = {full(x.name, name) for x in declared if name in x.publishers}
+        taken = {full(x.name, name) for x in declared if name in x.subscribers}
         served = {full(x.name, name) for x in services if name in x.meaning}
         ros.spin_until(lambda name=name: name in ros.node.get_node_names(), f'the {name}')
         ros.spin_until(

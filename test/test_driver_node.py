@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from hmsa_ros.nodes import interface
+from hmsa_ros.contract import topics
 from hmsa_ros.nodes.conversions import from_time, to_command
 
 TUTORIALS = Path(__file__).resolve().parent.parent / 'docs' / 'tutorials'
@@ -37,18 +37,18 @@ def nothing(joint):
 
 def field(ros):
     """Return a list that fills with the levels that took effect."""
-    topic = interface.FLUX_DENSITY_APPLIED
+    topic = topics.FLUX_DENSITY_APPLIED
     return ros.collect(topic.type, topic.name, topic.qos)
 
 
 @pytest.mark.ros
 def test_driver_of_the_tutorial_keeps_the_contract_of_a_driver(start, ros):
     applied = field(ros)
-    states = ros.collect(interface.JOINT_STATES.type, interface.JOINT_STATES.name)
+    states = ros.collect(topics.JOINT_STATES.type, topics.JOINT_STATES.name)
     driver = start.hmsa('driver', *BENCH, PYTHONPATH=str(TUTORIALS))
     command = ros.publisher(
-        interface.FLUX_DENSITY_COMMAND.type, interface.FLUX_DENSITY_COMMAND.name,
-        interface.FLUX_DENSITY_COMMAND.qos)
+        topics.FLUX_DENSITY_COMMAND.type, topics.FLUX_DENSITY_COMMAND.name,
+        topics.FLUX_DENSITY_COMMAND.qos)
     ros.spin_until(lambda: applied and states, 'the level at the start')
     assert applied[0].magnetic_field.z == 0.0
 
@@ -80,8 +80,8 @@ def test_hardware_that_breaks_ends_the_driver_with_all_coils_switched_off(start,
         'sh', '-c', 'cd "$0" && exec "$@"', tmp_path, sys.executable, '-m', 'hmsa_ros',
         'driver', '--ros-args', '-p', 'hardware:=lab:Coil', '-p', 'publish_rate:=20.0')
     command = ros.publisher(
-        interface.FLUX_DENSITY_COMMAND.type, interface.FLUX_DENSITY_COMMAND.name,
-        interface.FLUX_DENSITY_COMMAND.qos)
+        topics.FLUX_DENSITY_COMMAND.type, topics.FLUX_DENSITY_COMMAND.name,
+        topics.FLUX_DENSITY_COMMAND.qos)
     ros.spin_until(lambda: applied, 'the level at the start')
     command.publish(to_command(0, 0.25, 'coil'))
     assert driver.wait() == 1

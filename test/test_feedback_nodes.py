@@ -10,7 +10,7 @@ from std_srvs.srv import Trigger
 import yaml
 
 from benchmarks.bench_feedback import GRAPHS, judge, run
-from hmsa_ros.nodes import interface
+from hmsa_ros.contract import topics
 
 pytestmark = pytest.mark.ros
 # Where the kernels must be compiled first that takes a while.
@@ -20,14 +20,14 @@ PLANT = ('--ros-args', '-p', 'mismatch.shear_modulus:=1.2', '-p', 'stretch_noise
 
 def begin(start, ros, mode, *more):
     """Start both and wait for them; return a function of the newest sentence and its values."""
-    statuses = ros.collect(interface.STATUS.type, 'planner/status', interface.STATUS.qos)
-    samples = ros.collect(interface.JOINT_STATES.type, 'joint_states', interface.JOINT_STATES.qos)
+    statuses = ros.collect(topics.STATUS.type, 'planner/status', topics.STATUS.qos)
+    samples = ros.collect(topics.JOINT_STATES.type, 'joint_states', topics.JOINT_STATES.qos)
     start.hmsa('plant', *PLANT)
     # Commands far enough ahead for a busy machine.
     start.hmsa(
         'planner', '--ros-args', '-p', f'feedback:={mode}', '-p', 'lead_time:=0.3', *more)
     ros.spin_until(lambda: statuses and samples, 'planner and plant', RUN_SECONDS)
-    found = ros.collect(interface.ESTIMATE.type, 'planner/estimate', interface.ESTIMATE.qos)
+    found = ros.collect(topics.ESTIMATE.type, 'planner/estimate', topics.ESTIMATE.qos)
 
     def read():
         if not found:

@@ -5,11 +5,10 @@ import re
 import pytest
 from rclpy.parameter import Parameter
 
-from hmsa_ros.contract.parameters import ACTUATOR
+from hmsa_ros.contract import topics
+from hmsa_ros.contract.parameters import ACTUATOR, INITIAL_STRETCH, JOINT, ParameterSpec
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.joints import declare_joints, joint_names, JOINTS
-from hmsa_ros.nodes.parameters import INITIAL_STRETCH, JOINT, ParameterSpec
 
 OWN = (*ACTUATOR, INITIAL_STRETCH)
 SPECS = (*OWN, JOINT, JOINTS, ParameterSpec('other', 1, 'Not for one joint.', '', 0, 9))
@@ -77,7 +76,7 @@ def test_bad_value_of_a_joint_is_refused(make_ros, given, text):
 
 def test_topic_of_a_joint_has_its_name_where_there_are_several():
     several = ('left', 'right')
-    assert interface.of_joint(interface.SETPOINT, 'left', ('left',)) is interface.SETPOINT
-    assert interface.of_joint(interface.SETPOINT, 'left', several).name == '~/left/setpoint'
-    assert interface.of_joint(
-        interface.FLUX_DENSITY_COMMAND, 'left', several).name == 'left/flux_density_command'
+    assert topics.of_joint(topics.SETPOINT, 'left', ('left',)) is topics.SETPOINT
+    assert topics.of_joint(topics.SETPOINT, 'left', several).name == '~/left/setpoint'
+    assert topics.of_joint(
+        topics.FLUX_DENSITY_COMMAND, 'left', several).name == 'left/flux_density_command'

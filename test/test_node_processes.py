@@ -13,8 +13,8 @@ from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool
 
 from hmsa_ros.cli import main
+from hmsa_ros.contract import topics
 from hmsa_ros.core.residual import residual_vibration
-from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import from_time, to_trajectory
 
 pytestmark = pytest.mark.ros
@@ -105,14 +105,14 @@ def test_process_that_refuses_to_start_says_why_and_has_no_traceback(start, node
 def test_signal_ends_planner_and_plant_at_work_with_status_0_and_no_word(ros, start, number):
     # At work: samples flow, and a plan is being sent.
     processes = [start.hmsa(node) for node in NODES]
-    samples = ros.collect(interface.JOINT_STATES.type, interface.JOINT_STATES.name)
+    samples = ros.collect(topics.JOINT_STATES.type, topics.JOINT_STATES.name)
     commands = ros.collect(
-        interface.FLUX_DENSITY_COMMAND.type, interface.FLUX_DENSITY_COMMAND.name)
+        topics.FLUX_DENSITY_COMMAND.type, topics.FLUX_DENSITY_COMMAND.name)
     setpoints = ros.publisher(
-        interface.JOINT_TRAJECTORY.type,
-        interface.from_outside(interface.JOINT_TRAJECTORY.name, interface.PLANNER))
+        topics.JOINT_TRAJECTORY.type,
+        topics.from_outside(topics.JOINT_TRAJECTORY.name, topics.PLANNER))
     ros.spin_until(
-        lambda: ros.node.count_publishers(interface.FLUX_DENSITY_COMMAND.name), 'the planner')
+        lambda: ros.node.count_publishers(topics.FLUX_DENSITY_COMMAND.name), 'the planner')
     setpoints.publish(to_trajectory(
         [(1.1 + 0.1 * (k % 2), (k + 1) * SPELL) for k in range(1000)], 'actuator'))
     ros.spin_until(lambda: samples and commands, 'samples and commands')
@@ -155,24 +155,24 @@ def test_loop_leaves_no_residual_vibration_beside_a_process_that_takes_a_core(
     start.hmsa(
         'planner', '--ros-args', '-p', 'use_sim_time:=true', '-p', 'lead_time:=0.1')
 
-    def collect(topic: interface.Topic, qos: QoSProfile | None = None) -> list[Any]:
+    def collect(topic: topics.Topic, qos: QoSProfile | None = None) -> list[Any]:
         messages: list[Any] = ros.collect(
-            topic.type, interface.from_outside(topic.name, 'planner'), qos or topic.qos)
+            topic.type, topics.from_outside(topic.name, 'planner'), qos or topic.qos)
         return messages
 
-    samples = collect(interface.JOINT_STATES, QoSProfile(depth=100_000))
-    statuses = collect(interface.STATUS)
-    plans = collect(interface.PLAN)
-    reports = collect(interface.DIAGNOSTICS)
-    command = interface.FLUX_DENSITY_COMMAND.name
+    samples = collect(topics.JOINT_STATES, QoSProfile(depth=100_000))
+    statuses = collect(topics.STATUS)
+    plans = collect(topics.PLAN)
+    reports = collect(topics.DIAGNOSTICS)
+    command = topics.FLUX_DENSITY_COMMAND.name
     ros.spin_until(
         lambda: ros.node.count_publishers(command) and ros.node.count_subscribers(command)
-        and ros.node.count_publishers(interface.JOINT_STATES.name), 'both nodes')
+        and ros.node.count_publishers(topics.JOINT_STATES.name), 'both nodes')
     targets = (1.1, 1.2, 0.9, 1.4)
     request = to_trajectory(
         [(x, (k + 1) * SPELL) for k, x in enumerate(targets)], 'actuator', frame='a loop')
     trajectories = ros.publisher(
-        interface.JOINT_TRAJECTORY.type, 'planner/joint_trajectory')
+        topics.JOINT_TRAJECTORY.type, 'planner/joint_trajectory')
 
     def values(status: Any) -> dict[str, str]:
         return {x.key: x.value for x in status.values}

@@ -15,18 +15,13 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 import yaml
 
-from hmsa_ros.contract.parameters import ACTUATOR
+from hmsa_ros.contract.actuator import actuator_from
+from hmsa_ros.contract.parameters import ACTUATOR, BLOCK, ParameterSpec
 from hmsa_ros.contract.topics import NODES
 from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.errors import BadInputError
 import hmsa_ros.nodes
-from hmsa_ros.nodes.parameters import (
-    actuator_from,
-    BLOCK,
-    check_names,
-    declare,
-    ParameterSpec,
-)
+from hmsa_ros.nodes.parameters import check_names, declare
 from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.plant import PlantNode
 

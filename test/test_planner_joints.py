@@ -18,6 +18,7 @@ from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
+from hmsa_ros.contract import topics
 from hmsa_ros.core.model import natural_frequency
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.planner import Options, Planner
@@ -58,10 +59,11 @@ class Driver:
         self.received = 0
         self.hold_back = False
         self.held: list[Any] = []
-        topic = interface.of_joint(interface.FLUX_DENSITY_COMMAND, joint, joints)
-        ros.node.create_subscription(topic.type, topic.name, self.on_command, topic.qos)
-        topic = interface.of_joint(interface.FLUX_DENSITY_APPLIED, joint, joints)
-        self.applied = ros.node.create_publisher(topic.type, topic.name, topic.qos)
+        interface.subscribe(
+            ros.node, topics.of_joint(topics.FLUX_DENSITY_COMMAND, joint, joints),
+            self.on_command)
+        self.applied = interface.publisher(
+            ros.node, topics.of_joint(topics.FLUX_DENSITY_APPLIED, joint, joints))
 
     def on_command(self, message: Any) -> None:
         """Take a command, or keep it on its way."""
@@ -117,10 +119,10 @@ class Rig:
         self.planner = served.nodes[0]
         self.drivers = {x: Driver(ros, x, joints) for x in joints}
         self.statuses = ros.collect(
-            interface.STATUS.type, 'planner/status', interface.STATUS.qos)
-        self.plans = ros.collect(interface.PLAN.type, 'planner/plan', interface.PLAN.qos)
+            topics.STATUS.type, 'planner/status', topics.STATUS.qos)
+        self.plans = ros.collect(topics.PLAN.type, 'planner/plan', topics.PLAN.qos)
         self.trajectories = ros.publisher(
-            JointTrajectory, 'planner/joint_trajectory', interface.JOINT_TRAJECTORY.qos)
+            JointTrajectory, 'planner/joint_trajectory', topics.JOINT_TRAJECTORY.qos)
         channels = self.planner._channels.values()
         ros.spin_until(
             lambda: all(x._command.get_subscription_count() for x in channels)
@@ -249,7 +251,7 @@ def test_some_joints_only_by_parameter_and_one_by_its_own_setpoint(rig):
     assert not groups['left'].plan.segments
     assert groups['right'].plan.segments[0].arrival == groups['top'].plan.segments[0].arrival
     setpoints = planner.ros.publisher(
-        Float64, 'planner/left/setpoint', interface.SETPOINT.qos)
+        Float64, 'planner/left/setpoint', topics.SETPOINT.qos)
     setpoints.publish(Float64(data=1.3))
     planner.verdict(code='accepted', request='', plan=2)
     assert groups['left'].plan.segments[0].stretch == 1.3
@@ -263,13 +265,12 @@ def test_some_joints_only_by_parameter_and_one_by_its_own_setpoint(rig):
 
 def test_first_request_waits_for_the_state_in_force(rig, ros):
     planner = rig()
-    samples = ros.node.create_publisher(
-        JointState, 'joint_states', interface.JOINT_STATES.qos)
+    samples = interface.publisher(ros.node, topics.JOINT_STATES)
     ros.spin_until(lambda: planner.planner.count_publishers('joint_states'), 'the publisher')
     driver = planner.driver
     driver.plant.set_state(1.15, 3.0, 0.06)
     planner.trajectories.publish(to_trajectory([(1.3, SPELL)], 'actuator'))
-    setpoints = ros.publisher(Float64, 'planner/setpoint', interface.SETPOINT.qos)
+    setpoints = ros.publisher(Float64, 'planner/setpoint', topics.SETPOINT.qos)
     # Somebody publishes samples: the planner asks for one, and this request waits its turn.
     ros.spin_until(samples.get_subscription_count, 'the subscription')
     setpoints.publish(Float64(data=1.25))
@@ -301,11 +302,9 @@ def test_planner_that_is_killed_is_followed_by_one_that_takes_over(ros, start, m
     arguments = ('planner', '--ros-args', *QUIET)
     clock = ros.node.create_publisher(
         Clock, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
-    samples = ros.node.create_publisher(
-        JointState, 'joint_states', interface.JOINT_STATES.qos)
-    setpoints = ros.node.create_publisher(
-        Float64, 'planner/setpoint', interface.SETPOINT.qos)
-    statuses = ros.collect(interface.STATUS.type, 'planner/status', interface.STATUS.qos)
+    samples = interface.publisher(ros.node, topics.JOINT_STATES)
+    setpoints = interface.publisher(ros.node, topics.SETPOINT, topics.PLANNER)
+    statuses = ros.collect(topics.STATUS.type, 'planner/status', topics.STATUS.qos)
     driver = Driver(ros)
     now = START
 
@@ -500,7 +499,7 @@ def test_changed_block_and_lead_time_are_taken_by_the_next_plan(rig):
 def test_two_clocks_are_told_of_and_their_quarrel_makes_no_storm(rig, make_ros):
     planner = rig()
     arrays = planner.ros.collect(
-        interface.DIAGNOSTICS.type, '/diagnostics', interface.DIAGNOSTICS.qos)
+        topics.DIAGNOSTICS.type, '/diagnostics', topics.DIAGNOSTICS.qos)
     planner.send(to_trajectory(SEQUENCE, 'actuator'))
     other = make_ros()
     clock = other.publisher(
@@ -541,8 +540,8 @@ def test_step_back_of_the_wall_clock_is_noticed():
 def test_plan_is_dropped_when_the_wall_clock_is_set_back(ros, serve):
     served = serve(PlannerNode)
     planner = served.nodes[0]
-    statuses = ros.collect(interface.STATUS.type, 'planner/status', interface.STATUS.qos)
-    setpoints = ros.publisher(Float64, 'planner/setpoint', interface.SETPOINT.qos)
+    statuses = ros.collect(topics.STATUS.type, 'planner/status', topics.STATUS.qos)
+    setpoints = ros.publisher(Float64, 'planner/setpoint', topics.SETPOINT.qos)
     setpoints.publish(Float64(data=1.1))
     ros.spin_until(
         lambda: statuses and statuses[-1].values[0].value == 'accepted', 'the plan')

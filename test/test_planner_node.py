@@ -16,18 +16,13 @@ from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
+from hmsa_ros.contract import topics
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.planner import Options, PlannedLevel, Planner
 from hmsa_ros.core.shapers.pace import Pace
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.identification.files import errors_from
-from hmsa_ros.nodes import interface
-from hmsa_ros.nodes.conversions import (
-    from_command,
-    from_time,
-    to_time,
-    to_trajectory,
-)
+from hmsa_ros.nodes.conversions import from_command, from_time, to_time, to_trajectory
 from hmsa_ros.nodes.planner import PlannerNode
 
 pytestmark = pytest.mark.ros
@@ -63,13 +58,13 @@ class Bench:
             Options(flux_density_min=-0.5, flux_density_max=0.5, lead_time=LEAD))
         self.now = 0
         self.expected: list[PlannedLevel] = []
-        self.commands = self.collect(interface.FLUX_DENSITY_COMMAND)
-        self.plans = self.collect(interface.PLAN)
-        self.statuses = self.collect(interface.STATUS)
-        self.trajectories = self.publisher(interface.JOINT_TRAJECTORY)
-        self.setpoints = self.publisher(interface.SETPOINT)
+        self.commands = self.collect(topics.FLUX_DENSITY_COMMAND)
+        self.plans = self.collect(topics.PLAN)
+        self.statuses = self.collect(topics.STATUS)
+        self.trajectories = self.publisher(topics.JOINT_TRAJECTORY)
+        self.setpoints = self.publisher(topics.SETPOINT)
         # Who carries commands out reports on them; this one is silent.
-        self.publisher(interface.FLUX_DENSITY_APPLIED)
+        self.publisher(topics.FLUX_DENSITY_APPLIED)
         self.requests = 0
 
     def name(self, entry: Any) -> str:
@@ -77,7 +72,7 @@ class Bench:
         if entry.name in self.remapped:
             return self.remapped[entry.name]
         namespace, _, node = self.prefix.rpartition('/')
-        name = interface.from_outside(entry.name, node)
+        name = topics.from_outside(entry.name, node)
         return name if name.startswith('/') else f'{namespace}/{name}'
 
     def collect(self, topic: Any) -> list[Any]:
@@ -283,9 +278,9 @@ def test_late_joiner_gets_plan_and_status(bench, make_ros):
     planner.request(*SEQUENCE)
     late = make_ros()
     plans = late.collect(
-        interface.PLAN.type, planner.name(interface.PLAN), interface.PLAN.qos)
+        topics.PLAN.type, planner.name(topics.PLAN), topics.PLAN.qos)
     statuses = late.collect(
-        interface.STATUS.type, planner.name(interface.STATUS), interface.STATUS.qos)
+        topics.STATUS.type, planner.name(topics.STATUS), topics.STATUS.qos)
     late.spin_until(lambda: plans and statuses, 'plan and status')
     assert plans == planner.plans[-1:]
     assert statuses == planner.statuses[-1:]
@@ -351,7 +346,7 @@ def test_the_file_of_an_identification_is_a_parameter_file(bench, tmp_path):
         '    identification.values: [12000.0, 0.002]\n'
         '    identification.covariance: [144.0, 0.0, 0.0, 1.0e-10]\n')
     planner = bench('--params-file', str(file))
-    answer = planner.ros.call(Trigger, planner.name(interface.SAVE_ESTIMATE))
+    answer = planner.ros.call(Trigger, planner.name(topics.SAVE_ESTIMATE))
     assert not answer.success
     assert 'feedback_file is empty' in answer.message
 
@@ -362,7 +357,7 @@ def test_stop_comes_to_rest_without_vibration(bench):
     # The middle of the first move lies lead_time ahead of this.
     planner.at(START + 3 * MS)
     planner.core.stop(planner.now)
-    answer = planner.ros.call(Trigger, planner.name(interface.STOP))
+    answer = planner.ros.call(Trigger, planner.name(topics.STOP))
     assert (answer.success, answer.message) == (True, 'accepted')
     planner.take()
     # The first move is cut off by two levels: one that brakes, one that holds.
@@ -485,7 +480,7 @@ def test_nothing_is_accepted_before_simulated_time_has_started(bench):
     assert 'expected messages on /clock' in status.message
     planner.setpoints.publish(Float64(data=1.1))
     planner.verdict('no_time', request='')
-    answer = planner.ros.call(Trigger, planner.name(interface.STOP))
+    answer = planner.ros.call(Trigger, planner.name(topics.STOP))
     assert not answer.success
     assert '/clock' in answer.message
     planner.at(START)
@@ -585,7 +580,7 @@ def test_a_sample_that_cannot_be_read_is_ignored(serve, monkeypatch, data):
 
 def test_diagnostics_count_what_was_sent_and_refused(bench):
     planner = bench()
-    arrays = planner.collect(interface.DIAGNOSTICS)
+    arrays = planner.collect(topics.DIAGNOSTICS)
     planner.request(*SEQUENCE)
     planner.run(END)
     planner.send(trajectory(), 'bad_input')
@@ -604,7 +599,7 @@ def test_diagnostics_count_what_was_sent_and_refused(bench):
 
 def test_command_sent_after_its_time_is_counted_as_late(bench):
     planner = bench()
-    arrays = planner.collect(interface.DIAGNOSTICS)
+    arrays = planner.collect(topics.DIAGNOSTICS)
     planner.request(*SEQUENCE)
     planner.at(END)
 

@@ -13,11 +13,13 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool
 
+from hmsa_ros.contract import topics
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.simulation import ActuatorSimulation
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import from_time, to_clock, to_command, to_time
 from hmsa_ros.nodes.guard import Allegiance
+from hmsa_ros.nodes.message_types import interface_class
 from hmsa_ros.nodes.plant import PlantNode
 
 pytestmark = pytest.mark.ros
@@ -34,7 +36,6 @@ class Stand:
     def __init__(self, ros: Any, *, node: str = 'plant', subscribers: int = 1) -> None:
         self.ros = ros
         self.node = node
-        topics = interface
         self.samples = ros.collect(topics.JOINT_STATES.type, topics.JOINT_STATES.name, EVERY)
         applied = topics.FLUX_DENSITY_APPLIED
         self.applied = ros.collect(applied.type, applied.name, applied.qos)
@@ -52,17 +53,17 @@ class Stand:
             publisher.publish(to_command(stamp, flux_density, ''))
         assert publisher.wait_for_all_acked(Duration(seconds=60))
 
-    def call(self, service: interface.Service, **request: Any) -> Any:
+    def call(self, service: topics.Service, **request: Any) -> Any:
         """Call a service."""
+        kind = interface_class(service.type)
         return self.ros.call(
-            service.type, interface.from_outside(service.name, self.node),
-            service.type.Request(**request))
+            kind, topics.from_outside(service.name, self.node), kind.Request(**request))
 
     def step(self, count: int) -> int:
         """Advance by samples and return the time in ns."""
         results = self.ros.set_parameters(self.node, [Parameter('step_count', value=count)])
         assert results[0].successful, results[0].reason
-        answer = self.call(interface.STEP)
+        answer = self.call(topics.STEP)
         assert answer.success, answer.message
         now = round(float(answer.message.split()[1]) * 1e9)
         self.ros.spin_until(
@@ -144,7 +145,7 @@ def test_the_parameters_describe_coil_sensor_delays_and_another_actuator(stand):
 
 def test_a_second_publisher_is_told_and_obeyed_by_default(stand):
     plant = stand()
-    topic = interface.FLUX_DENSITY_COMMAND
+    topic = topics.FLUX_DENSITY_COMMAND
     second = plant.ros.publisher(topic.type, topic.name, topic.qos)
     plant.send((0, 0.05))
     plant.send((0, 0.03), publisher=second)
@@ -160,7 +161,7 @@ def test_a_second_publisher_is_told_and_obeyed_by_default(stand):
 
 def test_only_the_first_publisher_is_obeyed_until_it_is_gone(stand):
     plant = stand('-p', 'command_source:=first')
-    topic = interface.FLUX_DENSITY_COMMAND
+    topic = topics.FLUX_DENSITY_COMMAND
     second = plant.ros.publisher(topic.type, topic.name, topic.qos)
     plant.send((0, 0.05))
     plant.step(2)
@@ -203,7 +204,7 @@ def test_a_reset_leads_to_the_state_of_its_parameters(stand):
     results = plant.ros.set_parameters('plant', [
         Parameter('reset_stretch', value=1.2), Parameter('reset_rate', value=2.5)])
     assert all(x.successful for x in results)
-    answer = plant.call(interface.RESET)
+    answer = plant.call(topics.RESET)
     assert (answer.success, answer.message) == (True, 'at rate 2.5/s at stretch 1.2')
     plant.step(1)
     simulation = ActuatorSimulation(paper_actuator(), stretch=1.2, time=START + 10 * MS)
@@ -217,7 +218,7 @@ def test_a_reset_leads_to_the_state_of_its_parameters(stand):
 
 def test_a_disturbing_force_acts_from_its_stamp_on(stand):
     plant = stand()
-    topic = interface.DISTURBANCE_FORCE
+    topic = topics.DISTURBANCE_FORCE
     publisher = plant.ros.publisher(topic.type, topic.name, topic.qos)
     message = WrenchStamped()
     message.header.stamp = to_time(START + 2_345_678)
@@ -246,8 +247,7 @@ def test_a_disturbing_force_acts_from_its_stamp_on(stand):
 def test_another_clock_beside_the_authority_is_told(stand):
     plant = stand('-p', 'real_time_factor:=2.0')
     assert plant.report('time', clock_publishers=1).level == DiagnosticStatus.OK
-    clock = interface.CLOCK_TOPIC
-    other = plant.ros.node.create_publisher(clock.type, clock.name, clock.qos)
+    other = interface.publisher(plant.ros.node, topics.CLOCK_TOPIC)
     other.publish(to_clock(START))
     status = plant.report('time', clock_publishers=2)
     assert status.level == DiagnosticStatus.WARN
@@ -258,7 +258,7 @@ def test_the_achieved_real_time_factor_is_told_and_can_be_changed(stand):
     plant = stand()
     assert plant.ros.set_parameters(
         'plant', [Parameter('real_time_factor', value=0.25)])[0].successful
-    assert plant.call(interface.SET_PAUSED, data=False).success
+    assert plant.call(topics.SET_PAUSED, data=False).success
     plant.report('time', real_time_factor='0.25')
 
     def achieved() -> float:
@@ -280,7 +280,7 @@ def test_an_inactive_plant_holds_time_and_takes_no_commands(ros, serve):
     assert change(Transition.TRANSITION_CONFIGURE)
     plant = Stand(ros)
     plant.send((0, 0.05))
-    assert not plant.call(interface.STEP).success
+    assert not plant.call(topics.STEP).success
     plant.report('time', state='inactive')
     assert plant.samples == []
     assert change(Transition.TRANSITION_ACTIVATE)

@@ -7,10 +7,10 @@ from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool
 
+from hmsa_ros.contract import topics
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.simulation import ActuatorSimulation
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import from_time, to_command
 from hmsa_ros.nodes.plant import PlantNode
 
@@ -25,16 +25,16 @@ def test_each_joint_has_topics_parameters_and_a_motion_of_its_own(ros, serve):
     serve(PlantNode, *LEADING, '-p', 'joints:=[left, right, middle]', '-p',
           'left.initial_stretch:=1.1', '-p', 'right.slew_limit:=20.0')
     samples = ros.collect(
-        interface.JOINT_STATES.type, 'joint_states', QoSProfile(depth=100_000))
+        topics.JOINT_STATES.type, 'joint_states', QoSProfile(depth=100_000))
     told = {x: ros.collect(
-        interface.FLUX_DENSITY_APPLIED.type, f'{x}/flux_density_applied',
-        interface.FLUX_DENSITY_APPLIED.qos) for x in ('left', 'right', 'middle')}
+        topics.FLUX_DENSITY_APPLIED.type, f'{x}/flux_density_applied',
+        topics.FLUX_DENSITY_APPLIED.qos) for x in ('left', 'right', 'middle')}
     plants = {
         'left': ActuatorSimulation(paper_actuator(), time=START, stretch=1.1),
         'right': ActuatorSimulation(paper_actuator(), time=START, slew_limit=20.0),
         'middle': ActuatorSimulation(paper_actuator(), time=START, slew_limit=math.inf)}
     for k, joint in enumerate(('left', 'right')):
-        topic = interface.FLUX_DENSITY_COMMAND
+        topic = topics.FLUX_DENSITY_COMMAND
         publisher = ros.publisher(topic.type, f'{joint}/{topic.name}', topic.qos)
         stamp, level = START + (5 + k) * MS + 123_456, 0.04 + 0.01 * k
         publisher.publish(to_command(stamp, level, ''))
@@ -52,10 +52,10 @@ def test_each_joint_has_topics_parameters_and_a_motion_of_its_own(ros, serve):
                 plants[name].stretch, plants[name].rate, plants[name].flux_density)
     assert {name: [x.magnetic_field.z for x in found][1:] for name, found in told.items()} == {
         'left': [0.04], 'right': [0.05], 'middle': []}
-    topics = {x for x, _ in ros.node.get_topic_names_and_types()}
-    assert '/right/disturbance_force' in topics
+    names = {x for x, _ in ros.node.get_topic_names_and_types()}
+    assert '/right/disturbance_force' in names
     # A topic of numbers for each of many would cost more than it tells.
-    assert not [x for x in topics if x.endswith('/stretch')]
+    assert not [x for x in names if x.endswith('/stretch')]
 
 
 @pytest.mark.parametrize(('arguments', 'sentence'), [

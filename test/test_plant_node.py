@@ -12,11 +12,11 @@ from rclpy.duration import Duration
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_srvs.srv import SetBool, Trigger
 
+from hmsa_ros.contract import topics
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.residual import residual_vibration
 from hmsa_ros.core.simulation import simulate
-from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import from_time, to_clock, to_command
 from hmsa_ros.nodes.plant import PlantNode
 
@@ -64,11 +64,11 @@ class Bench:
     def __init__(self, ros: Any, served: Any) -> None:
         self.ros = ros
         self.served = served
-        self.samples = self.collect(interface.JOINT_STATES, EVERY)
-        command = interface.FLUX_DENSITY_COMMAND
+        self.samples = self.collect(topics.JOINT_STATES, EVERY)
+        command = topics.FLUX_DENSITY_COMMAND
         self.publisher = ros.publisher(command.type, command.name, command.qos)
 
-    def collect(self, topic: interface.Topic, qos: QoSProfile | None = None) -> list[Any]:
+    def collect(self, topic: topics.Topic, qos: QoSProfile | None = None) -> list[Any]:
         """Return the messages of a topic, once its publisher is there."""
         messages: list[Any] = self.ros.collect(topic.type, topic.name, qos or topic.qos)
         self.ros.spin_until(lambda: self.ros.node.count_publishers(topic.name), topic.name)
@@ -87,18 +87,18 @@ class Bench:
     def pause(self, paused: bool = True) -> None:
         """Pause the plant or let it go on."""
         answer = self.ros.call(
-            SetBool, interface.from_outside(interface.SET_PAUSED.name, 'plant'),
+            SetBool, topics.from_outside(topics.SET_PAUSED.name, 'plant'),
             SetBool.Request(data=paused))
         assert (answer.success, answer.message) == (True, 'paused' if paused else 'running')
 
-    def trigger(self, service: interface.Service) -> Any:
+    def trigger(self, service: topics.Service) -> Any:
         """Call a service."""
-        return self.ros.call(Trigger, interface.from_outside(service.name, 'plant'))
+        return self.ros.call(Trigger, topics.from_outside(service.name, 'plant'))
 
     def step(self) -> int:
         """Make one step and return the time in ns that it led to."""
         known = len(self.samples)
-        answer = self.trigger(interface.STEP)
+        answer = self.trigger(topics.STEP)
         assert answer.success
         self.ros.spin_until(
             lambda: len(self.samples) > known
@@ -135,7 +135,7 @@ class Bench:
 
     def diagnostics(self, **values: Any) -> DiagnosticStatus:
         """Wait for diagnostics with values, and return them."""
-        arrays = self.collect(interface.DIAGNOSTICS)
+        arrays = self.collect(topics.DIAGNOSTICS)
         expected = {key: str(value) for key, value in values.items()}
 
         def seen() -> bool:
@@ -223,8 +223,8 @@ def test_bad_commands_are_refused_and_counted_and_the_run_goes_on(leading):
 
 def test_sample_has_stretch_rate_and_flux_density_of_the_joint(bench):
     plant = bench(*LEADING, '-p', 'joint:=knee', '-p', 'initial_stretch:=1.2')
-    stretches = plant.collect(interface.STRETCH, EVERY)
-    rates = plant.collect(interface.STRETCH_RATE, EVERY)
+    stretches = plant.collect(topics.STRETCH, EVERY)
+    rates = plant.collect(topics.STRETCH_RATE, EVERY)
     plant.send((START + 3 * MS, 0.05))
     plant.run(START + 20 * MS)
     plant.ros.spin_until(
@@ -243,7 +243,7 @@ def test_sample_has_stretch_rate_and_flux_density_of_the_joint(bench):
 
 def test_clock_and_samples_have_the_same_time_and_it_keeps_to_the_real_time_factor(bench):
     plant = bench(*LEADING, '-p', 'real_time_factor:=0.1', '-p', 'start_time:=5.0')
-    clocks = plant.collect(interface.CLOCK_TOPIC, QoSProfile(
+    clocks = plant.collect(topics.CLOCK_TOPIC, QoSProfile(
         depth=10_000, reliability=ReliabilityPolicy.BEST_EFFORT))
     begin = time.monotonic_ns()
     plant.run(5 * 10**9 + 30 * MS)
@@ -282,14 +282,14 @@ def test_batch_runs_commands_that_were_queued_while_paused_without_residual_vibr
 
 
 def test_paused_plant_stands_still_and_repeats_its_time(leading):
-    clocks = leading.collect(interface.CLOCK_TOPIC)
+    clocks = leading.collect(topics.CLOCK_TOPIC)
     leading.ros.spin_until(lambda: len(clocks) >= 3, 'the time while paused')
     assert {from_time(x.clock) for x in clocks} == {START}
     assert leading.samples == []
 
 
 def test_each_step_advances_a_paused_plant_and_the_clock_by_one_sample(leading):
-    clocks = leading.collect(interface.CLOCK_TOPIC, QoSProfile(
+    clocks = leading.collect(topics.CLOCK_TOPIC, QoSProfile(
         depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT))
     leading.send((START + MS // 2, 0.05))
     assert [leading.step() for _ in range(3)] == [START + k * MS for k in (1, 2, 3)]
@@ -304,7 +304,7 @@ def test_each_step_advances_a_paused_plant_and_the_clock_by_one_sample(leading):
 
 def test_step_is_refused_while_the_plant_runs(leading):
     leading.pause(False)
-    answer = leading.trigger(interface.STEP)
+    answer = leading.trigger(topics.STEP)
     assert not answer.success
     assert 'expected it paused' in answer.message
 
@@ -345,7 +345,7 @@ def test_following_plant_starts_again_when_the_clock_jumps_back(following):
 
 def test_following_plant_tells_of_two_clocks_and_of_one_again(following, make_ros):
     plant, clock = following
-    arrays = plant.collect(interface.DIAGNOSTICS)
+    arrays = plant.collect(topics.DIAGNOSTICS)
 
     def told() -> str:
         return str(arrays[-1].status[1].message) if arrays else ''
@@ -354,7 +354,7 @@ def test_following_plant_tells_of_two_clocks_and_of_one_again(following, make_ro
     plant.wait(START)
     other = make_ros()
     second = other.publisher(
-        interface.CLOCK_TOPIC.type, interface.CLOCK_TOPIC.name, interface.CLOCK_TOPIC.qos)
+        topics.CLOCK_TOPIC.type, topics.CLOCK_TOPIC.name, topics.CLOCK_TOPIC.qos)
     plant.ros.spin_until(lambda: '2 publishers of /clock' in told(), 'two clocks')
     # Far behind: the simulation starts again, and goes on with whoever comes next.
 
@@ -377,7 +377,7 @@ def test_following_plant_can_be_paused(following):
     plant.send((START + 40 * MS, 0.1))
     plant.pause()
     clock.set(START + 50 * MS)
-    answer = plant.trigger(interface.STEP)
+    answer = plant.trigger(topics.STEP)
     assert not answer.success
     assert 'expected publish_clock true' in answer.message
     plant.diagnostics(time=f'{(START + 50 * MS) / 1e9:.9f}')

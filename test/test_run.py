@@ -78,9 +78,9 @@ def test_a_block_arrives_and_stays_though_it_creeps(start, tmp_path, feedback):
 
 @pytest.mark.slow
 def test_an_interrupted_experiment_brings_the_running_actuator_to_rest(start, ros, tmp_path):
-    from hmsa_ros.nodes import interface
+    from hmsa_ros.contract import topics
 
-    statuses = ros.collect(interface.STATUS.type, 'planner/status', interface.STATUS.qos)
+    statuses = ros.collect(topics.STATUS.type, 'planner/status', topics.STATUS.qos)
     nodes = [start.hmsa('plant'), start.hmsa('planner')]
 
     def now(key: str) -> str:

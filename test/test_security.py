@@ -14,7 +14,9 @@ from xml.etree import ElementTree
 
 from conftest import RosSide
 import pytest
+from std_msgs.msg import Float64
 
+from hmsa_ros.contract import topics
 from hmsa_ros.nodes import interface
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -126,7 +128,7 @@ def enclave_of(node: str) -> set[Grant]:
 
 def test_policies_follow_the_schema_and_name_an_enclave_for_every_node_and_person():
     assert set(GRANTS) == {f'/hmsa/{x}' for x in (
-        *interface.NODES, 'replay', 'operator', 'viewer')}
+        *topics.NODES, 'replay', 'operator', 'viewer')}
 
 
 def test_names_are_written_out_but_for_users_whose_own_names_end_in_a_number():
@@ -208,23 +210,22 @@ def test_policies_grant_exactly_what_the_nodes_do(tmp_path, start, ros):
         'planner', '--ros-args', *simulated, '-p', 'takeover_timeout:=60.0')
     # There to be recorded, without a coil.
     driver = start.hmsa('driver', '--ros-args', '-p', 'autostart:=false')
-    force = ros.node.create_publisher(
-        interface.DISTURBANCE_FORCE.type, '/disturbance_force', interface.DISTURBANCE_FORCE.qos)
-    for topic in (interface.JOINT_TRAJECTORY, interface.SETPOINT):
+    force = interface.publisher(ros.node, topics.DISTURBANCE_FORCE)
+    for topic in (topics.JOINT_TRAJECTORY, topics.SETPOINT):
         ros.publisher(topic.type, f'/planner/{topic.name[2:]}', topic.qos, subscribers=2)
     requests = ros.publisher(
-        interface.SETPOINT.type, '/planner/setpoint', interface.SETPOINT.qos, subscribers=2)
+        topics.SETPOINT.type, '/planner/setpoint', topics.SETPOINT.qos, subscribers=2)
     sent = [0.0]
 
     def looks_for_the_state() -> bool:
         if time.monotonic() > sent[0] + 1.0:
             # Said again, in case simulated time had not reached the planner yet.
             sent[0] = time.monotonic()
-            requests.publish(interface.SETPOINT.type(data=1.1))
+            requests.publish(Float64(data=1.1))
         return ('subscribe', '/joint_states') in seen.get('planner', set())
 
     watch(ros, RUNNING, seen, looks_for_the_state, 'the planner to look for the state in force')
-    ros.call(interface.SET_PAUSED.type, '/plant/set_paused')
+    ros.call(topics.SET_PAUSED.type, '/plant/set_paused')
     # The plant follows a clock, and there is a player to be recorded, below.
     later = {('subscribe', '/clock'), ('subscribe', '/player/transition_event')}
     watch(ros, RUNNING, seen, nothing_left('planner', 'plant', without=later),

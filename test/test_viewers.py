@@ -17,13 +17,15 @@ from xml.etree import ElementTree
 from beam_oracle import silicone
 import numpy as np
 import pytest
+from std_msgs.msg import Float64
 import yaml
 
 from hmsa_ros import rerun_view
+from hmsa_ros.contract import topics
 from hmsa_ros.contract.actuator import parameters_of
 from hmsa_ros.core.parameters import paper_actuator
-from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.markers import Block, Scene, State
+from hmsa_ros.nodes.message_types import interface_class
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIG = ROOT / 'config'
@@ -49,31 +51,27 @@ FOXGLOVE_PANELS = {
 PLOT_STYLES = {'Lines', 'Dots', 'LinesAndDots', 'Sticks', 'Steps', 'StepsInv'}
 
 
-def topics() -> Mapping[str, interface.Topic]:
+def by_name() -> Mapping[str, topics.Topic]:
     """Return the topics by full name, of one joint and no namespace."""
     found = {}
-    for topic in vars(interface).values():
-        if isinstance(topic, interface.Topic):
+    for topic in vars(topics).values():
+        if isinstance(topic, topics.Topic):
             for node in (*topic.publishers, *topic.subscribers):
-                name = interface.from_outside(topic.name, node)
+                name = topics.from_outside(topic.name, node)
                 found[name if name.startswith('/') else f'/{name}'] = topic
     return found
 
 
-def services() -> Mapping[str, interface.Service]:
+def services() -> Mapping[str, topics.Service]:
     """Return the services by full name."""
-    return {f'/{interface.from_outside(service.name, node)}': service
-            for service in vars(interface).values()
-            if isinstance(service, interface.Service) for node in service.meaning}
+    return {f'/{topics.from_outside(service.name, node)}': service
+            for service in vars(topics).values()
+            if isinstance(service, topics.Service) for node in service.meaning}
 
 
-def type_name(kind: type[Any], what: str = 'msg') -> str:
-    """Return the name of a message type."""
-    return f'{kind.__module__.partition(".")[0]}/{what}/{kind.__name__}'
-
-
-def field(kind: type[Any], path: str) -> None:
+def field(type_name: str, path: str) -> None:
     """Follow a path of fields, as ``points[:].positions[0]``, through a message type."""
+    kind = interface_class(type_name)
     message: Any = kind()
     for part in path.split('.'):
         name, index = re.fullmatch(r'(\w+)((?:\[[\d:]*\])?)', part).groups()  # type: ignore[union-attr]
@@ -115,12 +113,12 @@ def test_rviz_shows_the_markers_of_plant_and_planner_as_they_are_offered():
                 if x['Class'] == 'rviz_default_plugins/MarkerArray']
     # Relative, so that RViz in the nodes' namespace finds them.
     assert {x['Topic']['Value'] for x in displays} == {
-        interface.from_outside(interface.MARKERS.name, node)
-        for node in interface.MARKERS.publishers}
+        topics.from_outside(topics.MARKERS.name, node)
+        for node in topics.MARKERS.publishers}
     for display in displays:
         assert display['Enabled'] is True
         assert display['Topic']['Reliability Policy'] == 'Reliable'
-        assert interface.MARKERS.qos.durability.name == 'TRANSIENT_LOCAL'
+        assert topics.MARKERS.qos.latched
         assert display['Topic']['Durability Policy'] == 'Transient Local'
 
 
@@ -158,13 +156,13 @@ def test_foxglove_layout_has_each_panel_once_in_its_place():
 
 
 def test_foxglove_shows_topics_and_fields_that_there_are():
-    known = topics()
+    known = by_name()
     for name, config in FOXGLOVE['configById'].items():
         kind = name.partition('!')[0]
         if kind == '3D':
             assert config['topics']
             for topic in config['topics']:
-                assert known[topic] is interface.MARKERS
+                assert known[topic] is topics.MARKERS
         elif kind == 'Plot':
             for path in config['paths']:
                 topic, _, fields = path['value'].partition('.')
@@ -174,17 +172,17 @@ def test_foxglove_shows_topics_and_fields_that_there_are():
         elif kind == 'RawMessages':
             assert config['topicPath'] in known
         elif kind == 'DiagnosticSummary':
-            assert config['topicToRender'] == interface.DIAGNOSTICS.name
+            assert config['topicToRender'] == topics.DIAGNOSTICS.name
 
 
 def test_foxglove_publishes_and_calls_what_the_planner_takes():
     publish = FOXGLOVE['configById']['Publish!setpoint']
     assert publish['topicName'] == '/planner/setpoint'
-    topic = topics()[publish['topicName']]
-    assert publish['datatype'] == type_name(topic.type)
-    assert topic.type(**json.loads(publish['value'])).data > 0.0
+    topic = by_name()[publish['topicName']]
+    assert publish['datatype'] == topic.type
+    assert interface_class(topic.type)(**json.loads(publish['value'])).data > 0.0
     call = FOXGLOVE['configById']['CallService!stop']
-    request = services()[call['serviceName']].type.Request
+    request = interface_class(services()[call['serviceName']].type).Request
     assert json.loads(call['requestPayload']) == {}
     assert request.get_fields_and_field_types() == {}
 
@@ -212,7 +210,7 @@ def test_plotjuggler_file_has_what_plotjuggler_reads():
 
 
 def test_plotjuggler_shows_topics_and_fields_that_there_are():
-    known = topics()
+    known = by_name()
     names = []
     for curve in PLOTJUGGLER.iter('curve'):
         names += [curve.attrib['curve_x'], curve.attrib['curve_y']] \
@@ -230,9 +228,9 @@ def test_plotjuggler_shows_topics_and_fields_that_there_are():
 
 
 def test_rerun_view_names_topics_that_there_are():
-    known = topics()
+    known = by_name()
     assert f'/{rerun_view.JOINT_STATES}' in known
-    assert all(known[f'/{name}'] is interface.MARKERS for name in rerun_view.MARKERS)
+    assert all(known[f'/{name}'] is topics.MARKERS for name in rerun_view.MARKERS)
     for path in list(rerun_view.views().values())[:-1]:
         topic, _, fields = path.rpartition('/')
         field(known[topic].type, f'{fields}[0]')
@@ -279,13 +277,13 @@ def test_rerun_has_data_under_every_path_that_its_views_show(
     start.hmsa('planner')
     # The test itself and the recorder.
     setpoint = ros.publisher(
-        interface.SETPOINT.type, '/planner/setpoint', interface.SETPOINT.qos, subscribers=2)
+        topics.SETPOINT.type, '/planner/setpoint', topics.SETPOINT.qos, subscribers=2)
     states, targets = (
-        ros.collect(interface.MARKERS.type, f'/{node}/markers', interface.MARKERS.qos)
-        for node in interface.MARKERS.publishers)
+        ros.collect(topics.MARKERS.type, f'/{node}/markers', topics.MARKERS.qos)
+        for node in topics.MARKERS.publishers)
     for text in ('/plant/markers', '/planner/markers', '/joint_states'):
         recorder.wait_for_output(f'subscribed to {text}')
-    setpoint.publish(interface.SETPOINT.type(data=1.1))
+    setpoint.publish(Float64(data=1.1))
     # Until it has set out: its field is there.
     ros.spin_until(
         lambda: targets and targets[-1].markers[0].action == 0

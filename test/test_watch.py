@@ -20,8 +20,9 @@ import numpy as np
 import pyte
 import pytest
 
+from hmsa_ros.contract.status import Verdict
 from hmsa_ros.watch.chart import limits, strip
-from hmsa_ros.watch.scene import History, Joint, Report, RequestState, Scene
+from hmsa_ros.watch.scene import History, Joint, Report, Scene
 from hmsa_ros.watch.screen import as_json, line, Screen
 
 WAIT_SECONDS = 60.0
@@ -45,7 +46,7 @@ def scene(*joints):
     return Scene(
         'domain 42  /', 100.0, stamp=12.5, age=0.01, sample_rate=1000.0,
         joints=joints or (joint(),), progress=0.25,
-        request=RequestState(0, 'accepted', 'accepted', 'moving', 1, 3),
+        request=Verdict(0, 'accepted', 'accepted', '', 'moving', 1, 3),
         reports=[Report('planner', 1, '2 commands sent late', {'sent': 6, 'late': 2}),
                  Report('plant', 0, 'commands in time', {'late': 0}, age=9.0)])
 
@@ -137,7 +138,7 @@ def test_a_refusal_is_shown_to_its_end():
     reason = (
         'the stretch of point 3 is 2.4: expected between 0.643172 and 1.905871, where the flux '
         'density of -0.2 T to 0.2 T holds the actuator and its chains are not at their end')
-    seen = replace(scene(), request=RequestState(2, reason, 'out_of_range', 'idle', 0, 0))
+    seen = replace(scene(), request=Verdict(2, reason, 'out_of_range', '', 'idle', 0, 0))
     lines = [x.plain for x in Screen(10.0).lines(seen, 80, 24)]
     place = next(i for i, x in enumerate(lines) if x.startswith('verdict  ERROR '))
     assert reason in ' '.join(x[15:].strip() for x in lines[place:place + 4])
@@ -262,6 +263,7 @@ def test_each_joint_has_its_own_target_command_and_history(ros, ros_env, wait_un
     from sensor_msgs.msg import JointState, MagneticField
     from std_msgs.msg import Header
 
+    from hmsa_ros.contract import topics
     from hmsa_ros.nodes import interface
     from hmsa_ros.nodes.conversions import to_time
     from hmsa_ros.watch.listener import Listener
@@ -274,7 +276,7 @@ def test_each_joint_has_its_own_target_command_and_history(ros, ros_env, wait_un
     publish = {
         name: ros.node.create_publisher(kind, name, qos).publish for name, kind, qos in (
             ('joint_states', JointState, 100), ('diagnostics', DiagnosticArray, 10),
-            ('planner/status', DiagnosticStatus, interface.LATCHED),
+            ('planner/status', DiagnosticStatus, interface.profile(topics.LATCHED)),
             ('right/flux_density_command', MagneticField, 100))}
     publish['planner/status'](status(
         'planner: request', DiagnosticStatus.OK, 'left, right', state='moving', stretch='',
@@ -320,27 +322,28 @@ def test_garbage_on_its_topics_neither_ends_nor_misleads_it(ros, ros_env, wait_u
     from trajectory_msgs.msg import JointTrajectory
 
     from benchmarks.faults import garbage
+    from hmsa_ros.contract import topics
     from hmsa_ros.nodes import interface
     from hmsa_ros.nodes.conversions import to_command
     from hmsa_ros.watch.listener import Listener
 
     dice = random.Random(7)
-    topics = [
+    senders = [
         (kind, ros.node.create_publisher(kind, name, qos)) for name, kind, qos in (
             ('joint_states', JointState, 1000), ('diagnostics', DiagnosticArray, 1000),
-            ('planner/status', DiagnosticStatus, interface.LATCHED),
-            ('planner/plan', JointTrajectory, interface.LATCHED),
+            ('planner/status', DiagnosticStatus, interface.profile(topics.LATCHED)),
+            ('planner/plan', JointTrajectory, interface.profile(topics.LATCHED)),
             ('flux_density_command', type(to_command(0, 0.0, '')), 1000))]
     screen = Screen(span=10.0, unicode=True)
     with Listener(span=10.0) as listener:
         def aside():
-            for kind, publisher in topics:
+            for kind, publisher in senders:
                 for made in (garbage.message, garbage.encoding):
                     # What the middleware itself does not take never arrives.
                     with suppress(Exception):
                         publisher.publish(made(kind, dice))
             # What it is made for, with values that are wild.
-            topics[1][1].publish(DiagnosticArray(status=[DiagnosticStatus(
+            senders[1][1].publish(DiagnosticArray(status=[DiagnosticStatus(
                 name='planner: \x1b[2J', message='\x1b]0;mine\x07', level=bytes([255]),
                 values=[KeyValue(key='late', value=dice.choice(('²', '9' * 5000, '7')))])]))
             seen = listener.look()
@@ -353,7 +356,7 @@ def test_garbage_on_its_topics_neither_ends_nor_misleads_it(ros, ros_env, wait_u
         names = wait_until(lambda: len(found := aside()) == 5 and found)
         assert len(names) == 5
         good = JointState(name=['finger'], position=[1.25], velocity=[0.0], effort=[0.01])
-        topics[0][1].publish(good)
+        senders[0][1].publish(good)
         wait_until(lambda: {x.name: x for x in listener.look().joints}['finger'].stretch == 1.25)
 
 

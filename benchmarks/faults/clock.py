@@ -13,6 +13,7 @@ from time import monotonic, sleep
 
 import rclpy
 
+from hmsa_ros.contract import topics
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import to_clock
@@ -30,8 +31,7 @@ def main(arguments: list[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     rclpy.init(args=[])
     node = rclpy.create_node('clock', enable_rosout=False)
-    topic = interface.CLOCK_TOPIC
-    publisher = node.create_publisher(topic.type, topic.name, topic.qos)
+    publisher = interface.publisher(node, topics.CLOCK_TOPIC)
     begin = monotonic()
     try:
         while rclpy.ok():

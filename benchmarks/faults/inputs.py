@@ -5,11 +5,13 @@ from contextlib import suppress
 import random
 from typing import Any
 
+from std_srvs.srv import SetBool
+
 from benchmarks.faults import garbage
 from benchmarks.faults.common import jump, LIMIT, move, moves, pair, Register, share
 from benchmarks.faults.rig import hushed, Rig
 from benchmarks.faults.table import Seen
-from hmsa_ros.nodes import interface
+from hmsa_ros.contract import topics
 from hmsa_ros.nodes.conversions import to_command
 from hmsa_ros.nodes.message_types import interface_class
 
@@ -18,15 +20,15 @@ _COUNT = 300
 _CALLS = 60
 
 
-def input_topics() -> Iterator[tuple[interface.Topic, str]]:
+def input_topics() -> Iterator[tuple[topics.Topic, str]]:
     """Yield every topic that nodes of the package take messages from, and whose private it is."""
-    for topic in vars(interface).values():
-        if isinstance(topic, interface.Topic) and topic.subscribers:
+    for topic in vars(topics).values():
+        if isinstance(topic, topics.Topic) and topic.subscribers:
             yield topic, next(
-                (x for x in topic.subscribers if x != interface.RECORDER), '')
+                (x for x in topic.subscribers if x != topics.RECORDER), '')
     # Parameters and rclpy subscribe to these.
-    yield interface.CLOCK_TOPIC, ''
-    yield interface.DIAGNOSTICS, ''
+    yield topics.CLOCK_TOPIC, ''
+    yield topics.DIAGNOSTICS, ''
 
 
 @FAULTS.fault(
@@ -49,7 +51,7 @@ def _topics(rig: Rig) -> Seen:
                 made = garbage.message if dice.random() < 0.5 else garbage.encoding
                 # What the middleware itself does not take never arrives.
                 with suppress(Exception):
-                    publisher.publish(made(topic.type, dice))
+                    publisher.publish(made(interface_class(topic.type), dice))
             rig.spin(0.005)
         for _, publisher in publishers:
             rig.node.destroy_publisher(publisher)
@@ -91,7 +93,7 @@ def _services(rig: Rig) -> Seen:
             for _ in range(_CALLS):
                 rig.call_by_name(kind, name, wild_request(kind, name, dice))
             called += 1
-    rig.call(interface.SET_PAUSED, 'plant', interface.SET_PAUSED.type.Request(data=False))
+    rig.call(topics.SET_PAUSED, 'plant', SetBool.Request(data=False))
     refused = rig.set_parameters(
         'planner', use_sim_time=False, flux_density_min=-0.5, flux_density_max=0.5,
         shaper='two_step')
@@ -170,8 +172,8 @@ def _stranger(rig: Rig, source: str) -> tuple[float, int, float, float]:
     """Have a stranger command the plant while the planner holds 1.2."""
     pair(rig, plant={'command_source': source})
     moves(rig, (1.2,))
-    stranger = rig.publisher(interface.FLUX_DENSITY_COMMAND)
-    name = interface.FLUX_DENSITY_COMMAND.name
+    stranger = rig.publisher(topics.FLUX_DENSITY_COMMAND)
+    name = topics.FLUX_DENSITY_COMMAND.name
     rig.spin_until(lambda: rig.node.count_publishers(name) == 2, 'the stranger')
     rig.spin(0.5)
     mark = rig.count()

@@ -2,14 +2,15 @@
 
 from dataclasses import replace
 
+from geometry_msgs.msg import WrenchStamped
 import numpy as np
 
 from benchmarks.faults.common import await_change, LIMIT, moves, pair, Register, share
 from benchmarks.faults.rig import Rig, settled
 from benchmarks.faults.table import Seen
+from hmsa_ros.contract import topics
 from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.core.simulation import ActuatorSimulation
-from hmsa_ros.nodes import interface
 
 FAULTS = Register()
 _SHARES = (0.01, 0.05, 0.1, 0.2)
@@ -129,17 +130,16 @@ def _transport(rig: Rig) -> Seen:
 def _disturbance(rig: Rig) -> Seen:
     pair(rig)
     moves(rig, (1.2,))
-    topic = interface.DISTURBANCE_FORCE
-    publisher = rig.publisher(topic)
+    publisher = rig.publisher(topics.DISTURBANCE_FORCE)
     rig.spin_until(publisher.get_subscription_count, 'the plant to listen to forces')
-    push = topic.type()
+    push = WrenchStamped()
     push.wrench.force.z = 0.05
     mark = rig.count()
     publisher.publish(push)
     rig.let_pass(0.5)
     pushed = float(rig.samples()[1][-1, 0])
     flux = float(np.ptp(rig.samples(mark)[1][:, 2]))
-    publisher.publish(topic.type())
+    publisher.publish(WrenchStamped())
     rig.let_pass(1.0)
     back = float(rig.samples()[1][-1, 0])
     worst = moves(rig, (1.1, 1.3), start=1.2)

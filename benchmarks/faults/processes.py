@@ -5,6 +5,7 @@ import signal
 import subprocess
 
 import numpy as np
+from std_msgs.msg import Float64
 
 from benchmarks.faults.common import (
     await_change,
@@ -21,7 +22,7 @@ from benchmarks.faults.rig import Rig, settled
 from benchmarks.faults.table import Seen
 from hmsa_ros.bag.reader import BagReader
 from hmsa_ros.bag.recover import recover
-from hmsa_ros.nodes import interface
+from hmsa_ros.contract import topics
 
 FAULTS = Register()
 _TIMEOUT = 0.5
@@ -202,7 +203,7 @@ def _recorder_killed(rig: Rig) -> Seen:
     worst = max(worst, moves(rig, (1.1, 1.3), start=1.4))
     recover(bag, rig.folder / 'recovered')
     reader = BagReader(rig.folder / 'recovered')
-    topic = '/' + interface.JOINT_STATES.name
+    topic = '/' + topics.JOINT_STATES.name
     decode = reader.decoder(topic)
     stamps = [decode(x.data).header.stamp for x in reader.messages((topic,))]
     times = np.array([x.sec * 10**9 + x.nanosec for x in stamps])
@@ -246,7 +247,7 @@ def _disk_full(rig: Rig) -> Seen:
 def _gaps(bag: Path) -> tuple[int, int]:
     """Count missing samples in a bag."""
     reader = BagReader(bag)
-    topic = '/' + interface.JOINT_STATES.name
+    topic = '/' + topics.JOINT_STATES.name
     decode = reader.decoder(topic)
     stamps = [decode(x.data).header.stamp for x in reader.messages((topic,))]
     times = np.array([x.sec * 10**9 + x.nanosec for x in stamps])
@@ -273,8 +274,8 @@ def _deactivated(rig: Rig) -> Seen:
     rest = float(np.ptp(rig.samples()[1][-50:, 0]))
     sent = len(rig.commands)
     mark = rig.count()
-    rig.publisher(interface.SETPOINT, interface.PLANNER).publish(
-        interface.SETPOINT.type(data=1.1))
+    rig.publisher(topics.SETPOINT, topics.PLANNER).publish(
+        Float64(data=1.1))
     rig.let_pass(0.05, 60.0)
     moved = jump(rig, mark)
     sent = len(rig.commands) - sent

@@ -11,6 +11,7 @@ the clock of the nodes does.
 import argparse
 from collections import deque
 from contextlib import suppress
+from dataclasses import replace
 import signal
 import sys
 from time import monotonic
@@ -21,6 +22,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import MagneticField
 
+from hmsa_ros.contract import topics
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.runner import spin
 
@@ -40,9 +42,9 @@ class Relay(Node):
         # Stamps of commands that are lost; a heartbeat may repeat one before it applies.
         self._lost: list[Time] = []
         self._waiting: deque[tuple[float, MagneticField]] = deque()
-        topic = interface.FLUX_DENSITY_COMMAND
-        self._publisher = self.create_publisher(topic.type, options.target, topic.qos)
-        self.create_subscription(topic.type, options.source, self._on_command, topic.qos)
+        topic = topics.FLUX_DENSITY_COMMAND
+        self._publisher = interface.publisher(self, replace(topic, name=options.target))
+        interface.subscribe(self, replace(topic, name=options.source), self._on_command)
         self.create_timer(
             _TICK_SECONDS, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 

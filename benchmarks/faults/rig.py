@@ -19,11 +19,14 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState, MagneticField
+from std_msgs.msg import Float64
 
+from hmsa_ros.contract import topics
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import from_time, to_trajectory
+from hmsa_ros.nodes.message_types import interface_class
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 #: Patience with a process that starts, or with a condition, in s.
@@ -141,14 +144,14 @@ class Rig:
         self._seen: dict[str, int] = {}
         self._watch = watch
         if watch:
-            self._subscribe(interface.JOINT_STATES, '', self._on_sample)
-            self._subscribe(interface.FLUX_DENSITY_COMMAND, '', lambda x: self.commands.append(
+            self._subscribe(topics.JOINT_STATES, '', self._on_sample)
+            self._subscribe(topics.FLUX_DENSITY_COMMAND, '', lambda x: self.commands.append(
                 (from_time(x.header.stamp), x.magnetic_field.z)))
-            self._subscribe(interface.FLUX_DENSITY_APPLIED, '', self._on_applied)
-        self._subscribe(interface.STATUS, interface.PLANNER, self._on_verdict)
-        self._subscribe(interface.DIAGNOSTICS, '', self._on_diagnostics)
-        self._setpoint = self.publisher(interface.SETPOINT, interface.PLANNER)
-        self._trajectory = self.publisher(interface.JOINT_TRAJECTORY, interface.PLANNER)
+            self._subscribe(topics.FLUX_DENSITY_APPLIED, '', self._on_applied)
+        self._subscribe(topics.STATUS, topics.PLANNER, self._on_verdict)
+        self._subscribe(topics.DIAGNOSTICS, '', self._on_diagnostics)
+        self._setpoint = self.publisher(topics.SETPOINT, topics.PLANNER)
+        self._trajectory = self.publisher(topics.JOINT_TRAJECTORY, topics.PLANNER)
 
     def __enter__(self) -> 'Rig':
         """Return the rig."""
@@ -190,7 +193,7 @@ class Rig:
 
     def relay(self, *options: str) -> dict[str, str]:
         """Start a relay and return the remapping with which the planner sends through it."""
-        name = interface.FLUX_DENSITY_COMMAND.name
+        name = topics.FLUX_DENSITY_COMMAND.name
         self.run('relay', '-m', 'benchmarks.faults.relay', f'{name}_sent', name, *options)
         self.spin_until(
             lambda: self.node.count_subscribers(f'{name}_sent') > 0
@@ -203,9 +206,9 @@ class Rig:
 
     def ready(self, *names: str) -> None:
         """Wait until nodes are there and have found each other."""
-        if interface.PLANT in names and self._watch:
+        if topics.PLANT in names and self._watch:
             self.spin_until(lambda: len(self._stamps) > 0, 'the first sample')
-        if interface.PLANNER in names:
+        if topics.PLANNER in names:
             self.spin_until(
                 lambda: self.verdicts and self._setpoint.get_subscription_count() > 0,
                 'the planner')
@@ -217,7 +220,7 @@ class Rig:
         """Return the last line of each traceback in the logs of the package's nodes."""
         found = []
         for log in {x.log for x in self.children}:
-            if log.stem.split('_')[0] not in interface.NODES:
+            if log.stem.split('_')[0] not in topics.NODES:
                 continue
             for part in log.read_text(errors='replace').split(_TRACE)[1:]:
                 # Frames are indented; the first line that is not names the exception.
@@ -228,15 +231,13 @@ class Rig:
     # -- what is seen --------------------------------------------------------------------------
 
     def _subscribe(
-            self, topic: interface.Topic, owner: str, callback: Callable[[Any], None]) -> None:
-        name = interface.from_outside(topic.name, owner)
-        self.node.create_subscription(
-            topic.type, name, lambda x: None if self.deaf else callback(x), topic.qos)
+            self, topic: topics.Topic, owner: str, callback: Callable[[Any], None]) -> None:
+        interface.subscribe(
+            self.node, topic, lambda x: None if self.deaf else callback(x), owner)
 
-    def publisher(self, topic: interface.Topic, owner: str = '') -> Any:
+    def publisher(self, topic: topics.Topic, owner: str = '') -> Any:
         """Return a publisher of ours."""
-        return self.node.create_publisher(
-            topic.type, interface.from_outside(topic.name, owner), topic.qos)
+        return interface.publisher(self.node, topic, owner)
 
     def _on_sample(self, message: JointState) -> None:
         self._stamps.append(from_time(message.header.stamp))
@@ -322,7 +323,7 @@ class Rig:
 
     def publish_setpoint(self, stretch: float) -> None:
         """Ask for a stretch and do not wait."""
-        self._setpoint.publish(interface.SETPOINT.type(data=float(stretch)))
+        self._setpoint.publish(Float64(data=float(stretch)))
 
     def publish_trajectory(self, message: Any) -> None:
         """Send a sequence and do not wait."""
@@ -344,10 +345,10 @@ class Rig:
         self.spin_until(lambda: len(self.verdicts) > before, 'a verdict')
         return self.verdicts[-1]
 
-    def call(self, service: interface.Service | type, owner: str, request: Any = None) -> Any:
+    def call(self, service: topics.Service, owner: str, request: Any = None) -> Any:
         """Call a service of a node."""
         return self.call_by_name(
-            service.type, interface.from_outside(service.name, owner), request)
+            interface_class(service.type), topics.from_outside(service.name, owner), request)
 
     def call_by_name(self, kind: type[Any], name: str, request: Any = None) -> Any:
         """Call a service by its name."""

@@ -5,6 +5,7 @@ import signal
 from benchmarks.faults.common import await_change, jump, move, pair, Register, share
 from benchmarks.faults.rig import Rig
 from benchmarks.faults.table import Seen
+from hmsa_ros.contract import topics
 from hmsa_ros.nodes import interface
 
 FAULTS = Register()
@@ -16,12 +17,10 @@ _LEFT = 0.02
 def _failing(rig: Rig, fault: str, word: str, counter: str) -> Seen:
     """Learn with a sensor that works, have it fail at rest, and move again."""
     told: list[tuple[str, dict[str, str]]] = []
-    topic = interface.ESTIMATE
-    rig.node.create_subscription(
-        topic.type, interface.from_outside(topic.name, interface.PLANNER),
-        lambda x: told.extend(
-            (y.message, {z.key: z.value for z in y.values}) for y in x.status), topic.qos)
-    name = interface.JOINT_STATES.name
+    interface.subscribe(
+        rig.node, topics.ESTIMATE, lambda x: told.extend(
+            (y.message, {z.key: z.value for z in y.values}) for y in x.status), topics.PLANNER)
+    name = topics.JOINT_STATES.name
     sensor = rig.run('sensor', '-m', 'benchmarks.faults.sensor', name, f'{name}_seen', fault)
     pair(rig, plant={'mismatch.shear_modulus': 1.1}, planner={'feedback': 'adapt'},
          remap={name: f'{name}_seen'})

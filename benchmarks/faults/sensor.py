@@ -10,6 +10,7 @@ import argparse
 from collections.abc import Sequence
 from contextlib import suppress
 import copy
+from dataclasses import replace
 import math
 import random
 import signal
@@ -19,6 +20,7 @@ import rclpy
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
+from hmsa_ros.contract import topics
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.runner import spin
 
@@ -38,9 +40,9 @@ class Sensor(Node):
         self._random = random.Random(1)
         self._held: JointState | None = None
         self._last = 0.0
-        topic = interface.JOINT_STATES
-        self._publisher = self.create_publisher(topic.type, options.target, topic.qos)
-        self.create_subscription(topic.type, options.source, self._on_sample, topic.qos)
+        topic = topics.JOINT_STATES
+        self._publisher = interface.publisher(self, replace(topic, name=options.target))
+        interface.subscribe(self, replace(topic, name=options.source), self._on_sample)
 
     def _on_sample(self, message: JointState) -> None:
         stretch = message.position[0] + self._random.gauss(0.0, _NOISE)

@@ -3,7 +3,7 @@
 from benchmarks.faults.common import LIMIT, moves, pair, Register, share
 from benchmarks.faults.rig import Rig, settled
 from benchmarks.faults.table import Seen
-from hmsa_ros.nodes import interface
+from hmsa_ros.contract import topics
 
 FAULTS = Register()
 _FOLLOWS = {'use_sim_time': True}
@@ -95,14 +95,14 @@ def _two(rig: Rig) -> Seen:
     moves(rig, (1.1,))
     second = rig.run('clock_second', '-m', 'benchmarks.faults.clock', '--start', '1100')
     rig.spin_until(
-        lambda: rig.node.count_publishers(interface.CLOCK_TOPIC.name) == 2, 'the second clock')
+        lambda: rig.node.count_publishers(topics.CLOCK_TOPIC.name) == 2, 'the second clock')
     worst = 0
     for _ in range(3):
         rig.spin(1.0)
         worst = max(worst, rig.level('planner'), rig.level('plant'))
     second.end()
     rig.spin_until(
-        lambda: rig.node.count_publishers(interface.CLOCK_TOPIC.name) == 1,
+        lambda: rig.node.count_publishers(topics.CLOCK_TOPIC.name) == 1,
         'the second clock to go')
     rig.spin(1.0)
     rig.setpoint(1.05)

@@ -28,8 +28,8 @@ from sphinx.util.docutils import SphinxDirective
 
 from hmsa_ros import errors
 from hmsa_ros.cli import build_parser
+from hmsa_ros.contract import topics
 from hmsa_ros.core.status import Code, EXPLANATIONS
-from hmsa_ros.nodes import interface
 
 LOGGER = logging.getLogger(__name__)
 PACKAGE = Path(errors.__file__).parent
@@ -43,9 +43,9 @@ NOT_PUBLIC = re.compile(
     r'\.(__main__|cli|compiling|dop853|kernels|law|\w+_kernel|ros_launch|warmup)\b')
 
 
-def interface_entries(kind: type) -> list[Any]:
-    """Return what `hmsa_ros.nodes.interface` declares of a kind (Topic, Service), in its order."""
-    return [x for x in vars(interface).values() if isinstance(x, kind)]
+def contract_entries(kind: type) -> list[Any]:
+    """Return what `hmsa_ros.contract.topics` declares of a kind (Topic, Service), in its order."""
+    return [x for x in vars(topics).values() if isinstance(x, kind)]
 
 
 def parameters(node: str) -> tuple[Any, ...]:
@@ -169,17 +169,11 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
         for line in lines) + '\n'
 
 
-def type_name(kind: type) -> str:
-    """Return a message or service class as ROS writes it, as ``sensor_msgs/msg/JointState``."""
-    package, group = kind.__module__.split('.')[:2]
-    return f'{package}/{group}/{kind.__name__}'
-
-
-def qos_text(qos: Any) -> str:
+def qos_text(qos: topics.Quality) -> str:
     """Return reliability, durability if it is not volatile, and depth in words."""
-    words = [qos.reliability.name.lower().replace('_', ' ')]
-    if qos.durability.name != 'VOLATILE':
-        words.append(qos.durability.name.lower().replace('_', ' '))
+    words = ['reliable' if qos.reliable else 'best effort']
+    if qos.latched:
+        words.append('transient local')
     return ', '.join([*words, f'depth {qos.depth}'])
 
 
@@ -212,7 +206,7 @@ class Topics(Generated):
     def markdown(self, argument: str) -> str:
         """Return a table of all topics (see `Generated.markdown`)."""
         rows = []
-        for topic in interface_entries(interface.Topic):
+        for topic in contract_entries(topics.Topic):
             if not topic.meaning or not (topic.publishers or topic.subscribers):
                 self.missing(
                     f'topic {topic.name} in hmsa_ros.contract.topics has no meaning, or no '
@@ -220,7 +214,7 @@ class Topics(Generated):
             rows.append((
                 f'`{topic.name}`',
                 f'{topic.meaning}<br>*From {" and ".join(topic.publishers) or "you"} to '
-                f'{" and ".join(topic.subscribers) or "you"}: `{type_name(topic.type)}`, '
+                f'{" and ".join(topic.subscribers) or "you"}: `{topic.type}`, '
                 f'{qos_text(topic.qos)}.*'))
         return table(('name', 'meaning'), rows)
 
@@ -230,7 +224,7 @@ class Services(Generated):
 
     def markdown(self, argument: str) -> str:
         """Return a table of all services (see `Generated.markdown`)."""
-        services = interface_entries(interface.Service)
+        services = contract_entries(topics.Service)
         for service in services:
             if not service.meaning:
                 self.missing(
@@ -239,8 +233,8 @@ class Services(Generated):
         return table(
             ('node', 'name', 'meaning'),
             ((node, f'`{service.name}`',
-              f'{service.meaning[node]}<br>*`{type_name(service.type)}`*')
-             for node in interface.NODES for service in services if node in service.meaning))
+              f'{service.meaning[node]}<br>*`{service.type}`*')
+             for node in topics.NODES for service in services if node in service.meaning))
 
 
 class Parameters(Generated):

@@ -18,27 +18,11 @@ Value = bool | int | float | str | list[str] | list[float]
 @dataclass(frozen=True)
 class ParameterSpec:
     """
-    One parameter: name, default, unit, range and description.
+    One parameter: name in snake case, default, and what it may be.
 
-    Attributes
-    ----------
-    name : str
-        Snake case, groups separated by dots.
-    default : bool, int, float, str or list
-        Its type is the parameter's type.
-    description : str
-        One sentence without the unit.
-    unit : str
-        Unit in plain text, empty for a dimensionless value.
-    minimum, maximum : float, optional
-        Closed range of a number, or of each in a list.
-    choices : tuple of str
-        Admissible values of a string, empty for any.
-    read_only : bool
-        Whether the value is fixed at the start.
-    items : type
-        ``str`` or ``float``: what a list holds.
-
+    The default's type is the parameter's; ``items`` is what a list holds. The description is a
+    sentence without the unit, which is empty for a dimensionless value. Numbers, those of a list
+    too, may have a closed range and strings choices; a ``read_only`` one is fixed at the start.
     """
 
     name: str
@@ -53,17 +37,7 @@ class ParameterSpec:
 
     def taken(self, value: Any) -> Any:
         """
-        Return a value as the nodes use it, checked.
-
-        Parameters
-        ----------
-        value : object
-            As ROS or a file gives it; one item is a list of one, None is an empty list.
-
-        Returns
-        -------
-        object
-            Of the default's type.
+        Return a value of ROS or a file, checked, as the nodes use it; one item is a list of one.
 
         Raises
         ------
@@ -83,7 +57,6 @@ class ParameterSpec:
         return value
 
     def _as_list(self, value: Any) -> list[Any]:
-        """Return the items of a list."""
         if value is None:
             return []
         several = not isinstance(value, str) and (

@@ -2,29 +2,17 @@
 Names, types, quality of service and meaning of every topic and service, without ROS.
 
 All names are relative or private, so that namespaces and remapping work; only ``/clock`` and
-``/diagnostics`` are absolute, as ROS has them. `hmsa_ros.nodes.interface` binds this page to
+``/diagnostics`` are absolute, as ROS has them. `hmsa_ros.nodes.interface` takes this page to
 rclpy; the reference in the documentation is made from it.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 
 @dataclass(frozen=True)
 class Quality:
-    """
-    Quality of service: the last `depth` messages are kept.
-
-    Attributes
-    ----------
-    depth : int
-        Of the queue.
-    reliable : bool
-        Whether lost messages are sent again.
-    latched : bool
-        Whether a late subscriber gets the kept messages (transient local).
-
-    """
+    """Quality of service: how many messages are kept, and also for late subscribers if latched."""
 
     depth: int
     reliable: bool = True
@@ -45,21 +33,10 @@ CLOCK = Quality(1, reliable=False)
 @dataclass(frozen=True)
 class Topic:
     """
-    A topic.
+    A topic by its relative or private name, and the nodes of this package that send and take it.
 
-    Attributes
-    ----------
-    name : str
-        Relative or private.
-    type : str
-        Message type, for example ``'sensor_msgs/msg/JointState'``.
-    qos : Quality
-        Of publishers and subscribers alike.
-    meaning : str
-        What a message says, in one or two sentences.
-    publishers, subscribers : tuple of str
-        Nodes of this package that send and take it.
-
+    The type is one like ``'sensor_msgs/msg/JointState'``; publishers and subscribers share the
+    quality of service.
     """
 
     name: str
@@ -72,19 +49,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class Service:
-    """
-    A service.
-
-    Attributes
-    ----------
-    name : str
-        Private to the node that serves it.
-    type : str
-        Service type, for example ``'std_srvs/srv/Trigger'``.
-    meaning : mapping of str to str
-        What a call does, in one or two sentences, by the node that serves it.
-
-    """
+    """A service by its private name and type, and what a call does by the node that serves it."""
 
     name: str
     type: str
@@ -200,13 +165,14 @@ SPLIT_BAGFILE = Service('~/split_bagfile', _TRIGGER, {
     RECORDER: 'Closes the current file and continues in a new one.'})
 
 
-def of_joint(name: str, joint: str, joints: Sequence[str]) -> str:
-    """Return a topic's name for a joint: before its last part, if there are several joints."""
+def of_joint(topic: Topic, joint: str, joints: Sequence[str]) -> Topic:
+    """Return the topic of a joint, which is in its name if there are several joints."""
     if len(joints) == 1:
-        return name
-    return f'~/{joint}/{name[2:]}' if name.startswith('~/') else f'{joint}/{name}'
+        return topic
+    start = '~/' if topic.name.startswith('~/') else ''
+    return replace(topic, name=f'{start}{joint}/{topic.name.removeprefix(start)}')
 
 
 def from_outside(name: str, node: str) -> str:
-    """Return ``'~/stop'`` of a planner as ``'planner/stop'``; other names unchanged."""
-    return f'{node}/{name[2:]}' if name.startswith('~/') else name
+    """Return ``'~/stop'`` as ``'planner/stop'``; other names, and without a node, unchanged."""
+    return f'{node}/{name[2:]}' if node and name.startswith('~/') else name

@@ -12,7 +12,7 @@ import numpy as np
 
 from hmsa_ros.core.schedule import CommandSchedule
 from hmsa_ros.device.protocol import Change, Sample
-from hmsa_ros.device.watchdog import Fallback, Watched
+from hmsa_ros.device.watchdog import Device, Fallback
 from hmsa_ros.errors import BadInputError
 
 
@@ -28,23 +28,12 @@ class Hardware(Protocol):
 
 def load(text: str) -> Callable[[str], Hardware]:
     """
-    Find what makes the hardware of a joint.
-
-    Parameters
-    ----------
-    text : str
-        ``'MODULE:NAME'`` of something that takes the name of a joint and returns its `Hardware`;
-        the module may be in the working directory.
-
-    Returns
-    -------
-    callable
-        It, with errors of what it does as `BadInputError`.
+    Return what makes the hardware of a joint by its name, found by ``'MODULE:NAME'``.
 
     Raises
     ------
     BadInputError
-        If there is no such thing.
+        If there is no such thing; what is returned raises it, too, where it fails.
 
     """
     module, _, name = text.partition(':')
@@ -104,14 +93,13 @@ class HardwareJoint:
     fallback: Fallback = field(default_factory=lambda: Fallback(safe_flux='zero'))
 
     def __post_init__(self) -> None:
-        """Check the limit."""
         if not 0.0 < self.limit < math.inf:
             raise BadInputError(f'limit is {self.limit:g} T: expected a number above 0')
 
 
-class HardwareDevice(Watched):
+class HardwareDevice(Device):
     """
-    Real actuators; a `Device`.
+    Real actuators.
 
     Parameters
     ----------
@@ -126,7 +114,6 @@ class HardwareDevice(Watched):
 
     def __init__(
             self, joints: Sequence[HardwareJoint], *, time: int, period: int = 0) -> None:
-        """Switch the coils off."""
         super().__init__(x.fallback for x in joints)
         self._joints = tuple(joints)
         self._time = time
@@ -158,16 +145,7 @@ class HardwareDevice(Watched):
 
     def receive(self, joint: int, stamp: int, level: float) -> None:
         """
-        Take a level, which is late if it is stamped before the last call of `advance`.
-
-        Parameters
-        ----------
-        joint : int
-            Its place.
-        stamp : int
-            Time in ns from which it applies; a past one, or 0, at once.
-        level : float
-            In T.
+        Take a level in T that applies from a stamp in ns on; a past one, or 0, at once.
 
         Raises
         ------
@@ -200,7 +178,6 @@ class HardwareDevice(Watched):
                 Sample(self._time, read[:, 0], read[:, 1], np.array(self._levels)))
 
     def _watch(self, i: int) -> None:
-        """Obey the watchdog of a joint."""
         schedule = self._schedules[i]
         if self._heard[i]:
             self._heard[i] = False

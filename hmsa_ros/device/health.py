@@ -1,7 +1,6 @@
 """Whether a device is well driven: the verdict on its commands, and on how often it is sampled."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 import math
 
 from hmsa_ros.core.model import natural_frequency
@@ -12,35 +11,24 @@ _OK, _WARN, _ERROR = 0, 1, 2
 _SAMPLES_A_PERIOD = 10.0
 
 
-@dataclass(frozen=True)
-class CommandHealth:
-    """Counts of late, refused and failed commands, and joints nobody or several command."""
-
-    late: int
-    refused: int
-    refused_source: int
-    failed: int
-    silent: Sequence[str]
-    crowded: Sequence[str]
-
-    def verdict(self) -> tuple[int, str]:
-        """Return level (0 OK, 1 WARN, 2 ERROR) and message for /diagnostics."""
-        level, notes = _OK, []
-        if self.late or self.refused or self.refused_source:
-            level = _WARN
-            notes.append(
-                f'{self.late} commands late, {self.refused + self.refused_source} refused')
-        if self.crowded:
-            level = _WARN
-            notes.append(f'several publishers command {_listed(self.crowded)}')
-        if self.failed:
-            level = _ERROR
-            notes.append(
-                f'{self.failed} times started again after a load too large to follow')
-        if self.silent:
-            level = _ERROR
-            notes.append(f'no command and no heartbeat for {_listed(self.silent)}')
-        return level, '; '.join(notes) or 'commands in time'
+def judge_commands(
+        *, late: int = 0, refused: int = 0, refused_source: int = 0, failed: int = 0,
+        silent: Sequence[str] = (), crowded: Sequence[str] = ()) -> tuple[int, str]:
+    """Return level and message for /diagnostics: of counts, and joints nobody or many command."""
+    level, notes = _OK, []
+    if late or refused or refused_source:
+        level = _WARN
+        notes.append(f'{late} commands late, {refused + refused_source} refused')
+    if crowded:
+        level = _WARN
+        notes.append(f'several publishers command {_listed(crowded)}')
+    if failed:
+        level = _ERROR
+        notes.append(f'{failed} times started again after a load too large to follow')
+    if silent:
+        level = _ERROR
+        notes.append(f'no command and no heartbeat for {_listed(silent)}')
+    return level, '; '.join(notes) or 'commands in time'
 
 
 def _listed(names: Sequence[str]) -> str:

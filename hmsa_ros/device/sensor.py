@@ -39,7 +39,6 @@ class SensorErrors:
     stretch_gain: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         for name in ('stretch_noise', 'rate_noise'):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise BadInputError(f'{name} is {getattr(self, name):g}: expected at least 0')
@@ -52,23 +51,10 @@ class SensorErrors:
 
 
 class Sensor:
-    """
-    Measures with errors, and answers later.
-
-    Parameters
-    ----------
-    errors : sequence of SensorErrors
-        Of each actuator.
-    delay : int
-        Time in ns between taking a sample and having it.
-    seed : int
-        Of the noise: the same seed gives the same errors.
-
-    """
+    """Measures with errors, drawn from a seed, and answers some ns later."""
 
     def __init__(
             self, errors: Sequence[SensorErrors], delay: int = 0, seed: int = 0) -> None:
-        """Begin the noise."""
         self._deviations = np.array(
             [[x.stretch_noise for x in errors], [x.rate_noise for x in errors]])
         self._bias = np.array([x.stretch_bias for x in errors])

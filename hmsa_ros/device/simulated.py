@@ -10,7 +10,7 @@ from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
 from hmsa_ros.device.sensor import Sensor, SensorErrors
 from hmsa_ros.device.transport import Transport
-from hmsa_ros.device.watchdog import Fallback, Watched
+from hmsa_ros.device.watchdog import Device, Fallback
 
 # A gap of the clock that is not simulated through but skipped.
 _LARGEST_GAP_NS = 5 * NANOSECONDS
@@ -25,9 +25,9 @@ class SimulatedJoint:
     errors: SensorErrors = field(default_factory=SensorErrors)
 
 
-class SimulatedDevice(Watched):
+class SimulatedDevice(Device):
     """
-    Simulated actuators; a `Device`.
+    Simulated actuators.
 
     Commands take effect exactly at their stamps, inside the integration.
 
@@ -38,25 +38,17 @@ class SimulatedDevice(Watched):
     period : int
         Between samples, in ns, at least 1; they lie on a grid from time zero.
     time : int
-        Time at the start in ns; its state is the first sample.
+        Time at the start in ns; its state is the first sample (`next_sample`).
     command_delay, measurement_delay : int
         Transport delays of commands and samples in ns, at least 0.
     seed : int
         Of the sensor's noise.
-
-    Attributes
-    ----------
-    period : int
-        As given.
-    next_sample : int
-        Time in ns of the next sample.
 
     """
 
     def __init__(
             self, joints: Sequence[SimulatedJoint], *, period: int, time: int = 0,
             command_delay: int = 0, measurement_delay: int = 0, seed: int = 0) -> None:
-        """Start at rest."""
         super().__init__(x.fallback for x in joints)
         self.period = period
         self.next_sample = time
@@ -92,7 +84,7 @@ class SimulatedDevice(Watched):
         return self._actuators.schedules[joint].current
 
     def changes(self) -> list[Change]:
-        """Return which levels took effect since the last call."""
+        """Return which levels took effect."""
         self._changes += [Change(*x) for x in self._actuators.changes]
         self._actuators.changes.clear()
         return super().changes()
@@ -100,15 +92,7 @@ class SimulatedDevice(Watched):
     # -- what drives it ------------------------------------------------------------------------
 
     def receive(self, joint: int, stamp: int, level: float) -> None:
-        """
-        Have a command in T take effect at its stamp in ns (0 for now), or its delay later.
-
-        Raises
-        ------
-        BadInputError
-            If nobody could follow it.
-
-        """
+        """Have a command in T take effect at its stamp in ns (0 for now), or its delay later."""
         if self._transit.delay:
             self._actuators.setups[joint].check_level(level)
             self._transit.send(self.time, (joint, stamp, level))
@@ -160,8 +144,7 @@ class SimulatedDevice(Watched):
     def follow(self, now: int, *, standing: bool = False) -> int:
         """Follow a clock (ns), or hold while ``standing``; return by how many ns it jumped."""
         # A device that has not begun, one that is held, and one whose clock jumps goes on from the
-        # clock's time; where the clock has jumped back it starts again. Samples stay on the grid
-        # from time zero.
+        # clock's time; where the clock has jumped back it starts again.
         gap = now - self.time
         if self.time == 0:
             self._go_on_from(now)

@@ -11,22 +11,16 @@ T = TypeVar('T')
 
 class Transport(Generic[T]):
     """
-    Things on their way, all of which take the same time.
-
-    Parameters
-    ----------
-    delay : int
-        In ns, at least 0.
+    Things on their way, all of which take the same time in ns.
 
     Raises
     ------
     BadInputError
-        If the delay is negative.
+        If that is negative.
 
     """
 
     def __init__(self, delay: int) -> None:
-        """Begin with nothing on its way."""
         if delay < 0:
             raise BadInputError(f'delay is {delay} ns: expected at least 0')
         self.delay = delay

@@ -1,11 +1,12 @@
-"""Watchdog: what a coil does when nobody commands it any more."""
+"""Devices, and their watchdogs: what a coil does when nobody commands it any more."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 import math
 
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.device.protocol import Kind, Notice, Outbox
+from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
 from hmsa_ros.errors import BadInputError
 
 #: What to do: keep the last level, go to zero at once, or ramp to zero.
@@ -42,7 +43,6 @@ class Fallback:
     ramp_rate: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if not 0.0 <= self.timeout < math.inf:
             raise BadInputError(f'timeout is {self.timeout:g} s: expected at least 0')
         if self.safe_flux not in SAFE_FLUX:
@@ -56,19 +56,11 @@ class Watchdog:
     """
     Notices that commands and heartbeats have ceased, and commands the safe flux then.
 
-    Armed by the first command, so that an actuator nobody has moved yet raises no alarm.
-
-    Attributes
-    ----------
-    tripped : bool
-        Whether the silence has lasted too long.
-    trips : int
-        How often it has.
-
+    Armed by the first command, so that an actuator nobody has moved yet raises no alarm. While
+    the silence is too long it is ``tripped``; ``trips`` counts how often it was.
     """
 
     def __init__(self, fallback: Fallback) -> None:
-        """Start unarmed."""
         self._fallback = fallback
         self._timeout = round(fallback.timeout * NANOSECONDS)
         self._last: int | None = None
@@ -138,13 +130,47 @@ class Watchdog:
         self.tripped = False
 
 
-class Watched(Outbox):
-    """What devices have in common: a watchdog for each joint, and notices about commands."""
+class Device(ABC):
+    """
+    Actuators with their amplifiers, sensors and watchdogs.
+
+    Whoever drives it says what time it is, and collects what came of it: `changes`, `samples` and
+    `notices` return what is new since they were last called, in the order in which it happened.
+    """
 
     def __init__(self, fallbacks: Iterable[Fallback]) -> None:
-        """Start with the watchdogs unarmed."""
-        super().__init__()
         self._watchdogs = [Watchdog(x) for x in fallbacks]
+        self._changes: list[Change] = []
+        self._samples: list[Sample] = []
+        self._notices: list[Notice] = []
+
+    @property
+    @abstractmethod
+    def time(self) -> int:
+        """Time in ns that it has been advanced to."""
+
+    @abstractmethod
+    def receive(self, joint: int, stamp: int, level: float) -> None:
+        """Take a level in T from a stamp in ns on (0: now), which supersedes all from then on."""
+
+    @abstractmethod
+    def advance(self, time: int) -> None:
+        """Do what is due up to a time in ns."""
+
+    def changes(self) -> list[Change]:
+        """Return which levels took effect."""
+        found, self._changes = self._changes, []
+        return found
+
+    def samples(self) -> list[Sample]:
+        """Return what was measured."""
+        found, self._samples = self._samples, []
+        return found
+
+    def notices(self) -> list[Notice]:
+        """Return what there is to log."""
+        found, self._notices = self._notices, []
+        return found
 
     @property
     def silent(self) -> list[int]:

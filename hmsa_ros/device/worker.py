@@ -16,25 +16,13 @@ _WATCHED = 250_000
 
 class HardwareWorker:
     """
-    A device of hardware that lets time run by itself; a `Device`, for one other thread.
+    A device of hardware that lets time run by itself, by a clock in ns, for one other thread.
 
-    Parameters
-    ----------
-    device : HardwareDevice
-        Nobody else calls it from now on.
-    clock : callable
-        Returns the present time in ns: the clock of the stamps.
-
-    Attributes
-    ----------
-    failure : HmsaError or None
-        Why it has ended by itself: an error of the hardware. The coils are switched off then, as
-        far as the hardware still obeys.
-
+    ``failure`` says why it has ended by itself: an error of the hardware. The coils are switched
+    off then, as far as the hardware still obeys.
     """
 
     def __init__(self, device: HardwareDevice, clock: Callable[[], int]) -> None:
-        """Begin to write and to read."""
         self._device, self._clock = device, clock
         self._turn = Condition()
         self._ended = False
@@ -59,35 +47,24 @@ class HardwareWorker:
         return self._device.trips
 
     def receive(self, joint: int, stamp: int, level: float) -> None:
-        """
-        Take a level in T that applies from a stamp in ns on; a past one, or 0, at once.
-
-        Raises
-        ------
-        BadInputError
-            If the level is beyond the limit.
-
-        """
+        """Have the device take a level in T that applies from a stamp in ns on."""
         with self._turn:
             self._advance()
             self._device.receive(joint, stamp, level)
             self._turn.notify()
 
-    def advance(self, time: int) -> None:
-        """Do nothing: time runs."""
-
     def changes(self) -> list[Change]:
-        """Return which levels took effect since the last call."""
+        """Return which levels took effect."""
         with self._turn:
             return self._device.changes()
 
     def samples(self) -> list[Sample]:
-        """Return what was measured since the last call."""
+        """Return what was measured."""
         with self._turn:
             return self._device.samples()
 
     def notices(self) -> list[Notice]:
-        """Return what there is to log since the last call."""
+        """Return what there is to log."""
         with self._turn:
             return self._device.notices()
 

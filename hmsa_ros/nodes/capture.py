@@ -232,7 +232,6 @@ class Capture:
             return
 
     def _run(self) -> None:
-        """Wait, take, pass on."""
         wait_set = None
         try:
             while True:
@@ -311,15 +310,8 @@ class SimulatedTime:
     The time of a message is that of the last ``/clock`` message received before it, by the
     stamps of the middleware, however late either is taken. Of several publishers of ``/clock``
     the first one is followed until it falls silent: a time that goes to and fro between two
-    simulations is none.
-
-    Attributes
-    ----------
-    jumps : int
-        How often time has jumped back.
-    ignored : int
-        Messages of other publishers than the one that is followed, and such as tell no time.
-
+    simulations is none. ``jumps`` counts how often time has jumped back, ``ignored`` the messages
+    of other publishers, and such as tell no time.
     """
 
     def __init__(self) -> None:

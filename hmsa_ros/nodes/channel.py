@@ -6,6 +6,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import MagneticField
 from std_msgs.msg import Float64
 
+from hmsa_ros.contract import topics
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import conversions, interface
 from hmsa_ros.nodes.timekeeping import Seldom
@@ -23,14 +24,12 @@ class JointChannel:
         self._node, self._joint, self._runtime, self._serve = node, joint, runtime, serve
         self._tell_ignored = Seldom()
         self._command = interface.publisher(
-            node, interface.of_joint(interface.FLUX_DENSITY_COMMAND, joint, joints))
-        topic = interface.of_joint(interface.SETPOINT, joint, joints)
-        node.create_subscription(topic.type, topic.name, self._on_setpoint, topic.qos)
-        self._applied = ''
-        if not linked:
-            topic = interface.of_joint(interface.FLUX_DENSITY_APPLIED, joint, joints)
-            self._applied = node.create_subscription(
-                topic.type, topic.name, self._on_applied, topic.qos).topic_name
+            node, topics.of_joint(topics.FLUX_DENSITY_COMMAND, joint, joints))
+        interface.subscribe(
+            node, topics.of_joint(topics.SETPOINT, joint, joints), self._on_setpoint)
+        self._applied = '' if linked else interface.subscribe(
+            node, topics.of_joint(topics.FLUX_DENSITY_APPLIED, joint, joints),
+            self._on_applied).topic_name
 
     def send(self, command: Send, frame: str) -> None:
         """Publish a command in the frame of the coil."""
@@ -44,7 +43,7 @@ class JointChannel:
         if not self._command.get_subscription_count():
             return f'nobody subscribes to {self._command.topic_name}: start a plant or a driver'
         if not self._node.count_publishers(self._applied) and not self._node.count_publishers(
-                interface.JOINT_STATES.name):
+                topics.JOINT_STATES.name):
             return (
                 f'nobody reports levels that take effect ({self._applied}) or samples '
                 '(joint_states): start a plant, or a driver that does')

@@ -8,11 +8,12 @@ planned comes after it, while nothing else is due.
 
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 import gc
 
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
+from hmsa_ros.contract import topics
 from hmsa_ros.device.protocol import Change, Sample
 from hmsa_ros.nodes import conversions, interface
 from hmsa_ros.nodes.device_node import DeviceNode, TICK_SECONDS
@@ -33,7 +34,6 @@ class LinkedPlanner(PlannerNode):
     linked = True
 
     def __init__(self) -> None:
-        """Begin without a plant."""
         self.plant: Linked | None = None
         self._last = 0
         self._waiting: deque[Output] = deque()
@@ -48,7 +48,7 @@ class LinkedPlanner(PlannerNode):
     def send(self) -> None:
         """Give the plant the commands that are due."""
         if self._channels:
-            self._take(self._runtime.send(self._now()))
+            self._take(self._runtime.send(self.now()))
 
     def serve(self, left: Callable[[], bool]) -> None:
         """Do what is due, and publish a message at least, others while there is time left."""
@@ -62,7 +62,7 @@ class LinkedPlanner(PlannerNode):
     def serve_if_due(self) -> None:
         """Do what is due, if there is anything."""
         wake = self._runtime.wake
-        if wake is not None and wake <= self._now():
+        if wake is not None and wake <= self.now():
             self._serve()
 
     def take_change(self, joint: str, change: Change) -> None:
@@ -78,11 +78,12 @@ class LinkedPlanner(PlannerNode):
                 sample.flux_density.tolist(), strict=True):
             self._runtime.observed(name, sample.time, *values)
 
-    def _now(self) -> int:
+    def now(self) -> int:
+        """Return the time in ns, which a plant that leads it knows best."""
         time = None if self.plant is None or not self._clock_reader.simulated else \
             self.plant.leading_time
         if time is None:
-            return super()._now()
+            return super().now()
         last, self._last = self._last, time
         if time < last:
             self._runtime.clock_set_back(last - time)
@@ -116,17 +117,15 @@ class Linked(DeviceNode):
     """A device that a planner in the same process commands; begins a class of such nodes."""
 
     def __init__(self, planner: LinkedPlanner) -> None:
-        """Take a planner."""
         self._planner = planner
         self.companion = planner.get_name()
         self.cycles = Cycles(round(TICK_SECONDS * 1e9))
         super().__init__()  # type: ignore[call-arg]  # that of the node it is linked to
         planner.plant = self
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._of_loop = interface.publisher(self, interface.DIAGNOSTICS)
+        self._of_loop = interface.publisher(self, topics.DIAGNOSTICS)
         self.keep(
-            self.create_timer(TICK_SECONDS, self._cycle, clock=steady),
-            self.create_timer(1.0, self._report, clock=steady), self._of_loop)
+            self.every(TICK_SECONDS, self._cycle), self.every(1.0, self._report_loop),
+            self._of_loop)
 
     def command(self, command: Send) -> None:
         """Obey a command of the planner."""
@@ -154,13 +153,12 @@ class Linked(DeviceNode):
         self._planner.take_sample(self._values.names, sample)
         super()._publish_sample(sample)
 
-    def _report(self) -> None:
+    def _report_loop(self) -> None:
         """Publish how the loop keeps time; garbage is collected now, between two cycles."""
         gc.collect()
         severity, message, values = self.cycles.report()
         self._of_loop.publish(conversions.to_diagnostics(
-            int(self.get_clock().now().nanoseconds), conversions.to_status(
-                'controller: loop', '', bytes([severity]), message, values)))
+            self.now(), conversions.to_status('controller: loop', '', severity, message, values)))
 
 
 class LinkedPlant(Linked, PlantNode):
@@ -186,6 +184,5 @@ def make() -> Sequence[Node]:
     return device, planner
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Run planner and plant, or driver, in one process; return the exit status."""
-    return run(make, args)
+#: Run by ``hmsa controller`` with the command line's arguments; returns the exit status.
+main = partial(run, make)

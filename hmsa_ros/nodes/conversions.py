@@ -1,7 +1,6 @@
 """Conversion between messages and the records of `hmsa_ros.core`."""
 
 from collections.abc import Iterable, Mapping, Sequence
-import re
 from struct import unpack_from
 from typing import TYPE_CHECKING
 
@@ -21,8 +20,6 @@ if TYPE_CHECKING:
     # Numba comes along with the planner, which a recorder has no use for.
     from hmsa_ros.runtime.records import StatusChanged
 
-# Anybody may send a status; Python refuses to read numbers of thousands of digits.
-_WHOLE = re.compile('[0-9]{1,18}')
 # Encapsulation and stamp: bytes at the beginning of a message with a header.
 _STAMPED = 12
 
@@ -74,41 +71,21 @@ def from_command(message: MagneticField) -> tuple[int, float]:
 def to_trajectory(
         setpoints: Iterable[tuple[float | Sequence[float], int]], joints: str | Sequence[str], *,
         stamp: int = 0, frame: str = '', raw: bool = False) -> JointTrajectory:
-    """
-    Return setpoints, or raw levels, as a trajectory message.
-
-    Parameters
-    ----------
-    setpoints : iterable of (float or sequence of float, int)
-        Stretch, of all joints or one a joint, and time from the start in ns until which it lasts;
-        if raw, flux density in T and time from which it applies.
-    joints : str or sequence of str
-        Name or names.
-    stamp : int
-        Start in ns; 0 for now.
-    frame : str
-        Identifies the request: the planner's verdict repeats it.
-    raw : bool
-        Whether they are levels.
-
-    Returns
-    -------
-    trajectory_msgs.msg.JointTrajectory
-        One point each.
-
-    """
+    """Return stretches (until ns from the start), or raw levels (T, from ns on), as a message."""
+    # Of all joints or one a joint. Stamp 0 ns is now; the planner's verdict repeats the frame.
     names = [joints] if isinstance(joints, str) else list(joints)
     return JointTrajectory(
         header=Header(stamp=to_time(stamp), frame_id=frame), joint_names=names,
         points=[
             JointTrajectoryPoint(
-                time_from_start=_to_duration(time),
+                time_from_start=to_duration(time),
                 **{'effort' if raw else 'positions': np.broadcast_to(
                     stretch, len(names)).tolist()})
             for stretch, time in setpoints])
 
 
-def _to_duration(nanoseconds: int) -> Duration:
+def to_duration(nanoseconds: int) -> Duration:
+    """Return a duration as a message."""
     sec, nanosec = divmod(nanoseconds, NANOSECONDS)
     return Duration(sec=sec, nanosec=nanosec)
 
@@ -116,22 +93,7 @@ def _to_duration(nanoseconds: int) -> Duration:
 def to_plan(
         stamps: Sequence[int],
         samples: Mapping[str, Sequence[tuple[float, float, float]]]) -> JointTrajectory:
-    """
-    Return a preview, stamped with the first of the changes of level of any joint.
-
-    Parameters
-    ----------
-    stamps : sequence of int
-        In ns, increasing.
-    samples : mapping of str to sequence of (float, float, float)
-        By joint, one for each stamp: stretch, rate in 1/s and flux density in T from then on.
-
-    Returns
-    -------
-    trajectory_msgs.msg.JointTrajectory
-        Positions, velocities and effort are what the samples say.
-
-    """
+    """Return each joint's stretch, rate in 1/s and level in T, from stamps in ns on."""
     start = stamps[0] if stamps else 0
     message = JointTrajectory(
         header=Header(stamp=to_time(start)), joint_names=list(samples))
@@ -139,7 +101,7 @@ def to_plan(
         stretches, rates, flux_densities = zip(*point, strict=True)
         message.points.append(JointTrajectoryPoint(
             positions=stretches, velocities=rates, effort=flux_densities,
-            time_from_start=_to_duration(stamp - start)))
+            time_from_start=to_duration(stamp - start)))
     return message
 
 
@@ -162,8 +124,7 @@ def to_planner_status(status: 'StatusChanged') -> DiagnosticStatus:
     if status.unheard:
         values['unheard'] = status.unheard
         severity, message = max(severity, 1), f'{message}; but {status.unheard}'
-    return to_status(
-        'planner: request', ', '.join(each), bytes([severity]), message, values)
+    return to_status('planner: request', ', '.join(each), severity, message, values)
 
 
 def of_joints(key: str, by_joint: Mapping[str, object]) -> dict[str, object]:
@@ -172,11 +133,11 @@ def of_joints(key: str, by_joint: Mapping[str, object]) -> dict[str, object]:
 
 
 def to_status(
-        name: str, joint: str, level: bytes, message: str,
+        name: str, joint: str, level: int, message: str,
         values: Mapping[str, object]) -> DiagnosticStatus:
     """Return a diagnostic status; ``hardware_id`` is the joint, values become text."""
     return DiagnosticStatus(
-        name=name, hardware_id=joint, level=level, message=message,
+        name=name, hardware_id=joint, level=bytes([level]), message=message,
         values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
 
 
@@ -186,11 +147,6 @@ def stamp_of(data: bytes) -> int:
         return 0
     seconds, nanoseconds = unpack_from('<iI' if data[1] & 1 else '>iI', data, 4)
     return int(seconds) * NANOSECONDS + int(nanoseconds)
-
-
-def whole(text: str | None) -> int:
-    """Return the whole number in a status, 0 where it has none."""
-    return int(text) if text and _WHOLE.fullmatch(text) else 0
 
 
 def to_diagnostics(stamp: int, *statuses: DiagnosticStatus) -> DiagnosticArray:

@@ -5,9 +5,11 @@ from typing import Any
 
 from sensor_msgs.msg import MagneticField
 
+from hmsa_ros.contract import topics
 from hmsa_ros.contract.parameters import ParameterSpec
-from hmsa_ros.device.protocol import Change, Device, Kind, Notice
-from hmsa_ros.device.watchdog import Fallback, SAFE_FLUX
+from hmsa_ros.device.protocol import Change, Kind, Notice
+from hmsa_ros.device.watchdog import Device, Fallback, SAFE_FLUX
+from hmsa_ros.device.worker import HardwareWorker
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import conversions, interface
 from hmsa_ros.nodes.guard import CommandInput
@@ -46,9 +48,8 @@ class DeviceJoint:
     """
 
     def __init__(
-            self, node: ManagedNode, device: Device, number: int, names: Sequence[str],
-            values: Mapping[str, Any], companion: str = '') -> None:
-        """Create its topics."""
+            self, node: ManagedNode, device: Device | HardwareWorker, number: int,
+            names: Sequence[str], values: Mapping[str, Any], companion: str = '') -> None:
         self.name = names[number]
         self._node = node
         self._device = device
@@ -58,9 +59,9 @@ class DeviceJoint:
         self._tell_refused, self._tell_late = Seldom(), Seldom()
         self.received = self.refused = self.late = self.latest = self.failed = 0
         self._applied = interface.publisher(
-            node, interface.of_joint(interface.FLUX_DENSITY_APPLIED, self.name, names))
+            node, topics.of_joint(topics.FLUX_DENSITY_APPLIED, self.name, names))
         self.commands = CommandInput(
-            node, interface.of_joint(interface.FLUX_DENSITY_COMMAND, self.name, names),
+            node, topics.of_joint(topics.FLUX_DENSITY_COMMAND, self.name, names),
             self._on_command, values['command_source'], companion)
 
     # -- out -----------------------------------------------------------------------------------

@@ -1,13 +1,13 @@
 """What all nodes have that pass commands to a device and publish what comes of it."""
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from hmsa_ros.contract.parameters import ParameterSpec
-from hmsa_ros.device.health import CommandHealth
+from hmsa_ros.device.health import judge_commands
 from hmsa_ros.device.protocol import Change, Sample
 from hmsa_ros.nodes import conversions
 from hmsa_ros.nodes.device_joint import DeviceJoint
@@ -61,11 +61,21 @@ class DeviceNode(ManagedNode):
         """Time in ns, if this device is the authority on it."""
         return None
 
-    def _open_samples(self) -> None:
-        """Create the topics of the samples."""
+    def _open(self, joint: type[DeviceJoint]) -> None:
+        """Create the topics of samples and joints, and look at the time from now on."""
         scalars, names = self._values[PUBLISH_SCALARS.name], self._values.names
         self._samples = SamplePublisher(self, names, scalars=scalars == 'always' or (
             scalars == 'auto' and len(names) == 1))
+        self._joints = [
+            joint(self, self._device, i, names, self._values.of(x), self.companion)
+            for i, x in enumerate(names)]
+        self._publish_news()
+        if not self.companion:
+            self.every(TICK_SECONDS, self.on_tick)
+        self.diagnose(self._report)
+
+    def _report(self) -> Iterable[DiagnosticStatus]:
+        yield self._status_of_commands()
 
     def cleanup(self) -> None:
         """Close the inputs that no executor serves."""
@@ -97,20 +107,18 @@ class DeviceNode(ManagedNode):
     def _status_of_commands(self, **values: object) -> DiagnosticStatus:
         """Return how commands fare, with more values."""
         joints = self._joints
-        health = CommandHealth(
-            late=sum(x.late for x in joints),
-            refused=sum(x.refused + x.commands.unreadable for x in joints),
-            refused_source=sum(x.commands.refused for x in joints),
-            failed=sum(x.failed for x in joints),
-            silent=[joints[i].name for i in self._device.silent],
-            crowded=[x.name for x in joints if x.crowded()])
-        level, message = health.verdict()
+        counts = {
+            'late': sum(x.late for x in joints),
+            'refused': sum(x.refused + x.commands.unreadable for x in joints),
+            'refused_source': sum(x.commands.refused for x in joints),
+            'failed': sum(x.failed for x in joints)}
+        silent = [joints[i].name for i in self._device.silent]
+        level, message = judge_commands(
+            **counts, silent=silent, crowded=[x.name for x in joints if x.crowded()])
         return conversions.to_status(
             f'{self.get_name()}: commands', ', '.join(x.name for x in joints),
-            bytes([level]), message,
-            {'received': sum(x.received for x in joints), 'late': health.late,
-             'refused': health.refused, 'refused_source': health.refused_source,
-             'failed': health.failed,
+            level, message,
+            {'received': sum(x.received for x in joints), **counts,
              'largest_lateness_ms': f'{max(x.latest for x in joints) / 1e6:.3f}',
-             'timeouts': self._device.trips, 'silent': len(health.silent),
+             'timeouts': self._device.trips, 'silent': len(silent),
              'time': f'{self._device.time / 1e9:.9f}', **values})

@@ -1,27 +1,19 @@
 """Driver node: real hardware in the place of the plant, written to at the stamps of commands."""
 
-from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from time import time_ns
 
-from rclpy.clock import Clock, ClockType
-
-from hmsa_ros.contract.parameters import ParameterSpec, PUBLISH_RATE
+from hmsa_ros.contract import topics
+from hmsa_ros.contract.parameters import JOINT, ParameterSpec, PUBLISH_RATE
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.device.hardware import HardwareDevice, HardwareJoint, load
 from hmsa_ros.device.worker import HardwareWorker
 from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.nodes import conversions, interface
 from hmsa_ros.nodes.device_joint import DeviceJoint, FALLBACK, fallback_from
-from hmsa_ros.nodes.device_node import (
-    COMMAND_SOURCE,
-    DeviceNode,
-    PUBLISH_SCALARS,
-    TICK_SECONDS,
-)
+from hmsa_ros.nodes.device_node import COMMAND_SOURCE, DeviceNode, PUBLISH_SCALARS
 from hmsa_ros.nodes.joints import declare_joints, JointParameters, JOINTS
 from hmsa_ros.nodes.managed import AUTOSTART
-from hmsa_ros.nodes.parameters import JOINT
 from hmsa_ros.nodes.runner import run
 
 #: Parameters that each joint may have values of its own for.
@@ -60,8 +52,7 @@ class DriverNode(DeviceNode):
     _device: HardwareWorker
 
     def __init__(self) -> None:
-        """Declare the parameters, and start if told to."""
-        super().__init__(interface.DRIVER)
+        super().__init__(topics.DRIVER)
         self._values = declare_joints(
             self, [x for x in PARAMETERS if x is not AUTOSTART], OWN)
         self.failure: HmsaError | None = None
@@ -81,17 +72,7 @@ class DriverNode(DeviceNode):
             raise BadInputError(
                 'use_sim_time is true: expected false, hardware follows the clock of the machine')
         self._device = HardwareWorker(_make_device(self._values), time_ns)
-        names = self._values.names
-        self._open_samples()
-        self._joints = [
-            DeviceJoint(self, self._device, i, names, self._values.of(x), self.companion)
-            for i, x in enumerate(names)]
-        self._diagnostics = interface.publisher(self, interface.DIAGNOSTICS)
-        self._publish_news()
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        if not self.companion:
-            self.create_timer(TICK_SECONDS, self.on_tick, clock=steady)
-        self.create_timer(1.0, self._on_diagnostics, clock=steady)
+        self._open(DeviceJoint)
 
     def deactivate(self) -> None:
         """Switch the coils off."""
@@ -107,22 +88,16 @@ class DriverNode(DeviceNode):
         if self._device.failure is not None:
             self.failure, self.finished = self._device.failure, True
 
-    def _on_diagnostics(self) -> None:
-        self._diagnostics.publish(conversions.to_diagnostics(
-            time_ns(), self._status_of_commands()))
-
 
 def _make_device(values: JointParameters) -> HardwareDevice:
     """Return the device that parameters describe, with its coils switched off."""
     make = load(values[HARDWARE.name])
-    settings = [values.of(x) for x in values.names]
     rate = values[PUBLISH_RATE.name]
     return HardwareDevice(
         [HardwareJoint(make(name), own['flux_density_limit'], fallback_from(own))
-         for name, own in zip(values.names, settings, strict=True)],
+         for name, own in ((x, values.of(x)) for x in values.names)],
         time=time_ns(), period=max(round(NANOSECONDS / rate), 1) if rate else 0)
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the driver with the command line's arguments; return the exit status."""
-    return run(DriverNode, args)
+#: Run by ``hmsa driver`` with the command line's arguments; returns the exit status.
+main = partial(run, DriverNode)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from rclpy.node import Node
 from sensor_msgs.msg import MagneticField
 
+from hmsa_ros.contract import topics
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.capture import decode, RawSubscription
@@ -27,7 +28,6 @@ class Allegiance:
     """
 
     def __init__(self) -> None:
-        """Obey nobody yet."""
         self.source: bytes | None = None
         self.refused = 0
 
@@ -57,9 +57,8 @@ class CommandInput:
     """
 
     def __init__(
-            self, node: Node, topic: interface.Topic, take: Callable[[MagneticField], None],
+            self, node: Node, topic: topics.Topic, take: Callable[[MagneticField], None],
             source: str, companion: str = '') -> None:
-        """Subscribe."""
         self._companion = companion
         self._companions: dict[bytes, bool] = {}
         self.unreadable = 0
@@ -71,9 +70,9 @@ class CommandInput:
         if source == 'first':
             self._allegiance = Allegiance()
         if source == 'first' or companion:
-            self._raw = RawSubscription(node, topic.type, topic.name, topic.qos)
+            self._raw = interface.listen(node, topic)
         else:
-            node.create_subscription(topic.type, topic.name, take, topic.qos)
+            interface.subscribe(node, topic, take)
 
     @property
     def refused(self) -> int:
@@ -123,7 +122,7 @@ class CommandInput:
 
     def _obey(self, data: bytes) -> None:
         try:
-            message = decode(data, self._topic.type)
+            message = decode(data, MagneticField)
         except BadInputError as error:
             self.unreadable += 1
             self._node.get_logger().error(

@@ -6,24 +6,17 @@ them, each may have a value of its own beside it: ``left.actuator.remanence`` ov
 ``actuator.remanence`` for the joint ``left``, and is not set unless somebody sets it.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 import re
 from typing import Any
 
-from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from hmsa_ros.contract.parameters import JOINT, ParameterSpec
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.nodes.parameters import (
-    declare,
-    descriptor,
-    from_files,
-    JOINT,
-    ParameterSpec,
-    refusal,
-)
+from hmsa_ros.nodes.parameters import declare, declare_one, from_files
 
 JOINTS = ParameterSpec(
     'joints', [],
@@ -72,10 +65,8 @@ class JointParameters:
     ----------
     names : tuple of str
         The joints.
-    specs : mapping of str to ParameterSpec
-        All that is declared, by full name.
-    values : mapping of str to object
-        By full name; an override that is not set is missing.
+    specs, values : mapping of str
+        What is declared, and set: an override that is not is missing; by full name.
     own : frozenset of str
         Parameters that a joint may have a value of its own for.
 
@@ -97,6 +88,26 @@ class JointParameters:
             if name in self.own else self.values[name]
             for name in self.specs if name in self.values
             and (name in self.own or not self._is_override(name))}
+
+    def each(self, make: Callable[[str, dict[str, Any]], Any]) -> dict[str, Any]:
+        """
+        Return by joint what is made of its name and values.
+
+        Raises
+        ------
+        BadInputError
+            If one is refused; it names the joint where there are several.
+
+        """
+        found = {}
+        for name in self.names:
+            try:
+                found[name] = make(name, self.of(name))
+            except BadInputError as error:
+                if len(self.names) == 1:
+                    raise
+                raise BadInputError(f'joint {name}: {error}') from error
+        return found
 
     def _is_override(self, name: str) -> bool:
         joint, _, rest = name.partition('.')
@@ -131,13 +142,9 @@ def declare_joints(
         for general in own:
             spec = replace(general, name=f'{joint}.{general.name}')
             declared[spec.name] = spec
-            try:
-                # A list, whose type is dynamic, is declared by the lack of a value.
-                value = node.declare_parameter(
-                    spec.name, filled.get(general.name, _TYPES.get(type(spec.default))),
-                    descriptor(spec)).value
-            except ParameterException as error:
-                raise refusal(node, spec) from error
+            # A list, whose type is dynamic, is declared by the lack of a value.
+            value = declare_one(
+                node, spec, filled.get(general.name, _TYPES.get(type(spec.default))))
             if value is not None:
                 values[spec.name] = spec.taken(value)
     return JointParameters(

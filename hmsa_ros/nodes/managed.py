@@ -5,15 +5,27 @@ The states and services are those of ROS 2 (``ros2 lifecycle``, launch). With th
 ``autostart``, which is true by default, a node configures and activates itself when it starts.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticStatus
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock as RclpyClock
+from rclpy.clock import ClockType
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock
 
-from hmsa_ros.errors import HmsaError
+from hmsa_ros.contract import topics
+from hmsa_ros.contract.parameters import ParameterSpec
+from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.conversions import to_diagnostics
+from hmsa_ros.nodes.message_types import interface_class
 from hmsa_ros.nodes.parameter_service import CarefulParameterService
-from hmsa_ros.nodes.parameters import check_names, declare, ParameterSpec
+from hmsa_ros.nodes.parameters import check_names, declare
 
 AUTOSTART = ParameterSpec(
     'autostart', True,
@@ -32,7 +44,6 @@ class ManagedNode(LifecycleNode):
     """
 
     def __init__(self, name: str) -> None:
-        """Create the node, unconfigured."""
         super().__init__(name, start_parameter_services=False)
         self._parameter_service = CarefulParameterService(self)
         self._guard_clock()
@@ -80,6 +91,54 @@ class ManagedNode(LifecycleNode):
         """Name of the state: unconfigured, inactive, active or finalized."""
         label: str = self._state_machine.current_state[1]
         return label
+
+    # -- what a subclass uses ------------------------------------------------------------------
+
+    def every(self, seconds: float, act: Callable[[], None]) -> Timer:
+        """Do something periodically in steady time, as simulated time may run at any pace."""
+        return self.create_timer(
+            seconds, act, clock=RclpyClock(clock_type=ClockType.STEADY_TIME))
+
+    def offer(self, service: topics.Service, act: Callable[..., tuple[bool, str]]) -> None:
+        """Answer calls with success and message; ``act`` gets the data of a request with any."""
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                response.success, response.message = (
+                    act(request.data) if hasattr(request, 'data') else act())
+            except HmsaError as error:
+                response.success, response.message = False, str(error)
+            return response
+
+        self.create_service(interface_class(service.type), service.name, answer)
+
+    def diagnose(self, report: Callable[[], Iterable[DiagnosticStatus]]) -> None:
+        """Publish statuses once a second."""
+        publisher = interface.publisher(self, topics.DIAGNOSTICS)
+
+        def publish() -> None:
+            statuses = [*report()]
+            publisher.publish(to_diagnostics(self.now(), *statuses))
+
+        self.every(1.0, publish)
+
+    def on_change(self, take: Callable[[Sequence[Parameter]], None]) -> None:
+        """Have parameters that are set taken together, or refused by `BadInputError`."""
+        def change(parameters: Sequence[Parameter]) -> SetParametersResult:
+            try:
+                take(parameters)
+            except BadInputError as error:
+                return SetParametersResult(successful=False, reason=str(error))
+            return SetParametersResult(successful=True)
+
+        self.add_on_set_parameters_callback(change)
+
+    def now(self) -> int:
+        """Return the node's time in ns."""
+        return int(self.get_clock().now().nanoseconds)
+
+    def keep(self, *entities: object) -> None:
+        """Keep what was created when the node is cleaned up."""
+        self._kept |= {*entities}
 
     # -- what a subclass does ------------------------------------------------------------------
 
@@ -163,12 +222,7 @@ class ManagedNode(LifecycleNode):
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
 
-    def keep(self, *entities: object) -> None:
-        """Keep what was created when the node is cleaned up."""
-        self._kept |= {*entities}
-
     def _entities(self) -> set[object]:
-        """Return all that this node has created."""
         return {*self.publishers, *self.subscriptions, *self.services, *self.clients,
                 *self.timers}
 

@@ -3,13 +3,15 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
+from hmsa_ros.contract import topics
+from hmsa_ros.contract.actuator import actuator_from
+from hmsa_ros.contract.parameters import ParameterSpec
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.joints import JointParameters
+from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.markers import Block, Scene, State
-from hmsa_ros.nodes.parameters import actuator_from, ParameterSpec
 
 MARKER_SCALE = ParameterSpec(
     'marker_scale', 1.0,
@@ -41,18 +43,16 @@ class StateMarkers:
     """
 
     def __init__(
-            self, node: Node, values: JointParameters, pace: float,
+            self, node: ManagedNode, values: JointParameters, pace: float,
             states: Callable[[], tuple[int, Sequence[State]]]) -> None:
-        """Create the publisher, and the timer unless the rate is 0."""
-        self._publisher = interface.publisher(node, interface.MARKERS)
+        self._publisher = interface.publisher(node, topics.MARKERS)
         self._states = states
         rate: float = values[MARKER_RATE.name]
         lifetime = 0.0
         if rate > 0.0:
             lifetime = max(1.0, pace) * max(_LIFETIME_SECONDS, _LIFETIME_PERIODS / rate)
             # The eye's time, whatever pace simulated time has.
-            node.create_timer(
-                1.0 / rate, self._show, clock=Clock(clock_type=ClockType.STEADY_TIME))
+            node.every(1.0 / rate, self._show)
         self._scene = scene_from(values, lifetime if pace > 0.0 else 0.0)
 
     def _show(self) -> None:
@@ -65,8 +65,7 @@ class TargetMarkers:
     """Publishes where the joints are to go, whenever that changes."""
 
     def __init__(self, node: Node, values: JointParameters) -> None:
-        """Create the publisher."""
-        self._publisher = interface.publisher(node, interface.MARKERS)
+        self._publisher = interface.publisher(node, topics.MARKERS)
         self._scene = scene_from(values)
         self._shown: Any = None
 

@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 import math
 
-from builtin_interfaces.msg import Duration, Time
 from geometry_msgs.msg import Point, Pose, Quaternion, Vector3
 import numpy as np
 from std_msgs.msg import ColorRGBA, Header
@@ -30,6 +29,7 @@ from hmsa_ros.core.laws.bending import centreline, tangent
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.nodes.conversions import to_duration, to_time
 
 #: Identifiers of a joint's markers, the same in every message.
 BLOCK, MAGNETISATION, FIELD, LABEL, TARGET = range(5)
@@ -61,9 +61,9 @@ class Block:
     joint : str
         Its name, the namespace of its markers.
     half_length, half_thickness : float
-        L and H in m, greater than 0.
+        L and H in m.
     remanence : float
-        Br in T, greater than 0.
+        Br in T.
     width : float
         Width of a beam in m; 0 for a block.
     per_tesla : float
@@ -72,7 +72,7 @@ class Block:
     Raises
     ------
     BadInputError
-        If the name is empty or a value is not finite and greater than 0.
+        If the name is empty.
 
     """
 
@@ -84,15 +84,8 @@ class Block:
     per_tesla: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if not self.joint:
             raise BadInputError('joint is empty: expected a name')
-        for name in ('half_length', 'half_thickness', 'remanence'):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise BadInputError(
-                    f'{name} of {self.joint} is {value!r}: expected a finite number greater '
-                    'than 0')
 
     @classmethod
     def of(cls, joint: str, actuator: ActuatorParameters) -> 'Block':
@@ -106,20 +99,8 @@ class Block:
             per_tesla=2.0 * actuator.half_length / (3.0 * actuator.flux_density_unit))
 
     def bent(self, deflection: float) -> list[tuple[float, float, float]]:
-        """
-        Return a bent beam about the middle of the straight one.
-
-        Parameters
-        ----------
-        deflection : float
-            Of its tip over its length.
-
-        Returns
-        -------
-        list of (float, float, float)
-            Corners of triangles in m, three for each.
-
-        """
+        """Return the triangles, by their corners in m, of a beam bent by a share of its length."""
+        # About the middle of the straight one.
         along, across = (2.0 * self.half_length * x for x in centreline(deflection, _STATIONS))
         angle = tangent(deflection, np.linspace(0.0, 1.0, _STATIONS))
         x, z = along - self.half_length, across
@@ -168,26 +149,12 @@ class Scene:
     lifetime : float
         Seconds after which a viewer drops what was not sent again, 0 for never.
 
-    Raises
-    ------
-    BadInputError
-        If a number is not finite or out of range.
-
     """
 
     blocks: tuple[Block, ...]
     frame: str
     scale: float = 1.0
     lifetime: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        if not (math.isfinite(self.scale) and self.scale > 0.0):
-            raise BadInputError(
-                f'scale is {self.scale!r}: expected a finite number greater than 0')
-        if not (math.isfinite(self.lifetime) and self.lifetime >= 0.0):
-            raise BadInputError(
-                f'lifetime is {self.lifetime!r}: expected a finite number of at least 0 s')
 
     def places(self) -> list[tuple[float, float]]:
         """Return x and y of the blocks in m before scaling; their middle is the origin."""
@@ -250,17 +217,13 @@ class Scene:
         """Return a block at a stretch, or a beam at a deflection."""
         if block.width:
             marker = self._marker(stamp, block, number, Marker.TRIANGLE_LIST, colour)
-            marker.pose = self._pose(place, 0.0)
             marker.scale = Vector3(x=1.0, y=1.0, z=1.0)
-            marker.points = [
-                Point(x=x * self.scale, y=y * self.scale, z=z * self.scale)
-                for x, y, z in block.bent(stretch)]
-            return marker
-        size = block.size(stretch)
-        marker = self._marker(stamp, block, number, Marker.CUBE, colour)
+            marker.points = [self._point(*corner) for corner in block.bent(stretch)]
+        else:
+            marker = self._marker(stamp, block, number, Marker.CUBE, colour)
+            size = self._point(*block.size(stretch))
+            marker.scale = Vector3(x=size.x, y=size.y, z=size.z)
         marker.pose = self._pose(place, 0.0)
-        marker.scale = Vector3(
-            x=size[0] * self.scale, y=size[1] * self.scale, z=size[2] * self.scale)
         return marker
 
     def _along(
@@ -272,12 +235,9 @@ class Scene:
         angle = float(tangent(deflection, 0.5))
         x, z = math.cos(angle), math.sin(angle)
         along, across = centreline(deflection, 3)
-        begin = Point(
-            x=(place[0] + (2.0 * along[1] - 1.0 - 0.5 * x) * block.half_length) * self.scale,
-            y=place[1] * self.scale,
-            z=(2.0 * across[1] - 0.5 * z) * block.half_length * self.scale)
-        reach = block.half_length * self.scale
-        marker.points = [begin, Point(x=begin.x + reach * x, y=begin.y, z=begin.z + reach * z)]
+        marker.points = [self._point(
+            place[0] + (2.0 * along[1] - 1.0 + share * x) * block.half_length, place[1],
+            (2.0 * across[1] + share * z) * block.half_length) for share in (-0.5, 0.5)]
         return marker
 
     def _arrow(
@@ -288,36 +248,33 @@ class Scene:
             # An arrow of no length has no direction, which viewers complain of.
             return self._marker(stamp, block, number, Marker.ARROW, None)
         marker = self._marker(stamp, block, number, Marker.ARROW, colour)
-        half = length / 2 * self.scale
-        x, y = place[0] * self.scale, place[1] * self.scale
         marker.pose = Pose(orientation=Quaternion(w=1.0))
-        marker.points = [Point(x=x, y=y, z=-half), Point(x=x, y=y, z=half)]
+        marker.points = [self._point(*place, z) for z in (-length / 2, length / 2)]
         # Diameters of shaft and head, and the head's length, no longer than half the arrow.
         thickness = 0.12 * block.half_length * self.scale
         marker.scale = Vector3(
-            x=thickness, y=2.5 * thickness, z=min(3.0 * thickness, abs(half)))
+            x=thickness, y=2.5 * thickness,
+            z=min(3.0 * thickness, abs(length) / 2 * self.scale))
         return marker
 
     def _marker(
             self, stamp: int, block: Block, number: int, kind: int,
             colour: tuple[float, float, float, float] | None) -> Marker:
         """Return a marker without a place; without a colour it deletes the one before."""
-        sec, nanosec = divmod(stamp, NANOSECONDS)
         marker = Marker(
-            header=Header(stamp=Time(sec=sec, nanosec=nanosec), frame_id=self.frame),
-            ns=block.joint, id=number, type=kind)
+            header=Header(stamp=to_time(stamp), frame_id=self.frame), ns=block.joint, id=number,
+            type=kind)
         if colour is None:
             marker.action = Marker.DELETE
             return marker
         marker.action = Marker.ADD
         red, green, blue, alpha = colour
         marker.color = ColorRGBA(r=red, g=green, b=blue, a=alpha)
-        sec, nanosec = divmod(round(self.lifetime * NANOSECONDS), NANOSECONDS)
-        marker.lifetime = Duration(sec=sec, nanosec=nanosec)
+        marker.lifetime = to_duration(round(self.lifetime * NANOSECONDS))
         return marker
 
     def _pose(self, place: tuple[float, float], height: float) -> Pose:
-        return Pose(
-            position=Point(
-                x=place[0] * self.scale, y=place[1] * self.scale, z=height * self.scale),
-            orientation=Quaternion(w=1.0))
+        return Pose(position=self._point(*place, height), orientation=Quaternion(w=1.0))
+
+    def _point(self, x: float, y: float, z: float) -> Point:
+        return Point(x=x * self.scale, y=y * self.scale, z=z * self.scale)

@@ -1,16 +1,10 @@
-"""Classes of messages and services by the names of their types, and the other way round."""
+"""Classes of messages and services by the names of their types."""
 
 from importlib import import_module
 from typing import Any
 
 from hmsa_ros.bag.definitions import is_interface_package
 from hmsa_ros.errors import BagError
-
-
-def type_name_of(message_type: type[Any]) -> str:
-    """Return the name of a message class's type."""
-    package, folder, *_ = message_type.__module__.split('.')
-    return f'{package}/{folder}/{message_type.__name__}'
 
 
 def interface_class(type_name: str) -> type[Any]:

@@ -15,41 +15,16 @@ from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 
 from hmsa_ros.contract import topics
-from hmsa_ros.contract.actuator import actuator_from, completed
-from hmsa_ros.contract.parameters import (
-    BLOCK,
-    FIXED,
-    INITIAL_STRETCH,
-    JOINT,
-    LAW,
-    ParameterSpec,
-)
+from hmsa_ros.contract.actuator import completed
+from hmsa_ros.contract.parameters import FIXED, LAW, ParameterSpec
 from hmsa_ros.errors import BadInputError
-
-__all__ = [
-    'actuator_from', 'BLOCK', 'check_names', 'declare', 'descriptor', 'from_files',
-    'INITIAL_STRETCH', 'JOINT', 'ParameterSpec', 'refusal']
-
 
 # What hmsa identify once wrote beside the rest.
 _ONCE = {'identification.verdict', 'identification.noise_std'}
 
 
 def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
-    """
-    Return the descriptor that ``ros2 param describe`` shows.
-
-    Parameters
-    ----------
-    spec : ParameterSpec
-        What is declared.
-
-    Returns
-    -------
-    rcl_interfaces.msg.ParameterDescriptor
-        With description, range and additional constraints.
-
-    """
+    """Return the descriptor that ``ros2 param describe`` shows."""
     text = f'{spec.description} [{spec.unit}]' if spec.unit else spec.description
     descriptor = ParameterDescriptor(description=text, read_only=spec.read_only)
     # An empty list says nothing of its type: rclpy would take it for one of bytes and
@@ -72,19 +47,7 @@ def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
 
 def declare(node: Node, specs: Iterable[ParameterSpec]) -> Mapping[str, Any]:
     """
-    Declare parameters on a node and return their values.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Node to declare on.
-    specs : iterable of ParameterSpec
-        What to declare.
-
-    Returns
-    -------
-    mapping of str to object
-        Values by name.
+    Declare parameters on a node and return their values by name.
 
     Raises
     ------
@@ -97,44 +60,40 @@ def declare(node: Node, specs: Iterable[ParameterSpec]) -> Mapping[str, Any]:
     for spec in specs:
         if filled is None and spec.name in FIXED:
             filled = from_files(node, values)
-        try:
-            # The range is checked by `check`, whose message names what was expected; rclpy's
-            # does not.
-            value = node.declare_parameter(
-                spec.name, (filled or {}).get(spec.name, spec.default),
-                descriptor(spec)).value
-        except ParameterException as error:
-            raise refusal(node, spec) from error
-        values[spec.name] = spec.taken(value)
+        values[spec.name] = spec.taken(
+            declare_one(node, spec, (filled or {}).get(spec.name, spec.default)))
     return values
 
 
-def from_files(node: Node, values: Mapping[str, Any], joint: str = '') -> Mapping[str, Any]:
+def declare_one(node: Node, spec: ParameterSpec, default: Any) -> Any:
     """
-    Return constants of the law out of a file which the start values name.
-
-    As parameters they are recorded with the rest: a bag can be verified without the file.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Whose start values count.
-    values : mapping of str to object
-        Declared so far.
-    joint : str
-        Whose own values go before those for all; nothing is read where it has none.
-
-    Returns
-    -------
-    mapping of str to object
-        By name, without the joint.
+    Declare a parameter with a default, or with a type and without a value; return its value.
 
     Raises
     ------
     BadInputError
-        If the file cannot be used.
+        If a value from the command line or a file has the wrong type.
 
     """
+    try:
+        # The range is checked by `ParameterSpec`, whose message names what was expected; rclpy's
+        # does not.
+        return node.declare_parameter(spec.name, default, descriptor(spec)).value
+    except ParameterException as error:
+        override = node._parameter_overrides.get(spec.name)
+        got = 'a value of another kind' if override is None else repr(override.value)
+        expected = type(spec.default).__name__
+        if spec.minimum is not None or spec.maximum is not None:
+            expected += f', {spec.range_text()}'
+        raise BadInputError(f'parameter {spec.name} is {got}: expected {expected}') from error
+
+
+def from_files(node: Node, values: Mapping[str, Any], joint: str = '') -> Mapping[str, Any]:
+    """Return constants of the law out of a file which the start values name, by plain name."""
+    # As parameters they are recorded with the rest: a bag can be verified without the file. Of a
+    # joint, own values go before those for all; nothing is read where it has none.
+    # As parameters they are recorded with the rest: a bag can be verified without the file. Of a
+    # joint, own values go before those for all; nothing is read where it has none.
     given = {spec.name: found.value for spec in LAW if (found := node._parameter_overrides.get(
         f'{joint}.{spec.name}' if joint else spec.name)) is not None}
     if joint and not given:
@@ -146,14 +105,7 @@ def from_files(node: Node, values: Mapping[str, Any], joint: str = '') -> Mappin
 
 def check_names(node: Node) -> None:
     """
-    Refuse start values of parameters that there are not, as a mistyped name gives them.
-
-    Files may have sections for several nodes, so that names of other nodes of the package pass.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        With all its parameters declared.
+    Refuse start values of parameters that a node, all of whose are declared, does not have.
 
     Raises
     ------
@@ -161,6 +113,8 @@ def check_names(node: Node) -> None:
         If a name is unknown; the nearest one is suggested.
 
     """
+    # Files may have sections for several nodes: names of other nodes of the package pass.
+    # Files may have sections for several nodes: names of other nodes of the package pass.
     unknown = [x for x in node._parameter_overrides
                if not node.has_parameter(x) and not x.startswith('qos_overrides.')]
     if not unknown:
@@ -177,28 +131,3 @@ def check_names(node: Node) -> None:
         raise BadInputError(
             f'parameter {name} does not exist: expected one of the {node.get_name()}, such as '
             f'{near[0]}')
-
-
-def refusal(node: Node, spec: ParameterSpec) -> BadInputError:
-    """
-    Return the error for a start value that rclpy has refused.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        On which it was to be declared.
-    spec : ParameterSpec
-        What was to be declared.
-
-    Returns
-    -------
-    BadInputError
-        To raise.
-
-    """
-    override = node._parameter_overrides.get(spec.name)
-    got = 'a value of another kind' if override is None else repr(override.value)
-    expected = type(spec.default).__name__
-    if spec.minimum is not None or spec.maximum is not None:
-        expected += f', {spec.range_text()}'
-    return BadInputError(f'parameter {spec.name} is {got}: expected {expected}')

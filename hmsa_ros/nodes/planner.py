@@ -1,20 +1,21 @@
 """Planner node: setpoints in, the shaped stream of stamped flux density commands out."""
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import zip_longest
 import math
 from time import monotonic_ns
 
-from rcl_interfaces.msg import SetParametersResult
-from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
-from std_srvs.srv import Trigger
 
+from hmsa_ros.contract import topics
+from hmsa_ros.contract.actuator import actuator_from
 from hmsa_ros.core.actuators import unheld
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.core.warmup import warm_up
@@ -26,7 +27,7 @@ from hmsa_ros.nodes.joints import declare_joints
 from hmsa_ros.nodes.managed import AUTOSTART, ManagedNode
 from hmsa_ros.nodes.marker_publisher import TargetMarkers
 from hmsa_ros.nodes.newest_clock import NewestClock
-from hmsa_ros.nodes.parameters import actuator_from, check_names
+from hmsa_ros.nodes.parameters import check_names
 from hmsa_ros.nodes.planning import group_from, models_from, OWN, settings_from, SPECS
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.nodes.timekeeping import StepWatch
@@ -51,8 +52,7 @@ PARAMETERS = SPECS
 _POLL_NS = 2_000_000
 _LONGEST_POLL_NS = 100_000_000
 # Whoever publishes samples, reliably or not, is understood.
-_SAMPLES = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+_SAMPLES = replace(topics.JOINT_STATES, qos=topics.Quality(1000, reliable=False))
 # How long samples are listened to after they were wanted last: a subscription takes time to match.
 _LINGER_NS = 2 * NANOSECONDS
 
@@ -64,8 +64,7 @@ class PlannerNode(ManagedNode):
     linked = False
 
     def __init__(self) -> None:
-        """Declare the parameters, and start if told to."""
-        super().__init__(interface.PLANNER)
+        super().__init__(topics.PLANNER)
         self._settings = declare_joints(
             self, [x for x in PARAMETERS if x is not AUTOSTART], OWN)
         self._clock_reader = NewestClock(self)
@@ -80,12 +79,12 @@ class PlannerNode(ManagedNode):
             x.model.material.creep for x in self._runtime.group.planners.values()))
         if seconds > 1.0:
             self.get_logger().info(f'loaded the numerical kernels in {seconds:.1f} s')
-        self.add_on_set_parameters_callback(self._on_parameters)
+        self.on_change(self._take_parameters)
         self.autostart()
 
     def _new_runtime(self) -> PlannerRuntime:
         return PlannerRuntime(
-            group_from(self._settings), settings_from(self._settings), clock=self._now,
+            group_from(self._settings), settings_from(self._settings), clock=self.now,
             observable=self._observable, unheard=self._unheard)
 
     # -- states --------------------------------------------------------------------------------
@@ -99,29 +98,24 @@ class PlannerNode(ManagedNode):
                 self.get_logger().warning(f'joint {name}: {lost}')
         self._channels = {x: JointChannel(
             self, x, names, self._runtime, self._serve, linked=self.linked) for x in names}
-        self._plan, self._status, self._estimate, self._diagnostics = (
-            interface.publisher(self, x) for x in (
-                interface.PLAN, interface.STATUS, interface.ESTIMATE, interface.DIAGNOSTICS))
+        self._plan, self._status, self._estimate = (
+            interface.publisher(self, x) for x in (topics.PLAN, topics.STATUS, topics.ESTIMATE))
         self._targets = TargetMarkers(self, self._settings)
         self._publish: dict[type, Callable[..., None]] = {
             Send: self._publish_command, PlanChanged: self._publish_plan,
             StatusChanged: self._publish_status, EstimateChanged: self._publish_estimate,
             Note: self._log}
-        topic = interface.JOINT_TRAJECTORY
-        self.create_subscription(
-            topic.type, topic.name, self._on_trajectory, topic.qos, raw=True)
-        for service, callback in (
-                (interface.STOP, self._on_stop),
-                (interface.RESET_ESTIMATE, self._on_reset_estimate),
-                (interface.SAVE_ESTIMATE, self._on_save_estimate)):
-            self.create_service(service.type, service.name, callback)
-        # Steady time: timers on simulated time fire once a /clock message at the most, and
-        # what is due is decided by the node's clock anyhow.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._poll = self.create_timer(_POLL_NS / NANOSECONDS, self._serve, clock=steady)
+        interface.subscribe(self, topics.JOINT_TRAJECTORY, self._on_trajectory, raw=True)
+        self.offer(topics.STOP, self._on_stop)
+        self.offer(topics.RESET_ESTIMATE, lambda: (True, self._runtime.feedback.reset()))
+        self.offer(topics.SAVE_ESTIMATE, lambda: (
+            True, self._runtime.feedback.save(by_joint=bool(self._settings['joints']))))
+        # Timers on simulated time fire once a /clock message at the most, and what is due is
+        # decided by the node's clock anyhow.
+        self._poll = self.every(_POLL_NS / NANOSECONDS, self._serve)
         if self.linked:
             self._poll.cancel()
-        self.create_timer(1.0, self._on_diagnostics, clock=steady)
+        self.diagnose(self._report)
         self._jump = self.get_clock().create_jump_callback(
             JumpThreshold(
                 min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False),
@@ -156,21 +150,10 @@ class PlannerNode(ManagedNode):
             self._runtime.request(request)
         self._serve()
 
-    def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_stop(self) -> tuple[bool, str]:
         verdict = self._runtime.request(Stop())
-        response.success = verdict.severity < Severity.ERROR
-        response.message = verdict.message
         self._serve()
-        return response
-
-    def _on_reset_estimate(
-            self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return _answered(response, self._runtime.feedback.reset)
-
-    def _on_save_estimate(
-            self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return _answered(response, partial(
-            self._runtime.feedback.save, by_joint=bool(self._settings['joints'])))
+        return verdict.severity < Severity.ERROR, verdict.message
 
     def _on_sample(self, data: bytes) -> None:
         # Most of a thousand samples a second are of no use, and reading them takes time.
@@ -190,7 +173,7 @@ class PlannerNode(ManagedNode):
 
     def _observable(self) -> bool:
         """Return whether somebody may give samples."""
-        return bool(self.count_publishers(interface.JOINT_STATES.name))
+        return bool(self.count_publishers(topics.JOINT_STATES.name))
 
     def _unheard(self) -> str:
         """Return why nobody carries out commands; empty where somebody does."""
@@ -198,7 +181,8 @@ class PlannerNode(ManagedNode):
 
     # -- time ----------------------------------------------------------------------------------
 
-    def _now(self) -> int:
+    def now(self) -> int:
+        """Return the node's time in ns; that the clock was set back is noted."""
         before = monotonic_ns()
         now = self._clock_reader.read()
         if not self._clock_reader.simulated:
@@ -216,7 +200,7 @@ class PlannerNode(ManagedNode):
         if not self._channels:
             # Cleaned up, and this was on its way.
             return
-        self._take(self._runtime.tick(self._now()))
+        self._take(self._runtime.tick(self.now()))
         if not self.linked:
             self._listen()
             self._pace()
@@ -229,7 +213,7 @@ class PlannerNode(ManagedNode):
             return
         period = _POLL_NS
         if wake is not None and not self._clock_reader.simulated:
-            period = min(max(wake - self._now(), _POLL_NS), _LONGEST_POLL_NS)
+            period = min(max(wake - self.now(), _POLL_NS), _LONGEST_POLL_NS)
         if period != self._poll.timer_period_ns or self._poll.is_canceled():
             self._poll.timer_period_ns = period
             self._poll.reset()
@@ -240,9 +224,7 @@ class PlannerNode(ManagedNode):
         if wanted:
             self._listen_until = monotonic_ns() + _LINGER_NS
         if wanted and self._samples is None:
-            topic = interface.JOINT_STATES
-            self._samples = self.create_subscription(
-                topic.type, topic.name, self._on_sample, _SAMPLES, raw=True)
+            self._samples = interface.subscribe(self, _SAMPLES, self._on_sample, raw=True)
         elif self._samples is not None and monotonic_ns() > self._listen_until:
             self.destroy_subscription(self._samples)
             self._samples = None
@@ -250,7 +232,6 @@ class PlannerNode(ManagedNode):
     # -- out -----------------------------------------------------------------------------------
 
     def _take(self, outputs: Iterable[Output]) -> None:
-        """Publish what the runtime has to say."""
         for output in outputs:
             self._publish[type(output)](output)
 
@@ -262,13 +243,13 @@ class PlannerNode(ManagedNode):
 
     def _publish_status(self, status: StatusChanged) -> None:
         self._status.publish(conversions.to_planner_status(status))
-        self._targets.show(self._now(), {
+        self._targets.show(self.now(), {
             name: float(x.stretch) if x.stretch else None for name, x in status.each.items()})
 
     def _publish_estimate(self, estimate: EstimateChanged) -> None:
         self._estimate.publish(conversions.to_diagnostics(
             estimate.time, conversions.to_status(
-                f'{self.get_name()}: estimate', estimate.joint, bytes([estimate.severity]),
+                f'{self.get_name()}: estimate', estimate.joint, estimate.severity,
                 estimate.message, estimate.values)))
 
     def _log(self, note: Note) -> None:
@@ -277,7 +258,7 @@ class PlannerNode(ManagedNode):
         else:
             self.get_logger().warning(note.message)
 
-    def _on_diagnostics(self) -> None:
+    def _report(self) -> Iterable[DiagnosticStatus]:
         severity, message, values = self._runtime.report()
         clocks = self.count_publishers('/clock') if self._clock_reader.simulated else 1
         if clocks > 1:
@@ -287,35 +268,17 @@ class PlannerNode(ManagedNode):
             if not self._several_clocks:
                 self.get_logger().warning(message)
         self._several_clocks = clocks > 1
-        self._diagnostics.publish(conversions.to_diagnostics(
-            self._now(), conversions.to_status(
-                f'{self.get_name()}: commands', ', '.join(self._channels), bytes([severity]),
-                message, values)))
+        yield conversions.to_status(
+            f'{self.get_name()}: commands', ', '.join(self._channels), severity, message, values)
 
     # -- parameters ----------------------------------------------------------------------------
 
-    def _on_parameters(self, parameters: Sequence[Parameter]) -> SetParametersResult:
-        """Take changed parameters from the next request on, or refuse them together."""
-        try:
-            changed = self._settings.changed(parameters)
-            models = models_from(changed, self._runtime.group)
-        except BadInputError as error:
-            return SetParametersResult(successful=False, reason=str(error))
+    def _take_parameters(self, parameters: Sequence[Parameter]) -> None:
+        changed = self._settings.changed(parameters)
+        settings, models = settings_from(changed), models_from(changed, self._runtime.group)
         self._settings = changed
-        self._runtime.change(
-            settings_from(changed), models, simultaneous=changed['simultaneous_arrival'])
-        return SetParametersResult(successful=True)
+        self._runtime.change(settings, models, simultaneous=changed['simultaneous_arrival'])
 
 
-def _answered(response: Trigger.Response, work: Callable[[], str]) -> Trigger.Response:
-    """Return the response with what some work says, or why it is refused."""
-    try:
-        response.message, response.success = work(), True
-    except BadInputError as error:
-        response.message, response.success = str(error), False
-    return response
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the planner with the command line's arguments; return the exit status."""
-    return run(PlannerNode, args)
+#: Run by ``hmsa planner`` with the command line's arguments; returns the exit status.
+main = partial(run, PlannerNode)

@@ -2,18 +2,21 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 import math
 from typing import Any
 
 from hmsa_ros.contract.actuator import planned_from
 from hmsa_ros.contract.parameters import (
+    BLOCK,
     COIL_TIME_CONSTANT,
     CREEP_TOLERANCE,
     FIXED,
     FLUX_DENSITY_MAX,
     FLUX_DENSITY_MIN,
+    INITIAL_STRETCH,
+    JOINT,
     KNOWN,
+    ParameterSpec,
     SLEW_LIMIT,
     VISCOELASTIC,
 )
@@ -32,12 +35,6 @@ from hmsa_ros.identification.quantities import check_free
 from hmsa_ros.nodes.joints import JointParameters, JOINTS
 from hmsa_ros.nodes.managed import AUTOSTART
 from hmsa_ros.nodes.marker_publisher import MARKER_SCALE
-from hmsa_ros.nodes.parameters import (
-    BLOCK,
-    INITIAL_STRETCH,
-    JOINT,
-    ParameterSpec,
-)
 from hmsa_ros.runtime.feedback import MODES
 from hmsa_ros.runtime.measured import Tolerances
 from hmsa_ros.runtime.records import Settings
@@ -189,17 +186,7 @@ SPECS = (
 
 def options_from(values: Mapping[str, Any]) -> Options:
     """
-    Return the planning options that declared parameters describe.
-
-    Parameters
-    ----------
-    values : mapping of str to object
-        Of one joint.
-
-    Returns
-    -------
-    Options
-        In SI units.
+    Return the planning options that the declared parameters of a joint describe.
 
     Raises
     ------
@@ -207,115 +194,51 @@ def options_from(values: Mapping[str, Any]) -> Options:
         If the limits of the flux density are not in order.
 
     """
-    least, largest = float(values['flux_density_min']), float(values['flux_density_max'])
+    least, largest = values['flux_density_min'], values['flux_density_max']
     if not least < largest:
         raise BadInputError(
             f'parameter flux_density_min is {least:g} T: expected less than flux_density_max, '
             f'which is {largest:g} T')
     return Options(
-        shaper=str(values['shaper']), short_spell=str(values['short_spell']),
+        shaper=values['shaper'], short_spell=values['short_spell'],
         flux_density_min=least, flux_density_max=largest,
-        lead_time=nanoseconds(values['lead_time']),
+        lead_time=_nanoseconds(values['lead_time']),
         period=0 if values['command_mode'] == 'continuous'
-        else nanoseconds(values['command_period']),
-        slew_limit=float(values['slew_limit']) or math.inf,
-        order=int(values['robust_order']), errors=errors_from(
-            str(values['minimax_file']), values['minimax_errors']),
-        coil_time_constant=float(values['coil_time_constant']),
-        creep_tolerance=float(values['creep_tolerance']),
-        pace=Pace(float(values['smooth_periods']), float(values['stretch_rate_max']) or math.inf))
+        else _nanoseconds(values['command_period']),
+        slew_limit=values['slew_limit'] or math.inf, order=values['robust_order'],
+        errors=errors_from(values['minimax_file'], values['minimax_errors']),
+        coil_time_constant=values['coil_time_constant'],
+        creep_tolerance=values['creep_tolerance'],
+        pace=Pace(values['smooth_periods'], values['stretch_rate_max'] or math.inf))
 
 
-def nanoseconds(seconds: float) -> int:
-    """Return a time in s in ns."""
-    return round(float(seconds) * NANOSECONDS)
+def _nanoseconds(seconds: float) -> int:
+    return round(seconds * NANOSECONDS)
 
 
 def settings_from(values: JointParameters) -> Settings:
     """Return how a runtime deals with time, as parameters for all joints say."""
+    plain: dict[str, Any] = {x: values[x] for x in (
+        'replan_late', 'max_points', 'allow_partial_joints', 'feedback', 'feedback_cautious',
+        'feedback_tolerance', 'feedback_trim', 'feedback_frozen', 'feedback_file')}
+    times: dict[str, Any] = {x: _nanoseconds(values[x]) for x in (
+        'heartbeat_period', 'lateness_tolerance', 'takeover_timeout', 'takeover_max_age')}
     return Settings(
-        **{x: nanoseconds(values[x]) for x in (
-            'heartbeat_period', 'lateness_tolerance', 'takeover_timeout', 'takeover_max_age')},
-        replan_late=bool(values['replan_late']), max_points=int(values['max_points']),
-        allow_partial_joints=bool(values['allow_partial_joints']),
-        feedback=str(values['feedback']),
+        **plain, **times,
         feedback_parameters=check_free(values['feedback_parameters']),
-        feedback_cautious=bool(values['feedback_cautious']),
-        feedback_tolerance=float(values['feedback_tolerance']),
-        feedback_trim=float(values['feedback_trim']),
-        feedback_frozen=bool(values['feedback_frozen']),
-        feedback_file=str(values['feedback_file']),
-        known={name: _of(values, name, partial(Known.read, values.of(name)))
-               for name in values.names},
-        tolerances=Tolerances(*(float(values[f'{x}_tolerance']) for x in (
+        known=values.each(lambda _, own: Known.read(own)),
+        tolerances=Tolerances(*(values[f'{x}_tolerance'] for x in (
             'arrival', 'vibration', 'stretch'))))
 
 
-def group_from(parameters: JointParameters) -> PlannerGroup:
-    """
-    Return the planners that parameters describe.
-
-    Parameters
-    ----------
-    parameters : JointParameters
-        Of all joints.
-
-    Returns
-    -------
-    PlannerGroup
-        At rest.
-
-    Raises
-    ------
-    BadInputError
-        If a joint cannot be planned for.
-
-    """
-    planners = {}
-    for name in parameters.names:
-        values = parameters.of(name)
-        planners[name] = _of(parameters, name, lambda values=values: Planner(
-            planned_from(values), options_from(values),
-            stretch=values['initial_stretch']))
-    return PlannerGroup(planners, simultaneous=parameters['simultaneous_arrival'])
+def group_from(values: JointParameters) -> PlannerGroup:
+    """Return the planners that parameters describe, at rest; an impossible one is refused."""
+    planners = values.each(lambda _, own: Planner(
+        planned_from(own), options_from(own), stretch=own['initial_stretch']))
+    return PlannerGroup(planners, simultaneous=values['simultaneous_arrival'])
 
 
-def models_from(parameters: JointParameters, group: PlannerGroup) -> dict[str, Model]:
-    """
-    Return under which models planners are to go on.
-
-    Parameters
-    ----------
-    parameters : JointParameters
-        Of all joints.
-    group : PlannerGroup
-        As it is; it stays so.
-
-    Returns
-    -------
-    dict of str to Model
-        By joint, all of them checked.
-
-    Raises
-    ------
-    BadInputError
-        If one cannot be taken.
-
-    """
-    models = {}
-    for name, planner in group.planners.items():
-        values = parameters.of(name)
-        models[name] = _of(
-            parameters, name, lambda values=values, planner=planner:
-            planner.checked_model(options_from(values), planned_from(values)))
-    return models
-
-
-def _of(parameters: JointParameters, name: str, make: Any) -> Any:
-    """Return what is made for a joint; an error names it if there are several."""
-    try:
-        return make()
-    except BadInputError as error:
-        if len(parameters.names) == 1:
-            raise
-        raise BadInputError(f'joint {name}: {error}') from error
+def models_from(values: JointParameters, group: PlannerGroup) -> dict[str, Model]:
+    """Return by joint, all checked, under which models planners go on, which stay as they are."""
+    return values.each(lambda name, own: group.planners[name].checked_model(
+        options_from(own), planned_from(own)))

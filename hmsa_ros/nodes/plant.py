@@ -1,16 +1,15 @@
 """Plant node: simulated actuators, driven by stamped flux density commands."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
+from functools import partial
 from time import monotonic_ns, time_ns
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from rcl_interfaces.msg import SetParametersResult
-from rclpy.clock import Clock, ClockType
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.parameter import Parameter
-from std_srvs.srv import SetBool, Trigger
 
-from hmsa_ros.contract.parameters import PUBLISH_RATE
+from hmsa_ros.contract import topics
+from hmsa_ros.contract.parameters import JOINT, ParameterSpec, PUBLISH_RATE
 from hmsa_ros.core.actuators import unheld
 from hmsa_ros.core.pacer import Pacer
 from hmsa_ros.core.units import NANOSECONDS
@@ -19,22 +18,11 @@ from hmsa_ros.device.health import too_few_samples
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import conversions, interface
-from hmsa_ros.nodes.device_node import (
-    COMMAND_SOURCE,
-    DeviceNode,
-    PUBLISH_SCALARS,
-    TICK_SECONDS,
-)
+from hmsa_ros.nodes.device_node import COMMAND_SOURCE, DeviceNode, PUBLISH_SCALARS
 from hmsa_ros.nodes.joints import declare_joints, JointParameters, JOINTS
 from hmsa_ros.nodes.managed import AUTOSTART
-from hmsa_ros.nodes.marker_publisher import (
-    MARKER_FRAME,
-    MARKER_RATE,
-    MARKER_SCALE,
-    StateMarkers,
-)
+from hmsa_ros.nodes.marker_publisher import MARKER_FRAME, MARKER_RATE, MARKER_SCALE, StateMarkers
 from hmsa_ros.nodes.markers import State
-from hmsa_ros.nodes.parameters import JOINT, ParameterSpec
 from hmsa_ros.nodes.plant_joint import joint_from, OWN, PlantJoint
 from hmsa_ros.nodes.runner import run
 
@@ -87,11 +75,10 @@ class PlantNode(DeviceNode):
     """Advances a `SimulatedDevice` along a clock and publishes what comes of it."""
 
     def __init__(self) -> None:
-        """Declare the parameters, and start if told to."""
-        super().__init__(interface.PLANT)
+        super().__init__(topics.PLANT)
         self._values = declare_joints(
             self, [x for x in PARAMETERS if x is not AUTOSTART], OWN)
-        self.add_on_set_parameters_callback(self._on_parameters)
+        self.on_change(self._take_parameters)
         self._pacer = Pacer(0, 1.0)
         self._clock_seen = 0
         self.autostart()
@@ -120,26 +107,13 @@ class PlantNode(DeviceNode):
         self._measured = (start, monotonic_ns())
         self._clocks_warned = False
 
-        self._diagnostics = interface.publisher(self, interface.DIAGNOSTICS)
         self._clock_publisher = (
-            interface.publisher(self, interface.CLOCK_TOPIC) if self._authority else None)
-        self._open_samples()
-        self._joints = [
-            PlantJoint(
-                self, self._device, i, values.names, values.of(x), self.companion)
-            for i, x in enumerate(values.names)]
-        self._publish_news()
+            interface.publisher(self, topics.CLOCK_TOPIC) if self._authority else None)
+        self._open(PlantJoint)
         StateMarkers(self, values, factor, self._states)
-        self._serve(interface.RESET, self._on_reset)
-        self._serve(interface.STEP, self._on_step)
-        self._serve(interface.SET_PAUSED, self._on_set_paused)
-
-        # Steady time: what to simulate is decided by the pacer or the node's clock, and the
-        # tick only looks at it.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        if not self.companion:
-            self.create_timer(TICK_SECONDS, self.on_tick, clock=steady)
-        self.create_timer(1.0, self._on_diagnostics, clock=steady)
+        self.offer(topics.RESET, self._on_reset)
+        self.offer(topics.STEP, self._on_step)
+        self.offer(topics.SET_PAUSED, self._on_set_paused)
 
     def activate(self) -> None:
         """Let time run, from where it is."""
@@ -148,9 +122,6 @@ class PlantNode(DeviceNode):
     def deactivate(self) -> None:
         """Hold time; commands on their way are lost."""
         self._device.drop_commands()
-
-    def _serve(self, service: interface.Service, callback: Callable[..., object]) -> None:
-        self.create_service(service.type, service.name, callback)
 
     # -- time ----------------------------------------------------------------------------------
 
@@ -186,8 +157,7 @@ class PlantNode(DeviceNode):
     def _follow(self) -> None:
         """Advance to the node's clock: the wall clock, or somebody else's /clock."""
         # The wall clock is what rclpy's reads then, without its objects.
-        now = int(self.get_clock().now().nanoseconds) if (
-            self._time_source.ros_time_is_active) else time_ns()
+        now = self.now() if self._time_source.ros_time_is_active else time_ns()
         if now == 0:
             return
         behind = now - self._clock_seen < 1_000_000_000
@@ -202,7 +172,6 @@ class PlantNode(DeviceNode):
             self._sample()
 
     def _sample(self) -> None:
-        """Advance to the next sample and publish it."""
         self._advance()
         self._publish_news()
 
@@ -225,7 +194,7 @@ class PlantNode(DeviceNode):
 
     # -- services and parameters ---------------------------------------------------------------
 
-    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_reset(self) -> tuple[bool, str]:
         where = []
         for i, joint in enumerate(self._joints):
             values = self._values.of(joint.name)
@@ -235,70 +204,55 @@ class PlantNode(DeviceNode):
             where.append(f'{how} at {self._device.coordinates[i]} {self._device.stretch[i]:g}')
         self._device.drop_commands()
         self._publish_news()
-        response.success = True
-        response.message = where[0] if len(where) == 1 else ', '.join(
+        return True, where[0] if len(where) == 1 else ', '.join(
             f'{joint.name} {text}' for joint, text in zip(self._joints, where, strict=True))
-        return response
 
-    def _on_step(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_step(self) -> tuple[bool, str]:
         if not self._authority:
-            response.message = 'the plant follows a clock: expected publish_clock true'
-        elif not self._pacer.paused:
-            response.message = 'the plant is running: expected it paused (~/set_paused)'
-        elif not self.active:
-            response.message = f'the plant is {self.state}: expected it active'
-        else:
-            self._hear()
-            for _ in range(self._values['step_count']):
-                before = self._device.time
-                while self._device.time == before:
-                    # The first sample is the start itself.
-                    self._sample()
-            self._pacer.set_paused(True, self._device.time)
-            response.success = True
-            response.message = f'at {self._device.time / 1e9:.9f} s'
-        return response
+            return False, 'the plant follows a clock: expected publish_clock true'
+        if not self._pacer.paused:
+            return False, 'the plant is running: expected it paused (~/set_paused)'
+        if not self.active:
+            return False, f'the plant is {self.state}: expected it active'
+        self._hear()
+        for _ in range(self._values['step_count']):
+            before = self._device.time
+            while self._device.time == before:
+                # The first sample is the start itself.
+                self._sample()
+        self._pacer.set_paused(True, self._device.time)
+        return True, f'at {self._device.time / 1e9:.9f} s'
 
-    def _on_set_paused(
-            self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        self._pacer.set_paused(request.data, self._device.time)
-        response.success = True
-        response.message = 'paused' if request.data else 'running'
-        return response
+    def _on_set_paused(self, paused: bool) -> tuple[bool, str]:
+        self._pacer.set_paused(paused, self._device.time)
+        return True, 'paused' if paused else 'running'
 
-    def _on_parameters(self, parameters: Sequence[Parameter]) -> SetParametersResult:
-        """Take changed parameters, or refuse them together."""
-        try:
-            changed = self._values.changed(parameters)
-            joints_from(changed)
-        except BadInputError as error:
-            return SetParametersResult(successful=False, reason=str(error))
+    def _take_parameters(self, parameters: Sequence[Parameter]) -> None:
+        changed = self._values.changed(parameters)
+        _joints_from(changed)
         self._values = changed
         factor = changed['real_time_factor']
         if self._joints and self._authority and factor != self._pacer.factor:
             self._pacer.set_factor(factor, self._device.time)
-        return SetParametersResult(successful=True)
 
     # -- reports -------------------------------------------------------------------------------
 
-    def _on_diagnostics(self) -> None:
-        self._diagnostics.publish(conversions.to_diagnostics(
-            int(self.get_clock().now().nanoseconds),
-            self._status_of_commands(paused=self._pacer.paused, **conversions.of_joints(
-                'coordinate', dict(zip(
-                    (x.name for x in self._joints), self._device.coordinates, strict=True)))),
-            self._status_of_time()))
+    def _report(self) -> Iterable[DiagnosticStatus]:
+        yield self._status_of_commands(
+            paused=self._pacer.paused, **conversions.of_joints('coordinate', dict(zip(
+                (x.name for x in self._joints), self._device.coordinates, strict=True))))
+        yield self._status_of_time()
 
     def _status_of_time(self) -> DiagnosticStatus:
         then, since = self._measured
         steady = monotonic_ns()
         self._measured = (self._device.time, steady)
         achieved = (self._device.time - then) / max(steady - since, 1) if then else 0.0
-        level = DiagnosticStatus.OK
+        level = 0
         message = f'time is held, {self.state}' if self._standing else 'time runs'
-        clocks = self.count_publishers(interface.CLOCK_TOPIC.name)
+        clocks = self.count_publishers(topics.CLOCK_TOPIC.name)
         if clocks > 1 and (self._authority or self.get_parameter('use_sim_time').value):
-            level = DiagnosticStatus.WARN
+            level = 1
             message = f'{clocks} publishers of /clock: expected one'
             if self._authority:
                 message = (f'{message}, this plant, which is the authority on simulated time '
@@ -314,48 +268,21 @@ class PlantNode(DeviceNode):
              'real_time_factor_achieved': f'{achieved:.3f}', 'clock_publishers': clocks})
 
 
-def joints_from(values: JointParameters) -> list[SimulatedJoint]:
-    """
-    Return the simulated joints that parameters describe.
-
-    Parameters
-    ----------
-    values : JointParameters
-        Of the node.
-
-    Returns
-    -------
-    list of SimulatedJoint
-        In the order of the names.
-
-    Raises
-    ------
-    BadInputError
-        If a value is out of range; it names the joint where there are several.
-
-    """
-    found = []
-    for name in values.names:
-        try:
-            found.append(joint_from(values.of(name)))
-        except BadInputError as error:
-            if len(values.names) == 1:
-                raise
-            raise BadInputError(f'joint {name}: {error}') from error
-    return found
+def _joints_from(values: JointParameters) -> dict[str, SimulatedJoint]:
+    return values.each(lambda _, own: joint_from(own))
 
 
 def _make_device(values: JointParameters, start: int, logger: RcutilsLogger) -> SimulatedDevice:
     """Return the device at a start time in ns; what is odd is warned of."""
-    joints = joints_from(values)
-    for name, joint in zip(values.names, joints, strict=True):
+    joints = _joints_from(values)
+    for name, joint in joints.items():
         if few := too_few_samples(joint.setup.actuator, values['publish_rate']):
             logger.warning(f'joint {name}: {few}')
         if lost := unheld(joint.setup.actuator.nondimensional):
             logger.warning(f'joint {name}: {lost}')
-    warm_up(logger.info, creep=any(x.setup.creep for x in joints), planning=False)
+    warm_up(logger.info, creep=any(x.setup.creep for x in joints.values()), planning=False)
     return SimulatedDevice(
-        joints, period=max(round(NANOSECONDS / values['publish_rate']), 1), time=start,
+        [*joints.values()], period=max(round(NANOSECONDS / values['publish_rate']), 1), time=start,
         command_delay=round(values['command_delay'] * NANOSECONDS),
         measurement_delay=round(values['measurement_delay'] * NANOSECONDS),
         seed=values['seed'])
@@ -372,6 +299,5 @@ def _jump_in_words(jump: int, *, behind: bool) -> str:
     return f'{cause}: the simulation continues from there in its present state'
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the plant with the command line's arguments; return the exit status."""
-    return run(PlantNode, args)
+#: Run by ``hmsa plant`` with the command line's arguments; returns the exit status.
+main = partial(run, PlantNode)

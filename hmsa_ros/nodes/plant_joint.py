@@ -6,6 +6,7 @@ from typing import Any
 
 from geometry_msgs.msg import WrenchStamped
 
+from hmsa_ros.contract import topics
 from hmsa_ros.contract.actuator import actuator_from, creep_from
 from hmsa_ros.contract.parameters import (
     BLOCK,
@@ -63,11 +64,10 @@ class PlantJoint(DeviceJoint):
     def __init__(
             self, node: ManagedNode, device: SimulatedDevice, number: int,
             names: Sequence[str], values: Mapping[str, Any], companion: str = '') -> None:
-        """Create its topics."""
         super().__init__(node, device, number, names, values, companion)
         self._tell_force = Seldom()
-        topic = interface.of_joint(interface.DISTURBANCE_FORCE, self.name, names)
-        node.create_subscription(topic.type, topic.name, self._on_force, topic.qos)
+        interface.subscribe(
+            node, topics.of_joint(topics.DISTURBANCE_FORCE, self.name, names), self._on_force)
 
     def _on_force(self, message: WrenchStamped) -> None:
         if not self._node.active:

@@ -11,7 +11,7 @@ As a managed node it opens the bag and offers its topics when it is configured, 
 active, and gives both up when it is cleaned up.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import contextlib
 import os
 import sys
@@ -20,29 +20,26 @@ import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from rcl_interfaces.msg import SetParametersResult
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.parameter import Parameter
-from std_srvs.srv import Trigger
 
 from hmsa_ros.bag.limits import CHUNK_SIZE
 from hmsa_ros.bag.reader import BagReader
 from hmsa_ros.bag.sender import CLOCK_WHILE_WAITING_SECONDS, ClockOut, Excerpt, Sender
 from hmsa_ros.bag.transport import Transport
+from hmsa_ros.contract import topics
+from hmsa_ros.contract.parameters import ParameterSpec
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.audience import Audience
-from hmsa_ros.nodes.conversions import to_clock, to_diagnostics, to_status
+from hmsa_ros.nodes.conversions import to_clock, to_status
 from hmsa_ros.nodes.managed import ManagedNode
-from hmsa_ros.nodes.parameters import declare, ParameterSpec
+from hmsa_ros.nodes.parameters import declare
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.nodes.selection import Filter
 from hmsa_ros.nodes.senders import create_senders, latched
 
-DIAGNOSTICS_SECONDS = 1.0
 _POLL_SECONDS = 0.02
 # Reliable messages that found the receiver's queue full are sent again when a heartbeat of
 # Fast DDS asks for them, with other profiles than ours every 3 s: the wait at the end has to
@@ -128,30 +125,16 @@ PARAMETERS = (
 
 
 class Player(ManagedNode):
-    """
-    ROS 2 node that plays a bag.
-
-    Attributes
-    ----------
-    failure : HmsaError or None
-        Why playing ended early.
-    finished : bool
-        Whether there is nothing left to do.
-
-    Raises
-    ------
-    BadInputError
-        If a parameter or the bag cannot be used.
-
-    """
+    """ROS 2 node that plays a bag; ``failure`` says why playing ended early."""
 
     def __init__(self) -> None:
-        super().__init__(interface.PLAYER)
+        super().__init__(topics.PLAYER)
         self._values = declare(self, PARAMETERS)
         self.failure: HmsaError | None = None
-        self._transport = _nothing_to_play()
+        self._transport = Transport(0, 1.0)
+        self._transport.stop()
         self._thread: threading.Thread | None = None
-        self.add_on_set_parameters_callback(self._on_set_parameters)
+        self.on_change(self._take_parameters)
         self.autostart()
 
     # States ----------------------------------------------------------------------------------
@@ -189,7 +172,7 @@ class Player(ManagedNode):
         self._sender = Sender(
             self._reader, {name: x.publish for name, x in self._senders.items()},
             latched(self._reader, self._senders), self._transport, self._excerpt, self._clock_out)
-        self._offer()
+        self._offer_services()
         self._thread = threading.Thread(
             target=self._run, args=(self._transport,), name='player', daemon=True)
         self._thread.start()
@@ -223,7 +206,6 @@ class Player(ManagedNode):
                      for name in self._values[parameter])
 
     def _filter(self) -> Filter:
-        """Return which topics are sent."""
         values = self._values
         return Filter(
             self._names('play.topics_to_filter'), values['play.regex_to_filter'],
@@ -252,12 +234,11 @@ class Player(ManagedNode):
                 f'{self._reader.path} reaches to {latest * 1e-9:.0f} s: expected less than '
                 f'{_LATEST_CLOCK // 10**9} s for /clock')
         # First of all, so that nodes that wait for it can get ready.
-        self._clock_publisher = interface.publisher(self, interface.CLOCK_TOPIC)
+        self._clock_publisher = interface.publisher(self, topics.CLOCK_TOPIC)
         self._send_clock(self._excerpt.start)
         return ClockOut(self._send_clock, frequency, on_publish)
 
     def _send_clock(self, when: int) -> None:
-        """Publish a time of the bag."""
         self._clock_publisher.publish(to_clock(when))
 
     def _tell_problems(self) -> None:
@@ -334,74 +315,47 @@ class Player(ManagedNode):
 
     # Services and parameters, in the executor's thread ---------------------------------------
 
-    def _offer(self) -> None:
-        """Create services and diagnostics."""
-        def paused(state: Callable[[], bool]) -> Callable[..., Trigger.Response]:
-            return lambda _, response: self._change_pause(state(), response)
+    def _offer_services(self) -> None:
+        transport = self._transport
+        self.offer(topics.PAUSE, lambda: self._set_paused(True))
+        self.offer(topics.RESUME, lambda: self._set_paused(False))
+        self.offer(topics.TOGGLE_PAUSED, lambda: self._set_paused(not transport.paused))
+        self.offer(topics.IS_PAUSED, lambda: (
+            transport.paused, 'paused' if transport.paused else 'playing'))
+        self.offer(topics.PLAY_NEXT, self._on_play_next)
+        self.offer(topics.STOP, self._on_stop)
+        self.diagnose(self._report)
 
-        def is_paused(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-            response.success = self._transport.paused
-            response.message = 'paused' if response.success else 'playing'
-            return response
-
-        for service, callback in (
-                (interface.PAUSE, paused(lambda: True)),
-                (interface.RESUME, paused(lambda: False)),
-                (interface.TOGGLE_PAUSED, paused(lambda: not self._transport.paused)),
-                (interface.IS_PAUSED, is_paused),
-                (interface.PLAY_NEXT, self._on_play_next),
-                (interface.STOP, self._on_stop)):
-            self.create_service(Trigger, service.name, callback)
-        self._diagnostics = interface.publisher(self, interface.DIAGNOSTICS)
-        self.create_timer(
-            DIAGNOSTICS_SECONDS, self._on_diagnostics,
-            clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-    def _change_pause(self, paused: bool, response: Trigger.Response) -> Trigger.Response:
-        """Pause or go on, if the node is active."""
+    def _set_paused(self, paused: bool) -> tuple[bool, str]:
         if not self.active:
-            response.message = f'the player is {self.state}: expected an active one'
-            return response
+            return False, f'the player is {self.state}: expected an active one'
         self._transport.set_paused(paused)
-        response.success = True
-        response.message = 'paused' if paused else 'playing'
-        return response
+        return True, 'paused' if paused else 'playing'
 
-    def _on_play_next(
-            self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Send one message while paused."""
+    def _on_play_next(self) -> tuple[bool, str]:
         if not self.active or not self._transport.paused or self._transport.stopped:
-            response.message = 'not paused: expected a paused player; call pause first'
-            return response
-        response.success = self._transport.step(1.0)
-        response.message = 'sent' if response.success else 'there is no next message'
-        return response
+            return False, 'not paused: expected a paused player; call pause first'
+        sent = self._transport.step(1.0)
+        return sent, 'sent' if sent else 'there is no next message'
 
-    def _on_stop(
-            self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_stop(self) -> tuple[bool, str]:
         """End playing, and with it the process."""
-        response.success = True
-        response.message = 'stopped'
         # After this answer has left: the end of the process would overtake it.
-        self.create_timer(
-            0.1, self._transport.stop, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        return response
+        self.every(0.1, self._transport.stop)
+        return True, 'stopped'
 
-    def _on_set_parameters(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+    def _take_parameters(self, parameters: Sequence[Parameter]) -> None:
         """Take a new rate, or a time to go on from."""
         specs = {spec.name: spec for spec in PARAMETERS}
         playing = not self._transport.stopped
         for parameter in parameters:
-            try:
-                if parameter.name in specs:
-                    specs[parameter.name].check(parameter.value)
-            except BadInputError as error:
-                return SetParametersResult(successful=False, reason=str(error))
+            if parameter.name in specs:
+                specs[parameter.name].check(parameter.value)
             if parameter.name == 'play.seek' and playing:
                 length = (self._excerpt.end - self._excerpt.first) * 1e-9
                 if parameter.value > length:
-                    return SetParametersResult(
-                        successful=False, reason=f'parameter play.seek is {parameter.value:g}: '
+                    raise BadInputError(
+                        f'parameter play.seek is {parameter.value:g}: '
                         f'expected at most {length:g} s, where playing ends')
         # A rate set when nothing is played is that of the next time.
         for parameter in parameters if playing else ():
@@ -409,21 +363,18 @@ class Player(ManagedNode):
                 self._transport.set_rate(parameter.value)
             elif parameter.name == 'play.seek' and parameter.value >= 0.0:
                 self._transport.seek(self._excerpt.first + round(parameter.value * 1e9))
-        return SetParametersResult(successful=True)
 
-    def _on_diagnostics(self) -> None:
-        """Publish the state."""
+    def _report(self) -> Iterable[DiagnosticStatus]:
         transport, excerpt = self._transport, self._excerpt
         state = 'inactive' if not self.active else 'paused' if transport.paused else 'playing'
         values = {
-            'bag': str(self._reader.path), 'state': state, 'sent': str(self._sender.count),
+            'bag': self._reader.path, 'state': state, 'sent': self._sender.count,
             'position': f'{(transport.position - excerpt.first) * 1e-9:.3f}',
             'duration': f'{(excerpt.end - excerpt.first) * 1e-9:.3f}',
             'rate': f'{transport.rate:g}', 'largest_delay': f'{transport.late:.6f}',
         }
-        self._diagnostics.publish(to_diagnostics(self.get_clock().now().nanoseconds, to_status(
-            f'{self.get_fully_qualified_name().lstrip("/")}: bag', '', DiagnosticStatus.OK, state,
-            values)))
+        yield to_status(
+            f'{self.get_fully_qualified_name().lstrip("/")}: bag', '', 0, state, values)
 
 
 def _span(values: Mapping[str, Any], parameter: str) -> int:
@@ -431,13 +382,6 @@ def _span(values: Mapping[str, Any], parameter: str) -> int:
     seconds: int = values[f'{parameter}.sec']
     nanoseconds: int = values[f'{parameter}.nsec']
     return -1 if seconds < 0 else seconds * 10**9 + nanoseconds
-
-
-def _nothing_to_play() -> Transport:
-    """Return the transport of a player that is not configured."""
-    transport = Transport(0, 1.0)
-    transport.stop()
-    return transport
 
 
 def main(args: Sequence[str] | None = None) -> int:

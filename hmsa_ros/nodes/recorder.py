@@ -9,32 +9,31 @@ the bag when it is cleaned up.
 """
 
 from bisect import bisect_left
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 import datetime
+from functools import partial
 import json
 import os
 from pathlib import Path
 import time
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import ParameterEvent
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
-from rosgraph_msgs.msg import Clock as ClockMessage
-from std_srvs.srv import Trigger
+from rosgraph_msgs.msg import Clock
 
 from hmsa_ros import __version__
 from hmsa_ros.bag.experiment import SetpointLog
 from hmsa_ros.bag.reception import figures, judge, RecordedTopic
 from hmsa_ros.bag.recording import Limits, lost_by_topic, Recording, Status
 from hmsa_ros.bag.writer import BagWriter, parse_custom_data
-from hmsa_ros.contract.topics import Quality
+from hmsa_ros.contract import topics
 from hmsa_ros.errors import BadInputError, BagError
 from hmsa_ros.nodes import interface
-from hmsa_ros.nodes.capture import Capture, decode, RawSubscription, SimulatedTime, Taken
-from hmsa_ros.nodes.conversions import from_time, to_diagnostics, to_status
+from hmsa_ros.nodes.capture import Capture, decode, SimulatedTime, Taken
+from hmsa_ros.nodes.conversions import from_time, to_status
 from hmsa_ros.nodes.managed import ManagedNode
-from hmsa_ros.nodes.message_types import type_name_of
 from hmsa_ros.nodes.parameters import declare
 from hmsa_ros.nodes.recorder_parameters import PARAMETERS
 from hmsa_ros.nodes.remote_parameters import RemoteParameters
@@ -42,7 +41,6 @@ from hmsa_ros.nodes.runner import run
 from hmsa_ros.nodes.selection import Selection
 from hmsa_ros.nodes.subscribing import Subscriptions
 
-DIAGNOSTICS_SECONDS = 1.0
 # Between being told to end and the last look at what has come.
 _LINGER_SECONDS = 0.1
 # Nodes whose parameters are requested.
@@ -51,31 +49,14 @@ _MAX_NODES = 256
 # Topics with setpoints, by the last part of their names.
 _SETPOINTS = {
     topic.name.rsplit('/', 1)[-1]: topic
-    for topic in (interface.JOINT_TRAJECTORY, interface.SETPOINT)}
+    for topic in (topics.JOINT_TRAJECTORY, topics.SETPOINT)}
 
 
 class Recorder(ManagedNode):
-    """
-    ROS 2 node that records.
-
-    Attributes
-    ----------
-    folder : pathlib.Path
-        The bag's folder.
-    failure : BagError or None
-        Why recording failed.
-    finished : bool
-        Whether it has, so that the process ends.
-
-    Raises
-    ------
-    BadInputError
-        If a parameter cannot be used or the bag cannot be made.
-
-    """
+    """ROS 2 node that records to the bag in ``folder``; ``failure`` says why recording failed."""
 
     def __init__(self) -> None:
-        super().__init__(interface.RECORDER)
+        super().__init__(topics.RECORDER)
         self._parameters_in = declare(self, PARAMETERS)
         self.failure: BagError | None = None
         self._closed = True
@@ -85,9 +66,9 @@ class Recorder(ManagedNode):
         """Open the bag and start receiving."""
         values = self._parameters_in
         selection = Selection(
-            tuple(map(self._full_name, values['record.topics'])), values['record.all_topics'],
-            values['record.regex'], tuple(map(self._full_name, values['record.exclude_topics'])),
-            values['record.exclude_regex'])
+            tuple(map(self._full_name, values['record.topics'])), values['record.regex'],
+            tuple(map(self._full_name, values['record.exclude_topics'])),
+            values['record.exclude_regex'], values['record.all_topics'])
         # While inactive it is paused.
         self._paused = True
         self._resumes = not values['record.start_paused']
@@ -116,34 +97,27 @@ class Recorder(ManagedNode):
 
     def _start(self) -> None:
         """Create what the node offers and start receiving."""
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
         if self._sim_time is not None:
-            self._clock_subscription = RawSubscription(
-                self, ClockMessage, interface.CLOCK_TOPIC.name,
-                interface.profile(Quality(1000, reliable=False)))
-            self._capture.add(self._sim_time, self._clock_subscription)
+            self._capture.add(self._sim_time, interface.listen(self, replace(
+                topics.CLOCK_TOPIC, qos=topics.Quality(1000, reliable=False))))
         self._capture.start()
-        self._diagnostics = interface.publisher(self, interface.DIAGNOSTICS)
-        for name, callback in (
-                (interface.PAUSE.name, lambda _, answer: self._set_paused(True, answer)),
-                (interface.RESUME.name, lambda _, answer: self._set_paused(False, answer)),
-                (interface.IS_PAUSED.name, self._on_is_paused),
-                (interface.SPLIT_BAGFILE.name,
-                 lambda _, answer: self._answer(answer, self._recording.split)),
-                (interface.SNAPSHOT.name,
-                 lambda _, answer: self._answer(answer, self._recording.snapshot))):
-            self.create_service(Trigger, name, callback)
+        self.offer(topics.PAUSE, lambda: self._set_paused(True))
+        self.offer(topics.RESUME, lambda: self._set_paused(False))
+        self.offer(topics.IS_PAUSED, lambda: (
+            self._paused, 'paused' if self._paused else 'recording'))
+        self.offer(topics.SPLIT_BAGFILE, lambda: (True, self._recording.split()))
+        self.offer(topics.SNAPSHOT, lambda: (True, self._recording.snapshot()))
         for topic in _SETPOINTS.values():
             # From the start, so that the first one is not missed; others when they are found.
             self._follow_setpoints(topic, self._full_name(
-                interface.from_outside(topic.name, interface.PLANNER)))
+                topics.from_outside(topic.name, topics.PLANNER)))
         self._followed: dict[str, RemoteParameters] = {}
         self.create_subscription(
             ParameterEvent, '/parameter_events', self._on_parameter_event, 100)
         interval = (self._parameters_in['record.topic_polling_interval.sec']
                     + self._parameters_in['record.topic_polling_interval.nsec'] * 1e-9)
-        self.create_timer(max(interval, 1e-3), self._on_poll, clock=steady)
-        self.create_timer(DIAGNOSTICS_SECONDS, self._on_diagnostics, clock=steady)
+        self.every(max(interval, 1e-3), self._on_poll)
+        self.diagnose(self._status_of_bag)
         self.get_logger().info(f'recording to {self.folder}')
 
     def _full_name(self, name: str) -> str:
@@ -163,7 +137,7 @@ class Recorder(ManagedNode):
         self._recorded.look(found)
         for name, types in found:
             topic = _SETPOINTS.get(name.rsplit('/', 1)[-1])
-            if topic is not None and type_name_of(topic.type) in types and any(
+            if topic is not None and topic.type in types and any(
                     name.startswith(f'{node}/') for node in self._followed):
                 self._follow_setpoints(topic, name)
         for followed in self._followed.values():
@@ -183,12 +157,13 @@ class Recorder(ManagedNode):
                     and node not in self._followed and len(self._followed) < _MAX_NODES:
                 self._followed[node] = RemoteParameters(self, node)
 
-    def _follow_setpoints(self, topic: interface.Topic, name: str) -> None:
+    def _follow_setpoints(self, topic: topics.Topic, name: str) -> None:
         """Store the setpoints that are sent on a topic."""
         if name not in self._setpoint_topics:
             self._setpoint_topics.add(name)
-            self.create_subscription(
-                topic.type, name, lambda message: self._on_setpoint(name, message), topic.qos)
+            interface.subscribe(
+                self, replace(topic, name=name), lambda message: self._setpoints.add(
+                    name, self.now(), message))
 
     def _deliver(self, taken: Sequence[tuple[Any, list[Taken]]]) -> None:
         """Stamp, count and pass on what has been received."""
@@ -196,7 +171,7 @@ class Recorder(ManagedNode):
         if clock is not None and taken[0][0] is clock:
             for message in taken[0][1]:
                 try:
-                    now = from_time(decode(message.data, ClockMessage).clock)
+                    now = from_time(decode(message.data, Clock).clock)
                 except BadInputError:
                     now = -1
                 if now < 0:
@@ -237,10 +212,6 @@ class Recorder(ManagedNode):
             self._experiment.update(new)
             self._recording.note(new)
 
-    def _on_setpoint(self, name: str, message: Any) -> None:
-        """Store a setpoint or a sequence of them."""
-        self._setpoints.add(name, self.get_clock().now().nanoseconds, message)
-
     def _on_parameter_event(self, event: ParameterEvent) -> None:
         """Store a change of a parameter of the experiment's nodes."""
         followed = self._followed.get(event.node)
@@ -249,32 +220,12 @@ class Recorder(ManagedNode):
                 (parameter.name, parameter.value)
                 for parameter in [*event.new_parameters, *event.changed_parameters]))
 
-    def _set_paused(self, paused: bool, response: Trigger.Response) -> Trigger.Response:
-        """Pause or go on."""
+    def _set_paused(self, paused: bool) -> tuple[bool, str]:
         if not self.active:
-            response.message = f'the recorder is {self.state}: expected an active one'
-            return response
-        response.success = True
+            return False, f'the recorder is {self.state}: expected an active one'
         state = 'paused' if paused else 'recording'
-        response.message = state if self._paused != paused else f'already {state}'
-        self._paused = paused
-        return response
-
-    def _on_is_paused(
-            self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Say by ``success`` whether recording is paused."""
-        response.success = self._paused
-        response.message = 'paused' if self._paused else 'recording'
-        return response
-
-    @staticmethod
-    def _answer(response: Trigger.Response, action: Callable[[], str]) -> Trigger.Response:
-        """Do what was asked for and say how it went."""
-        try:
-            response.message, response.success = action(), True
-        except BagError as error:
-            response.message = str(error)
-        return response
+        same, self._paused = self._paused == paused, paused
+        return True, f'already {state}' if same else state
 
     def _lost(self, status: Status) -> dict[str, int]:
         """Return the number of lost messages by topic."""
@@ -286,8 +237,7 @@ class Recorder(ManagedNode):
         return {'lost': json.dumps({
             **dict.fromkeys(list(self._recorded.topics), 0), **lost})}
 
-    def _on_diagnostics(self) -> None:
-        """Publish the state."""
+    def _status_of_bag(self) -> Iterable[DiagnosticStatus]:
         status = self._recording.status()
         lost = self._lost(status)
         self._note(self._setpoints.news())
@@ -297,28 +247,25 @@ class Recorder(ManagedNode):
                  else 'waiting for /clock'
                  if self._sim_time is not None and not self._sim_time.started else 'recording')
         clocks = 0 if self._sim_time is None else self.count_publishers(
-            interface.CLOCK_TOPIC.name)
+            topics.CLOCK_TOPIC.name)
         level, text = judge(
             status, state, sum(lost.values()),
             flush_period=self._parameters_in['storage.flush_period'],
             clocks=clocks, clock_ignored=self._sim_time is not None and bool(
                 self._sim_time.ignored))
         values = {
-            'bag': str(self.folder),
+            'bag': self.folder,
             'state': state,
             'subscribed': f'{len(self._recorded.topics)}/{self._recorded.wanted_count}',
-            'received': str(sum(topic.received for topic in self._recorded.topics.values())),
+            'received': sum(topic.received for topic in self._recorded.topics.values()),
             **figures(status, lost),
             **({} if self._sim_time is None else {
-                'time_jumps': str(self._sim_time.jumps),
-                'clock_ignored': str(self._sim_time.ignored)}),
+                'time_jumps': self._sim_time.jumps, 'clock_ignored': self._sim_time.ignored}),
         }
-        self._diagnostics.publish(to_diagnostics(self.get_clock().now().nanoseconds, to_status(
-            f'{self.get_fully_qualified_name().lstrip("/")}: bag', '', bytes((level,)), text,
-            values)))
+        yield to_status(
+            f'{self.get_fully_qualified_name().lstrip("/")}: bag', '', level, text, values)
 
     def _report(self, sentence: str, failure: bool) -> None:
-        """Log what happened to the writer."""
         # On two lines: rclpy lets no line log with two severities.
         if failure:
             self.get_logger().error(sentence)
@@ -363,7 +310,6 @@ def _parted(
 
 
 def _limits(values: Mapping[str, Any]) -> Limits:
-    """Return what the parameters say of flushing, splitting and memory."""
     return Limits(
         values['storage.flush_period'], values['storage.max_bagfile_size'],
         values['storage.max_bagfile_duration'] * 10**9, values['storage.max_cache_size'],
@@ -371,7 +317,6 @@ def _limits(values: Mapping[str, Any]) -> Limits:
 
 
 def _writer(values: Mapping[str, Any], experiment: Mapping[str, str]) -> BagWriter:
-    """Make the bag."""
     return BagWriter(
         values['storage.uri'] or datetime.datetime.now().strftime('hmsa_%Y_%m_%d-%H_%M_%S'),
         preset=values['storage.storage_preset_profile'],
@@ -379,6 +324,5 @@ def _writer(values: Mapping[str, Any], experiment: Mapping[str, str]) -> BagWrit
         ros_distro=os.environ.get('ROS_DISTRO', 'jazzy'), fsync=values['storage.fsync'])
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the recorder with the command line's arguments; return the exit status."""
-    return run(Recorder, args)
+#: Run by ``hmsa recorder`` with the command line's arguments; returns the exit status.
+main = partial(run, Recorder)

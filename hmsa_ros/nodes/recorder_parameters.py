@@ -1,8 +1,8 @@
 """The parameters of the recorder."""
 
 from hmsa_ros.bag.output import PRESETS
-from hmsa_ros.nodes import interface
-from hmsa_ros.nodes.parameters import ParameterSpec
+from hmsa_ros.contract import topics
+from hmsa_ros.contract.parameters import ParameterSpec
 
 PARAMETERS = (
     ParameterSpec(
@@ -58,7 +58,7 @@ PARAMETERS = (
     ParameterSpec(
         'record.snapshot_duration', 10.0, 'How far back a snapshot reaches.', 's', 1e-3, 1e6),
     ParameterSpec(
-        'experiment.nodes', [interface.PLANNER, interface.PLANT],
+        'experiment.nodes', [topics.PLANNER, topics.PLANT],
         'Nodes whose parameters are stored in the bag; a name without a slash matches nodes in '
         'any namespace.'),
 )

@@ -16,7 +16,6 @@ class RemoteParameters:
     """The parameters of a node, requested once it is there and again when it comes back."""
 
     def __init__(self, node: Node, name: str) -> None:
-        """Create clients; nothing is asked yet."""
         self._name = name
         self._list = node.create_client(ListParameters, f'{name}/list_parameters')
         self._get = node.create_client(GetParameters, f'{name}/get_parameters')

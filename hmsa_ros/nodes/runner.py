@@ -47,25 +47,10 @@ def spin(nodes: Sequence[Node], ending: Callable[[], bool]) -> None:
 
 def run(
         factory: Callable[[], Node | Sequence[Node]], args: Sequence[str] | None = None) -> int:
-    """
-    Run one node, or several, as a process: initialise, spin until told to end, clean up.
-
-    Parameters
-    ----------
-    factory : callable
-        Makes the nodes; may raise `HmsaError` or an rclpy parameter error, which refuse the
-        start. A node with a ``close`` method has it called before the node is destroyed; an
-        error in its attribute ``failure`` makes the run a failed one, and a true attribute
-        ``finished`` ends it.
-    args : sequence of str, optional
-        Command-line arguments, ``--ros-args ...`` included; default ``sys.argv[1:]``.
-
-    Returns
-    -------
-    int
-        Exit status: 0 for a clean end, 2 for bad arguments or parameters, 1 for a failure.
-
-    """
+    """Run one node or several as a process; return 0, 1 for a failure, or 2 for bad parameters."""
+    # The factory may raise errors, which refuse the start. A node's method ``close`` is called
+    # before it is destroyed; an error in its attribute ``failure`` makes the run a failed one, and
+    # a true attribute ``finished`` ends it.
     ENDING.note()
     arguments = list(sys.argv[1:] if args is None else args)
     try:
@@ -88,15 +73,11 @@ def run(
         pass
     finally:
         for node in nodes:
-            getattr(node, 'close', _nothing)()
+            getattr(node, 'close', lambda: None)()
             node.destroy_node()
         rclpy.try_shutdown()
     failure = next(filter(None, (getattr(x, 'failure', None) for x in nodes)), None)
     return complain(failure, 1) if failure is not None and not status else status
-
-
-def _nothing() -> None:
-    """Have nothing to close."""
 
 
 def _avoid_pauses() -> None:

@@ -8,6 +8,7 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 
+from hmsa_ros.contract import topics
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.device.protocol import Sample
 from hmsa_ros.nodes import interface
@@ -29,11 +30,10 @@ class SamplePublisher:
     """
 
     def __init__(self, node: Node, names: Sequence[str], *, scalars: bool) -> None:
-        """Create the publishers."""
-        self._states = interface.publisher(node, interface.JOINT_STATES)
+        self._states = interface.publisher(node, topics.JOINT_STATES)
         self._scalars = [
-            tuple(interface.publisher(node, interface.of_joint(x, name, names))
-                  for x in (interface.STRETCH, interface.STRETCH_RATE))
+            tuple(interface.publisher(node, topics.of_joint(x, name, names))
+                  for x in (topics.STRETCH, topics.STRETCH_RATE))
             for name in names] if scalars else []
         count = len(names)
         message = JointState(name=list(names), **{

@@ -6,8 +6,8 @@ from typing import Any
 from rclpy.node import Node
 
 from hmsa_ros.bag.reader import BagReader, TopicInfo
+from hmsa_ros.contract import topics
 from hmsa_ros.errors import BadInputError, BagError, printable
-from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.message_types import interface_class
 from hmsa_ros.nodes.qos import publisher
 from hmsa_ros.nodes.selection import Filter, is_full_name
@@ -29,8 +29,8 @@ def create_senders(
         If more than `MOST_TOPICS` are wanted.
 
     """
-    topics = reader.topics
-    chosen = [name for name in topics if selection.passes(name)]
+    held = reader.topics
+    chosen = [name for name in held if selection.passes(name)]
     if len(chosen) > MOST_TOPICS:
         raise BadInputError(
             f'{reader.path} has {len(chosen)} topics to send: expected at most {MOST_TOPICS}; '
@@ -38,21 +38,21 @@ def create_senders(
     result: dict[str, Any] = {}
     told = []
     for name in chosen:
-        reason = _left_out(node, selection, name, topics[name], own_clock)
+        reason = _left_out(node, selection, name, held[name], own_clock)
         try:
             if not reason:
                 result[name] = node.create_publisher(
-                    interface_class(topics[name].type), name, publisher(topics[name].profiles))
+                    interface_class(held[name].type), name, publisher(held[name].profiles))
         except Exception as error:  # a quality of service that no publisher can have
             reason = f'it cannot be published ({" ".join(str(error).split())})'
         if reason:
             told.append(f'topic {name} is left out: {reason}')
     if len(told) > _NAMED_AT_MOST:
         told[_NAMED_AT_MOST:] = [f'{len(told) - _NAMED_AT_MOST} more topics are left out']
-    missing = [x for x in (*selection.topics, *selection.allow_commands) if x not in topics]
+    missing = [x for x in (*selection.topics, *selection.allow_commands) if x not in held]
     if missing:
         told.append(
-            f'the bag has no topic {", ".join(missing)}; it has {listed(topics) or "none"}')
+            f'the bag has no topic {", ".join(missing)}; it has {listed(held) or "none"}')
     for sentence in told:
         node.get_logger().warning(printable(sentence))
     return result
@@ -67,7 +67,7 @@ def _left_out(
     if selection.withholds(name, resolved, info.type):
         return ('it carries commands; name it in play.topics_to_filter or '
                 'play.allow_commands to send it')
-    if resolved == interface.CLOCK_TOPIC.name and own_clock:
+    if resolved == topics.CLOCK_TOPIC.name and own_clock:
         return 'the player publishes the clock itself'
     if info.encoding != 'cdr':
         return f'its messages are encoded as {info.encoding!r}, expected cdr'

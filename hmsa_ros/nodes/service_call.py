@@ -10,17 +10,8 @@ class ServiceCall:
 
     A server answers a client that it has just discovered before the way back is known to all: the
     answer is lost then, and its client would wait for ever. So a request must do no harm when it
-    is carried out twice.
-
-    Parameters
-    ----------
-    client : rclpy.client.Client
-        Its node must be served while `answer` is asked for.
-    request : object
-        The request.
-    patience : float
-        Time in s after which an answer counts as lost.
-
+    is carried out twice. An answer counts as lost after ``patience`` in s; meanwhile the client's
+    node must be served.
     """
 
     def __init__(self, client: Any, request: Any, patience: float = 2.0) -> None:

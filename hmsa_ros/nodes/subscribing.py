@@ -119,7 +119,6 @@ class Subscriptions:
             known.pop() if len(known) == 1 else '' if known else type_hash(type_name))
 
     def _warn(self, sentence: str) -> None:
-        """Warn once."""
         if sentence not in self._refused:
             self._refused.add(sentence)
             self._node.get_logger().warning(sentence)

@@ -10,7 +10,6 @@ class StepWatch:
     """Detects that a clock has been set back."""
 
     def __init__(self) -> None:
-        """Begin with the first readings."""
         self._offset: int | None = None
 
     def set_back(self, before: int, now: int, after: int) -> int:
@@ -36,7 +35,6 @@ class Seldom:
     """
 
     def __init__(self, seconds: float = 1.0) -> None:
-        """Begin with a first time at once."""
         self._seconds = seconds
         self._next = 0.0
 

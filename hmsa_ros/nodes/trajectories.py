@@ -41,23 +41,20 @@ class _Cursor:
         """Bytes that are left."""
         return len(self._data) - self.place
 
+    def _pass(self, size: int, alignment: int = 1) -> int:
+        """Return where some bytes begin, and go on behind them."""
+        place = -(-self.place // alignment) * alignment
+        if place + size > len(self._data):
+            raise BadInputError(_TOO_SHORT)
+        self.place = place + size
+        return place
+
     def take(self, kind: str, count: int = 1) -> tuple[float, ...]:
-        """
-        Return numbers of a kind of the module struct.
-
-        Raises
-        ------
-        BadInputError
-            If the message ends before.
-
-        """
+        """Return numbers of a kind of the module struct."""
         if not count:
             return ()
         size = struct.calcsize(f'<{kind}')
-        place = -(-self.place // size) * size
-        if place + count * size > len(self._data):
-            raise BadInputError(_TOO_SHORT)
-        self.place = place + count * size
+        place = self._pass(count * size, size)
         return struct.unpack_from(f'{self._order}{count}{kind}', self._data, place)
 
     def count(self) -> int:
@@ -71,21 +68,10 @@ class _Cursor:
         return int(seconds) * NANOSECONDS + int(nanoseconds)
 
     def text(self) -> str:
-        """
-        Return a string.
-
-        Raises
-        ------
-        BadInputError
-            If the message ends before.
-
-        """
+        """Return a string."""
         length = self.count()
-        if length > self.left:
-            raise BadInputError(_TOO_SHORT)
-        self.place += length
-        text = bytes(self._data[self.place - length:self.place])
-        return text.rstrip(b'\0').decode('utf-8', 'replace')
+        place = self._pass(length)
+        return bytes(self._data[place:place + length]).rstrip(b'\0').decode('utf-8', 'replace')
 
 
 def read_trajectory(data: bytes) -> Trajectory:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 import math
 from time import monotonic, sleep
 from uuid import uuid4
@@ -11,15 +10,17 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
-from hmsa_ros.core.status import Code
+from hmsa_ros.contract import topics
+from hmsa_ros.contract.status import Verdict
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.ending import ENDING
-from hmsa_ros.errors import BadInputError, HmsaError, printable
+from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.nodes import interface
-from hmsa_ros.nodes.capture import decode, RawSubscription
-from hmsa_ros.nodes.conversions import to_trajectory, whole
+from hmsa_ros.nodes.capture import decode
+from hmsa_ros.nodes.conversions import from_time, to_trajectory
 from hmsa_ros.nodes.service_call import ServiceCall
 from hmsa_ros.nodes.visitor import leave, visit
 from hmsa_ros.session import graph
@@ -36,106 +37,19 @@ _SETTLED_SECONDS = 1.0
 _UNHEARD_SECONDS = 3.0
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """
-    What the planner says of its last request.
-
-    Attributes
-    ----------
-    level : int
-        0 OK, 1 WARN, 2 ERROR.
-    message : str
-        One sentence.
-    code : str
-        As in `hmsa_ros.core.status.Code`.
-    request : str
-        Identifier of the request, as it was sent.
-    state : str
-        Progress: idle, waiting, moving, holding, settling, at_rest.
-    setpoint, setpoints : int
-        Which one is under way, from 1, and how many there are.
-    watching : bool
-        Whether setpoints that have begun are still to be judged by samples.
-    measured, finding : str
-        The worst that was measured since the request, in a word and in a sentence; empty where
-        nothing has been judged.
-    unheard : str
-        Why nobody carries out commands; empty where somebody does.
-
-    """
-
-    level: int
-    message: str
-    code: str
-    request: str
-    state: str
-    setpoint: int
-    setpoints: int
-    watching: bool = False
-    measured: str = ''
-    finding: str = ''
-    unheard: str = ''
-
-    @property
-    def failure(self) -> str:
-        """Why what was measured counts as a failure; empty if it does not."""
-        return self.finding if self.measured in (Code.OFF_TARGET, Code.VIBRATING) else ''
-
-    @property
-    def basis(self) -> str:
-        """What the state is known from, in words."""
-        if self.measured == Code.ARRIVED:
-            return 'measured'
-        return self.failure or 'predicted, not measured'
-
-    @classmethod
-    def from_message(cls, message: DiagnosticStatus) -> 'Verdict':
-        """
-        Read a status message.
-
-        Parameters
-        ----------
-        message : diagnostic_msgs.msg.DiagnosticStatus
-            As the planner publishes it.
-
-        Returns
-        -------
-        Verdict
-            Its content.
-
-        """
-        values = {x.key: printable(x.value) for x in message.values}
-        return cls(
-            message.level[0], printable(message.message), values.get('code', ''),
-            values.get('request', ''), values.get('state', ''),
-            whole(values.get('setpoint')), whole(values.get('setpoints')),
-            values.get('watching') == 'True', values.get('worst', ''),
-            values.get('worst_message', ''), values.get('unheard', ''))
-
-
 _SILENCE = Verdict(0, 'no reply from the planner yet', '', '', '', 0, 0)
 
 
 class PlannerClient:
     """
-    Talks to one planner; a context manager.
+    Talks to the planner of some joints; a context manager.
 
-    Parameters
-    ----------
-    namespace : str
-        Namespace of the planner.
-    joints : sequence of str
-        Names of its joints.
-    timeout : float
-        Patience with a silent planner in s.
-
+    Where it is silent, ``timeout`` in s is how long it is waited for.
     """
 
     def __init__(
             self, *, namespace: str = '', joints: Sequence[str] = ('actuator',),
             timeout: float = 10.0) -> None:
-        """Create a node of our own in a context of our own."""
         self._timeout = timeout
         self._joints = tuple(joints)
         self._namespace = namespace
@@ -144,50 +58,31 @@ class PlannerClient:
         self._executor.add_node(self.node)
         self._verdict: Verdict = _SILENCE
         self._requested = ''
-        topic = interface.STATUS
-        self.node.create_subscription(
-            topic.type, interface.from_outside(topic.name, interface.PLANNER),
-            self._on_status, topic.qos)
-        topic = interface.JOINT_TRAJECTORY
-        self._publisher = self.node.create_publisher(
-            topic.type, interface.from_outside(topic.name, interface.PLANNER), topic.qos)
+        interface.subscribe(self.node, topics.STATUS, self._on_status, topics.PLANNER)
+        self._publisher = interface.publisher(
+            self.node, topics.JOINT_TRAJECTORY, topics.PLANNER)
 
     def __enter__(self) -> 'PlannerClient':
-        """Return the client."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Leave the graph."""
         self._executor.shutdown()
         leave(self.node)
 
     def _on_status(self, message: DiagnosticStatus) -> None:
-        self._verdict = Verdict.from_message(message)
+        self._verdict = Verdict.read(message)
 
     def spin_until(
             self, condition: Callable[[], bool], failure: str,
             each: Callable[[], None] | None = None, timeout: float | None = None,
             time: Callable[[], float] = monotonic) -> None:
         """
-        Serve callbacks until a condition holds.
-
-        Parameters
-        ----------
-        condition : callable
-            Whether to continue.
-        failure : str
-            What to say if it does not come true.
-        each : callable, optional
-            Called about 20 times a second.
-        timeout : float, optional
-            Patience in s; default the client's.
-        time : callable
-            Returns the seconds that count for it.
+        Serve callbacks, and call ``each`` about 20 times a second, until a condition holds.
 
         Raises
         ------
         HmsaError
-            If the condition does not come true in time.
+            If it does not come true within a timeout in s, by default the client's, of ``time``.
         KeyboardInterrupt
             If a signal that was noted asks for the end.
 
@@ -203,20 +98,7 @@ class PlannerClient:
                 each()
 
     def find_planner(self, each: Callable[[], None] | None = None) -> None:
-        """
-        Wait until a planner listens and its status has arrived.
-
-        Parameters
-        ----------
-        each : callable, optional
-            Called while waiting.
-
-        Raises
-        ------
-        HmsaError
-            If there is none.
-
-        """
+        """Wait until a planner listens and its status has arrived, and call ``each`` meanwhile."""
         where = self._namespace or '/'
         failure = (
             f'no planner in namespace {where}; start one with hmsa planner, with the same '
@@ -235,20 +117,11 @@ class PlannerClient:
         self.spin_until(found, failure, each)
 
     def _planner_starts(self) -> bool:
-        """Return whether the planner's node is there."""
-        return (interface.PLANNER, f'/{self._namespace.strip("/")}') in (
+        return (topics.PLANNER, f'/{self._namespace.strip("/")}') in (
             self.node.get_node_names_and_namespaces())
 
     def find_recorder(self) -> None:
-        """
-        Wait until somebody who records subscribes to what is sent, and with it to all else.
-
-        Raises
-        ------
-        HmsaError
-            If there is nobody.
-
-        """
+        """Wait until somebody who records subscribes to what is sent, and with it to all else."""
         since = math.inf
 
         def recorded() -> bool:
@@ -279,20 +152,7 @@ class PlannerClient:
             self, setpoints: Sequence[tuple[float | Sequence[float], float]], *,
             time_begins: bool = False) -> Verdict:
         """
-        Send a sequence that begins now and wait for the verdict.
-
-        Parameters
-        ----------
-        setpoints : sequence of (float or sequence of float, float)
-            Stretch, of all joints or one a joint, and span in s.
-        time_begins : bool
-            Whether simulated time has just begun, so that the planner may not know yet: it is
-            asked again then.
-
-        Returns
-        -------
-        Verdict
-            Of level OK or WARN.
+        Send stretches, of all joints or one a joint, and spans in s; return the verdict on them.
 
         Raises
         ------
@@ -302,6 +162,7 @@ class PlannerClient:
             If it does not answer.
 
         """
+        # Where simulated time has just begun the planner may not know yet: it is asked again.
         points = []
         end = 0.0
         for stretch, span in setpoints:
@@ -345,25 +206,11 @@ class PlannerClient:
         """
         Wait until a sequence has been carried out, and judged where it is measured.
 
-        Parameters
-        ----------
-        verdict : Verdict
-            As `send` returned it.
-        each : callable, optional
-            Called about 20 times a second with the newest verdict.
-        timeout : float
-            Patience in s; in simulated ones where that time is published and runs slower.
-
-        Returns
-        -------
-        Verdict
-            The last one.
-
         Raises
         ------
         HmsaError
             If another request took its place, nobody carries out the commands, or it takes too
-            long.
+            long: more than ``timeout`` in s, simulated ones where they are published and slower.
 
         """
         heard = monotonic()
@@ -391,18 +238,9 @@ class PlannerClient:
         return self._verdict
 
     def stop(self) -> bool:
-        """
-        Have the planner drop what is ahead and come to rest; signals do not cut this short.
-
-        Returns
-        -------
-        bool
-            Whether it says that it rests.
-
-        """
+        """Have the planner come to rest, signals or not; return whether it says that it rests."""
         stop = ServiceCall(
-            self.node.create_client(interface.STOP.type, interface.from_outside(
-                interface.STOP.name, interface.PLANNER)), Trigger.Request())
+            interface.client(self.node, topics.STOP, topics.PLANNER), Trigger.Request())
         begin = monotonic()
         answer = None
         while monotonic() - begin < _STOP_SECONDS:
@@ -421,11 +259,10 @@ class PlannerClient:
 @contextmanager
 def _slower_time(node: Node, patience: float) -> Iterator[Callable[[], float]]:
     """Give a clock in s of simulated time that is no faster than the wall's; silence counts."""
-    topic = interface.CLOCK_TOPIC
-    if not node.count_publishers(topic.name):
+    if not node.count_publishers(topics.CLOCK_TOPIC.name):
         yield monotonic
         return
-    clock = RawSubscription(node, topic.type, topic.name, topic.qos)
+    clock = interface.listen(node, topics.CLOCK_TOPIC)
     passed, heard, before = 0.0, monotonic(), math.nan
 
     def time() -> float:
@@ -433,8 +270,7 @@ def _slower_time(node: Node, patience: float) -> Iterator[Callable[[], float]]:
         now = monotonic()
         for taken in clock.take()[-1:]:
             with suppress(BadInputError):
-                stamp = decode(taken.data, topic.type).clock
-                seconds = stamp.sec + 1e-9 * stamp.nanosec
+                seconds = from_time(decode(taken.data, Clock).clock) / NANOSECONDS
                 if seconds > before:
                     passed += min(seconds - before, now - heard)
                 heard, before = now, seconds

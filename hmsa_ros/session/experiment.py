@@ -16,16 +16,17 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 
+from hmsa_ros.contract import topics
 from hmsa_ros.contract.parameters import BLOCK
-from hmsa_ros.contract.topics import of_joint
+from hmsa_ros.contract.status import Verdict, whole
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.nodes import interface
-from hmsa_ros.nodes.conversions import from_time, whole
+from hmsa_ros.nodes.conversions import from_time
 from hmsa_ros.nodes.remote_parameters import RemoteParameters
 from hmsa_ros.nodes.service_call import ServiceCall
-from hmsa_ros.session.client import PlannerClient, Verdict
+from hmsa_ros.session.client import PlannerClient
 from hmsa_ros.session.processes import NodeProcess, Session
 
 Setpoints = Sequence[tuple[Sequence[float], float]]
@@ -50,12 +51,9 @@ class Experiment:
     setpoints : sequence of (sequence of float, float)
         Stretch of all joints, or one a joint, and span in s; empty where there are levels.
     nodes : tuple of NodeProcess
-        To start besides the recorder, among them a paused plant that leads time; empty for
-        nodes that run already.
-    namespace : str
+        To start besides the recorder, among them a paused plant that leads time, or none.
+    namespace, joints : str, tuple of str
         Of planner and plant.
-    joints : tuple of str
-        Of the planner.
     expected : mapping of str to object
         Parameters of running nodes by ``'node.name'``, from a parameter file.
     levels : sequence of (float, float)
@@ -84,14 +82,14 @@ class Experiment:
     def topics(self) -> list[str]:
         """Return the full names of the topics to record."""
         own = [
-            of_joint(topic.name, joint, self.joints) for joint in self.joints
-            for topic in (interface.FLUX_DENSITY_COMMAND, interface.FLUX_DENSITY_APPLIED)]
-        own += [interface.JOINT_STATES.name, *(
-            interface.from_outside(x.name, interface.PLANNER)
-            for x in (interface.JOINT_TRAJECTORY, interface.PLAN, interface.STATUS,
-                      interface.ESTIMATE))]
+            topics.of_joint(topic, joint, self.joints).name for joint in self.joints
+            for topic in (topics.FLUX_DENSITY_COMMAND, topics.FLUX_DENSITY_APPLIED)]
+        own += [topics.JOINT_STATES.name, *(
+            topics.from_outside(x.name, topics.PLANNER)
+            for x in (topics.JOINT_TRAJECTORY, topics.PLAN, topics.STATUS,
+                      topics.ESTIMATE))]
         if self.nodes:
-            own += [interface.STRETCH.name, interface.STRETCH_RATE.name]
+            own += [topics.STRETCH.name, topics.STRETCH_RATE.name]
         space = self.namespace.strip('/')
         return [*(f'/{space}/{x}' if space else f'/{x}' for x in own), '/diagnostics', '/clock']
 
@@ -134,21 +132,7 @@ def prepare(folder: Path) -> None:
 def conduct(
         experiment: Experiment, environment: Mapping[str, str], progress: Tell) -> Conducted:
     """
-    Carry out an experiment.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        In a prepared folder.
-    environment : mapping of str to str
-        Of the processes; this process must live in the same ROS domain.
-    progress : callable
-        Called with what is going on and the share of the sequence that is done.
-
-    Returns
-    -------
-    Conducted
-        The bag is closed.
+    Carry out an experiment in a prepared folder, in the ROS domain of this process.
 
     Raises
     ------
@@ -173,14 +157,14 @@ def conduct(
             if watch.sent:
                 progress('coming to rest', 1.0)
                 resting = client.stop()
-            session.stop((interface.RECORDER,))
+            session.stop((topics.RECORDER,))
             if resting:
                 raise
             raise HmsaError(
                 f'{str(error) or "interrupted"}; the planner does not say that the actuator '
                 'rests: look after the coil') from error
         progress('closing the bag', 1.0)
-        exits = session.stop((interface.RECORDER,))
+        exits = session.stop((topics.RECORDER,))
         for name, status in exits.items():
             if status:
                 raise HmsaError(
@@ -202,13 +186,13 @@ def _begin(experiment: Experiment, session: Session, watch: '_Watch') -> None:
         session.start(_recorder(experiment, bool(watch.parameter('planner.use_sim_time'))))
     watch.client.spin_until(
         lambda: watch.recorder_ready,
-        f'the recorder is not ready: {session.last_words(interface.RECORDER)}', session.check)
+        f'the recorder is not ready: {session.last_words(topics.RECORDER)}', session.check)
     if experiment.nodes:
         watch.unpause(session.check)
 
 
 def _recorder(experiment: Experiment, simulated: bool) -> NodeProcess:
-    return NodeProcess(interface.RECORDER, {
+    return NodeProcess(topics.RECORDER, {
         'use_sim_time': simulated, 'storage.uri': str(experiment.bag),
         'record.topics': experiment.topics()}, experiment.namespace)
 
@@ -253,13 +237,9 @@ class _Watch:
         self._over: float | None = None
         self._parameters: dict[str, str] = {}
         node = client.node
-        topic = interface.DIAGNOSTICS
-        node.create_subscription(topic.type, topic.name, self._on_diagnostics, topic.qos)
-        topic = interface.CLOCK_TOPIC
-        node.create_subscription(topic.type, topic.name, self._on_clock, topic.qos)
-        self._set_paused = node.create_client(
-            interface.SET_PAUSED.type,
-            interface.from_outside(interface.SET_PAUSED.name, interface.PLANT))
+        interface.subscribe(node, topics.DIAGNOSTICS, self._on_diagnostics)
+        interface.subscribe(node, topics.CLOCK_TOPIC, self._on_clock)
+        self._set_paused = interface.client(node, topics.SET_PAUSED, topics.PLANT)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -287,7 +267,7 @@ class _Watch:
     @property
     def measured(self) -> bool:
         """Whether somebody publishes samples."""
-        return bool(self.client.node.count_publishers(interface.JOINT_STATES.name))
+        return bool(self.client.node.count_publishers(topics.JOINT_STATES.name))
 
     # -- checks --------------------------------------------------------------------------------
 
@@ -295,7 +275,7 @@ class _Watch:
         """Ask planner and plant for their parameters; a driver of hardware may have none."""
         space = f'/{self._experiment.namespace.strip("/")}'.rstrip('/')
         asked = {x: RemoteParameters(self.client.node, f'{space}/{x}')
-                 for x in (interface.PLANNER, interface.PLANT)}
+                 for x in (topics.PLANNER, topics.PLANT)}
 
         def poll() -> None:
             each()
@@ -307,7 +287,7 @@ class _Watch:
             there = {x for x, own in self.client.node.get_node_names_and_namespaces()
                      if own == (space or '/')}
             return all(
-                self._known(node) for node in asked if node == interface.PLANNER or node in there)
+                self._known(node) for node in asked if node == topics.PLANNER or node in there)
 
         self.client.spin_until(known, 'the nodes do not give their parameters', poll)
 
@@ -343,7 +323,7 @@ class _Watch:
                 '): expected the same; start them with --params-file and that file')
         for spec in BLOCK:
             own, other = (self.parameter(f'{x}.{spec.name}')
-                          for x in (interface.PLANT, interface.PLANNER))
+                          for x in (topics.PLANT, topics.PLANNER))
             if own is not None and not _same(own, other):
                 self.notes.append(
                     f'{spec.name} is {other} for the planner and {own} for the plant')
@@ -353,7 +333,7 @@ class _Watch:
             'expected a plant or a driver of the coil (hmsa plant)')
         joints = self._experiment.joints
         if not self.client.node.count_publishers(
-                of_joint(interface.FLUX_DENSITY_APPLIED.name, joints[0], joints)):
+                topics.of_joint(topics.FLUX_DENSITY_APPLIED, joints[0], joints).name):
             self.notes.append(
                 'nobody reports the levels that take effect (flux_density_applied)')
             if not self.measured:
@@ -380,7 +360,7 @@ class _Watch:
         elif moment - self._seen[1] > _START_SECONDS:
             raise HmsaError(f'time does not advance beyond {now:g} s: expected messages on /clock')
         if not self.client.node.count_publishers(
-                interface.from_outside(interface.STATUS.name, interface.PLANNER)):
+                topics.from_outside(topics.STATUS.name, topics.PLANNER)):
             raise HmsaError('the planner has gone: expected it to run until the end')
         if unheard := self.client.unheard():
             raise HmsaError(

@@ -5,29 +5,11 @@ from collections.abc import Iterable, Sequence
 from rclpy.node import Node
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from hmsa_ros.nodes import interface
-from hmsa_ros.nodes.message_types import type_name_of
+from hmsa_ros.contract import topics
 
 
 def unheard(node: Node, namespace: str, joints: Sequence[str]) -> list[str]:
-    """
-    Return the topics of commands that nobody but recorders subscribes to.
-
-    Parameters
-    ----------
-    node : Node
-        That looks.
-    namespace : str
-        Of the planner.
-    joints : sequence of str
-        Whose commands count.
-
-    Returns
-    -------
-    list of str
-        Full names.
-
-    """
+    """Return a planner's topics of commands that nobody but recorders subscribes to."""
     leave_out = recorders(node)
     return [x for x in _commands(node, namespace, joints)
             if leave_out.issuperset(subscribers(node, x))]
@@ -47,14 +29,14 @@ def recorders(node: Node) -> set[str]:
 
 def _commands(node: Node, namespace: str, joints: Sequence[str]) -> list[str]:
     """Return the topics on which the planner commands joints, whatever they are called."""
-    planner = f'/{namespace.strip("/")}/{interface.PLANNER}'.replace('//', '/')
-    type_name = type_name_of(interface.FLUX_DENSITY_COMMAND.type)
-    topics = [
-        topic for topic, types in node.get_topic_names_and_types() if type_name in types
+    planner = f'/{namespace.strip("/")}/{topics.PLANNER}'.replace('//', '/')
+    named = [
+        topic for topic, types in node.get_topic_names_and_types()
+        if topics.FLUX_DENSITY_COMMAND.type in types
         and planner in _names(node.get_publishers_info_by_topic(topic))]
-    return [x for x in topics if x.split('/')[-2] in joints] or topics or [
+    return [x for x in named if x.split('/')[-2] in joints] or named or [
         node.resolve_topic_name(
-            interface.of_joint(interface.FLUX_DENSITY_COMMAND, x, joints).name) for x in joints]
+            topics.of_joint(topics.FLUX_DENSITY_COMMAND, x, joints).name) for x in joints]
 
 
 def _names(ends: Iterable[TopicEndpointInfo]) -> list[str]:

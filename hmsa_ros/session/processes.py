@@ -53,17 +53,14 @@ class Session:
     """Node processes, each with its log in a folder; a context manager that ends them."""
 
     def __init__(self, folder: Path, environment: Mapping[str, str]) -> None:
-        """Start nothing yet."""
         self._folder = folder
         self._environment = dict(environment)
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def __enter__(self) -> 'Session':
-        """Return the session."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End what still runs."""
         self.stop()
 
     def start(self, node: NodeProcess) -> None:

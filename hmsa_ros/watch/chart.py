@@ -14,17 +14,9 @@ _BRAILLE = 0x2800
 @dataclass(frozen=True)
 class Strip:
     """
-    A chart of one value and its target.
+    A chart of one value and its target between two edges, by rows from above.
 
-    Attributes
-    ----------
-    rows : tuple of str
-        From above, all of one width.
-    targets : tuple of tuple of int
-        In each row the columns that show the target alone, for another colour.
-    low, high : float
-        Values at the lower and the upper edge.
-
+    ``targets`` are the columns of each row that show the target alone, for another colour.
     """
 
     rows: tuple[str, ...]

@@ -13,24 +13,25 @@ from time import monotonic
 from typing import Any
 
 import numpy as np
-from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 
-from hmsa_ros.contract.topics import Quality
+from hmsa_ros.contract import topics
+from hmsa_ros.contract.status import texts, Verdict, whole
 from hmsa_ros.core.laws.coordinate import COORDINATES
 from hmsa_ros.core.schedule import CommandSchedule
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError, printable
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.capture import decode, RawSubscription, Taken
-from hmsa_ros.nodes.conversions import from_time, whole
+from hmsa_ros.nodes.conversions import from_time
+from hmsa_ros.nodes.message_types import interface_class
 from hmsa_ros.nodes.visitor import leave, visit
-from hmsa_ros.watch.scene import History, Joint, Report, RequestState, Scene
+from hmsa_ros.watch.scene import History, Joint, Report, Scene
 
 # Of the samples since the last look no more than these are kept: all of them at 1 kHz.
 _SAMPLES = 200
-_SAMPLE_QOS = interface.profile(Quality(_SAMPLES, reliable=False))
-_REPORT_QOS = interface.profile(Quality(100, reliable=False))
+_SAMPLE_QOS = topics.Quality(_SAMPLES, reliable=False)
+_REPORT_QOS = topics.Quality(100, reliable=False)
 # Joints times samples that are read at one look: all of them up to ten joints at 1 kHz.
 _MOST_READ = 1000
 # Between two looks at the graph, and how long discovery may take before its result counts.
@@ -79,21 +80,20 @@ class Listener:
     def __init__(
             self, *, namespace: str = '', joints: Sequence[str] = (),
             span: float = 10.0) -> None:
-        """Create a node of our own in a context of our own."""
         self._wanted = tuple(joints)
         self._span = span
         self._node = visit(
             'watch', namespace, enable_rosout=False, start_parameter_services=False)
         self._domain = int(self._node.context.get_domain_id())
         self._sources: list[_Source] = []
-        self._samples = self._subscribe(interface.JOINT_STATES, _SAMPLE_QOS)
-        self._status = self._subscribe(interface.STATUS)
-        self._plan = self._subscribe(interface.PLAN)
-        self._diagnostics = self._subscribe(interface.DIAGNOSTICS, _REPORT_QOS)
+        self._samples = self._subscribe(topics.JOINT_STATES, _SAMPLE_QOS)
+        self._status = self._subscribe(topics.STATUS)
+        self._plan = self._subscribe(topics.PLAN)
+        self._diagnostics = self._subscribe(topics.DIAGNOSTICS, _REPORT_QOS)
         self._commands: dict[str, tuple[_Source, CommandSchedule]] = {}
         self._joints: dict[str, Joint] = {}
         self._heard: dict[tuple[str, str, str], tuple[float, Report]] = {}
-        self._request: RequestState | None = None
+        self._request: Verdict | None = None
         self._targets: dict[str, float] = {}
         self._coordinates: dict[str, str] = {}
         self._planned_joints: tuple[str, ...] = ()
@@ -107,20 +107,18 @@ class Listener:
         self._counted: tuple[float, int] | None = None
 
     def __enter__(self) -> 'Listener':
-        """Return the listener."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Leave the graph."""
         for source in self._sources:
             source.subscription.destroy()
         leave(self._node)
 
-    def _subscribe(self, topic: interface.Topic, qos: QoSProfile | None = None) -> _Source:
-        name = interface.from_outside(topic.name, interface.PLANNER)
+    def _subscribe(self, topic: topics.Topic, qos: topics.Quality | None = None) -> _Source:
         source = _Source(
-            self._node.resolve_topic_name(name), topic.type,
-            RawSubscription(self._node, topic.type, name, qos or topic.qos))
+            self._node.resolve_topic_name(topics.from_outside(topic.name, topics.PLANNER)),
+            interface_class(topic.type), interface.listen(
+                self._node, replace(topic, qos=qos or topic.qos), topics.PLANNER))
         self._sources.append(source)
         return source
 
@@ -157,13 +155,13 @@ class Listener:
             'samples': node.count_publishers(self._samples.topic),
             'planner': node.count_publishers(self._status.topic)}
         space = node.get_namespace().rstrip('/')
-        end = f'/{interface.FLUX_DENSITY_COMMAND.name}'
+        end = f'/{topics.FLUX_DENSITY_COMMAND.name}'
         for name, _ in node.get_topic_names_and_types():
             if name.startswith(f'{space}/') and name.endswith(end):
                 joint = name[len(space):-len(end)].strip('/')
                 if '/' not in joint and joint not in self._commands:
                     self._commands[joint] = self._subscribe(
-                        replace(interface.FLUX_DENSITY_COMMAND, name=name),
+                        replace(topics.FLUX_DENSITY_COMMAND, name=name),
                         _REPORT_QOS), CommandSchedule(math.nan)
 
     def _take_planner(self) -> None:
@@ -173,16 +171,13 @@ class Listener:
             times = [from_time(x.time_from_start) for x in message.points]
             self._plan_span = (start, start + max(times)) if times else None
         for message in self._status.new():
-            values = {printable(x.key): printable(x.value) for x in message.values}
+            values = texts(message)
             # One joint has no name there; of several each has its own.
             self._name_coordinates(message.hardware_id, values)
             self._targets = {
                 key.rpartition('.')[0] or printable(message.hardware_id): _number(value)
                 for key, value in values.items() if key.rpartition('.')[2] == 'stretch'}
-            self._request = RequestState(
-                message.level[0], printable(message.message), values.get('code', ''),
-                values.get('state', ''), whole(values.get('setpoint')),
-                whole(values.get('setpoints')))
+            self._request = Verdict.read(message)
 
     def _take_samples(self, now: float) -> None:
         arrived = self._samples.subscription.take()
@@ -248,9 +243,9 @@ class Listener:
             for status in message.status:
                 name = printable(status.name.partition(':')[0].strip().rpartition('/')[2])
                 # A robot's diagnostics are of many other things.
-                if name not in interface.NODES and status.hardware_id not in self._joints:
+                if name not in topics.NODES and status.hardware_id not in self._joints:
                     continue
-                values = {printable(x.key): printable(x.value) for x in status.values}
+                values = texts(status)
                 self._name_coordinates(status.hardware_id, values)
                 counts = {key: whole(value) for key, value in values.items()
                           if '.' not in key and value.isdigit()}

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from hmsa_ros.contract.status import Verdict
 from hmsa_ros.core.laws.coordinate import POSITION
 from hmsa_ros.core.model import Array
 
@@ -17,7 +18,6 @@ class History:
     """The least and largest value in each slot of the last ``span`` seconds; peaks are kept."""
 
     def __init__(self, span: float, slots: int = 480) -> None:
-        """Begin empty."""
         self._slot = span / slots
         self._low = np.full(slots, np.nan)
         self._high = np.full(slots, np.nan)
@@ -57,23 +57,9 @@ class History:
 @dataclass
 class Joint:
     """
-    One actuator.
+    One actuator: newest sample, target and command (in SI, NaN if not known), and its chart.
 
-    Attributes
-    ----------
-    name : str
-        Of the joint.
-    coordinate : str
-        What its position is called, as far as known.
-    stretch, rate, flux_density : float
-        Newest sample; the rate in 1/s, the flux density in force in T. NaN if not known.
-    target : float
-        Stretch that is asked for.
-    commanded : float
-        Newest commanded flux density in T.
-    stretches, targets : History
-        Of the chart.
-
+    ``coordinate`` is what its position is called, as far as known.
     """
 
     name: str
@@ -85,18 +71,6 @@ class Joint:
     target: float = math.nan
     commanded: float = math.nan
     coordinate: str = POSITION
-
-
-@dataclass
-class RequestState:
-    """What the planner says of its last request, `LEVELS` by index; setpoints count from 1."""
-
-    level: int
-    message: str
-    code: str
-    state: str
-    setpoint: int
-    setpoints: int
 
 
 @dataclass
@@ -113,31 +87,11 @@ class Report:
 @dataclass
 class Scene:
     """
-    What is seen at one moment.
+    What is seen at one moment; numbers are NaN where they are not known.
 
-    Attributes
-    ----------
-    where : str
-        Domain and namespace, in words.
-    now : float
-        Time of this look, in s of a clock that only goes on.
-    stamp : float
-        Of the newest sample, in s; NaN without one.
-    age : float
-        Since the newest sample arrived, in s; NaN without one.
-    sample_rate : float
-        Samples that arrived a second; NaN without one.
-    joints : list of Joint
-        In the order of the samples.
-    request : RequestState or None
-        What the planner says; None before it does.
-    progress : float
-        Share of the plan that is done; NaN without a plan.
-    reports : list of Report
-        By name.
-    waiting : list of str
-        What is waited for, a sentence each.
-
+    ``now`` is the time of this look in s of a clock that only goes on, ``stamp`` that of the
+    newest sample, which arrived ``age`` s ago; ``progress`` is the share of the plan that is done,
+    ``waiting`` what is waited for, a sentence each.
     """
 
     where: str
@@ -146,7 +100,7 @@ class Scene:
     age: float = math.nan
     sample_rate: float = math.nan
     joints: Sequence[Joint] = field(default_factory=list)
-    request: RequestState | None = None
+    request: Verdict | None = None
     progress: float = math.nan
     reports: Sequence[Report] = field(default_factory=list)
     waiting: Sequence[str] = field(default_factory=list)

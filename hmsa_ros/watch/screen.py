@@ -52,7 +52,6 @@ class Screen:
     """Shows scenes on a terminal; charts of ``span`` seconds, in ASCII unless ``unicode``."""
 
     def __init__(self, span: float, *, unicode: bool = True) -> None:
-        """Take the settings."""
         self._span = span
         self._unicode = unicode
 

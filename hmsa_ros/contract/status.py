@@ -1,0 +1,68 @@
+"""What diagnostics say, and the planner's verdict among them."""
+
+from dataclasses import dataclass
+import re
+from typing import Any
+
+from hmsa_ros.core.status import Code
+from hmsa_ros.errors import printable
+
+# Anybody may send a status; Python refuses to read numbers of thousands of digits.
+_WHOLE = re.compile('[0-9]{1,18}')
+
+
+def texts(status: Any) -> dict[str, str]:
+    """Return the values of a diagnostic_msgs/msg/DiagnosticStatus by key, both printable."""
+    return {printable(x.key): printable(x.value) for x in status.values}
+
+
+def whole(text: str | None) -> int:
+    """Return the whole number in a status, 0 where it has none."""
+    return int(text) if text and _WHOLE.fullmatch(text) else 0
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """
+    What the planner says of its last request, named as it was sent.
+
+    The level is 0 OK, 1 WARN or 2 ERROR, the code one of `Code`. ``state`` is idle, waiting,
+    moving, holding, settling or at_rest, on the way to ``setpoint``, from 1. While ``watching``,
+    setpoints that have begun are still to be judged by samples; the worst that was ``measured``
+    is a code, with its sentence ``finding``. ``unheard`` says why nobody carries out commands.
+    """
+
+    level: int
+    message: str
+    code: str
+    request: str
+    state: str
+    setpoint: int
+    setpoints: int
+    watching: bool = False
+    measured: str = ''
+    finding: str = ''
+    unheard: str = ''
+
+    @property
+    def failure(self) -> str:
+        """Why what was measured counts as a failure; empty if it does not."""
+        return self.finding if self.measured in (Code.OFF_TARGET, Code.VIBRATING) else ''
+
+    @property
+    def basis(self) -> str:
+        """What the state is known from, in words."""
+        if self.measured == Code.ARRIVED:
+            return 'measured'
+        return self.failure or 'predicted, not measured'
+
+    @classmethod
+    def read(cls, status: Any) -> 'Verdict':
+        """Read a DiagnosticStatus that the planner publishes."""
+        values = texts(status)
+        return cls(
+            status.level[0], printable(status.message), values.get('code', ''),
+            values.get('request', ''), values.get('state', ''),
+            whole(values.get('setpoint')), whole(values.get('setpoints')),
+            values.get('watching') == 'True', values.get('worst', ''),
+            values.get('worst_message', ''), values.get('unheard', ''))
