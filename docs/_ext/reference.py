@@ -143,10 +143,10 @@ def faults(name: str, thing: Any) -> list[str]:
                 part.strip() for line in get_doc_object(thing)['Attributes']
                 for part in line.name.split(',')}
             found = [f'field {x.name} is not under Attributes' for x in fields(thing)
-                     if x.name in vars(thing)['__annotations__'] and '\n' in text
+                     if x.name in vars(thing)['__annotations__'] and '\nAttributes\n-' in text
                      and not x.name.startswith('_') and x.name not in documented]
-    if '\n' not in text.partition('\n\nRaises\n------\n')[0]:
-        # One line that says it all but what is raised.
+    if not re.search(r'^(Parameters|Returns|Yields)\n-', text, re.M):
+        # Words that say it all but what is raised.
         ignored = ignored | {'PR01', 'RT01', 'YD01'}
     return found + [
         f'{code} {reason}' for code, reason in validate(name)['errors'] if code not in ignored]

@@ -31,15 +31,7 @@ _LARGEST_LOAD = 1e9
 
 
 def check_stretch(stretch: float, material: Material, name: str = 'stretch') -> None:
-    """
-    Refuse a stretch outside the limits of a group, or of a chain limit alone.
-
-    Raises
-    ------
-    BadInputError
-        If it is not finite or not between the limiting stretches.
-
-    """
+    """Refuse with `BadInputError` a stretch outside the limits of a group or chain limit."""
     lower, upper = stretch_limits(material)
     if not lower < stretch < upper:
         elastic = getattr(material, 'law', None)
@@ -54,20 +46,7 @@ def check_stretch(stretch: float, material: Material, name: str = 'stretch') -> 
 
 
 def unheld(material: NondimensionalParameters) -> str:
-    """
-    Return which stretches cannot be held because the force falls there.
-
-    Parameters
-    ----------
-    material : NondimensionalParameters
-        The group.
-
-    Returns
-    -------
-    str
-        A sentence without a full stop; empty where the force rises everywhere.
-
-    """
+    """Return in words which stretches the force falls at, so that none is held; empty for none."""
     if material.law is None:
         return ''
     sides = [
@@ -82,36 +61,17 @@ def unheld(material: NondimensionalParameters) -> str:
 @dataclass(frozen=True)
 class Setup:
     """
-    One actuator with the amplifier and the coil that drive it.
+    One actuator with the amplifier and the coil that drive it; it starts at rest, relaxed.
 
     An amplifier with a slew limit ramps to a commanded level; a coil with a time constant
     follows the amplifier as a first order lag. Both together are a ramp that is followed late.
-
-    Attributes
-    ----------
-    actuator : ActuatorParameters
-        The block.
-    stretch : float
-        Stretch at the start, at rest and held by its flux density.
-    slew_limit : float
-        Largest change of the amplifier's level in T/s, greater than 0; infinite for steps.
-    coil_time_constant : float
-        Of the lag in s, at least 0; 0 for none.
-    creep : Creep
-        What the elastomer adds to its law; it has relaxed at the start.
-
-    Raises
-    ------
-    BadInputError
-        If a value is out of range.
-
     """
 
     actuator: ActuatorParameters
-    stretch: float = 1.0
-    slew_limit: float = math.inf
-    coil_time_constant: float = 0.0
-    creep: Creep = field(default_factory=Creep)
+    stretch: float = 1.0  #: held at the start by its flux density
+    slew_limit: float = math.inf  #: of the level in T/s, above 0; infinite for steps
+    coil_time_constant: float = 0.0  #: in s; 0 for no lag
+    creep: Creep = field(default_factory=Creep)  #: what the elastomer adds to its law
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -171,27 +131,11 @@ class Setup:
 
 class Actuators:
     """
-    Actuators that take stamped commands and forces, and advance together to a time.
+    Actuators that take stamped commands and forces, and advance together to a time in ns.
 
-    Parameters
-    ----------
-    setups : sequence of Setup
-        At least one.
-    time : int
-        Time at the start in ns.
-
-    Attributes
-    ----------
-    setups : tuple of Setup
-        As given.
-    time : int
-        Time in ns that the state belongs to.
-    schedules, forces : list of CommandSchedule
-        Flux density in T and disturbing force in N, in force and ahead, for each actuator.
-    changes : list of (int, int, float)
-        Actuator, time in ns and level in T of each change of level that has taken effect.
-        Whoever reads it clears it.
-
+    ``schedules`` and ``forces`` have, of each, the levels in T and the disturbing forces in N that
+    are in force and ahead; ``changes`` actuator, time in ns and level in T of each change that has
+    taken effect. Whoever reads the changes clears them.
     """
 
     def __init__(self, setups: Sequence[Setup], *, time: int = 0) -> None:
@@ -265,18 +209,8 @@ class Actuators:
         """
         Have one go on from another state, relaxed, with nothing ahead and no force.
 
-        Parameters
-        ----------
-        i, stretch, rate, flux_density : int, float, float, float
-            Which; its state, with the rate in 1/s; the field in force in T.
-        level : float, optional
-            In T, that the amplifier is on its way to; default the flux density.
-
-        Raises
-        ------
-        BadInputError
-            If the stretch is outside the limits or the rate is not finite.
-
+        The rate is in 1/s; ``level`` (T) is what the amplifier is on its way to, if it is not the
+        flux density in force. A state out of range is a `BadInputError`.
         """
         check_stretch(stretch, self.setups[i].actuator.nondimensional)
         if not math.isfinite(rate):
@@ -306,27 +240,10 @@ class Actuators:
 
     def command(self, i: int, stamp: int, flux_density: float) -> int:
         """
-        Take a command that applies from its stamp on.
+        Take a command in T from its stamp in ns on, which supersedes all stamped at or after it.
 
-        A command that asks for the level which holds then anyway changes nothing.
-
-        Parameters
-        ----------
-        i, stamp, flux_density : int, int, float
-            For which; time in ns from which the signed value in T applies, superseding all
-            commands stamped at or after it.
-
-        Returns
-        -------
-        int
-            How late the change is in ns, 0 if it is not or if nothing changes; a late one
-            applies at once.
-
-        Raises
-        ------
-        BadInputError
-            If the value is not finite or nobody could follow it.
-
+        Returns how late the change is in ns: a late one applies at once. A command for the level
+        which holds then anyway changes nothing, and is not late.
         """
         self.setups[i].check_level(flux_density)
         changed = self.schedules[i].insert(max(stamp, self.time), flux_density)
@@ -377,18 +294,8 @@ class Actuators:
         """
         Integrate to a time in ns, each change applied exactly at its stamp.
 
-        A time that is not ahead changes nothing but applies what is due.
-
-        Parameters
-        ----------
-        time : int
-            In ns.
-
-        Returns
-        -------
-        list of (int, int)
-            Actuators whose load is too large to follow, and the time in ns where they stay.
-
+        Returns the actuators whose load is too large to follow, and the times in ns where they
+        stay. A time that is not ahead changes nothing but applies what is due.
         """
         due = self._events <= time
         failed = []

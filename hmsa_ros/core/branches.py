@@ -11,20 +11,10 @@ from hmsa_ros.core.model import Array
 
 
 class Branches:
-    """
-    The branches of several actuators, and the integration of all of them.
-
-    Parameters
-    ----------
-    creeps : sequence of Creep
-        Of each actuator.
-    time_units : ndarray, shape (n,)
-        Their units of time in s.
-
-    """
+    """The branches of several actuators, and the integration of all of them."""
 
     def __init__(self, creeps: Sequence[Creep], time_units: Array) -> None:
-        """Begin with forces of 0."""
+        """Begin with forces of 0; units of time are in s."""
         self._creeping = np.array([bool(x) for x in creeps])
         self._work = response_kernel.work_space(MOST)
         self._branches = np.zeros((len(creeps), MOST, 3))

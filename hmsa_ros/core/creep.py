@@ -15,28 +15,15 @@ _STIFFEST = 1e3
 @dataclass(frozen=True)
 class Creep:
     """
-    Maxwell branches of an elastomer.
+    Up to three Maxwell branches of an elastomer.
 
     The law is what the elastomer holds in the end; branch i adds h_i to its force, with
     h_i' = ratio_i (dW/dl)' - h_i/time_i (J. C. Simo, Comput. Methods Appl. Mech. Eng. 60, 153
     (1987), in the force of the block).
-
-    Attributes
-    ----------
-    ratios : tuple of float
-        Stiffness of each branch in units of that of the law, from 0 to 1000; at most three.
-    times : tuple of float
-        Relaxation time of each in s, above 0.
-
-    Raises
-    ------
-    BadInputError
-        If there are too many, the lengths differ or a value is out of range.
-
     """
 
-    ratios: tuple[float, ...] = ()
-    times: tuple[float, ...] = ()
+    ratios: tuple[float, ...] = ()  #: stiffness in units of that of the law, 0 to 1000
+    times: tuple[float, ...] = ()  #: of relaxation, in s
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -63,15 +50,7 @@ class Creep:
         return any(self.ratios)
 
     def check(self, time_unit: float) -> None:
-        """
-        Refuse a branch that only damps an actuator with a unit of time in s.
-
-        Raises
-        ------
-        BadInputError
-            If it is too fast to be told from damping.
-
-        """
+        """Refuse with `BadInputError` what only damps, for a unit of time in s."""
         for time in self.times:
             if time < _FASTEST * time_unit:
                 raise BadInputError(

@@ -22,33 +22,13 @@ _SETTLED = 40.0
 
 @dataclass(frozen=True)
 class Delivery:
-    """
-    Nondimensional properties of the hardware that carries the command.
+    """Nondimensional properties of the hardware that carries the command."""
 
-    Attributes
-    ----------
-    period : float
-        Commands take effect at multiples of this; 0 for any time.
-    slew : float
-        Largest change of the load per unit of time; infinite for steps.
-    resolution : float
-        Times of commands are rounded to multiples of this; 0 for none.
-    lag : float
-        Time constant with which the field follows the amplifier; 0 for at once.
-    ripple : float
-        Vibration that levels which follow creep may leave, as a share of the move.
-
-    Raises
-    ------
-    BadInputError
-        If a value is out of range.
-
-    """
-
-    period: float = 0.0
-    slew: float = math.inf
-    resolution: float = 0.0
-    lag: float = 0.0
+    period: float = 0.0  #: commands take effect at multiples of this; 0 for any time
+    slew: float = math.inf  #: largest change of the load per unit of time; infinite for steps
+    resolution: float = 0.0  #: times of commands are rounded to multiples of this; 0 for none
+    lag: float = 0.0  #: time constant of the field behind the amplifier
+    #: Vibration that levels which follow creep may leave, as a share of the move.
     ripple: float = 1e-6
 
     def __post_init__(self) -> None:

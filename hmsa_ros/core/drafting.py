@@ -52,28 +52,13 @@ def finish(steps: Steps[T]) -> T:
 
 @dataclass(frozen=True)
 class Outset:
-    """
-    What a draft is worked out from.
-
-    Attributes
-    ----------
-    plan : Plan
-        In force.
-    model : Model
-        To plan with.
-    begin : int
-        Time in ns that the draft begins at the soonest.
-    state : State
-        Predicted then.
-    stale : int or None
-        Place of the first level of the plan whose prediction does not hold any more.
-
-    """
+    """What a draft is worked out from: a state predicted at a time in ns."""
 
     plan: Plan
     model: Model
-    begin: int
+    begin: int  #: the soonest time
     state: State
+    #: Place of the first level of the plan whose prediction holds no more.
     stale: int | None = None
 
     def on_grid(self, time: int) -> int:
@@ -94,15 +79,7 @@ def on_grid(time: int, model: Model) -> int:
 
 
 def check_points(points: Sequence[tuple[float, int]], rest: float) -> Steps[None]:
-    """
-    Check stretches and ends (ns from the start) of a sequence; yields where it may pause.
-
-    Raises
-    ------
-    RefusedError
-        If there are none, one is not a stretch, or times do not increase.
-
-    """
+    """Refuse points (stretch, end in ns from the start) that are no sequence: `RefusedError`."""
     if not points:
         raise RefusedError(
             Code.BAD_INPUT, 'the trajectory has no points: expected at least one')
@@ -121,15 +98,7 @@ def check_points(points: Sequence[tuple[float, int]], rest: float) -> Steps[None
 
 
 def check_target(stretch: float, rest: float) -> None:
-    """
-    Check that a number can be a stretch of an actuator with a rest there.
-
-    Raises
-    ------
-    RefusedError
-        If not.
-
-    """
+    """Refuse with `RefusedError` what no actuator with a rest there has as a stretch."""
     if reason := impossible(stretch, rest):
         raise RefusedError(Code.BAD_INPUT, reason)
 
@@ -140,11 +109,7 @@ def draft_sequence(
     """
     Plan checked points (stretch, end in ns) from a start in ns; None if they change nothing.
 
-    Raises
-    ------
-    RefusedError
-        If it cannot be carried out.
-
+    What cannot be carried out is a `RefusedError`.
     """
     begin = outset.begin
     if points[0][1] == 0 and len(points) > 1 and base == begin:
@@ -236,28 +201,8 @@ def draft_resumption(outset: Outset, arrival: int | None = None) -> Steps[Draft 
     """
     Plan what is left of the running plan anew, until it is on its way again; None if nothing is.
 
-    Parameters
-    ----------
-    outset : Outset
-        From where.
-    arrival : int, optional
-        Time in ns of rest at the setpoint under way; default as soon as its shaper can.
-
-    Returns
-    -------
-    Draft or None
-        The setpoints that are left.
-
-    Yields
-    ------
-    None
-        Wherever it may be continued later.
-
-    Raises
-    ------
-    RefusedError
-        If it cannot be carried out from there.
-
+    Rest at the setpoint under way is at ``arrival`` in ns, or as soon as its shaper can. What
+    cannot be carried out from there is a `RefusedError`.
     """
     # Setpoints end when they did; one that there is no time left for is left out. From where the
     # new plan meets the running one it goes on as that.

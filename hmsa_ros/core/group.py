@@ -28,24 +28,12 @@ _COMPARED = 100
 
 @dataclass(frozen=True)
 class Progress:
-    """
-    How far a joint, or all of them, have come in their sequence.
+    """How far a joint, or all of them, have come in their sequence."""
 
-    Attributes
-    ----------
-    state : str
-        idle, waiting, moving, holding, settling or at_rest.
-    setpoint, setpoints : int
-        Which one is under way, from 1, and how many there are.
-    stretch : str
-        Target; empty for none, or for several joints.
-
-    """
-
-    state: str = 'idle'
-    setpoint: int = 0
+    state: str = 'idle'  #: idle, or another of `_STATES`
+    setpoint: int = 0  #: under way, from 1
     setpoints: int = 0
-    stretch: str = ''
+    stretch: str = ''  #: target; empty for none, or for several joints
 
 
 @dataclass(frozen=True)
@@ -60,22 +48,8 @@ class PlannerGroup:
     """
     Several planners, each with a block, limits and a timeline of its own.
 
-    Parameters
-    ----------
-    planners : mapping of str to Planner
-        By joint; lead time and command period must be the same for all.
-    simultaneous : bool
-        Whether joints that would arrive sooner begin later, so that all arrive together.
-
-    Attributes
-    ----------
-    planners : mapping of str to Planner
-        As given.
-    simultaneous : bool
-        May be changed; taken from the next request on.
-    number : int
-        Counts accepted requests from 1.
-
+    Lead time and command period must be the same for all. Where they are to be ``simultaneous``,
+    which may change from request to request, joints that would arrive sooner begin later.
     """
 
     def __init__(

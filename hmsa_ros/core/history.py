@@ -14,23 +14,11 @@ _AS_PLANNED = 3e-8
 
 @dataclass(frozen=True)
 class Deviation:
-    """
-    How what took effect differs from what was planned.
+    """How what took effect differs from what was planned."""
 
-    Attributes
-    ----------
-    late : int
-        By how many ns a planned change came later; negative for earlier.
-    lost : int
-        Planned changes before it that never took effect.
-    foreign : bool
-        Whether the level was not planned at all.
-
-    """
-
-    late: int = 0
-    lost: int = 0
-    foreign: bool = False
+    late: int = 0  #: ns by which a change came later than planned
+    lost: int = 0  #: planned changes before it that never took effect
+    foreign: bool = False  #: whether the level was not planned at all
 
 
 @dataclass(frozen=True)
@@ -40,24 +28,12 @@ class History:
 
     Only what has been handed out is predicted anew where reality differs, so that the work
     does not grow with the plan; `predicted` catches up as far as somebody needs it.
-
-    Attributes
-    ----------
-    levels : tuple of PlannedLevel
-        By stamp.
-    sent : int
-        How many of them, the first ones, have been handed out; at least 1.
-    known : int
-        Place of the last one that is known to have taken effect.
-    stale : int or None
-        Place of the first level whose prediction does not follow from the one before; None for
-        none. It is never among those handed out.
-
     """
 
     levels: tuple[PlannedLevel, ...]
-    sent: int = 1
-    known: int = 0
+    sent: int = 1  #: how many, the first ones, have been handed out; at least 1
+    known: int = 0  #: place of the last one known to have taken effect
+    #: Place of the first level, not handed out yet, whose prediction holds no more.
     stale: int | None = None
 
     def unheard(self, now: int) -> int:

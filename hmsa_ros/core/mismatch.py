@@ -11,31 +11,13 @@ from hmsa_ros.errors import BadInputError
 
 @dataclass(frozen=True)
 class Errors:
-    """
-    By how much the actuator differs from the model: actual value = model's (1 + error).
+    """By how much the actuator differs from the model: actual value = model's (1 + error)."""
 
-    Attributes
-    ----------
-    shear_modulus : float
-        Of G, above -1. It scales the loads, the time unit and, for a given coefficient c, zeta.
-    zeta : float
-        Of the damping coefficient c, at least -1.
-    j_lim : float
-        Of J_lim, above -1.
-    remanence : float
-        Of Br, above -1. It scales the loads.
-
-    Raises
-    ------
-    BadInputError
-        If a value is not finite or out of range.
-
-    """
-
+    #: Of G, which scales the loads, the time unit and, for a given coefficient c, zeta.
     shear_modulus: float = 0.0
-    zeta: float = 0.0
+    zeta: float = 0.0  #: of the damping coefficient c
     j_lim: float = 0.0
-    remanence: float = 0.0
+    remanence: float = 0.0  #: of Br, which scales the loads
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -78,22 +60,9 @@ Offs = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Ellipsoid:
-    """
-    Where errors may be together, around none.
+    """Where errors may be together, around none."""
 
-    Attributes
-    ----------
-    axes : tuple of Offs
-        Half axes, at most four.
-
-    Raises
-    ------
-    BadInputError
-        If there are none or more, or a share is not finite.
-
-    """
-
-    axes: tuple[Offs, ...]
+    axes: tuple[Offs, ...]  #: half axes, one to four
 
     def __post_init__(self) -> None:
         """Check the axes."""

@@ -1,8 +1,9 @@
 """
 The actuator's equations for arrays: energies, forces, equilibrium, limits, linearised motion.
 
-Every function takes arrays or scalars, broadcast against each other, and returns float64.
-Stretch comes first, then rate and load, then the material. The load is the signed
+Every function takes arrays or scalars, broadcast against each other, and returns float64,
+NaN outside the limits. Stretch comes first, then rate and load, then the material, a group or
+the chain limit of a Gent block. The load is the signed
 ``beta = Br B/(mu0 G)``; the paper's b is ``sign(beta) sqrt|beta|``. Equation numbers are those
 of Polymers 2022, 14, 3037. The equations themselves are in `hmsa_ros.core.law`.
 """
@@ -41,122 +42,34 @@ def _evaluate(what: int, values: ArrayLike, material: Material) -> Array:
 
 
 def elastic_energy(stretch: ArrayLike, material: Material) -> Array:
-    """
-    Return the elastic energy per volume in units of G, Eq. 4 for Gent.
-
-    Parameters
-    ----------
-    stretch : array_like
-        Principal stretch inside the limits.
-    material : NondimensionalParameters or float
-        The group, or the chain limit of a Gent block.
-
-    Returns
-    -------
-    ndarray
-        psi, 0 at stretch 1; NaN outside the limits.
-
-    """
+    """Return the elastic energy per volume in units of G, 0 at rest; Eq. 4 for Gent."""
     return _evaluate(law.ENERGY, stretch, material)
 
 
 def elastic_force(stretch: ArrayLike, material: Material) -> Array:
-    """
-    Return the load that holds a stretch at rest, psi' = beta_1.
-
-    Parameters
-    ----------
-    stretch : array_like
-        Principal stretch inside the limits.
-    material : NondimensionalParameters or float
-        The group, or the chain limit of a Gent block.
-
-    Returns
-    -------
-    ndarray
-        Signed load beta; NaN outside the limits.
-
-    """
+    """Return the signed load beta_1 = psi' that holds a stretch at rest."""
     return _evaluate(law.FORCE, stretch, material)
 
 
 def elastic_stiffness(stretch: ArrayLike, material: Material) -> Array:
-    """
-    Return psi'', the stiffness about a stretch.
-
-    Parameters
-    ----------
-    stretch : array_like
-        Principal stretch inside the limits.
-    material : NondimensionalParameters or float
-        The group, or the chain limit of a Gent block.
-
-    Returns
-    -------
-    ndarray
-        Positive; NaN outside the limits.
-
-    """
+    """Return psi'', the stiffness about a stretch."""
     return _evaluate(law.STIFFNESS, stretch, material)
 
 
 def mass(stretch: ArrayLike, material: NondimensionalParameters) -> Array:
-    """
-    Return the inertia m(l) = (l^-3 + c1)/6 of a block, from Eq. 7.
-
-    Parameters
-    ----------
-    stretch : array_like
-        Principal stretch inside the limits.
-    material : NondimensionalParameters
-        The group.
-
-    Returns
-    -------
-    ndarray
-        Positive.
-
-    """
+    """Return the inertia m(l) = (l^-3 + c1)/6 of a block, from Eq. 7."""
     return _evaluate(law.MASS, stretch, material)
 
 
 def damping(material: NondimensionalParameters) -> float:
-    """
-    Return the constant d = zeta c1/2 that multiplies the stretch rate.
-
-    Parameters
-    ----------
-    material : NondimensionalParameters
-        The group.
-
-    Returns
-    -------
-    float
-        At least 0.
-
-    """
+    """Return the constant d = zeta c1/2 that multiplies the stretch rate."""
     return float(material.packed[law.DAMPING])
 
 
 def acceleration(
         stretch: ArrayLike, rate: ArrayLike, load: ArrayLike,
         material: NondimensionalParameters) -> Array:
-    """
-    Return the second derivative of the stretch, Eq. 11.
-
-    Parameters
-    ----------
-    stretch, rate, load : array_like
-        Nondimensional state and signed load.
-    material : NondimensionalParameters
-        The group.
-
-    Returns
-    -------
-    ndarray
-        In nondimensional time; NaN outside the limits.
-
-    """
+    """Return the second derivative of the stretch in nondimensional time, Eq. 11."""
     columns = np.broadcast_arrays(_array(stretch), _array(rate), _array(load))
     out = np.empty(columns[0].size)
     law.accelerations(*(np.array(x).ravel() for x in columns), material.packed, out)
@@ -166,26 +79,7 @@ def acceleration(
 def acceleration_si(
         stretch: ArrayLike, rate: ArrayLike, flux_density: ArrayLike,
         actuator: ActuatorParameters) -> Array:
-    """
-    Return the second derivative of the stretch in SI units, Eq. 10.
-
-    Parameters
-    ----------
-    stretch : array_like
-        Principal stretch inside the limits.
-    rate : array_like
-        Stretch rate in 1/s.
-    flux_density : array_like
-        Signed applied flux density in T.
-    actuator : ActuatorParameters
-        The block.
-
-    Returns
-    -------
-    ndarray
-        In 1/s^2; NaN outside the limits.
-
-    """
+    """Return the second derivative of the stretch in 1/s^2, Eq. 10; rate in 1/s, field in T."""
     unit = actuator.time_unit
     return acceleration(
         stretch, _array(rate) * unit, _array(flux_density) / actuator.flux_density_unit,
@@ -195,121 +89,38 @@ def acceleration_si(
 def energy(
         stretch: ArrayLike, rate: ArrayLike, load: ArrayLike,
         material: NondimensionalParameters) -> Array:
-    """
-    Return the total energy m l'^2/2 + psi - beta l, which falls at the rate d l'^2.
-
-    Parameters
-    ----------
-    stretch, rate, load : array_like
-        Nondimensional state and signed load.
-    material : NondimensionalParameters
-        The group.
-
-    Returns
-    -------
-    ndarray
-        In units of the shear modulus.
-
-    """
+    """Return the total energy m l'^2/2 + psi - beta l, which falls at the rate d l'^2."""
     return (0.5 * mass(stretch, material) * _array(rate) ** 2
             + elastic_energy(stretch, material) - _array(load) * _array(stretch))
 
 
 def equilibrium_stretch(load: ArrayLike, material: Material) -> Array:
-    """
-    Return the stretch at which a constant load is in balance, the inverse of `elastic_force`.
-
-    Parameters
-    ----------
-    load : array_like
-        Signed load beta, finite.
-    material : NondimensionalParameters or float
-        The group, or the chain limit of a Gent block.
-
-    Returns
-    -------
-    ndarray
-        Inside the limits; unique, since the force is monotone.
-
-    """
+    """Return the one stretch at which a finite load is in balance; inverse of `elastic_force`."""
     return _evaluate(law.EQUILIBRIUM, load, material)
 
 
 def stretch_limits(material: Material) -> tuple[float, float]:
     """
-    Return the limiting stretches, at which the chains are fully extended.
+    Return the limiting stretches, at which the chains are fully extended, both excluded.
 
-    Parameters
-    ----------
-    material : NondimensionalParameters or float
-        The group, or the chain limit of a Gent block.
-
-    Returns
-    -------
-    tuple of float
-        Lower limit below 1 and upper limit above 1, both excluded; 0 and infinity where the
-        law has none.
-
+    They are 0 and infinity where the law has none.
     """
     made = packed(material)
     return float(made[law.LOWER]), float(made[law.UPPER])
 
 
 def natural_frequency(stretch: ArrayLike, material: NondimensionalParameters) -> Array:
-    """
-    Return the undamped angular frequency of small motion about a stretch.
-
-    Parameters
-    ----------
-    stretch : array_like
-        Principal stretch inside the limits.
-    material : NondimensionalParameters
-        The group.
-
-    Returns
-    -------
-    ndarray
-        sqrt(psi''/m), per unit of nondimensional time.
-
-    """
+    """Return sqrt(psi''/m), undamped and angular, of small motion about a stretch."""
     return _evaluate(law.FREQUENCY, stretch, material)
 
 
 def critical_zeta(stretch: ArrayLike, material: NondimensionalParameters) -> Array:
-    """
-    Return the damping above which small motion about a stretch does not oscillate.
-
-    Parameters
-    ----------
-    stretch : array_like
-        Principal stretch inside the limits.
-    material : NondimensionalParameters
-        The group; its own zeta plays no part.
-
-    Returns
-    -------
-    ndarray
-        (4/c1) sqrt(m psi'').
-
-    """
+    """Return (4/c1) sqrt(m psi''), above which small motion does not oscillate."""
     return _evaluate(law.CRITICAL_ZETA, stretch, material)
 
 
 def signed_root(load: ArrayLike) -> Array:
-    """
-    Return the paper's flux density b = sign(beta) sqrt|beta|.
-
-    Parameters
-    ----------
-    load : array_like
-        Signed load beta.
-
-    Returns
-    -------
-    ndarray
-        Signed b; negative in contraction, where the paper's b^2 is negative.
-
-    """
+    """Return the paper's flux density b = sign(beta) sqrt|beta|, negative in contraction."""
     load = _array(load)
     root: Array = np.sign(load) * np.sqrt(np.abs(load))
     return root

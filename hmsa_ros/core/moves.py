@@ -10,29 +10,15 @@ from hmsa_ros.errors import BadInputError
 
 @dataclass(frozen=True)
 class State:
-    """
-    Stretch, stretch rate, the load in force and the amplifier's output, nondimensional.
-
-    Attributes
-    ----------
-    stretch : float
-        Principal stretch.
-    rate : float
-        Per unit of nondimensional time.
-    load : float
-        Signed load beta in force; NaN for the one that holds the stretch. It matters where a
-        slew limit makes the next level start from it, or where the field lags.
-    amplifier : float or None
-        Load that a field that lags is following; None where the two are the same.
-    followed : tuple of float
-        Elastic force that each Maxwell branch has followed; empty where they have relaxed.
-
-    """
+    """Stretch, stretch rate, the load in force and the amplifier's output, nondimensional."""
 
     stretch: float
     rate: float = 0.0
+    #: In force: ramps and lags begin from it; NaN for the one that holds the stretch.
     load: float = math.nan
+    #: Load that a field that lags is following; None where the two are the same.
     amplifier: float | None = None
+    #: Elastic force that each Maxwell branch has followed; empty where they have relaxed.
     followed: tuple[float, ...] = ()
 
     @property
@@ -43,17 +29,7 @@ class State:
 
 @dataclass(frozen=True)
 class Level:
-    """
-    A constant load from a time on.
-
-    Attributes
-    ----------
-    time : float
-        From the start of the move.
-    load : float
-        Signed load beta.
-
-    """
+    """A constant load beta from a time on, counted from the start of the move."""
 
     time: float
     load: float
@@ -61,33 +37,15 @@ class Level:
 
 @dataclass(frozen=True)
 class Move:
-    """
-    How one target is reached.
-
-    Attributes
-    ----------
-    code : Code
-        Which command it is.
-    levels : tuple of Level
-        In order; the last one holds the target.
-    duration : float
-        Time until rest at the target; infinite where it is only approached.
-    reason : str
-        Why it is not the requested command; empty if it is.
-    tail : tuple of State
-        Predicted at the last levels, which hold the target while branches relax; empty where
-        none do.
-    vibration : float
-        Bound of the vibration of the stretch that these levels leave, peak to peak.
-
-    """
+    """How one target is reached."""
 
     code: Code
-    levels: tuple[Level, ...]
-    duration: float
-    reason: str = ''
+    levels: tuple[Level, ...]  #: in order; the last one holds the target
+    duration: float  #: time until rest at the target; infinite where it is only approached
+    reason: str = ''  #: why it is not the requested command; empty if it is
+    #: Predicted at the last levels, which hold the target while branches relax, if any do.
     tail: tuple[State, ...] = ()
-    vibration: float = 0.0
+    vibration: float = 0.0  #: bound of what these levels leave in the stretch, peak to peak
 
     def until(self, time: float) -> 'Move':
         """Return the move without the levels from a time on."""
@@ -100,20 +58,7 @@ class Move:
 
 @dataclass(frozen=True)
 class Limits:
-    """
-    Admissible loads.
-
-    Attributes
-    ----------
-    minimum, maximum : float
-        Signed loads beta, minimum below maximum.
-
-    Raises
-    ------
-    BadInputError
-        If they are not in order.
-
-    """
+    """Admissible signed loads beta, minimum below maximum."""
 
     minimum: float = -math.inf
     maximum: float = math.inf
@@ -126,15 +71,7 @@ class Limits:
                 f'{self.maximum:g}')
 
     def check(self, load: float, target: float, units: Units) -> None:
-        """
-        Refuse a load outside the limits; the message names the target in the units.
-
-        Raises
-        ------
-        RefusedError
-            With `Code.FLUX_LIMIT`.
-
-        """
+        """Refuse a load outside the limits with `RefusedError`; units word the message."""
         if not self.minimum <= load <= self.maximum:
             raise RefusedError(
                 Code.FLUX_LIMIT,

@@ -2,26 +2,7 @@
 
 
 class Pacer:
-    """
-    Computes how far a simulation should have got.
-
-    Parameters
-    ----------
-    start : int
-        Simulated time in ns to begin at.
-    factor : float
-        Simulated seconds per second; 0 for as fast as possible.
-    paused : bool
-        Whether to begin paused.
-
-    Attributes
-    ----------
-    factor : float
-        As given.
-    paused : bool
-        Whether time is held.
-
-    """
+    """Computes how far a simulation should have got, in ns; factor 0 is as fast as possible."""
 
     def __init__(self, start: int, factor: float, *, paused: bool = False) -> None:
         """Begin at a time; it runs from the first call of `target` on."""

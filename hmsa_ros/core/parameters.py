@@ -117,17 +117,7 @@ class NondimensionalParameters:
 
 @dataclass(frozen=True)
 class Geometry:
-    """
-    What sizes and law make of parameters in SI units, for a block and for a beam.
-
-    Attributes
-    ----------
-    half_length, half_thickness : float
-        In m, greater than 0.
-    law : Elastic, optional
-        That of a beam says more of its sizes.
-
-    """
+    """What sizes (m) and law make of parameters in SI units, for a block and for a beam."""
 
     half_length: float
     half_thickness: float

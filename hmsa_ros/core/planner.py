@@ -45,24 +45,7 @@ __all__ = ['Options', 'Plan', 'PlannedLevel', 'PlannedSegment', 'Planner']
 
 
 class Planner(RunningPlan):
-    """
-    Keeps one timeline and replaces its future on request.
-
-    Parameters
-    ----------
-    actuator : ActuatorParameters
-        The block.
-    options : Options
-        How to plan.
-    stretch : float
-        Stretch at rest before the first request; default that without a field.
-
-    Raises
-    ------
-    BadInputError
-        If the stretch or the options are out of range.
-
-    """
+    """Keeps one timeline and replaces its future on request."""
 
     def __init__(
             self, actuator: ActuatorParameters, options: Options, *,
@@ -121,34 +104,11 @@ class Planner(RunningPlan):
             self, points: Sequence[tuple[float, int]], stamp: int | None,
             now: int) -> Steps[Draft | None]:
         """
-        Work out a setpoint sequence.
+        Work out a sequence of points: stretch, and end in ns from the start, strictly increasing.
 
-        Parameters
-        ----------
-        points : sequence of (float, int)
-            Stretch, and time in ns from the start of the sequence until which it lasts,
-            strictly increasing.
-        stamp : int or None
-            Start of the sequence in ns; None for now. A future one keeps the running plan
-            until then, a past one joins the sequence in the middle.
-        now : int
-            Current time in ns.
-
-        Returns
-        -------
-        Draft or None
-            For `take`; None where the request changes nothing.
-
-        Yields
-        ------
-        None
-            Wherever it may be continued later.
-
-        Raises
-        ------
-        RefusedError
-            If the request cannot be carried out.
-
+        ``stamp`` is the start in ns, or None for now. A future one keeps the running plan until
+        then, a past one joins the sequence in the middle. The draft is None where the request
+        changes nothing; what cannot be carried out is a `RefusedError`.
         """
         yield from check_points(points, self.model.material.rest)
         soonest = self.soonest(now)
@@ -162,11 +122,7 @@ class Planner(RunningPlan):
         """
         Work out levels in T, in force from times in ns on that count from a stamp, or from now.
 
-        Raises
-        ------
-        RefusedError
-            If they cannot be carried out.
-
+        What cannot be carried out is a `RefusedError`.
         """
         check_levels(points, self.model)
         soonest = self.soonest(now)

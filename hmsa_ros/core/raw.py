@@ -29,11 +29,7 @@ def check_levels(points: Sequence[tuple[float, int]], model: Model) -> None:
     """
     Check flux densities in T and the times in ns from the start from which they apply.
 
-    Raises
-    ------
-    RefusedError
-        If there are none, times do not increase, or a level is outside the coil's limits.
-
+    Where there are none, times do not increase or the coil has no such level: `RefusedError`.
     """
     least, most = model.options.flux_density_min, model.options.flux_density_max
     if not points:
@@ -59,33 +55,10 @@ def check_levels(points: Sequence[tuple[float, int]], model: Model) -> None:
 
 def draft_levels(outset: Outset, points: Sequence[tuple[float, int]]) -> Steps[Draft]:
     """
-    Plan checked levels.
+    Plan checked levels (T, ns); their one setpoint is the stretch that the last one holds.
 
-    Where the motion has not ended with the last of them, a shaped move to the stretch that it
-    holds takes its place.
-
-    Parameters
-    ----------
-    outset : Outset
-        Where the first of them applies.
-    points : sequence of (float, int)
-        Levels in T, and times in ns from which they apply.
-
-    Returns
-    -------
-    Draft
-        With one setpoint, the stretch that the last level holds.
-
-    Yields
-    ------
-    None
-        Where it may pause.
-
-    Raises
-    ------
-    RefusedError
-        If the motion goes beyond the limits of the block, or there is no way to rest.
-
+    Where the motion has not ended with the last of them, a shaped move to that stretch takes its
+    place. A motion beyond the limits of the block, or without a way to rest, is a `RefusedError`.
     """
     model, state = outset.model, outset.state
     levels: list[PlannedLevel] = []

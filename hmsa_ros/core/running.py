@@ -29,27 +29,7 @@ class RunningPlan:
     """
     One timeline, of which the past is what really took effect.
 
-    Parameters
-    ----------
-    model : Model
-        Under which the next request is planned.
-    stretch : float
-        Stretch at rest before the first request.
-
-    Attributes
-    ----------
-    model : Model
-        As given.
-    plan : Plan
-        In force.
-    revision : int
-        Grows whenever what is going to happen changes: a draft made before is no good then.
-
-    Raises
-    ------
-    BadInputError
-        If the stretch is out of range.
-
+    ``revision`` grows whenever what is going to happen changes: drafts made before are no good.
     """
 
     def __init__(self, model: Model, stretch: float) -> None:
@@ -76,24 +56,10 @@ class RunningPlan:
             self, stamp: int, stretch: float, rate: float, in_force: float,
             flux_density: float | None = None) -> None:
         """
-        Go on from a state that was measured; plans are dropped.
+        Drop plans and go on from a state measured at a stamp in ns, with the rate in 1/s.
 
-        Parameters
-        ----------
-        stamp : int
-            Time in ns that it belongs to.
-        stretch, rate : float
-            The rate in 1/s.
-        in_force : float
-            Flux density in T.
-        flux_density : float, optional
-            Level in T that a slew limit is still ramping to; default the one in force.
-
-        Raises
-        ------
-        BadInputError
-            If a number is not finite, or the stretch is outside the limits.
-
+        ``in_force`` is the field in T, ``flux_density`` the level that a slew limit still ramps
+        to. A state that the block cannot have is a `BadInputError`.
         """
         model = self.model
         check_stretch(stretch, model.material, 'stretch in force')

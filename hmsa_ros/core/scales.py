@@ -30,26 +30,11 @@ _HALVINGS = 50
 
 @dataclass(frozen=True)
 class Coil:
-    """
-    What the coil and its amplifier can do.
+    """What the coil and its amplifier can do."""
 
-    Attributes
-    ----------
-    flux_density_min, flux_density_max : float
-        Range of the flux density in T, not empty.
-    slew_limit : float
-        Rate of the amplifier's ramps in T/s; 0 for steps.
-
-    Raises
-    ------
-    BadInputError
-        If the range is empty or a value is not finite or out of range.
-
-    """
-
-    flux_density_min: float
-    flux_density_max: float
-    slew_limit: float = 0.0
+    flux_density_min: float  #: in T
+    flux_density_max: float  #: in T
+    slew_limit: float = 0.0  #: ramps in T/s; 0 for steps
 
     def __post_init__(self) -> None:
         """Check the range."""
@@ -64,71 +49,28 @@ class Coil:
 
 @dataclass(frozen=True)
 class Scales:
-    """
-    What follows from an actuator's parameters and its coil.
+    """What follows from an actuator's parameters and its coil."""
 
-    Attributes
-    ----------
-    time_unit : float
-        L sqrt(rho/G) in s.
-    frequency : float
-        Undamped natural frequency about rest without field, in Hz.
-    c1 : float
-        Shape 2 H^2/L^2.
-    zeta, critical_zeta : float
-        Nondimensional damping, and that above which small motion about rest does not oscillate.
-    damping, critical_damping : float
-        The same as coefficients in N s/m.
-    flux_density_unit : float
-        Flux density of the load 1, mu0 G/Br in T.
-    flux_densities : tuple of (float, float)
-        Stretches within the coil's reach, and the flux density in T that holds each.
-    stretch_limits : tuple of float
-        Stretches at which the chains are fully extended.
-    held : tuple of float
-        Lowest and highest stretch that the coil can hold.
-    reached : tuple of float
-        Lowest and highest stretch that the two-step command reaches from rest within the coil's
-        range; that at rest without field on a side where there is none.
-    target, duration : float
-        Stretch of a usual move from rest and how long the two-step command takes, in s; both
-        NaN where there is none.
-
-    """
-
-    time_unit: float
-    frequency: float
-    c1: float
+    time_unit: float  #: L sqrt(rho/G) in s
+    frequency: float  #: undamped, about rest without field, in Hz
+    c1: float  #: shape 2 H^2/L^2
     zeta: float
-    critical_zeta: float
-    damping: float
+    critical_zeta: float  #: above which small motion about rest does not oscillate
+    damping: float  #: zeta as a coefficient in N s/m
     critical_damping: float
-    flux_density_unit: float
+    flux_density_unit: float  #: of the load 1, mu0 G/Br in T
+    #: Stretches within reach of the coil, and the T that hold them.
     flux_densities: tuple[tuple[float, float], ...]
-    stretch_limits: tuple[float, float]
-    held: tuple[float, float]
+    stretch_limits: tuple[float, float]  #: at which the chains are fully extended
+    held: tuple[float, float]  #: lowest and highest stretch that the coil can hold
+    #: The same that a two-step command reaches from rest; rest itself on a side without one.
     reached: tuple[float, float]
-    target: float
-    duration: float
+    target: float  #: of a usual move from rest; NaN for none
+    duration: float  #: of the two-step command for it, in s
 
 
 def scales(actuator: ActuatorParameters, coil: Coil) -> Scales:
-    """
-    Work out what follows from an actuator's parameters.
-
-    Parameters
-    ----------
-    actuator : ActuatorParameters
-        The block.
-    coil : Coil
-        Its coil. Ramps (``slew_limit``) are left out of account.
-
-    Returns
-    -------
-    Scales
-        Times, damping, flux densities and reach.
-
-    """
+    """Work out what follows from parameters and coil; ramps are left out of account."""
     material = actuator.nondimensional
     home = material.rest
     unit = actuator.flux_density_unit

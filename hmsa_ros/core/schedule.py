@@ -59,22 +59,10 @@ class CommandSchedule(Superseding[float]):
 
     def insert(self, stamp: int, value: float) -> bool:
         """
-        Take a command; those stamped at or after it are dropped.
+        Take a level in T from a stamp in ns on; return whether anything is different from before.
 
-        One that repeats the level of its time, as a heartbeat does, adds nothing.
-
-        Parameters
-        ----------
-        stamp : int
-            Time in ns from which the value applies.
-        value : float
-            Level in T.
-
-        Returns
-        -------
-        bool
-            Whether anything is different from before.
-
+        Commands stamped at or after it are dropped. One that repeats the level of its time, as a
+        heartbeat does, adds nothing.
         """
         if self._stamps and self._stamps[-1] == stamp and self._things[-1] == value:
             return False

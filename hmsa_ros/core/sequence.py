@@ -30,31 +30,14 @@ _LOOK, _LOOK_RTOL = 300, 1e-7
 
 @dataclass(frozen=True)
 class Segment:
-    """
-    One setpoint of a plan.
-
-    Attributes
-    ----------
-    setpoint : Setpoint
-        As requested.
-    begin : float
-        Time at which the move begins, from the start of the sequence.
-    start, end : State
-        Predicted at ``begin`` and at the end of the span (after the last change of level, for
-        an infinite span).
-    move : Move
-        The command; its times count from ``begin``.
-    holding : float
-        Load that holds the stretch once nothing creeps.
-
-    """
+    """One setpoint of a plan."""
 
     setpoint: Setpoint
-    begin: float
-    start: State
-    end: State
-    move: Move
-    holding: float
+    begin: float  #: when the move begins, from the start of the sequence
+    start: State  #: predicted at begin
+    end: State  #: predicted at the end of the span, or after the last change of level
+    move: Move  #: its times count from begin
+    holding: float  #: load that holds the stretch once nothing creeps
 
 
 def plan_sequence(
@@ -124,13 +107,7 @@ def segments(
     """
     Plan as `plan_sequence` does, setpoint by setpoint; the first may have a shaper of its own.
 
-    Raises
-    ------
-    RefusedError
-        If a setpoint cannot be had.
-    BadInputError
-        If an argument is out of range.
-
+    Raises `RefusedError` where a setpoint cannot be had, `BadInputError` for another argument.
     """
     if short_spell not in SHORT_SPELL:
         raise BadInputError(

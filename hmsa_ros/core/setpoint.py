@@ -18,25 +18,10 @@ def impossible(stretch: float, rest: float) -> str:
 
 @dataclass(frozen=True)
 class Setpoint:
-    """
-    A stretch and how long it lasts, the paper's (lambda_d, span).
+    """A stretch and how long it lasts, the paper's (lambda_d, span)."""
 
-    Attributes
-    ----------
-    stretch : float
-        Target; the deflection of a beam.
-    span : float
-        Time from leaving the previous setpoint to leaving this one, greater than 0; infinite
-        for the last one of a sequence that is held.
-
-    Raises
-    ------
-    BadInputError
-        If a value is not in range.
-
-    """
-
-    stretch: float
+    stretch: float  #: target; the deflection of a beam
+    #: Time from leaving the setpoint before to leaving this one, above 0; infinite to stay.
     span: float
 
     def __post_init__(self) -> None:

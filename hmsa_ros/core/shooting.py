@@ -35,22 +35,12 @@ Attempt = tuple[tuple[Level, ...], float] | None
 
 @dataclass(frozen=True)
 class Template:
-    """
-    Levels with their derivatives by the unknowns, two or, for a field that lags, three.
+    """Levels with their derivatives by the unknowns, two or, for a field that lags, three."""
 
-    Attributes
-    ----------
-    times, loads : ndarray, shape (n,)
-        Of the levels; the first at time 0, the last holds the target.
-    d_times, d_loads : ndarray, shape (n, 2) or (n, 3)
-        Derivatives by the unknowns.
-
-    """
-
-    times: Array
-    loads: Array
-    d_times: Array
-    d_loads: Array
+    times: Array  #: (n,), the first is 0
+    loads: Array  #: (n,), the last holds the target
+    d_times: Array  #: (n, 2) or (n, 3)
+    d_loads: Array  #: (n, 2) or (n, 3)
 
     @classmethod
     def of(cls, levels: Sequence[Level], unknowns: Sequence[tuple[str, int]]) -> 'Template':
@@ -76,25 +66,10 @@ def solve(
         template: Template, request: 'Request', delivery: Delivery | None = None, *,
         wait: float = 0.0) -> Attempt:
     """
-    Solve a template for rest at the target.
+    Solve a template for rest at the target; the delivery is that of the request unless given.
 
-    Parameters
-    ----------
-    template : Template
-        Levels to begin with, and which of their numbers are free.
-    request : Request
-        The move.
-    delivery : Delivery, optional
-        How commands reach the coil; default as in the request.
-    wait : float
-        Where branches creep and the amplifier ramps: rest is when the last ramp ends, or at least
-        so long after the last level begins, and on a grid whole periods.
-
-    Returns
-    -------
-    Attempt
-        Levels and time of rest, or None.
-
+    Where branches creep and the amplifier ramps, rest is when the last ramp ends, or at least
+    ``wait`` after the last level begins, and on a grid whole periods.
     """
     delivery = delivery or request.delivery
     times, loads = template.times.copy(), template.loads.copy()

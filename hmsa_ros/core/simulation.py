@@ -127,15 +127,7 @@ def followed_by(state: State, material: NondimensionalParameters) -> tuple[float
 def sampled(
         switches: Array, loads: Array, slopes: Array, times: Array, state: State,
         material: NondimensionalParameters, rtol: float, lag: float = 0.0) -> Array:
-    """
-    Return samples of stretch, rate, field and what branches follow, shape (3 + n, m).
-
-    Raises
-    ------
-    HmsaError
-        If the integration does not get through.
-
-    """
+    """Return stretch, rate, field and what branches follow, (3 + n, m), or raise `HmsaError`."""
     branches = np.column_stack([material.branches, followed_by(state, material)])
     out = np.empty((response_kernel.FOLLOWED + len(branches), times.size))
     status = response_kernel.trajectory_late(
@@ -275,15 +267,7 @@ class ActuatorSimulation:
         return self._all.equilibrium(0)
 
     def advance(self, time: int) -> None:
-        """
-        Integrate to a time in ns, as `Actuators.advance`.
-
-        Raises
-        ------
-        HmsaError
-            If the load is too large to follow.
-
-        """
+        """Integrate to a time in ns; a load too large to follow is an `HmsaError`."""
         failed = self._all.advance(time)
         self._all.changes.clear()
         if failed:

@@ -20,22 +20,10 @@ _INSIDE = 1e-3
 
 @dataclass(frozen=True)
 class Brake:
-    """
-    A load that stops a motion at its turning point.
-
-    Attributes
-    ----------
-    load : float
-        Held until then.
-    duration : float
-        Until then; 0 for what is at rest already.
-    stretch : float
-        There.
-
-    """
+    """A load that stops a motion at a stretch, its turning point, where it is held until then."""
 
     load: float
-    duration: float
+    duration: float  #: until then; 0 for what is at rest already
     stretch: float
 
 

@@ -37,85 +37,34 @@ ALWAYS = -2**62
 
 @dataclass(frozen=True)
 class Options:
-    """
-    How requests are planned.
+    """How requests are planned."""
 
-    Attributes
-    ----------
-    shaper : str
-        Name of a shaper.
-    short_spell : {'refuse', 'continue'}
-        For a span that ends before the move.
-    flux_density_min, flux_density_max : float
-        In T.
-    lead_time : int
-        In ns: how far ahead of its stamp a command is sent.
-    period : int
-        In ns: commands are stamped with multiples of it; 0 for any time.
-    slew_limit : float
-        Largest change of the flux density in T/s; infinite for steps.
-    order : int
-        Of the robust shaper.
-    errors : tuple of float or Ellipsoid
-        Of G, damping coefficient and J_lim, as shares, for which minimax plans.
-    coil_time_constant : float
-        In s: the field follows the amplifier with this lag of first order; 0 for at once.
-    creep_tolerance : float
-        Vibration that levels which follow creep may leave, as a share of the move.
-    pace : Pace
-        How fast the shaper smooth moves; the rate in 1/s.
-
-    """
-
-    shaper: str = 'two_step'
-    short_spell: str = 'refuse'
-    flux_density_min: float = -math.inf
-    flux_density_max: float = math.inf
-    lead_time: int = 50_000_000
-    period: int = 0
-    slew_limit: float = math.inf
-    order: int = 2
-    coil_time_constant: float = 0.0
+    shaper: str = 'two_step'  #: a name in `hmsa_ros.core.shapers.SHAPERS`
+    short_spell: str = 'refuse'  #: for a span that ends before the move: refuse or continue
+    flux_density_min: float = -math.inf  #: in T
+    flux_density_max: float = math.inf  #: in T
+    lead_time: int = 50_000_000  #: in ns, how far ahead of its stamp a command is sent
+    period: int = 0  #: in ns, of which stamps are multiples; 0 for any time
+    slew_limit: float = math.inf  #: in T/s; infinite for steps
+    order: int = 2  #: of the shapers robust and minimax
+    coil_time_constant: float = 0.0  #: in s, of a lag of first order; 0 for at once
+    #: Vibration that levels which follow creep may leave, as a share of the move.
     creep_tolerance: float = IDEAL.ripple
+    #: Of G, damping coefficient and J_lim, as shares, for which minimax plans.
     errors: Uncertainty = ERRORS
-    pace: Pace = PACE
+    pace: Pace = PACE  #: of the shaper smooth; the rate in 1/s
 
 
 @dataclass(frozen=True)
 class Model:
-    """
-    Everything that a prediction depends on: the block and how commands reach it.
-
-    Attributes
-    ----------
-    actuator : ActuatorParameters
-        The block.
-    options : Options
-        How to plan.
-    material : NondimensionalParameters
-        Of the block.
-    units : Units
-        Sizes of the nondimensional units of time (s) and load (T).
-    limits : Limits
-        Admissible loads.
-    delivery : Delivery
-        Nondimensional.
-    pace : Pace
-        Nondimensional.
-
-    Raises
-    ------
-    BadInputError
-        If the options are out of range.
-
-    """
+    """Everything that a prediction depends on: the block and how commands reach it."""
 
     actuator: ActuatorParameters
     options: Options
     material: NondimensionalParameters = field(init=False)
-    units: Units = field(init=False)
+    units: Units = field(init=False)  #: sizes of the nondimensional units of time (s) and load (T)
     limits: Limits = field(init=False)
-    delivery: Delivery = field(init=False)
+    delivery: Delivery = field(init=False)  #: nondimensional, as limits and pace are
     pace: Pace = field(init=False)
 
     def __post_init__(self) -> None:
@@ -178,36 +127,16 @@ class Model:
 
 @dataclass(frozen=True, slots=True)
 class PlannedLevel:
-    """
-    A change of level.
+    """A change of level, and what is predicted at its stamp."""
 
-    Attributes
-    ----------
-    stamp : int
-        Time in ns from which it applies.
-    flux_density : float
-        In T.
-    stretch, rate : float
-        Predicted at the stamp; the rate in 1/s.
-    in_force : float
-        Flux density in T predicted at the stamp, from which a slew limit ramps to the level.
-    model : Model
-        Under which the motion from the stamp on is predicted.
-    amplifier : float or None
-        Output of the amplifier in T predicted at the stamp; None where the field does not lag
-        behind it.
-    followed : tuple of float
-        What Maxwell branches have followed by then, in units of G; empty where they have relaxed.
-
-    """
-
-    stamp: int
-    flux_density: float
+    stamp: int  #: in ns, from which it applies
+    flux_density: float  #: in T
     stretch: float
-    rate: float
-    in_force: float
-    model: Model = field(repr=False)
-    amplifier: float | None = None
+    rate: float  #: in 1/s
+    in_force: float  #: in T, from which a slew limit ramps to the level
+    model: Model = field(repr=False)  #: of the motion from the stamp on
+    amplifier: float | None = None  #: its output in T; None where the field does not lag behind it
+    #: By Maxwell branches, in units of G; empty where they have relaxed.
     followed: tuple[float, ...] = ()
 
     def at(self, time: int) -> State:
@@ -265,59 +194,26 @@ class PlannedLevel:
 
 @dataclass(frozen=True, slots=True)
 class PlannedSegment:
-    """
-    One setpoint on the timeline.
+    """One setpoint on the timeline, times in ns."""
 
-    Attributes
-    ----------
-    stretch : float
-        Target.
-    begin : int
-        Time in ns at which the move begins.
-    arrival : int or None
-        Time in ns of rest at the target; None where it is only approached.
-    code : Code
-        Which command it is.
-    reason : str
-        Why it is not the requested one; empty if it is.
-    since : int
-        Time in ns from which the setpoint holds; the move may begin later.
-    vibration : float
-        Bound of what levels that follow creep leave of it in stretch, peak to peak.
-
-    """
-
-    stretch: float
-    begin: int
-    arrival: int | None
+    stretch: float  #: target
+    begin: int  #: of the move
+    arrival: int | None  #: of rest at the target; None where it is only approached
     code: Code
-    reason: str
-    since: int
+    reason: str  #: why it is not the requested command; empty if it is
+    since: int  #: from which the setpoint holds; the move may begin later
+    #: Bound of what levels that follow creep leave of it in stretch, peak to peak.
     vibration: float = 0.0
 
 
 @dataclass(frozen=True)
 class Plan:
-    """
-    What is going to happen, from the level in force on.
+    """What is going to happen, from the level in force on."""
 
-    Attributes
-    ----------
-    number : int
-        Counts accepted requests from 1; 0 before the first.
-    levels : tuple of PlannedLevel
-        By stamp; the first ones may lie in the past.
-    segments : tuple of PlannedSegment
-        By time.
-    kept : int
-        How many of them, the first ones, belong to earlier requests.
-
-    """
-
-    number: int
-    levels: tuple[PlannedLevel, ...]
-    segments: tuple[PlannedSegment, ...]
-    kept: int = 0
+    number: int  #: counts accepted requests from 1; 0 before the first
+    levels: tuple[PlannedLevel, ...]  #: by stamp; the first ones may lie in the past
+    segments: tuple[PlannedSegment, ...]  #: by time
+    kept: int = 0  #: how many segments, the first ones, belong to earlier requests
 
     def ahead(self, now: int, limit: int | None = None) -> tuple[PlannedLevel, ...]:
         """Return levels from the one in force on; none that is in force for ever."""
@@ -340,30 +236,15 @@ class Plan:
 
 @dataclass(frozen=True)
 class Draft:
-    """
-    A plan that has been worked out and not been taken yet.
+    """A plan that has been worked out and not been taken yet."""
 
-    Attributes
-    ----------
-    begin : int
-        Time in ns from which it replaces what was planned.
-    levels, segments : tuple
-        From then on.
-    resumed : int or None
-        Place of the first setpoint of the running plan that it plans anew; None for a new
-        request.
-    missed : int
-        How many setpoints are left out, since their time is over.
-    warning : PlannedSegment or None
-        The first that is not reached by the requested command, and only roughly.
-
-    """
-
-    begin: int
+    begin: int  #: in ns, from which it replaces what was planned
     levels: tuple[PlannedLevel, ...]
     segments: tuple[PlannedSegment, ...]
+    #: Place of the first setpoint of the running plan that it plans anew; None for a new request.
     resumed: int | None = None
-    missed: int = 0
+    missed: int = 0  #: setpoints left out, since their time is over
+    #: The first that is only roughly reached, by another command than requested.
     warning: PlannedSegment | None = None
 
     def delayed(self, delays: Sequence[int]) -> 'Draft':

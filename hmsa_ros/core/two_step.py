@@ -43,30 +43,14 @@ _WORK = kernels.work_space()
 
 @dataclass(frozen=True)
 class TwoStep:
-    """
-    Result of `plan_two_step`.
+    """Result of `plan_two_step`; loads and times are NaN where there are none."""
 
-    Attributes
-    ----------
-    code : Code
-        ``TWO_STEP`` or ``HOLD`` where the plan leaves no vibration; any other value says why
-        there is none.
-    beta_p : float
-        Intermediate load; NaN without a plan.
-    tau_p : float
-        Time at which the target is reached at rest; NaN without a plan.
-    beta_1 : float
-        Load that holds the target; NaN for a target outside the limits.
-    passes : int
-        Integrations that the solution took.
-
-    """
-
+    #: ``TWO_STEP`` or ``HOLD`` where the plan leaves no vibration, else why there is none.
     code: Code
-    beta_p: float
-    tau_p: float
-    beta_1: float
-    passes: int
+    beta_p: float  #: intermediate load
+    tau_p: float  #: time at which the target is reached at rest
+    beta_1: float  #: load that holds the target; NaN outside the limits
+    passes: int  #: integrations that the solution took
 
 
 def plan_two_step(
@@ -123,19 +107,9 @@ def plan_two_step(
 
 @dataclass(frozen=True)
 class TwoStepBatch:
-    """
-    Result of `plan_two_step_batch`: arrays of the broadcast shape.
+    """Result of `plan_two_step_batch`: arrays of the broadcast shape, as in `TwoStep`."""
 
-    Attributes
-    ----------
-    status : ndarray of int64
-        Keys of `CODES`.
-    beta_p, tau_p, beta_1 : ndarray of float64
-        As in `TwoStep`, NaN where there is no plan.
-
-    """
-
-    status: NDArray[np.int64]
+    status: NDArray[np.int64]  #: keys of `CODES`
     beta_p: NDArray[np.float64]
     tau_p: NDArray[np.float64]
     beta_1: NDArray[np.float64]

@@ -10,25 +10,13 @@ MU_0 = 1.25663706127e-6
 
 @dataclass(frozen=True)
 class Units:
-    """
-    Units in which messages give times and loads.
+    """Units in which messages give times and loads."""
 
-    Attributes
-    ----------
-    time, load : float
-        Size of the nondimensional unit in the named unit.
-    time_name, load_name : str
-        With a leading space; empty for nondimensional values.
-    coordinate : str
-        What a position is called.
-
-    """
-
-    time: float = 1.0
+    time: float = 1.0  #: size of the nondimensional unit in the named one, as load
     load: float = 1.0
-    time_name: str = ''
+    time_name: str = ''  #: with a leading space; empty for nondimensional values, as load_name
     load_name: str = ''
-    coordinate: str = 'stretch'
+    coordinate: str = 'stretch'  #: what a position is called
 
     def time_text(self, value: float) -> str:
         """Word a nondimensional time with four significant digits."""

@@ -36,29 +36,12 @@ def warm_up(
         say: Callable[[str], object] = lambda _: None, *, batch: bool = False,
         creep: bool = False, planning: bool = True) -> float:
     """
-    Run every kernel once.
+    Run every kernel once; return the seconds that it took.
 
-    Parameters
-    ----------
-    say : callable
-        Gets a sentence before the first kernel is compiled, if one must be.
-    batch : bool
-        Also the parallel one, which no node uses.
-    creep : bool
-        Also those for an elastomer that creeps.
-    planning : bool
-        Also those that plan, which no plant uses.
-
-    Returns
-    -------
-    float
-        Seconds that it took.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        If a signal that was noted asks for the end.
-
+    ``say`` gets a sentence before the first kernel is compiled, if one must be. ``batch`` adds the
+    parallel kernel, which no node uses; ``creep`` those for an elastomer that creeps; ``planning``
+    those that plan, which no plant uses. A noted signal that asks for the end is a
+    `KeyboardInterrupt`.
     """
     begin = perf_counter()
     with announced(say):

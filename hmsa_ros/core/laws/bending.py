@@ -127,14 +127,10 @@ def packed() -> tuple[float, ...]:
     """
     Return the constants of the kernel `hmsa_ros.core.laws.kernels.beam`.
 
-    Returns
-    -------
-    tuple of float
-        Number of pieces; deflections of the fold and of the end of the tables; inverse of the
-        share of ``1 - sqrt(1 - u/fold)`` that each piece has; force, stiffness, inertia and
-        damping at the end. Then of each piece: deflection and energy where it begins, and the
-        factors of the powers of what is beyond for force, inertia and damping.
-
+    Number of pieces; deflections of the fold and of the end of the tables; inverse of the
+    share of ``1 - sqrt(1 - u/fold)`` that each piece has; force, stiffness, inertia and
+    damping at the end. Then of each piece: deflection and energy where it begins, and the
+    factors of the powers of what is beyond for force, inertia and damping.
     """
     most = float(deflection(fold()))
     end = float(deflection(_TABLE_ANGLE))

@@ -8,37 +8,19 @@ from hmsa_ros.core.laws.record import Elastic
 
 @dataclass(frozen=True)
 class Coordinate:
-    """
-    What a position is, and which values it may have.
+    """What a position is, and which values it may have."""
 
-    Attributes
-    ----------
-    name, plural, symbol, tex : str
-        In sentences, and in the axes of figures.
-    meaning : str
-        What it is, and about which value.
-    rest : float
-        Without a field.
-    at_rest, possible, conceivable : tuple of float
-        What a sensor may show without a field, and usually, and what can be a position at all.
-    usual : tuple of float
-        Range of a motion that is not too large.
-    looks : str
-        What other values may be, and how to mend them; empty where the values tell.
-
-    """
-
-    name: str
+    name: str  #: in sentences, as plural
     plural: str
-    symbol: str
+    symbol: str  #: in axes of figures, as tex
     tex: str
-    meaning: str
-    rest: float
-    at_rest: tuple[float, float]
-    possible: tuple[float, float]
-    conceivable: tuple[float, float]
-    usual: tuple[float, float]
-    looks: str = ''
+    meaning: str  #: what it is, and about which value
+    rest: float  #: without a field
+    at_rest: tuple[float, float]  #: what a sensor may show without a field
+    possible: tuple[float, float]  #: what a sensor may usually show
+    conceivable: tuple[float, float]  #: what can be a position at all
+    usual: tuple[float, float]  #: range of a motion that is not too large
+    looks: str = ''  #: what other values may be, and how to mend them; empty where the values tell
 
 
 STRETCH = Coordinate(

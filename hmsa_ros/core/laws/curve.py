@@ -47,26 +47,13 @@ _LOOK = 24
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """
-    Level in T against stretch.
+    """Level in T against stretch, as a spline of degree 5."""
 
-    Attributes
-    ----------
-    breaks : ndarray, shape (p + 1,)
-        Stretches at which the pieces meet.
-    pieces : ndarray, shape (p, 6)
-        Factors of the powers of the stretch beyond the beginning of each piece, in T.
-    slope : float
-        At stretch 1, in T.
-    scatter : float
-        Standard deviation of the points in T, estimated.
-
-    """
-
-    breaks: Array
+    breaks: Array  #: (p + 1,), stretches at which the pieces meet
+    #: (p, 6), factors in T of the powers of the stretch beyond the beginning of each piece.
     pieces: Array
-    slope: float
-    scatter: float
+    slope: float  #: at stretch 1, in T
+    scatter: float  #: standard deviation of the points in T, estimated
 
     def at(self, stretch: float, order: int = 0) -> float:
         """Return the level at a stretch, or a derivative of it."""
@@ -77,19 +64,10 @@ class Curve:
 
     def packed(self, unit: float) -> tuple[float, ...]:
         """
-        Return the constants of the kernel `hmsa_ros.core.laws.kernels.table`.
+        Return the constants of the kernel `hmsa_ros.core.laws.kernels.table`, for a unit in T.
 
-        Parameters
-        ----------
-        unit : float
-            Of the level, in T.
-
-        Returns
-        -------
-        tuple of float
-            Number of pieces and depths of the stops; of each piece begin, energy there and
-            factors; end, energy, force and stiffness there.
-
+        Number of pieces and depths of the stops; of each piece begin, energy there and factors;
+        end, energy, force and stiffness there.
         """
         pieces = self.pieces / unit
         widths = np.diff(self.breaks)
@@ -110,24 +88,9 @@ class Curve:
 
 def points_in(name: str) -> tuple[list[float], list[float]]:
     """
-    Return the points of a file.
+    Return stretches and levels in T of a CSV with the columns ``stretch`` and ``flux_density``.
 
-    Parameters
-    ----------
-    name : str
-        Path of a CSV with the columns ``stretch`` and ``flux_density``; a relative one is from
-        the working directory.
-
-    Returns
-    -------
-    tuple of list of float
-        Stretches, and levels in T.
-
-    Raises
-    ------
-    BadInputError
-        If the file cannot be read, or a row cannot be used.
-
+    A file or row that cannot be used is a `BadInputError`.
     """
     from hmsa_ros.columns import read_table
 
@@ -179,25 +142,10 @@ def _check(
 @lru_cache(maxsize=32)
 def fitted(stretch: tuple[float, ...], flux: tuple[float, ...]) -> Curve:
     """
-    Return the curve through points.
+    Return the curve through points, which rises everywhere and is 0 at stretch 1.
 
-    Parameters
-    ----------
-    stretch : tuple of float
-        Rising, some below and some above 1.
-    flux : tuple of float
-        Levels that hold them, in T.
-
-    Returns
-    -------
-    Curve
-        It rises everywhere, and is 0 at stretch 1.
-
-    Raises
-    ------
-    BadInputError
-        If the points are no table, or no rising curve follows them within their scatter.
-
+    Points are stretches, rising from below 1 to above, and the levels in T that hold them. Points
+    that no rising curve follows within their scatter are a `BadInputError`.
     """
     _check(stretch, flux, 'law table', [f'row {i}' for i in range(1, len(stretch) + 1)])
     x, y = np.array(stretch), np.array(flux)

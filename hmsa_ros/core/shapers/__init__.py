@@ -35,15 +35,7 @@ SHAPERS: dict[str, Shaper] = {
 
 
 def get_shaper(name: str) -> Shaper:
-    """
-    Return the shaper of a name in `SHAPERS`.
-
-    Raises
-    ------
-    BadInputError
-        If there is none of that name.
-
-    """
+    """Return the shaper of a name in `SHAPERS`, a `BadInputError` for another."""
     try:
         return SHAPERS[name]
     except KeyError:

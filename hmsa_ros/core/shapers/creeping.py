@@ -38,15 +38,7 @@ _SHORTEST = 1e-9
 
 
 def check(material: NondimensionalParameters, shaper: str) -> None:
-    """
-    Refuse what creep is not planned for.
-
-    Raises
-    ------
-    BadInputError
-        If something creeps and the shaper is another than `SHAPERS`.
-
-    """
+    """Refuse with `BadInputError` another shaper than `SHAPERS` for what creeps."""
     if material.creep and shaper not in SHAPERS:
         raise BadInputError(
             f'shaper {shaper} does not know of viscoelastic.ratio: expected one of '
@@ -98,15 +90,7 @@ def two_levels(request: Request, plain: Move) -> Attempt:
 
 
 def free_levels(request: Request) -> Move:
-    """
-    Come to rest by two levels of free heights.
-
-    Raises
-    ------
-    RefusedError
-        If there are none within the limits.
-
-    """
+    """Come to rest by two levels of free heights; `RefusedError` if the limits have none."""
     found = free_heights(request, [('load', 0), ('load', 1)])
     if found is None:
         raise RefusedError(
@@ -135,25 +119,8 @@ def held(request: Request, found: Move, span: float) -> Move:
     """
     Return a move with the staircase that keeps it at rest while branches relax.
 
-    Parameters
-    ----------
-    request : Request
-        The move.
-    found : Move
-        As a shaper answers, with times as commands carry them.
-    span : float
-        Time from the start of the move until which it is held.
-
-    Returns
-    -------
-    Move
-        As it was where nothing creeps or the target is only approached.
-
-    Raises
-    ------
-    RefusedError
-        If a level is outside the limits.
-
+    Its times are as commands carry them; it is held until ``span`` after its start. Where nothing
+    creeps, or the target is only approached, it stays as it was.
     """
     material, delivery = request.material, request.delivery
     if not material.creep or not found.duration < np.inf:

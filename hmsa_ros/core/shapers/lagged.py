@@ -132,11 +132,7 @@ def three_levels(request: Request, code: Code, reason: str) -> Move:
     """
     Come to rest by three levels of free heights: the shortest of those within the limits.
 
-    Raises
-    ------
-    RefusedError
-        If there is none of up to seven half periods.
-
+    Where there are none of up to seven half periods: `RefusedError`.
     """
     found = free_heights(request, _FREE_LOADS)
     if found is None:

@@ -36,24 +36,6 @@ def ei(request: Request) -> Move:
 
     The undamped amplitudes are weighted with the decay over half a period, as is usual for
     light damping.
-
-    Parameters
-    ----------
-    request : Request
-        The move.
-
-    Returns
-    -------
-    Move
-        Three levels.
-
-    Raises
-    ------
-    RefusedError
-        If the target lies outside the stretch limits or needs a load outside the limits.
-    BadInputError
-        If the elastomer creeps.
-
     """
     return _shaped(
         request, (1.0 + _EI_TOLERANCE, 2.0 * (1.0 - _EI_TOLERANCE), 1.0 + _EI_TOLERANCE))

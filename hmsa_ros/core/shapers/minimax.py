@@ -59,26 +59,10 @@ def minimax(request: Request) -> Move:
     """
     Command a move that leaves the least vibration at the worst, within ``request.errors``.
 
-    Parameters
-    ----------
-    request : Request
-        The move. It takes as long as the chain of ``request.order`` two-step commands, and its
-        levels are within those of the chain and the loads that hold start and target.
-
-    Returns
-    -------
-    Move
-        Some levels and the one that holds the target. At arrival some vibration is left even if
-        the model is exact, about as much as at the worst. Where no such command is better than
-        the chain, what `robust` answers.
-
-    Raises
-    ------
-    RefusedError
-        As `robust`.
-    BadInputError
-        If the order is below 1, an error is out of range, or the elastomer creeps.
-
+    It takes as long as the chain of ``request.order`` two-step commands, and its levels are within
+    those of the chain and the loads that hold start and target. At arrival some vibration is left
+    even if the model is exact, about as much as at the worst. Where no such command is better than
+    the chain, it is what `robust` answers.
     """
     as_errors(request.errors)
     check(request.material, 'minimax')
@@ -208,15 +192,10 @@ def _designed(request: Request) -> Move:
 
 @dataclass(frozen=True)
 class _Frame:
-    """
-    Times of levels and of their end, what they may be, and the last levels.
+    """Times of levels and of their end, what they may be, and the last levels."""
 
-    Where a field lags, a push between the levels and the last one settles it: its time is the
-    last one of ``times``, and ``last`` that of the level that holds the target.
-    """
-
-    times: list[float]
-    last: float
+    times: list[float]  #: the last is that of the push that settles a lagging field, if it does
+    last: float  #: time of the level that holds the target
     low: Array
     high: Array
 
@@ -361,22 +340,10 @@ def _starts(request: Request, chain: Move, times: Sequence[float]) -> list[Array
 
 def least_largest(now: Array, slopes: Array, low: Array, high: Array) -> Array:
     """
-    Return what makes the longest of some vectors shortest, vectors being linear in it.
+    Return what makes the longest of some vectors shortest, to a percent or so of the least.
 
-    Parameters
-    ----------
-    now : ndarray, shape (n, 2)
-        The vectors at 0.
-    slopes : ndarray, shape (n, 2, m)
-        Their derivatives.
-    low, high : ndarray, shape (m,)
-        Bounds of the result, around 0.
-
-    Returns
-    -------
-    ndarray, shape (m,)
-        To a percent or so of the least.
-
+    Vectors are ``now`` (n, 2) at 0, with derivatives ``slopes`` (n, 2, m); the result (m,) is
+    between the bounds ``low`` and ``high`` around 0.
     """
     x: Array = np.zeros(len(low))
     best, least, vectors = x, largest(now), now

@@ -38,29 +38,8 @@ def minimum_time(request: Request, reason: str = '') -> Move:
 
     With bounded load the fastest transfer is bang-bang with one switch. It exists from any
     state, moving ones and those above critical damping included, as long as the limits leave
-    room on both sides of the target's own load. Without limits, a push of twice the move's
-    change of load is used.
-
-    Parameters
-    ----------
-    request : Request
-        The move.
-    reason : str
-        Why it takes the place of another command.
-
-    Returns
-    -------
-    Move
-        Three levels.
-
-    Raises
-    ------
-    RefusedError
-        If the target lies outside the stretch limits, needs a load outside the limits, or the
-        limits leave no room.
-    BadInputError
-        If the elastomer creeps.
-
+    room on both sides of the target's own load: `RefusedError` otherwise. Without limits, a push
+    of twice the move's change of load is used. ``reason`` is why it takes the place of another.
     """
     check(request.material, 'minimum_time')
     holding = request.holding_load()

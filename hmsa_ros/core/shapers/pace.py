@@ -11,25 +11,11 @@ LEAST_PERIODS, MOST_PERIODS = 0.2, 50.0
 
 @dataclass(frozen=True)
 class Pace:
-    """
-    How fast the shaper smooth moves.
+    """How fast the shaper smooth moves."""
 
-    Attributes
-    ----------
-    periods : float
-        Natural periods about the target that a move takes at the least, 0.2 to 50.
-    rate : float
-        Largest stretch rate, above 0; infinite for any.
-
-    Raises
-    ------
-    BadInputError
-        If a value is out of range.
-
-    """
-
+    #: Natural periods about the target that a move takes at the least, 0.2 to 50.
     periods: float = 1.0
-    rate: float = math.inf
+    rate: float = math.inf  #: largest stretch rate, above 0; infinite for any
 
     def __post_init__(self) -> None:
         """Check the numbers."""

@@ -23,13 +23,9 @@ LARGEST_ERROR = 0.9
 
 def as_errors(values: Sequence[float] | Ellipsoid) -> Uncertainty:
     """
-    Return errors of G, damping coefficient and J_lim, checked; an ellipsoid is checked already.
+    Return errors of G, damping coefficient and J_lim; an ellipsoid is checked already.
 
-    Raises
-    ------
-    BadInputError
-        If they are not three numbers of 0 to 0.9.
-
+    Others than three numbers of 0 to 0.9 are a `BadInputError`.
     """
     if isinstance(values, Ellipsoid):
         return values
@@ -42,43 +38,18 @@ def as_errors(values: Sequence[float] | Ellipsoid) -> Uncertainty:
 
 @dataclass(frozen=True)
 class Request:
-    """
-    One move to be commanded.
-
-    Attributes
-    ----------
-    state : State
-        At the start, moving or at rest.
-    target : float
-        Stretch to come to rest at.
-    material : NondimensionalParameters
-        zeta, J_lim and c1.
-    limits : Limits
-        Admissible loads.
-    delivery : Delivery
-        How commands reach the coil.
-    order : int
-        Number of chained two-step commands of the robust shaper, at least 1; minimax takes as
-        long.
-    units : Units
-        For the messages.
-    errors : tuple of float or Ellipsoid
-        Of G, damping coefficient and J_lim, as `as_errors` returns them: minimax plans for
-        these.
-    pace : Pace
-        How fast the shaper smooth moves; the rate per unit of nondimensional time.
-
-    """
+    """One move to be commanded, from a state of motion or rest to rest at a target."""
 
     state: State
     target: float
     material: NondimensionalParameters
     limits: Limits = field(default_factory=Limits)
     delivery: Delivery = IDEAL
-    order: int = 2
-    units: Units = field(default_factory=Units)
+    order: int = 2  #: chained two-step commands of robust, at least 1; minimax takes as long
+    units: Units = field(default_factory=Units)  #: for the messages
+    #: Of G, damping coefficient and J_lim, as `as_errors` returns them, for minimax.
     errors: Uncertainty = ERRORS
-    pace: Pace = PACE
+    pace: Pace = PACE  #: of smooth; the rate per unit of nondimensional time
 
     @property
     def named_target(self) -> str:
@@ -108,15 +79,7 @@ class Request:
         return all(self.limits.minimum <= x.load <= self.limits.maximum for x in levels)
 
     def holding_load(self) -> float:
-        """
-        Check the target and return the signed load that holds it, beta_1.
-
-        Raises
-        ------
-        RefusedError
-            If the target lies outside the stretch limits or beta_1 outside the load limits.
-
-        """
+        """Return the load that holds the target, beta_1; `RefusedError` outside the limits."""
         try:
             check_stretch(self.target, self.material, 'target stretch')
         except BadInputError as error:

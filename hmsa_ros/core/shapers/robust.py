@@ -25,24 +25,9 @@ def robust(request: Request) -> Move:
     """
     Command a move through ``request.order`` chained two-step commands.
 
-    Parameters
-    ----------
-    request : Request
-        The move; of order 1 it is the two-step command itself.
-
-    Returns
-    -------
-    Move
-        ``order + 1`` levels on ideal hardware, about ``order`` times as long as the two-step
-        command. Where there is none, what `two_step` answers.
-
-    Raises
-    ------
-    RefusedError
-        As `two_step`.
-    BadInputError
-        If the order is below 1.
-
+    It has ``order + 1`` levels on ideal hardware, and takes about ``order`` times as long as the
+    two-step command, which is that of order 1. Where there is no chain, it is what `two_step`
+    answers. An order below 1 is a `BadInputError`.
     """
     if request.order < 1:
         raise BadInputError(f'order is {request.order}: expected at least 1')

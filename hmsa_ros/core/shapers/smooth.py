@@ -56,21 +56,8 @@ def smooth(request: Request) -> Move:
     """
     Command a move along a smooth path of the stretch, in the shortest time that limits allow.
 
-    Parameters
-    ----------
-    request : Request
-        The move; ``request.pace`` has its least duration and largest rate.
-
-    Returns
-    -------
-    Move
-        Levels that follow the path and end at rest exactly, and the one that holds the target.
-
-    Raises
-    ------
-    RefusedError
-        If the target is out of range, or no path keeps the limits.
-
+    ``request.pace`` has its least duration and largest rate. The move ends at rest exactly. Where
+    no path keeps the limits: `RefusedError`.
     """
     holding = request.holding_load()
     if _there(request):

@@ -10,25 +10,10 @@ from hmsa_ros.core.status import Code, RefusedError
 
 def through(request: Request, duration: float) -> Move:
     """
-    Plan levels, each as long as the others, that lead to rest in a given time.
+    Plan levels, each as long as the others, from any state to rest after a duration.
 
-    Parameters
-    ----------
-    request : Request
-        From any state.
-    duration : float
-        Until rest at the target.
-
-    Returns
-    -------
-    Move
-        Two levels and the holding one; three before it where the field lags.
-
-    Raises
-    ------
-    RefusedError
-        If there is no such move within the limits.
-
+    There are two levels and the holding one, and three before it where the field lags. Where the
+    limits have no such move: `RefusedError`.
     """
     holding = request.holding_load()
     count = 3 if request.delivery.lag > 0.0 else 2

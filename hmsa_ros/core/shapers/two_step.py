@@ -39,23 +39,6 @@ def two_step(request: Request) -> Move:
     leads to rest within the limits, two are used. Where the response is too damped to cross
     the target there is no such command; the plain step, which does not overshoot there, takes
     its place. Both say so in the move's reason.
-
-    Parameters
-    ----------
-    request : Request
-        The move.
-
-    Returns
-    -------
-    Move
-        Two levels on ideal hardware.
-
-    Raises
-    ------
-    RefusedError
-        If the target lies outside the stretch limits, or no command within the load limits
-        was found.
-
     """
     if request.delivery.lag > 0.0:
         return _late(request)
