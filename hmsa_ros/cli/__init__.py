@@ -59,22 +59,20 @@ def build_parser() -> Parser:
     parser.add_argument('--version', action='version', version=f'hmsa_ros {__version__}')
     subparsers = parser.add_subparsers(metavar='COMMAND', required=True)
     for name in COMMANDS:
-        import_module(f'hmsa_ros.cli.{name}').add_parser(subparsers)
-    for command in subparsers.choices.values():
-        command.set_defaults(parser=command)
+        module = import_module(f'hmsa_ros.cli.{name}')
+        before = set(subparsers.choices)
+        module.add_parser(subparsers)
+        for added in subparsers.choices.keys() - before:
+            command = subparsers.choices[added]
+            command.set_defaults(parser=command, run=module.run)
     return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """
-    Run the ``hmsa`` command.
+    Run the ``hmsa`` command; return its exit status.
 
-    Returns
-    -------
-    int
-        Exit status: 0 done, 1 the run failed, 2 bad input, 130 interrupted
-        (SIGINT; 143 by SIGTERM, 129 by SIGHUP).
-
+    0 is done, 1 the run failed, 2 bad input, 130 interrupted (SIGINT; 143 SIGTERM, 129 SIGHUP).
     """
     words = list(sys.argv[1:] if argv is None else argv)
     arguments, unknown = build_parser().parse_known_args(split_ros_args(words))

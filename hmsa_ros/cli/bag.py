@@ -8,6 +8,7 @@ import sys
 from typing import Any
 
 from hmsa_ros.bag.limits import CHUNK_SIZE, MEBIBYTE
+from hmsa_ros.cli.options import add_options, JSON
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError, printable
 from hmsa_ros.files import json_text
@@ -26,17 +27,10 @@ def add_parser(subparsers: Any) -> None:
         'info', help='print the contents of a bag',
         description='Print topics, counts, rates, losses, duration and parameters of a bag.',
         epilog='example: hmsa bag info hmsa_demo/run --json')
-    info.add_argument('bag', metavar='BAG', help='folder of a bag, or an .mcap file')
-    info.add_argument('--json', action='store_true', help='print one JSON object')
-    info.set_defaults(run=run, action=_info)
     recover = actions.add_parser(
         'recover', help='rescue a readable bag from a truncated one',
         description='Copy everything readable in a bag to a new bag.',
         epilog='example: hmsa bag recover cut_off_run --out saved_run')
-    recover.add_argument('bag', metavar='BAG', help='folder of a bag, or an .mcap file')
-    recover.add_argument(
-        '--out', metavar='DIR', required=True, help='folder of the new bag; must not exist')
-    recover.set_defaults(run=run, action=_recover)
     verify = actions.add_parser(
         'verify', help='integrate the recorded commands and compare with the recorded motion',
         description='Integrate the recorded commands with the recorded parameters and print '
@@ -44,20 +38,24 @@ def add_parser(subparsers: Any) -> None:
                     'it is larger than the tolerance, if the bag is damaged, or if a command '
                     'was never applied.',
         epilog='example: hmsa bag verify hmsa_demo/run --tolerance 1e-6')
-    verify.add_argument('bag', metavar='BAG', help='folder of a bag, or an .mcap file')
-    verify.add_argument(
-        '--tolerance', type=float, default=1e-9, metavar='D',
-        help='largest difference of the stretch, or of the deflection of a beam, that passes '
-             '(default %(default)g)')
-    verify.add_argument(
-        '--params-file', type=Path, metavar='YAML',
-        help='parameter file (YAML) of the actuator, for a bag without its parameters')
-    verify.add_argument('--json', action='store_true', help='print one JSON object')
-    verify.set_defaults(run=run, action=_verify)
-    for action in (info, recover, verify):
-        action.add_argument(
-            '--max-chunk', type=float, default=CHUNK_SIZE / MEBIBYTE, metavar='MIB',
-            help='largest chunk or message to read, in MiB (default %(default)g)')
+    tolerance = (
+        '--tolerance', 'D', float,
+        'largest difference of the stretch, or of the deflection of a beam, that passes '
+        '(default %(default)g)', {'default': 1e-9})
+    params_file = (
+        '--params-file', 'YAML', Path,
+        'parameter file (YAML) of the actuator, for a bag without its parameters')
+    out = ('--out', 'DIR', str, 'folder of the new bag; must not exist', {'required': True})
+    max_chunk = (
+        '--max-chunk', 'MIB', float,
+        'largest chunk or message to read, in MiB (default %(default)g)',
+        {'default': CHUNK_SIZE / MEBIBYTE})
+    for action, function, options in (
+            (info, _info, [JSON]), (recover, _recover, [out]),
+            (verify, _verify, [tolerance, params_file, JSON])):
+        action.add_argument('bag', metavar='BAG', help='folder of a bag, or an .mcap file')
+        add_options(action, *options, max_chunk)
+        action.set_defaults(action=function)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -66,8 +64,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     Raises
     ------
-    HmsaError
-        If an option is out of range, or the bag cannot be read.
+    BadInputError
+        If an option is out of range.
 
     """
     if not 0.0 < arguments.max_chunk <= _LARGEST_CHUNK:

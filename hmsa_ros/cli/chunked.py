@@ -6,8 +6,9 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 import sys
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
+from hmsa_ros.cli.options import Row
 from hmsa_ros.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -16,19 +17,16 @@ if TYPE_CHECKING:
     from hmsa_ros.studies.executors import Start
 
 
-def add_options(parser: Any, *, workers: str) -> None:
-    """Add the options of the engine."""
-    parser.add_argument('--workers', type=int, metavar='N', help=workers)
-    parser.add_argument(
-        '--shard', metavar='I/N',
-        help='compute part I of N only, as a job of an array does; I from 0 to N-1 or from 1 to N')
-    parser.add_argument(
-        '--dask', metavar='ADDRESS',
-        help='compute on a Dask cluster: its address, its scheduler file (.json), or "local"; '
-             'all workers must see the folder of --out')
-    parser.add_argument(
-        '--resume', action='store_true',
-        help='keep the chunks of an earlier run that are there and whole')
+def options(workers: str) -> tuple[Row, ...]:
+    """Return the options of the engine."""
+    return (
+        ('--workers', 'N', int, workers),
+        ('--shard', 'I/N', str,
+         'compute part I of N only, as a job of an array does; I from 0 to N-1 or from 1 to N'),
+        ('--dask', 'ADDRESS', str,
+         'compute on a Dask cluster: its address, its scheduler file (.json), or "local"; all '
+         'workers must see the folder of --out'),
+        ('--resume', 'keep the chunks of an earlier run that are there and whole'))
 
 
 def asked(arguments: argparse.Namespace) -> list[str]:

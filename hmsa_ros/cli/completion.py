@@ -26,53 +26,24 @@ _FOLDERS = ('DIR',)
 
 @dataclass(frozen=True)
 class Option:
-    """
-    An option.
+    """An option."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Short and long.
-    text : str
-        What it does.
-    value : str
-        ``''`` for none, ``'file'``, ``'folder'``, ``'any'``, or ``'one'`` of ``choices``.
-    choices : tuple of str
-        Values that there are.
-
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # short and long
     text: str
-    value: str = ''
+    value: str = ''  # '' for none, 'file', 'folder', 'any', or 'one' of the choices
     choices: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Command:
-    """
-    A command, or the program itself.
+    """A command, or the program itself."""
 
-    Attributes
-    ----------
-    path : str
-        Its words without the program's name, with spaces between.
-    text : str
-        What it does.
-    options : tuple of Option
-        In the order of the help.
-    words : dict of str to str
-        What its positional arguments may be, and what that means: commands, or choices.
-    files : bool
-        Whether they are files.
-
-    """
-
-    path: str
+    path: str  # its words without the program's name, with spaces between
     text: str
     options: tuple[Option, ...]
+    # Commands or choices that its positional arguments may be, and what they mean.
     words: dict[str, str] = field(default_factory=dict)
-    files: bool = False
+    files: bool = False  # whether positional arguments are files
 
 
 def add_parser(subparsers: Any) -> None:
@@ -84,7 +55,6 @@ def add_parser(subparsers: Any) -> None:
                     'fish: hmsa completion fish > ~/.config/fish/completions/hmsa.fish',
         epilog='example: hmsa completion bash')
     parser.add_argument('shell', choices=tuple(_SCRIPTS), help='the shell')
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -6,7 +6,9 @@ import os
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
+from hmsa_ros.cli.options import add_options
 from hmsa_ros.cli.progress import progress
+from hmsa_ros.cli.tables import table
 from hmsa_ros.ending import ENDING
 from hmsa_ros.files import json_text
 
@@ -23,11 +25,10 @@ def add_parser(subparsers: Any) -> None:
                     'that is 20 % stiffer than it knows. Writes a bag, two pictures and the '
                     'logs.',
         epilog='example: hmsa demo --out my_first_run')
-    parser.add_argument(
-        '--out', type=Path, metavar='DIR',
-        help='output folder (default hmsa_demo/ plus date and time)')
-    parser.add_argument('--json', action='store_true', help='print the result as JSON')
-    parser.set_defaults(run=run)
+    add_options(
+        parser,
+        ('--out', 'DIR', Path, 'output folder (default hmsa_demo/ plus date and time)'),
+        ('--json', 'print the result as JSON'))
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -62,33 +63,29 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _print_table(result: 'DemoResult') -> None:
-    from rich.box import SIMPLE
     from rich.console import Console
-    from rich.table import Table
 
-    table = Table(box=SIMPLE, collapse_padding=True, pad_edge=False, caption=(
+    console = Console()
+    moves = table(
         'b and tau nondimensional as in the paper; residual: peak-to-peak stretch after '
-        'arrival, share of the step; unshaped: simulated on the same plant'))
-    for name in ('target', 'b_p', 'tau_p', 'b_1', 'arrival ms', 'residual', 'unshaped'):
-        table.add_column(name, justify='right', no_wrap=True)
-    table.add_column('held', no_wrap=True)
+        'arrival, share of the step; unshaped: simulated on the same plant',
+        ('target', 'b_p', 'tau_p', 'b_1', 'arrival ms', 'residual', 'unshaped'), 'held')
     for x in result.setpoints:
-        table.add_row(
+        moves.add_row(
             f'{x.stretch:g}', f'{x.b_p:.5f}', f'{x.tau_p:.5f}', f'{x.b_1:.5f}',
             f'{x.arrival * 1e3:.3f}', f'{x.residual:.1e}', f'{x.residual_unshaped:.1%}',
             'yes' if x.reached else 'no')
-    console = Console()
-    console.print(table)
-    table = Table(box=SIMPLE, collapse_padding=True, pad_edge=False, caption=(
+    console.print(moves)
+    adapted = table(
         'a larger block, simulated in this process, whose shear modulus is 20 % above that '
-        'planned with; vibration after the arrival and rest beside the target, share of the step'))
-    for name in ('feedback', 'target', 'arrival ms', 'vibration', 'offset'):
-        table.add_column(name, justify='right', no_wrap=True)
+        'planned with; vibration after the arrival and rest beside the target, share of the step',
+        ('feedback', 'target', 'arrival ms', 'vibration', 'offset'))
     for y in result.adapting.results:
-        table.add_row(
+        adapted.add_row(
             y.feedback, f'{y.stretch:g}', f'{y.arrival * 1e3:.1f}', f'{y.vibration:.2%}',
             f'{y.offset:+.2%}')
-    console.print(table)
-    console.print(f'bag      {result.bag}', highlight=False, soft_wrap=True)
-    console.print(f'picture  {result.picture}', highlight=False, soft_wrap=True)
-    console.print(f'         {result.adapting.picture}', highlight=False, soft_wrap=True)
+    console.print(adapted)
+    for line in (
+            f'bag      {result.bag}', f'picture  {result.picture}',
+            f'         {result.adapting.picture}'):
+        console.print(line, highlight=False, soft_wrap=True)

@@ -1,12 +1,12 @@
 """``hmsa excite``: the sequence of levels to record for identification."""
 
 import argparse
-import json
 import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.files import write_text
+from hmsa_ros.cli.options import add_options, JSON
+from hmsa_ros.files import json_text, write_text
 
 if TYPE_CHECKING:
     from hmsa_ros.core.parameters import ActuatorParameters
@@ -22,45 +22,29 @@ def add_parser(subparsers: Any) -> None:
                     "it with plain steps and with the paper's sequence, repeated for the same "
                     'time.',
         epilog='example: hmsa excite --params-file actuator.yaml --duration 2 --out levels.csv')
-    parser.add_argument(
-        '--params-file', type=Path, metavar='YAML', dest='params_file',
-        help='parameter file with what is known of the block, flux_density_min, '
-             'flux_density_max and slew_limit (default: the defaults of the nodes)')
-    parser.add_argument(
-        '--duration', type=float, metavar='S',
-        help='duration in s (default 180 periods of the block)')
-    parser.add_argument(
-        '--free', default='', metavar='NAME,...', help='parameters to identify, as in hmsa '
-                                                       'identify')
-    parser.add_argument(
-        '--stretch-min', type=float, metavar='X', dest='stretch_min',
-        help='smallest stretch allowed (default 0.6; a deflection of -0.6 for a beam)')
-    parser.add_argument(
-        '--stretch-max', type=float, metavar='X', dest='stretch_max',
-        help='largest stretch allowed (default 2; a deflection of 0.6 for a beam)')
-    parser.add_argument(
-        '--rate', type=float, default=1000.0, metavar='HZ',
-        help='sample rate of the sensor in Hz (default 1000)')
-    parser.add_argument(
-        '--noise', type=float, default=1e-3, metavar='X',
-        help='standard deviation of the stretch samples (default 0.001)')
-    parser.add_argument(
-        '--out', type=Path, metavar='CSV',
-        help='CSV to write, with the columns time and flux_density; an existing file is replaced')
-    parser.add_argument('--json', action='store_true', help='print one JSON object')
-    parser.set_defaults(run=run)
+    add_options(
+        parser,
+        ('--params-file', 'YAML', Path,
+         'parameter file with what is known of the block, flux_density_min, flux_density_max and '
+         'slew_limit (default: the defaults of the nodes)'),
+        ('--duration', 'S', float, 'duration in s (default 180 periods of the block)'),
+        ('--free', 'NAME,...', str, 'parameters to identify, as in hmsa identify',
+         {'default': ''}),
+        ('--stretch-min', 'X', float,
+         'smallest stretch allowed (default 0.6; a deflection of -0.6 for a beam)'),
+        ('--stretch-max', 'X', float,
+         'largest stretch allowed (default 2; a deflection of 0.6 for a beam)'),
+        ('--rate', 'HZ', float, 'sample rate of the sensor in Hz (default 1000)',
+         {'default': 1000.0}),
+        ('--noise', 'X', float, 'standard deviation of the stretch samples (default 0.001)',
+         {'default': 1e-3}),
+        ('--out', 'CSV', Path,
+         'CSV to write, with the columns time and flux_density; an existing file is replaced'),
+        JSON)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """
-    Design, write and print.
-
-    Raises
-    ------
-    BadInputError
-        If a file or a number cannot be used.
-
-    """
+    """Design, write and print."""
     from hmsa_ros.identification.excitation import Bounds, excite
     from hmsa_ros.identification.files import read_belief
     from hmsa_ros.identification.quantities import DEFAULT_FREE
@@ -78,10 +62,9 @@ def run(arguments: argparse.Namespace) -> int:
         lines = ['time,flux_density', *(f'{x:.9f},{y:.9g}' for x, y in rows)]
         write_text(arguments.out, '\n'.join(lines) + '\n')
     if arguments.json:
-        print(json.dumps({
-            'duration': found.duration, **_record(found.best), 'improvement': _finite(
-                found.improvement), 'plain': _record(found.plain),
-            'paper': _record(found.paper)}, indent=2, allow_nan=False))
+        print(json_text({
+            'duration': found.duration, **_record(found.best), 'improvement': found.improvement,
+            'plain': _record(found.plain), 'paper': _record(found.paper)}))
         return 0
     for line in table(found, belief.actuator):
         print(line)
@@ -90,37 +73,17 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
 def _record(program: 'Program') -> dict[str, Any]:
     """Return a sequence as JSON."""
     return {
         'levels': [[x, y] for x, y in zip(
             program.level_times.tolist(), program.levels.tolist(), strict=True)],
-        'std': {name: _finite(x) for name, x in program.std.items()},
-        'stretch_min': program.reach[0], 'stretch_max': program.reach[1],
-        'ends_at_rest': program.ends_at_rest}
+        'std': program.std, 'stretch_min': program.reach[0],
+        'stretch_max': program.reach[1], 'ends_at_rest': program.ends_at_rest}
 
 
 def table(found: 'Excitation', actuator: 'ActuatorParameters') -> list[str]:
-    """
-    Return the information in the sequences, a line each.
-
-    Parameters
-    ----------
-    found : Excitation
-        As designed.
-    actuator : ActuatorParameters
-        That they move.
-
-    Returns
-    -------
-    list of str
-        Aligned.
-
-    """
+    """Return the information in the sequences, aligned, a line each."""
     from hmsa_ros.identification.quantities import modulus_of
 
     programs = (found.best, found.plain, found.paper)

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from hmsa_ros.cli.options import add_options
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
 
@@ -18,12 +19,12 @@ def add_parser(subparsers: Any) -> None:
         epilog='example: hmsa export hmsa_demo/run --out run.csv')
     parser.add_argument(
         'run_path', type=Path, metavar='RUN', help='folder of a bag, or an .mcap file')
-    parser.add_argument(
-        '--out', type=Path, required=True, metavar='FILE',
-        help='file to write, ending in .csv or .parquet; an existing file is replaced')
-    parser.add_argument(
-        '--joint', default='', metavar='NAME', help='joint to export, if the bag has several')
-    parser.set_defaults(run=run)
+    add_options(
+        parser,
+        ('--out', 'FILE', Path,
+         'file to write, ending in .csv or .parquet; an existing file is replaced',
+         {'required': True}),
+        ('--joint', 'NAME', str, 'joint to export, if the bag has several', {'default': ''}))
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -32,8 +33,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     Raises
     ------
-    HmsaError
-        If the bag cannot be read or a file cannot be written.
+    BadInputError
+        If the bag has several runs.
 
     """
     from hmsa_ros.runs.bags import read_runs

@@ -18,7 +18,6 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         '--out', type=Path, default=Path('figures'), metavar='DIR',
         help='output folder, created if missing (default figures)')
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

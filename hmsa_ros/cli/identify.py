@@ -6,6 +6,7 @@ from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
 
+from hmsa_ros.cli.options import add_options, JSON
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import write_text
 
@@ -25,33 +26,26 @@ def add_parser(subparsers: Any) -> None:
         epilog='example: hmsa identify camera.csv --commands levels.csv --out actuator.yaml')
     parser.add_argument(
         'recording', type=Path, metavar='RUN', help='a bag, or a CSV of samples')
-    parser.add_argument(
-        '--commands', type=Path, metavar='CSV',
-        help='CSV of time, flux_density: the level in force from that time on')
-    parser.add_argument(
-        '--params-file', type=Path, metavar='YAML', dest='params_file',
-        help='parameter file with what is known, such as geometry and density')
-    parser.add_argument(
-        '--free', default='', metavar='NAME,...',
-        help='parameters to identify (default shear_modulus, damping_coefficient, chain_limit, '
-             'remanence, stretch_bias); others: density, time_unit, stretch_gain, '
-             'sensor_latency, coil_time_constant, constant_force, initial_stretch, '
-             'initial_rate, viscoelastic_ratio, viscoelastic_time')
-    parser.add_argument(
-        '--joint', default='', metavar='NAME', help='joint to identify, if the bag has several')
-    parser.add_argument(
-        '--profile', default='', metavar='NAME',
-        help='also print the profile likelihood of this parameter')
-    parser.add_argument(
-        '--out', type=Path, metavar='YAML',
-        help='parameter file to write for planner and plant, only if identified; an existing '
-             'file is replaced')
-    parser.add_argument(
-        '--report', type=Path, metavar='HTML',
-        help='HTML page to write: data, fit, residuals and intervals; an existing file is '
-             'replaced')
-    parser.add_argument('--json', action='store_true', help='print one JSON object')
-    parser.set_defaults(run=run)
+    add_options(
+        parser,
+        ('--commands', 'CSV', Path,
+         'CSV of time, flux_density: the level in force from that time on'),
+        ('--params-file', 'YAML', Path,
+         'parameter file with what is known, such as geometry and density'),
+        ('--free', 'NAME,...', str,
+         'parameters to identify (default shear_modulus, damping_coefficient, chain_limit, '
+         'remanence, stretch_bias); others: density, time_unit, stretch_gain, sensor_latency, '
+         'coil_time_constant, constant_force, initial_stretch, initial_rate, '
+         'viscoelastic_ratio, viscoelastic_time', {'default': ''}),
+        ('--joint', 'NAME', str, 'joint to identify, if the bag has several', {'default': ''}),
+        ('--profile', 'NAME', str, 'also print the profile likelihood of this parameter',
+         {'default': ''}),
+        ('--out', 'YAML', Path,
+         'parameter file to write for planner and plant, only if identified; an existing file is '
+         'replaced'),
+        ('--report', 'HTML', Path,
+         'HTML page to write: data, fit, residuals and intervals; an existing file is replaced'),
+        JSON)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -137,20 +131,7 @@ def _read(
 
 
 def table(found: 'Identification') -> list[str]:
-    """
-    Return the result, a line each.
-
-    Parameters
-    ----------
-    found : Identification
-        What was found.
-
-    Returns
-    -------
-    list of str
-        Aligned.
-
-    """
+    """Return the result, aligned, a line each."""
     lines = [f'{"parameter":<22}{"value":>14}{"std":>11}{"95 % interval":>28}  unit']
     for key in found.names:
         name, x = found.shown(key)

@@ -1,14 +1,14 @@
 """``hmsa init``: a parameter file for one's own actuator, with what follows from it."""
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
-import json
 import math
 from pathlib import Path
 import sys
 from typing import Any, cast, TYPE_CHECKING
 
+from hmsa_ros.cli.options import add_options, JSON, Row
 from hmsa_ros.cli.quantities import (
     BEAM,
     BY_KEY,
@@ -22,7 +22,7 @@ from hmsa_ros.cli.quantities import (
 )
 from hmsa_ros.contract.parameters import PUBLISH_RATE
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import write_text
+from hmsa_ros.files import json_text, write_text
 
 if TYPE_CHECKING:
     from hmsa_ros.core.parameters import ActuatorParameters
@@ -53,49 +53,36 @@ def add_parser(subparsers: Any) -> None:
         epilog='example: hmsa init --half-length 5mm --half-thickness 5mm --density 1.9g/cm3 \\\n'
                '    --shear-modulus 30kPa --j-lim 20 --zeta 0.1 --remanence 80mT \\\n'
                '    --flux-max 200mT --out my_actuator.yaml')
-    parser.add_argument(
-        '--beam', action='store_true',
-        help='a beam, clamped at one end and free at the other, magnetised along its length, in a '
-             'field across it; its setpoints are deflections of the tip over the length')
-    for quantity in QUANTITIES:
-        unit = f' [{quantity.unit}]' if quantity.unit else ''
-        default = _FOLLOWS.get(quantity.key) or f'{quantity.default:g}'
-        parser.add_argument(
-            quantity.option, type=_reader(quantity), metavar='X', dest=quantity.key,
-            help=f'{quantity.text}{unit} (default {default})')
-    for quantity in BEAM:
-        if quantity.key not in BY_KEY:
-            unit = f' [{quantity.unit}]' if quantity.unit else ''
-            parser.add_argument(
-                quantity.option, type=_reader(quantity), metavar='X', dest=quantity.key,
-                help=f'{quantity.text}{unit} (default {quantity.default:g}), with --beam')
-    parser.add_argument(
-        DAMPING.option, type=_reader(DAMPING), metavar='X', dest=DAMPING.key,
-        help=f'{DAMPING.text} [{DAMPING.unit}], in place of --zeta; with --beam of its tip, in '
-             'place of --damping-ratio')
-    parser.add_argument(
-        '--joint', default='', metavar='NAME',
-        help=f'joint name (default {_JOINT}), or several separated by commas for identical '
-             'actuators')
-    parser.add_argument(
-        '--out', type=Path, default=_FILE, metavar='FILE',
-        help=f'file to write (default {_FILE})')
-    parser.add_argument('--force', action='store_true', help='replace an existing file')
-    parser.add_argument(
-        '--yes', action='store_true', help='do not ask; use the defaults for values that are '
-                                           'not given')
-    parser.add_argument('--json', action='store_true', help='print one JSON object')
-    parser.set_defaults(run=run)
+    add_options(
+        parser,
+        ('--beam',
+         'a beam, clamped at one end and free at the other, magnetised along its length, in a '
+         'field across it; its setpoints are deflections of the tip over the length'),
+        *(_option(x) for x in (
+            *QUANTITIES, *(x for x in BEAM if x.key not in BY_KEY), DAMPING)),
+        ('--joint', 'NAME', str,
+         f'joint name (default {_JOINT}), or several separated by commas for identical actuators',
+         {'default': ''}),
+        ('--out', 'FILE', Path, f'file to write (default {_FILE})', {'default': _FILE}),
+        ('--force', 'replace an existing file'),
+        ('--yes', 'do not ask; use the defaults for values that are not given'),
+        JSON)
 
 
-def _reader(quantity: Quantity) -> Callable[[str], float]:
-    """Return the reader of an option's value."""
+def _option(quantity: Quantity) -> Row:
+    """Return the option of a quantity."""
     def read(text: str) -> float:
         try:
             return quantity.parse(text)
         except BadInputError as error:
             raise argparse.ArgumentTypeError(str(error)) from error
-    return read
+
+    note = ', in place of --zeta; with --beam of its tip, in place of --damping-ratio'
+    if quantity is not DAMPING:
+        default = _FOLLOWS.get(quantity.key) or f'{quantity.default:g}'
+        note = f' (default {default}){"" if quantity.key in BY_KEY else ", with --beam"}'
+    unit = f' [{quantity.unit}]' if quantity.unit else ''
+    return quantity.option, 'X', read, f'{quantity.text}{unit}{note}'
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -148,11 +135,9 @@ def run(arguments: argparse.Namespace) -> int:
     for doubt in doubts:
         print(f'hmsa: warning: {doubt}', file=sys.stderr)
     if arguments.json:
-        print(json.dumps({
+        print(json_text({
             'file': str(path), 'joints': joints, 'parameters': _parameters(actuator, coil),
-            'scales': {key: None if isinstance(x, float) and math.isnan(x) else x
-                       for key, x in asdict(found).items()},
-            'warnings': doubts}, indent=2))
+            'scales': asdict(found), 'warnings': doubts}))
         return 0
     for line in table(found, actuator):
         print(line)

@@ -33,7 +33,7 @@ def add_parser(subparsers: Any) -> None:
             usage=f'hmsa {name} [-h] [--ros-args ...]',
             epilog='ROS arguments are parameters (-p NAME:=VALUE, --params-file FILE) and '
                    f'remappings (-r FROM:=TO). example: hmsa {name} --ros-args {_EXAMPLES[name]}')
-        parser.set_defaults(run=run, node=name)
+        parser.set_defaults(node=name)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
+from hmsa_ros.cli.options import add_options, MATERIAL
 from hmsa_ros.cli.setpoints import setpoint
 from hmsa_ros.core.setpoint import impossible
 from hmsa_ros.errors import BadInputError
@@ -30,40 +31,28 @@ def add_parser(subparsers: Any) -> None:
         'setpoints', nargs='+', type=setpoint, metavar='STRETCH:SPAN',
         help='stretch, or deflection of a beam, to come to rest at, and how long this setpoint '
              'lasts (move plus hold)')
-    parser.add_argument(
-        '--start', type=float, metavar='S',
-        help='initial stretch, at rest (default 1; 0 for the deflection of a beam)')
-    parser.add_argument(
-        '--zeta', type=float, metavar='Z',
-        help='nondimensional damping coefficient, at least 0 (default 0.2)')
-    parser.add_argument(
-        '--j-lim', type=float, metavar='J',
-        help='chain limit of the Gent model, above 0 (default 5)')
-    parser.add_argument(
-        '--c1', type=float, metavar='C',
-        help='shape 2 H^2/L^2, above 0 (default 2)')
-    parser.add_argument(
-        '--shaper', metavar='NAME',
-        help='two_step (default), robust, minimax, minimum_time, smooth, step, zv, zvd or ei')
-    parser.add_argument(
-        '--order', type=int, default=2, metavar='N',
-        help='two-step commands that robust chains; minimax takes as long (default 2)')
-    parser.add_argument(
-        '--errors', metavar='G,C,J',
-        help='errors of shear modulus, damping coefficient and chain limit, as shares, for which '
-             'minimax plans (default 0.1,0.1,0.1, or where 95 %% of the covariance lie that hmsa '
-             'identify wrote to --params-file)')
-    parser.add_argument(
-        '--periods', type=float, default=1.0, metavar='N',
-        help='natural periods that a move of smooth takes at the least (default 1)')
-    parser.add_argument(
-        '--max-rate', type=float, default=math.inf, metavar='R',
-        help='largest stretch rate on the way of smooth (default any)')
-    parser.add_argument(
-        '--params-file', type=Path, metavar='YAML',
-        help='parameter file (YAML) of planner and plant, for a plan in seconds and tesla')
-    parser.add_argument('--json', action='store_true', help='print JSON in full precision')
-    parser.set_defaults(run=run)
+    add_options(
+        parser,
+        ('--start', 'S', float,
+         'initial stretch, at rest (default 1; 0 for the deflection of a beam)'),
+        *((option, metavar, float, text) for option, metavar, text in MATERIAL),
+        ('--shaper', 'NAME', str,
+         'two_step (default), robust, minimax, minimum_time, smooth, step, zv, zvd or ei'),
+        ('--order', 'N', int,
+         'two-step commands that robust chains; minimax takes as long (default 2)',
+         {'default': 2}),
+        ('--errors', 'G,C,J', str,
+         'errors of shear modulus, damping coefficient and chain limit, as shares, for which '
+         'minimax plans (default 0.1,0.1,0.1, or where 95 %% of the covariance lie that hmsa '
+         'identify wrote to --params-file)'),
+        ('--periods', 'N', float,
+         'natural periods that a move of smooth takes at the least (default 1)',
+         {'default': 1.0}),
+        ('--max-rate', 'R', float, 'largest stretch rate on the way of smooth (default any)',
+         {'default': math.inf}),
+        ('--params-file', 'YAML', Path,
+         'parameter file (YAML) of planner and plant, for a plan in seconds and tesla'),
+        ('--json', 'print JSON in full precision'))
 
 
 def run(arguments: argparse.Namespace) -> int:

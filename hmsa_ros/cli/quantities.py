@@ -39,42 +39,18 @@ _ZHAO = 'Zhao et al., J. Mech. Phys. Solids 124 (2019) 244'
 
 @dataclass(frozen=True)
 class Quantity:
-    """
-    A number that the user gives.
+    """A number that the user gives."""
 
-    Attributes
-    ----------
-    key : str
-        Name in the code and, with hyphens, of the option.
-    parameter : str
-        Name of the nodes' parameter.
-    text : str
-        What it is.
-    unit : str
-        SI unit; empty for a dimensionless number.
-    default : float or None
-        None where it follows from another, see `default_of`.
-    least, largest : float
-        What the nodes take.
-    usual : tuple of float
-        What is usual; beyond it a warning is given.
-    source : str
-        Why that is usual, for the warning.
-    hints : tuple of (float, float, str)
-        Ranges with a guess at what went wrong there.
-
-    """
-
-    key: str
-    parameter: str
+    key: str  # name in the code and, with hyphens, of the option
+    parameter: str  # name of the nodes' parameter
     text: str
-    unit: str
-    default: float | None
-    least: float
+    unit: str  # SI; empty for a dimensionless number
+    default: float | None  # None where it follows from another, see `default_of`
+    least: float  # what the nodes take
     largest: float
-    usual: tuple[float, float]
-    source: str
-    hints: tuple[tuple[float, float, str], ...] = ()
+    usual: tuple[float, float]  # beyond it a warning is given
+    source: str  # why that is usual
+    hints: tuple[tuple[float, float, str], ...] = ()  # ranges, and what may have gone wrong there
 
     @classmethod
     def of(

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
+from hmsa_ros.cli.options import add_options
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import write_text
@@ -23,20 +24,19 @@ def add_parser(subparsers: Any) -> None:
         epilog='example: hmsa report hmsa_demo/run --out run.html --pdf run.pdf')
     parser.add_argument(
         'bags', nargs='+', type=Path, metavar='BAG', help='folder of a bag, or an .mcap file')
-    parser.add_argument(
-        '--out', type=Path, metavar='FILE',
-        help='page to write; an existing file is replaced (default: NAME_report.html in this '
-             'folder, NAME being the first bag)')
-    parser.add_argument('--png', type=Path, metavar='FILE', help='picture to write as well')
-    parser.add_argument(
-        '--pdf', type=Path, metavar='FILE', help='picture to write as well, for a paper')
+    add_options(
+        parser,
+        ('--out', 'FILE', Path,
+         'page to write; an existing file is replaced (default: NAME_report.html in this folder, '
+         'NAME being the first bag)'),
+        ('--png', 'FILE', Path, 'picture to write as well'),
+        ('--pdf', 'FILE', Path, 'picture to write as well, for a paper'))
     parser.add_argument(
         '--params-file', '--params', dest='params', type=Path, metavar='YAML',
         help='parameter file (YAML) of the real actuator (default: the parameters in the bag)')
     parser.add_argument(
         '--joint', default='', metavar='NAME',
         help='joint to show, or several separated by commas (default: those with commands)')
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

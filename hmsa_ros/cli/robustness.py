@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli import chunked
+from hmsa_ros.cli.options import add_options, MATERIAL
 from hmsa_ros.cli.plan import given, refuse_fixed
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text, make_folder
@@ -47,50 +48,34 @@ def add_parser(subparsers: Any) -> None:
                     'residual over the duration; pictures as PDF too; existing files are '
                     'replaced.',
         epilog='example: hmsa robustness --move 1.0:1.4 1.2:0.8 --errors 0.05 --order 2 3 4')
-    parser.add_argument(
-        '--move', nargs='+', type=_move, metavar='START:TARGET',
-        help='moves from one stretch at rest to another (default 1.0:1.1 1.0:1.4 1.0:0.7; of a '
-             'beam 0:0.1 0:0.4)')
-    parser.add_argument(
-        '--shapers', metavar='NAME,...',
-        help='shapers, separated by commas (default all, or all that know of the creep of the '
-             'parameter file)')
-    parser.add_argument(
-        '--errors', type=float, default=0.1, metavar='E',
-        help='largest error in the table and the box, as a share (default 0.1); the curves go '
-             'to twice that')
-    parser.add_argument(
-        '--order', nargs='+', type=int, metavar='N',
-        help='orders of robust and minimax (default 2 3)')
-    parser.add_argument(
-        '--zeta', type=float, metavar='Z',
-        help='nominal nondimensional damping coefficient, at least 0 (default 0.2)')
-    parser.add_argument(
-        '--j-lim', type=float, metavar='J',
-        help='nominal chain limit of the Gent model, above 0 (default 5)')
-    parser.add_argument(
-        '--c1', type=float, metavar='C',
-        help='shape 2 H^2/L^2, above 0 (default 2)')
-    parser.add_argument(
-        '--out', type=Path, metavar='DIR',
-        help='output folder, created if missing (default robustness; with --feedback feedback)')
-    parser.add_argument(
-        '--feedback', action='store_true',
-        help='compare open loop with corrections from samples instead: vibration and offset '
-             'after moves with G up to 20 %% off, noise, delay and an unknown bias of the '
-             'sensor; takes minutes; of the other options --params-file, --seeds, --out, '
-             '--json and those below; writes files only with --out or --shard, --dask and '
-             '--resume')
-    parser.add_argument(
-        '--params-file', type=Path, metavar='YAML', dest='params_file',
-        help='actuator and coil in place of --zeta, --j-lim and --c1, of any law; with '
-             '--feedback seen by a camera (default: blocks and sensors of a list)')
-    parser.add_argument(
-        '--seeds', type=int, default=10, metavar='N',
-        help='runs with different noise for --feedback (default 10)')
-    chunked.add_options(parser, workers='processes (default 1)')
-    parser.add_argument('--json', action='store_true', help='print JSON in full precision')
-    parser.set_defaults(run=run)
+    add_options(
+        parser,
+        ('--move', 'START:TARGET', _move,
+         'moves from one stretch at rest to another (default 1.0:1.1 1.0:1.4 1.0:0.7; of a beam '
+         '0:0.1 0:0.4)', {'nargs': '+'}),
+        ('--shapers', 'NAME,...', str,
+         'shapers, separated by commas (default all, or all that know of the creep of the '
+         'parameter file)'),
+        ('--errors', 'E', float,
+         'largest error in the table and the box, as a share (default 0.1); the curves go to '
+         'twice that', {'default': 0.1}),
+        ('--order', 'N', int, 'orders of robust and minimax (default 2 3)', {'nargs': '+'}),
+        *((option, metavar, float, text if option == '--c1' else f'nominal {text}')
+          for option, metavar, text in MATERIAL),
+        ('--out', 'DIR', Path,
+         'output folder, created if missing (default robustness; with --feedback feedback)'),
+        ('--feedback',
+         'compare open loop with corrections from samples instead: vibration and offset after '
+         'moves with G up to 20 %% off, noise, delay and an unknown bias of the sensor; takes '
+         'minutes; of the other options --params-file, --seeds, --out, --json and those below; '
+         'writes files only with --out or --shard, --dask and --resume'),
+        ('--params-file', 'YAML', Path,
+         'actuator and coil in place of --zeta, --j-lim and --c1, of any law; with --feedback '
+         'seen by a camera (default: blocks and sensors of a list)'),
+        ('--seeds', 'N', int, 'runs with different noise for --feedback (default 10)',
+         {'default': 10}),
+        *chunked.options('processes (default 1)'),
+        ('--json', 'print JSON in full precision'))
 
 
 def run(arguments: argparse.Namespace) -> int:

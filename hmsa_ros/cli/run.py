@@ -1,17 +1,20 @@
 """``hmsa run``: a whole experiment with one command."""
 
 import argparse
+from dataclasses import asdict
 from datetime import datetime
-import json
 import math
 import os
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
+from hmsa_ros.cli.options import add_options, NAMESPACE
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.setpoints import add_sequence, levels_of
+from hmsa_ros.cli.tables import table
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.files import json_text
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -35,32 +38,26 @@ def add_parser(subparsers: Any) -> None:
                     'rest and closes the bag.',
         epilog='example: hmsa run 1.10:0.2 1.20:0.2 1.00:0.2 --simulate')
     add_sequence(parser)
-    parser.add_argument(
-        '--simulate', action='store_true',
-        help='start a planner and a simulated plant for this run, which lead simulated time')
-    parser.add_argument(
-        '--params-file', type=Path, metavar='YAML', dest='params_file',
-        help='parameter file: of the nodes to start, or to hold those that run against')
-    parser.add_argument(
-        '--feedback', choices=('off', 'observe', 'adapt'), metavar='MODE',
-        help='off, observe or adapt: what the planner does with the samples; a planner that runs '
-             'already must be set to it (default as it is; off)')
-    parser.add_argument(
-        '--tolerance', type=float, metavar='X',
-        help='offset and residual vibration of a setpoint that counts as reached, as a share of '
-             'the step, noise of the sensor apart (default 0.02); the end of --levels is judged '
-             "by the planner's arrival_tolerance and vibration_tolerance")
-    parser.add_argument('--report', action='store_true', help='write report.html as well')
-    parser.add_argument(
-        '--out', type=Path, metavar='DIR',
-        help='folder for the output (default hmsa_run/ and the time of day)')
-    parser.add_argument('--json', action='store_true', help='print the result as JSON')
-    parser.add_argument(
-        '--namespace', default='', metavar='NS', help='namespace of the planner')
-    parser.add_argument(
-        '--joint', default='actuator', metavar='NAMES',
-        help='joint, or joints with commas between (default actuator)')
-    parser.set_defaults(run=run)
+    add_options(
+        parser,
+        ('--simulate',
+         'start a planner and a simulated plant for this run, which lead simulated time'),
+        ('--params-file', 'YAML', Path,
+         'parameter file: of the nodes to start, or to hold those that run against'),
+        ('--feedback', 'MODE', str,
+         'off, observe or adapt: what the planner does with the samples; a planner that runs '
+         'already must be set to it (default as it is; off)',
+         {'choices': ('off', 'observe', 'adapt')}),
+        ('--tolerance', 'X', float,
+         'offset and residual vibration of a setpoint that counts as reached, as a share of the '
+         'step, noise of the sensor apart (default 0.02); the end of --levels is judged by the '
+         "planner's arrival_tolerance and vibration_tolerance"),
+        ('--report', 'write report.html as well'),
+        ('--out', 'DIR', Path, 'folder for the output (default hmsa_run/ and the time of day)'),
+        ('--json', 'print the result as JSON'),
+        NAMESPACE,
+        ('--joint', 'NAMES', str, 'joint, or joints with commas between (default actuator)',
+         {'default': 'actuator'}))
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -97,11 +94,11 @@ def run(arguments: argparse.Namespace) -> int:
         return ENDING.status
     verdict, reason = _verdict(measured, done, levels=bool(experiment.levels))
     if arguments.json:
-        print(json.dumps({
-            'verdict': verdict, 'reason': reason, 'setpoints': [_record(x) for x in measured],
-            **({'levels': [_record(x) for x in levels]} if experiment.levels else {}),
-            'notes': list(done.notes), 'exits': done.exits, 'bag': str(experiment.bag),
-            'report': None if report is None else str(report)}, indent=2, allow_nan=False))
+        print(json_text({
+            'verdict': verdict, 'reason': reason, 'setpoints': [asdict(x) for x in measured],
+            **({'levels': [asdict(x) for x in levels]} if experiment.levels else {}),
+            'notes': done.notes, 'exits': done.exits, 'bag': str(experiment.bag),
+            'report': None if report is None else str(report)}))
     else:
         _print(measured, levels, reason, done, experiment.bag, report)
     return 0 if verdict in ('arrived', NOT_MEASURED) else 1
@@ -188,37 +185,24 @@ def _verdict(
     return missed[0].verdict, f'{missed[0].sentence()}{rest}'
 
 
-def _record(arrival: 'Arrival | LevelResult') -> dict[str, Any]:
-    """Return a setpoint or a level as JSON."""
-    from dataclasses import asdict
-
-    return {key: None if isinstance(x, float) and not math.isfinite(x) else x
-            for key, x in asdict(arrival).items()}
-
-
 def _print(
         measured: 'list[Arrival]', levels: 'list[LevelResult]', reason: str, done: 'Conducted',
         bag: Path, report: Path | None) -> None:
-    from rich.box import SIMPLE
     from rich.console import Console
-    from rich.table import Table
 
     console = Console()
     if levels:
         console.print(_level_table(levels))
     if measured:
-        table = Table(box=SIMPLE, collapse_padding=True, pad_edge=False, caption=(
+        moves = table(
             'measured after arrival: mean, its distance from the target, and vibration from peak '
-            'to peak'))
-        for name in ('target', 'reached', 'offset', 'residual', 'arrival ms'):
-            table.add_column(name, justify='right', no_wrap=True)
-        table.add_column('verdict', no_wrap=True)
+            'to peak', ('target', 'reached', 'offset', 'residual', 'arrival ms'), 'verdict')
         for x in measured:
-            table.add_row(
+            moves.add_row(
                 f'{x.joint} {x.stretch:g}' if len({y.joint for y in measured}) > 1
                 else f'{x.stretch:g}', f'{x.reached:.5f}', f'{x.offset:+.1e}',
                 f'{x.residual:.1e}', f'{x.arrival * 1e3:.3f}', x.verdict.replace('_', ' '))
-        console.print(table)
+        console.print(moves)
     for line in (
             *(f'note     {x}' for x in done.notes), f'verdict  {reason}', f'bag      {bag}',
             *([] if report is None else [f'report   {report}'])):
@@ -227,21 +211,17 @@ def _print(
 
 def _level_table(levels: 'list[LevelResult]') -> 'Table':
     """Return the table of the levels that were in force for the longest."""
-    from rich.box import SIMPLE
-    from rich.table import Table
-
     longest = sorted(levels, key=lambda x: -x.duration)[:_MOST_LEVELS]
     chosen = [x for x in levels if x in longest or x is levels[-1]]
     short = len(levels) - len(chosen)
     few = f'; {short} short ones left out' if short else ''
-    table = Table(box=SIMPLE, collapse_padding=True, pad_edge=False, caption=(
+    made = table(
         'rest: what the level holds by the parameters; then what was measured while it '
-        f'was in force; the last row is the end{few}'))
-    for name in ('level mT', 'times', 'in all ms', 'rest', 'mean', 'least', 'greatest'):
-        table.add_column(name, justify='right', no_wrap=True)
+        f'was in force; the last row is the end{few}',
+        ('level mT', 'times', 'in all ms', 'rest', 'mean', 'least', 'greatest'))
     for x in chosen:
         name = f'{x.joint} ' if len({y.joint for y in levels}) > 1 else ''
-        table.add_row(
+        made.add_row(
             f'{name}{x.flux_density * 1e3:.4g}', str(x.times), f'{x.duration * 1e3:.4g}', *(
                 f'{y:.5f}' for y in (x.rest, x.mean, x.least, x.greatest)))
-    return table
+    return made

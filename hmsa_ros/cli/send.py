@@ -4,6 +4,7 @@ import argparse
 import sys
 from typing import Any
 
+from hmsa_ros.cli.options import add_options, NAMESPACE
 from hmsa_ros.cli.setpoints import add_sequence, levels_of
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, HmsaError
@@ -17,21 +18,18 @@ def add_parser(subparsers: Any) -> None:
                     'beginning now, and print its verdict.',
         epilog='example: hmsa send 1.10:2 1.20:2 --wait')
     add_sequence(parser)
-    parser.add_argument(
-        '--wait', action='store_true',
-        help='report progress until the sequence has been carried out, and fail if a setpoint was '
-             'measured to be missed')
-    parser.add_argument(
-        '--recorded', action='store_true', help='wait until a recorder has subscribed, then send')
-    parser.add_argument(
-        '--namespace', default='', metavar='NS', help='namespace of the planner')
-    parser.add_argument(
-        '--joint', default='actuator', metavar='NAMES',
-        help='joint, or several separated by commas (default actuator)')
-    parser.add_argument(
-        '--timeout', type=float, default=10.0, metavar='S',
-        help='seconds to wait for a reply, and past the end of the sequence (default 10 s)')
-    parser.set_defaults(run=run)
+    add_options(
+        parser,
+        ('--wait',
+         'report progress until the sequence has been carried out, and fail if a setpoint was '
+         'measured to be missed'),
+        ('--recorded', 'wait until a recorder has subscribed, then send'),
+        NAMESPACE,
+        ('--joint', 'NAMES', str, 'joint, or several separated by commas (default actuator)',
+         {'default': 'actuator'}),
+        ('--timeout', 'S', float,
+         'seconds to wait for a reply, and past the end of the sequence (default 10 s)',
+         {'default': 10.0}))
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -9,6 +9,7 @@ import shutil
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli import chunked
+from hmsa_ros.cli.options import add_options, MATERIAL
 from hmsa_ros.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -21,13 +22,11 @@ if TYPE_CHECKING:
 _SMALL = 3.4
 #: From so many points on, what a sweep takes is said before.
 _LARGE = 1_000_000
-# Column, option, and what it is.
+# Option of a column, and what it is.
 _AXES = (
-    ('start', '--start', 'initial stretch, at rest (default 1; of a beam 0)'),
-    ('target', '--target', 'stretch to come to rest at (default 1.1)'),
-    ('zeta', '--zeta', 'nondimensional damping coefficient, at least 0 (default 0.2)'),
-    ('j_lim', '--j-lim', 'chain limit of the Gent model, above 0 (default 5)'),
-    ('c1', '--c1', 'shape 2 H^2/L^2, above 0 (default 2)'),
+    ('--start', 'initial stretch, at rest (default 1; of a beam 0)'),
+    ('--target', 'stretch to come to rest at (default 1.1)'),
+    *((option, text) for option, _, text in MATERIAL),
 )
 
 
@@ -43,58 +42,47 @@ def add_parser(subparsers: Any) -> None:
                     'others are still planned. The table is the same, to the byte, however many '
                     'workers or shards compute it.',
         epilog='example: hmsa sweep --zeta 0:2:1000 --j-lim log:0.1:100:50 --out sweep.csv')
-    for _, option, text in _AXES:
-        parser.add_argument(option, metavar='GRID', help=text)
-    parser.add_argument(
-        '--vary', action='append', default=[], metavar='NAME=GRID',
-        help='another column: load_min, load_max, period, slew, lag or a constant of the law '
-             '(law.c10, ...); with --params-file a parameter, such as actuator.shear_modulus, '
-             'flux_density_max, slew_limit, coil_time_constant or command_period. The actuator '
-             'may differ from what is planned with, in error.shear_modulus, error.zeta, '
-             'error.j_lim and error.remanence (shares); with --params-file in '
-             'actual.shear_modulus, actual.remanence, actual.coil_time_constant and so on (SI)')
-    parser.add_argument(
-        '--residual', action='store_true',
-        help='carry out each plan too: columns residual (vibration after arrival, peak to peak) '
-             'and offset at rest, as shares of the step; so do columns of the actuator. With '
-             '--identified the samples are actuators, and plans are made with the file')
-    parser.add_argument(
-        '--law', metavar='NAME,...', help='elastic laws to compare, separated by commas')
-    parser.add_argument(
-        '--shaper', metavar='NAME,...',
-        help='shapers to compare, separated by commas (default two_step)')
-    parser.add_argument(
-        '--params-file', type=Path, metavar='YAML',
-        help='parameter file (YAML) of planner and plant: plans in seconds and tesla, within the '
-             'limits of its coil')
-    parser.add_argument(
-        '--identified', action='store_true',
-        help='draw samples of what hmsa identify wrote to --params-file, normal with its '
-             'covariance')
-    parser.add_argument(
-        '--samples', type=int, metavar='N', help='how many samples are drawn (default 1024)')
-    parser.add_argument(
-        '--seed', type=int, default=0, metavar='S', help='of the samples (default 0)')
-    parser.add_argument(
-        '--cases', type=Path, metavar='FILE.csv',
-        help='CSV with a header of columns; each row is combined with the samples, and with the '
-             'grids of the other columns')
-    parser.add_argument(
-        '--out', type=Path, metavar='FILE|DIR',
-        help='file to write, ending in .csv or .parquet; an existing file is replaced. Or a '
-             'folder, which keeps the chunks and gets table.parquet once all are there '
-             '(default: CSV on standard output)')
-    parser.add_argument(
-        '--picture', type=Path, nargs='+', default=[], metavar='FILE',
-        help='draw the results too, each name ending in .png or .pdf: curves over one column of '
-             'numbers, a map with contours over two, bands of quantiles of samples; hatched where '
-             'there is no plan. A folder of --out gets table.png and table.pdf')
-    parser.add_argument(
-        '--show', metavar='COLUMN,...',
-        help='columns to draw (default: duration and first level, or residual and offset)')
-    chunked.add_options(parser, workers=(
-        'processes; 1 computes in this one (default: one a core for large sweeps)'))
-    parser.set_defaults(run=run)
+    add_options(
+        parser,
+        *((option, 'GRID', str, text) for option, text in _AXES),
+        ('--vary', 'NAME=GRID', str,
+         'another column: load_min, load_max, period, slew, lag or a constant of the law '
+         '(law.c10, ...); with --params-file a parameter, such as actuator.shear_modulus, '
+         'flux_density_max, slew_limit, coil_time_constant or command_period. The actuator may '
+         'differ from what is planned with, in error.shear_modulus, error.zeta, error.j_lim and '
+         'error.remanence (shares); with --params-file in actual.shear_modulus, '
+         'actual.remanence, actual.coil_time_constant and so on (SI)',
+         {'action': 'append', 'default': []}),
+        ('--residual',
+         'carry out each plan too: columns residual (vibration after arrival, peak to peak) and '
+         'offset at rest, as shares of the step; so do columns of the actuator. With '
+         '--identified the samples are actuators, and plans are made with the file'),
+        ('--law', 'NAME,...', str, 'elastic laws to compare, separated by commas'),
+        ('--shaper', 'NAME,...', str,
+         'shapers to compare, separated by commas (default two_step)'),
+        ('--params-file', 'YAML', Path,
+         'parameter file (YAML) of planner and plant: plans in seconds and tesla, within the '
+         'limits of its coil'),
+        ('--identified',
+         'draw samples of what hmsa identify wrote to --params-file, normal with its covariance'),
+        ('--samples', 'N', int, 'how many samples are drawn (default 1024)'),
+        ('--seed', 'S', int, 'of the samples (default 0)', {'default': 0}),
+        ('--cases', 'FILE.csv', Path,
+         'CSV with a header of columns; each row is combined with the samples, and with the '
+         'grids of the other columns'),
+        ('--out', 'FILE|DIR', Path,
+         'file to write, ending in .csv or .parquet; an existing file is replaced. Or a folder, '
+         'which keeps the chunks and gets table.parquet once all are there (default: CSV on '
+         'standard output)'),
+        ('--picture', 'FILE', Path,
+         'draw the results too, each name ending in .png or .pdf: curves over one column of '
+         'numbers, a map with contours over two, bands of quantiles of samples; hatched where '
+         'there is no plan. A folder of --out gets table.png and table.pdf',
+         {'nargs': '+', 'default': []}),
+        ('--show', 'COLUMN,...', str,
+         'columns to draw (default: duration and first level, or residual and offset)'),
+        *chunked.options(
+            'processes; 1 computes in this one (default: one a core for large sweeps)'))
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -190,7 +178,8 @@ def _sweep(arguments: argparse.Namespace) -> 'Sweep':
     elif arguments.identified:
         raise BadInputError(
             '--identified without --params-file: expected the file that hmsa identify --out wrote')
-    texts = {x: y for x, _, _ in _AXES if (y := getattr(arguments, x)) is not None}
+    columns = [option.removeprefix('--').replace('-', '_') for option, _ in _AXES]
+    texts = {x: y for x in columns if (y := getattr(arguments, x)) is not None}
     if arguments.residual and f'{ACTUAL}shear_modulus' in belief.names:
         # Under any law, plans are made with the modulus about which the samples are.
         texts[f'{BLOCK_OF}shear_modulus'] = repr(

@@ -10,6 +10,7 @@ import sys
 from time import monotonic
 from typing import Any, TYPE_CHECKING
 
+from hmsa_ros.cli.options import add_options
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError
 
@@ -32,26 +33,16 @@ def add_parser(subparsers: Any) -> None:
                     'the last request, and losses, live in the terminal. Quit with q or Ctrl-C. '
                     'Without a terminal it prints one line per second.',
         epilog='example: hmsa watch --joint actuator --span 5')
-    parser.add_argument(
-        '--namespace', default='', metavar='NS', help='namespace of planner and plant')
-    parser.add_argument(
-        '--joint', default='', metavar='NAME',
-        help='joint to show, or several separated by commas (default all)')
-    parser.add_argument(
-        '--span', type=float, default=10.0, metavar='S',
-        help='time shown in the charts (default 10 s)')
-    parser.add_argument(
-        '--rate', type=float, default=5.0, metavar='HZ',
-        help='refresh rate, 0.1 to 30 Hz (default 5)')
-    parser.add_argument(
-        '--once', action='store_true', help='print one view and exit; status 1 if there is '
-                                            'nothing to show')
-    parser.add_argument(
-        '--timeout', type=float, default=5.0, metavar='S',
-        help='seconds that --once waits (default 5)')
-    parser.add_argument(
-        '--json', action='store_true', help='print one JSON object per line, every second')
-    parser.set_defaults(run=run)
+    add_options(
+        parser,
+        ('--namespace', 'NS', str, 'namespace of planner and plant', {'default': ''}),
+        ('--joint', 'NAME', str, 'joint to show, or several separated by commas (default all)',
+         {'default': ''}),
+        ('--span', 'S', float, 'time shown in the charts (default 10 s)', {'default': 10.0}),
+        ('--rate', 'HZ', float, 'refresh rate, 0.1 to 30 Hz (default 5)', {'default': 5.0}),
+        ('--once', 'print one view and exit; status 1 if there is nothing to show'),
+        ('--timeout', 'S', float, 'seconds that --once waits (default 5)', {'default': 5.0}),
+        ('--json', 'print one JSON object per line, every second'))
 
 
 def run(arguments: argparse.Namespace) -> int:
