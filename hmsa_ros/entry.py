@@ -1,6 +1,7 @@
 """Entry points of all processes: signals are taken over before anything slow is imported."""
 
 from collections.abc import Sequence
+from functools import partial
 import sys
 
 from hmsa_ros.ending import ENDING
@@ -19,31 +20,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     return status
 
 
-def planner() -> int:
-    """Run ``hmsa planner``."""
-    return main(['planner', *sys.argv[1:]])
+def _node(name: str) -> int:
+    """Run ``hmsa NAME`` as a program of its own."""
+    return main([name, *sys.argv[1:]])
 
 
-def plant() -> int:
-    """Run ``hmsa plant``."""
-    return main(['plant', *sys.argv[1:]])
-
-
-def driver() -> int:
-    """Run ``hmsa driver``."""
-    return main(['driver', *sys.argv[1:]])
-
-
-def recorder() -> int:
-    """Run ``hmsa recorder``."""
-    return main(['recorder', *sys.argv[1:]])
-
-
-def controller() -> int:
-    """Run ``hmsa controller``."""
-    return main(['controller', *sys.argv[1:]])
-
-
-def player() -> int:
-    """Run ``hmsa player``."""
-    return main(['player', *sys.argv[1:]])
+planner = partial(_node, 'planner')
+plant = partial(_node, 'plant')
+driver = partial(_node, 'driver')
+recorder = partial(_node, 'recorder')
+controller = partial(_node, 'controller')
+player = partial(_node, 'player')

@@ -1,6 +1,7 @@
 """Elastic laws: each against SymPy, finite differences and plans of 40 digits."""
 
 from dataclasses import replace
+import json
 import math
 
 import mpmath
@@ -242,6 +243,13 @@ def test_gent_has_no_constants_of_a_law():
     assert set(parameters_of(paper_actuator())) == {
         x.name for x in BLOCK if x.name.startswith('actuator.')}
     assert block('neo_hookean').chain_limit == math.inf
+
+
+def test_a_plan_as_json_has_null_for_a_chain_limit_that_there_is_not(tmp_path, capsys):
+    file = tmp_path / 'law.yaml'
+    file.write_text('/**:\n  ros__parameters:\n    law: neo_hookean\n    law.c10: 5000.0\n')
+    assert main(['plan', '1.1:10', '--params-file', str(file), '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['j_lim'] is None
 
 
 def test_identification_scales_a_law_and_keeps_the_ratios_of_its_constants(tmp_path):

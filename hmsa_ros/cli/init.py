@@ -119,10 +119,11 @@ def run(arguments: argparse.Namespace) -> int:
     for key, quantity in by_key.items():
         if key not in given and not (key in _DAMPED and DAMPING.key in given):
             given[key] = default_of(quantity, given)
-    actuator, coil = _beam(given) if arguments.beam else _block(given)
 
-    from hmsa_ros.core.scales import scales
+    from hmsa_ros.core.scales import Coil, scales
 
+    actuator = _beam(given) if arguments.beam else _block(given)
+    coil = Coil(given['flux_min'], given['flux_max'], given['slew_limit'])
     found = scales(actuator, coil)
     doubts = _doubts(given, found)
     if guessed:
@@ -222,12 +223,11 @@ def _answer(question: str) -> str:
     return line.strip()
 
 
-def _beam(given: Mapping[str, float]) -> 'tuple[ActuatorParameters, Coil]':
-    """Return the beam and its coil."""
+def _beam(given: Mapping[str, float]) -> 'ActuatorParameters':
+    """Return the beam."""
     from hmsa_ros.contract.actuator import actuator_from
     from hmsa_ros.contract.parameters import BLOCK
     from hmsa_ros.core.model import critical_zeta
-    from hmsa_ros.core.scales import Coil
 
     beam = actuator_from({x.name: x.default for x in BLOCK} | {
         'law': 'beam', 'actuator.damping_coefficient': 0.0} | {
@@ -237,16 +237,13 @@ def _beam(given: Mapping[str, float]) -> 'tuple[ActuatorParameters, Coil]':
     if damping is None:
         damping = given['damping_ratio'] * beam.damping_unit * float(
             critical_zeta(beam.rest, beam.nondimensional))
-    return (
-        replace(beam, damping_coefficient=damping),
-        Coil(given['flux_min'], given['flux_max'], given['slew_limit']))
+    return replace(beam, damping_coefficient=damping)
 
 
-def _block(given: Mapping[str, float]) -> 'tuple[ActuatorParameters, Coil]':
-    """Return the block and its coil."""
+def _block(given: Mapping[str, float]) -> 'ActuatorParameters':
+    """Return the block."""
     from hmsa_ros.core.creep import Creep
     from hmsa_ros.core.parameters import ActuatorParameters
-    from hmsa_ros.core.scales import Coil
 
     damping = given.get(DAMPING.key)
     if damping is None:
@@ -255,10 +252,7 @@ def _block(given: Mapping[str, float]) -> 'tuple[ActuatorParameters, Coil]':
             * math.sqrt(given['density'] * given['shear_modulus']))
     block = {x.parameter.partition('.')[2]: given[x.key] for x in QUANTITIES
              if x.parameter.startswith('actuator.')}
-    return (
-        ActuatorParameters(
-            damping_coefficient=damping, law=None, creep=Creep(), **block),
-        Coil(given['flux_min'], given['flux_max'], given['slew_limit']))
+    return ActuatorParameters(damping_coefficient=damping, law=None, creep=Creep(), **block)
 
 
 def _doubts(given: Mapping[str, float], found: 'Scales') -> list[str]:

@@ -2,7 +2,6 @@
 
 import argparse
 from collections.abc import Mapping, Sequence
-import json
 import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -11,11 +10,13 @@ from hmsa_ros.cli.options import add_options, MATERIAL
 from hmsa_ros.cli.setpoints import setpoint
 from hmsa_ros.core.setpoint import impossible
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.files import json_text
 
 if TYPE_CHECKING:
     from hmsa_ros.core.mismatch import Uncertainty
     from hmsa_ros.core.moves import State
     from hmsa_ros.core.sequence import Segment
+    from hmsa_ros.studies.settings import Setting
 
 
 def add_parser(subparsers: Any) -> None:
@@ -56,83 +57,64 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Plan and print."""
-    if arguments.params_file is not None:
-        return _run_si(arguments)
-    from hmsa_ros.core.parameters import NondimensionalParameters
+    """Plan and print, in seconds and tesla for the actuator of a parameter file."""
     from hmsa_ros.core.sequence import plan_sequence
     from hmsa_ros.core.setpoint import Setpoint
     from hmsa_ros.core.shapers.pace import Pace
 
+    model = nominal(arguments)
+    group, time, load = model.material, model.units.time, model.units.load
     segments = plan_sequence(
-        [Setpoint(*x) for x in _possible(arguments.setpoints, 1.0)],
-        NondimensionalParameters(**given(arguments)), start=_start(arguments, 1.0),
-        shaper=arguments.shaper or 'two_step', order=arguments.order, errors=_errors(arguments),
-        pace=Pace(arguments.periods, arguments.max_rate))
-    rows = [_row(segment) for segment in segments]
-    if arguments.json:
-        print(json.dumps({'segments': rows}, indent=2))
+        [Setpoint(stretch, span / time)
+         for stretch, span in _possible(arguments.setpoints, group.rest)],
+        group, start=_start(arguments, group.rest), shaper=arguments.shaper or 'two_step',
+        limits=model.limits, delivery=model.delivery, units=model.units, order=arguments.order,
+        errors=_errors(arguments), pace=Pace(arguments.periods, arguments.max_rate * time))
+    if arguments.params_file is None:
+        facts = {}
+        rows = [_row(x) for x in segments]
+        columns = 'stretch', 'span', 'b_p', 'tau_p', 'b_1'
+        caption = 'nondimensional: time in L sqrt(rho/G), b = sqrt(Br B/(mu0 G))'
     else:
-        _print_table(
-            rows, ('stretch', 'span', 'b_p', 'tau_p', 'b_1'),
-            'nondimensional: time in L sqrt(rho/G), b = sqrt(Br B/(mu0 G))')
+        facts = {'c1': group.c1, 'zeta': group.zeta, 'j_lim': group.j_lim, 'time_unit': time,
+                 'flux_density_unit': load}
+        rows = [_si_row(x, time, load) for x in segments]
+        columns = 'stretch', 'span', 'flux_density_p', 'time_p', 'flux_density_1'
+        caption = (f'times in s, flux densities in T; c1 {group.c1:.6g}, zeta {group.zeta:.6g}, '
+                   f'time unit {time:.6g} s')
+    if arguments.json:
+        print(json_text({**facts, 'segments': rows}))
+    else:
+        _print_table(rows, columns, caption, group.coordinate.name)
         _print_reasons(segments)
     return 0
 
 
-def given(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the nondimensional parameters that have options, as far as these are given."""
-    return {name: value for name in ('zeta', 'j_lim', 'c1')
-            if (value := getattr(arguments, name)) is not None}
-
-
-def refuse_fixed(arguments: argparse.Namespace) -> None:
+def nominal(arguments: argparse.Namespace) -> 'Setting':
     """
-    Refuse options that say otherwise than a parameter file.
+    Return what is planned with: what the options say, or the parameter file.
 
     Raises
     ------
     BadInputError
-        If there is one.
+        If both say something.
 
     """
-    fixed = [f'--{name.replace("_", "-")}' for name in given(arguments)]
-    if fixed:
-        raise BadInputError(
-            f'both --params-file and {", ".join(fixed)} are given: expected only one of them, '
-            'since the file sets these values')
-
-
-def _run_si(arguments: argparse.Namespace) -> int:
-    """Plan in seconds and tesla for the actuator of a parameter file."""
-    from hmsa_ros.core.sequence import plan_sequence
-    from hmsa_ros.core.setpoint import Setpoint
-    from hmsa_ros.core.shapers.pace import Pace
+    from hmsa_ros.core.parameters import NondimensionalParameters
     from hmsa_ros.runs.model import model_of
+    from hmsa_ros.studies.settings import Setting
 
-    refuse_fixed(arguments)
+    given = {name: value for name in ('zeta', 'j_lim', 'c1')
+             if (value := getattr(arguments, name)) is not None}
+    if arguments.params_file is None:
+        return Setting(NondimensionalParameters(**given))
+    if given:
+        fixed = ', '.join(f'--{name.replace("_", "-")}' for name in given)
+        raise BadInputError(
+            f'both --params-file and {fixed} are given: expected only one of them, since the file '
+            'sets these values')
     model = model_of(arguments.params_file)
-    time, load = model.units.time, model.units.load
-    segments = plan_sequence(
-        [Setpoint(stretch, span / time)
-         for stretch, span in _possible(arguments.setpoints, model.material.rest)],
-        model.material, start=_start(arguments, model.material.rest),
-        shaper=arguments.shaper or 'two_step', limits=model.limits, delivery=model.delivery,
-        units=model.units, order=arguments.order, errors=_errors(arguments),
-        pace=Pace(arguments.periods, arguments.max_rate * time))
-    rows = [_si_row(x, time, load) for x in segments]
-    group = model.material
-    if arguments.json:
-        print(json.dumps({
-            'c1': group.c1, 'zeta': group.zeta, 'j_lim': group.j_lim, 'time_unit': time,
-            'flux_density_unit': load, 'segments': rows}, indent=2))
-    else:
-        _print_table(
-            rows, ('stretch', 'span', 'flux_density_p', 'time_p', 'flux_density_1'),
-            f'times in s, flux densities in T; c1 {group.c1:.6g}, zeta {group.zeta:.6g}, '
-            f'time unit {time:.6g} s', group.coordinate.name)
-        _print_reasons(segments)
-    return 0
+    return Setting(model.material, model.limits, model.delivery, model.units)
 
 
 def _possible(setpoints: Sequence[tuple[float, float]], rest: float) -> list[tuple[float, float]]:
@@ -209,7 +191,7 @@ def _row(segment: 'Segment') -> dict[str, float | str | None]:
 
 def _print_table(
         rows: Sequence[Mapping[str, float | str | None]], columns: Sequence[str], caption: str,
-        coordinate: str = 'stretch') -> None:
+        coordinate: str) -> None:
     from rich.console import Console
     from rich.table import Table
 

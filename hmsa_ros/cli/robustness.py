@@ -10,14 +10,11 @@ from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli import chunked
 from hmsa_ros.cli.options import add_options, MATERIAL
-from hmsa_ros.cli.plan import given, refuse_fixed
+from hmsa_ros.cli.plan import nominal
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text, make_folder
 
 if TYPE_CHECKING:
-    from hmsa_ros.core.delivery import Delivery
-    from hmsa_ros.core.moves import Limits
-    from hmsa_ros.core.parameters import NondimensionalParameters
     from hmsa_ros.studies.executors import Start
     from hmsa_ros.studies.matrix import Row
     from hmsa_ros.studies.robustness import Case, Result
@@ -99,16 +96,16 @@ def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> 
         study,
     )
 
-    material, limits, delivery = _nominal(arguments)
-    shapers = creeping.SHAPERS if material.creep else None
+    model = nominal(arguments)
+    shapers = creeping.SHAPERS if model.material.creep else None
     if arguments.shapers is not None:
         shapers = tuple(name.strip() for name in arguments.shapers.split(','))
     compared = candidates(shapers, arguments.order or ORDERS)
     cases = [
-        Case(start, target, material, limits, delivery, arguments.errors,
+        Case(begin, target, model.material, model.limits, model.delivery, arguments.errors,
              max(arguments.errors, min(2.0 * arguments.errors, LARGEST)))
-        for start, target in dict.fromkeys(
-            arguments.move or (_MOVES if material.rest else _BENDS))]
+        for begin, target in dict.fromkeys(
+            arguments.move or (_MOVES if model.material.rest else _BENDS))]
     tasks = list(product(cases, compared))
     folder: Path = arguments.out or Path('robustness')
 
@@ -131,21 +128,6 @@ def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> 
             found.append(result)
             advance(1)
     return finish(found)
-
-
-def _nominal(
-        arguments: argparse.Namespace) -> 'tuple[NondimensionalParameters, Limits, Delivery]':
-    """Return what is planned with: of the options, or of the parameter file."""
-    from hmsa_ros.core.delivery import IDEAL
-    from hmsa_ros.core.moves import Limits
-    from hmsa_ros.core.parameters import NondimensionalParameters
-    from hmsa_ros.runs.model import model_of
-
-    if arguments.params_file is None:
-        return NondimensionalParameters(**given(arguments)), Limits(), IDEAL
-    refuse_fixed(arguments)
-    model = model_of(arguments.params_file)
-    return model.material, model.limits, model.delivery
 
 
 def _show(

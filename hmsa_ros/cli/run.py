@@ -81,10 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
             done = conduct(experiment, dict(os.environ), update)
             ENDING.check()
             update('evaluating the bag', None)
-            measured = _measure(experiment, tolerance) if (
-                done.measured and not experiment.levels) else []
-            levels = _measure_levels(experiment) if (
-                done.measured and experiment.levels) else []
+            measured, levels = _measure(experiment, tolerance) if done.measured else ([], [])
             report = _report(experiment.bag, folder / 'report.html') if (
                 arguments.report and done.measured) else None
     except KeyboardInterrupt:
@@ -135,27 +132,22 @@ def _experiment(arguments: argparse.Namespace, folder: Path) -> 'Experiment':
         tuple(arguments.joint.split(',')), expected, levels_of(arguments))
 
 
-def _measure(experiment: 'Experiment', tolerance: float) -> 'list[Arrival]':
-    """Read the bag and measure each joint."""
-    from hmsa_ros.report.outcome import arrivals
+def _measure(
+        experiment: 'Experiment', tolerance: float) -> 'tuple[list[Arrival], list[LevelResult]]':
+    """Read the bag and measure the moves or the levels of each joint."""
+    from hmsa_ros.report.outcome import arrivals, level_results
     from hmsa_ros.runs.bags import read_runs
 
     several = len(experiment.joints) > 1
-    found = []
-    for each in read_runs(experiment.bag, joints=experiment.joints if several else ()):
+    runs = read_runs(experiment.bag, joints=experiment.joints if several else ())
+    if experiment.levels:
+        return [], [level for each in runs for level in level_results(each)]
+    moves = []
+    for each in runs:
         place = experiment.joints.index(each.joint) if several else 0
         targets = [x[place] if len(x) > 1 else x[0] for x, _ in experiment.setpoints]
-        found += arrivals(each, targets, tolerance)
-    return found
-
-
-def _measure_levels(experiment: 'Experiment') -> 'list[LevelResult]':
-    """Read the bag and measure the levels of each joint."""
-    from hmsa_ros.report.outcome import level_results
-    from hmsa_ros.runs.bags import read_runs
-
-    several = experiment.joints if len(experiment.joints) > 1 else ()
-    return [y for x in read_runs(experiment.bag, joints=several) for y in level_results(x)]
+        moves += arrivals(each, targets, tolerance)
+    return moves, []
 
 
 def _report(bag: Path, path: Path) -> Path:

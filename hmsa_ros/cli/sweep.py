@@ -13,6 +13,7 @@ from hmsa_ros.cli.options import add_options, MATERIAL
 from hmsa_ros.errors import BadInputError
 
 if TYPE_CHECKING:
+    from hmsa_ros.core.model import Array
     from hmsa_ros.studies.chunks import Chunks
     from hmsa_ros.studies.engine import Outcome
     from hmsa_ros.studies.sweep import Sweep
@@ -99,11 +100,12 @@ class _Picture:
 
     def __init__(self, sweep: 'Sweep', arguments: argparse.Namespace) -> None:
         """Find out what, before anything is computed."""
-        from hmsa_ros.studies.views import Shown
+        import numpy as np
 
         self._sweep = sweep
         self._view: View | None = None
-        self._shown: Shown | None = None
+        self._columns: dict[str, Array] = {}
+        self._added = 0
         self._paths: list[Path] = arguments.picture
         names = list(sweep.shown) if arguments.show is None else _names(arguments.show)
         wrong = [x for x in names if x not in sweep.results]
@@ -128,22 +130,24 @@ class _Picture:
                 raise
             chunked.say(str(error))
             return
-        self._shown = Shown(names, sweep.size)
+        self._columns = {name: np.full(sweep.size, np.nan) for name in names}
 
     def add(self, table: Any) -> None:
         """Take the next rows, by column."""
-        if self._shown is not None:
-            self._shown.add(table)
+        begin = self._added
+        for name, column in self._columns.items():
+            self._added = begin + len(table[name])
+            column[begin:self._added] = table[name]
 
     def draw(self, *, changed: bool = True) -> list[Path]:
         """Draw all rows unless they are drawn already; return the files."""
-        if self._shown is None or self._view is None:
+        if self._view is None:
             return []
         if not changed and self._default and all(x.exists() for x in self._paths):
             return self._paths
         from hmsa_ros.figures.sweeps import draw_sweep
 
-        draw_sweep(self._paths, self._view, self._shown.columns, self._sweep.fixed)
+        draw_sweep(self._paths, self._view, self._columns, self._sweep.fixed)
         return self._paths
 
 

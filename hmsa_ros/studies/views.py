@@ -130,19 +130,3 @@ class View:
 
 def _stride(size: int) -> int:
     return -(-size // _MOST_POINTS)
-
-
-class Shown:
-    """Collects the columns that are drawn while the rows of a sweep are computed or read."""
-
-    def __init__(self, names: Sequence[str], size: int) -> None:
-        self.columns: dict[str, Array] = {name: np.full(size, math.nan) for name in names}
-        self._done = 0
-
-    def add(self, table: Mapping[str, NDArray[Any]]) -> None:
-        """Add the next rows, from all their columns by name."""
-        size = 0
-        for name, column in self.columns.items():
-            size = len(table[name])
-            column[self._done:self._done + size] = table[name]
-        self._done += size
