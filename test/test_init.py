@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from hmsa_ros.cli import main
-from hmsa_ros.cli.quantities import BY_KEY, DAMPING, NEEDED, QUANTITIES
+from hmsa_ros.cli.quantities import BY_KEY, DAMPING, OPTIONAL, QUANTITIES
 from hmsa_ros.core.model import elastic_force, natural_frequency
 from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters, paper_actuator
 from hmsa_ros.core.scales import Coil, scales
@@ -274,7 +274,7 @@ def test_numbers_are_taken_in_the_range_that_the_nodes_take():
             spec = declared[quantity.parameter]
             assert (quantity.least, quantity.largest) == (spec.minimum, spec.maximum)
             assert quantity.unit == spec.unit
-    assert set(NEEDED) <= set(BY_KEY)
+    assert set(OPTIONAL) <= set(BY_KEY)
 
 
 # Asking --------------------------------------------------------------------------------------

@@ -59,15 +59,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """
-    Carry out one action.
-
-    Raises
-    ------
-    BadInputError
-        If an option is out of range.
-
-    """
+    """Carry out one action; raise `BadInputError` if the largest chunk is out of range."""
     if not 0.0 < arguments.max_chunk <= _LARGEST_CHUNK:
         raise BadInputError(
             f'largest chunk is {arguments.max_chunk:g} MiB: expected more than 0 and at most '

@@ -30,15 +30,7 @@ def options(workers: str) -> tuple[Row, ...]:
 
 
 def asked(arguments: argparse.Namespace) -> list[str]:
-    """
-    Return the options of chunks that are given.
-
-    Raises
-    ------
-    BadInputError
-        If they do not go together.
-
-    """
+    """Return the options of chunks that are given; raise `BadInputError` if they do not fit."""
     if arguments.workers is not None and arguments.workers < 1:
         raise BadInputError(f'--workers is {arguments.workers}: expected at least 1')
     if arguments.dask is not None and arguments.workers is not None and arguments.dask != 'local':

@@ -28,15 +28,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """
-    Read and write.
-
-    Raises
-    ------
-    BadInputError
-        If the bag has several runs.
-
-    """
+    """Read and write; raise `BadInputError` if the bag has several runs."""
     from hmsa_ros.runs.bags import read_runs
     from hmsa_ros.runs.tables import levels_of, samples_of, write_table
 

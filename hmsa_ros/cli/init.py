@@ -15,8 +15,7 @@ from hmsa_ros.cli.quantities import (
     DAMPING,
     default_of,
     joint_names,
-    NEEDED,
-    NEEDED_OF_BEAM,
+    OPTIONAL,
     QUANTITIES,
     Quantity,
 )
@@ -86,15 +85,7 @@ def _option(quantity: Quantity) -> Row:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """
-    Ask, write and print.
-
-    Raises
-    ------
-    BadInputError
-        If a number is missing or out of range, or the file exists or cannot be written.
-
-    """
+    """Ask, write and print; raise `BadInputError` for what cannot be used."""
     path: Path = arguments.out
     if not arguments.force and path.exists():
         raise BadInputError(f'{path} exists: name another file with --out, or add --force')
@@ -104,9 +95,8 @@ def run(arguments: argparse.Namespace) -> int:
     asked = BEAM if arguments.beam else QUANTITIES
     given = _given(arguments, asked)
     joints = joint_names(arguments.joint)
-    missing = [key for key in (NEEDED_OF_BEAM if arguments.beam else NEEDED)
-               if key not in given and not (key in _DAMPED and DAMPING.key in given)]
     by_key = {x.key: x for x in asked}
+    missing = [key for key in by_key if key not in OPTIONAL and not _known(key, given)]
     if missing and not arguments.yes:
         if not sys.stdin.isatty():
             raise BadInputError(
@@ -117,7 +107,7 @@ def run(arguments: argparse.Namespace) -> int:
         given, joints = _ask(asked, given, joints)
     guessed = [key for key in _GUESSES if key in missing and arguments.yes]
     for key, quantity in by_key.items():
-        if key not in given and not (key in _DAMPED and DAMPING.key in given):
+        if not _known(key, given):
             given[key] = default_of(quantity, given)
 
     from hmsa_ros.core.scales import Coil, scales
@@ -171,6 +161,11 @@ def _given(arguments: argparse.Namespace, asked: Sequence[Quantity]) -> dict[str
     return given
 
 
+def _known(key: str, given: Mapping[str, float]) -> bool:
+    """Return whether a value is given, or the damping coefficient in its place."""
+    return key in given or (key in _DAMPED and DAMPING.key in given)
+
+
 def _ask(
         asked: Sequence[Quantity], given: Mapping[str, float],
         joints: list[str]) -> tuple[dict[str, float], list[str]]:
@@ -181,7 +176,7 @@ def _ask(
         'for the value in brackets.', file=sys.stderr)
     for quantity in asked:
         key = quantity.key
-        if key in answers or (key in _DAMPED and DAMPING.key in answers):
+        if _known(key, answers):
             continue
         default = default_of(quantity, answers)
         while True:

@@ -91,15 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def nominal(arguments: argparse.Namespace) -> 'Setting':
-    """
-    Return what is planned with: what the options say, or the parameter file.
-
-    Raises
-    ------
-    BadInputError
-        If both say something.
-
-    """
+    """Return what options or a file plan with; raise `BadInputError` if both say something."""
     from hmsa_ros.core.parameters import NondimensionalParameters
     from hmsa_ros.runs.model import model_of
     from hmsa_ros.studies.settings import Setting

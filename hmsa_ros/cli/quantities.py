@@ -70,15 +70,7 @@ class Quantity:
         return '--' + self.key.replace('_', '-')
 
     def parse(self, text: str) -> float:
-        """
-        Read a number in SI units, or with a unit behind it as in ``'10 mm'``; return it in SI.
-
-        Raises
-        ------
-        BadInputError
-            If it is no number, has another unit or is out of range.
-
-        """
+        """Read a number in SI units or with a unit, ``'10 mm'``, or raise `BadInputError`."""
         found = _NUMBER.fullmatch(text)
         units = _UNITS[self.unit]
         if found is None:
@@ -199,12 +191,8 @@ BEAM: tuple[Quantity, ...] = (
 DAMPING = Quantity.of(
     'damping', _BLOCK['damping_coefficient'], 'damping coefficient c', (0.0, math.inf), '',
     follows=True)
-#: What only the user can know: given, or entered, or left to --yes.
-NEEDED_OF_BEAM = (
-    'length', 'thickness', 'width', 'youngs_modulus', 'density', 'remanence', 'damping_ratio',
-    'flux_max')
-NEEDED = ('half_length', 'half_thickness', 'shear_modulus', 'density', 'remanence', 'j_lim',
-          'zeta', 'flux_max')
+#: What the user need not know: all others are given, or entered, or left to --yes.
+OPTIONAL = ('flux_min', 'slew_limit')
 
 
 def default_of(quantity: Quantity, given: Mapping[str, float]) -> float:
@@ -215,15 +203,7 @@ def default_of(quantity: Quantity, given: Mapping[str, float]) -> float:
 
 
 def joint_names(text: str) -> list[str]:
-    """
-    Read names of joints with commas or spaces between; none from an empty text.
-
-    Raises
-    ------
-    BadInputError
-        If one is not a ROS name or is named twice.
-
-    """
+    """Read names of joints, none from an empty text; raise `BadInputError` for a wrong one."""
     names = text.replace(',', ' ').split()
     for name in names:
         if not _NAME.fullmatch(name):

@@ -33,16 +33,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """
-    Send and, if asked to, wait.
-
-    Raises
-    ------
-    HmsaError
-        If there is no planner, it refuses, the sequence is not carried out, or the stretch was
-        measured to have missed a setpoint.
-
-    """
+    """Send and, if asked to, wait; raise `HmsaError` if the sequence is not carried out."""
     from hmsa_ros.session.client import PlannerClient
 
     if not arguments.timeout > 0.0:

@@ -23,15 +23,7 @@ def add_sequence(parser: argparse.ArgumentParser) -> None:
 
 
 def levels_of(arguments: argparse.Namespace) -> list[tuple[float, float]]:
-    """
-    Return times in s and flux densities in T of the file of levels; none where it is setpoints.
-
-    Raises
-    ------
-    BadInputError
-        If neither or both are given, or the file cannot be used.
-
-    """
+    """Return times in s and flux densities in T of --levels, if any, or raise `BadInputError`."""
     if bool(arguments.setpoints) == (arguments.levels is not None):
         raise BadInputError(
             ('both setpoints and --levels are given' if arguments.setpoints
@@ -46,15 +38,7 @@ def levels_of(arguments: argparse.Namespace) -> list[tuple[float, float]]:
 
 
 def setpoint(text: str) -> tuple[float, float]:
-    """
-    Read stretch and hold time from a text as ``'1.10:10'``.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        If it is not two numbers in range.
-
-    """
+    """Read stretch and time from ``'1.10:10'``; raise `ArgumentTypeError` for anything else."""
     stretches, span = setpoint_of_joints(text)
     if len(stretches) > 1:
         raise _no_setpoint(text)
@@ -62,15 +46,7 @@ def setpoint(text: str) -> tuple[float, float]:
 
 
 def setpoint_of_joints(text: str) -> tuple[tuple[float, ...], float]:
-    """
-    Read one stretch or one a joint, and the hold time, from ``'1.10:10'`` or ``'1.10,1.20:10'``.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        If it is not numbers in range.
-
-    """
+    """Read stretches and time from ``'1.10,1.20:10'``, or raise `ArgumentTypeError`."""
     stretches, colon, span = text.partition(':')
     try:
         if not colon:

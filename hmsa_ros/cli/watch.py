@@ -46,15 +46,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """
-    Watch until told to end.
-
-    Raises
-    ------
-    BadInputError
-        If an option is out of range.
-
-    """
+    """Watch until told to end; raise `BadInputError` if an option is out of range."""
     for name, least, largest in (('span', 0.1, 3600.0), ('rate', 0.1, 30.0),
                                  ('timeout', 0.0, 1e6)):
         value = getattr(arguments, name)

@@ -55,15 +55,7 @@ def _too_many(column: str, points: int) -> BadInputError:
 
 
 def parse_values(text: str, column: str) -> Array | Spread:
-    """
-    Read what a column takes: a grid, or ``sobol:LOW:HIGH`` or ``normal:MEAN:STD``.
-
-    Raises
-    ------
-    BadInputError
-        If the text is nothing of this.
-
-    """
+    """Read a grid, ``sobol:LOW:HIGH`` or ``normal:MEAN:STD``, or raise `BadInputError`."""
     kind, colon, rest = text.strip().partition(':')
     if not colon or kind not in {'sobol', 'normal'}:
         return parse_grid(text, column)
@@ -120,16 +112,7 @@ def _part(part: str, text: str, column: str) -> Array:
 
 
 def read_cases(path: Path, columns: Collection[str]) -> dict[str, Array]:
-    """
-    Read a CSV of cases with some of the columns, numbers out of range and NaN as they are.
-
-    Raises
-    ------
-    BadInputError
-        If the file cannot be read, a column is unknown or repeated, a row has more or fewer
-        cells than the header, or a cell is no number.
-
-    """
+    """Read a CSV with some of the columns, numbers as they are, or raise `BadInputError`."""
     expected = ', '.join(columns)
     rows: list[list[float]] = []
     try:
@@ -178,15 +161,7 @@ def _case(cells: Sequence[str], names: Sequence[str], where: str) -> list[float]
 
 def draw(
         spreads: Mapping[str, Spread], belief: Belief, count: int, seed: int) -> dict[str, Array]:
-    """
-    Draw the first samples of a sequence, by column; the same on every machine.
-
-    Raises
-    ------
-    BadInputError
-        If the number or the seed is out of range, or the covariance is none.
-
-    """
+    """Draw samples by column, the same on every machine, or raise `BadInputError`."""
     from scipy.special import ndtri
     from scipy.stats import qmc
 

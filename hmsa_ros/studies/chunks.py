@@ -94,15 +94,7 @@ class Chunks:
         return index * self.rows, min((index + 1) * self.rows, self.size)
 
     def check(self) -> None:
-        """
-        Refuse the folder of something else; nothing is written.
-
-        Raises
-        ------
-        BadInputError
-            If it is one.
-
-        """
+        """Raise `BadInputError` if the folder is that of something else; nothing is written."""
         described = self._described
         if described.exists():
             try:
@@ -148,15 +140,7 @@ class Chunks:
         return good
 
     def write(self, index: int, table: Any, beside: Path) -> None:
-        """
-        Write a chunk, by way of another folder of the same file system.
-
-        Raises
-        ------
-        HmsaError
-            If it cannot be written.
-
-        """
+        """Write a chunk by way of another folder of the same file system, or raise `HmsaError`."""
         _, parquet = require_arrow()
         made = io.BytesIO()
         parquet.write_table(
@@ -174,15 +158,7 @@ class Chunks:
                 'expected a folder with room that all workers can write to') from error
 
     def tables(self) -> Iterator[Any]:
-        """
-        Yield the tables of all chunks, in order.
-
-        Raises
-        ------
-        HmsaError
-            If a chunk is missing or damaged.
-
-        """
+        """Yield the tables of all chunks in order; raise `HmsaError` if one is missing or bad."""
         _, parquet = require_arrow()
         files = self.found()
         for index in range(self.count):

@@ -48,15 +48,7 @@ def limits_of(target: float, material: NondimensionalParameters, number: int) ->
 
 def settling_time(
         move: Move, start: float, target: float, material: NondimensionalParameters) -> float:
-    """
-    Return the time from which the stretch stays within 1 % of the step about the target.
-
-    Raises
-    ------
-    HmsaError
-        If it has not settled in the time in which small motion dies out.
-
-    """
+    """Return from when the stretch stays within 1 % of the step, or raise `HmsaError`."""
     _, decay = ringing(target, material)
     times = np.linspace(0.0, move.levels[-1].time + _DECADES / decay, _SAMPLES)
     away = np.abs(Actual.off(material).response(move, start, times) - target)

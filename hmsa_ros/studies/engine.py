@@ -39,15 +39,7 @@ class Outcome:
 
 
 def parse_shard(text: str) -> tuple[int, int]:
-    """
-    Read ``I/N``, part I of N from 0 or from 1 on; return the part, from 0, and the parts.
-
-    Raises
-    ------
-    BadInputError
-        If it is something else.
-
-    """
+    """Read ``I/N``, I from 0 or from 1 on; return I from 0, and N, or raise `BadInputError`."""
     part, slash, parts = text.partition('/')
     if not (slash and part.isdecimal() and parts.isdecimal()
             and 0 <= int(part) <= int(parts) and int(parts) > 0):

@@ -75,15 +75,8 @@ def local(workers: int) -> Start:
 
 @contextmanager
 def dask(address: str, workers: int | None = None) -> Iterator[tuple[Executor, int]]:
-    """
-    Yield an executor of a Dask cluster (``local``, address or scheduler file), as `here` does.
-
-    Raises
-    ------
-    BadInputError
-        If dask.distributed is not installed, or no scheduler answers.
-
-    """
+    """Yield an executor of a Dask cluster as `here` does, or raise `BadInputError`."""
+    # An address is that of a scheduler, its file, or 'local' for a cluster on this machine.
     try:
         from dask import config
         from distributed import Client, LocalCluster
@@ -124,15 +117,7 @@ def given(executor: Executor) -> Iterator[tuple[Executor, int]]:
 def in_order(
         start: Start, function: Callable[..., Result],
         tasks: Iterable[tuple[Any, ...]]) -> Iterator[Result]:
-    """
-    Yield what a function returns for each of many arguments, in their order.
-
-    Raises
-    ------
-    HmsaError
-        If a worker dies.
-
-    """
+    """Yield what a function returns for each of many arguments in order, or raise `HmsaError`."""
     running: deque[Future[Result]] = deque()
     try:
         with start() as (executor, ahead):

@@ -13,15 +13,7 @@ _OTHERS = {'coil_time_constant': 'coil_time_constant', 'time_unit': 'actuator.de
 
 
 def belief_of(found: Known, path: Path) -> Belief:
-    """
-    Return what a file says of the block, in SI units; a unit of time becomes a density.
-
-    Raises
-    ------
-    BadInputError
-        If the file has no covariance of the block.
-
-    """
+    """Return what a file says of the block in SI units; raise `BadInputError` if nothing."""
     numbers, known = found.actuator.numbers, found.known
     means, names, places = [], [], []
     slopes = np.eye(len(known.names))

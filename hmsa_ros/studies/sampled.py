@@ -41,15 +41,7 @@ class SampledStudy:
 
 
 def ideal_move(start: float, target: float, material: NondimensionalParameters) -> Move:
-    """
-    Return the two-step command for ideal hardware between two stretches at rest.
-
-    Raises
-    ------
-    HmsaError
-        If there is no two-step command.
-
-    """
+    """Return the two-step command for ideal hardware; raise `HmsaError` if there is none."""
     move = two_step(Request(State(start), target, material))
     if move.code is not Code.TWO_STEP:
         raise HmsaError(

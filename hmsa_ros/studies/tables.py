@@ -28,15 +28,7 @@ def repeating(table: Any) -> list[str]:
 @contextmanager
 def open_writer(
         path: Path | None, columns: Sequence[str]) -> Iterator[Callable[[Block], None]]:
-    """
-    Yield what writes blocks to a file (.csv or .parquet), replaced at the end, or to stdout.
-
-    Raises
-    ------
-    BadInputError
-        If the name ends otherwise, pyarrow is missing, or the file cannot be written.
-
-    """
+    """Yield what writes blocks to a file or, without one, to stdout; or raise `BadInputError`."""
     if path is None:
         yield _csv_writer(sys.stdout, columns)
         sys.stdout.flush()

@@ -72,15 +72,7 @@ class View:
 
     @classmethod
     def of(cls, axes: Sequence[Axis]) -> 'View':
-        """
-        Choose a view of the axes with more than one value, in order.
-
-        Raises
-        ------
-        BadInputError
-            If there is no picture of that many.
-
-        """
+        """Choose a view of the axes of several values; raise `BadInputError` if there is none."""
         rows = math.prod(x.size for x in axes)
         if rows > MOST_ROWS:
             raise BadInputError(
