@@ -18,20 +18,7 @@ from hmsa_ros.core.units import MU_0
 
 @dataclass(frozen=True)
 class Chain:
-    """
-    A clamped-free beam, magnetised along its length.
-
-    Attributes
-    ----------
-    links : int
-        How many.
-    length, width, thickness, density, youngs, remanence : float
-        Of the beam, in SI.
-    tip_damping : float
-        Damping of the tip in its first mode in N s/m; each joint damps in proportion to its
-        stiffness, as the material does.
-
-    """
+    """A clamped-free beam, magnetised along its length, in SI units."""
 
     links: int
     length: float
@@ -40,25 +27,10 @@ class Chain:
     density: float
     youngs: float
     remanence: float
-    tip_damping: float
+    tip_damping: float  # in its first mode in N s/m; joints damp in proportion to stiffness
 
     def follow(self, pieces: Sequence[tuple[float, float]], samples: int) -> tuple[Array, Array]:
-        """
-        Return times in s and deflections of the tip over the length, from rest.
-
-        Parameters
-        ----------
-        pieces : sequence of (float, float)
-            Duration in s and flux density in T of each level.
-        samples : int
-            Of each piece.
-
-        Returns
-        -------
-        time, deflection : ndarray
-            Samples of all pieces.
-
-        """
+        """Return times in s and deflections over the length from rest, for pieces in s and T."""
         n, link = self.links, self.length / self.links
         area = self.width * self.thickness
         bending = self.youngs * self.width * self.thickness ** 3 / 12.0

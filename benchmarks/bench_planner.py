@@ -184,9 +184,9 @@ def compare(*, quick: bool = False) -> Report:
             entries += _c_programs(Path(folder), reference, 10 if quick else 1000, ours)
         else:
             missing.append('C')
-        for name, make in (('CasADi, collocation, Newton', contenders.with_rootfinder),
-                           ('CasADi, collocation, IPOPT', contenders.with_ipopt)):
-            solve = make(ACTUATOR, POLYNOMIALS)
+        for name, method in (('CasADi, collocation, Newton', 'newton'),
+                             ('CasADi, collocation, IPOPT', 'ipopt')):
+            solve = contenders.with_casadi(method, ACTUATOR, POLYNOMIALS)
             if solve is None:
                 missing.append(name)
             else:

@@ -28,17 +28,7 @@ Simulation = Callable[[float], np.ndarray]
 
 
 class Sequence:
-    """
-    Steps and the times to sample at.
-
-    Parameters
-    ----------
-    span : float
-        Length of each step.
-    rate : int
-        Samples a unit of time.
-
-    """
+    """Steps of a length and the times to sample at."""
 
     def __init__(self, span: float, rate: int) -> None:
         """Make the grid."""

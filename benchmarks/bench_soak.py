@@ -70,128 +70,52 @@ _SAME = 1e-9
 
 @dataclass
 class Cycle:
-    """
-    What became of one cycle and its bag.
+    """What became of one cycle and its bag."""
 
-    Attributes
-    ----------
-    kind : str
-        ``calm`` or ``rough``.
-    killed : str
-        Node that was killed in it; empty for none.
-    samples : int
-        Of the plant in the bag.
-    missing : int
-        Samples between others that are not in the bag, in calm ones.
-    odd : int
-        Distances between two samples that are no whole number of ms, in calm ones.
-    lost : int
-        As the recorder counts them; -1 if the bag does not tell, as one of a killed recorder.
-    difference : float
-        Largest difference of the stretch to the commands integrated anew; NaN if not checked.
-    late : int
-        Commands that came after their time.
-    failure : str
-        Why the bag could not be checked; empty if it could.
-
-    """
-
-    kind: str
-    killed: str
-    samples: int = 0
-    missing: int = 0
-    odd: int = 0
-    lost: int = 0
-    difference: float = math.nan
-    late: int = 0
-    failure: str = ''
+    kind: str  # 'calm' or 'rough'
+    killed: str  # node that was killed in it; empty for none
+    samples: int = 0  # of the plant in the bag
+    missing: int = 0  # samples between others that are not in the bag, in calm ones
+    odd: int = 0  # distances of two samples that are no whole number of ms, in calm ones
+    lost: int = 0  # as the recorder counts them; -1 if the bag does not tell
+    difference: float = math.nan  # of the stretch to the commands integrated anew
+    late: int = 0  # commands that came after their time
+    failure: str = ''  # why the bag could not be checked
 
 
 @dataclass
 class Witness:
-    """
-    What the recorder that lived through all cycles has written.
+    """What the recorder that lived through all cycles has written."""
 
-    Attributes
-    ----------
-    hours : float
-        Of simulated time that it lived.
-    files : int
-        Of its bag.
-    samples, messages : int
-        Of the plant's stretch, and of all topics, as the `mcap` package reads them.
-    told : int
-        Messages of all topics by the bag's metadata.
-    lost : int
-        Messages, by its own count.
-
-    """
-
-    hours: float
+    hours: float  # of simulated time that it lived
     files: int
-    samples: int
-    messages: int
-    told: int
-    lost: int
+    samples: int  # of the plant's stretch, as the mcap package reads them
+    messages: int  # of all topics, by the same package
+    told: int  # messages of all topics by the bag's metadata
+    lost: int  # by its own count
 
 
 @dataclass
 class Result:
-    """
-    What the soak found.
+    """What the soak found over DDS."""
 
-    Attributes
-    ----------
-    hours : float
-        Simulated over DDS.
-    wall : float
-        Hours that it took.
-    requests, garbage, calls : int
-        Setpoints, sequences and stops; messages of garbage; calls of services.
-    cycles : list of Cycle
-        In order.
-    memory : dict of list
-        Samples by node.
-    witness : Witness, optional
-        Of the recorder that lived through all of it.
-    trends : dict of Trend
-        By node.
-    traces : list of str
-        Unhandled exceptions.
-    ended : list of str
-        Nodes that ended without being told.
-    broken : list of str
-        Cycles that could not be finished, and why.
-    statuses : list of int
-        Exit statuses of nodes that were told to end.
-
-    """
-
-    hours: float = 0.0
-    wall: float = 0.0
-    requests: int = 0
-    garbage: int = 0
-    calls: int = 0
+    hours: float = 0.0  # simulated
+    wall: float = 0.0  # hours that it took
+    requests: int = 0  # setpoints, sequences and stops
+    garbage: int = 0  # messages
+    calls: int = 0  # of services
     cycles: list[Cycle] = field(default_factory=list)
     memory: dict[str, list[Sample]] = field(
         default_factory=lambda: {x: [] for x in (*_NODES, _WITNESS)})
     witness: Witness | None = None
     trends: dict[str, Trend] = field(default_factory=dict)
-    traces: list[str] = field(default_factory=list)
-    ended: list[str] = field(default_factory=list)
-    broken: list[str] = field(default_factory=list)
-    statuses: list[int] = field(default_factory=list)
+    traces: list[str] = field(default_factory=list)  # unhandled exceptions
+    ended: list[str] = field(default_factory=list)  # nodes that ended without being told
+    broken: list[str] = field(default_factory=list)  # cycles that could not be finished, and why
+    statuses: list[int] = field(default_factory=list)  # of nodes that were told to end
 
     def failures(self) -> list[str]:
-        """
-        Say what is not as it has to be.
-
-        Returns
-        -------
-        list of str
-            Empty if all is well.
-
-        """
+        """Say what is not as it has to be."""
         found = [f'unhandled exception in the {x}' for x in self.traces]
         found += [f'{x} ended by itself' for x in self.ended]
         found += self.broken
@@ -218,24 +142,7 @@ class Result:
 
 
 def check_bag(folder: Path, kind: str, killed: str, step: int = _STEP_NS) -> Cycle:
-    """
-    Look for gaps in a bag, integrate its commands anew, and remove it if all is well.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the bag.
-    kind, killed : str
-        As of `Cycle`.
-    step : int
-        Between two samples, in ns.
-
-    Returns
-    -------
-    Cycle
-        What was found.
-
-    """
+    """Look for gaps in a bag, integrate its commands anew, and remove it if all is well."""
     from hmsa_ros.bag.info import lost_messages
     from hmsa_ros.bag.reader import BagReader
     from hmsa_ros.bag.recover import recover
@@ -277,22 +184,7 @@ def check_bag(folder: Path, kind: str, killed: str, step: int = _STEP_NS) -> Cyc
 
 
 def read_witness(folder: Path, hours: float) -> Witness:
-    """
-    Count what a long recording holds, by a reader that is not this package's.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the bag.
-    hours : float
-        That the recorder lived.
-
-    Returns
-    -------
-    Witness
-        The counts.
-
-    """
+    """Count what a long recording holds, by a reader that is not this package's."""
     from mcap.reader import make_reader
 
     from hmsa_ros.bag.info import summarize
@@ -467,19 +359,7 @@ class Soak:
     # -- what is done to them ------------------------------------------------------------------
 
     def cycle(self, kind: str, seconds: float, victim: str) -> None:
-        """
-        Run one cycle with a bag of its own.
-
-        Parameters
-        ----------
-        kind : str
-            ``calm`` or ``rough``.
-        seconds : float
-            Of simulated time.
-        victim : str
-            Node to kill half way through; empty for none.
-
-        """
+        """Run one cycle with a bag of its own; a victim is killed half way through."""
         bag = self.rig.folder / f'bag{self._bags}'
         self._bags += 1
         self._start('recorder', **{'storage.uri': bag})
@@ -504,15 +384,7 @@ class Soak:
             check_bag, bag, kind, victim, round(_NANOSECONDS / self._rate)))
 
     def start_again(self, why: str) -> None:
-        """
-        Start all nodes anew, after a cycle that could not be finished.
-
-        Parameters
-        ----------
-        why : str
-            What happened; it makes the soak fail.
-
-        """
+        """Start all nodes anew, after a cycle that could not be finished, which is a failure."""
         self.result.broken.append(why)
         self._publish_inputs()
         for child in self._children.values():
@@ -661,34 +533,7 @@ class Soak:
 def run_over_dds(
         folder: Path, domain: int, *, hours: float, minutes: float, length: float,
         factor: float, rate: float = RATE, seed: int = 1) -> Result:
-    """
-    Wear out real processes.
-
-    Parameters
-    ----------
-    folder : Path
-        For logs and bags.
-    domain : int
-        ROS domain for this alone.
-    hours : float
-        Of simulated time, at most.
-    minutes : float
-        On the wall, at most.
-    length : float
-        Of a cycle in simulated s.
-    factor : float
-        Simulated seconds per second that the plant is asked for; 0 for as fast as it can.
-    rate : float
-        Of the plant, in Hz.
-    seed : int
-        Of all chance.
-
-    Returns
-    -------
-    Result
-        What was found.
-
-    """
+    """Wear out real processes for hours of simulated time or minutes on the wall."""
     kinds = cycle((
         ('calm', 'planner'), ('rough', 'plant'), ('calm', 'recorder'), ('rough', ''),
         ('calm', ''), ('rough', 'planner'), ('calm', ''), ('calm', '')))
@@ -714,47 +559,21 @@ def run_over_dds(
 
 @dataclass
 class Core:
-    """
-    What the soak in process found.
+    """What the soak in process found."""
 
-    Attributes
-    ----------
-    hours, wall : float
-        Simulated, and that it took.
-    steps, requests, refused, commands : int
-        Of 1 ms; requests, how many of them were garbage and refused; commands sent.
-    drift : int
-        Time at the end less the steps that were made, in ns.
-    difference : float
-        Largest difference of the stretch to what the planner predicted.
-    memory : list of Sample
-        Of this process.
-    trend : Trend
-        Of them.
-
-    """
-
-    hours: float
-    wall: float
-    steps: int
+    hours: float  # simulated
+    wall: float  # hours that it took
+    steps: int  # of 1 ms
     requests: int
-    refused: int
+    refused: int  # requests that were garbage
     commands: int
-    drift: int
-    difference: float
+    drift: int  # time at the end less the steps that were made, in ns
+    difference: float  # of the stretch to what the planner predicted
     memory: list[Sample]
     trend: Trend
 
     def failures(self) -> list[str]:
-        """
-        Say what is not as it has to be.
-
-        Returns
-        -------
-        list of str
-            Empty if all is well.
-
-        """
+        """Say what is not as it has to be."""
         found = []
         if self.drift:
             found.append(f'in process: time drifted by {self.drift} ns')
@@ -853,17 +672,7 @@ def run_in_process(hours: float, seed: int = 2) -> Core:
 
 
 def draw(result: Result, file: Path) -> None:
-    """
-    Draw the memory of the processes over simulated time.
-
-    Parameters
-    ----------
-    result : Result
-        Of the part over DDS.
-    file : Path
-        A PNG.
-
-    """
+    """Draw the memory of the processes over simulated time as a PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -885,22 +694,7 @@ def draw(result: Result, file: Path) -> None:
 
 
 def report(result: Result, core: Core, rate: float = RATE) -> list[str]:
-    """
-    Say what was found.
-
-    Parameters
-    ----------
-    result, core : Result, Core
-        Of both parts.
-    rate : float
-        Of the plant over DDS, in Hz.
-
-    Returns
-    -------
-    list of str
-        Sentences for the console and the page.
-
-    """
+    """Say what both parts found, in sentences for the console and the page."""
     calm = [x for x in result.cycles if x.kind == 'calm']
     checked = [x.difference for x in calm if not x.late and not math.isnan(x.difference)]
     lines = [
@@ -946,37 +740,7 @@ def run(
         console: Console, *, hours: float = 8.0, minutes: float = math.inf,
         factor: float | None = None, rate: float = RATE, quick: bool = False,
         picture: Path | None = None) -> tuple[dict[str, Any], str, int]:
-    """
-    Run both parts and print what was found.
-
-    Parameters
-    ----------
-    console : Console
-        Where to.
-    hours : float
-        Of simulated time.
-    minutes : float
-        On the wall, at most, for the part over DDS.
-    factor : float, optional
-        Simulated seconds per second that the plant is asked for; 0 for as fast as it can.
-        Default `FACTOR`, more for a rate below `RATE`.
-    rate : float
-        Of the plant, in Hz.
-    quick : bool
-        About a minute of everything.
-    picture : Path, optional
-        For the memory curve.
-
-    Returns
-    -------
-    record : dict
-        For a JSON file.
-    text : str
-        For a page.
-    status : int
-        Exit status: 1 if anything is not as it has to be.
-
-    """
+    """Run both parts, print what was found, and return record, text and exit status."""
     domain = ros_domain()
     length = 300.0
     if factor is None:

@@ -32,22 +32,7 @@ def holding_load(stretch: float, j_lim: float) -> float:
 
 
 def acceleration(stretch, rate, load, actuator: Actuator):
-    """
-    Return l'' of Eq. 11 for numbers, arrays or symbols.
-
-    Parameters
-    ----------
-    stretch, rate, load : float
-        State and load.
-    actuator : Actuator
-        zeta, J_lim and c1.
-
-    Returns
-    -------
-    float
-        Of the kind of the arguments.
-
-    """
+    """Return l'' of Eq. 11 for numbers, arrays or symbols."""
     cube = stretch * stretch * stretch
     left = 1.0 - (2.0 / stretch + stretch * stretch - 3.0) / actuator.j_lim
     return (1.5 * rate * rate / stretch - 3.0 * actuator.zeta * actuator.c1 * cube * rate
@@ -56,22 +41,7 @@ def acceleration(stretch, rate, load, actuator: Actuator):
 
 
 def with_scipy(actuator: Actuator, tolerance: float) -> Solver:
-    """
-    Shoot with SciPy: DOP853, its event for the turning point, brentq on the load.
-
-    Parameters
-    ----------
-    actuator : Actuator
-        zeta, J_lim and c1.
-    tolerance : float
-        Of the integration, relative and absolute; a tenth of it for the root.
-
-    Returns
-    -------
-    callable
-        Solver.
-
-    """
+    """Shoot with SciPy: DOP853, its event for the turning point, brentq on the load."""
     def solve(start: float, target: float) -> tuple[float, float]:
         times = []
 
@@ -100,35 +70,13 @@ def with_scipy(actuator: Actuator, tolerance: float) -> Solver:
 
 @dataclass(frozen=True)
 class Collocation:
-    """
-    Legendre collocation in CasADi on a few elements of free length.
-
-    Attributes
-    ----------
-    elements, degree : int
-        Of the polynomials.
-
-    """
+    """Legendre collocation in CasADi on a few elements of free length."""
 
     elements: int = 2
     degree: int = 9
 
     def equations(self, actuator: Actuator):
-        """
-        Set up unknowns, parameters and equations.
-
-        Parameters
-        ----------
-        actuator : Actuator
-            zeta, J_lim and c1.
-
-        Returns
-        -------
-        tuple
-            Symbols of unknowns (the last two are beta_p and tau_p), of start and target, the
-            equations, and a function for the first guess.
-
-        """
+        """Return symbols of unknowns and of start and target, equations, and a first guess."""
         import casadi
 
         # CasADi's own table of these points ends at degree 9 and at about ten digits.
@@ -184,68 +132,28 @@ class Collocation:
         return symbols, ends_of_move, casadi.vertcat(*equations), guess
 
 
-def with_ipopt(actuator: Actuator, collocation: Collocation) -> Solver | None:
-    """
-    Solve the collocation equations as an optimal control problem, with IPOPT.
-
-    Parameters
-    ----------
-    actuator : Actuator
-        zeta, J_lim and c1.
-    collocation : Collocation
-        Polynomials.
-
-    Returns
-    -------
-    callable or None
-        Solver.
-
-    """
+def with_casadi(method: str, actuator: Actuator, collocation: Collocation) -> Solver | None:
+    """Solve the collocation equations by IPOPT, as an optimal control problem, or by Newton."""
     try:
         import casadi
     except ImportError:
         return None
     symbols, ends, equations, guess = collocation.equations(actuator)
-    solver = casadi.nlpsol(
-        'plan', 'ipopt', {'x': symbols, 'p': ends, 'f': 0, 'g': equations},
-        {'ipopt.print_level': 0, 'print_time': False, 'ipopt.sb': 'yes', 'ipopt.tol': 1e-13,
-         'ipopt.constr_viol_tol': 1e-13})
+    problem = {'x': symbols, 'p': ends, 'g': equations}
+    bounds = {}
+    if method == 'ipopt':
+        bounds = {'lbg': 0.0, 'ubg': 0.0}
+        solver = casadi.nlpsol(
+            'plan', 'ipopt', {**problem, 'f': 0},
+            {'ipopt.print_level': 0, 'print_time': False, 'ipopt.sb': 'yes', 'ipopt.tol': 1e-13,
+             'ipopt.constr_viol_tol': 1e-13})
+    else:
+        solver = casadi.rootfinder(
+            'plan', 'newton', problem,
+            {'abstol': 1e-12, 'linear_solver': 'csparse', 'max_iter': 50})
 
     def solve(start: float, target: float) -> tuple[float, float]:
-        found = solver(x0=guess(start, target), p=[start, target], lbg=0.0, ubg=0.0)['x']
-        return float(found[-2]), float(found[-1])
-
-    return solve
-
-
-def with_rootfinder(actuator: Actuator, collocation: Collocation) -> Solver | None:
-    """
-    Solve the collocation equations with CasADi's Newton method.
-
-    Parameters
-    ----------
-    actuator : Actuator
-        zeta, J_lim and c1.
-    collocation : Collocation
-        Polynomials.
-
-    Returns
-    -------
-    callable or None
-        Solver.
-
-    """
-    try:
-        import casadi
-    except ImportError:
-        return None
-    symbols, ends, equations, guess = collocation.equations(actuator)
-    solver = casadi.rootfinder(
-        'plan', 'newton', {'x': symbols, 'p': ends, 'g': equations},
-        {'abstol': 1e-12, 'linear_solver': 'csparse', 'max_iter': 50})
-
-    def solve(start: float, target: float) -> tuple[float, float]:
-        found = solver(x0=guess(start, target), p=[start, target])['x']
+        found = solver(x0=guess(start, target), p=[start, target], **bounds)['x']
         return float(found[-2]), float(found[-1])
 
     return solve

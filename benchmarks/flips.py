@@ -31,23 +31,11 @@ _HEADS_KILLED = {**_HEADS, Opcode.METADATA: 4}
 
 @dataclass(frozen=True)
 class Count:
-    """
-    Result of the flips.
+    """Result of the flips."""
 
-    Attributes
-    ----------
-    said : int
-        A problem was named, or the bag refused.
-    harmless : int
-        Nothing was said, and everything was read as it was written.
-    wrong : tuple of str
-        Something else was read without a word.
-
-    """
-
-    said: int
-    harmless: int
-    wrong: tuple[str, ...]
+    said: int  # a problem was named, or the bag refused
+    harmless: int  # nothing was said, and everything was read as it was written
+    wrong: tuple[str, ...]  # something else was read without a word
 
 
 def make_bag(folder: Path, *, preset: str = 'none', killed: bool = False) -> Path:

@@ -20,75 +20,28 @@ Clock = Callable[[], tuple[float, float]]
 
 @dataclass(frozen=True)
 class Row:
-    """
-    One measured line of a table.
-
-    Attributes
-    ----------
-    name : str
-        What was measured.
-    setting : str
-        Its tolerance or what else was set.
-    least, median : float or None
-        Seconds for one unit of work; None where it could not be measured.
-    error : float or None
-        Largest error.
-    note : str
-        What else is to be said.
-
-    """
+    """One measured line of a table."""
 
     name: str
-    setting: str = ''
-    least: float | None = None
+    setting: str = ''  # its tolerance or what else was set
+    least: float | None = None  # seconds for one unit of work; None where it could not be measured
     median: float | None = None
-    error: float | None = None
+    error: float | None = None  # the largest one
     note: str = ''
 
 
 @dataclass(frozen=True)
 class Contender:
-    """
-    Something to be timed.
-
-    Attributes
-    ----------
-    name : str
-        What it is.
-    setting : str
-        Its tolerance or what else was set.
-    clock : callable
-        Runs for a while; returns the least and the median seconds for one unit of work.
-    error : float
-        Its largest error.
-
-    """
+    """Something to be timed."""
 
     name: str
-    setting: str
-    clock: Clock
-    error: float
+    setting: str  # its tolerance or what else was set
+    clock: Clock  # runs a while; returns least and median seconds for one unit of work
+    error: float  # the largest one
 
 
 def stopwatch(work: Callable[[], object], units: float, *, least: float = 0.1) -> Clock:
-    """
-    Make a clock of a function.
-
-    Parameters
-    ----------
-    work : callable
-        Called again and again.
-    units : float
-        Units of work that one call does.
-    least : float
-        Seconds that one run of the clock takes at least; one call is made at least.
-
-    Returns
-    -------
-    callable
-        For a `Contender`.
-
-    """
+    """Make a clock of a function that does units of work, for at least so many seconds."""
     def clock() -> tuple[float, float]:
         spans = []
         end = perf_counter() + least
@@ -163,29 +116,13 @@ def text_of_time(seconds: float | None) -> str:
 
 @dataclass(frozen=True)
 class Report:
-    """
-    A table of rows.
+    """A table of rows."""
 
-    Attributes
-    ----------
-    key : str
-        Name in the JSON file.
-    title : str
-        What is compared.
-    unit : str
-        Heading of the times.
-    error : str
-        Heading of the errors.
-    rows : list of Row
-        The first one is what the others are compared to.
-
-    """
-
-    key: str
+    key: str  # name in the JSON file
     title: str
-    unit: str
-    error: str
-    rows: list[Row]
+    unit: str  # heading of the times
+    error: str  # heading of the errors
+    rows: list[Row]  # the first one is what the others are compared to
 
     def _cells(self) -> tuple[list[str], list[list[str]]]:
         head = ['', 'setting', self.unit, 'median', 'ratio', self.error, 'remark']

@@ -21,15 +21,7 @@ Series = list[Decimal]
 
 @dataclass(frozen=True)
 class Actuator:
-    """
-    The nondimensional group of Eq. 11.
-
-    Attributes
-    ----------
-    zeta, j_lim, c1 : float
-        Damping, chain limit and shape, taken at their exact binary values.
-
-    """
+    """Damping, chain limit and shape of Eq. 11, taken at their exact binary values."""
 
     zeta: float = 0.2
     j_lim: float = 5.0
@@ -146,27 +138,7 @@ def _holding_load(stretch: Decimal, j_lim: Decimal) -> Decimal:
 
 
 def two_step(start: float, target: float, actuator: Actuator) -> tuple[Decimal, Decimal]:
-    """
-    Solve Eq. 13 for one move from rest by the secant method.
-
-    Parameters
-    ----------
-    start, target : float
-        Different stretches inside the limits, taken at their exact binary values.
-    actuator : Actuator
-        zeta, J_lim and c1, well below critical damping.
-
-    Returns
-    -------
-    beta_p, tau_p : Decimal
-        To about 28 digits.
-
-    Raises
-    ------
-    ArithmeticError
-        If the secant method does not settle.
-
-    """
+    """Solve Eq. 13 for one move from rest by the secant method, to about 28 digits."""
     with _precise():
         l0, l1, j_lim = Decimal(start), Decimal(target), Decimal(actuator.j_lim)
         low, high = _holding_load(l0, j_lim), _holding_load(l1, j_lim)
@@ -190,26 +162,7 @@ def two_step(start: float, target: float, actuator: Actuator) -> tuple[Decimal, 
 def response(
         switches: Sequence[float], loads: Sequence[float], times: Iterable[float],
         start: float, actuator: Actuator) -> list[Decimal]:
-    """
-    Sample the response from rest to a piecewise constant load.
-
-    Parameters
-    ----------
-    switches, loads : sequence of float
-        Load from each time on; the motion begins at the first.
-    times : iterable of float
-        Increasing, none before the first switch.
-    start : float
-        Stretch at rest.
-    actuator : Actuator
-        zeta, J_lim and c1.
-
-    Returns
-    -------
-    list of Decimal
-        Stretch at the times.
-
-    """
+    """Sample the response from rest to a piecewise constant load."""
     with _precise():
         samples = []
         here, rate, now = Decimal(start), Decimal(0), Decimal(switches[0])

@@ -10,32 +10,14 @@ from rich.table import Table
 
 @dataclass(frozen=True)
 class Sheet:
-    """
-    A table with headings of its own.
+    """A table with headings of its own."""
 
-    Attributes
-    ----------
-    key : str
-        Name in the JSON file and in the marks of a page.
-    title : str
-        What is shown.
-    head : sequence of str
-        Headings; the first column holds text, the others numbers.
-    rows : sequence of sequence of str
-        Cells.
-    figures : mapping
-        The same in full precision, for the JSON file.
-    passed : bool
-        Whether what was promised was seen.
-
-    """
-
-    key: str
+    key: str  # name in the JSON file and in the marks of a page
     title: str
-    head: Sequence[str]
+    head: Sequence[str]  # of a first column of text and others of numbers
     rows: Sequence[Sequence[str]]
-    figures: Mapping[str, Any] = field(default_factory=dict)
-    passed: bool = True
+    figures: Mapping[str, Any] = field(default_factory=dict)  # the same in full, for JSON
+    passed: bool = True  # whether what was promised was seen
 
     def show(self, console: Console) -> None:
         """Print the table."""

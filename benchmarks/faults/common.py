@@ -24,20 +24,7 @@ class Register(list[Fault]):
 
     def fault(
             self, key: str, name: str, how: str, expected: str) -> Callable[[Inject], Inject]:
-        """
-        Enter a function as a fault.
-
-        Parameters
-        ----------
-        key, name, how, expected : str
-            As of `Fault`.
-
-        Returns
-        -------
-        callable
-            A decorator.
-
-        """
+        """Return what enters a function as a fault."""
         def enter(inject: Inject) -> Inject:
             self.append(Fault(key, name, how, expected, inject))
             return inject

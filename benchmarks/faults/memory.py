@@ -14,21 +14,7 @@ LONG = 0.1
 
 
 def used(pid: int) -> tuple[int, int, int]:
-    """
-    Return the memory of a process.
-
-    Parameters
-    ----------
-    pid : int
-        Of the process.
-
-    Returns
-    -------
-    own, pss, rss : int
-        Anonymous memory, which is the process's own, proportional and resident set size, in
-        bytes; 0 for a process that has ended.
-
-    """
+    """Return anonymous memory, PSS and RSS of a process in bytes; 0 for one that has ended."""
     found = {}
     try:
         with open(f'/proc/{pid}/smaps_rollup', encoding='ascii') as file:
@@ -43,53 +29,24 @@ def used(pid: int) -> tuple[int, int, int]:
 
 @dataclass(frozen=True)
 class Sample:
-    """
-    Memory of a process at a moment.
+    """Memory of a process at a moment, in bytes; leaks show in what is its own."""
 
-    Attributes
-    ----------
-    time : float
-        In h of simulated time, all lives of the run together.
-    life : int
-        Counts the processes that have carried the name.
-    age : float
-        Since this process was started, in h of simulated time.
-    own, pss, rss : int
-        Anonymous memory, proportional and resident set size in bytes. The first is what leaks
-        show in: the others change as processes come and go that use the same libraries.
-
-    """
-
-    time: float
-    life: int
-    age: float
-    own: int
+    time: float  # in h of simulated time, all lives of the run together
+    life: int  # counts the processes that have carried the name
+    age: float  # since this process was started, in h of simulated time
+    own: int  # anonymous memory; the others change with who shares the libraries
     pss: int
     rss: int
 
 
 @dataclass(frozen=True)
 class Trend:
-    """
-    How memory changes.
+    """How memory changes."""
 
-    Attributes
-    ----------
-    slope : float
-        In bytes per simulated hour, from all lives, each with a level of its own.
-    error : float
-        Standard error of the slope; infinite for too few samples.
-    span : float
-        Longest part of a life that counts, in h.
-    samples : int
-        That were used.
-
-    """
-
-    slope: float
-    error: float
-    span: float
-    samples: int
+    slope: float  # bytes per simulated hour, from all lives, each with a level of its own
+    error: float  # standard error of the slope; infinite for too few samples
+    span: float  # longest part of a life that counts, in h
+    samples: int  # that were used
 
     @property
     def flat(self) -> bool:

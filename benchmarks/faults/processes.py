@@ -202,12 +202,7 @@ def _recorder_killed(rig: Rig) -> Seen:
     recorder.end(signal.SIGKILL)
     worst = max(worst, moves(rig, (1.1, 1.3), start=1.4))
     recover(bag, rig.folder / 'recovered')
-    reader = BagReader(rig.folder / 'recovered')
-    topic = '/' + topics.JOINT_STATES.name
-    decode = reader.decoder(topic)
-    stamps = [decode(x.data).header.stamp for x in reader.messages((topic,))]
-    times = np.array([x.sec * 10**9 + x.nanosec for x in stamps])
-    gaps = int(np.sum(np.diff(times) != 10**6))
+    times, gaps = _samples(rig.folder / 'recovered')
     lost = (last - times[-1]) * 1e-9
     return Seen(
         f'{len(times)} samples recovered, {gaps} gaps; residual of the moves {worst:.1e}',
@@ -235,23 +230,23 @@ def _disk_full(rig: Rig) -> Seen:
             lambda: rig.level('recorder') >= 2 or not recorder.alive, 'the disk to be full')
         worst = moves(rig)
         told = rig.level('recorder')
-        gaps, count = _gaps(disk / 'bag')
+        times, gaps = _samples(disk / 'bag')
         status = recorder.end()
     finally:
         subprocess.run(['umount', '--lazy', str(disk)], check=False)
     return Seen(
-        f'recorder level {told}, {count} samples readable with {gaps} gaps, exit {status}',
-        share(worst), told == 2 and gaps == 0 and count > 1000 and worst < LIMIT)
+        f'recorder level {told}, {len(times)} samples readable with {gaps} gaps, exit {status}',
+        share(worst), told == 2 and gaps == 0 and len(times) > 1000 and worst < LIMIT)
 
 
-def _gaps(bag: Path) -> tuple[int, int]:
-    """Count missing samples in a bag."""
+def _samples(bag: Path) -> tuple[np.ndarray, int]:
+    """Return the times of the samples in a bag in ns, and how many are missing between them."""
     reader = BagReader(bag)
     topic = '/' + topics.JOINT_STATES.name
     decode = reader.decoder(topic)
     stamps = [decode(x.data).header.stamp for x in reader.messages((topic,))]
     times = np.array([x.sec * 10**9 + x.nanosec for x in stamps])
-    return int(np.sum(np.diff(times) != 10**6)), len(times)
+    return times, int(np.sum(np.diff(times) != 10**6))
 
 
 @FAULTS.fault(

@@ -11,65 +11,27 @@ from hmsa_ros.errors import HmsaError
 
 @dataclass(frozen=True)
 class Seen:
-    """
-    What was seen of a fault.
-
-    Attributes
-    ----------
-    text : str
-        In a few words.
-    figure : str
-        Residual as a share of the step, or loss with its unit.
-    met : bool
-        Whether it is what was expected.
-
-    """
+    """What was seen of a fault."""
 
     text: str
-    figure: str
-    met: bool
+    figure: str  # residual as a share of the step, or loss with its unit
+    met: bool  # whether it is what was expected
 
 
 @dataclass(frozen=True)
 class Fault:
-    """
-    A fault to inject.
+    """A fault to inject."""
 
-    Attributes
-    ----------
-    key : str
-        To ask for it on the command line.
-    name : str
-        What goes wrong.
-    how : str
-        How it is made.
-    expected : str
-        What has to be seen.
-    inject : callable
-        Does it in a rig of its own.
-
-    """
-
-    key: str
-    name: str
-    how: str
-    expected: str
-    inject: Callable[[Rig], Seen]
+    key: str  # to ask for it on the command line
+    name: str  # what goes wrong
+    how: str  # how it is made
+    expected: str  # what has to be seen
+    inject: Callable[[Rig], Seen]  # does it in a rig of its own
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """
-    A row of the table.
-
-    Attributes
-    ----------
-    fault : Fault
-        What was injected.
-    seen : Seen
-        What came of it.
-
-    """
+    """A row of the table."""
 
     fault: Fault
     seen: Seen
