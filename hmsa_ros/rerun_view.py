@@ -159,10 +159,8 @@ def main(args: Sequence[str] | None = None) -> int:
         if given.save is not None:
             # Only then does the file get its index.
             recording.disconnect()
-    except BadInputError as error:
-        return complain(error, 2)
     except HmsaError as error:
-        return complain(error, 1)
+        return complain(error, 2 if isinstance(error, BadInputError) else 1)
     return 0
 
 

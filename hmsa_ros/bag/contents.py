@@ -5,10 +5,8 @@ from collections.abc import Iterable, Mapping
 
 from hmsa_ros import __version__
 from hmsa_ros.bag import metadata
-from hmsa_ros.bag.output import OutputFile, Topic
-from hmsa_ros.errors import BagError
-
-MAX_CHANNELS = 2**16 - 1
+from hmsa_ros.bag.output import OutputFile
+from hmsa_ros.bag.topics import Topic
 
 
 class Contents:
@@ -23,7 +21,7 @@ class Contents:
         self.topics: list[Topic] = []
         self.files: list[metadata.FileMetadata] = []
         self.custom_data: dict[str, str] = {}
-        self.dropped: dict[str, int] = {}
+        self.dropped: Counter[str] = Counter()
         self.ended = False
         self._ros_distro = ros_distro
         self._counts: Counter[int] = Counter()
@@ -38,17 +36,6 @@ class Contents:
         """Return what a file says of the experiment."""
         return {'version': __version__, **self.custom_data}
 
-    def number_of(self, topic: Topic) -> int | None:
-        """Return the number of a topic that is known, None of a new one."""
-        return next((
-            number for number, known in enumerate(self.topics)
-            if (known.name, known.type) == (topic.name, topic.type)), None)
-
-    def check_room(self) -> None:
-        """Refuse one topic more than MCAP can number, by a `BagError`."""
-        if len(self.topics) >= MAX_CHANNELS:
-            raise BagError(f'a bag cannot have more than {MAX_CHANNELS} topics')
-
     def counts(self) -> dict[str, int]:
         """Return the number of messages written, by topic."""
         return {topic.name: self._counts[number]
@@ -60,15 +47,12 @@ class Contents:
 
     def lose(self, numbers: Iterable[int]) -> None:
         """Count messages that could not be written."""
-        for number in numbers:
-            name = self.topics[number].name
-            self.dropped[name] = self.dropped.get(name, 0) + 1
+        self.dropped.update(self.topics[number].name for number in numbers)
 
     def lose_file(self, file: OutputFile) -> None:
         """Count the messages of a file that is gone."""
         for number, count in file.counts.items():
-            name = self.topics[number].name
-            self.dropped[name] = self.dropped.get(name, 0) + count
+            self.dropped[self.topics[number].name] += count
             self._counts[number] -= count
 
     def describe(self, file: OutputFile | None) -> metadata.BagMetadata:

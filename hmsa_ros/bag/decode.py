@@ -2,32 +2,19 @@
 
 from collections.abc import Callable
 import contextlib
-from dataclasses import dataclass
 import io
 import re
 from typing import Any
 
-from hmsa_ros.bag import limits, qos
+from hmsa_ros.bag import limits
+from hmsa_ros.bag.topics import Topic
 from hmsa_ros.errors import BagError
 
 # A field that is an array of messages.
 _NESTED = re.compile(r'^\s*(?:[A-Z]\w*|\w+/[\w/]+)\s*\[', re.MULTILINE)
 
 
-@dataclass(frozen=True)
-class TopicInfo:
-    """A topic of a bag."""
-
-    name: str
-    type: str  # empty if the bag does not have it
-    encoding: str = 'cdr'  # of the messages
-    definition_encoding: str = ''
-    definition: str = ''  # with its dependencies; empty if the bag has none
-    profiles: tuple[qos.Qos, ...] = ()  # what the publishers offered
-    type_hash: str = ''  # RIHS01 hash, empty if unknown
-
-
-def make_decoder(info: TopicInfo) -> Callable[[bytes], Any]:
+def make_decoder(info: Topic) -> Callable[[bytes], Any]:
     """Return what decodes a topic's payloads; both raise `BagError` where it cannot be done."""
     from mcap.records import Schema
     from mcap_ros2.decoder import DecoderFactory

@@ -38,7 +38,8 @@ _INDEX_HEAD = struct.Struct('<BQHI')
 _COMPRESS: Mapping[str, Any] = {
     '': lambda data: data, 'lz4': lz4.frame.compress, 'zstd': zstandard.compress}
 
-Entries = Sequence[tuple[int, int, int, int, bytes]]
+#: A message: topic number, log and publish time in ns, sequence and payload.
+Entry = tuple[int, int, int, int, bytes]
 
 
 class Stream:
@@ -106,8 +107,8 @@ class Framing:
             metadata=metadata))
         self._declared.append(self._channels[-1])
 
-    def add_chunk(self, entries: Entries) -> None:
-        """Store messages: channel less one, log and publish time in ns, sequence, payload."""
+    def add_chunk(self, entries: Sequence[Entry]) -> None:
+        """Store messages, the topic of each being its channel less one."""
         declared = _packed(self._declared)
         content, places = _messages(entries, len(declared))
         data = declared + content
@@ -149,7 +150,7 @@ class Framing:
         self._stream.commit()
         self._metadata.append(MetadataIndex(offset=offset, length=len(data), name=name))
 
-    def finish(self) -> None:
+    def add_summary(self) -> None:
         """Store the summary and the end of the file."""
         stream = self._stream
         stream.write(_packed([DataEnd(stream.crc if self._crc else 0)]))
@@ -191,7 +192,7 @@ def _packed(records: Iterable[McapRecord]) -> bytes:
     return bytes(builder.end())  # type: ignore[no-untyped-call]
 
 
-def _messages(entries: Entries, place: int) -> tuple[bytes, dict[int, list[int]]]:
+def _messages(entries: Sequence[Entry], place: int) -> tuple[bytes, dict[int, list[int]]]:
     """Return messages as bytes that begin at a place, and by topic their times and places."""
     pack, head = MESSAGE_HEAD.pack, MESSAGE_HEAD.size
     parts: list[bytes] = []

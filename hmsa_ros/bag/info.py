@@ -1,7 +1,7 @@
 """What is in a bag, in figures and in words."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 import datetime
 import json
 import os
@@ -10,6 +10,11 @@ from hmsa_ros.bag import limits, qos
 from hmsa_ros.bag.experiment import node_parameters, parameter_key
 from hmsa_ros.bag.reader import BagReader
 from hmsa_ros.errors import BagError, printable
+
+# What is told as JSON, in this order.
+_SHOWN = (
+    'path', 'files', 'start_ns', 'end_ns', 'duration', 'message_count', 'lost', 'topics',
+    'parameters', 'custom_data', 'complete', 'problems')
 
 
 @dataclass(frozen=True)
@@ -100,23 +105,10 @@ def lost_messages(custom_data: Mapping[str, str]) -> dict[str, int] | None:
 
 def to_json(summary: BagSummary) -> str:
     """Return a summary as one JSON object."""
-    return json.dumps({
-        'path': summary.path,
-        'files': [{'name': name, 'size': size} for name, size in summary.files],
-        'start_ns': summary.start_ns,
-        'end_ns': summary.end_ns,
-        'duration': summary.duration,
-        'message_count': summary.message_count,
-        'lost': summary.lost,
-        'topics': [{
-            'name': topic.name, 'type': topic.type, 'count': topic.count, 'rate': topic.rate,
-            'lost': topic.lost, 'reliability': topic.reliability,
-            'durability': topic.durability} for topic in summary.topics],
-        'parameters': dict(summary.parameters),
-        'custom_data': dict(summary.custom_data),
-        'complete': summary.complete,
-        'problems': list(summary.problems),
-    }, indent=2, allow_nan=False)
+    shown = asdict(summary) | {
+        'files': [{'name': name, 'size': size} for name, size in summary.files]}
+    return json.dumps(
+        {key: shown.get(key, getattr(summary, key)) for key in _SHOWN}, indent=2, allow_nan=False)
 
 
 def to_text(summary: BagSummary) -> str:

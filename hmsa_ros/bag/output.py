@@ -5,16 +5,16 @@ A chunk is in the file whole or not at all, and room for the chunk and for the s
 on the disk before, so that a full disk leaves a file that can still be closed.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import os
 from pathlib import Path
 
 from hmsa_ros import __version__
 from hmsa_ros.bag import metadata, qos
-from hmsa_ros.bag.framing import Entries, Framing, Stream
+from hmsa_ros.bag.framing import Entry, Framing, Stream
 from hmsa_ros.bag.records import MESSAGE_HEAD
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.bag.topics import Topic
 
 LIBRARY = f'hmsa_ros {__version__}'
 #: Name of the metadata record with the experiment.
@@ -46,25 +46,7 @@ PRESETS: Mapping[str, Preset] = {
 }
 
 
-@dataclass(frozen=True)
-class Topic:
-    """A topic to be written."""
-
-    name: str  # for example ``'/joint_states'``
-    type: str  # for example ``'sensor_msgs/msg/JointState'``
-    definition: str = ''  # with its dependencies; empty if not known
-    definition_encoding: str = 'ros2msg'  # or ``'ros2idl'``, empty
-    profiles: tuple[qos.Qos, ...] = ()  # what the publishers offer
-    type_hash: str = ''  # RIHS01 hash, empty if not known
-
-    def __post_init__(self) -> None:
-        if not self.name:
-            raise BadInputError('a topic has an empty name: expected a name such as /stretch')
-        if not self.type:
-            raise BadInputError(f'topic {self.name} has an empty type: expected a message type')
-
-
-class OutputFile:
+class OutputFile(Framing):
     """
     One file of a bag; its methods raise `OSError` if the disk does not take what they write.
 
@@ -74,27 +56,14 @@ class OutputFile:
 
     def __init__(self, path: Path, number: int, preset: Preset) -> None:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+        super().__init__(Stream(descriptor), LIBRARY, preset.compression, crc=preset.crc)
         self.path = path
         self.number = number
         self.overhead = self.notes_size = 0
         self.noted: dict[str, str] = {}
-        self._stream = Stream(descriptor)
-        self._schemas: dict[str, int] = {}
+        self._types: dict[str, int] = {}
         self._ending = False
         self._end_size = self._notes_room = self._room = 0
-        self._framing = Framing(
-            self._stream, LIBRARY, preset.compression, crc=preset.crc)
-        self.counts = self._framing.counts
-
-    @property
-    def start(self) -> int:
-        """Return the lowest log time stored."""
-        return self._framing.start
-
-    @property
-    def end(self) -> int:
-        """Return the highest log time stored."""
-        return self._framing.end
 
     @property
     def size(self) -> int:
@@ -116,29 +85,29 @@ class OutputFile:
             'offered_qos_profiles': qos.to_yaml(topic.profiles),
             'topic_type_hash': topic.type_hash}
         size = len(topic.name) * 4 + sum(map(len, values.values())) + 100
-        if topic.type not in self._schemas:
+        if topic.type not in self._types:
             size += len(data) + len(topic.type) * 4
         # In a chunk, in the summary, and in the metadata.
         self._end_size += 4 * size
         self.reserve(0)
         self.overhead += size
-        if topic.type not in self._schemas:
-            self._schemas[topic.type] = self._framing.add_schema(
+        if topic.type not in self._types:
+            self._types[topic.type] = self.add_schema(
                 topic.type, topic.definition_encoding, data)
-        self._framing.add_channel(topic.name, self._schemas[topic.type], values)
+        self.add_channel(topic.name, self._types[topic.type], values)
 
-    def write(self, entries: Entries, size: int) -> None:
+    def write(self, entries: Sequence[Entry], size: int) -> None:
         """Store messages with ``size`` bytes of payload as one chunk."""
         index = _CHUNK_BYTES + _CHANNEL_BYTES * len({entry[0] for entry in entries})
         content = size + _MESSAGE_BYTES * len(entries) + self.overhead
         # What cannot be compressed becomes a little longer.
         self.reserve(content + content // 128 + 2 * index)
         self._end_size += index
-        self._framing.add_chunk(entries)
+        self.add_chunk(entries)
 
     def describe(self, serialized_metadata: str, notes: Mapping[str, str]) -> None:
         """Store the record that rosbag2 has at both ends of a file, and the experiment."""
-        self._add_metadata('rosbag2', {'serialized_metadata': serialized_metadata})
+        self._store('rosbag2', {'serialized_metadata': serialized_metadata})
         self.note(notes)
 
     def note(self, values: Mapping[str, str]) -> None:
@@ -147,17 +116,17 @@ class OutputFile:
         if new:
             # All of it comes once more at the end, and twice in the metadata file.
             self._notes_room = 4 * sum(len(key) + len(value) for key, value in values.items())
-            self.notes_size += self._add_metadata(EXPERIMENT, new)
+            self.notes_size += self._store(EXPERIMENT, new)
             self.noted.update(new)
 
-    def _add_metadata(self, name: str, values: Mapping[str, str]) -> int:
+    def _store(self, name: str, values: Mapping[str, str]) -> int:
         """Store a metadata record and return its length."""
         if not self._ending:
             self.reserve(100 + sum(
                 4 * (len(key) + len(value)) + 8 for key, value in values.items()))
         self._end_size += len(name) + 50
         before = self.size
-        self._framing.add_metadata(name, values)
+        self.add_metadata(name, values)
         self.overhead += self.size - before
         return self.size - before
 
@@ -166,7 +135,7 @@ class OutputFile:
         """Store the metadata and the summary in the room taken, and close the file."""
         self._ending = True
         self.describe(serialized_metadata, notes)
-        self._framing.finish()
+        self.add_summary()
         os.ftruncate(self._stream.descriptor, self.size)
         if fsync:
             self.sync()

@@ -4,8 +4,8 @@ Quality of service as rosbag2 stores it: a YAML list of profiles.
 Jazzy (metadata version 9) writes names (``reliable``); older bags hold the numbers of rmw.
 """
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
 from typing import Any
 
 import yaml
@@ -19,6 +19,9 @@ DURABILITIES = ('system_default', 'transient_local', 'volatile', 'unknown', 'bes
 LIVELINESSES = (
     'system_default', 'automatic', 'manual_by_node', 'manual_by_topic', 'unknown',
     'best_available')
+_POLICIES = {
+    'history': HISTORIES, 'reliability': RELIABILITIES, 'durability': DURABILITIES,
+    'liveliness': LIVELINESSES}
 INFINITE_NS = 9223372036854775807
 #: Key of custom data, before a topic's name: profiles of publishers that came later.
 LATER = 'offered_qos_profiles.'
@@ -39,11 +42,8 @@ class Qos:
     avoid_ros_namespace_conventions: bool = False
 
     def __post_init__(self) -> None:
-        for name, value, known in (
-                ('history', self.history, HISTORIES),
-                ('reliability', self.reliability, RELIABILITIES),
-                ('durability', self.durability, DURABILITIES),
-                ('liveliness', self.liveliness, LIVELINESSES)):
+        for name, known in _POLICIES.items():
+            value = getattr(self, name)
             if value not in known:
                 raise BagError(f'QoS {name} is {value!r}: expected one of {", ".join(known)}')
         for name, number in (
@@ -53,38 +53,34 @@ class Qos:
                 raise BagError(f'QoS {name} is {number}: expected at least 0')
 
 
-def _time_to_map(nanoseconds: int) -> dict[str, int]:
-    """Split as rosbag2 does."""
-    return {'sec': nanoseconds // 10**9, 'nsec': nanoseconds % 10**9}
+# As rosbag2 names the fields, in its order.
+_KEYS = {x.name: x.name.removesuffix('_ns') for x in fields(Qos)} | {
+    'lease_ns': 'liveliness_lease_duration'}
 
 
-def _time_from_map(value: Any) -> int:
-    """Read a duration; at most what means none."""
-    total = int(value['sec']) * 10**9 + int(value['nsec'])
-    return min(total, INFINITE_NS)
+def _stored(name: str, value: Any) -> Any:
+    """Return a field's value as rosbag2 stores it."""
+    return {'sec': value // 10**9, 'nsec': value % 10**9} if name.endswith('_ns') else value
 
 
-def _name(value: Any, known: tuple[str, ...]) -> str:
-    """Read a policy given as a name or as the number of rmw; what is unknown says so."""
-    if isinstance(value, str):
-        return value if value in known else 'unknown'
-    number = int(value)
-    return known[number] if 0 <= number < len(known) else 'unknown'
+def _read(name: str, value: Any) -> Any:
+    """Read a field's value; a policy is a name or the number of rmw, unknown ones say so."""
+    known = _POLICIES.get(name)
+    if known is not None:
+        if isinstance(value, str):
+            return value if value in known else 'unknown'
+        number = int(value)
+        return known[number] if 0 <= number < len(known) else 'unknown'
+    if name.endswith('_ns'):
+        return min(int(value['sec']) * 10**9 + int(value['nsec']), INFINITE_NS)
+    return max(0, int(value)) if name == 'depth' else bool(value)
 
 
 def to_maps(profiles: Iterable[Qos]) -> list[dict[str, Any]]:
     """Return profiles as plain maps, in the order of keys that rosbag2 writes."""
     return [{
-        'history': profile.history,
-        'depth': profile.depth,
-        'reliability': profile.reliability,
-        'durability': profile.durability,
-        'deadline': _time_to_map(profile.deadline_ns),
-        'lifespan': _time_to_map(profile.lifespan_ns),
-        'liveliness': profile.liveliness,
-        'liveliness_lease_duration': _time_to_map(profile.lease_ns),
-        'avoid_ros_namespace_conventions': profile.avoid_ros_namespace_conventions,
-    } for profile in profiles]
+        key: _stored(name, getattr(profile, name)) for name, key in _KEYS.items()}
+        for profile in profiles]
 
 
 def to_yaml(profiles: Iterable[Qos]) -> str:
@@ -100,23 +96,11 @@ def from_stored(value: Any) -> tuple[Qos, ...]:
     """Read profiles from YAML or a newer file's list, none from None, or raise `BagError`."""
     try:
         items = limits.load_yaml(value) if isinstance(value, str) else value
-        return tuple(_from_map(item) for item in items or ())
+        return tuple(
+            Qos(**{name: _read(name, item[key]) for name, key in _KEYS.items()})
+            for item in items or ())
     except (BagError, KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         what = str(error) if isinstance(error, BagError) else type(error).__name__
         raise BagError(
             f'offered_qos_profiles cannot be read ({what}): expected a YAML list of '
             'profiles') from error
-
-
-def _from_map(item: Mapping[str, Any]) -> Qos:
-    """Read one profile."""
-    return Qos(
-        history=_name(item['history'], HISTORIES),
-        depth=max(0, int(item['depth'])),
-        reliability=_name(item['reliability'], RELIABILITIES),
-        durability=_name(item['durability'], DURABILITIES),
-        deadline_ns=_time_from_map(item['deadline']),
-        lifespan_ns=_time_from_map(item['lifespan']),
-        liveliness=_name(item['liveliness'], LIVELINESSES),
-        lease_ns=_time_from_map(item['liveliness_lease_duration']),
-        avoid_ros_namespace_conventions=bool(item['avoid_ros_namespace_conventions']))

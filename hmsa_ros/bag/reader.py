@@ -24,17 +24,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from hmsa_ros.bag import limits, metadata
-from hmsa_ros.bag.decode import make_decoder, TopicInfo
+from hmsa_ros.bag.decode import make_decoder
 from hmsa_ros.bag.folder import Folder
 from hmsa_ros.bag.intake import Intake, Problems, ScannedFile
 from hmsa_ros.bag.merge import Cursor, merge, Message
 from hmsa_ros.bag.output import EXPERIMENT
 from hmsa_ros.bag.records import Block
 from hmsa_ros.bag.scan import check_data, scan
-from hmsa_ros.bag.topics import Topics
+from hmsa_ros.bag.topics import Topic, Topics
 from hmsa_ros.errors import BadInputError, BagError
 
-__all__ = ['BagReader', 'DecodedMessage', 'Message', 'TopicInfo', 'read_messages']
+__all__ = ['BagReader', 'DecodedMessage', 'Message', 'Topic', 'read_messages']
 # Later than any log time.
 _NEVER = 2**64
 
@@ -66,7 +66,7 @@ class BagReader:
         As given.
     files : tuple of pathlib.Path
         The files read, in order.
-    topics : mapping of str to TopicInfo
+    topics : mapping of str to Topic
         By name, in order of appearance.
     metadata : hmsa_ros.bag.metadata.BagMetadata or None
         What ``metadata.yaml`` says, if it is there and can be read.

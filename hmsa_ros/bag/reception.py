@@ -5,8 +5,9 @@ from dataclasses import dataclass, field
 import time
 from typing import Any
 
+from hmsa_ros.bag.framing import Entry
 from hmsa_ros.bag.qos import Qos
-from hmsa_ros.bag.recording import Message, Status
+from hmsa_ros.bag.recording import Status
 
 OK, WARN, ERROR = range(3)
 # Between two flushes messages wait: only more than that is reported.
@@ -30,11 +31,11 @@ class RecordedTopic:
 
     def take(
             self, messages: Iterable[tuple[int, int, int, bytes, bytes]],
-            at: Callable[[int], int] | None, *, paused: bool) -> tuple[list[Message], int]:
+            at: Callable[[int], int] | None, *, paused: bool) -> tuple[list[Entry], int]:
         """Count gaps; return the messages to write, and the length of their payloads in bytes."""
         # Source and reception stamp in ns, sequence number, publisher, payload of each; at() gives
         # the log time at a moment of system time. What passes while paused is not missed.
-        batch: list[Message] = []
+        batch: list[Entry] = []
         size = 0
         for source, received, sequence, publisher, data in messages:
             before = self.last.get(publisher)

@@ -5,18 +5,20 @@ Who receives messages puts them here and goes on at once; compressing and waitin
 happen in the thread. What cannot be kept is counted by topic, never dropped in silence.
 """
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from concurrent.futures import Future
 import threading
 import time
 from typing import NamedTuple
 
-from hmsa_ros.bag.sink import Limits, Message, Sink
-from hmsa_ros.bag.writer import BagWriter, Topic
+from hmsa_ros.bag.framing import Entry
+from hmsa_ros.bag.sink import Limits, Sink
+from hmsa_ros.bag.topics import number_of, Topic
+from hmsa_ros.bag.writer import BagWriter
 from hmsa_ros.errors import BagError
 
-__all__ = ['Limits', 'lost_by_topic', 'Message', 'Recording', 'Status']
+__all__ = ['Limits', 'lost_by_topic', 'Recording', 'Status']
 
 # What a queued message takes in memory besides its payload.
 MESSAGE_OVERHEAD = 250
@@ -25,7 +27,6 @@ RETRY_SECONDS = 1.0
 END_SECONDS = 10.0
 # On top of it, for a disk that does not answer.
 _GRACE_SECONDS = 5.0
-
 
 
 class Status(NamedTuple):
@@ -46,20 +47,17 @@ class Status(NamedTuple):
     crowded: int
 
 
-@dataclass
-class _Task:
-    """Something the thread is asked to do, and its answer."""
+class _Task(NamedTuple):
+    """Something the thread is asked to do, and where its answer goes."""
 
     action: Callable[[], str]
-    done: threading.Event = field(default_factory=threading.Event)
-    answer: str = ''
-    error: BaseException | None = None
+    answer: Future[str]
 
 
 class _Batch(NamedTuple):
     """Messages, what they take in memory, and since when they wait."""
 
-    messages: list[Message]
+    messages: list[Entry]
     size: int
     since: float
 
@@ -85,11 +83,11 @@ class Recording:
         self._items: deque[_Item] = deque()
         self._queued = 0
         self._topics: list[Topic] = []
-        self._overflowed: dict[int, int] = {}
+        self._overflowed = Counter[int]()
         self._closing = False
         self._error = ''
         self._next_retry = 0.0
-        self._rest: Iterator[Message] | None = None
+        self._rest: Iterator[Entry] | None = None
         self._batch = _Batch([], 0, 0.0)
         self._deadline = float('inf')
         self._sink = Sink(writer, limits, self._release)
@@ -101,16 +99,14 @@ class Recording:
     def add_topic(self, topic: Topic) -> int:
         """Announce a topic, or new offers of a known one; return its number for the messages."""
         with self._condition:
-            number = next((
-                i for i, known in enumerate(self._topics)
-                if (known.name, known.type) == (topic.name, topic.type)), len(self._topics))
+            number = number_of(topic, self._topics)
             if number == len(self._topics):
                 self._topics.append(topic)
             self._items.append(topic)
             self._condition.notify()
         return number
 
-    def put(self, messages: list[Message], payload_bytes: int) -> None:
+    def put(self, messages: list[Entry], payload_bytes: int) -> None:
         """Record messages, whose payloads have so many bytes in all; returns at once."""
         size = payload_bytes + MESSAGE_OVERHEAD * len(messages)
         with self._condition:
@@ -140,7 +136,7 @@ class Recording:
         For when time has jumped back: a snapshot does not reach back beyond it either.
         """
         with self._condition:
-            self._items.append(_Task(self._sink.begin_anew))
+            self._items.append(_Task(self._sink.begin_anew, Future()))
             self._condition.notify()
 
     def snapshot(self) -> str:
@@ -188,16 +184,16 @@ class Recording:
 
     def _ask(self, action: Callable[[], str]) -> str:
         """Have the thread do something and return its answer."""
-        request = _Task(action)
+        answer = Future[str]()
         with self._condition:
             if self._closing:
                 raise BagError('the recording has ended')
-            self._items.append(request)
+            self._items.append(_Task(action, answer))
             self._condition.notify()
-        request.done.wait()
-        if request.error is not None:
-            raise BagError(str(request.error)) from request.error
-        return request.answer
+        try:
+            return answer.result()
+        except (OSError, BagError) as error:
+            raise BagError(str(error)) from error
 
     # In the thread ---------------------------------------------------------------------------
 
@@ -250,7 +246,7 @@ class Recording:
                 self._items.popleft()
                 self._writer.note(item)
 
-    def _write(self, messages: Iterator[Message], batch: _Batch) -> None:
+    def _write(self, messages: Iterator[Entry], batch: _Batch) -> None:
         """Write messages; on failure what is left waits for the next try."""
         self._rest, self._batch = messages, batch
         self._sink.put(messages, batch.size, self._queued)
@@ -260,10 +256,9 @@ class Recording:
         """Return whether the end has taken too long."""
         return time.monotonic() > self._deadline
 
-    def _lose(self, messages: Iterable[Message]) -> None:
+    def _lose(self, messages: Iterable[Entry]) -> None:
         """Count messages that will not be written."""
-        for message in messages:
-            self._overflowed[message[0]] = self._overflowed.get(message[0], 0) + 1
+        self._overflowed.update(message[0] for message in messages)
 
     def _release(self, size: int) -> None:
         """Give memory back to the queue."""
@@ -274,13 +269,11 @@ class Recording:
     def _answer(request: _Task) -> None:
         """Do what was asked for."""
         try:
-            request.answer = request.action()
-        except (OSError, BagError) as error:
-            request.error = error
-            if isinstance(error, OSError):
+            request.answer.set_result(request.action())
+        except BaseException as error:
+            request.answer.set_exception(error)
+            if not isinstance(error, BagError):
                 raise
-        finally:
-            request.done.set()
 
     def _fail(self, error: OSError) -> None:
         """Take note that writing is not possible."""
@@ -314,8 +307,7 @@ class Recording:
                 if isinstance(item, _Batch):
                     self._lose(item.messages)
                 elif isinstance(item, _Task):
-                    item.error = BagError('the recording has ended')
-                    item.done.set()
+                    item.answer.set_exception(BagError('the recording has ended'))
             self._items.clear()
 
 
@@ -331,8 +323,7 @@ def _reason(error: OSError) -> str:
 
 def lost_by_topic(*counts: Mapping[str, int]) -> dict[str, int]:
     """Return the sums of losses of several kinds by topic."""
-    total: dict[str, int] = {}
+    total = Counter[str]()
     for count in counts:
-        for topic, number in count.items():
-            total[topic] = total.get(topic, 0) + number
+        total.update(count)
     return total

@@ -1,12 +1,13 @@
 """Making a readable bag out of what a crash, a full disk or a damaged file left."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import os
 
 from hmsa_ros.bag import limits
+from hmsa_ros.bag.framing import Entry
 from hmsa_ros.bag.reader import BagReader
-from hmsa_ros.bag.writer import BagWriter, Topic
+from hmsa_ros.bag.writer import BagWriter
 from hmsa_ros.errors import BagError
 
 
@@ -28,7 +29,7 @@ def recover(
         with BagWriter(out, custom_data=reader.custom_data) as writer:
             numbers: dict[str, int] = {}
 
-            def entries() -> Iterator[tuple[int, int, int, int, bytes]]:
+            def entries() -> Iterator[Entry]:
                 for message in reader.stored_messages():
                     if message.topic not in numbers:
                         numbers[message.topic] = _add(reader, writer, message.topic)
@@ -55,7 +56,5 @@ def recover(
 
 def _add(reader: BagReader, writer: BagWriter, name: str) -> int:
     """Announce a topic of one bag to another."""
-    info = reader.topics[name]
-    return writer.add_topic(Topic(
-        name, info.type or 'unknown', info.definition, info.definition_encoding, info.profiles,
-        info.type_hash))
+    topic = reader.topics[name]
+    return writer.add_topic(replace(topic, type=topic.type or 'unknown'))

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 import time
 
+from hmsa_ros.bag.framing import Entry
 from hmsa_ros.bag.writer import BagWriter, MIN_FILE_SIZE
 from hmsa_ros.errors import BadInputError, BagError
 
@@ -12,8 +13,6 @@ from hmsa_ros.errors import BadInputError, BagError
 #: declarations, an index, and waiting for the disk.
 FILE_BURST = 10
 FILE_SECONDS = 1.0
-
-Message = tuple[int, int, int, int, bytes]
 
 
 @dataclass(frozen=True)
@@ -67,10 +66,10 @@ class Sink:
         self._writer = writer
         self._limits = limits
         self._release = release
-        self._ring: deque[tuple[list[Message], int]] = deque()
+        self._ring: deque[tuple[list[Entry], int]] = deque()
         self.pace = _Pace()
 
-    def put(self, messages: Iterator[Message], size: int, queued: int) -> None:
+    def put(self, messages: Iterator[Entry], size: int, queued: int) -> None:
         """Take messages that use ``size`` of the ``queued`` bytes."""
         if self._limits.snapshot_ns:
             self._keep(list(messages), size, queued)
@@ -81,7 +80,7 @@ class Sink:
             self._writer.write(messages)
         self._release(size)
 
-    def _write_splitting(self, messages: Iterator[Message]) -> None:
+    def _write_splitting(self, messages: Iterator[Entry]) -> None:
         """Write one message after the other, with a new file where a limit is reached."""
         writer, limits = self._writer, self._limits
         for message in messages:
@@ -91,7 +90,7 @@ class Sink:
                 writer.split()
             writer.write((message,))
 
-    def _keep(self, messages: list[Message], size: int, queued: int) -> None:
+    def _keep(self, messages: list[Entry], size: int, queued: int) -> None:
         """Keep messages in memory for a snapshot, the oldest giving way."""
         self._ring.append((messages, size))
         newest = messages[-1][1]

@@ -1,15 +1,34 @@
 """The topics of a bag, from the channels of its files and from what its metadata say."""
 
-from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from mcap.records import Channel, Schema
 
 from hmsa_ros.bag import limits, qos
-from hmsa_ros.bag.decode import TopicInfo
 from hmsa_ros.bag.intake import Problems, ScannedFile
 from hmsa_ros.bag.metadata import TopicMetadata
 from hmsa_ros.errors import BagError
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a bag, read or to be written."""
+
+    name: str  # for example ``'/joint_states'``
+    type: str  # for example ``'sensor_msgs/msg/JointState'``; empty if a bag does not have it
+    definition: str = ''  # with its dependencies; empty if not known
+    definition_encoding: str = 'ros2msg'  # or ``'ros2idl'``, empty
+    profiles: tuple[qos.Qos, ...] = ()  # what the publishers offer
+    type_hash: str = ''  # RIHS01 hash, empty if not known
+    encoding: str = 'cdr'  # of the messages
+
+
+def number_of(topic: Topic, known: Sequence[Topic]) -> int:
+    """Return the number of a topic among those known, or the next one for a new topic."""
+    return next((
+        number for number, other in enumerate(known)
+        if (other.name, other.type) == (topic.name, topic.type)), len(known))
 
 
 class Topics:
@@ -21,7 +40,7 @@ class Topics:
         self._described = {topic.name: topic for topic in described}
         self._custom_data = custom_data
         self._problems = problems
-        self.by_name: dict[str, TopicInfo] = {}
+        self.by_name: dict[str, Topic] = {}
 
     def add(self, file: ScannedFile, channel: Channel) -> None:
         """Take in a channel as a topic."""
@@ -49,10 +68,10 @@ class Topics:
                 file, channel.topic, self._custom_data.get(qos.LATER + channel.topic, '')):
             profiles += tuple(profile for profile in more if profile not in profiles)
         if known is None:
-            self.by_name[channel.topic] = TopicInfo(
-                channel.topic, schema.name, channel.message_encoding, schema.encoding,
-                schema.data.decode('utf-8', 'replace'), profiles,
-                channel.metadata.get('topic_type_hash', ''))
+            self.by_name[channel.topic] = Topic(
+                channel.topic, schema.name, schema.data.decode('utf-8', 'replace'),
+                schema.encoding, profiles, channel.metadata.get('topic_type_hash', ''),
+                channel.message_encoding)
         elif len(profiles) > len(known.profiles):
             # A later split may know more publishers.
             self.by_name[channel.topic] = replace(known, profiles=profiles)

@@ -14,29 +14,22 @@ import operator
 import os
 from pathlib import Path
 import re
-from typing import NamedTuple
 
 from hmsa_ros.bag import metadata, qos
 from hmsa_ros.bag.contents import Contents
-from hmsa_ros.bag.output import OutputFile, PRESETS, RESERVE_STEP, Topic
+from hmsa_ros.bag.framing import Entry
+from hmsa_ros.bag.output import OutputFile, PRESETS, RESERVE_STEP
 from hmsa_ros.bag.records import MESSAGE_HEAD
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.bag.topics import number_of, Topic
+from hmsa_ros.errors import BadInputError, BagError
 
-__all__ = ['BagWriter', 'Entry', 'MIN_FILE_SIZE', 'parse_custom_data', 'PRESETS', 'Topic']
+__all__ = ['BagWriter', 'MIN_FILE_SIZE', 'parse_custom_data', 'PRESETS', 'Topic']
 # Metadata records that a file may have in any case.
 _NOTES_SIZE = 2**20
 MIN_FILE_SIZE = 1024
+#: What MCAP can number.
+MAX_CHANNELS = 2**16 - 1
 _TOPIC_OF = operator.itemgetter(0)
-
-
-class Entry(NamedTuple):
-    """A message to be written: topic number, stamps in nanoseconds, sequence and payload."""
-
-    topic: int
-    log_time: int
-    publish_time: int
-    sequence: int
-    data: bytes
 
 
 class BagWriter:
@@ -97,7 +90,7 @@ class BagWriter:
         self._preset = PRESETS[preset]
         self._chunk_size = chunk_size
         self._fsync = fsync
-        self._waiting: list[tuple[int, int, int, int, bytes]] = []
+        self._waiting: list[Entry] = []
         self._waiting_size = 0
         self._file: OutputFile | None = None
         self._next_number = 0
@@ -149,22 +142,25 @@ class BagWriter:
         return self._contents.counts()
 
     def add_topic(self, topic: Topic) -> int:
-        """Announce a topic and return its number; its first profiles hold for every file."""
+        """Announce a topic and return its number, or raise `BagError` beyond `MAX_CHANNELS`."""
+        _check(topic)
         contents = self._contents
-        number = contents.number_of(topic)
-        if number is not None:
+        number = number_of(topic, contents.topics)
+        if number < len(contents.topics):
+            # Its first profiles hold for every file.
             known = contents.topics[number]
             if set(topic.profiles) - set(known.profiles):
                 self.note({qos.LATER + topic.name: qos.to_yaml(topic.profiles)})
             return number
-        contents.check_room()
+        if number >= MAX_CHANNELS:
+            raise BagError(f'a bag cannot have more than {MAX_CHANNELS} topics')
         if self._file is not None:
             self._file.declare(topic)
         contents.topics.append(topic)
-        return len(contents.topics) - 1
+        return number
 
-    def write(self, entries: Iterable[tuple[int, int, int, int, bytes]]) -> None:
-        """Add messages in any order of stamps; full chunks go to the file."""
+    def write(self, entries: Iterable[Entry]) -> None:
+        """Add messages in any order of log times (ns); full chunks go to the file."""
         for entry in entries:
             log_time = entry[1]
             if not self._waiting:
@@ -314,6 +310,14 @@ class BagWriter:
         """Bring ``metadata.yaml`` up to date."""
         self._contents.ended = self._closed
         metadata.write(self.folder, self._contents.describe(self._file))
+
+
+def _check(topic: Topic) -> None:
+    """Refuse a topic that nobody could name or decode."""
+    if not topic.name:
+        raise BadInputError('a topic has an empty name: expected a name such as /stretch')
+    if not topic.type:
+        raise BadInputError(f'topic {topic.name} has an empty type: expected a message type')
 
 
 def _make(folder: Path) -> None:

@@ -21,6 +21,7 @@ FLUX = 'nondim. flux density $b$ [1]'
 TAU_P = r'intermediate time $\tau_p$ [1]'
 #: Critical damping as the paper quotes it, for 1 -> 1.1.
 PAPER_CRITICAL = 2.14
+_COMMANDS = (('unshaped', style.UNSHAPED), ('shaped', style.SHAPED))
 _ALONE: dict[str, Any] = {
     'color': style.GREEN, 'linewidth': 1.2, 'linestyle': (0, (6, 1.5, 1, 1.5)), 'zorder': 2}
 _CASES: tuple[dict[str, Any], ...] = (
@@ -79,31 +80,18 @@ def _plot_targets(axes: Axes, run: Run) -> None:
 
 
 def _plot_responses(axes: Axes, runs: Sequence[Run]) -> None:
-    run = _find(runs, 'unshaped')
-    axes.plot(run.time, run.stretch, label='unshaped', **style.UNSHAPED)
-    run = _find(runs, 'shaped')
-    axes.plot(run.time, run.stretch, label='shaped', **style.SHAPED)
+    for command, look in _COMMANDS:
+        run = _find(runs, command)
+        axes.plot(run.time, run.stretch, label=command, **look)
     axes.set_xlim(0.0, float(run.time[-1]))
 
 
 def _plot_phase(axes: Axes, runs: Sequence[Run]) -> None:
-    run = _find(runs, 'unshaped')
-    axes.plot(run.stretch, run.rate, label='unshaped', **style.UNSHAPED)
-    run = _find(runs, 'shaped')
-    axes.plot(run.stretch, run.rate, label='shaped', **style.SHAPED)
+    for command, look in _COMMANDS:
+        run = _find(runs, command)
+        axes.plot(run.stretch, run.rate, label=command, **look)
     axes.plot(
         run.targets, np.zeros(len(run.targets)), label='equilibrium', **style.EQUILIBRIUM)
-
-
-def _legend_below(figure: Figure, *panels: Axes) -> None:
-    """Put one legend for all panels below them."""
-    entries: dict[str, Any] = {}
-    for axes in panels:
-        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            entries.setdefault(label, handle)
-    figure.legend(
-        entries.values(), entries.keys(), loc='outside lower center', ncols=len(entries),
-        columnspacing=1.8)
 
 
 def _draw_multi_step(figure: Figure, runs: tuple[Run, ...]) -> None:
@@ -111,19 +99,18 @@ def _draw_multi_step(figure: Figure, runs: tuple[Run, ...]) -> None:
     left, right = figure.subplots(1, 2)
     _plot_command(left, run, **style.UNSHAPED | {'linestyle': '-', 'linewidth': 1.4})
     for i, load in enumerate(run.loads):
-        left.annotate(
-            f'$b_{i + 1}$', (float(run.switches[i]) + 5.0, float(signed_root(load))),
-            xytext=(0, 4), textcoords='offset points', ha='center')
+        style.note(
+            left, f'$b_{i + 1}$', (float(run.switches[i]) + 5.0, float(signed_root(load))), (0, 4),
+            ha='center')
     left.set_xlim(-0.5, float(run.time[-1]))
     left.set_ylim(0.0, 1.12)
     style.finish(left, TAU, FLUX, 'a')
     for i, target in enumerate(run.targets):
         right.axhline(target, **style.TARGET)
         # Beside the panel, where no curve runs.
-        right.annotate(
-            rf'$\lambda(b_{i + 1})={target:.2f}$', (1.0, target),
-            xycoords=('axes fraction', 'data'), xytext=(3, 0), textcoords='offset points',
-            va='center', fontsize=8)
+        style.note(
+            right, rf'$\lambda(b_{i + 1})={target:.2f}$', (1.0, target), (3, 0),
+            xycoords=('axes fraction', 'data'), va='center', fontsize=8)
     right.plot(
         run.time, run.stretch, **style.UNSHAPED | {'linestyle': '-', 'linewidth': 1.4})
     right.set_xlim(0.0, float(run.time[-1]))
@@ -143,26 +130,20 @@ def _draw_single_move(figure: Figure, runs: tuple[Run, ...]) -> None:
         '', (6.5, b_1), xytext=(6.5, b_p),
         arrowprops={'arrowstyle': '<->', 'color': style.BLACK, 'linewidth': 0.8,
                     'shrinkA': 0, 'shrinkB': 0})
-    left.annotate(
-        f'$b_a=b_1-b_p={b_1 - b_p:.4f}$', (6.5, 0.5 * (b_1 + b_p)), xytext=(-4, 0),
-        textcoords='offset points', ha='right', va='center')
-    left.annotate(
-        f'$b_1={b_1:.4f}$', (10.0, b_1), xytext=(0, 4), textcoords='offset points', ha='right')
-    left.annotate(
-        f'$b_p={b_p:.4f}$', (10.0, b_p), xytext=(0, -11), textcoords='offset points',
-        ha='right')
+    style.note(
+        left, f'$b_a=b_1-b_p={b_1 - b_p:.4f}$', (6.5, 0.5 * (b_1 + b_p)), (-4, 0), ha='right',
+        va='center')
+    style.note(left, f'$b_1={b_1:.4f}$', (10.0, b_1), (0, 4), ha='right')
+    style.note(left, f'$b_p={b_p:.4f}$', (10.0, b_p), (0, -11), ha='right')
     # The balance of forces at the two critical points, Eq. 11 times m.
-    left.annotate(
-        r'$b_1^2$ equals the elastic force: $\ddot{\lambda}=0$', (tau_p, b_1),
-        xytext=(16, 26), textcoords='offset points', va='center',
-        arrowprops={'arrowstyle': '-', 'linewidth': 0.6, 'shrinkB': 4})
-    left.annotate(
-        r'$b_p^2$ below the elastic force: $\ddot{\lambda}<0$', (tau_p, b_p),
-        xytext=(16, -32), textcoords='offset points', va='center',
-        arrowprops={'arrowstyle': '-', 'linewidth': 0.6, 'shrinkB': 4})
+    for text, b, height in (
+            (r'$b_1^2$ equals the elastic force: $\ddot{\lambda}=0$', b_1, 26),
+            (r'$b_p^2$ below the elastic force: $\ddot{\lambda}<0$', b_p, -32)):
+        style.note(
+            left, text, (tau_p, b), (16, height), va='center',
+            arrowprops={'arrowstyle': '-', 'linewidth': 0.6, 'shrinkB': 4})
     left.axvline(tau_p, **style.TARGET)
-    left.annotate(
-        rf'$\tau_p={tau_p:.4f}$', (tau_p, 0.03), xytext=(4, 0), textcoords='offset points')
+    style.note(left, rf'$\tau_p={tau_p:.4f}$', (tau_p, 0.03), (4, 0))
     left.set_xlim(-0.3, 10.0)
     left.set_ylim(0.0, 0.7)
     style.finish(left, TAU, FLUX, 'a')
@@ -175,7 +156,7 @@ def _draw_single_move(figure: Figure, runs: tuple[Run, ...]) -> None:
     right.plot([tau_p], shaped.targets, **style.EQUILIBRIUM)
     right.set_xlim(0.0, 10.0)
     style.finish(right, TAU, STRETCH, 'b')
-    _legend_below(figure, right)
+    style.legend_below(figure, right)
 
 
 def _draw_shaped_multi_step(figure: Figure, runs: tuple[Run, ...]) -> None:
@@ -186,18 +167,16 @@ def _draw_shaped_multi_step(figure: Figure, runs: tuple[Run, ...]) -> None:
     for i in range(len(shaped.targets)):
         begin, arrival = shaped.switches[2 * i:2 * i + 2]
         b_p, b_1 = signed_root(shaped.loads[2 * i:2 * i + 2])
-        left.annotate(
-            f'$b_{{p{i + 1}}}$', (arrival, b_p), xytext=(3, -6), textcoords='offset points')
-        left.annotate(
-            f'$b_{i + 1}$', (begin + paper_data.SPAN / 2, b_1), xytext=(0, 4),
-            textcoords='offset points', ha='center')
+        style.note(left, f'$b_{{p{i + 1}}}$', (arrival, b_p), (3, -6))
+        style.note(
+            left, f'$b_{i + 1}$', (begin + paper_data.SPAN / 2, b_1), (0, 4), ha='center')
     left.set_xlim(-0.5, float(shaped.time[-1]))
     left.set_ylim(0.0, 1.12)
     style.finish(left, TAU, FLUX, 'a')
     _plot_targets(right, shaped)
     _plot_responses(right, runs)
     style.finish(right, TAU, STRETCH, 'b')
-    _legend_below(figure, right)
+    style.legend_below(figure, right)
 
 
 def _draw_sequences(figure: Figure, runs: tuple[Run, ...]) -> None:
@@ -217,7 +196,7 @@ def _draw_sequences(figure: Figure, runs: tuple[Run, ...]) -> None:
     style.finish(axes, STRETCH, RATE, 'b')
     axes.set_title(
         r'$\lambda_d$ = ' + ', '.join(f'{x:.2f}' for x in runs[0].targets), loc='right')
-    _legend_below(figure, panels['first'], axes)
+    style.legend_below(figure, panels['first'], axes)
 
 
 def _draw_damping_cases(figure: Figure, runs: tuple[Run, ...]) -> None:
@@ -236,7 +215,7 @@ def _draw_damping_cases(figure: Figure, runs: tuple[Run, ...]) -> None:
             style.finish(axes, TAU if row else '', '' if column else STRETCH,
                          letter if row == 0 else '')
             axes.set_title(f'{mode}, {command}', loc='right')
-    _legend_below(figure, grid[0, 0])
+    style.legend_below(figure, grid[0, 0])
 
 
 def _draw_damping_sweep(figure: Figure, sweep: Sweep) -> None:
@@ -257,7 +236,7 @@ def _draw_damping_sweep(figure: Figure, sweep: Sweep) -> None:
     right.set_xlim(near, near + 1.12 * (sweep.critical - near))
     right.set_ylim(0.0, top)
     style.finish(right, r'nondimensional damping $\zeta$ [1] (close-up)', '', 'b')
-    _legend_below(figure, left)
+    style.legend_below(figure, left)
 
 
 def _draw_chain_limit_cases(figure: Figure, runs: tuple[Run, ...]) -> None:
@@ -281,7 +260,7 @@ def _draw_chain_limit_cases(figure: Figure, runs: tuple[Run, ...]) -> None:
             rf'$\tilde{{\lambda}}_m={paper_data.NEAR_LIMIT:g}\,\lambda_m'
             rf'={pair[0].targets[2]:.3f}$', loc='right')
         right.set_ylim(1.35, 1.35 + 1.05 * (limit - 1.35))
-    _legend_below(figure, grid[0, 0])
+    style.legend_below(figure, grid[0, 0])
 
 
 def _draw_chain_limit_sweep(figure: Figure, sweep: Sweep) -> None:
@@ -298,7 +277,7 @@ def _draw_chain_limit_sweep(figure: Figure, sweep: Sweep) -> None:
         axes.set_xlim(0.0, float(sweep.j_lim[-1]))
     style.finish(left, extension, TAU_P, 'a')
     style.finish(right, extension, 'intermediate flux density $b_p$ [1]', 'b')
-    _legend_below(figure, right)
+    style.legend_below(figure, right)
 
 
 #: The figures by number.

@@ -8,6 +8,7 @@ with the sign of the field. What the paper leaves open is settled here, as const
 from collections.abc import Iterator, Sequence
 import csv
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +44,7 @@ SAMPLES = 1201
 SWEEP_POINTS = 1000
 
 _PAPER = NondimensionalParameters(zeta=0.2, j_lim=5.0)
+_BOTH = ('shaped', 'unshaped')
 # Fig. 8 ends where beta_1 - beta_p falls below this: what is left of it is rounding.
 _RESOLVED = 1e-12
 # The response near the limiting stretch is this much faster than elsewhere.
@@ -57,9 +59,9 @@ class Run:
     command: str  # ``shaped``, ``unshaped`` or ``b_p alone``
     material: NondimensionalParameters
     targets: tuple[float, ...]
-    switches: Array  # times at which a level of the load begins
-    loads: Array  # the levels beta
-    time: Array  # every switch is among them
+    switches: Array  # shape (m,): times at which a level of the load begins
+    loads: Array  # shape (m,): the levels beta
+    time: Array  # shape (n,), as stretch and rate; every switch is among them
     stretch: Array
     rate: Array
 
@@ -81,7 +83,7 @@ class Sweep:
 
     start: float
     target: float
-    zeta: Array
+    zeta: Array  # shape (n,), as all arrays
     j_lim: Array
     status: tuple[str, ...]  # ``two_step`` where there is a plan
     tau_p: Array  # NaN without a plan, as the loads
@@ -95,9 +97,10 @@ Data = tuple[Run, ...] | Sweep
 
 def respond(
         name: str, targets: Sequence[float], material: NondimensionalParameters, *,
-        commands: Sequence[str] = ('shaped', 'unshaped'), span: float = SPAN,
+        commands: Sequence[str] = _BOTH, span: float = SPAN,
         samples: int = SAMPLES, faster: int = 1) -> tuple[Run, ...]:
     """Compute the response to targets, each for a span, that starts at rest; a run a command."""
+    # Of at least 2 evenly spaced samples; those of the last setpoint are so many times denser.
     setpoints = [Setpoint(x, span) for x in targets]
     runs = []
     for command in commands:
@@ -122,33 +125,25 @@ def _levels(segments: Sequence[Segment]) -> tuple[Array, Array]:
     return times, loads
 
 
-def multi_step(samples: int = SAMPLES) -> tuple[Run, ...]:
-    """Compute Fig. 2: the response to plain steps, with so many samples a run."""
-    return respond(
-        '1.1, 1.2, 1.4', EXPANSION, _PAPER, commands=('unshaped',), samples=samples)
+def _respond_all(
+        sequences: Sequence[Sequence[float]], commands: Sequence[str],
+        samples: int = SAMPLES) -> tuple[Run, ...]:
+    """Compute the responses of the paper's block to sequences, with so many samples a run."""
+    return tuple(
+        run for targets in sequences for run in respond(
+            _names(targets), targets, _PAPER, commands=commands, samples=samples))
 
 
-def single_move(samples: int = SAMPLES) -> tuple[Run, ...]:
-    """Compute Fig. 3: one move, shaped, unshaped and with b_p alone."""
-    return respond(
-        '1.1', SINGLE, _PAPER, commands=('shaped', 'unshaped', 'b_p alone'), samples=samples)
+def _names(targets: Sequence[float]) -> str:
+    return ', '.join(f'{x:g}' for x in targets)
 
 
-def shaped_multi_step(samples: int = SAMPLES) -> tuple[Run, ...]:
-    """Compute Fig. 4: three setpoints, shaped and unshaped."""
-    return respond('1.1, 1.2, 1.4', EXPANSION, _PAPER, samples=samples)
-
-
-def expansion(samples: int = SAMPLES) -> tuple[Run, ...]:
-    """Compute Fig. 5: two sequences in expansion, each shaped and unshaped."""
-    return (*respond('1.1, 1.2, 1.4', EXPANSION, _PAPER, samples=samples),
-            *respond('1.15, 1.25, 1.35', SECOND_EXPANSION, _PAPER, samples=samples))
-
-
-def contraction(samples: int = SAMPLES) -> tuple[Run, ...]:
-    """Compute Fig. 6: two sequences in contraction, each shaped and unshaped."""
-    return (*respond('0.9, 0.8, 0.7', CONTRACTION, _PAPER, samples=samples),
-            *respond('0.85, 0.7, 0.85', SECOND_CONTRACTION, _PAPER, samples=samples))
+# Figs. 2 to 6, of the number of samples a run: one sequence or two.
+multi_step = partial(_respond_all, (EXPANSION,), ('unshaped',))
+single_move = partial(_respond_all, (SINGLE,), (*_BOTH, 'b_p alone'))
+shaped_multi_step = partial(_respond_all, (EXPANSION,), _BOTH)
+expansion = partial(_respond_all, (EXPANSION, SECOND_EXPANSION), _BOTH)
+contraction = partial(_respond_all, (CONTRACTION, SECOND_CONTRACTION), _BOTH)
 
 
 def damping_cases(samples: int = SAMPLES) -> tuple[Run, ...]:
@@ -156,7 +151,7 @@ def damping_cases(samples: int = SAMPLES) -> tuple[Run, ...]:
     return tuple(
         run for targets in (EXPANSION, DEEP_CONTRACTION) for zeta in ZETAS
         for run in respond(
-            f'zeta {zeta:.2f}, {", ".join(f"{x:g}" for x in targets)}', targets,
+            f'zeta {zeta:.2f}, {_names(targets)}', targets,
             NondimensionalParameters(zeta=zeta, j_lim=5.0), samples=samples))
 
 
@@ -182,8 +177,7 @@ def chain_limit_cases(samples: int = SAMPLES) -> tuple[Run, ...]:
         targets = (1.2, 1.4, NEAR_LIMIT * stretch_limits(j_lim)[1])
         runs += respond(
             f'J_lim {j_lim:g}', targets, NondimensionalParameters(zeta=0.2, j_lim=j_lim),
-            samples=samples,
-            faster=_FASTER)
+            samples=samples, faster=_FASTER)
     return tuple(runs)
 
 

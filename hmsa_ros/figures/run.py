@@ -90,8 +90,4 @@ def draw_run(
             **style.EQUILIBRIUM)
         style.finish(axes, r'stretch $\lambda$ [1]', r'stretch rate $\dot{\lambda}$ [1/s]', 'c')
         figure.align_ylabels([panels['command'], panels['response']])
-        handles = [
-            x for panel in ('response', 'phase')
-            for x in panels[panel].get_legend_handles_labels()[0]]
-        figure.legend(
-            handles=handles, loc='outside lower center', ncols=len(handles), columnspacing=1.8)
+        style.legend_below(figure, panels['response'], panels['phase'])

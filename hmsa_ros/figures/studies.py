@@ -1,6 +1,6 @@
 """Pictures of the studies: robustness, sampled hardware, heavy damping."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import math
 from pathlib import Path
 from typing import Any
@@ -8,7 +8,7 @@ from typing import Any
 from matplotlib.axes import Axes
 import numpy as np
 
-from hmsa_ros.core.model import critical_zeta, elastic_force
+from hmsa_ros.core.model import Array, critical_zeta, elastic_force
 from hmsa_ros.core.moves import Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.shapers.minimum_time import minimum_time
@@ -74,9 +74,7 @@ def draw_robustness(
                 axes, f'error of {_SYMBOLS[name]} alone [%]', 'residual [% of the step]', letter)
             axes.yaxis.minorticks_off()
         _bars(panels['box'], case, shown, looks, 'abcd'[len(names)])
-        figure.legend(
-            *panels['G'].get_legend_handles_labels(), loc='outside lower center', ncols=2,
-            columnspacing=1.8)
+        style.legend_below(figure, panels['G'], most=2)
 
 
 def _nominal(case: Case) -> str:
@@ -191,13 +189,10 @@ def draw_sampled(path: str | Path, study: SampledStudy, *, period: float = 0.28)
             study.periods, 100.0 * np.maximum(study.solved, _EXACT),
             label='solved on the grid', **style.SHAPED)
         axes.axhline(1e-6, color=style.GREY, linewidth=0.8, linestyle=(0, (4, 2)))
-        axes.annotate(
-            r'$10^{-8}$ of the step', (study.periods[0], 1e-6), xytext=(4, 3),
-            textcoords='offset points', fontsize=8, color='#555555')
+        small = {'fontsize': 8, 'color': '#555555'}
+        style.note(axes, r'$10^{-8}$ of the step', (study.periods[0], 1e-6), (4, 3), **small)
         axes.axvline(PROMISED, color=style.GREY, linewidth=0.8, linestyle=(0, (1, 1.5)))
-        axes.annotate(
-            r'$\tau_p/3$', (PROMISED, 1e-9), xytext=(4, 0), textcoords='offset points',
-            fontsize=8, color='#555555')
+        style.note(axes, r'$\tau_p/3$', (PROMISED, 1e-9), (4, 0), **small)
         axes.set_xscale('log')
         axes.set_yscale('log')
         axes.set_ylim(5e-14, 300.0)
@@ -211,15 +206,11 @@ def draw_sampled(path: str | Path, study: SampledStudy, *, period: float = 0.28)
         size = period * study.tau_p
         solved = solved_move(study.start, study.target, study.material, size)
         rounded = rounded_move(ideal_move(study.start, study.target, study.material), size)
-        end = 4.5 * study.tau_p
-        times = np.linspace(0.0, end, 1200)
-        looks = [(rounded, {**style.UNSHAPED, 'linestyle': '-'})]
+        moves = [(rounded, {**style.UNSHAPED, 'linestyle': '-'})]
         if solved is not None:
-            looks.append((solved, style.SHAPED))
-        for move, look in looks:
-            _levels(panels['command'], move, end, look)
-            panels['response'].plot(
-                times, Actual.off(study.material).response(move, study.start, times), **look)
+            moves.append((solved, style.SHAPED))
+        end = 4.5 * study.tau_p
+        _draw_moves(panels, study, study.material, moves, np.linspace(0.0, end, 1200))
         axes = panels['command']
         for number in range(int(1.6 * study.tau_p / size) + 1):
             axes.axvline(number * size, **style.TARGET)
@@ -227,21 +218,24 @@ def draw_sampled(path: str | Path, study: SampledStudy, *, period: float = 0.28)
         style.finish(
             axes, r'time $\tau$ [1]', r'load $\beta$ [1]', 'b')
         axes.set_title(rf'$T$ = {period:g} $\tau_p$, grid dotted', loc='right', fontsize=8)
-        axes = panels['response']
-        axes.axhline(study.target, **style.TARGET)
-        axes.set_xlim(0.0, end)
-        style.finish(axes, r'time $\tau$ [1]', r'stretch $\lambda$ [1]', 'c')
+        panels['response'].set_xlim(0.0, end)
         figure.align_ylabels([panels['command'], panels['response']])
-        figure.legend(
-            *panels['residual'].get_legend_handles_labels(), loc='outside lower center',
-            ncols=3, columnspacing=1.8)
+        style.legend_below(figure, panels['residual'])
 
 
-def _levels(axes: Axes, move: Move, end: float, look: dict[str, Any]) -> None:
-    """Draw the levels of a command."""
-    axes.step(
-        [*(x.time for x in move.levels), end],
-        [*(x.load for x in move.levels), move.levels[-1].load], where='post', **look)
+def _draw_moves(
+        panels: Mapping[str, Axes], study: SampledStudy | DampedStudy,
+        material: NondimensionalParameters, moves: Sequence[tuple[Move, dict[str, Any]]],
+        times: Array, unit: float = 1.0) -> None:
+    """Draw commands, their loads over a unit, and the responses to them, each in its look."""
+    for move, look in moves:
+        loads = [x.load / unit for x in move.levels]
+        panels['command'].step(
+            [*(x.time for x in move.levels), times[-1]], [*loads, loads[-1]], where='post', **look)
+        panels['response'].plot(
+            times, Actual.off(material).response(move, study.start, times), **look)
+    panels['response'].axhline(study.target, **style.TARGET)
+    style.finish(panels['response'], r'time $\tau$ [1]', r'stretch $\lambda$ [1]', 'c')
 
 
 def draw_damped(path: str | Path, study: DampedStudy, *, zeta: float = 4.0) -> None:
@@ -279,21 +273,11 @@ def draw_damped(path: str | Path, study: DampedStudy, *, zeta: float = 4.0) -> N
              {'color': colour, 'linewidth': 1.6})
             for row, colour in enumerate(colours)]
         end = float(np.interp(zeta, study.zetas, study.step)) * 1.1
-        times = np.linspace(0.0, end, 800)
-        for move, look in moves:
-            _levels(panels['command'], Move(move.code, tuple(
-                type(x)(x.time, x.load / holding) for x in move.levels), 0.0), end, look)
-            panels['response'].plot(
-                times, Actual.off(material).response(move, study.start, times), **look)
+        _draw_moves(panels, study, material, moves, np.linspace(0.0, end, 800), holding)
         axes = panels['command']
         axes.set_xlim(-0.02 * end, end)
         style.finish(axes, '', r'load $\beta/\beta_1$ [1]', 'b')
         axes.set_title(rf'$\zeta$ = {zeta:g}', loc='right', fontsize=8)
-        axes = panels['response']
-        axes.axhline(study.target, **style.TARGET)
-        axes.set_xlim(-0.02 * end, end)
-        style.finish(axes, r'time $\tau$ [1]', r'stretch $\lambda$ [1]', 'c')
+        panels['response'].set_xlim(-0.02 * end, end)
         figure.align_ylabels([panels['command'], panels['response']])
-        figure.legend(
-            *panels['times'].get_legend_handles_labels(), loc='outside lower center',
-            ncols=3, columnspacing=1.8)
+        style.legend_below(figure, panels['times'])

@@ -94,3 +94,19 @@ def finish(axes: Axes, x_label: str, y_label: str, letter: str = '') -> None:
             axis.set_minor_locator(AutoMinorLocator(2))
     axes.grid(visible=True, color='#E4E4E4', linewidth=0.5, zorder=0)
     axes.set_axisbelow(True)
+
+
+def legend_below(figure: Figure, *panels: Axes, most: int = 9) -> None:
+    """Put one legend for all panels below them, each label once, in so many columns at most."""
+    entries: dict[str, Any] = {}
+    for axes in panels:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    figure.legend(
+        entries.values(), entries.keys(), loc='outside lower center',
+        ncols=min(len(entries), most), columnspacing=1.8)
+
+
+def note(axes: Axes, text: str, place: tuple[Any, Any], offset: Any, **more: Any) -> None:
+    """Write a text some points away from a place."""
+    axes.annotate(text, place, xytext=offset, textcoords='offset points', **more)

@@ -5,7 +5,7 @@ from typing import Any
 
 from rclpy.node import Node
 
-from hmsa_ros.bag.reader import BagReader, TopicInfo
+from hmsa_ros.bag.reader import BagReader, Topic
 from hmsa_ros.contract import topics
 from hmsa_ros.errors import BadInputError, BagError, printable
 from hmsa_ros.nodes.message_types import interface_class
@@ -59,7 +59,7 @@ def create_senders(
 
 
 def _left_out(
-        node: Node, selection: Filter, name: str, info: TopicInfo, own_clock: bool) -> str:
+        node: Node, selection: Filter, name: str, info: Topic, own_clock: bool) -> str:
     """Return why a topic that passes the filter is not sent, empty if it is."""
     if not is_full_name(name):
         return 'it cannot be published, its name is not a valid ROS name'

@@ -356,10 +356,16 @@ def percent(share: float, digits: int = 3) -> str:
     return f'{100.0 * share:.{digits}g} %' if math.isfinite(share) else '–'
 
 
+def reach(parts: Sequence[Part], number: int) -> float:
+    """Return how far an arrival's panel reaches from 0, in percent of the step."""
+    return min(150.0, max([LEAST_PERCENT, *(
+        110.0 * x.error for x in results_of(parts, number) if math.isfinite(x.error))]))
+
+
 def arrival(parts: Sequence[Part], number: int) -> Figure:
     """Return the zoom on one arrival: distance from the target in percent of the step."""
     data = []
-    view, height = [0.0, 0.0], LEAST_PERCENT
+    view = [0.0, 0.0]
     results = [x for x in results_of(parts, number) if x.end > x.begin]
     unit = TimeUnit(1e-3, 'ms') if max(
         (x.arrival - x.begin for x in results), default=1.0) < 1.0 else TimeUnit(1.0, 's')
@@ -376,8 +382,6 @@ def arrival(parts: Sequence[Part], number: int) -> Figure:
         time = unit.of(found.time[inside] - result.arrival)
         view = [min(view[0], -BEFORE * float(unit.of(duration))), max(
             view[1], float(unit.of(min(result.end - result.arrival, AFTER * duration))))]
-        if math.isfinite(result.error):
-            height = max(height, 110.0 * result.error)
         for kind, stretch in (
                 ('plain steps', found.unshaped[0]), ('recorded', run.stretch),
                 ('plan', found.predicted[0])):
@@ -387,7 +391,7 @@ def arrival(parts: Sequence[Part], number: int) -> Figure:
                 part, kind, *decimate(
                     time, 100.0 * (stretch[inside] - result.stretch) / abs(step),
                     _PANEL_BUCKETS)))
-    height = min(height, 150.0)
+    height = reach(parts, number)
     title = _panel_title(parts, number)
     return Figure(
         f'arrival{number}', f'Setpoint {title}', 300, _grouped(data), {

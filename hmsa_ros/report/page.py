@@ -4,7 +4,7 @@ A report as one HTML page that needs nothing else: no network, no other file.
 What the page may load is nailed down in its content security policy, too.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from html import escape
@@ -48,6 +48,7 @@ class Cell:
 
 
 Row = list[Cell | str]
+_Values = list[Cell | str | float]
 
 
 def page(parts: Sequence[Part]) -> str:
@@ -296,84 +297,78 @@ def table(
         f'<button type="button" data-table="{key}">Copy table</button>'])
 
 
+def _table(
+        key: str, caption: str, columns: Mapping[str, str],
+        rows: Iterable[_Values]) -> str:
+    """Return a table of values, each in the format of its column; texts and cells as they are."""
+    return table(key, caption, list(columns), [[
+        x if isinstance(x, (str, Cell)) else cell(x, form)
+        for x, form in zip(row, columns.values(), strict=True)] for row in rows])
+
+
 def cell(value: float, form: str = '.6g') -> Cell:
     """Return a number as a cell."""
     value = float(value)
     return Cell(f'{value:{form}}', value) if math.isfinite(value) else Cell('–', math.nan)
 
 
-def _percent(share: float) -> Cell:
-    """Return a share as a cell in percent."""
-    return cell(100.0 * share, '.3g')
-
-
 def _setpoints(parts: Sequence[Part]) -> str:
     """Return the table of the setpoints and their results."""
-    rows: list[Row] = []
+    rows: list[_Values] = []
     for part in parts:
         for i, (move, x) in enumerate(zip(
                 part.evaluation.moves, part.evaluation.results, strict=True), 1):
             levels = len(move.flux_densities)
             rows.append([
-                part.run.label, Cell(str(i), i), cell(x.stretch), cell(x.b_p, '.5f'),
-                cell(x.tau_p, '.5f'), cell(x.b_1, '.5f'), cell(x.begin * 1e3, '.3f'),
-                cell(x.arrival * 1e3, '.3f'), cell(x.end * 1e3, '.3f'), _percent(x.error),
-                _percent(x.residual) if x.moved else NOT_MOVED, _percent(x.residual_unshaped),
+                part.run.label, Cell(str(i), i), x.stretch, x.b_p, x.tau_p, x.b_1, x.begin * 1e3,
+                x.arrival * 1e3, x.end * 1e3, 100.0 * x.error,
+                100.0 * x.residual if x.moved else NOT_MOVED, 100.0 * x.residual_unshaped,
                 'plain step' if levels == 1 else f'{levels} levels'])
-    symbol = parts[0].run.plant.coordinate.symbol
     if not rows:
         return text('No setpoint was carried out while the samples were recorded.')
-    header = [
-        'run', 'setpoint', f'target {symbol} [1]', 'b_p [1]', 'tau_p [1]', 'b_1 [1]', 'begin [ms]',
-        'arrival [ms]', 'until [ms]', 'largest error [%]', 'residual [%]', 'plain steps [%]',
-        'command']
-    return table(
+    return _table(
         'setpoint-table', 'b and tau nondimensional as in the paper: of the first level, the '
         'time until arrival, and of the level that holds the target. Error and residual in '
-        'percent of the step, from arrival on; times from the first command.',
-        header, rows)
+        'percent of the step, from arrival on; times from the first command.', {
+            'run': '', 'setpoint': '', f'target {parts[0].run.plant.coordinate.symbol} [1]': '.6g',
+            'b_p [1]': '.5f', 'tau_p [1]': '.5f', 'b_1 [1]': '.5f', 'begin [ms]': '.3f',
+            'arrival [ms]': '.3f', 'until [ms]': '.3f', 'largest error [%]': '.3g',
+            'residual [%]': '.3g', 'plain steps [%]': '.3g', 'command': ''}, rows)
 
 
 def _requests(parts: Sequence[Part], unit: TimeUnit) -> str:
     """Return the table of verdicts."""
-    rows: list[Row] = []
+    rows: list[_Values] = []
     for part in parts:
         before = None
         for x in part.run.verdicts:
             if (x.code, x.message) != before and x.code != 'none':
                 before = x.code, x.message
                 rows.append([
-                    part.run.label,
-                    cell(unit.of(part.evaluation.seconds(x.sent)).item(), '.3f'), x.level,
+                    part.run.label, unit.of(part.evaluation.seconds(x.sent)).item(), x.level,
                     x.code, x.message])
-    if not rows:
-        return ''
-    return table(
-        'request-table', 'Verdicts of the planner on the requests.',
-        ['run', f'time [{unit.name}]', 'level', 'code', 'message'], rows[:_MOST_ROWS])
+    return '' if not rows else _table(
+        'request-table', 'Verdicts of the planner on the requests.', {
+            'run': '', f'time [{unit.name}]': '.3f', 'level': '', 'code': '', 'message': ''},
+        rows[:_MOST_ROWS])
 
 
 def _plan(parts: Sequence[Part], unit: TimeUnit) -> str:
     """Return the table of planned changes of level."""
-    rows: list[Row] = []
-    for part in parts:
-        for x in plan_points(part.run, part.evaluation):
-            rows.append([
-                part.run.label, cell(unit.of(x.time).item(), '.4f'),
-                cell(x.planned * 1e3, '.4f'), cell(x.commanded * 1e3, '.4f'),
-                cell(x.stretch, '.7f'), cell(x.recorded_stretch, '.7f'),
-                cell(x.rate, '.4g'), cell(x.recorded_rate, '.4g'),
-                cell(x.deviation, '.2e')])
+    rows: list[_Values] = [
+        [part.run.label, unit.of(x.time).item(), x.planned * 1e3, x.commanded * 1e3, x.stretch,
+         x.recorded_stretch, x.rate, x.recorded_rate, x.deviation]
+        for part in parts for x in plan_points(part.run, part.evaluation)]
     what = parts[0].run.plant.coordinate
     name, symbol = what.name, what.symbol
-    return table(
+    return _table(
         'plan-table', f'Each change of level: flux density planned and commanded; {name} and '
         'rate of the first sample from then on; and the largest distance of the recorded from '
-        f'the predicted {name} until the next change.',
-        ['run', f'time [{unit.name}]', 'B planned [mT]', 'B commanded [mT]',
-         f'{symbol} planned [1]', f'{symbol} recorded [1]', 'rate planned [1/s]',
-         'rate recorded [1/s]', f'largest |Δ{symbol}| [1]'],
-        rows[:_MOST_ROWS])
+        f'the predicted {name} until the next change.', {
+            'run': '', f'time [{unit.name}]': '.4f', 'B planned [mT]': '.4f',
+            'B commanded [mT]': '.4f', f'{symbol} planned [1]': '.7f',
+            f'{symbol} recorded [1]': '.7f', 'rate planned [1/s]': '.4g',
+            'rate recorded [1/s]': '.4g', f'largest |Δ{symbol}| [1]': '.2e'}, rows[:_MOST_ROWS])
 
 
 def _repeats(parts: Sequence[Part]) -> str:
@@ -383,7 +378,7 @@ def _repeats(parts: Sequence[Part]) -> str:
 
 def _timing(parts: Sequence[Part]) -> str:
     """Return the table of times."""
-    rows: list[Row] = []
+    rows: list[_Values] = []
     for part in parts:
         x = part.timing
         for name, values in (
@@ -393,15 +388,12 @@ def _timing(parts: Sequence[Part]) -> str:
                 ('interval of the stamps', x.interval),
                 ('interval of the recorded samples', x.arrival_interval)):
             if len(values):
-                low, middle, high, top = np.quantile(values, [0.0, 0.5, 0.99, 1.0]) * 1e3
                 rows.append([
                     part.run.label, name, Cell(str(len(values)), len(values)),
-                    *(cell(y, '.4f') for y in (low, middle, high, top)),
-                    cell(float(np.std(values)) * 1e3, '.4f')])
-    return table(
-        'timing-table', 'Jitter is the standard deviation.',
-        ['run', 'quantity', 'count', 'least [ms]', 'median [ms]', '99 % [ms]', 'largest [ms]',
-         'jitter [ms]'], rows)
+                    *np.quantile(values, [0.0, 0.5, 0.99, 1.0]) * 1e3, np.std(values) * 1e3])
+    return _table('timing-table', 'Jitter is the standard deviation.', {
+        'run': '', 'quantity': '', 'count': '', 'least [ms]': '.4f', 'median [ms]': '.4f',
+        '99 % [ms]': '.4f', 'largest [ms]': '.4f', 'jitter [ms]': '.4f'}, rows)
 
 
 def _lost(summary: BagSummary | None) -> str:

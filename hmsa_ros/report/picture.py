@@ -1,7 +1,6 @@
 """A report as a picture for a paper: PNG, or PDF with lines instead of pixels."""
 
 from collections.abc import Sequence
-import math
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +12,16 @@ from hmsa_ros.report.charts import (
     BEFORE,
     commanded,
     decimate,
-    LEAST_PERCENT,
     Part,
+    reach,
     residual_text,
     results_of,
+    RUN_COLOURS,
     time_unit,
     TimeUnit,
     worst,
 )
 
-_COLOURS = (
-    style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY_BLUE, style.VERMILION,
-    style.BLACK)
 # Panels of arrivals in a row.
 _PANELS = 3
 
@@ -43,12 +40,12 @@ def draw(path: Path, parts: Sequence[Part], kind: str) -> None:
             rows,  # type: ignore[arg-type]
             height_ratios=[1.0, 1.45, 1.3][:len(rows)])
         for number, part in enumerate(parts):
-            colour = _COLOURS[number % len(_COLOURS)] if len(parts) > 1 else ''
+            colour = RUN_COLOURS[number % len(RUN_COLOURS)] if len(parts) > 1 else ''
             _draw_run(axes, part, unit, colour)
             for i in shown:
                 if i < len(part.evaluation.results):
                     _draw_arrival(
-                        axes[f'arrival{i}'], part, i, _height(parts, i), colour)
+                        axes[f'arrival{i}'], part, i, reach(parts, i), colour)
         begin = float(unit.of(min(x.evaluation.time[0] for x in parts)))
         end = float(unit.of(max(x.evaluation.time[-1] for x in parts)))
         for key in ('command', 'response'):
@@ -65,12 +62,7 @@ def draw(path: Path, parts: Sequence[Part], kind: str) -> None:
             style.finish(panel, 'time after arrival [ms]', 'distance [% of step]', letter)
             panel.set_title(_title(parts, i), loc='right', fontsize=8)
         figure.align_ylabels([axes['command'], axes['response']])
-        handles = {
-            label: handle for panel in ('response', 'phase') for handle, label in zip(
-                *axes[panel].get_legend_handles_labels(), strict=True)}
-        figure.legend(
-            handles=list(handles.values()), loc='outside lower center',
-            ncols=min(len(handles), 4), columnspacing=1.8)
+        style.legend_below(figure, axes['response'], axes['phase'], most=4)
 
 
 def _styled(kind: dict[str, Any], colour: str) -> dict[str, Any]:
@@ -123,12 +115,6 @@ def _draw_arrival(
             **_styled(kind, colour))
     panel.axvline(0.0, **style.TARGET)
     panel.set_ylim(-height, height)
-
-
-def _height(parts: Sequence[Part], number: int) -> float:
-    """Return how far an arrival's panel reaches from 0, in percent."""
-    return min(150.0, max([LEAST_PERCENT, *(
-        110.0 * x.error for x in results_of(parts, number) if math.isfinite(x.error))]))
 
 
 def _title(parts: Sequence[Part], number: int) -> str:

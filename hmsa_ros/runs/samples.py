@@ -187,7 +187,7 @@ class _Layout:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Samples of one actuator, of one length."""
+    """Samples of one actuator, all of shape (n,)."""
 
     time: Times  # stamps in ns, increasing
     logged: Times  # when they were recorded, in ns
@@ -204,9 +204,9 @@ def tidy(
     """
     Leave out what cannot be a motion, sort by stamp and complete the rate.
 
-    Arrays are in the order recorded, stamps in ns, with NaN for what was not; ``left_out`` says
-    how many were left out before, ``where`` names what is read in messages. Raises
-    `BadInputError` if no stretch is a finite number.
+    Arrays of shape (n,) are in the order recorded, stamps in ns, with NaN for what was not;
+    ``left_out`` says how many were left out before, ``where`` names what is read in messages.
+    Raises `BadInputError` if no stretch is a finite number.
     """
     notes = []
     if not stamps.any():

@@ -7,18 +7,13 @@ from hmsa_ros.bag.reader import BagReader
 from hmsa_ros.contract import topics as contract
 from hmsa_ros.errors import BadInputError
 
-JOINT_STATES = contract.JOINT_STATES.name
-COMMAND = contract.FLUX_DENSITY_COMMAND.name
-APPLIED = contract.FLUX_DENSITY_APPLIED.name
-FORCE = contract.DISTURBANCE_FORCE.name
-PLAN, TRAJECTORY, SETPOINT, STATUS = (
-    contract.from_outside(x.name, contract.PLANNER)
-    for x in (contract.PLAN, contract.JOINT_TRAJECTORY, contract.SETPOINT, contract.STATUS))
+#: Message type by role: the end of a topic's name.
 TYPES = {
     contract.from_outside(x.name, contract.PLANNER): x.type for x in (
         contract.JOINT_STATES, contract.FLUX_DENSITY_COMMAND, contract.FLUX_DENSITY_APPLIED,
         contract.DISTURBANCE_FORCE, contract.PLAN, contract.JOINT_TRAJECTORY, contract.SETPOINT,
         contract.STATUS)}
+JOINT_STATES, COMMAND, APPLIED, FORCE, PLAN, TRAJECTORY, SETPOINT, STATUS = TYPES
 # Roles whose topics are one for each joint where there are several.
 _OF_A_JOINT = (COMMAND, APPLIED, FORCE, SETPOINT)
 

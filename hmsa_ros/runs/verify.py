@@ -8,7 +8,7 @@ forces are applied too, and the Maxwell branches of an elastomer that creeps are
 Measurement noise is not: it is the difference that is left.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 import heapq
 import math
@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hmsa_ros.bag import limits
 from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
@@ -57,16 +56,9 @@ class Verification:
     unapplied_count: int = 0  # changes of level that never took effect, as reported
 
 
-def verify(
-        path: str | os.PathLike[str], *, parameters: Mapping[str, object] | None = None,
-        max_chunk_size: int = limits.CHUNK_SIZE) -> list[Verification]:
-    """
-    Integrate the recorded commands of a bag; compare each actuator with its recorded stretch.
-
-    Arguments and errors are those of `read_runs` and of `verify_run`.
-    """
-    return [verify_run(run) for run in read_runs(
-        Path(path), parameters=parameters, max_chunk_size=max_chunk_size)]
+def verify(path: str | os.PathLike[str]) -> list[Verification]:
+    """Compare each actuator of a bag with its recorded stretch: `read_runs`, then `verify_run`."""
+    return [verify_run(run) for run in read_runs(Path(path))]
 
 
 def verify_run(run: Run) -> Verification:
@@ -139,7 +131,7 @@ class _Replay:
                 self.left_out += 1
                 self.refused += kind == _COMMAND
 
-    def _samples(self) -> 'Iterator[tuple[int, int, int, float]]':
+    def _samples(self) -> Iterator[tuple[int, int, int, float]]:
         """Return when each sample was recorded, its stamp and stretch."""
         run, window = self._run, self._window
         logged = np.maximum.accumulate(run.logged[window])
@@ -148,7 +140,7 @@ class _Replay:
                 strict=True):
             yield at, _SAMPLE, stamp, stretch
 
-    def _commands(self, first: int) -> 'Iterator[tuple[int, int, int, float]]':
+    def _commands(self, first: int) -> Iterator[tuple[int, int, int, float]]:
         """Return what took effect, which is known from the begin; or what was commanded."""
         run = self._run
         begin = int(run.time[first])
@@ -161,7 +153,7 @@ class _Replay:
             if level.sent > run.logged[first] or level.stamp > begin:
                 yield level.sent, _COMMAND, level.stamp, level.flux_density
 
-    def _forces(self) -> 'Iterator[tuple[int, int, int, float]]':
+    def _forces(self) -> Iterator[tuple[int, int, int, float]]:
         for sent, stamp, newton in self._run.forces:
             yield sent, _FORCE, stamp, newton
 
