@@ -151,13 +151,10 @@ def from_map(content: Any, source: str) -> BagMetadata:
         duration = int(content['duration']['nanoseconds'])
         count = int(content['message_count'])
         paths = [str(path) for path in content['relative_file_paths'] or ()]
-        if 'files' in content:
-            files = tuple(FileMetadata(
-                str(entry['path']), int(entry['starting_time']['nanoseconds_since_epoch']),
-                int(entry['duration']['nanoseconds']), int(entry['message_count']))
-                for entry in content['files'] or ())
-        else:
-            files = tuple(FileMetadata(path) for path in paths)
+        files = tuple(FileMetadata(
+            str(entry['path']), int(entry['starting_time']['nanoseconds_since_epoch']),
+            int(entry['duration']['nanoseconds']), int(entry['message_count']))
+            for entry in content.get('files') or ())
         # Up to version 8 a path could carry the folder's name; it never leads out of it.
         return BagMetadata(
             start, duration, count, topics, files or tuple(map(FileMetadata, paths)),

@@ -151,7 +151,7 @@ def _residuals() -> Iterator[str]:
         *((x, NondimensionalParameters(zeta, 5.0))
           for x in (paper_data.EXPANSION, paper_data.DEEP_CONTRACTION)
           for zeta in paper_data.ZETAS),
-        *((_near_limit_targets(j_lim), NondimensionalParameters(0.2, j_lim))
+        *((paper_data.near_limit(j_lim), NondimensionalParameters(0.2, j_lim))
           for j_lim in paper_data.J_LIMS))
     for targets, material in cases:
         shaped, plain = paper_data.respond('', targets, material, samples=30_001)
@@ -180,7 +180,7 @@ def _settling() -> Iterator[str]:
 def _cycles() -> Iterator[str]:
     yield 'unshaped, cycles until within 5 % of the step, from rest:'
     for j_lim in paper_data.J_LIMS:
-        targets = _near_limit_targets(j_lim)
+        targets = paper_data.near_limit(j_lim)
         run = _unshaped(targets, NondimensionalParameters(0.2, j_lim), 60.0)
         counts = (f'{run.turning_points(*part) / 2:g}' for part in _unsettled(run, 60.0))
         yield f'  J_lim {j_lim:g}, {_names(targets)}: {", ".join(counts)}'
@@ -266,10 +266,6 @@ def _shaped(targets: Sequence[float], material: NondimensionalParameters) -> Run
 def _resample(run: Run, time: Floats) -> Array:
     stretch, _ = simulate(run.switches, run.loads, time, run.material)
     return stretch
-
-
-def _near_limit_targets(j_lim: float) -> tuple[float, ...]:
-    return (1.2, 1.4, paper_data.NEAR_LIMIT * stretch_limits(j_lim)[1])
 
 
 def _names(targets: Sequence[float]) -> str:

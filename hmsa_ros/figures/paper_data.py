@@ -170,14 +170,18 @@ def damping_sweep(points: int = SWEEP_POINTS) -> Sweep:
     return _sweep(start, target, zeta, np.full(points, _PAPER.j_lim), critical)
 
 
+def near_limit(j_lim: float) -> tuple[float, ...]:
+    """Return the stretches of Fig. 9."""
+    return (1.2, 1.4, NEAR_LIMIT * stretch_limits(j_lim)[1])
+
+
 def chain_limit_cases(samples: int = SAMPLES) -> tuple[Run, ...]:
     """Compute Fig. 9: three values of J_lim, the last setpoint near the limiting stretch."""
     runs: list[Run] = []
     for j_lim in J_LIMS:
-        targets = (1.2, 1.4, NEAR_LIMIT * stretch_limits(j_lim)[1])
         runs += respond(
-            f'J_lim {j_lim:g}', targets, NondimensionalParameters(zeta=0.2, j_lim=j_lim),
-            samples=samples, faster=_FASTER)
+            f'J_lim {j_lim:g}', near_limit(j_lim),
+            NondimensionalParameters(zeta=0.2, j_lim=j_lim), samples=samples, faster=_FASTER)
     return tuple(runs)
 
 

@@ -1,6 +1,7 @@
 """Joint states as columns: read quickly, picked by joint, put in order."""
 
 from array import array
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import chain
@@ -53,7 +54,7 @@ class SampleReader:
     def __init__(self, decode: Callable[[bytes], Any]) -> None:
         self._decode = decode
         self._layouts: dict[int, _Layout | None] = {}
-        self._columns: dict[_Shape, _Columns] = {}
+        self._columns: defaultdict[_Shape, _Columns] = defaultdict(_Columns)
 
     def take(self, logged: int, data: bytes) -> None:
         """Take in a sample."""
@@ -74,10 +75,7 @@ class SampleReader:
             self, logged: int, stamp: int, names: tuple[str, ...],
             numbers: list[tuple[float, ...]]) -> None:
         position, velocity, effort = map(len, numbers)
-        shape = (names, position, velocity, effort)
-        columns = self._columns.get(shape)
-        if columns is None:
-            columns = self._columns[shape] = _Columns()
+        columns = self._columns[names, position, velocity, effort]
         # Both are made first: what cannot be kept leaves no half of it behind.
         times, row = array('q', (logged, stamp)), array('d', chain.from_iterable(numbers))
         columns.times.extend(times)

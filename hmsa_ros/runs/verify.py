@@ -11,6 +11,7 @@ Measurement noise is not: it is the difference that is left.
 from collections.abc import Iterator
 from dataclasses import dataclass
 import heapq
+import itertools
 import math
 import os
 from pathlib import Path
@@ -113,8 +114,12 @@ class _Replay:
             self.notes.append(
                 'the first sample is not one of rest: what the branches of viscoelastic.* hold by '
                 'then is not known and taken as nothing, expected differences that fade')
+        samples = zip(
+            np.maximum.accumulate(run.logged[self._window]).tolist(), itertools.repeat(_SAMPLE),
+            run.time[self._window].tolist(), run.stretch[self._window].tolist(), strict=False)
+        forces = ((sent, _FORCE, stamp, newton) for sent, stamp, newton in run.forces)
         for _, kind, stamp, value in heapq.merge(
-                self._samples(), self._commands(first), self._forces(), key=lambda x: x[:2]):
+                samples, self._commands(first), forces, key=lambda x: x[:2]):
             if kind == _SAMPLE:
                 simulation.advance(stamp)
                 difference = abs(simulation.stretch - value)
@@ -131,15 +136,6 @@ class _Replay:
                 self.left_out += 1
                 self.refused += kind == _COMMAND
 
-    def _samples(self) -> Iterator[tuple[int, int, int, float]]:
-        """Return when each sample was recorded, its stamp and stretch."""
-        run, window = self._run, self._window
-        logged = np.maximum.accumulate(run.logged[window])
-        for at, stamp, stretch in zip(
-                logged.tolist(), run.time[window].tolist(), run.stretch[window].tolist(),
-                strict=True):
-            yield at, _SAMPLE, stamp, stretch
-
     def _commands(self, first: int) -> Iterator[tuple[int, int, int, float]]:
         """Return what took effect, which is known from the begin; or what was commanded."""
         run = self._run
@@ -152,10 +148,6 @@ class _Replay:
         for level in run.commands:
             if level.sent > run.logged[first] or level.stamp > begin:
                 yield level.sent, _COMMAND, level.stamp, level.flux_density
-
-    def _forces(self) -> Iterator[tuple[int, int, int, float]]:
-        for sent, stamp, newton in self._run.forces:
-            yield sent, _FORCE, stamp, newton
 
 
 def _one_run(run: Run) -> slice:
