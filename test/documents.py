@@ -568,7 +568,7 @@ def _check_message(kind: str, words: list[str]) -> None:
         known: str | None = _known_name(name, types)
         _require(known, f'no topic {name!r}')
         _require(types[str(known)] == type_name,
-                 f'{name} has type {types[str(known)]}, not {type_name}')
+                 f'{name} has type {types[str(known)].rpartition("/")[2]}, not {type_name}')
     else:
         services = {
             topics.from_outside(x.name, node): x.type for x in vars(topics).values()

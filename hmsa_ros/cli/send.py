@@ -48,9 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.recorded:
             client.find_recorder()
         client.find_plant()
-        # A planner that has just started may not have heard the time yet.
-        verdict = (client.send_levels(levels, time_begins=True) if levels
-                   else client.send(arguments.setpoints, time_begins=True))
+        verdict = client.send(arguments.setpoints, levels)
         print(verdict.message)
         if not arguments.wait:
             return 0

@@ -9,6 +9,7 @@ with the publisher's identifier, so that a gap in its sequence numbers is a lost
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
 import ctypes
+from functools import cache
 import threading
 import time
 from typing import Any, NamedTuple
@@ -121,11 +122,17 @@ class _Taker:
         return result
 
 
+@cache
+def _taker() -> _Taker | None:
+    """Return what tells publishers apart, None where rcl's library is not found."""
+    try:
+        return _Taker()
+    except (OSError, AttributeError):
+        return None
+
+
 class RawSubscription:
     """A subscription that belongs to no executor and is read by ``take``."""
-
-    _taker: _Taker | None = None
-    _taker_tried = False
 
     def __init__(
             self, node: Node, message_type: type[Any], topic: str, qos: QoSProfile) -> None:
@@ -135,24 +142,13 @@ class RawSubscription:
             self.handle = _rclpy.Subscription(
                 node.handle, message_type, topic, qos.get_c_qos_profile())
 
-    @classmethod
-    def tells_publishers(cls) -> bool:
-        """Return whether `take` tells publishers apart, which needs rcl's library."""
-        if not cls._taker_tried:
-            cls._taker_tried = True
-            try:
-                cls._taker = _Taker()
-            except (OSError, AttributeError):
-                cls._taker = None
-        return cls._taker is not None
-
     def take(self, limit: int = _BATCH) -> list[Taken]:
         """Take at most ``limit`` messages in order of arrival; none if there are none."""
         try:
             with self.handle:
-                if self.tells_publishers() and self._taker is not None:
-                    return self._taker.take(self.handle.pointer, limit)
-                return self._take_by_rclpy(limit)
+                taker = _taker()
+                return self._take_by_rclpy(limit) if taker is None else taker.take(
+                    self.handle.pointer, limit)
         except InvalidHandle:
             return []
 

@@ -5,7 +5,7 @@ Publishers are distinguished by their identifiers (GIDs): those of the graph, an
 message, which rclpy does not provide and `hmsa_ros.nodes.capture` does.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 
 from rclpy.node import Node
 from sensor_msgs.msg import MagneticField
@@ -31,11 +31,11 @@ class Allegiance:
         self.source: bytes | None = None
         self.refused = 0
 
-    def accepts(self, publisher: bytes, present: Callable[[], Sequence[bytes]]) -> bool:
+    def accepts(self, publisher: bytes, present: Callable[[], Iterable[bytes]]) -> bool:
         """Return whether to obey a publisher; an unknown one only if it is the only one."""
         if publisher and publisher == self.source:
             return True
-        others = [bytes(x) for x in present()]
+        others = [*present()]
         if not publisher:
             accepted = len(others) <= 1
         else:
@@ -83,10 +83,11 @@ class CommandInput:
         """Return how many publishers the topic has."""
         return int(self._node.count_publishers(self._topic.name))
 
-    def publishers(self) -> list[bytes]:
-        """Return the identifiers of all publishers of the topic, as the graph knows them."""
+    def _publishers(self) -> dict[bytes, tuple[str, str]]:
+        """Return name and namespace of the topic's publishers by identifier, as in the graph."""
         name = self._node.resolve_topic_name(self._topic.name)
-        return [bytes(x.endpoint_gid) for x in self._node.get_publishers_info_by_topic(name)]
+        return {bytes(x.endpoint_gid): (x.node_name, x.node_namespace)
+                for x in self._node.get_publishers_info_by_topic(name)}
 
     def poll(self) -> None:
         """Take what has arrived, where the node's executor does not."""
@@ -96,7 +97,7 @@ class CommandInput:
             if self._companion and self._is_companion(taken.publisher):
                 continue
             if self._allegiance is None or self._allegiance.accepts(
-                    taken.publisher, self.publishers):
+                    taken.publisher, self._publishers):
                 self._obey(taken.data)
             else:
                 self._node.get_logger().warning(
@@ -108,10 +109,7 @@ class CommandInput:
         """Return whether a publisher is the companion; looked up in the graph once."""
         if publisher not in self._companions:
             own = self._companion, self._node.get_namespace()
-            name = self._node.resolve_topic_name(self._topic.name)
-            found = {
-                bytes(x.endpoint_gid): (x.node_name, x.node_namespace) == own
-                for x in self._node.get_publishers_info_by_topic(name)}
+            found = {x: node == own for x, node in self._publishers().items()}
             if self._allegiance is not None:
                 self._allegiance.source = next((x for x in found if found[x]), None)
             # Where the sender of a message is not known, it is the companion's if all are.

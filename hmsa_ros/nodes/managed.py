@@ -10,11 +10,13 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.clock import Clock as RclpyClock
 from rclpy.clock import ClockType
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from rclpy.parameter_service import ParameterService
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock
 
@@ -24,7 +26,6 @@ from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import to_diagnostics
 from hmsa_ros.nodes.message_types import interface_class
-from hmsa_ros.nodes.parameter_service import CarefulParameterService
 from hmsa_ros.nodes.parameters import check_names, declare
 
 AUTOSTART = ParameterSpec(
@@ -45,7 +46,7 @@ class ManagedNode(LifecycleNode):
 
     def __init__(self, name: str) -> None:
         super().__init__(name, start_parameter_services=False)
-        self._parameter_service = CarefulParameterService(self)
+        self._parameter_service = _CarefulParameterService(self)
         self._guard_clock()
         self.active = False
         self.finished = False
@@ -236,3 +237,41 @@ class ManagedNode(LifecycleNode):
             for entity in list(found):
                 if entity not in self._kept:
                     destroy(entity)
+
+
+class _CarefulParameterService(ParameterService):
+    """
+    The parameter services of rclpy, which refuse what they cannot read.
+
+    Those of rclpy raise an error on a value whose type does not exist, and with it end the
+    node: anybody in the domain could end it with one message.
+    """
+
+    def _set_parameters_callback(
+            self, request: SetParameters.Request,
+            response: SetParameters.Response) -> SetParameters.Response:
+        change = super()._set_parameters_callback
+        response.results = []
+        for parameter in request.parameters:
+            # One at a time: what cannot be read is no reason to refuse the others.
+            try:
+                one = change(
+                    SetParameters.Request(parameters=[parameter]), SetParameters.Response())
+                response.results.append(one.results[0])
+            except Exception as error:  # rclpy raises errors of several unrelated classes here
+                response.results.append(_refused(error))
+        return response
+
+    def _set_parameters_atomically_callback(
+            self, request: SetParametersAtomically.Request,
+            response: SetParametersAtomically.Response) -> SetParametersAtomically.Response:
+        try:
+            return super()._set_parameters_atomically_callback(request, response)
+        except Exception as error:  # as above
+            response.result = _refused(error)
+            return response
+
+
+def _refused(error: Exception) -> SetParametersResult:
+    return SetParametersResult(
+        successful=False, reason=f'{error}: expected a declared parameter of its own type')

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from functools import partial
+import math
 from time import monotonic_ns, time_ns
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -149,10 +150,7 @@ class PlantNode(DeviceNode):
             if steady - self._clock_published >= _PAUSED_CLOCK_NS:
                 self._publish_clock(steady)
             return
-        target = self._pacer.target(steady)
-        while (self._pacer.unlimited or self._device.next_sample <= target) \
-                and monotonic_ns() - steady < _BUDGET_NS:
-            self._sample()
+        self._run(math.inf if self._pacer.unlimited else self._pacer.target(steady))
 
     def _follow(self) -> None:
         """Advance to the node's clock: the wall clock, or somebody else's /clock."""
@@ -166,9 +164,13 @@ class PlantNode(DeviceNode):
         if jump:
             self.get_logger().warning(
                 _jump_in_words(jump, behind=behind), throttle_duration_sec=1.0)
+        if not self._standing:
+            self._run(now)
+
+    def _run(self, target: float) -> None:
+        """Simulate up to a time in ns, as far as a tick reaches."""
         begin = monotonic_ns()
-        while (self._device.next_sample <= now and not self._standing
-                and monotonic_ns() - begin < _BUDGET_NS):
+        while self._device.next_sample <= target and monotonic_ns() - begin < _BUDGET_NS:
             self._sample()
 
     def _sample(self) -> None:

@@ -42,9 +42,17 @@ _SILENCE = Verdict(0, 'no reply from the planner yet', '', '', '', 0, 0)
 
 class PlannerClient:
     """
-    Talks to the planner of some joints; a context manager.
+    Talks to one planner; a context manager.
 
-    Where it is silent, ``timeout`` in s is how long it is waited for.
+    Parameters
+    ----------
+    namespace : str
+        Namespace of the planner.
+    joints : sequence of str
+        Names of its joints.
+    timeout : float
+        Patience with a silent planner in s.
+
     """
 
     def __init__(
@@ -149,10 +157,22 @@ class PlannerClient:
         return graph.unheard(self.node, self._namespace, self._joints)
 
     def send(
-            self, setpoints: Sequence[tuple[float | Sequence[float], float]], *,
-            time_begins: bool = False) -> Verdict:
+            self, setpoints: Sequence[tuple[float | Sequence[float], float]],
+            levels: Sequence[tuple[float, float]] = ()) -> Verdict:
         """
-        Send stretches, of all joints or one a joint, and spans in s; return the verdict on them.
+        Send a sequence that begins now and wait for the verdict.
+
+        Parameters
+        ----------
+        setpoints : sequence of (float or sequence of float, float)
+            Stretch, of all joints or one a joint, and span in s.
+        levels : sequence of (float, float)
+            In their place: time in s from now, and flux density in T of all joints from then on.
+
+        Returns
+        -------
+        Verdict
+            Of level OK or WARN.
 
         Raises
         ------
@@ -162,8 +182,8 @@ class PlannerClient:
             If it does not answer.
 
         """
-        # Where simulated time has just begun the planner may not know yet: it is asked again.
-        points = []
+        points: list[tuple[float | Sequence[float], int]] = [
+            (level, round(time * NANOSECONDS)) for time, level in levels]
         end = 0.0
         for stretch, span in setpoints:
             if np.size(stretch) not in (1, len(self._joints)):
@@ -174,28 +194,18 @@ class PlannerClient:
             if end >= 2**31:
                 raise BadInputError(f'the sequence lasts {end:g} s: expected less than 2^31 s')
             points.append((stretch, round(end * NANOSECONDS)))
-        return self._ask(points, raw=False, time_begins=time_begins)
-
-    def send_levels(
-            self, levels: Sequence[tuple[float, float]], *, time_begins: bool = False) -> Verdict:
-        """Send levels (time in s from now, flux density in T of all joints), as `send` does."""
-        return self._ask(
-            [(y, round(x * NANOSECONDS)) for x, y in levels], raw=True, time_begins=time_begins)
-
-    def _ask(
-            self, points: Sequence[tuple[float | Sequence[float], int]], *, raw: bool,
-            time_begins: bool) -> Verdict:
         deadline = monotonic() + self._timeout
         while True:
             request = self._requested = uuid4().hex
             self._publisher.publish(to_trajectory(
-                points, self._joints, frame=request, raw=raw))
+                points, self._joints, frame=request, raw=bool(levels)))
             self.spin_until(
                 lambda request=request: self._verdict.request == request,  # type: ignore[misc]
                 'the planner did not reply with a verdict')
             if self._verdict.level < DiagnosticStatus.ERROR[0]:
                 return self._verdict
-            if not time_begins or self._verdict.code != 'no_time' or monotonic() > deadline:
+            # A planner that has just started may not have heard the time yet.
+            if self._verdict.code != 'no_time' or monotonic() > deadline:
                 raise BadInputError(f'the planner refused: {self._verdict.message}')
             self._executor.spin_once(timeout_sec=_SLICE_SECONDS)
             sleep(_SLICE_SECONDS)
@@ -206,11 +216,25 @@ class PlannerClient:
         """
         Wait until a sequence has been carried out, and judged where it is measured.
 
+        Parameters
+        ----------
+        verdict : Verdict
+            As `send` returned it.
+        each : callable, optional
+            Called about 20 times a second with the newest verdict.
+        timeout : float
+            Patience in s; in simulated ones where that time is published and runs slower.
+
+        Returns
+        -------
+        Verdict
+            The last one.
+
         Raises
         ------
         HmsaError
             If another request took its place, nobody carries out the commands, or it takes too
-            long: more than ``timeout`` in s, simulated ones where they are published and slower.
+            long.
 
         """
         heard = monotonic()

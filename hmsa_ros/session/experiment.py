@@ -132,7 +132,21 @@ def prepare(folder: Path) -> None:
 def conduct(
         experiment: Experiment, environment: Mapping[str, str], progress: Tell) -> Conducted:
     """
-    Carry out an experiment in a prepared folder, in the ROS domain of this process.
+    Carry out an experiment.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        In a prepared folder.
+    environment : mapping of str to str
+        Of the processes; this process must live in the same ROS domain.
+    progress : callable
+        Called with what is going on and the share of the sequence that is done.
+
+    Returns
+    -------
+    Conducted
+        The bag is closed.
 
     Raises
     ------
@@ -146,25 +160,25 @@ def conduct(
     with Session(experiment.folder, environment) as session, PlannerClient(
             namespace=experiment.namespace, joints=experiment.joints,
             timeout=_START_SECONDS) as client:
-        watch = _Watch(client, experiment)
+        watch = _Watch(client, experiment, session.check)
         try:
             progress('starting the nodes' if experiment.nodes else 'looking for the nodes', 0.0)
             _begin(experiment, session, watch)
-            verdict = _carry_out(experiment, session, watch, progress)
+            verdict = _carry_out(experiment, watch, progress)
             measured = watch.measured
         except BaseException as error:
             resting = True
             if watch.sent:
                 progress('coming to rest', 1.0)
                 resting = client.stop()
-            session.stop((topics.RECORDER,))
+            session.stop()
             if resting:
                 raise
             raise HmsaError(
                 f'{str(error) or "interrupted"}; the planner does not say that the actuator '
                 'rests: look after the coil') from error
         progress('closing the bag', 1.0)
-        exits = session.stop((topics.RECORDER,))
+        exits = session.stop()
         for name, status in exits.items():
             if status:
                 raise HmsaError(
@@ -180,7 +194,7 @@ def _begin(experiment: Experiment, session: Session, watch: '_Watch') -> None:
     if experiment.nodes:
         session.start(_recorder(experiment, True))
     watch.client.find_planner(session.check)
-    watch.read_parameters(session.check)
+    watch.read_parameters()
     if not experiment.nodes:
         watch.check()
         session.start(_recorder(experiment, bool(watch.parameter('planner.use_sim_time'))))
@@ -188,7 +202,7 @@ def _begin(experiment: Experiment, session: Session, watch: '_Watch') -> None:
         lambda: watch.recorder_ready,
         f'the recorder is not ready: {session.last_words(topics.RECORDER)}', session.check)
     if experiment.nodes:
-        watch.unpause(session.check)
+        watch.unpause()
 
 
 def _recorder(experiment: Experiment, simulated: bool) -> NodeProcess:
@@ -197,20 +211,16 @@ def _recorder(experiment: Experiment, simulated: bool) -> NodeProcess:
         'record.topics': experiment.topics()}, experiment.namespace)
 
 
-def _carry_out(
-        experiment: Experiment, session: Session, watch: '_Watch', progress: Tell) -> Verdict:
+def _carry_out(experiment: Experiment, watch: '_Watch', progress: Tell) -> Verdict:
     """Send the sequence, and wait until the last setpoint has been watched for its span."""
     watch.sent = True
-    verdict = (
-        watch.client.send_levels(experiment.levels, time_begins=True) if experiment.levels
-        else watch.client.send(experiment.setpoints, time_begins=True))
+    verdict = watch.client.send(experiment.setpoints, experiment.levels)
     begin = watch.now
     lead = watch.parameter('planner.lead_time')
     total = experiment.duration + (
         float(lead) if isinstance(lead, (int, float)) else 0.0)
 
     def report() -> None:
-        session.check()
         watch.look(begin + total)
         progress('running the sequence', min((watch.now - begin) / total, 1.0))
 
@@ -223,8 +233,12 @@ def _carry_out(
 class _Watch:
     """What an experiment looks at: who is there, the recorder's readiness, and the time."""
 
-    def __init__(self, client: PlannerClient, experiment: Experiment) -> None:
+    def __init__(
+            self, client: PlannerClient, experiment: Experiment,
+            check: Callable[[], None]) -> None:
         self.client = client
+        # That what was started runs.
+        self._check = check
         self.sent = False
         self.notes: list[str] = []
         self._experiment = experiment
@@ -271,14 +285,14 @@ class _Watch:
 
     # -- checks --------------------------------------------------------------------------------
 
-    def read_parameters(self, each: Callable[[], None]) -> None:
+    def read_parameters(self) -> None:
         """Ask planner and plant for their parameters; a driver of hardware may have none."""
         space = f'/{self._experiment.namespace.strip("/")}'.rstrip('/')
         asked = {x: RemoteParameters(self.client.node, f'{space}/{x}')
                  for x in (topics.PLANNER, topics.PLANT)}
 
         def poll() -> None:
-            each()
+            self._check()
             for node, remote in asked.items():
                 if not self._known(node):
                     remote.poll(partial(self._note, node))
@@ -351,6 +365,7 @@ class _Watch:
             If something has gone.
 
         """
+        self._check()
         moment, now = monotonic(), self.now
         if moment - self._looked < _LOOK_SECONDS:
             return
@@ -372,14 +387,14 @@ class _Watch:
                 raise HmsaError(
                     f'the sequence has not come to its end {_GRACE_SECONDS:g} s after its time')
 
-    def unpause(self, each: Callable[[], None]) -> None:
+    def unpause(self) -> None:
         """Let simulated time run."""
-        self.client.spin_until(
-            self._set_paused.service_is_ready, 'the plant offers no service to unpause it', each)
         call = ServiceCall(self._set_paused, SetBool.Request(data=False))
-        self.client.spin_until(
-            lambda: call.answer() is not None, 'the plant did not answer', each)
-        self.client.spin_until(lambda: self.now > 0.0, 'time does not begin to advance', each)
+        for condition, failure in (
+                (lambda: call.ready, 'the plant offers no service to unpause it'),
+                (lambda: call.answer() is not None, 'the plant did not answer'),
+                (lambda: self.now > 0.0, 'time does not begin to advance')):
+            self.client.spin_until(condition, failure, self._check)
 
 
 def _same(own: object, other: object) -> bool:

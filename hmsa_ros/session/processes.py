@@ -1,6 +1,6 @@
 """Node processes: started together, ended in order, never left behind."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 import ctypes
 from dataclasses import dataclass
 import json
@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 
+from hmsa_ros.contract.topics import RECORDER
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.middleware import RANGE
 
@@ -98,10 +99,9 @@ class Session:
         lines = self.log(name).read_text(errors='replace').strip().splitlines()
         return f'{lines[-1] if lines else "it printed nothing"} (log: {self.log(name)})'
 
-    def stop(self, order: Sequence[str] = ()) -> dict[str, int]:
-        """End all nodes, those of ``order`` first one by one; return exit status by node."""
-        names = [*(x for x in order if x in self._processes),
-                 *(x for x in self._processes if x not in order)]
+    def stop(self) -> dict[str, int]:
+        """End all nodes one by one, the recorder first; return exit status by node."""
+        names = sorted(self._processes, key=lambda x: x != RECORDER)
         for name in names:
             process = self._processes[name]
             if process.poll() is None:

@@ -14,15 +14,13 @@ _BRAILLE = 0x2800
 @dataclass(frozen=True)
 class Strip:
     """
-    A chart of one value and its target between two edges, by rows from above.
+    A chart of one value and its target, by rows from above.
 
     ``targets`` are the columns of each row that show the target alone, for another colour.
     """
 
     rows: tuple[str, ...]
     targets: tuple[tuple[int, ...], ...]
-    low: float
-    high: float
 
 
 def dots(braille: bool) -> tuple[int, int]:
@@ -78,4 +76,4 @@ def strip(
         rows = [''.join(row) for row in marks.tolist()]
     alone = theirs & ~ours
     return Strip(
-        tuple(rows), tuple(tuple(np.flatnonzero(x).tolist()) for x in alone), low, high)
+        tuple(rows), tuple(tuple(np.flatnonzero(x).tolist()) for x in alone))

@@ -29,18 +29,14 @@ class History:
         count = len(self._low)
         times = before + (now - before) * np.arange(1, len(values) + 1) / max(len(values), 1)
         slots = np.floor(times / self._slot).astype(np.int64)
-        for slot in np.unique(slots[slots > self._newest - count]).tolist():
-            part = values[slots == slot]
-            place = slot % count
-            self._low[place] = np.fmin(self._low[place], part.min())
-            self._high[place] = np.fmax(self._high[place], part.max())
+        kept = slots > self._newest - count
+        np.fmin.at(self._low, slots[kept] % count, values[kept])
+        np.fmax.at(self._high, slots[kept] % count, values[kept])
 
     def _advance(self, now: float) -> None:
-        newest = math.floor(now / self._slot)
-        gone = min(newest - self._newest, len(self._low))
-        for slot in range(newest - gone + 1, newest + 1):
-            self._low[slot % len(self._low)] = np.nan
-            self._high[slot % len(self._high)] = np.nan
+        newest, count = math.floor(now / self._slot), len(self._low)
+        begun = np.arange(max(self._newest, newest - count) + 1, newest + 1) % count
+        self._low[begun] = self._high[begun] = np.nan
         self._newest = max(newest, self._newest)
 
     def ranges(self, now: float, columns: int) -> tuple[Array, Array]:

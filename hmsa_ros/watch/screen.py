@@ -9,7 +9,6 @@ from rich.cells import cell_len
 from rich.text import Text
 
 from hmsa_ros.core.laws.coordinate import shared_name
-from hmsa_ros.core.model import Array
 from hmsa_ros.watch.chart import dots, limits, strip
 from hmsa_ros.watch.scene import Joint, LEVELS, Report, Scene
 
@@ -126,24 +125,30 @@ class Screen:
         second = Text(
             f'flux density {_millitesla(joint.flux_density)}, '
             f'commanded {_millitesla(joint.commanded)}')
-        columns = max(width - _GUTTER, 1) * dots(self._unicode)[0]
-        value, target = self._history(joint, now, columns)
-        drawn = strip(
-            value, target, rows, limits(*value, *target, least=_LEAST_RANGE),
-            braille=self._unicode)
+        chart, (low, high) = self._chart(joint, now, max(width - _GUTTER, 1), rows)
         lines = []
-        for i, (row, alone) in enumerate(zip(drawn.rows, drawn.targets, strict=True)):
-            label = {0: f'{drawn.high:.4f}', rows - 1: f'{drawn.low:.4f}'}.get(i, '')
+        for i, row in enumerate(chart):
+            label = {0: f'{high:.4f}', rows - 1: f'{low:.4f}'}.get(i, '')
             line = Text(f'{label:>{_GUTTER - 2}} ', style=_SOFT)
             line.append('│' if self._unicode else '|')
-            lines.append(line.append(_coloured(row, alone)))
+            lines.append(line.append(row))
         second.append(f'   {self._span:g} s across', style=_SOFT)
         return [first, second, *lines]
 
-    def _history(
-            self, joint: Joint, now: float, columns: int
-    ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        return joint.stretches.ranges(now, columns), joint.targets.ranges(now, columns)
+    def _chart(
+            self, joint: Joint, now: float, width: int, rows: int
+    ) -> tuple[list[Text], tuple[float, float]]:
+        """Return a chart, and the values at its lower and upper edge."""
+        columns = width * dots(self._unicode)[0]
+        value, target = (x.ranges(now, columns) for x in (joint.stretches, joint.targets))
+        edges = limits(*value, *target, least=_LEAST_RANGE)
+        drawn = strip(value, target, rows, edges, braille=self._unicode)
+        texts = []
+        for row, alone in zip(drawn.rows, drawn.targets, strict=True):
+            texts.append(Text(row, style=_VALUE))
+            for column in alone:
+                texts[-1].stylize(_TARGET, column, column + 1)
+        return texts, edges
 
     def _table(self, scene: Scene, width: int, room: int) -> list[Text]:
         """Return a line for each joint, with a chart of one row at its end."""
@@ -163,27 +168,15 @@ class Screen:
             line.append(f'{number(joint.stretch):>{_WIDE}}', style=_VALUE)
             line.append(f' {number(joint.target):>8}', style=_TARGET)
             line.append(f' {_off(joint):>8} {_millitesla(joint.flux_density):>13} ')
-            across = (width - cell_len(line.plain)) * dots(self._unicode)[0]
+            across = width - cell_len(line.plain)
             if across > 0:
-                value, target = self._history(joint, scene.now, across)
-                drawn = strip(
-                    value, target, 1, limits(*value, *target, least=_LEAST_RANGE),
-                    braille=self._unicode)
-                line.append(_coloured(drawn.rows[0], drawn.targets[0]))
+                line.append(self._chart(joint, scene.now, across, 1)[0][0])
             lines.append(line)
         hidden = len(scene.joints) - len(shown)
         if hidden:
             lines.append(Text(
                 f'and {hidden} more: name some with --joint', style=_SOFT))
         return lines
-
-
-def _coloured(row: str, alone: tuple[int, ...]) -> Text:
-    """Return a row of a chart, the target in its own colour."""
-    text = Text(row, style=_VALUE)
-    for column in alone:
-        text.stylize(_TARGET, column, column + 1)
-    return text
 
 
 def _judged(name: str, level: int, message: str, width: int, rows: int) -> list[Text]:
