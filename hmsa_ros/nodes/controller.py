@@ -150,7 +150,7 @@ class Linked(DeviceNode):
         super()._publish_change(change)
 
     def _publish_sample(self, sample: Sample) -> None:
-        self._planner.take_sample(self._values.names, sample)
+        self._planner.take_sample(self.values.names, sample)
         super()._publish_sample(sample)
 
     def _report_loop(self) -> None:

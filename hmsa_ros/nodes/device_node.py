@@ -1,20 +1,41 @@
 """What all nodes have that pass commands to a device and publish what comes of it."""
 
 from abc import abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from sensor_msgs.msg import MagneticField
 
+from hmsa_ros.contract import topics
 from hmsa_ros.contract.parameters import ParameterSpec
 from hmsa_ros.device.health import judge_commands
-from hmsa_ros.device.protocol import Change, Sample
-from hmsa_ros.nodes import conversions
-from hmsa_ros.nodes.device_joint import DeviceJoint
-from hmsa_ros.nodes.guard import COMMAND_SOURCES
+from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
+from hmsa_ros.device.watchdog import Fallback, SAFE_FLUX
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.nodes import conversions, interface
+from hmsa_ros.nodes.guard import COMMAND_SOURCES, CommandInput
 from hmsa_ros.nodes.joints import JointParameters
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.samples import SamplePublisher
+from hmsa_ros.nodes.timekeeping import Seldom
+
+#: What a joint does when nobody commands it; each may have values of its own.
+FALLBACK = (
+    ParameterSpec(
+        'command_timeout', 1.0,
+        'Watchdog: longest time without command or heartbeat, after the first one, before the '
+        'coil does what safe_flux says; 0 disables it. Paused time does not count.',
+        's', 0.0, 1e6),
+    ParameterSpec(
+        'safe_flux', 'hold',
+        'What the coil does when the watchdog trips: hold the commanded level, go to zero, or '
+        'ramp to zero. Use zero or ramp for a real coil that must not be left on.',
+        choices=SAFE_FLUX),
+    ParameterSpec(
+        'safe_ramp_rate', 1.0, 'Rate of the ramp to zero, which has steps of 1 ms.', 'T/s',
+        1e-9, 1e12),
+)
 
 COMMAND_SOURCE = ParameterSpec(
     'command_source', 'any',
@@ -29,6 +50,86 @@ PUBLISH_SCALARS = ParameterSpec(
 TICK_SECONDS = 0.001
 
 
+def fallback_from(values: Mapping[str, Any]) -> Fallback:
+    """Return what the values of `FALLBACK` describe."""
+    return Fallback(values['command_timeout'], values['safe_flux'], values['safe_ramp_rate'])
+
+
+class DeviceJoint:
+    """
+    An actuator on the wire; it obeys ``commands`` while its node is active.
+
+    ``received``, ``refused``, ``late`` and ``failed`` count commands that came, were refused or
+    late, and how often the device failed; ``latest`` is the largest lateness in ns.
+    """
+
+    def __init__(self, node: 'DeviceNode', number: int) -> None:
+        names = node.values.names
+        self.name = names[number]
+        self._node, self._device, self._number = node, node.device, number
+        self._of_me = '' if len(names) == 1 else f'joint {self.name}: '
+        self._crowded = False
+        self._tell_refused, self._tell_late = Seldom(), Seldom()
+        self.received = self.refused = self.late = self.latest = self.failed = 0
+        self._applied = interface.publisher(
+            node, topics.of_joint(topics.FLUX_DENSITY_APPLIED, self.name, names))
+        self.commands = CommandInput(
+            node, topics.of_joint(topics.FLUX_DENSITY_COMMAND, self.name, names),
+            self._on_command, node.values['command_source'], node.companion)
+
+    # -- out -----------------------------------------------------------------------------------
+
+    def publish_applied(self, change: Change) -> None:
+        """Publish that a level has taken effect."""
+        self._applied.publish(conversions.to_command(change.stamp, change.level, ''))
+
+    def log(self, notice: Notice) -> None:
+        """Count and log what the device has noticed."""
+        logger = self._node.get_logger()
+        text = f'{self._of_me}{notice.text}'
+        if notice.kind == Kind.LATE:
+            self.late += 1
+            self.latest = max(self.latest, notice.late)
+            if self._tell_late():
+                logger.warning(text)
+        elif notice.kind == Kind.HEARD:
+            logger.info(text)
+        else:
+            self.failed += notice.kind == Kind.FAILED
+            logger.error(text)
+
+    # -- in ------------------------------------------------------------------------------------
+
+    def _on_command(self, message: MagneticField) -> None:
+        self._obey(lambda: conversions.from_command(message))
+
+    def command(self, stamp: int, level: float) -> None:
+        """Obey a level in T from a stamp in ns on, from a planner in the same process."""
+        self._obey(lambda: (stamp, level))
+
+    def _obey(self, read: Callable[[], tuple[int, float]]) -> None:
+        if not self._node.active:
+            return
+        self.received += 1
+        try:
+            self._device.receive(self._number, *read())
+        except BadInputError as error:
+            self.refused += 1
+            if self._tell_refused():
+                self._node.get_logger().error(
+                    f'{self._of_me}command refused, the previous one stays in force: {error}')
+
+    def crowded(self) -> bool:
+        """Return whether several publishers command this joint, and log it once."""
+        count = self.commands.count()
+        if count > 1 and not self._crowded:
+            self._node.get_logger().warning(
+                f'{self._of_me}{count} publishers command this joint: expected one; with '
+                'command_source first only the first is obeyed')
+        self._crowded = count > 1
+        return self._crowded
+
+
 class DeviceNode(ManagedNode):
     """
     Publishes what comes of a device in ``on_tick``; ``_go_on`` of a subclass lets it go on.
@@ -38,8 +139,8 @@ class DeviceNode(ManagedNode):
     """
 
     companion = ''
-    _values: JointParameters
-    _device: Any
+    values: JointParameters
+    device: Any
     _joints: Sequence[DeviceJoint] = ()
 
     def on_tick(self) -> None:
@@ -63,12 +164,10 @@ class DeviceNode(ManagedNode):
 
     def _open(self, joint: type[DeviceJoint]) -> None:
         """Create the topics of samples and joints, and look at the time from now on."""
-        scalars, names = self._values[PUBLISH_SCALARS.name], self._values.names
+        scalars, names = self.values[PUBLISH_SCALARS.name], self.values.names
         self._samples = SamplePublisher(self, names, scalars=scalars == 'always' or (
             scalars == 'auto' and len(names) == 1))
-        self._joints = [
-            joint(self, self._device, i, names, self._values.of(x), self.companion)
-            for i, x in enumerate(names)]
+        self._joints = [joint(self, i) for i in range(len(names))]
         self._publish_news()
         if not self.companion:
             self.every(TICK_SECONDS, self.on_tick)
@@ -91,11 +190,11 @@ class DeviceNode(ManagedNode):
 
     def _publish_news(self) -> None:
         """Publish what has come of the device since the last time."""
-        for notice in self._device.notices():
+        for notice in self.device.notices():
             self._joints[notice.joint].log(notice)
-        for change in self._device.changes():
+        for change in self.device.changes():
             self._publish_change(change)
-        for sample in self._device.samples():
+        for sample in self.device.samples():
             self._publish_sample(sample)
 
     def _publish_change(self, change: Change) -> None:
@@ -112,7 +211,7 @@ class DeviceNode(ManagedNode):
             'refused': sum(x.refused + x.commands.unreadable for x in joints),
             'refused_source': sum(x.commands.refused for x in joints),
             'failed': sum(x.failed for x in joints)}
-        silent = [joints[i].name for i in self._device.silent]
+        silent = [joints[i].name for i in self.device.silent]
         level, message = judge_commands(
             **counts, silent=silent, crowded=[x.name for x in joints if x.crowded()])
         return conversions.to_status(
@@ -120,5 +219,5 @@ class DeviceNode(ManagedNode):
             level, message,
             {'received': sum(x.received for x in joints), **counts,
              'largest_lateness_ms': f'{max(x.latest for x in joints) / 1e6:.3f}',
-             'timeouts': self._device.trips, 'silent': len(silent),
-             'time': f'{self._device.time / 1e9:.9f}', **values})
+             'timeouts': self.device.trips, 'silent': len(silent),
+             'time': f'{self.device.time / 1e9:.9f}', **values})

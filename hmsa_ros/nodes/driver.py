@@ -10,8 +10,14 @@ from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.device.hardware import HardwareDevice, HardwareJoint, load
 from hmsa_ros.device.worker import HardwareWorker
 from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.nodes.device_joint import DeviceJoint, FALLBACK, fallback_from
-from hmsa_ros.nodes.device_node import COMMAND_SOURCE, DeviceNode, PUBLISH_SCALARS
+from hmsa_ros.nodes.device_node import (
+    COMMAND_SOURCE,
+    DeviceJoint,
+    DeviceNode,
+    FALLBACK,
+    fallback_from,
+    PUBLISH_SCALARS,
+)
 from hmsa_ros.nodes.joints import declare_joints, JointParameters, JOINTS
 from hmsa_ros.nodes.managed import AUTOSTART
 from hmsa_ros.nodes.runner import run
@@ -49,11 +55,11 @@ PARAMETERS = (
 class DriverNode(DeviceNode):
     """Passes commands to hardware, which a thread serves, and publishes what comes of it."""
 
-    _device: HardwareWorker
+    device: HardwareWorker
 
     def __init__(self) -> None:
         super().__init__(topics.DRIVER)
-        self._values = declare_joints(
+        self.values = declare_joints(
             self, [x for x in PARAMETERS if x is not AUTOSTART], OWN)
         self.failure: HmsaError | None = None
         self.autostart()
@@ -71,22 +77,22 @@ class DriverNode(DeviceNode):
         if self.get_parameter('use_sim_time').value:
             raise BadInputError(
                 'use_sim_time is true: expected false, hardware follows the clock of the machine')
-        self._device = HardwareWorker(_make_device(self._values), time_ns)
+        self.device = HardwareWorker(_make_device(self.values), time_ns)
         self._open(DeviceJoint)
 
     def deactivate(self) -> None:
         """Switch the coils off."""
-        self._device.switch_off()
+        self.device.switch_off()
 
     def cleanup(self) -> None:
         """Switch the coils off, and leave the hardware alone."""
         if self._joints:
-            self._device.close()
+            self.device.close()
         super().cleanup()
 
     def _go_on(self) -> None:
-        if self._device.failure is not None:
-            self.failure, self.finished = self._device.failure, True
+        if self.device.failure is not None:
+            self.failure, self.finished = self.device.failure, True
 
 
 def _make_device(values: JointParameters) -> HardwareDevice:

@@ -77,7 +77,7 @@ class PlantNode(DeviceNode):
 
     def __init__(self) -> None:
         super().__init__(topics.PLANT)
-        self._values = declare_joints(
+        self.values = declare_joints(
             self, [x for x in PARAMETERS if x is not AUTOSTART], OWN)
         self.on_change(self._take_parameters)
         self._pacer = Pacer(0, 1.0)
@@ -94,7 +94,7 @@ class PlantNode(DeviceNode):
             If parameters do not go together.
 
         """
-        values = self._values
+        values = self.values
         self._authority: bool = values['publish_clock']
         if self._authority and self.get_parameter('use_sim_time').value:
             raise BadInputError(
@@ -102,7 +102,7 @@ class PlantNode(DeviceNode):
                 'leads simulated time or follows it')
         start = round(values['start_time'] * NANOSECONDS) if self._authority else 0
         factor = values['real_time_factor'] if self._authority else 1.0
-        self._device = _make_device(values, start, self.get_logger())
+        self.device = _make_device(values, start, self.get_logger())
         self._pacer = Pacer(start, factor, paused=values['start_paused'])
         self._clock_published = 0
         self._measured = (start, monotonic_ns())
@@ -118,11 +118,11 @@ class PlantNode(DeviceNode):
 
     def activate(self) -> None:
         """Let time run, from where it is."""
-        self._pacer.set_paused(self._pacer.paused, self._device.time)
+        self._pacer.set_paused(self._pacer.paused, self.device.time)
 
     def deactivate(self) -> None:
         """Hold time; commands on their way are lost."""
-        self._device.drop_commands()
+        self.device.drop_commands()
 
     # -- time ----------------------------------------------------------------------------------
 
@@ -134,7 +134,7 @@ class PlantNode(DeviceNode):
     @property
     def leading_time(self) -> int | None:
         """Simulated time in ns, if this plant is the authority on it."""
-        return self._device.time if self._joints and self._authority else None
+        return self.device.time if self._joints and self._authority else None
 
     def _go_on(self) -> None:
         """Let time run as far as it has come."""
@@ -160,7 +160,7 @@ class PlantNode(DeviceNode):
             return
         behind = now - self._clock_seen < 1_000_000_000
         self._clock_seen = now
-        jump = self._device.follow(now, standing=self._standing)
+        jump = self.device.follow(now, standing=self._standing)
         if jump:
             self.get_logger().warning(
                 _jump_in_words(jump, behind=behind), throttle_duration_sec=1.0)
@@ -170,7 +170,7 @@ class PlantNode(DeviceNode):
     def _run(self, target: float) -> None:
         """Simulate up to a time in ns, as far as a tick reaches."""
         begin = monotonic_ns()
-        while self._device.next_sample <= target and monotonic_ns() - begin < _BUDGET_NS:
+        while self.device.next_sample <= target and monotonic_ns() - begin < _BUDGET_NS:
             self._sample()
 
     def _sample(self) -> None:
@@ -178,20 +178,20 @@ class PlantNode(DeviceNode):
         self._publish_news()
 
     def _advance(self) -> None:
-        self._device.advance(self._device.next_sample)
+        self.device.advance(self.device.next_sample)
         self._publish_clock(monotonic_ns())
 
     # -- what else is published ----------------------------------------------------------------
 
     def _states(self) -> tuple[int, list[State]]:
         """Return the time and what the joints do, for who looks."""
-        device = self._device
+        device = self.device
         return device.time, [State(*x) for x in zip(
             device.stretch.tolist(), device.flux_density.tolist(), strict=True)]
 
     def _publish_clock(self, steady: int) -> None:
         if self._clock_publisher is not None:
-            self._clock_publisher.publish(conversions.to_clock(self._device.time))
+            self._clock_publisher.publish(conversions.to_clock(self.device.time))
         self._clock_published = steady
 
     # -- services and parameters ---------------------------------------------------------------
@@ -199,12 +199,12 @@ class PlantNode(DeviceNode):
     def _on_reset(self) -> tuple[bool, str]:
         where = []
         for i, joint in enumerate(self._joints):
-            values = self._values.of(joint.name)
+            values = self.values.of(joint.name)
             rate = values['reset_rate']
-            self._device.restart(i, values['reset_stretch'] or None, rate)
+            self.device.restart(i, values['reset_stretch'] or None, rate)
             how = f'at rate {rate:g}/s' if rate else 'at rest'
-            where.append(f'{how} at {self._device.coordinates[i]} {self._device.stretch[i]:g}')
-        self._device.drop_commands()
+            where.append(f'{how} at {self.device.coordinates[i]} {self.device.stretch[i]:g}')
+        self.device.drop_commands()
         self._publish_news()
         return True, where[0] if len(where) == 1 else ', '.join(
             f'{joint.name} {text}' for joint, text in zip(self._joints, where, strict=True))
@@ -217,39 +217,39 @@ class PlantNode(DeviceNode):
         if not self.active:
             return False, f'the plant is {self.state}: expected it active'
         self._hear()
-        for _ in range(self._values['step_count']):
-            before = self._device.time
-            while self._device.time == before:
+        for _ in range(self.values['step_count']):
+            before = self.device.time
+            while self.device.time == before:
                 # The first sample is the start itself.
                 self._sample()
-        self._pacer.set_paused(True, self._device.time)
-        return True, f'at {self._device.time / 1e9:.9f} s'
+        self._pacer.set_paused(True, self.device.time)
+        return True, f'at {self.device.time / 1e9:.9f} s'
 
     def _on_set_paused(self, paused: bool) -> tuple[bool, str]:
-        self._pacer.set_paused(paused, self._device.time)
+        self._pacer.set_paused(paused, self.device.time)
         return True, 'paused' if paused else 'running'
 
     def _take_parameters(self, parameters: Sequence[Parameter]) -> None:
-        changed = self._values.changed(parameters)
+        changed = self.values.changed(parameters)
         _joints_from(changed)
-        self._values = changed
+        self.values = changed
         factor = changed['real_time_factor']
         if self._joints and self._authority and factor != self._pacer.factor:
-            self._pacer.set_factor(factor, self._device.time)
+            self._pacer.set_factor(factor, self.device.time)
 
     # -- reports -------------------------------------------------------------------------------
 
     def _report(self) -> Iterable[DiagnosticStatus]:
         yield self._status_of_commands(
             paused=self._pacer.paused, **conversions.of_joints('coordinate', dict(zip(
-                (x.name for x in self._joints), self._device.coordinates, strict=True))))
+                (x.name for x in self._joints), self.device.coordinates, strict=True))))
         yield self._status_of_time()
 
     def _status_of_time(self) -> DiagnosticStatus:
         then, since = self._measured
         steady = monotonic_ns()
-        self._measured = (self._device.time, steady)
-        achieved = (self._device.time - then) / max(steady - since, 1) if then else 0.0
+        self._measured = (self.device.time, steady)
+        achieved = (self.device.time - then) / max(steady - since, 1) if then else 0.0
         level = 0
         message = f'time is held, {self.state}' if self._standing else 'time runs'
         clocks = self.count_publishers(topics.CLOCK_TOPIC.name)

@@ -1,6 +1,6 @@
 """One joint of the plant: what it simulates, and the forces that disturb it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 import math
 from typing import Any
 
@@ -22,8 +22,7 @@ from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import conversions, interface
-from hmsa_ros.nodes.device_joint import DeviceJoint, FALLBACK, fallback_from
-from hmsa_ros.nodes.managed import ManagedNode
+from hmsa_ros.nodes.device_node import DeviceJoint, DeviceNode, FALLBACK, fallback_from
 from hmsa_ros.nodes.timekeeping import Seldom
 
 #: Parameters that each joint may have values of its own for.
@@ -61,13 +60,11 @@ class PlantJoint(DeviceJoint):
 
     _device: SimulatedDevice
 
-    def __init__(
-            self, node: ManagedNode, device: SimulatedDevice, number: int,
-            names: Sequence[str], values: Mapping[str, Any], companion: str = '') -> None:
-        super().__init__(node, device, number, names, values, companion)
+    def __init__(self, node: DeviceNode, number: int) -> None:
+        super().__init__(node, number)
         self._tell_force = Seldom()
-        interface.subscribe(
-            node, topics.of_joint(topics.DISTURBANCE_FORCE, self.name, names), self._on_force)
+        interface.subscribe(node, topics.of_joint(
+            topics.DISTURBANCE_FORCE, self.name, node.values.names), self._on_force)
 
     def _on_force(self, message: WrenchStamped) -> None:
         if not self._node.active:
