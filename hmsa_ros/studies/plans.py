@@ -106,6 +106,7 @@ def carried_out(
         shapers: NDArray[np.str_]) -> tuple[Plans, Array, Array]:
     """Return plans, and vibration and offset that they leave on `actuals`, shares of the step."""
     plans = Plans.none(len(which))
+    # NaN where there is no plan, no move, or a motion that cannot be followed.
     left = np.full((2, len(which)), math.nan)
     # Rows that differ in the actuator alone have one plan.
     made: dict[tuple[Setting, float, float, str], tuple[_Planned, float]] = {}
