@@ -65,7 +65,7 @@ def own_time(name: str, parameters: dict[str, str], count: int) -> Row:
             begin = thread_time()
             channel._on_setpoint(message)
             spans.append(thread_time() - begin)
-        refused = node._runtime.refused
+        refused = node._runtime.planning.refused
         node.destroy_node()
     finally:
         rclpy.try_shutdown()

@@ -1,14 +1,13 @@
 """``hmsa identify``: the parameters of an actuator out of a recording."""
 
 import argparse
-import json
 from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.options import add_options, JSON
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import write_text
+from hmsa_ros.files import json_text, write_text
 
 if TYPE_CHECKING:
     from hmsa_ros.identification import Identification, Recording
@@ -78,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
         record = found.record()
         if curve:
             record['profile'] = {'name': arguments.profile, 'points': curve}
-        print(json.dumps(record, indent=2, allow_nan=False))
+        print(json_text(record))
     else:
         for line in table(found):
             print(line)

@@ -69,25 +69,17 @@ class Course:
             *(x for x in other.levels if x[0] < begin), *self.levels))
 
 
-@dataclass(frozen=True)
-class Expectation:
-    """What is expected to be left at the end of a course."""
-
-    amplitude: float  # of the vibration in the most probable motion
-    offset: float  # of its rest from the target
-    size: float  # root of the expected square of both together
-
-
 def expect(
         estimate: Estimate, course: Course, slew_limit: float = math.inf,
-        until: int = 0) -> Expectation:
+        until: int = 0) -> float:
     """
     Return what a course is expected to leave; infinite where the motion cannot be followed.
+
+    It is the root of the expected square of vibration and distance from the target together.
 
     The estimate is of a time from which on the course may still be changed; the course has the
     level in force then. If it ends before `until`, in ns, that counts: vibration decays meanwhile.
     """
-    nothing = Expectation(math.inf, math.inf, math.inf)
     begin = estimate.time
     end = max(course.arrival, begin, until)
     motion = follow(
@@ -97,7 +89,7 @@ def expect(
         0.0, np.array([(end - begin) / NANOSECONDS]))
     at = rest(estimate.values, estimate.free, course.holding)
     if motion is None or at is None:
-        return nothing
+        return math.inf
     stretch, frequency, by = at
     rows = np.zeros((3, len(estimate.covariance)))
     rows[0] = motion.by[0]
@@ -107,9 +99,7 @@ def expect(
     misses = np.array([
         motion.stretch[0] - stretch, motion.rate[0] / frequency, stretch - course.target])
     spread = float(np.einsum('ij,jk,ik->', rows, estimate.covariance, rows))
-    return Expectation(
-        math.hypot(misses[0], misses[1]), float(misses[2]),
-        math.sqrt(float(misses @ misses) + max(spread, 0.0)))
+    return math.sqrt(float(misses @ misses) + max(spread, 0.0))
 
 
 def patience(
@@ -121,7 +111,7 @@ def patience(
     The estimate is of the begin of the move, the step its change of stretch, above 0, and the
     tolerance the share of the step from which on that is too much.
     """
-    if expect(estimate, course, slew_limit).size <= tolerance * step:
+    if expect(estimate, course, slew_limit) <= tolerance * step:
         return 1.0
     return caution(len(estimate.free), estimate.noise / step)
 
@@ -183,8 +173,8 @@ class Corrector:
             return None
         for found in self._candidates(model, estimate, course):
             whole = found.follows(course, estimate.time)
-            size = expect(estimate, whole, slew).size
-            now = expect(estimate, course, slew, whole.arrival).size
+            size = expect(estimate, whole, slew)
+            now = expect(estimate, course, slew, whole.arrival)
             if size < least and worthwhile(now, size, estimate.noise):
                 best, least = whole, math.sqrt(_SHARE) * size
         return best

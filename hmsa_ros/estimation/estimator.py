@@ -26,8 +26,9 @@ _FIRST_NOISE, _LEAST_NOISE = 1e-3, 2e-6
 _FEWEST_FOR_NOISE = 10
 # How fast the estimate of the noise follows the residuals.
 _NOISE_GAIN = 0.05
-# Times the prior's spread that an estimate may be off it.
-_BOUND = 4.0
+# Times the prior's spread that an estimate may be off it, and that a parameter may wander in a
+# second.
+_BOUND, _DRIFT = 4.0, 0.003
 # Share of a variance that keeps a parameter where it is.
 _FIXED = 1e-12
 # Deviation of stretch and, in natural frequencies, of rate of a block at rest, and of one whose
@@ -47,12 +48,10 @@ class Options:
     window: int = 120  # largest number of samples in the horizon
     noise: float = 0.0  # standard deviation of a sample of stretch; 0 to estimate it
     learn: bool = True  # estimate parameters from the first sample on; else the state alone
-    gate: float = 6.0  # deviations of the innovation from which a sample is rejected
-    drift: float = 0.003  # share of the prior's spread that a parameter may wander in a second
     slew_limit: float = math.inf  # of the amplifier in T/s; infinite for steps
 
     def __post_init__(self) -> None:
-        for name, least in (('window', 10), ('noise', 0.0), ('gate', 1.0), ('drift', 0.0)):
+        for name, least in (('window', 10), ('noise', 0.0)):
             if not least <= getattr(self, name) < math.inf:
                 raise BadInputError(
                     f'{name} is {getattr(self, name)}: expected at least {least:g}')
@@ -87,7 +86,7 @@ class Estimator:
         self.prior = prior
         self.options = options or Options()
         self.noise = self.options.noise or _FIRST_NOISE
-        self.screening = Screening(self.options.gate, self.prior.coordinate)
+        self.screening = Screening(prior.coordinate)
         # Else parameters stay as they are from the next update on.
         self.learning = self.options.learn
         # Covariance of the parameters while they stay as they are.
@@ -127,13 +126,6 @@ class Estimator:
         self.screening.late += len(self._pending[:-limit])
         del self._pending[:-limit]
         return True
-
-    def reset(self, prior: Prior | None = None) -> None:
-        """Forget what was learnt, or go on from another prior."""
-        self.prior = prior or self.prior
-        self._window = self._solution = self._fixed = None
-        self._pending.clear()
-        self.screening = Screening(self.options.gate, self.prior.coordinate)
 
     def update(self, time: int) -> Estimate | None:
         """
@@ -273,7 +265,7 @@ class Estimator:
         # Vibration decays to nothing, and a state that is known exactly has no covariance.
         drift[-2:] = _AT_REST ** 2, (_AT_REST / found.values['time_unit']) ** 2
         if self._fixed is None:
-            drift[:-2] = self.options.drift ** 2 * (time - window.begin) * self.prior.spread ** 2
+            drift[:-2] = _DRIFT ** 2 * (time - window.begin) * self.prior.spread ** 2
         shift = round(time * NANOSECONDS)
         seconds = shift / NANOSECONDS
         moved = window.move_on(place, time, found, self.noise, drift)

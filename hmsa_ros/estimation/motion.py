@@ -11,9 +11,8 @@ from hmsa_ros.core.delivery import late
 from hmsa_ros.core.law import elastic_force, evaluate, FORCE, natural_frequency
 from hmsa_ros.core.model import Array
 from hmsa_ros.identification import kernels
-from hmsa_ros.identification.quantities import derivative
 from hmsa_ros.identification.recording import pieces
-from hmsa_ros.identification.response import set_rest, Setup
+from hmsa_ros.identification.response import sensed, set_rest, Setup
 
 # Relative tolerance: far below the noise of a sensor.
 _RTOL = 1e-7
@@ -58,16 +57,7 @@ class Motion:
     def measured(
             self, values: Mapping[str, float], free: Sequence[str]) -> tuple[Array, Array]:
         """Return what the sensor shows, shape (n,), and its derivatives, shape (n, p + 2)."""
-        gain = values['stretch_gain']
-        by = gain * self.by
-        for j, name in enumerate(free):
-            if name == 'stretch_bias':
-                by[:, j] = 1.0
-            elif name == 'stretch_gain':
-                by[:, j] = derivative(name, gain) * self.stretch
-            elif name == 'sensor_latency':
-                by[:, j] = -gain * self.rate
-        return gain * self.stretch + values['stretch_bias'], by
+        return sensed(values, free, self.stretch, self.rate, self.by)
 
 
 def follow(

@@ -56,13 +56,7 @@ class Prior:
         Return what is known of a block that was never identified.
 
         Others are values of coil and sensor that are not the defaults, and deviations replace some
-        of `DEVIATIONS`.
-
-        Raises
-        ------
-        BadInputError
-            If a name is unknown or cannot be tracked.
-
+        of `DEVIATIONS`. `BadInputError` says which name is unknown or cannot be tracked.
         """
         free = check_free(free, actuator.law)
         wrong = [x for x in free if x in _NOT_TRACKED]

@@ -17,11 +17,10 @@ import numpy as np
 
 from hmsa_ros.core.model import Array
 from hmsa_ros.estimation.motion import follow, Levels, Motion
+from hmsa_ros.identification.fit import loss, weights_of
 from hmsa_ros.identification.quantities import from_coordinate, QUANTITIES, to_coordinate
 from hmsa_ros.identification.response import clip, complete
 
-# Residuals from this many deviations on count less and less (Huber).
-_HUBER = 3.0
 # Steps of Gauss and Newton at most, halvings of each, and the step, in deviations, that ends them.
 _PASSES, _HALVINGS, _SMALL = 6, 4, 0.03
 # A coordinate sought by its logarithm goes no further than this in one step.
@@ -134,13 +133,10 @@ class Window:
         n = len(self.stretch)
         shown, by = motion.measured(values, self.free)
         residual: Array = self.stretch - shown[:n]
-        size = np.abs(residual) / noise
-        weights: Array = _HUBER / np.maximum(size, _HUBER)
-        inner = np.minimum(size, _HUBER)
         apart = z - self.mean
-        cost = float(np.sum(0.5 * inner ** 2 + _HUBER * (size - inner))
-                     + 0.5 * apart @ prior @ apart)
-        return values, motion, residual, by[:n], weights, cost
+        cost = loss(residual, noise, convex=True) + 0.5 * float(apart @ prior @ apart)
+        return (
+            values, motion, residual, by[:n], weights_of(residual, noise, convex=True), cost)
 
     def move_on(
             self, count: int, begin: float, solution: Solution, noise: float,

@@ -1,6 +1,6 @@
 """Whether data hold the parameters, and whether the model holds the data."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import math
 
@@ -128,48 +128,30 @@ def _listed(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f'{", ".join(names[:-1])} and {names[-1]}'
 
 
-@dataclass(frozen=True, eq=False)
-class _Columns:
-    """Directions of the residuals that stand for something the model leaves out."""
-
-    recording: Recording
-    fit: Fit
-    at_rest: bool
-
-    def all(self) -> list[tuple[str, Array]]:
-        """Return names and columns."""
-        fit, time = self.fit, self.recording.time
-        unit = fit.values['time_unit']
-        found: list[tuple[str, Array]] = []
-        names = [x for x in ('coil_time_constant', 'sensor_latency') if x not in fit.free]
-        if names:
-            found += [(_WORDS[x], y) for x, y in zip(
-                names, self._by(names, fit.values).T, strict=True)]
-        if 'viscoelastic_ratio' not in fit.free:
-            span = float(time[-1] - time[0])
-            for tau in (2.0 * unit, 0.03 * span, 0.3 * span):
-                column = self._by(
-                    ['viscoelastic_ratio'], {**fit.values, 'viscoelastic_time': tau})
-                found.append((f'creep with a time of {tau:.2g} s', column[:, 0]))
-        middle = 0.5 * (time[0] + time[-1])
-        found.append(('drift of the sensor or the temperature', time - middle))
-        levels = self.recording.levels
-        signs = np.sign(np.diff(levels, prepend=levels[0]))
-        for i in range(1, len(signs)):
-            signs[i] = signs[i] or signs[i - 1]
-        place = np.searchsorted(self.recording.level_times, time, side='right').clip(1) - 1
-        if len(set(signs[place].tolist()) - {0.0}) > 1:
-            found.append((
-                'hysteresis: rest depends on whether the level was raised or lowered',
-                signs[place]))
-        return found
-
-    def _by(self, names: Sequence[str], values: dict[str, float]) -> Array:
+def _columns(recording: Recording, fit: Fit, at_rest: bool) -> Iterator[tuple[str, Array]]:
+    """Yield directions of the residuals that stand for something the model leaves out."""
+    def by(name: str, **values: float) -> Array:
         response = respond(
-            self.recording, complete(values, self.fit.free), names, at_rest=self.at_rest)
-        if response is None:
-            return np.zeros((len(self.recording.time), len(names)))
-        return response.jacobian
+            recording, complete({**fit.values, **values}, fit.free), [name], at_rest=at_rest)
+        return np.zeros(len(time)) if response is None else response.jacobian[:, 0]
+
+    time = recording.time
+    for name, words in _WORDS.items():
+        if name not in fit.free:
+            yield words, by(name)
+    if 'viscoelastic_ratio' not in fit.free:
+        span = float(time[-1] - time[0])
+        for tau in (2.0 * fit.values['time_unit'], 0.03 * span, 0.3 * span):
+            yield f'creep with a time of {tau:.2g} s', by(
+                'viscoelastic_ratio', viscoelastic_time=tau)
+    yield 'drift of the sensor or the temperature', time - 0.5 * (time[0] + time[-1])
+    levels = recording.levels
+    signs = np.sign(np.diff(levels, prepend=levels[0]))
+    for i in range(1, len(signs)):
+        signs[i] = signs[i] or signs[i - 1]
+    place = np.searchsorted(recording.level_times, time, side='right').clip(1) - 1
+    if len(set(signs[place].tolist()) - {0.0}) > 1:
+        yield 'hysteresis: rest depends on whether the level was raised or lowered', signs[place]
 
 
 _WORDS = {
@@ -193,7 +175,7 @@ def signatures(
     total = float(residual @ residual)
     quantum = recording.quantum
     results = []
-    for name, column in _Columns(recording, fit, at_rest).all():
+    for name, column in _columns(recording, fit, at_rest):
         direction = root * column
         norm = float(np.linalg.norm(direction))
         direction = direction - base @ (base.T @ direction)
@@ -316,15 +298,7 @@ def distant(recording: Recording, fit: Fit, found: Whiteness) -> bool:
 
 
 def check_plausible(recording: Recording, fit: Fit, unknown: Sequence[str] = ()) -> None:
-    """
-    Refuse what can only come from data in other units.
-
-    Raises
-    ------
-    BadInputError
-        If a free parameter has a value that no elastomer has.
-
-    """
+    """Raise `BadInputError` for what can only come from data in other units."""
     modulus, ratio = modulus_of(fit.values.get('law'))
     for name, (least, most, power) in _USUAL.items():
         value, label = fit.values[name], name

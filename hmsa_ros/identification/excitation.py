@@ -29,7 +29,7 @@ from hmsa_ros.identification.quantities import (
     values_of,
 )
 from hmsa_ros.identification.recording import Course
-from hmsa_ros.identification.response import respond
+from hmsa_ros.identification.response import respond, Response
 
 _PATTERN = 5  # levels in the pattern that is repeated
 # Tries to find the largest pattern inside the limits, what they aim at, and what is large enough.
@@ -70,15 +70,7 @@ class Bounds:
                 f'slew limit is {self.slew_limit:g} T/s: expected a number above 0')
 
     def of_motion(self, actuator: ActuatorParameters) -> tuple[float, float]:
-        """
-        Return the range of the motion of an actuator.
-
-        Raises
-        ------
-        BadInputError
-            If it does not hold rest.
-
-        """
+        """Return the range of an actuator's motion; `BadInputError` if it lacks rest."""
         what, rest = actuator.coordinate, actuator.rest
         least = what.usual[0] if self.stretch_min is None else self.stretch_min
         most = what.usual[1] if self.stretch_max is None else self.stretch_max
@@ -185,21 +177,21 @@ class Designer:
         return float(model.elastic_force(stretch, self._group)
                      ) * self._actuator.flux_density_unit
 
-    def _course(self, times: Array, level_times: Array, levels: Array) -> Course:
-        return Course(times, level_times, levels, self._bounds.slew_limit)
+    def _respond(
+            self, times: Array, level_times: Array, levels: Array, rtol: float,
+            free: Sequence[str] = ()) -> Response | None:
+        course = Course(times, level_times, levels, self._bounds.slew_limit)
+        return respond(course, self._values, free, rtol=rtol)
 
     def judge(self, level_times: Array, levels: Array) -> Program | None:
         """Return the information in a sequence, None if its motion cannot be followed."""
-        coarse = respond(
-            self._course(self._dense, level_times, levels), self._values, (), rtol=1e-6)
+        coarse = self._respond(self._dense, level_times, levels, 1e-6)
         if coarse is None:
             return None
         reach = float(np.min(coarse.stretch)), float(np.max(coarse.stretch))
         late = self._dense > self.duration - 0.5 * self.period
         rest = float(np.ptp(coarse.stretch[late])) < _REST
-        response = respond(
-            self._course(self._times, level_times, levels), self._values, self._free,
-            rtol=1e-6)
+        response = self._respond(self._times, level_times, levels, 1e-6, self._free)
         if response is None:
             return None
         matrix = response.jacobian.T @ response.jacobian / self._noise ** 2
@@ -221,10 +213,8 @@ class Designer:
         keep = level_times < end
         level_times, levels = level_times[keep], levels[keep]
         # Ramps have to be over before the last move begins.
-        state = respond(
-            self._course(
-                np.linspace(0.0, end, 50, dtype=np.float64), level_times, levels), self._values,
-            (), rtol=1e-9)
+        state = self._respond(
+            np.linspace(0.0, end, 50, dtype=np.float64), level_times, levels, 1e-9)
         time, level = self._actuator.time_unit, float(levels[-1])
         slew = self._bounds.slew_limit / self._unit * time
         try:
@@ -259,8 +249,7 @@ class Designer:
 
     def _excess(self, level_times: Array, levels: Array) -> float:
         """Return the largest motion from rest as a share of what its limits allow."""
-        response = respond(
-            self._course(self._dense, level_times, levels), self._values, (), rtol=1e-4)
+        response = self._respond(self._dense, level_times, levels, 1e-4)
         if response is None:
             return math.inf
         rest, (low, high) = self._group.rest, self._reach
@@ -301,11 +290,7 @@ class Designer:
         """
         Return the best sequence that is found; the same seed gives the same one.
 
-        Raises
-        ------
-        BadInputError
-            If no sequence keeps within the limits.
-
+        Raises `BadInputError` if none keeps within the limits.
         """
         if self.duration > _WINDOW * self.period:
             # What is best in the long run is so already over some tens of periods.

@@ -132,11 +132,7 @@ def errors_from(file: str, others: Sequence[float]) -> Uncertainty:
     """
     Return `errors_of` of what ``hmsa identify --out`` wrote, or the others for no file.
 
-    Raises
-    ------
-    BadInputError
-        If a number is out of range, or the file cannot be read or has no covariance.
-
+    Raises `BadInputError` if the file cannot be read or has no covariance.
     """
     errors = as_errors(others)
     if not file or isinstance(errors, Ellipsoid):

@@ -24,7 +24,7 @@ from hmsa_ros.identification.quantities import (
     to_coordinate,
     values_of,
 )
-from hmsa_ros.identification.recording import as_recording, Recording
+from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.response import complete, respond
 from hmsa_ros.identification.result import Estimate, Identification, Verdict
 from hmsa_ros.identification.start import scan, segments, starts
@@ -104,8 +104,11 @@ def identify(
         if stretch is None or level_times is None or levels is None:
             raise BadInputError(
                 'stretch, level_times or levels is missing: expected all three beside time')
-        recording = as_recording(
-            time, stretch, level_times, levels, slew_limit, actuator.coordinate)
+        recording = Recording(
+            np.asarray(time, dtype=np.float64), np.asarray(stretch, dtype=np.float64),
+            np.atleast_1d(np.asarray(level_times, dtype=np.float64)),
+            np.atleast_1d(np.asarray(levels, dtype=np.float64)), slew_limit,
+            coordinate=actuator.coordinate)
     free = check_free(free, actuator.law)
     values = complete(values_of(actuator, known), ())
     if 'chain_limit' in free:

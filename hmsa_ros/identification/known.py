@@ -48,15 +48,7 @@ class Known:
 
     @classmethod
     def read(cls, settings: Mapping[str, Any]) -> 'Known':
-        """
-        Return what parameters by dotted name say.
-
-        Raises
-        ------
-        BadInputError
-            If they cannot be used.
-
-        """
+        """Return what parameters by dotted name say; `BadInputError` if they cannot be used."""
         names, values, flat = (
             settings.get(PREFIX + x) or [] for x in ('names', 'values', 'covariance'))
         if not names:

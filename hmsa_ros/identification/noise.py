@@ -44,11 +44,17 @@ class Whiteness:
 
 def autocorrelation(values: Array) -> Array:
     """Return the autocorrelation of values over their lags, biased, from 1 on; shape (n,)."""
-    n = len(values)
+    found = _products(values)
+    return found / found[0] if found[0] > 0.0 else np.append(1.0, np.zeros(len(values) - 1))
+
+
+def _products(columns: Array) -> Array:
+    """Return the sums of products of each column with itself, over their lags."""
+    n = len(columns)
     size = 1 << (2 * n - 1).bit_length()
-    spectrum = np.fft.rfft(values, size)
-    found: Array = np.fft.irfft(np.abs(spectrum) ** 2, size)[:n]
-    return found / found[0] if found[0] > 0.0 else np.append(1.0, np.zeros(n - 1))
+    spectrum = np.abs(np.fft.rfft(columns, size, axis=0)) ** 2
+    found: Array = np.fft.irfft(spectrum, size, axis=0)[:n]
+    return found
 
 
 def whiteness(residual: Array) -> Whiteness:
@@ -65,13 +71,9 @@ def whiteness(residual: Array) -> Whiteness:
     p_value = float(chdtrc(lags, q))
     if p_value > _WHITE:
         return Whiteness(rho, p_value, 0)
-    window, time = n // 4, 0.5
-    for lag in range(1, n // 4):
-        time += float(rho[lag])
-        if lag > _WINDOW * max(time, 0.5):
-            window = lag
-            break
-    return Whiteness(rho, p_value, max(window, 1))
+    times = np.cumsum(np.append(0.5, rho[1:n // 4]))
+    long = np.flatnonzero(np.arange(len(times)) > _WINDOW * np.maximum(times, 0.5))
+    return Whiteness(rho, p_value, int(long[0]) if len(long) else max(n // 4, 1))
 
 
 def errors_of_stamps(jacobian: Array, residual: Array, rate: Array) -> tuple[Array, Array]:
@@ -166,12 +168,7 @@ def hinted(
 
 def _sum_of_lags(columns: Array, weights: Array) -> Array:
     """Return the sum over all lags of the weighted products of each column with itself."""
-    n = len(columns)
-    size = 1 << (2 * n - 1).bit_length()
-    spectrum = np.abs(np.fft.rfft(columns, size, axis=0)) ** 2
-    products = np.fft.irfft(spectrum, size, axis=0)[:len(weights)]
-    weights = np.append(weights[0], 2.0 * weights[1:])
-    total: Array = weights @ products
+    total: Array = np.append(weights[0], 2.0 * weights[1:]) @ _products(columns)[:len(weights)]
     return total
 
 

@@ -69,13 +69,8 @@ def check_free(names: Iterable[str], law: Elastic | None = None) -> tuple[str, .
     Return the names of free parameters, each once.
 
     ``actuator.`` or ``law.`` before a name is dropped, and the modulus may have the name that it
-    has in the law. With a law in place of Gent the chain limit is not sought.
-
-    Raises
-    ------
-    BadInputError
-        If a name is unknown, none is given, or two exclude each other.
-
+    has in the law. With a law in place of Gent the chain limit is not sought. Raises
+    `BadInputError` if a name is unknown, none is given, or two exclude each other.
     """
     alias = modulus_of(law)[0]
     free = tuple(dict.fromkeys(
@@ -105,13 +100,8 @@ def values_of(
     """
     Return values of all quantities, geometry included, and the law under the name ``law``.
 
-    Others are those of coil and sensor that are not the defaults.
-
-    Raises
-    ------
-    BadInputError
-        If a name is unknown or a value out of range.
-
+    Others are those of coil and sensor that are not the defaults. Raises `BadInputError` if a name
+    of them is unknown or a value out of range.
     """
     values: dict[str, Any] = {name: x.default for name, x in QUANTITIES.items()}
     values |= actuator.numbers | {

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from hmsa_ros.core.laws.coordinate import Coordinate, STRETCH
 from hmsa_ros.core.model import Array
@@ -260,13 +260,3 @@ def pieces(
     # Of pieces that begin at once the last one counts.
     keep = np.append(np.diff(table[:, 0]) > 0.0, True)
     return table[keep, 0].copy(), table[keep, 1].copy(), table[keep, 2].copy()
-
-
-def as_recording(
-        time: ArrayLike, stretch: ArrayLike, level_times: ArrayLike, levels: ArrayLike,
-        slew_limit: float = math.inf, coordinate: Coordinate = STRETCH) -> Recording:
-    """Return a recording of arrays or lists."""
-    return Recording(
-        np.asarray(time, dtype=np.float64), np.asarray(stretch, dtype=np.float64),
-        np.atleast_1d(np.asarray(level_times, dtype=np.float64)),
-        np.atleast_1d(np.asarray(levels, dtype=np.float64)), slew_limit, coordinate=coordinate)

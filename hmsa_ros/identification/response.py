@@ -186,15 +186,23 @@ def respond(
             theta, material, branches, wanted, start, begins, levels, slopes, float(levels[0]),
             0.0, times, rtol, stretch, rate, raw, np.empty((0, len(wanted)))):
         return None
+    shown, jacobian = sensed(values, free, stretch, rate, raw[:, :inner_count] @ setup.mixing)
+    return Response(shown, rate, jacobian, values['stretch_gain'] * raw[:, inner_count:])
+
+
+def sensed(
+        values: Mapping[str, float], free: Sequence[str], stretch: Array, rate: Array, by: Array
+) -> tuple[Array, Array]:
+    """Return what the sensor shows of a motion, and its derivatives, by those of the stretch."""
     gain = values['stretch_gain']
-    jacobian = gain * raw[:, :inner_count] @ setup.mixing
+    shown_by = gain * by
+    by_sensor: dict[str, float | Array] = {
+        'stretch_bias': 1.0, 'stretch_gain': derivative('stretch_gain', gain) * stretch,
+        'sensor_latency': -gain * rate}
     for j, name in enumerate(free):
-        if name in _SENSOR:
-            jacobian[:, j] = derivative(name, values[name]) * (
-                1.0 if name == 'stretch_bias' else stretch if name == 'stretch_gain'
-                else -gain * rate)
-    return Response(
-        gain * stretch + values['stretch_bias'], rate, jacobian, gain * raw[:, inner_count:])
+        if name in by_sensor:
+            shown_by[:, j] = by_sensor[name]
+    return gain * stretch + values['stretch_bias'], shown_by
 
 
 def set_rest(

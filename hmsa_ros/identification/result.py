@@ -1,8 +1,7 @@
 """What an identification has found, as one frozen record."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-import math
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from hmsa_ros.core.model import Array
@@ -167,28 +166,17 @@ class Identification:
             if abs(matrix[i, j]) >= CONFOUNDED]
 
     def record(self) -> dict[str, Any]:
-        """Return it as ``hmsa identify --json`` prints it; what is no number is None."""
+        """Return it as ``hmsa identify --json`` prints it."""
         parameters = dict([self.shown('shear_modulus')]) | self.parameters
         return {
             'verdict': self.verdict, 'reason': self.reason, 'warnings': list(self.warnings),
             'parameters': {
-                name: {
-                    'value': _number(x.value), 'std': _number(x.std), 'low': _number(x.low),
-                    'high': _number(x.high), 'unit': x.unit, 'free': x.free}
-                for name, x in parameters.items()},
-            'names': list(self.names),
-            'covariance': [[_number(x) for x in row] for row in self.covariance.tolist()],
-            'noise_std': _number(self.noise_std), 'samples': self.samples,
-            'residual_rms': _number(self.residual_rms), 'outliers': self.outliers,
+                name: asdict(x) for name, x in parameters.items()},
+            'names': list(self.names), 'covariance': self.covariance.tolist(),
+            'noise_std': self.noise_std, 'samples': self.samples,
+            'residual_rms': self.residual_rms, 'outliers': self.outliers,
             'whiteness': {
-                'lag_one': _number(float(self.whiteness.autocorrelation[1])),
-                'p_value': _number(self.whiteness.p_value)},
-            'signatures': [
-                {'name': x.name, 'share': _number(x.share),
-                 'deviations': _number(x.deviations), 'found': x.found}
-                for x in self.signatures],
+                'lag_one': float(self.whiteness.autocorrelation[1]),
+                'p_value': self.whiteness.p_value},
+            'signatures': [asdict(x) for x in self.signatures],
             'starts': self.starts, 'agreed': self.agreed}
-
-
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None

@@ -1,12 +1,10 @@
 """Recordings out of bags."""
 
-from collections.abc import Sequence
 import math
 from pathlib import Path
 
 import numpy as np
 
-from hmsa_ros.core.model import Array
 from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
@@ -22,13 +20,8 @@ def read_bag(
     Read the recording of one actuator from a bag: a folder, or an ``.mcap`` file.
 
     Returned are the recording, with times from the first sample on, the actuator as given or as
-    the planner took it to be, and what the planner knew of the coil.
-
-    Raises
-    ------
-    BadInputError
-        If there is no bag, or several actuators and none is named.
-
+    the planner took it to be, and what the planner knew of the coil. Raises `BadInputError` if
+    there is no bag, or several actuators and none is named.
     """
     runs = read_runs(path, joints=[joint] if joint else [])
     if len(runs) > 1:
@@ -52,20 +45,13 @@ def read_bag(
         stamps = np.append(0.0, stamps)
         fields = np.append(field if math.isfinite(field) else 0.0, fields)
     slew = run.number('planner.slew_limit') or run.number('plant.slew_limit')
-    keep = _last_at_each(stamps)
+    # Of levels at one time the last one holds.
+    keep = np.append(np.diff(stamps) > 0.0, True)
+    notes = () if actuator is not None else tuple(
+        x.rstrip('.') for x in run.notes if 'plain steps' not in x)
     return (
         Recording(
             (run.time - zero) / NANOSECONDS, run.stretch, stamps[keep], fields[keep],
-            slew or math.inf, 0.0, run.label, () if actuator is not None else _notes(run.notes),
-            block.coordinate),
+            slew or math.inf, 0.0, run.label, notes, block.coordinate),
         block,
         {'coil_time_constant': run.number('planner.coil_time_constant')})
-
-
-def _last_at_each(stamps: Array) -> list[int]:
-    """Return the places of the last of those at one time."""
-    return [i for i in range(len(stamps)) if i + 1 == len(stamps) or stamps[i + 1] > stamps[i]]
-
-
-def _notes(notes: Sequence[str]) -> tuple[str, ...]:
-    return tuple(x.rstrip('.') for x in notes if 'plain steps' not in x)

@@ -33,12 +33,7 @@ def read_levels(path: Path) -> tuple[Array, Array, tuple[str, ...]]:
     Read the levels of the field from CSV: times in s, flux densities in T, and notes.
 
     The columns are ``time`` (s) and ``flux_density`` (T); each level holds from its time on.
-
-    Raises
-    ------
-    BadInputError
-        If it cannot be used.
-
+    `BadInputError` says why a file cannot be used.
     """
     table = read_table(path, ('time', 'flux_density'))
     if not len(table.lines):
@@ -68,12 +63,7 @@ def read_csv(
 
     It has the columns ``time`` (s) and ``stretch``, and ``flux_density`` (T) where there is no
     other file with the levels; that has ``time`` and ``flux_density``, in force from that time on.
-
-    Raises
-    ------
-    BadInputError
-        If it cannot be used: a sentence that says what, got and expected.
-
+    `BadInputError` says what cannot be used, got and expected.
     """
     own = () if commands is not None else ('flux_density',)
     table = read_table(path, ('time', 'stretch', *own), kind='a CSV or the folder of a bag')

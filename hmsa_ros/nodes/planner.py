@@ -145,7 +145,7 @@ class PlannerNode(ManagedNode):
         try:
             request = read_trajectory(data)
         except BadInputError as error:
-            self._runtime.refuse(error, Trajectory((), (), 0))
+            self._runtime.planning.refuse(error, Trajectory((), (), 0))
         else:
             self._runtime.request(request)
         self._serve()

@@ -8,15 +8,7 @@ from hmsa_ros.runtime.records import Request, Settings, Target, Trajectory
 
 
 def check_ready(now: int, *, active: bool) -> None:
-    """
-    Check whether requests can be taken at all, at a time in ns.
-
-    Raises
-    ------
-    RefusedError
-        If they cannot.
-
-    """
+    """Raise `RefusedError` if no request can be taken at all, at a time in ns."""
     if not active:
         raise RefusedError(
             Code.INACTIVE, 'the planner is inactive: expected it active (ros2 lifecycle set NODE '
@@ -32,11 +24,8 @@ def check_joints(request: Request, joints: Sequence[str], settings: Settings) ->
     """
     Check whom a request is for.
 
-    Raises
-    ------
-    RefusedError
-        If a joint is another one, there twice or missing, or there are too many setpoints.
-
+    Raises `RefusedError` if a joint is another one, there twice or missing, or there are too many
+    setpoints.
     """
     if isinstance(request, Target) and request.joint not in joints:
         raise RefusedError(

@@ -94,7 +94,7 @@ class Corrections:
     def _worthwhile(self, estimate: Estimate, planner: Planner, arrival: int) -> bool:
         """Return whether a plan is expected to leave more than it must."""
         course, gain = _course(planner.plan, estimate.time, _LITTLE if arrival else _GAIN)
-        return expect(estimate, course, planner.options.slew_limit).size > gain
+        return expect(estimate, course, planner.options.slew_limit) > gain
 
     def _correct(self, name: str, now: int) -> Steps[Mapping[str, Draft]]:
         """Plan the rest anew, if that is expected to leave less."""
@@ -112,8 +112,8 @@ class Corrections:
         slew = planner.options.slew_limit
         course, gain = _course(planner.plan, draft.begin, _LITTLE if arrival else _GAIN)
         segment = draft.segments[0]
-        before = expect(estimate, course, slew, segment.arrival or 0).size
-        after = expect(estimate, _drafted(draft), slew).size
+        before = expect(estimate, course, slew, segment.arrival or 0)
+        after = expect(estimate, _drafted(draft), slew)
         return {name: draft} if worthwhile(before, after, estimate.noise, gain) else {}
 
     def take(self, drafts: Mapping[str, Draft], now: int, request: str) -> Verdict | None:

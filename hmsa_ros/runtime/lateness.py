@@ -1,7 +1,6 @@
 """How late commands take effect, and what helps: delays of transport and of the driver differ."""
 
 from collections import deque
-from enum import Enum
 
 from hmsa_ros.core.units import NANOSECONDS
 
@@ -12,15 +11,6 @@ _ENOUGH = 3
 _REMEMBERED = 64
 # A driver's delay is called constant where sending earlier or later explains it less than this.
 _CONSTANT = 0.5
-
-
-class Cause(Enum):
-    """Why commands take effect late."""
-
-    UNKNOWN = 'unknown'
-    PLANNER = 'planner'
-    TRANSPORT = 'transport'
-    DRIVER = 'driver'
 
 
 class Lateness:
@@ -56,19 +46,19 @@ class Lateness:
         if sent is not None:
             self._recent.append((late, stamp - sent))
 
-    @property
-    def cause(self) -> Cause:
-        """What delays the commands, judged by the last ones."""
+    def _by_driver(self) -> bool | None:
+        """Return whether the driver delays the last commands; None if that cannot be told."""
         if self._recent and self._recent[-1][1] < 0:
-            return Cause.PLANNER
+            # They were sent too late.
+            return False
         if len(self._recent) < _ENOUGH:
-            return Cause.UNKNOWN
+            return None
         late = [x for x, _ in self._recent]
         under_way = [x + ahead for x, ahead in self._recent]
         spread, explained = max(late) - min(late), max(under_way) - min(under_way)
         if spread < _CONSTANT * explained:
-            return Cause.DRIVER
-        return Cause.TRANSPORT if explained < _CONSTANT * spread else Cause.UNKNOWN
+            return True
+        return False if explained < _CONSTANT * spread else None
 
     @property
     def words(self) -> str:
@@ -87,8 +77,8 @@ class Lateness:
                 f'more than {self.earliest / NANOSECONDS:.3g} s')
         if not self.largest:
             return 'see who else publishes commands, or what drops them'
-        cause = self.cause
-        if cause is Cause.DRIVER:
+        by_driver = self._by_driver()
+        if by_driver:
             return (
                 f'the driver applies commands up to {self.largest / 1e6:.3f} ms after their '
                 'stamps however early they are sent, so a larger lead_time does not help: let '
@@ -96,4 +86,4 @@ class Lateness:
                 f'{self.largest / NANOSECONDS:.3g} s, since a constant delay leaves no vibration')
         needed = (lead_time + self.largest) / NANOSECONDS
         return f'raise lead_time to more than {needed:.3g} s' + (
-            ', unless the driver itself is that slow' if cause is Cause.UNKNOWN else '')
+            ', unless the driver itself is that slow' if by_driver is None else '')

@@ -78,11 +78,7 @@ def save(file: str, estimates: Mapping[str, Estimate | None], *, by_joint: bool)
     """
     Write what was learnt by joint, and say so.
 
-    Raises
-    ------
-    BadInputError
-        If nothing was learnt yet, or it cannot be written.
-
+    Raises `BadInputError` if nothing was learnt yet, or it cannot be written.
     """
     if not file:
         raise BadInputError('parameter feedback_file is empty: expected the file to write to')

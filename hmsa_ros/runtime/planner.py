@@ -13,7 +13,6 @@ from hmsa_ros.core.group import PlannerGroup
 from hmsa_ros.core.status import RefusedError
 from hmsa_ros.core.timeline import Model
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.errors import HmsaError
 from hmsa_ros.runtime.bulletin import Bulletin
 from hmsa_ros.runtime.checks import check_joints, check_ready
 from hmsa_ros.runtime.corrections import Corrections
@@ -31,7 +30,7 @@ from hmsa_ros.runtime.records import (
 )
 from hmsa_ros.runtime.sending import Sending
 from hmsa_ros.runtime.slices import Clock, work_on
-from hmsa_ros.runtime.takeover import Sample, Takeover
+from hmsa_ros.runtime.takeover import Takeover
 from hmsa_ros.runtime.watching import Watch
 
 # Clock jumps nearer to each other than this make one verdict.
@@ -65,33 +64,13 @@ class PlannerRuntime:
         self._takeover = Takeover(group, clock, steady, observable, unheard)
         self._watch = Watch(group, steady)
         self._bulletin = Bulletin(group, self.following, self._watch, clock, steady, unheard)
-        self._sending = Sending(group, self.following, self._bulletin.outputs)
+        self.sending = Sending(group, self.following, self._bulletin.outputs)
         self.feedback = Feedback(group, settings, self._bulletin.outputs, clock)
-        self._planning = Planning(
+        self.planning = Planning(
             group, self.following, Corrections(group, self.feedback, clock), self._bulletin,
-            clock, steady, lambda: self._sending.send(clock()))
+            clock, steady, lambda: self.sending.send(clock()))
         self._last_jump: int | None = None
         self._set_back = 0
-
-    @property
-    def verdict(self) -> Verdict:
-        """The verdict on the last request."""
-        return self._bulletin.verdict
-
-    @property
-    def sent(self) -> int:
-        """Counter of commands."""
-        return self._sending.sent
-
-    @property
-    def heartbeats(self) -> int:
-        """Counter of signs of life."""
-        return self._sending.heartbeats
-
-    @property
-    def refused(self) -> int:
-        """Counter of requests that were refused."""
-        return self._planning.refused
 
     # -- in ------------------------------------------------------------------------------------
 
@@ -107,19 +86,19 @@ class PlannerRuntime:
             check_ready(self._clock(), active=self.active)
             check_joints(request, tuple(self.group.planners), self.settings)
         except RefusedError as error:
-            return self.refuse(error, request)
+            return self.planning.refuse(error, request)
         self._begin_anew()
-        work = self._planning.add(request, engaged=self._takeover.engaged)
+        work = self.planning.add(request, engaged=self._takeover.engaged)
         self._engage(begin=True)
         self._work_on()
-        while (self._takeover.engaged and work in self._planning
+        while (self._takeover.engaged and work in self.planning
                and not isinstance(request, Trajectory)):
             # Short work, which whoever asks wants to be done.
             self._work_on()
         if self._set_back:
             # While it was planned, for times that are not to come.
             return self.request(request)
-        return _WAITING if work in self._planning else self.verdict
+        return _WAITING if work in self.planning else self._bulletin.verdict
 
     def applied(self, joint: str, stamp: int, flux_density: float) -> None:
         """Take in that a joint's level in T has really been in force from a stamp in ns on."""
@@ -134,7 +113,7 @@ class PlannerRuntime:
             flux_density: float) -> None:
         """Take in a sample: stamp in ns, stretch, rate in 1/s and flux density in T."""
         if self._takeover.waiting or not self._takeover.engaged:
-            self._takeover.samples.add(joint, Sample(stamp, stretch, rate, flux_density))
+            self._takeover.observe(joint, stamp, stretch, rate, flux_density)
         self._watch.add(joint, stamp, stretch)
         self.feedback.add(joint, stamp, stretch)
 
@@ -155,7 +134,7 @@ class PlannerRuntime:
             return
         self.group.restart()
         self.following.restart()
-        self._planning.clear()
+        self.planning.clear()
         self._watch.restart()
         self.feedback.restart()
         self._takeover.drop()
@@ -176,14 +155,14 @@ class PlannerRuntime:
         self.active = False
         # What is seen before the joints have come to rest is not where they are later.
         self._takeover.drop()
-        self._planning.clear()
+        self.planning.clear()
         now = self._clock()
         if self._takeover.engaged and now:
             work = work_on(Stop(), self.group, self._clock)
-            while not self._planning.advance(work):
+            while not self.planning.advance(work):
                 pass
-            self._planning.clear()
-            self._sending.send(now, everything=True)
+            self.planning.clear()
+            self.sending.send(now, everything=True)
             self._watch.restart()
             self._bulletin.give(Verdict(Severity.OK, 'stopped', 'deactivated: coming to rest'))
         self._takeover.engaged = False
@@ -193,7 +172,7 @@ class PlannerRuntime:
             simultaneous: bool) -> None:
         """Take other settings now, and other models by joint from the next request on."""
         if settings.heartbeat_period != self.settings.heartbeat_period:
-            self._sending.next_beat = self._clock() + settings.heartbeat_period
+            self.sending.next_beat = self._clock() + settings.heartbeat_period
         self.settings = settings
         for name, model in self.feedback.change(settings, models).items():
             self.group.planners[name].take_model(model)
@@ -215,7 +194,7 @@ class PlannerRuntime:
     @property
     def wake(self) -> int | None:
         """Time in ns at which there is something to do next; None for never, 0 for now."""
-        if (self._set_back or self._planning or self._takeover.waiting
+        if (self._set_back or self.planning or self._takeover.waiting
                 or self._bulletin.outputs):
             return 0
         if not self._takeover.engaged:
@@ -225,7 +204,7 @@ class PlannerRuntime:
             self.group.next_command(), self._bulletin.next_change, self._bulletin.preview_again,
             self._watch.wake(now), self.feedback.wake]
         if self.settings.heartbeat_period:
-            times.append(self._sending.next_beat)
+            times.append(self.sending.next_beat)
         if self.following.astray:
             times.append(0)
         return min((x for x in times if x is not None), default=None)
@@ -263,8 +242,8 @@ class PlannerRuntime:
         if self.following.astray:
             # Before more of a plan is sent that does not hold.
             self._work_on()
-        self._sending.send(now)
-        self._sending.beat(now, self.settings)
+        self.sending.send(now)
+        self.sending.beat(now, self.settings)
         return True
 
     def _taken(self) -> list[Output]:
@@ -280,15 +259,11 @@ class PlannerRuntime:
         for note in self._takeover.go_on(self.settings, self.following.newest):
             self._bulletin.note(note)
         if self._takeover.engaged and not engaged:
-            self._sending.next_beat = self._clock() + self.settings.heartbeat_period
-
-    def refuse(self, error: HmsaError, request: Request) -> Verdict:
-        """Answer a request that cannot be read or carried out."""
-        return self._planning.refuse(error, request)
+            self.sending.next_beat = self._clock() + self.settings.heartbeat_period
 
     def _work_on(self) -> None:
         if self._takeover.engaged:
-            self._planning.work_on()
+            self.planning.work_on()
 
     def _judge(self, now: int) -> None:
         """Judge arrivals by what was measured."""
@@ -306,6 +281,6 @@ class PlannerRuntime:
 
     def report(self) -> tuple[Severity, str, dict[str, object]]:
         """Return how commands fare: severity, a sentence and counters."""
-        severity, message, counters = self._sending.report()
+        severity, message, counters = self.sending.report()
         return severity, message, {
-            **counters, 'refused': self._planning.refused, 'clock_jumps': self.clock_jumps}
+            **counters, 'refused': self.planning.refused, 'clock_jumps': self.clock_jumps}

@@ -1,7 +1,6 @@
 """The plant and the state in force, waited for before the first command."""
 
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 import math
 
 from hmsa_ros.core.group import PlannerGroup
@@ -10,83 +9,24 @@ from hmsa_ros.runtime.records import Settings
 from hmsa_ros.runtime.slices import Clock
 
 
-@dataclass(frozen=True)
-class Sample:
-    """Stretch, rate in 1/s and flux density in force in T at a stamp in ns."""
-
-    stamp: int
-    stretch: float
-    rate: float
-    flux_density: float
-
-    @property
-    def complete(self) -> bool:
-        """Whether everything was measured."""
-        return math.isfinite(self.stretch + self.rate + self.flux_density)
-
-
-class Observations:
-    """
-    The newest sample of each joint.
-
-    Parameters
-    ----------
-    joints : collection of str
-        Those that count.
-
-    """
-
-    def __init__(self, joints: Collection[str]) -> None:
-        """Begin with none."""
-        self._joints = frozenset(joints)
-        self._newest: dict[str, Sample] = {}
-
-    def add(self, joint: str, sample: Sample) -> None:
-        """Take in a sample; one of another joint, or with a gap, does not count."""
-        if joint in self._joints and sample.complete:
-            self._newest[joint] = sample
-
-    def clear(self) -> None:
-        """Forget them, as after a jump of the clock."""
-        self._newest.clear()
-
-    def fresh(self, now: int, max_age: int) -> dict[str, Sample]:
-        """Return by joint the samples that are not older than an age; times in ns."""
-        return {
-            joint: x for joint, x in self._newest.items() if abs(now - x.stamp) <= max_age}
-
-
 class Takeover:
     """
     Waits for samples of where the joints are before the first request, and goes on from there.
 
-    Parameters
-    ----------
-    group : PlannerGroup
-        The joints.
-    clock, steady : callable
-        Return the present time in ns: that of the stamps, and one that patience is measured by.
-    observable : callable
-        Returns whether somebody may give samples.
-    unheard : callable
-        Returns why nobody carries out commands; empty where somebody does.
-
-    Attributes
-    ----------
-    engaged : bool
-        Whether it is known where the joints are, or they are taken to rest.
-
+    `clock` returns the time of the stamps in ns, `steady` one that patience is measured by,
+    `observable` whether somebody may give samples, and `unheard` why nobody carries out commands.
     """
 
     def __init__(
             self, group: PlannerGroup, clock: Clock, steady: Clock,
             observable: Callable[[], bool], unheard: Callable[[], str]) -> None:
-        """Begin with nothing known."""
         self._group, self._clock, self._steady = group, clock, steady
         self._observable, self._unheard = observable, unheard
         self._until: int | None = None
+        # Whether it is known where the joints are, or they are taken to rest.
         self.engaged = False
-        self.samples = Observations(group.planners)
+        # Stamp in ns, stretch, rate in 1/s and flux density in T of the newest of each joint.
+        self._samples: dict[str, tuple[int, float, float, float]] = {}
 
     @property
     def waiting(self) -> bool:
@@ -102,32 +42,32 @@ class Takeover:
         else:
             self.engaged = True
 
+    def observe(
+            self, joint: str, stamp: int, stretch: float, rate: float,
+            flux_density: float) -> None:
+        """Take in a sample; one of another joint, or with a gap, does not count."""
+        if joint in self._group.planners and math.isfinite(stretch + rate + flux_density):
+            self._samples[joint] = stamp, stretch, rate, flux_density
+
     def drop(self) -> None:
         """Wait for nothing, and forget the samples."""
         self._until = None
-        self.samples.clear()
+        self._samples.clear()
 
     def go_on(
             self, settings: Settings, newest: Mapping[str, tuple[int, float]]) -> list[str]:
         """
         Go on from the samples there are, once there is nothing more to wait for.
 
-        Parameters
-        ----------
-        settings : Settings
-            How old they may be.
-        newest : mapping of str to (int, float)
-            Stamp in ns and level in T of the newest change of each joint.
-
-        Returns
-        -------
-        list of str
-            Why samples do not count, in a sentence each.
-
+        The newest change of each joint has its stamp in ns and its level in T. Returned is in a
+        sentence each why samples do not count.
         """
         if self._until is None:
             return []
-        samples = self.samples.fresh(self._clock(), settings.takeover_max_age)
+        now = self._clock()
+        samples = {
+            name: x for name, x in self._samples.items()
+            if abs(now - x[0]) <= settings.takeover_max_age}
         if self._steady() <= self._until and (
                 len(samples) < len(self._group.planners) or self._unheard()):
             return []
@@ -141,12 +81,10 @@ class Takeover:
                         f'no sample of joint {name} on joint_states: it is assumed at rest where '
                         'it began (initial_stretch)')
                 continue
-            x = samples[name]
-            level = newest.get(name)
+            sample, level = samples[name], newest.get(name)
             try:
                 planner.take_over(
-                    x.stamp, x.stretch, x.rate, x.flux_density,
-                    level[1] if level is not None and level[0] <= x.stamp else None)
+                    *sample, level[1] if level is not None and level[0] <= sample[0] else None)
             except BadInputError as error:
                 notes.append(f'sample of joint {name} ignored: {error}')
         return notes
