@@ -127,11 +127,6 @@ class Corrector:
     def __init__(self, options: Options) -> None:
         self.options = options
 
-    def model(self, estimate: Estimate) -> Model:
-        """Return the model of an estimate."""
-        return Model(estimate.actuator, replace(
-            self.options, coil_time_constant=estimate.values['coil_time_constant']))
-
     def first(
             self, estimate: Estimate, target: float, in_force: float, *,
             shaper: str = 'two_step', order: int = 2,
@@ -143,7 +138,7 @@ class Corrector:
         early effect shows what the actuator is, but it gets more time, by `caution`, for
         corrections until rest.
         """
-        model = self.model(estimate)
+        model = estimate.model(self.options)
         move = get_shaper(shaper)(replace(
             self._request(model, estimate, target, in_force), order=order))
         found = _placed(move, model, estimate.time, target)
@@ -168,7 +163,7 @@ class Corrector:
         best: Course | None = None
         least = math.inf
         try:
-            model = self.model(estimate)
+            model = estimate.model(self.options)
         except BadInputError:
             return None
         for found in self._candidates(model, estimate, course):

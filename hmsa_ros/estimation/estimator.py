@@ -12,6 +12,8 @@ import numpy as np
 
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
+from hmsa_ros.core.timeline import Model
+from hmsa_ros.core.timeline import Options as PlannerOptions
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation.motion import behind, follow, Levels, rest
@@ -48,10 +50,11 @@ class Options:
     window: int = 120  # largest number of samples in the horizon
     noise: float = 0.0  # standard deviation of a sample of stretch; 0 to estimate it
     learn: bool = True  # estimate parameters from the first sample on; else the state alone
+    gate: float = 6.0  # deviations of the innovation from which a sample is rejected
     slew_limit: float = math.inf  # of the amplifier in T/s; infinite for steps
 
     def __post_init__(self) -> None:
-        for name, least in (('window', 10), ('noise', 0.0)):
+        for name, least in (('window', 10), ('noise', 0.0), ('gate', 1.0)):
             if not least <= getattr(self, name) < math.inf:
                 raise BadInputError(
                     f'{name} is {getattr(self, name)}: expected at least {least:g}')
@@ -78,6 +81,11 @@ class Estimate:
         """The block."""
         return actuator_of(self.values)
 
+    def model(self, options: PlannerOptions) -> Model:
+        """Return the model to plan with; the estimated lag takes the place of the options'."""
+        return Model(self.actuator, replace(
+            options, coil_time_constant=self.values['coil_time_constant']))
+
 
 class Estimator:
     """Tracks one actuator."""
@@ -86,7 +94,7 @@ class Estimator:
         self.prior = prior
         self.options = options or Options()
         self.noise = self.options.noise or _FIRST_NOISE
-        self.screening = Screening(prior.coordinate)
+        self.screening = Screening(self.options.gate, prior.coordinate)
         # Else parameters stay as they are from the next update on.
         self.learning = self.options.learn
         # Covariance of the parameters while they stay as they are.

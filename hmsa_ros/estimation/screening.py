@@ -7,8 +7,6 @@ from hmsa_ros.core.model import Array
 from hmsa_ros.estimation.motion import follow, Levels
 from hmsa_ros.estimation.window import Solution, Window
 
-# Deviations of the innovation from which on a sample is rejected.
-_GATE = 6.0
 # So many rejected samples in a row are no outliers: sensor or actuator is not where it was.
 _LOST = 6
 # So many that fit make up for them.
@@ -20,15 +18,15 @@ _EQUAL, _MOTION = 4, 8.0
 
 class Screening:
     """
-    Rejects samples, and says what is wrong with the sensor.
+    Rejects samples from so many deviations of the innovation on, and says what is wrong.
 
     Counts are those of values that are no number, came twice, came after their time was over, did
     not fit, or were repeated while the actuator moved.
 
     """
 
-    def __init__(self, coordinate: Coordinate) -> None:
-        self._conceivable = coordinate.conceivable
+    def __init__(self, gate: float, coordinate: Coordinate) -> None:
+        self._gate, self._conceivable = gate, coordinate.conceivable
         self.unreadable = self.repeated = self.late = self.rejected = self.frozen = 0
         self.trouble = ''  # why nothing should be built on samples
         self._in_a_row = self._fitted = 0
@@ -70,7 +68,7 @@ class Screening:
             self._reject('the sensor repeats the same value while the actuator should move')
             return False
         off = value - expected
-        if abs(off) > _GATE * spread:
+        if abs(off) > self._gate * spread:
             self.rejected += 1
             self._reject(
                 f'samples lie {off:+.3g} off what is expected: a jump of the sensor, or a '

@@ -1,6 +1,6 @@
 """What an estimate means, in a sentence."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 import math
 from typing import Any
 
@@ -28,11 +28,6 @@ _ABSOLUTE = {
     'stretch_bias': ('bias of the sensor', '', 1.0)}
 
 
-def differences(estimate: Estimate, nominal: Mapping[str, Any]) -> list[str]:
-    """Return which parameters differ from what was known of them, such as ``G about +20 %``."""
-    return list(_differences(estimate, nominal))
-
-
 def confounded(estimate: Estimate) -> bool:
     """Return whether a tracked bias of the sensor and a constant force look alike as yet."""
     if not set(_PAIR) <= set(estimate.free):
@@ -43,7 +38,9 @@ def confounded(estimate: Estimate) -> bool:
     return abs(together) > _HIDDEN and estimate.deviations[_PAIR[0]] > _UNKNOWN
 
 
-def _differences(estimate: Estimate, nominal: Mapping[str, Any]) -> Iterator[str]:
+def differences(estimate: Estimate, nominal: Mapping[str, Any]) -> list[str]:
+    """Return which parameters differ from what was known of them, such as ``G about +20 %``."""
+    found = []
     hidden = _PAIR if confounded(estimate) else ()
     for name in estimate.free:
         if name in hidden:
@@ -55,10 +52,11 @@ def _differences(estimate: Estimate, nominal: Mapping[str, Any]) -> Iterator[str
         if name in _ABSOLUTE:
             label, unit, factor = _ABSOLUTE[name]
             if name != 'stretch_bias' or abs(change) > _MATTERS:
-                yield f'{label} about {factor * value:.2g} {unit}'.rstrip()
+                found.append(f'{label} about {factor * value:.2g} {unit}'.rstrip())
         elif before and abs(change / before) > _MATTERS:
             label = modulus_of(nominal['law'])[0] if name == 'shear_modulus' else name
-            yield f'{_NAMES[label]} about {100.0 * change / before:+.0f} %'
+            found.append(f'{_NAMES[label]} about {100.0 * change / before:+.0f} %')
+    return found
 
 
 def sentence(

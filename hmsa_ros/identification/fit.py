@@ -219,7 +219,9 @@ class _Search:
                 # never rising, so that it comes to an end.
                 scale = min(scale, robust_scale(residual))
             damping = max(0.1 * damping, 1e-12)
-        return self._fit(values, response, residual, scale, converged)
+        return Fit(
+            values, self._free, response, residual * self._spread, weights_of(residual, scale),
+            scale, converged, self._passes, self._spread, self._prior(scale))
 
     def _normal(
             self, response: Response, residual: Array, weights: Array, shifts: Array,
@@ -238,13 +240,6 @@ class _Search:
             gradient[first:] -= prior * (shifts - self._middle)
         size = np.sqrt(np.maximum(np.diag(matrix), 1e-12))
         return matrix / np.outer(size, size), gradient, size
-
-    def _fit(
-            self, values: dict[str, float], response: Response, residual: Array, scale: float,
-            converged: bool) -> Fit:
-        return Fit(
-            values, self._free, response, residual * self._spread, weights_of(residual, scale),
-            scale, converged, self._passes, self._spread, self._prior(scale))
 
 
 def _stride(values: Mapping[str, float], free: Sequence[str], step: Array) -> float:

@@ -6,8 +6,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from hmsa_ros.core.delivery import ramps
 from hmsa_ros.core.laws.coordinate import Coordinate, STRETCH
 from hmsa_ros.core.model import Array
+from hmsa_ros.core.moves import Level
 from hmsa_ros.errors import BadInputError
 
 #: Fewer samples than this hold no motion and five parameters.
@@ -239,24 +241,12 @@ def pieces(
     """
     first = max(int(np.searchsorted(times, begin, side='right')) - 1, 0)
     level = float(levels[first])
-    ahead = range(first + 1, len(times))
     if math.isinf(slew):
-        places = list(ahead)
-        return (np.append(begin, times[places]), np.append(level, levels[places]),
-                np.zeros(1 + len(places)))
-    rows = [(begin, level, 0.0)]
-    for i in ahead:
-        start, target = float(times[i]), float(levels[i])
-        until = float(times[i + 1]) if i + 1 < len(times) else math.inf
-        sign = math.copysign(slew, target - level)
-        duration = abs(target - level) / slew
-        if start + duration <= until:
-            rows += [(start, level, sign if duration else 0.0), (start + duration, target, 0.0)]
-            level = target
-        else:
-            rows.append((start, level, sign))
-            level += sign * (until - start)
-    table = np.array(rows)
+        return (np.append(begin, times[first + 1:]), np.append(level, levels[first + 1:]),
+                np.zeros(len(times) - first))
+    ahead = [Level(*x) for x in zip(
+        times[first + 1:].tolist(), levels[first + 1:].tolist(), strict=True)]
+    table = np.array([(begin, level, 0.0), *ramps(ahead, level, math.inf, slew)[0]])
     # Of pieces that begin at once the last one counts.
     keep = np.append(np.diff(table[:, 0]) > 0.0, True)
     return table[keep, 0].copy(), table[keep, 1].copy(), table[keep, 2].copy()

@@ -9,9 +9,9 @@ from std_msgs.msg import Float64
 from hmsa_ros.contract import topics
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import conversions, interface
-from hmsa_ros.nodes.timekeeping import Seldom
 from hmsa_ros.runtime.planner import PlannerRuntime
 from hmsa_ros.runtime.records import Send, Target
+from hmsa_ros.runtime.seldom import Seldom
 
 
 class JointChannel:

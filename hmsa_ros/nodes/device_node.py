@@ -18,7 +18,7 @@ from hmsa_ros.nodes.guard import COMMAND_SOURCES, CommandInput
 from hmsa_ros.nodes.joints import JointParameters
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.samples import SamplePublisher
-from hmsa_ros.nodes.timekeeping import Seldom
+from hmsa_ros.runtime.seldom import Seldom
 
 #: What a joint does when nobody commands it; each may have values of its own.
 FALLBACK = (

@@ -23,7 +23,7 @@ from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import conversions, interface
 from hmsa_ros.nodes.device_node import DeviceJoint, DeviceNode, FALLBACK, fallback_from
-from hmsa_ros.nodes.timekeeping import Seldom
+from hmsa_ros.runtime.seldom import Seldom
 
 #: Parameters that each joint may have values of its own for.
 OWN = (

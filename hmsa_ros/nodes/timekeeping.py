@@ -1,6 +1,4 @@
-"""What nodes measure against a clock that does not step: steps of the wall clock, and pauses."""
-
-from time import monotonic
+"""What nodes measure against a clock that does not step: steps of the wall clock."""
 
 # Less is the clock being slewed, or the two readings being apart.
 _STEP_NS = 5_000_000
@@ -23,25 +21,3 @@ class StepWatch:
         if last is None or last - offset < _STEP_NS:
             return 0
         return last - offset
-
-
-class Seldom:
-    """
-    Says at most once in so many seconds that it is time to report something again.
-
-    A logger's own throttle looks for the place in the code that it is called from before it
-    decides, which takes up to a millisecond: too long for what may come a thousand times a
-    second.
-    """
-
-    def __init__(self, seconds: float = 1.0) -> None:
-        self._seconds = seconds
-        self._next = 0.0
-
-    def __call__(self) -> bool:
-        """Return whether it is time."""
-        now = monotonic()
-        if now < self._next:
-            return False
-        self._next = now + self._seconds
-        return True

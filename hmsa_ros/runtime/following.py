@@ -1,7 +1,6 @@
 """Late, lost and foreign commands, and the new plans that they call for."""
 
 from collections.abc import Mapping
-from time import monotonic_ns
 
 from hmsa_ros.core.drafting import Steps
 from hmsa_ros.core.group import PlannerGroup, Resumption
@@ -10,22 +9,8 @@ from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.runtime.lateness import Lateness
 from hmsa_ros.runtime.records import Note, Settings, Severity, Verdict
+from hmsa_ros.runtime.seldom import Seldom
 from hmsa_ros.runtime.slices import Clock, in_time, Work
-
-
-class Seldom:
-    """Says at most once a second that it is time to report something again."""
-
-    def __init__(self) -> None:
-        self._next = 0
-
-    def __call__(self) -> bool:
-        """Return whether it is time."""
-        now = monotonic_ns()
-        if now < self._next:
-            return False
-        self._next = now + NANOSECONDS
-        return True
 
 
 class Following:
@@ -109,8 +94,13 @@ class Following:
         if not self._tell_late():
             return []
         return [Note(Severity.WARN, (
-            f'command {late / 1e6:.3f} ms after the time it applies: '
-            f'{self.lateness.advice(self._group.planners[joint].options.lead_time)}'))]
+            f'command {late / 1e6:.3f} ms after the time it applies: {self.advice}'))]
+
+    @property
+    def advice(self) -> str:
+        """What helps where commands come late; all joints have the same lead time."""
+        planner = next(iter(self._group.planners.values()))
+        return self.lateness.advice(planner.options.lead_time)
 
     # -- plans made anew -----------------------------------------------------------------------
 
@@ -159,11 +149,10 @@ class Following:
             Severity.ERROR, 'not_converged', f'joint {name} cannot be replanned: {error}',
             request)
 
-    def give_up(self, lead_time: int, request: str) -> Verdict:
+    def give_up(self, request: str) -> Verdict:
         """Return the verdict where commands come late for ever."""
         self.given_up.clear()
         return Verdict(
             Severity.WARN, 'late',
-            f'{self.lateness.words} and leave vibration: '
-            f'{self.lateness.advice(lead_time)}', request,
+            f'{self.lateness.words} and leave vibration: {self.advice}', request,
             {'largest_lateness': self.lateness.largest / NANOSECONDS})

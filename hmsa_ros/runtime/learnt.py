@@ -1,7 +1,6 @@
 """What was learnt of an actuator: as a model to plan with, and as a parameter file."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
@@ -26,8 +25,7 @@ _OTHERS = ('coil_time_constant', 'stretch_bias', 'stretch_gain')
 def learnt_model(model: Model, estimate: Estimate, held: float) -> Model:
     """Return a model with an estimate's parameters; as it is if that cannot hold a stretch."""
     try:
-        found = Model(estimate.actuator, replace(
-            model.options, coil_time_constant=estimate.values['coil_time_constant']))
+        found = estimate.model(model.options)
         check_stretch(held, found.material, 'stretch')
     except BadInputError:
         return model

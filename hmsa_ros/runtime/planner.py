@@ -281,6 +281,11 @@ class PlannerRuntime:
 
     def report(self) -> tuple[Severity, str, dict[str, object]]:
         """Return how commands fare: severity, a sentence and counters."""
-        severity, message, counters = self.sending.report()
-        return severity, message, {
-            **counters, 'refused': self.planning.refused, 'clock_jumps': self.clock_jumps}
+        late, message = self.following.lateness, 'commands sent in time'
+        if late.count:
+            message = f'{late.count} commands late: {self.following.advice}'
+        return Severity.WARN if late.count else Severity.OK, message, {
+            'sent': self.sending.sent, 'late': late.count, 'replanned': self.following.replanned,
+            'heartbeats': self.sending.heartbeats,
+            'largest_lateness_ms': f'{late.largest / 1e6:.3f}',
+            'refused': self.planning.refused, 'clock_jumps': self.clock_jumps}

@@ -77,7 +77,9 @@ class Planning:
             if self.advance(work) and work in self._queue:
                 self._queue.remove(work)
         if self._following.given_up:
-            self._give_up()
+            self._bulletin.give(
+                self._following.give_up(self._bulletin.verdict.request),
+                log=self._following.tell_replanned())
 
     def advance(self, work: Work) -> bool:
         """Go on with one piece of work; say whether it is done."""
@@ -160,11 +162,6 @@ class Planning:
             self._bulletin.judge_again(drafts)
             self._bulletin.show()
             self._bulletin.give(verdict)
-
-    def _give_up(self) -> None:
-        verdict = self._following.give_up(next(
-            iter(self._group.planners.values())).options.lead_time, self._bulletin.verdict.request)
-        self._bulletin.give(verdict, log=self._following.tell_replanned())
 
 
 def _accepted(drafts: Mapping[str, Draft]) -> str:

@@ -2,7 +2,7 @@
 
 from hmsa_ros.core.group import PlannerGroup
 from hmsa_ros.runtime.following import Following
-from hmsa_ros.runtime.records import Output, Send, Settings, Severity
+from hmsa_ros.runtime.records import Output, Send, Settings
 
 # So far ahead that all there is gets sent.
 _FAR = 2**62
@@ -40,14 +40,3 @@ class Sending:
             if following is None or stamp < following:
                 self._outputs.append(Send(name, stamp, level.flux_density))
                 self.heartbeats += 1
-
-    def report(self) -> tuple[Severity, str, dict[str, object]]:
-        """Return how commands fare: severity, a sentence and counters."""
-        late = self._following.lateness
-        lead_time = next(iter(self._group.planners.values())).options.lead_time
-        message = 'commands sent in time'
-        if late.count:
-            message = f'{late.count} commands late: {late.advice(lead_time)}'
-        return Severity.WARN if late.count else Severity.OK, message, {
-            'sent': self.sent, 'late': late.count, 'replanned': self._following.replanned,
-            'heartbeats': self.heartbeats, 'largest_lateness_ms': f'{late.largest / 1e6:.3f}'}
