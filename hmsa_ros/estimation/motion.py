@@ -57,7 +57,8 @@ class Motion:
     def measured(
             self, values: Mapping[str, float], free: Sequence[str]) -> tuple[Array, Array]:
         """Return what the sensor shows, shape (n,), and its derivatives, shape (n, p + 2)."""
-        return sensed(values, free, self.stretch, self.rate, self.by)
+        return sensed(
+            values, free, self.stretch, self.rate, values['stretch_gain'] * self.by)
 
 
 def follow(

@@ -128,22 +128,20 @@ def _listed(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f'{", ".join(names[:-1])} and {names[-1]}'
 
 
-def _columns(recording: Recording, fit: Fit, at_rest: bool) -> Iterator[tuple[str, Array]]:
+def _columns(fit: Fit) -> Iterator[tuple[str, Array]]:
     """Yield directions of the residuals that stand for something the model leaves out."""
-    def by(name: str, **values: float) -> Array:
-        response = respond(
-            recording, complete({**fit.values, **values}, fit.free), [name], at_rest=at_rest)
-        return np.zeros(len(time)) if response is None else response.jacobian[:, 0]
+    def by(names: Sequence[str], **values: float) -> Array:
+        response = respond(recording, complete({**fit.values, **values}, fit.free), names)
+        return np.zeros((len(names), len(time))) if response is None else response.jacobian.T
 
-    time = recording.time
-    for name, words in _WORDS.items():
-        if name not in fit.free:
-            yield words, by(name)
+    recording, time = fit.recording, fit.recording.time
+    if names := [x for x in _WORDS if x not in fit.free]:
+        yield from zip((_WORDS[x] for x in names), by(names), strict=True)
     if 'viscoelastic_ratio' not in fit.free:
         span = float(time[-1] - time[0])
         for tau in (2.0 * fit.values['time_unit'], 0.03 * span, 0.3 * span):
-            yield f'creep with a time of {tau:.2g} s', by(
-                'viscoelastic_ratio', viscoelastic_time=tau)
+            column, = by(['viscoelastic_ratio'], viscoelastic_time=tau)
+            yield f'creep with a time of {tau:.2g} s', column
     yield 'drift of the sensor or the temperature', time - 0.5 * (time[0] + time[-1])
     levels = recording.levels
     signs = np.sign(np.diff(levels, prepend=levels[0]))
@@ -158,9 +156,7 @@ _WORDS = {
     'coil_time_constant': 'lag of the coil', 'sensor_latency': 'latency of the sensor'}
 
 
-def signatures(
-        recording: Recording, fit: Fit, found: Whiteness, *, at_rest: bool
-) -> tuple[Signature, ...]:
+def signatures(fit: Fit, found: Whiteness) -> tuple[Signature, ...]:
     """
     Look in the residuals for what the model leaves out; the largest comes first.
 
@@ -173,9 +169,9 @@ def signatures(
         np.linalg.norm(known, axis=0), 1e-300))
     residual = root * fit.residual
     total = float(residual @ residual)
-    quantum = recording.quantum
+    quantum = fit.recording.quantum
     results = []
-    for name, column in _columns(recording, fit, at_rest):
+    for name, column in _columns(fit):
         direction = root * column
         norm = float(np.linalg.norm(direction))
         direction = direction - base @ (base.T @ direction)
@@ -191,22 +187,22 @@ def signatures(
         results.append(Signature(name, share, deviations, bool(
             share > _SHARE and deviations > _DEVIATIONS
             and abs(size) / math.sqrt(len(residual)) > 0.5 * quantum)))
-    if recording.earlier:
+    if fit.recording.earlier:
         # Switches at unknown times look like lag and latency, and stand for both.
         results = [x for x in results if 'coil' not in x.name and 'latency' not in x.name]
-    results += _jitter(recording, fit)
+    results += _jitter(fit)
     if not found.white:
-        results += _second_mode(recording, fit)
+        results += _second_mode(fit)
     return tuple(sorted(results, key=lambda x: (-x.found, -x.share)))
 
 
-def _jitter(recording: Recording, fit: Fit) -> list[Signature]:
+def _jitter(fit: Fit) -> list[Signature]:
     """Look for residuals that grow with the rate: stamps that are not those of the exposure."""
     if fit.scale < _NUMERICAL:
         return []
     keep = fit.weights > 0.0
     # A device that stamps evenly can be mended; of other stamps the errors are a part of the fit.
-    counted = fit.residual if _even(recording) else fit.root * fit.residual
+    counted = fit.residual if _even(fit.recording) else fit.root * fit.residual
     weighted = counted[keep]
     squares, speed = weighted ** 2, fit.response.rate[keep] ** 2
     centred = speed - np.mean(speed)
@@ -230,9 +226,10 @@ def _even(recording: Recording) -> bool:
     return bool(np.max(gaps) <= 1.5 * np.min(gaps))
 
 
-def _second_mode(recording: Recording, fit: Fit) -> list[Signature]:
+def _second_mode(fit: Fit) -> list[Signature]:
     """Look for one sharp frequency in the residuals, of evenly spaced samples."""
-    if not _even(recording):
+    time = fit.recording.time
+    if not _even(fit.recording):
         return []
     power = np.abs(np.fft.rfft(fit.residual * fit.weights)) ** 2
     power = power[3:]
@@ -243,8 +240,7 @@ def _second_mode(recording: Recording, fit: Fit) -> list[Signature]:
     share = float(np.sum(near) / np.sum(power))
     # Fisher's g: the chance of the largest of m exponential shares.
     chance = len(power) * math.exp(-len(power) * float(power[place]) / float(np.sum(power)))
-    frequency = (place + 3) / (
-        float(np.mean(np.diff(recording.time))) * len(recording.time))
+    frequency = (place + 3) / (float(np.mean(np.diff(time))) * len(time))
     group = group_of(fit.values)
     own = float(model.natural_frequency(group.rest, group)) / complete(
         fit.values, fit.free)['time_unit'] / (2.0 * math.pi)
@@ -255,7 +251,7 @@ def _second_mode(recording: Recording, fit: Fit) -> list[Signature]:
         bool(share > 0.3 and chance < 1e-6 and apart and frequency > own))]
 
 
-def in_motion(recording: Recording, fit: Fit) -> float:
+def in_motion(fit: Fit) -> float:
     """Return how much larger residuals are in motion than at rest; 1 where nobody can tell."""
     speed = np.abs(fit.response.rate)
     order = np.argsort(speed)
@@ -267,7 +263,7 @@ def in_motion(recording: Recording, fit: Fit) -> float:
     return float(fast / slow) if slow > 0.0 else 1.0
 
 
-def mistaken(recording: Recording, fit: Fit, chance: float = 0.02) -> bool:
+def mistaken(fit: Fit, chance: float = 0.02) -> bool:
     """
     Whether what did not count is motion: it lies right after the changes of level.
 
@@ -277,7 +273,7 @@ def mistaken(recording: Recording, fit: Fit, chance: float = 0.02) -> bool:
     # Slow to load, and no use to a planner that estimates.
     from scipy.special import bdtrc
 
-    out = fit.weights < _OUT
+    out, recording = fit.weights < _OUT, fit.recording
     changes = recording.level_times[1:][np.diff(recording.levels) != 0.0]
     if not np.any(out) or not len(changes):
         return False
@@ -291,14 +287,15 @@ def mistaken(recording: Recording, fit: Fit, chance: float = 0.02) -> bool:
         np.count_nonzero(after & out) - 1, np.count_nonzero(out), usual) < chance)
 
 
-def distant(recording: Recording, fit: Fit, found: Whiteness) -> bool:
+def distant(fit: Fit, found: Whiteness) -> bool:
     """Whether nothing of the motion was fitted."""
-    return not found.white and fit.scale > DISTANT * float(np.std(recording.stretch)) and abs(
+    return not found.white and fit.scale > DISTANT * float(np.std(fit.recording.stretch)) and abs(
         float(found.autocorrelation[1])) > 0.2
 
 
-def check_plausible(recording: Recording, fit: Fit, unknown: Sequence[str] = ()) -> None:
+def check_plausible(fit: Fit, unknown: Sequence[str] = ()) -> None:
     """Raise `BadInputError` for what can only come from data in other units."""
+    recording = fit.recording
     modulus, ratio = modulus_of(fit.values.get('law'))
     for name, (least, most, power) in _USUAL.items():
         value, label = fit.values[name], name
@@ -319,16 +316,14 @@ def check_plausible(recording: Recording, fit: Fit, unknown: Sequence[str] = ())
             f'the actuator in --params-file{hint}')
 
 
-def misfit(
-        recording: Recording, fit: Fit, found: Whiteness, marks: Sequence[Signature]
-) -> str:
+def misfit(fit: Fit, found: Whiteness, marks: Sequence[Signature]) -> str:
     """Return why the model is rejected, with the figures; empty if it is not."""
-    motion = float(np.std(recording.stretch))
+    motion = float(np.std(fit.recording.stretch))
     figures = (
         f'residuals of {fit.scale:.3g} with an autocorrelation of '
         f'{float(autocorrelation(fit.residual * fit.root)[1]):.2f} from one sample '
         f'to the next (white with a probability of {found.p_value:.2g})')
-    if distant(recording, fit, found):
+    if distant(fit, found):
         return (
             f'no motion of the model is like the recorded one: {figures}, against a motion of '
             f'{motion:.3g} rms; are times in s and levels in tesla, of one clock and one run, and '
@@ -341,13 +336,13 @@ def misfit(
             f'{x.name} ({x.share:.0%} of them, {x.deviations:.0f} deviations)' for x in seen[:3])
         return f'the model leaves {figures}, which look like {words}{_remedy(seen)}'
     lost = int(np.count_nonzero(fit.weights < _OUT))
-    if lost > 1 and mistaken(recording, fit):
+    if lost > 1 and mistaken(fit):
         return (
             f'{lost} samples right after changes of level are not those of the model, which '
             f'leaves {figures} elsewhere: the motion itself is not described; are the levels '
             'at their true times, and are enough samples in motion?')
-    ratio = in_motion(recording, fit)
-    if not found.white and ratio > _IN_MOTION and recording.quantum == 0.0 and (
+    ratio = in_motion(fit)
+    if not found.white and ratio > _IN_MOTION and fit.recording.quantum == 0.0 and (
             abs(float(found.autocorrelation[1])) > 0.3):
         return (
             f'the model leaves {figures}, {ratio:.1f} times as large in fast motion as in '

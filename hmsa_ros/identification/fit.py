@@ -35,6 +35,7 @@ LEAST_SCALE = 3.0 * _NUMERICAL
 class Fit:
     """A minimum that was found."""
 
+    recording: Recording
     values: dict[str, Any]  # of all quantities, and the law
     free: tuple[str, ...]  # columns of the Jacobian
     response: Response
@@ -114,24 +115,23 @@ def moved(values: Mapping[str, float], free: Sequence[str], step: Array) -> dict
 
 def fit(
         recording: Recording, values: Mapping[str, float], free: Sequence[str], *,
-        at_rest: bool = True, most: int = _MAX_PASSES, spread: Array | None = None
-) -> Fit | None:
+        most: int = _MAX_PASSES, spread: Array | None = None) -> Fit | None:
     """
     Descend from start values of all quantities to a minimum; None if they cannot be followed.
 
     The spread is the deviation of each sample over that of one at rest; all alike without it.
     """
-    return _Search(recording, tuple(free), at_rest, most, spread).run(values)
+    return _Search(recording, tuple(free), most, spread).run(values)
 
 
 class _Search:
     """A descent, with the uncertain switches beside the parameters."""
 
     def __init__(
-            self, recording: Recording, free: tuple[str, ...], at_rest: bool, most: int,
+            self, recording: Recording, free: tuple[str, ...], most: int,
             spread: Array | None) -> None:
         self._spread: Array = np.ones(len(recording.time)) if spread is None else spread
-        self._recording, self._free, self._at_rest = recording, free, at_rest
+        self._recording, self._free = recording, free
         self._most = most
         self._passes = 0
         # First no sample is left out, so that the few in motion are not taken for outliers.
@@ -142,8 +142,7 @@ class _Search:
 
     def _respond(self, values: Mapping[str, float], shifts: Array) -> Response | None:
         self._passes += 1
-        return respond(
-            self._recording, values, self._free, at_rest=self._at_rest, shifts=shifts)
+        return respond(self._recording, values, self._free, shifts=shifts)
 
     def _residual(self, response: Response) -> Array:
         return (self._recording.stretch - response.stretch) / self._spread
@@ -220,8 +219,9 @@ class _Search:
                 scale = min(scale, robust_scale(residual))
             damping = max(0.1 * damping, 1e-12)
         return Fit(
-            values, self._free, response, residual * self._spread, weights_of(residual, scale),
-            scale, converged, self._passes, self._spread, self._prior(scale))
+            self._recording, values, self._free, response, residual * self._spread,
+            weights_of(residual, scale), scale, converged, self._passes, self._spread,
+            self._prior(scale))
 
     def _normal(
             self, response: Response, residual: Array, weights: Array, shifts: Array,

@@ -114,17 +114,16 @@ def identify(
     if 'chain_limit' in free:
         # Endless chains are no start: the derivative by their inverse is taken of the limit.
         values['chain_limit'] = min(values['chain_limit'], 1e9)
-    at_rest = _begins_at_rest(recording) and not {'initial_stretch', 'initial_rate'} & set(free)
-    if not at_rest:
+    if not _begins_at_rest(recording) or {'initial_stretch', 'initial_rate'} & set(free):
+        recording = replace(recording, at_rest=False)
         values['initial_stretch'] = float(np.median(recording.stretch[:3]))
         free = tuple(dict.fromkeys((*free, 'initial_stretch', 'initial_rate')))
     if len(recording.time) < 2 * len(free):
         raise BadInputError(
             f'{recording.label} has {len(recording.time)} samples for {len(free)} free '
             f'parameters: expected {2 * len(free)} or more')
-    best, tried, agreed = _search(recording, values, free, at_rest)
-    best = _with_errors_of_stamps(recording, best, at_rest)
-    return _conclude(recording, best, tried, agreed, at_rest)
+    best, tried, agreed = _search(recording, values, free)
+    return _conclude(_with_errors_of_stamps(best), tried, agreed)
 
 
 def _begins_at_rest(recording: Recording) -> bool:
@@ -144,7 +143,7 @@ def _begins_at_rest(recording: Recording) -> bool:
     return float(np.std(before)) < 4.0 * quiet
 
 
-def _good(recording: Recording, found: Fit) -> bool:
+def _good(found: Fit) -> bool:
     """Whether a fit leaves little but white noise, and outliers here and there."""
     differences = np.diff(found.residual)
     out = found.weights < 0.5
@@ -152,13 +151,13 @@ def _good(recording: Recording, found: Fit) -> bool:
         found.converged
         and found.scale < _NEAR_WHITE * robust_scale(differences) / math.sqrt(2.0)
         # Of few samples a level even what is far off differs from one to the next.
-        and found.scale < diagnosis.DISTANT * float(np.std(recording.stretch))
+        and found.scale < diagnosis.DISTANT * float(np.std(found.recording.stretch))
         and np.count_nonzero(out[1:] & out[:-1]) <= _ADJACENT * len(out)
-        and not diagnosis.mistaken(recording, found, _DOUBT))
+        and not diagnosis.mistaken(found, _DOUBT))
 
 
 def _search(
-        recording: Recording, values: Mapping[str, float], free: Sequence[str], at_rest: bool
+        recording: Recording, values: Mapping[str, float], free: Sequence[str]
 ) -> tuple[Fit, int, int]:
     """Return the best of the fits, how many there are, and how many ended there."""
     found: list[Fit] = []
@@ -166,25 +165,24 @@ def _search(
     def tried(candidates: Sequence[Mapping[str, float]]) -> bool:
         for candidate in candidates:
             few = any(x.converged for x in found)
-            one = fit(recording, candidate, free, at_rest=at_rest,
-                      most=_FEW_PASSES if few else _FIRST_PASSES)
+            one = fit(recording, candidate, free, most=_FEW_PASSES if few else _FIRST_PASSES)
             if few and one is not None and not one.converged and _promising(found, one):
-                one = fit(recording, one.values, free, at_rest=at_rest, most=_FIRST_PASSES)
+                one = fit(recording, one.values, free, most=_FIRST_PASSES)
             if one is not None:
                 found.append(one)
-                if _good(recording, one) or _settled(recording, found):
+                if _good(one) or _settled(found):
                     return True
         return False
 
     given = starts(recording, values, free)
-    nearest = min((given[0], given[-1]), key=lambda x: _miss(recording, x, at_rest))
+    nearest = min((given[0], given[-1]), key=lambda x: _miss(recording, x))
     # A frequency far from that of the values given may be one of the noise.
     near = abs(math.log(nearest['time_unit'] / values['time_unit'])) < math.log(_FAR)
     if not near or not tried([nearest]):
         # All time units, and what else was seen in the data; the likeliest first.
-        others = [*scan(recording, values, free, at_rest=at_rest),
+        others = [*scan(recording, values, free),
                   *(x for x in given if not near or x is not nearest)]
-        tried(sorted(others, key=lambda x: _miss(recording, x, at_rest)))
+        tried(sorted(others, key=lambda x: _miss(recording, x)))
     if not found:
         raise BadInputError(
             f'no start value leads to a motion that {recording.label} could be compared with: '
@@ -192,18 +190,18 @@ def _search(
             'more than it can hold')
     best, agreed = _best(found)
     if not best.converged:
-        best = fit(recording, best.values, free, at_rest=at_rest) or best
+        best = fit(recording, best.values, free) or best
     return best, len(found), agreed
 
 
-def _with_errors_of_stamps(recording: Recording, best: Fit, at_rest: bool) -> Fit:
+def _with_errors_of_stamps(best: Fit) -> Fit:
     """Return a fit in which samples in motion count less, if errors of the stamps show there."""
-    found = best
+    found, recording = best, best.recording
     for _ in range(_MOST_SPREADS):
         spread, _ = errors_of_stamps(found.jacobian, found.residual, found.response.rate)
         if np.array_equal(spread, found.spread):
             return found
-        again = fit(recording, found.values, found.free, at_rest=at_rest, spread=spread)
+        again = fit(recording, found.values, found.free, spread=spread)
         # What the model leaves out is larger in motion too, but not from sample to sample.
         if again is None or not again.converged or whiteness(
                 again.root * again.residual).p_value < _CERTAIN or (
@@ -229,27 +227,25 @@ def _promising(found: Sequence[Fit], one: Fit) -> bool:
         best.residual, best.scale, convex=True)
 
 
-def _settled(recording: Recording, found: Sequence[Fit]) -> bool:
+def _settled(found: Sequence[Fit]) -> bool:
     """Whether several starts ended at the likeliest fit, though it leaves more than noise."""
     best, agreed = _best(found)
     return (
         agreed >= _ENOUGH and best.converged
-        and best.scale < diagnosis.DISTANT * float(np.std(recording.stretch))
-        and not diagnosis.mistaken(recording, best, _DOUBT))
+        and best.scale < diagnosis.DISTANT * float(np.std(best.recording.stretch))
+        and not diagnosis.mistaken(best, _DOUBT))
 
 
-def _miss(recording: Recording, candidate: Mapping[str, float], at_rest: bool) -> float:
+def _miss(recording: Recording, candidate: Mapping[str, float]) -> float:
     """Return how far the motion of some values is from the recorded one in the mean."""
-    response = respond(recording, candidate, (), at_rest=at_rest, rtol=1e-4)
+    response = respond(recording, candidate, (), rtol=1e-4)
     return math.inf if response is None else float(
         np.mean(np.abs(recording.stretch - response.stretch)))
 
 
-def _conclude(
-        recording: Recording, best: Fit, tried: int, agreed: int, at_rest: bool
-) -> Identification:
+def _conclude(best: Fit, tried: int, agreed: int) -> Identification:
     """Return the result of a fit."""
-    root = best.root
+    root, recording = best.root, best.recording
     weighted = root * best.residual
     counted = float(np.sum(best.weights))
     freedom = max(counted - len(best.free), 1.0)
@@ -260,7 +256,7 @@ def _conclude(
     columns = root[:, None] * best.jacobian
     correlated = widening(columns, weighted, inverse, found)
     _, variance = errors_of_stamps(best.jacobian, best.residual, best.response.rate)
-    variance += _blurred(recording, best, deviation, columns, inverse, at_rest)
+    variance += _blurred(best, deviation, columns, inverse)
     hint: Array = np.zeros(len(best.free))
     if not recording.earlier and not _DELAYS.intersection(best.free):
         hint = hinted(root * best.response.rate, columns, weighted, inverse, found)
@@ -268,16 +264,16 @@ def _conclude(
     held, factors = (
         correlated * np.sqrt(np.maximum(x / np.diag(inverse) / deviation ** 2, 1.0))
         for x in (variance, variance + hint))
-    bent = _bent(recording, best, inverse, deviation, held, at_rest)
+    bent = _bent(best, inverse, deviation, held)
     held, factors = bent * held, bent * factors
     covariance = inverse * deviation ** 2 * np.outer(factors, factors)
     weak = diagnosis.weakness(best, deviation, held)
-    marks = diagnosis.signatures(recording, best, found, at_rest=at_rest)
-    reason = diagnosis.misfit(recording, best, found, marks)
+    marks = diagnosis.signatures(best, found)
+    reason = diagnosis.misfit(best, found, marks)
     verdict: Verdict = 'model_rejected'
-    distant = diagnosis.distant(recording, best, found)
+    distant = diagnosis.distant(best, found)
     if not distant:
-        diagnosis.check_plausible(recording, best, weak.names if weak else ())
+        diagnosis.check_plausible(best, weak.names if weak else ())
     if weak is not None and not distant:
         # What the model lacks widens all intervals, and may be why nothing is held.
         verdict = 'not_identifiable'
@@ -298,12 +294,12 @@ def _conclude(
     parameters, matrix = _estimates(best, covariance, freedom, lost)
     outliers = int(np.count_nonzero(best.weights == 0.0))
     warnings = (*recording.notes, *_warnings(
-        recording, best, deviation, correlated, outliers, found.white))
+        best, deviation, correlated, outliers, found.white))
     return Identification(
         verdict, reason, warnings, parameters, best.free, matrix, deviation,
         float(np.sqrt(np.mean(best.residual ** 2))), len(recording.time), outliers, recording,
         best.response.stretch, best.residual, best.weights, best.spread, found, marks,
-        float(np.max(correlated)), complete(best.values, best.free), at_rest, tried, agreed)
+        float(np.max(correlated)), complete(best.values, best.free), tried, agreed)
 
 
 def _stamp_error(best: Fit, deviation: float) -> float:
@@ -313,14 +309,12 @@ def _stamp_error(best: Fit, deviation: float) -> float:
         abs(float(best.response.rate[place])), 1e-300)
 
 
-def _blurred(
-        recording: Recording, best: Fit, deviation: float, columns: Array, inverse: Array,
-        at_rest: bool) -> Array:
+def _blurred(best: Fit, deviation: float, columns: Array, inverse: Array) -> Array:
     """Return the squares of what the curvature of the motion moves where stamps are off."""
     error = _stamp_error(best, deviation)
     nothing: Array = np.zeros(len(best.free))
     late = {**best.values, 'sensor_latency': best.values['sensor_latency'] + error}
-    after = respond(recording, late, (), at_rest=at_rest) if error else None
+    after = respond(best.recording, late, ()) if error else None
     if after is None:
         return nothing
     # In the mean a sample lies half the square of the error times the acceleration off.
@@ -329,9 +323,7 @@ def _blurred(
     return moved ** 2
 
 
-def _bent(
-        recording: Recording, best: Fit, inverse: Array, deviation: float, held: Array,
-        at_rest: bool) -> Array:
+def _bent(best: Fit, inverse: Array, deviation: float, held: Array) -> Array:
     """
     Return by how much deviations are larger than the information at the optimum says.
 
@@ -348,8 +340,7 @@ def _bent(
         for change in (-2.0 * std[place], 2.0 * std[place]):
             step = inverse[:, place] / inverse[place, place] * change
             start = moved(best.values, best.free, step)
-            one = fit(recording, start, others, at_rest=at_rest, spread=best.spread) \
-                if others else None
+            one = fit(best.recording, start, others, spread=best.spread) if others else None
             if one is not None:
                 worse = (float(weights @ one.residual ** 2) - base) / deviation ** 2
                 largest = max(largest, 2.0 * held[place] / math.sqrt(max(worse, 1e-2)))
@@ -406,11 +397,9 @@ def _estimates(
 
 
 def _warnings(
-        recording: Recording, best: Fit, deviation: float, factors: Array, outliers: int,
-        white: bool
-) -> list[str]:
+        best: Fit, deviation: float, factors: Array, outliers: int, white: bool) -> list[str]:
     """Return what a reader should know besides the verdict, a sentence each."""
-    found = []
+    found, recording = [], best.recording
     if outliers:
         found.append(
             f'{outliers} of {len(recording.time)} samples are more than six deviations off and '
@@ -425,18 +414,18 @@ def _warnings(
             f'{float(np.max(factors)):.3g} times')
     if recording.quantum:
         found.append(f'the {recording.coordinate.name} comes in steps of {recording.quantum:.3g}')
-    if _shaped(recording, best):
+    if _shaped(best):
         found.append(
             'all moves are shaped so that nothing rings: they carry about a sixth of the '
             'information of plain steps; record what hmsa excite proposes')
     return found
 
 
-def _shaped(recording: Recording, best: Fit) -> bool:
+def _shaped(best: Fit) -> bool:
     """Whether hardly any motion goes past the stretch that it comes to rest at."""
     fitted, before = best.response.stretch, None
     past = []
-    for begin, end, _, _ in segments(recording, 6):
+    for begin, end, _, _ in segments(best.recording, 6):
         rest = float(fitted[end - 1])
         before = float(fitted[begin]) if before is None else before
         if abs(rest - before) > 0.01:
@@ -488,8 +477,7 @@ def profile(
     rows = []
     for x in centre + 4.0 * std * np.linspace(-1.0, 1.0, points):
         values = {**found.values, name: from_coordinate(name, float(x))}
-        one = fit(kept, values, others, at_rest=found.at_rest,
-                  spread=found.spread) if others else None
+        one = fit(kept, values, others, spread=found.spread) if others else None
         if one is not None:
             loss = float(np.sum(weights * one.residual ** 2))
             rows.append((values[name], max(loss - base, 0.0) / found.noise_std ** 2))

@@ -96,9 +96,9 @@ def _fitted(found: Identification, size: float) -> tuple[Array, Array]:
     dense = np.union1d(recording.time, np.arange(
         recording.time[0], recording.time[-1], _FINE * unit, dtype=np.float64)) if (
             recording.time[-1] - recording.time[0] < _MOST_FINE * _FINE * unit) else recording.time
-    course = Course(dense, recording.level_times, recording.levels, recording.slew_limit)
-    response = None if recording.earlier else respond(
-        course, found.values, (), at_rest=found.at_rest)
+    course = Course(dense, recording.level_times, recording.levels, recording.slew_limit,
+                    at_rest=recording.at_rest)
+    response = None if recording.earlier else respond(course, found.values, ())
     if response is None:
         return decimate(recording.time / size, found.fitted)
     return decimate(dense / size, response.stretch)

@@ -50,6 +50,8 @@ class Recording:
         What a reader should know, one sentence each.
     coordinate : Coordinate
         What the samples are.
+    at_rest : bool
+        Whether the motion begins at rest, as `identify` finds out.
 
     Raises
     ------
@@ -68,6 +70,7 @@ class Recording:
     label: str = 'recording'
     notes: tuple[str, ...] = ()
     coordinate: Coordinate = STRETCH
+    at_rest: bool = True
 
     def __post_init__(self) -> None:
         """Check the arrays."""
@@ -222,6 +225,7 @@ class Course:
     levels: Array
     slew_limit: float = math.inf
     earlier: float = 0.0
+    at_rest: bool = True
 
     @property
     def uncertain(self) -> NDArray[np.int64]:

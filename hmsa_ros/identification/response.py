@@ -148,8 +148,7 @@ class Setup:
 
 def respond(
         recording: Recording | Course, values: Mapping[str, float], free: Sequence[str], *,
-        at_rest: bool = True, rtol: float = RTOL, shifts: Array | None = None
-) -> Response | None:
+        rtol: float = RTOL, shifts: Array | None = None) -> Response | None:
     """
     Simulate what the sensor would have shown; None if the motion meets the limits of the chains.
 
@@ -163,7 +162,7 @@ def respond(
     branches = setup.branches
     times = recording.time - values['sensor_latency']
     begin = float(recording.time[0])
-    if at_rest:
+    if recording.at_rest:
         begin = min(begin, float(recording.level_times[0]), float(times[0]))
     level_times, uncertain = recording.level_times, recording.uncertain
     if len(uncertain):
@@ -176,33 +175,37 @@ def respond(
         place = np.searchsorted(begins, level_times[uncertain])
         wanted = np.append(wanted, kernels.SWITCH + place)
     start = np.zeros(len(wanted))
-    if at_rest and not set_rest(theta, material, float(levels[0]), wanted, start):
-        return None
-    if not at_rest:
+    if not recording.at_rest:
         start[wanted == kernels.STRETCH] = 1.0
+    elif not set_rest(theta, material, float(levels[0]), wanted, start):
+        return None
     n = len(times)
     stretch, rate, raw = np.empty(n), np.empty(n), np.empty((n, len(wanted)))
     if not kernels.respond(
             theta, material, branches, wanted, start, begins, levels, slopes, float(levels[0]),
             0.0, times, rtol, stretch, rate, raw, np.empty((0, len(wanted)))):
         return None
+    raw = values['stretch_gain'] * raw
     shown, jacobian = sensed(values, free, stretch, rate, raw[:, :inner_count] @ setup.mixing)
-    return Response(shown, rate, jacobian, values['stretch_gain'] * raw[:, inner_count:])
+    return Response(shown, rate, jacobian, raw[:, inner_count:])
 
 
 def sensed(
         values: Mapping[str, float], free: Sequence[str], stretch: Array, rate: Array, by: Array
 ) -> tuple[Array, Array]:
-    """Return what the sensor shows of a motion, and its derivatives, by those of the stretch."""
+    """
+    Return what the sensor shows of a motion, and its derivatives.
+
+    Given are those by parameters of the motion; the columns of the sensor's own are filled in.
+    """
     gain = values['stretch_gain']
-    shown_by = gain * by
     by_sensor: dict[str, float | Array] = {
         'stretch_bias': 1.0, 'stretch_gain': derivative('stretch_gain', gain) * stretch,
         'sensor_latency': -gain * rate}
     for j, name in enumerate(free):
         if name in by_sensor:
-            shown_by[:, j] = by_sensor[name]
-    return gain * stretch + values['stretch_bias'], shown_by
+            by[:, j] = by_sensor[name]
+    return gain * stretch + values['stretch_bias'], by
 
 
 def set_rest(

@@ -104,8 +104,6 @@ class Identification:
         Largest factor by which correlation widened a deviation.
     values : dict of str to object
         Of all quantities, and the law, at the optimum, whatever the verdict.
-    at_rest : bool
-        Whether the motion began at rest.
     starts, agreed : int
         Start values that were tried, and how many of them ended at this optimum.
 
@@ -130,7 +128,6 @@ class Identification:
     signatures: tuple[Signature, ...]
     widened: float
     values: Mapping[str, Any]
-    at_rest: bool
     starts: int
     agreed: int
 
@@ -138,6 +135,11 @@ class Identification:
     def actuator(self) -> ActuatorParameters:
         """The block at the optimum; trust it only if the verdict is ``identified``."""
         return actuator_of(self.values)
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the motion began at rest."""
+        return self.recording.at_rest
 
     def shown(self, name: str) -> tuple[str, Estimate]:
         """Return a parameter as readers know it: the modulus of a beam is Young's."""

@@ -166,8 +166,8 @@ def starts(
 
 
 def scan(
-        recording: Recording, values: Mapping[str, float], free: Sequence[str], *,
-        at_rest: bool) -> list[dict[str, float]]:
+        recording: Recording, values: Mapping[str, float], free: Sequence[str]
+) -> list[dict[str, float]]:
     """
     Return start values by trying time units and dampings on the first of the data.
 
@@ -195,7 +195,7 @@ def scan(
                 # The share of critical damping about rest.
                 candidate = candidate | {
                     'damping_coefficient': decay * critical * damping_unit(candidate)}
-            response = respond(part, candidate, (), at_rest=at_rest, rtol=1e-5)
+            response = respond(part, candidate, (), rtol=1e-5)
             if response is not None:
                 miss = float(np.mean(np.abs(part.stretch - response.stretch)))
                 tried.append((miss, decay, candidate))
