@@ -8,6 +8,7 @@ levels and dwells is repeated; levels and dwells are sought at random and improv
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 import math
 
@@ -217,35 +218,30 @@ class Designer:
             np.linspace(0.0, end, 50, dtype=np.float64), level_times, levels, 1e-9)
         time, level = self._actuator.time_unit, float(levels[-1])
         slew = self._bounds.slew_limit / self._unit * time
-        try:
-            if state is None:
-                return np.append(level_times, end), np.append(levels, 0.0)
-            loads = (self._bounds.flux_density_min / self._unit,
-                     self._bounds.flux_density_max / self._unit)
-            segment, = plan_sequence(
-                [Setpoint(self._group.rest, math.inf)], self._group,
-                start=State(float(state.stretch[-1]), float(state.rate[-1]) * time,
-                            level / self._unit),
-                limits=Limits(*loads), delivery=Delivery(slew=slew))
-            more = [(end + x.time * time, x.load * self._unit) for x in segment.move.levels]
-            if not math.isfinite(segment.move.duration):
-                more = [(end, 0.0)]
-        except (RefusedError, BadInputError):
-            more = [(end, 0.0)]
+        more = [(end, 0.0)]
+        if state is not None:
+            start = State(
+                float(state.stretch[-1]), float(state.rate[-1]) * time, level / self._unit)
+            with suppress(RefusedError, BadInputError):
+                limits = Limits(self._bounds.flux_density_min / self._unit,
+                                self._bounds.flux_density_max / self._unit)
+                segment, = plan_sequence(
+                    [Setpoint(self._group.rest, math.inf)], self._group, start=start,
+                    limits=limits, delivery=Delivery(slew=slew))
+                if math.isfinite(segment.move.duration):
+                    more = [
+                        (end + x.time * time, x.load * self._unit) for x in segment.move.levels]
         return (np.append(level_times, [x for x, _ in more]),
                 np.append(levels, [x for _, x in more]))
 
     def _pattern(self, targets: Array, dwells: Array) -> tuple[Array, Array]:
         """Return the levels of a pattern that is repeated; the first is rest without field."""
-        fields = [float(np.clip(x, *self._range)) for x in targets]
-        times, levels = [0.0], [0.0]
-        now, i = _BEGIN * self.period, 0
-        while now < self.duration:
-            times.append(now)
-            levels.append(fields[i % len(fields)])
-            now += float(dwells[i % len(dwells)]) * self.period
-            i += 1
-        return np.array(times), np.array(levels)
+        spans = dwells * self.period
+        most = math.ceil(self.duration / float(np.min(spans)))
+        times = np.cumsum(np.append(_BEGIN * self.period, np.resize(spans, most)))
+        times = times[times < self.duration]
+        levels = np.resize(np.clip(targets, *self._range), len(times))
+        return np.append(0.0, times), np.append(0.0, levels)
 
     def _excess(self, level_times: Array, levels: Array) -> float:
         """Return the largest motion from rest as a share of what its limits allow."""
