@@ -22,7 +22,6 @@ class Screening:
 
     Counts are those of values that are no number, came twice, came after their time was over, did
     not fit, or were repeated while the actuator moved.
-
     """
 
     def __init__(self, gate: float, coordinate: Coordinate) -> None:

@@ -129,7 +129,6 @@ class Designer:
 
     The duration is in s, the rate in samples per second, and the noise the standard deviation of a
     sample. A duration that holds no sequence is refused.
-
     """
 
     def __init__(

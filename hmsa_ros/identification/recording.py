@@ -217,7 +217,6 @@ class Course:
     What may be recorded: samples to come, not checked, as a search makes thousands.
 
     The fields are those of a `Recording`.
-
     """
 
     time: Array

@@ -19,7 +19,6 @@ class Lateness:
 
     A command that arrives late is the later the later it was sent. One that a driver applies late
     is as late as any other, however far ahead of its stamp it was sent.
-
     """
 
     def __init__(self) -> None:

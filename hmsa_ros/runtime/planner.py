@@ -47,7 +47,6 @@ class PlannerRuntime:
     patience and the length of a slice are measured by. `observable` returns whether somebody may
     give samples, and `unheard` why nobody carries out commands (empty where somebody does): the
     first request waits for both.
-
     """
 
     def __init__(

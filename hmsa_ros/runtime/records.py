@@ -22,7 +22,7 @@ class Settings:
     replan_late: bool = True  # plan the rest of a sequence anew when reality has left the plan
     lateness_tolerance: int = 5000  # how late a command may be without a new plan
     takeover_timeout: int = NANOSECONDS // 2  # wait for plant and sample at first; 0 for not
-    takeover_max_age: int = NANOSECONDS // 2  # of such a sample
+    takeover_max_age: int = NANOSECONDS // 2  # largest age of such a sample
     max_points: int = 100_000  # setpoints of one request, of all joints together
     allow_partial_joints: bool = False  # whether a trajectory may lack joints
     tolerances: Tolerances = field(default_factory=Tolerances)
@@ -31,7 +31,7 @@ class Settings:
     feedback_parameters: tuple[str, ...] = TRACKED  # what is estimated besides the state
     feedback_cautious: bool = False  # take longer for moves that are expected to leave much
     feedback_tolerance: float = TOLERANCE  # share of its step from which on that is much
-    feedback_trim: float = 0.0  # largest change in T of a holding level against a constant force
+    feedback_trim: float = 0.0  # largest change in T of a level against a force; 0: none
     feedback_frozen: bool = False  # estimate the state alone, and keep the parameters
     feedback_file: str = ''  # where to write what was learnt; empty for nowhere
     # By joint, how well parameters are known before the first sample.
@@ -54,7 +54,6 @@ class Trajectory:
     A point has the stretch of each joint, and the time in ns from the start until which it lasts;
     if raw, the flux density in T of each joint, and the time from which it applies. Points are
     read bit by bit, and may raise `RefusedError` where they cannot be read.
-
     """
 
     joints: tuple[str, ...]
