@@ -12,10 +12,10 @@ import math
 import re
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hmsa_ros.core import kernels, law
-from hmsa_ros.core.branches import Branches
-from hmsa_ros.core.creep import Creep
+from hmsa_ros.core import kernels, law, response_kernel
+from hmsa_ros.core.creep import Creep, MOST
 from hmsa_ros.core.laws.coordinate import STRETCH
 from hmsa_ros.core.model import Array, Material, stretch_limits
 from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters
@@ -97,36 +97,53 @@ class Setup:
         return self.actuator.load_per_newton
 
     def check_level(self, flux_density: float) -> None:
-        """
-        Refuse a level in T that nobody could follow.
-
-        Raises
-        ------
-        BadInputError
-            If the value is not finite or too large.
-
-        """
-        unit = self.actuator.flux_density_unit
-        if not abs(flux_density / unit) < _LARGEST_LOAD:
-            raise BadInputError(
-                f'flux density is {flux_density:g} T: expected a finite value below '
-                f'{_LARGEST_LOAD * unit:g} T')
+        """Refuse with `BadInputError` a level in T that nobody could follow."""
+        _check_load('flux density', flux_density, 'T', self.actuator.flux_density_unit)
 
     def check_force(self, force: float) -> None:
-        """
-        Refuse a disturbing force in N that nobody could follow.
+        """Refuse with `BadInputError` a disturbing force in N that nobody could follow."""
+        _check_load('disturbing force', force, 'N', 1.0 / self.load_per_newton)
 
-        Raises
-        ------
-        BadInputError
-            If the value is not finite or too large.
 
-        """
-        unit = self.load_per_newton
-        if not abs(force * unit) < _LARGEST_LOAD:
-            raise BadInputError(
-                f'disturbing force is {force:g} N: expected a finite value below '
-                f'{_LARGEST_LOAD / unit:g} N')
+def _check_load(name: str, value: float, unit_name: str, unit: float) -> None:
+    """Refuse a value whose load is too large; the load 1 is a unit of it."""
+    if not abs(value / unit) < _LARGEST_LOAD:
+        raise BadInputError(
+            f'{name} is {value:g} {unit_name}: expected a finite value below '
+            f'{_LARGEST_LOAD * unit:g} {unit_name}')
+
+
+class _Branches:
+    """The branches of several actuators, and the integration of all of them."""
+
+    def __init__(self, creeps: Sequence[Creep], time_units: Array) -> None:
+        """Begin with forces of 0; units of time are in s."""
+        self._creeping = np.array([bool(x) for x in creeps])
+        self._work = response_kernel.work_space(MOST)
+        self._branches = np.zeros((len(creeps), MOST, 3))
+        for branches, creep, unit in zip(
+                self._branches, creeps, time_units.tolist(), strict=True):
+            held = [x for x in zip(creep.ratios, creep.times, strict=True) if x[0] > 0.0]
+            for branch, (ratio, time) in zip(branches, held, strict=False):
+                branch[response_kernel.RATIO] = ratio
+                branch[response_kernel.SPEED] = unit / time
+
+    def relax(self, i: int, force: float) -> None:
+        """Have the branches of one hold nothing, as after a long time under an elastic force."""
+        self._branches[i, :, response_kernel.FOLLOWER] = force
+
+    def follow(
+            self, work: Array, first: int, last: int, wanted: NDArray[np.bool_], state: Array,
+            drive: Array, material: Array, durations: Array, rtol: float,
+            status: NDArray[np.int64]) -> int:
+        """Integrate as `hmsa_ros.core.kernels.follow`; return how many do not get through."""
+        failed: int = kernels.follow(
+            work, first, last, wanted & ~self._creeping, state, drive, material, durations, rtol,
+            status)
+        failed += response_kernel.follow_creeping(
+            self._work, first, last, wanted & self._creeping, state, drive, material,
+            self._branches, durations, rtol, status)
+        return failed
 
 
 class Actuators:
@@ -164,7 +181,7 @@ class Actuators:
         self._kernel: Callable[..., int] = kernels.follow
         self._branches = None
         if any(x.creep for x in self.setups):
-            self._branches = Branches([x.creep for x in self.setups], self._time_units)
+            self._branches = _Branches([x.creep for x in self.setups], self._time_units)
             self._kernel = self._branches.follow
         self.schedules = [CommandSchedule(0.0) for _ in blocks]
         self.forces = [CommandSchedule(0.0) for _ in blocks]

@@ -74,26 +74,10 @@ def pieces(
         levels: Sequence[Level], load: float, end: float,
         slew: float) -> tuple[Array, Array, Array, float]:
     """
-    Return the load that levels make, piece by piece.
+    Return switches, loads and slopes (m,) of the load that levels make, and the last load.
 
-    Parameters
-    ----------
-    levels : sequence of Level
-        By time, the first at the start.
-    load : float
-        In force before the first level.
-    end : float
-        Time until which the load is wanted, not before the last level.
-    slew : float
-        Largest change of the load per unit of time; infinite for steps.
-
-    Returns
-    -------
-    switches, loads, slopes : ndarray, shape (m,)
-        From ``switches[i]`` on the load is ``loads[i] + slopes[i] (t - switches[i])``.
-    load : float
-        In force at the end.
-
+    From ``switches[i]`` on the load is ``loads[i] + slopes[i] (t - switches[i])``. Levels are by
+    time, the first at the start, and ``load`` is in force before; ``end`` is not before the last.
     """
     rows, load = ramps(levels, load, end, slew)
     switches, loads, slopes = np.array(rows).T

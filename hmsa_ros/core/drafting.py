@@ -20,7 +20,7 @@ from hmsa_ros.core.shapers import Shaper
 from hmsa_ros.core.shapers.through import through
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.stopping import brake, holdable
-from hmsa_ros.core.timeline import Draft, Model, Plan, PlannedLevel, PlannedSegment, scaled
+from hmsa_ros.core.timeline import Draft, Model, Plan, PlannedLevel, PlannedSegment
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
 
@@ -64,12 +64,6 @@ class Outset:
     def on_grid(self, time: int) -> int:
         """Return the next multiple of the command period."""
         return on_grid(time, self.model)
-
-    def is_target(self, stretch: float) -> bool:
-        """Return whether the plan ends at a stretch, is on the way and has nothing between."""
-        planned = self.plan.segments
-        return bool(planned) and planned[-1].stretch == stretch \
-            and planned[-1].since <= self.begin
 
 
 def on_grid(time: int, model: Model) -> int:
@@ -138,16 +132,16 @@ def draft_sequence(
             left = end
         if number % _CHECKED == _CHECKED - 1:
             yield
-    if len(setpoints) == 1 and outset.is_target(setpoints[0].stretch):
+    return (yield from draft_setpoints(outset, setpoints))
+
+
+def draft_setpoints(outset: Outset, setpoints: Sequence[Setpoint]) -> Steps[Draft | None]:
+    """Plan setpoints; None where the plan is on the way to the only one, with nothing between."""
+    planned = outset.plan.segments
+    if len(setpoints) == 1 and planned and planned[-1].stretch == setpoints[0].stretch \
+            and planned[-1].since <= outset.begin:
         return None
     return (yield from draft_moves(outset, setpoints))
-
-
-def draft_target(outset: Outset, stretch: float) -> Steps[Draft | None]:
-    """Plan a move to one stretch that is held then; None where it changes nothing."""
-    if outset.is_target(stretch):
-        return None
-    return (yield from draft_moves(outset, [Setpoint(stretch, math.inf)]))
 
 
 def draft_stop(outset: Outset) -> Steps[Draft]:
@@ -269,11 +263,7 @@ def _meeting(outset: Outset, state: State, following: int) -> int | None:
     if (level.stamp != planned.begin or level.model is not outset.model
             or outset.stale is not None and place < outset.stale):
         return None
-    unit = level.model.units
-    here = replace(
-        level, stretch=state.stretch, rate=state.rate / unit.time,
-        in_force=state.load * unit.load, amplifier=scaled(state.amplifier, unit.load),
-        followed=state.followed)
+    here = PlannedLevel.of(level.stamp, level.flux_density, state, level.model)
     return place if agree(here, level) else None
 
 
@@ -303,14 +293,6 @@ def _planned(
         short_spell=options.short_spell, errors=options.errors, pace=model.pace)
 
 
-def placed_level(model: Model, stamp: int, flux_density: float, state: State) -> PlannedLevel:
-    """Place a level in T at a stamp in ns, where it finds the actuator in a state."""
-    unit = model.units
-    return PlannedLevel(
-        stamp, flux_density, state.stretch, state.rate / unit.time, state.load * unit.load, model,
-        scaled(state.amplifier, unit.load), state.followed)
-
-
 def _placed(
         model: Model, begin: int, segment: Segment) -> tuple[list[PlannedLevel], PlannedSegment]:
     """Place a planned move on the timeline, in SI units."""
@@ -327,8 +309,8 @@ def _placed(
         elif number:
             state = model.follow(state, segment.move.levels[number - 1].load, level.time - time)
         time = level.time
-        levels.append(placed_level(
-            model, start + model.ns(time), level.load * model.units.load, state))
+        levels.append(PlannedLevel.of(
+            start + model.ns(time), level.load * model.units.load, state, model))
     duration = segment.move.duration
     return levels, PlannedSegment(
         segment.setpoint.stretch, start,

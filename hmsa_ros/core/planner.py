@@ -16,8 +16,8 @@ from hmsa_ros.core.drafting import (
     draft_moves,
     draft_resumption,
     draft_sequence,
+    draft_setpoints,
     draft_stop,
-    draft_target,
     finish,
     later_outsets,
     on_grid,
@@ -136,7 +136,8 @@ class Planner(RunningPlan):
     def draft_setpoint(self, stretch: float, now: int) -> Steps[Draft | None]:
         """Work out a move to one stretch; None where it changes nothing."""
         check_target(stretch, self.model.material.rest)
-        return (yield from draft_target(self._outset(self.soonest(now)), stretch))
+        outset = self._outset(self.soonest(now))
+        return (yield from draft_setpoints(outset, [Setpoint(stretch, math.inf)]))
 
     def draft_stop(self, now: int) -> Steps[Draft]:
         """Work out how to come to rest."""

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 import math
 
-from hmsa_ros.core.drafting import draft_moves, Outset, placed_level, Steps
+from hmsa_ros.core.drafting import draft_moves, Outset, Steps
 from hmsa_ros.core.model import equilibrium_stretch, stretch_limits
 from hmsa_ros.core.moves import State
 from hmsa_ros.core.setpoint import Setpoint
@@ -74,7 +74,7 @@ def draft_levels(outset: Outset, points: Sequence[tuple[float, int]]) -> Steps[D
             _check_motion(number - 1, before, state, stamp)
             state = model.follow(
                 state, before.flux_density / model.units.load, model.time(stamp - before.stamp))
-        levels.append(placed_level(model, stamp, flux_density, state))
+        levels.append(PlannedLevel.of(stamp, flux_density, state, model))
         yield
     last = levels[-1]
     _check_motion(len(points) - 1, last, state, None)

@@ -10,29 +10,10 @@ def residual_vibration(
         time: ArrayLike, stretch: ArrayLike, *, arrival: float, end: float,
         step: float) -> float:
     """
-    Return the peak-to-peak stretch after arrival as a share of the step.
+    Return the peak-to-peak stretch after arrival as a share, not percent, of the commanded step.
 
-    Parameters
-    ----------
-    time : array_like, shape (n,)
-        Increasing.
-    stretch : array_like, shape (n,)
-        Samples.
-    arrival, end : float
-        Part of the time that counts, both included, in the unit of ``time``.
-    step : float
-        Difference of stretch that was commanded.
-
-    Returns
-    -------
-    float
-        0 for rest; a share, not percent.
-
-    Raises
-    ------
-    HmsaError
-        If no two samples lie between arrival and end, or the step is zero.
-
+    Samples from ``arrival`` to ``end`` count, in the unit of ``time``, which increases. Fewer than
+    two of them, or a step of zero, are an `HmsaError`.
     """
     time = np.asarray(time, dtype=np.float64)
     inside = (time >= arrival) & (time <= end)

@@ -9,7 +9,7 @@ arrive there too, for which a third number is free. Newton solves them with the 
 come out of the integration.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 import math
@@ -94,6 +94,15 @@ def solve(
         return None
     levels = tuple(Level(t, x) for t, x in zip(times.tolist(), loads.tolist(), strict=True))
     return levels, duration
+
+
+def first_kept(guesses: Iterable[Template], request: 'Request') -> Attempt:
+    """Return the first solution of some guesses that keeps the load limits, if there is one."""
+    for guess in guesses:
+        found = solve(guess, request)
+        if found is not None and request.keeps(found[0]):
+            return found
+    return None
 
 
 def approach(

@@ -285,31 +285,10 @@ def unshaped(
         targets: Sequence[float], begins: Sequence[float], times: ArrayLike,
         material: NondimensionalParameters, *, start: float | None = None) -> tuple[Array, Array]:
     """
-    Sample the response to plain steps, the paper's unshaped input.
+    Sample stretch and rate (n,) under plain steps to targets, the paper's unshaped input.
 
-    Parameters
-    ----------
-    targets : sequence of float
-        Stretches whose holding load is applied.
-    begins : sequence of float
-        Times at which each step begins.
-    times : array_like, shape (n,)
-        Times to sample at.
-    material : NondimensionalParameters
-        zeta, J_lim and c1.
-    start : float
-        Stretch at rest before the first step; default that without a field.
-
-    Returns
-    -------
-    stretch, rate : ndarray, shape (n,)
-        Samples.
-
-    Raises
-    ------
-    BadInputError
-        If a stretch or the times are out of range.
-
+    Each step begins at its time with the load that holds its target. The start is at rest, by
+    default without a field. A stretch or times out of range are a `BadInputError`.
     """
     for target in targets:
         check_stretch(target, material, 'target')

@@ -182,14 +182,18 @@ class PlannedLevel:
             field=self.in_force / model.units.load)
         return list(zip(stretch.tolist(), (rate / model.units.time).tolist(), strict=True))
 
+    @classmethod
+    def of(cls, stamp: int, flux_density: float, state: State, model: Model) -> 'PlannedLevel':
+        """Return a level in T from a stamp in ns on, where the actuator is in a model's state."""
+        units = model.units
+        return cls(
+            stamp, flux_density, state.stretch, state.rate / units.time, state.load * units.load,
+            model, scaled(state.amplifier, units.load), state.followed)
+
     def after(self, level: 'PlannedLevel') -> 'PlannedLevel':
         """Return this level with what is predicted at its stamp if another one precedes it."""
-        state = level.at(self.stamp)
-        units = level.model.units
-        return replace(
-            self, stretch=state.stretch, rate=state.rate / units.time,
-            in_force=state.load * units.load, amplifier=scaled(state.amplifier, units.load),
-            followed=state.followed)
+        found = self.of(self.stamp, self.flux_density, level.at(self.stamp), level.model)
+        return replace(found, model=self.model)
 
 
 @dataclass(frozen=True, slots=True)

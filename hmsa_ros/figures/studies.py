@@ -11,9 +11,9 @@ import numpy as np
 from hmsa_ros.core.model import Array, critical_zeta, elastic_force
 from hmsa_ros.core.moves import Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.core.shapers.linear import step
 from hmsa_ros.core.shapers.minimum_time import minimum_time
 from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.core.shapers.step import step
 from hmsa_ros.figures import style
 from hmsa_ros.studies.damped import DampedStudy, LIMITS, limits_of, SETTLED
 from hmsa_ros.studies.residual import Actual

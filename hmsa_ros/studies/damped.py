@@ -12,9 +12,9 @@ import numpy as np
 from hmsa_ros.core.model import Array, elastic_force, Floats
 from hmsa_ros.core.moves import Limits, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.core.shapers.linear import step
 from hmsa_ros.core.shapers.minimum_time import minimum_time
 from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.core.shapers.step import step
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.studies.residual import Actual, ringing
 

@@ -8,13 +8,12 @@ nondimensional; `Units` only words the messages.
 from collections.abc import Callable
 
 from hmsa_ros.core.moves import Move
-from hmsa_ros.core.shapers.linear import ei, zv, zvd
+from hmsa_ros.core.shapers.linear import ei, step, zv, zvd
 from hmsa_ros.core.shapers.minimax import minimax
 from hmsa_ros.core.shapers.minimum_time import minimum_time
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.shapers.robust import robust
 from hmsa_ros.core.shapers.smooth import smooth
-from hmsa_ros.core.shapers.step import step
 from hmsa_ros.core.shapers.two_step import two_step
 from hmsa_ros.errors import BadInputError
 

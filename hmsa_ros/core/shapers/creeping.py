@@ -66,7 +66,7 @@ def two_levels(request: Request, plain: Move) -> Attempt:
     """Solve for level and duration with branches, given those without them."""
     material, state = request.material, request.state
     branches = material.branches.tolist()
-    frequency = float(law.natural_frequency(request.target, material.packed))
+    frequency = request.frequency
     # How much of a branch a motion as fast as this feels.
     felt = [1.0 / (1.0 + (speed / frequency) ** 2) for _, speed in branches]
     force = float(law.elastic_force(state.stretch, material.packed))
@@ -168,7 +168,7 @@ def _ramped(
             f'ramps of {request.units.slew_text(delivery.slew)} are too slow to follow creep at '
             f'{request.named_target}: expected a larger slew limit')
     inertia = law.mass(request.target, packed)
-    frequency = law.natural_frequency(request.target, packed)
+    frequency = request.frequency
     if delivery.period > 0.0:
         return 0.0 * ramps, float(np.sum(np.abs(changes) * ramps) / (inertia * frequency))
     # In the middle of the ramp the step would have been: what is left is of second order.

@@ -15,7 +15,7 @@ from hmsa_ros.core import law
 from hmsa_ros.core.delivery import Delivery
 from hmsa_ros.core.moves import Level, Limits, Move
 from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.core.shooting import approach, Attempt, on_time, solve, Template
+from hmsa_ros.core.shooting import approach, Attempt, first_kept, on_time, solve, Template
 from hmsa_ros.core.simulation import followed_by
 from hmsa_ros.core.status import Code, RefusedError
 
@@ -41,17 +41,16 @@ def at_rest(request: Request) -> bool:
         return False
     holding = request.balance(followed_by(state, request.material))
     packed = request.material.packed
-    frequency = float(law.natural_frequency(request.target, packed))
     stiffness = float(law.elastic_stiffness(request.target, packed))
-    return (abs(state.rate) <= _AT_REST * frequency
+    return (abs(state.rate) <= _AT_REST * request.frequency
             and max(abs(request.field - holding), abs(request.load - holding) * (
                 not math.isinf(request.delivery.slew))) <= _AT_REST * stiffness)
 
 
 def settle(request: Request, plain: Move) -> Move | None:
     """Have the field arrive with the stretch, given the two levels without a lag; or None."""
-    attempt = _sampled if request.delivery.period > 0.0 else _pushed
-    found = attempt(request, plain)
+    found = first_kept(_sampled(request, plain), request) if request.delivery.period > 0.0 \
+        else _pushed(request, plain)
     return None if found is None else Move(plain.code, *found, plain.reason)
 
 
@@ -103,9 +102,9 @@ def _template(
     return template
 
 
-def _sampled(request: Request, plain: Move) -> Attempt:
+def _sampled(request: Request, plain: Move) -> Iterator[Template]:
     """
-    Solve for three heights on the grid.
+    Yield guesses of three heights on the grid.
 
     The second of them lasts a period; the last one, which settles the field, long enough not to
     ask for much more than the limits.
@@ -122,10 +121,7 @@ def _sampled(request: Request, plain: Move) -> Attempt:
         between = first.load + (last.load - first.load) * min(max(late / period, 0.0), 1.0)
         levels = (first, Level((count - push - 1) * period, between),
                   Level((count - push) * period, last.load), Level(count * period, last.load))
-        found = solve(Template.of(levels, _FREE_LOADS), request)
-        if found is not None and request.keeps(found[0]):
-            return found
-    return None
+        yield Template.of(levels, _FREE_LOADS)
 
 
 def three_levels(request: Request, code: Code, reason: str) -> Move:
@@ -143,19 +139,16 @@ def three_levels(request: Request, code: Code, reason: str) -> Move:
 def free_heights(request: Request, free: Sequence[tuple[str, int]]) -> Attempt:
     """Solve for levels of free heights, all as long: the shortest that keep the limits."""
     holding = request.holding_load()
-    for length in _lengths(request, holding, len(free)):
-        guess = [Level(0.0, 0.5 * (request.load + holding))]
-        guess += [Level((1 + i) * length, holding) for i in range(len(free))]
-        found = solve(Template.of(guess, free), request)
-        if found is not None and request.keeps(found[0]):
-            return found
-    return None
+    first = Level(0.0, 0.5 * (request.load + holding))
+    return first_kept((
+        Template.of([first, *(Level((1 + i) * x, holding) for i in range(len(free)))], free)
+        for x in _lengths(request, holding, len(free))), request)
 
 
 def _lengths(request: Request, holding: float, count: int) -> Iterator[float]:
     """Yield how long each of so many levels may last."""
     delivery = request.delivery
-    half = math.pi / law.natural_frequency(request.target, request.material.packed)
+    half = math.pi / request.frequency
     ramp = delivery.ramp(holding - request.load)
     before = 0.0
     for share in _LENGTHS:
@@ -216,16 +209,17 @@ def push_brake_push(
 
 def fastest_on_grid(request: Request, loads: tuple[float, float]) -> Attempt:
     """Return the shortest three levels on the grid that keep the limits, if there are any."""
+    return first_kept(_on_grid(request, loads), request)
+
+
+def _on_grid(request: Request, loads: tuple[float, float]) -> Iterator[Template]:
     period = request.delivery.period
     holding = request.holding_load()
-    half = math.pi / law.natural_frequency(request.target, request.material.packed)
+    half = math.pi / request.frequency
     most = math.ceil((2.0 * half + 3.0 * request.delivery.lag) / period) + 6
     for count in range(3, most):
         last = max(1, min(count // 3, math.ceil(_PUSHES[0] * request.delivery.lag / period)))
         first = max(1, (count - last) // 2)
         guess = (Level(0.0, 0.5 * (loads[0] + holding)), Level(first * period, holding),
                  Level((count - last) * period, holding), Level(count * period, holding))
-        found = solve(Template.of(guess, _FREE_LOADS), request)
-        if found is not None and request.keeps(found[0]):
-            return found
-    return None
+        yield Template.of(guess, _FREE_LOADS)

@@ -1,5 +1,5 @@
 """
-Linear input shapers, as references for comparison.
+The plain step and linear input shapers, as references for comparison.
 
 ZV and ZVD (N. C. Singer, W. P. Seering, "Preshaping command inputs to reduce system
 vibration", J. Dyn. Syst. Meas. Control 112, 1990) and EI with 5 % tolerated vibration
@@ -18,6 +18,11 @@ from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.status import Code
 
 _EI_TOLERANCE = 0.05
+
+
+def step(request: Request) -> Move:
+    """Apply the target's own load at once and let the motion ring down, the paper's unshaped."""
+    return request.plain(Code.STEP, '')
 
 
 def zv(request: Request) -> Move:

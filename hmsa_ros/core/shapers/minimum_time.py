@@ -44,12 +44,11 @@ def minimum_time(request: Request, reason: str = '') -> Move:
     check(request.material, 'minimum_time')
     holding = request.holding_load()
     state, target = request.state, request.target
-    frequency = _frequency(request)
     if request.delivery.lag > 0.0:
-        return _late(request, holding, frequency, reason)
-    if abs(target - state.stretch) <= _AT_REST and abs(state.rate) <= _AT_REST * frequency:
+        return _late(request, holding, reason)
+    if abs(target - state.stretch) <= _AT_REST and abs(state.rate) <= _AT_REST * request.frequency:
         return Move(Code.HOLD, (Level(0.0, holding),), 0.0)
-    least, most = _bounds(request, holding, frequency)
+    least, most = _bounds(request, holding)
     for share in _SHARES:
         # On a grid and through ramps full height may leave no time to switch.
         found = _attempt(
@@ -63,16 +62,16 @@ def minimum_time(request: Request, reason: str = '') -> Move:
         f'rest at {target:g}')
 
 
-def _late(request: Request, holding: float, frequency: float, reason: str) -> Move:
+def _late(request: Request, holding: float, reason: str) -> Move:
     """Push, brake and push again, so that the field arrives with the stretch."""
     if at_rest(request):
         return Move(Code.HOLD, (Level(0.0, holding),), 0.0)
     if request.delivery.period > 0.0:
-        found = fastest_on_grid(request, _bounds(request, holding, frequency))
+        found = fastest_on_grid(request, _bounds(request, holding))
         if found is not None:
             return Move(Code.MINIMUM_TIME, *found, reason)
         return three_levels(request, Code.MINIMUM_TIME, reason)
-    least, most = _bounds(request, holding, frequency)
+    least, most = _bounds(request, holding)
     work = kernels.work_space()
     for share in _SHARES:
         low, high = holding + share * (least - holding), holding + share * (most - holding)
@@ -125,16 +124,12 @@ def _on_grid(
     return None
 
 
-def _frequency(request: Request) -> float:
-    return float(law.natural_frequency(request.target, request.material.packed))
-
-
-def _bounds(request: Request, holding: float, frequency: float) -> tuple[float, float]:
+def _bounds(request: Request, holding: float) -> tuple[float, float]:
     """Return the loads to push and brake with: the limits, or twice the move's own change."""
     state = request.state
     change = abs(holding - law.elastic_force(state.stretch, request.material.packed))
     mass = law.mass(state.stretch, request.material.packed)
-    room = 2.0 * (change + mass * abs(state.rate) * frequency)
+    room = 2.0 * (change + mass * abs(state.rate) * request.frequency)
     least = max(request.limits.minimum, holding - room)
     most = min(request.limits.maximum, holding + room)
     if math.isfinite(request.limits.minimum):
@@ -195,7 +190,7 @@ def _durations(
             work, state.stretch, state.rate, -direction, push, 1.0, packed, _RTOL)
         if status == kernels.DONE:
             here = State(stretch, 0.0)
-    stride = 0.02 / (_frequency(request) + material.zeta)
+    stride = 0.02 / (request.frequency + material.zeta)
     low = 0.0
     high = stride
     ahead = follow(here, high)

@@ -74,6 +74,11 @@ class Request:
             return self.state.load
         return float(law.elastic_force(self.state.stretch, self.material.packed))
 
+    @property
+    def frequency(self) -> float:
+        """Undamped angular frequency of small motion about the target."""
+        return float(law.natural_frequency(self.target, self.material.packed))
+
     def keeps(self, levels: Sequence[Level]) -> bool:
         """Return whether levels are inside the load limits."""
         return all(self.limits.minimum <= x.load <= self.limits.maximum for x in levels)

@@ -245,7 +245,7 @@ def _settled(request: Request, times: Array, loads: Array, d_loads: Array) -> At
     """
     packed = request.material.packed
     state = replace(request.state, load=request.field)
-    frequency = law.natural_frequency(request.target, packed)
+    frequency = request.frequency
     stiffness = law.elastic_stiffness(request.target, packed)
     move = abs(request.target - state.stretch) + abs(state.rate) / frequency
     change = max(_CHANGE * float(np.ptp(loads)), _LEAST_CHANGE)

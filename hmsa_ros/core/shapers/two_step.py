@@ -2,18 +2,17 @@
 
 import contextlib
 from dataclasses import replace
-from itertools import product
+from itertools import product, starmap
 import math
 
 import numpy as np
 
-from hmsa_ros.core import law
 from hmsa_ros.core.moves import Level, Limits, Move
 from hmsa_ros.core.shapers.creeping import free_levels, two_levels
 from hmsa_ros.core.shapers.lagged import at_rest, settle, three_levels
 from hmsa_ros.core.shapers.minimum_time import minimum_time
 from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.core.shooting import approach, Attempt, solve, Template
+from hmsa_ros.core.shooting import approach, Attempt, first_kept, solve, Template
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.two_step import plan_two_step
 
@@ -223,19 +222,20 @@ def _ramped(request: Request, first: Level, last: Level) -> Move:
 def _searched(request: Request, holding: float) -> Attempt:
     """Solve for a level and its hold from many guesses, those that hold shortest first."""
     slew, start = request.delivery.slew, request.load
-    eighth = 0.25 * math.pi / law.natural_frequency(request.target, request.material.packed)
+    eighth = 0.25 * math.pi / request.frequency
     if abs(holding - start) > _MOST_HALF_PERIODS * 4.0 * eighth * slew:
         return None
     reach = 8.0 * eighth * slew
     low = max(request.limits.minimum, min(start, holding) - reach)
     high = min(request.limits.maximum, max(start, holding) + reach)
-    for hold, height in product(range(_LONGEST_HOLD), _HEIGHTS):
+
+    def guess(hold: int, height: float) -> Template:
         level = low + height * (high - low)
-        guess = (Level(0.0, level), Level(abs(level - start) / slew + hold * eighth, holding))
-        found = solve(Template.of(guess, [('load', 0), ('time', 1)]), request)
-        if found is not None and request.keeps(found[0]):
-            return found
-    return None
+        return Template.of(
+            (Level(0.0, level), Level(abs(level - start) / slew + hold * eighth, holding)),
+            [('load', 0), ('time', 1)])
+
+    return first_kept(starmap(guess, product(range(_LONGEST_HOLD), _HEIGHTS)), request)
 
 
 def _no_single(request: Request) -> str:
@@ -265,7 +265,7 @@ def _swings(request: Request, holding: float) -> Attempt:
     Bounded in its rate of change, the fastest load ramps without a pause and turns twice.
     """
     slew, start = request.delivery.slew, request.load
-    longest = 0.5 * math.pi / law.natural_frequency(request.target, request.material.packed)
+    longest = 0.5 * math.pi / request.frequency
     for share, rest, sign in product(_SWINGS, _SWINGS, (1.0, -1.0)):
         high = start + sign * slew * share * longest
         low = holding - sign * slew * rest * longest
