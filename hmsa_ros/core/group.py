@@ -49,7 +49,8 @@ class PlannerGroup:
     Several planners, each with a block, limits and a timeline of its own.
 
     Lead time and command period must be the same for all. Where they are to be ``simultaneous``,
-    which may change from request to request, joints that would arrive sooner begin later.
+    which may change from request to request, joints that would arrive sooner begin later, so that
+    all arrive together. ``number`` counts accepted requests from 1.
     """
 
     def __init__(

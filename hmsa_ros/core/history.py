@@ -16,7 +16,7 @@ _AS_PLANNED = 3e-8
 class Deviation:
     """How what took effect differs from what was planned."""
 
-    late: int = 0  #: ns by which a change came later than planned
+    late: int = 0  #: ns by which a change came later than planned; negative for earlier
     lost: int = 0  #: planned changes before it that never took effect
     foreign: bool = False  #: whether the level was not planned at all
 

@@ -11,7 +11,11 @@ from hmsa_ros.errors import BadInputError
 
 @dataclass(frozen=True)
 class Errors:
-    """By how much the actuator differs from the model: actual value = model's (1 + error)."""
+    """
+    By how much the actuator differs from the model: actual value = model's (1 + error).
+
+    Errors are above -1; that of the damping coefficient may be -1, for none.
+    """
 
     #: Of G, which scales the loads, the time unit and, for a given coefficient c, zeta.
     shear_modulus: float = 0.0

@@ -2,7 +2,11 @@
 
 
 class Pacer:
-    """Computes how far a simulation should have got, in ns; factor 0 is as fast as possible."""
+    """
+    Computes how far a simulation should have got, in ns.
+
+    ``factor`` is in simulated seconds per second, 0 for as fast as possible.
+    """
 
     def __init__(self, start: int, factor: float, *, paused: bool = False) -> None:
         """Begin at a time; it runs from the first call of `target` on."""

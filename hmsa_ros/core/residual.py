@@ -12,8 +12,8 @@ def residual_vibration(
     """
     Return the peak-to-peak stretch after arrival as a share, not percent, of the commanded step.
 
-    Samples from ``arrival`` to ``end`` count, in the unit of ``time``, which increases. Fewer than
-    two of them, or a step of zero, are an `HmsaError`.
+    Samples from ``arrival`` to ``end``, both included, count; ``time`` (n,) increases, in the unit
+    of both. Fewer than two of them, or a step of zero, are an `HmsaError`. 0 is rest.
     """
     time = np.asarray(time, dtype=np.float64)
     inside = (time >= arrival) & (time <= end)
