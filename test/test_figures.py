@@ -15,10 +15,14 @@ from scipy.integrate import quad, solve_ivp
 from hmsa_ros.cli import main
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.two_step import plan_two_step
+from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.figures import claims, paper_data
 from hmsa_ros.figures.paper import FIGURES, write_figure
-from hmsa_ros.figures.run import draw_run
+from hmsa_ros.report.evaluation import Evaluation, MoveResult
+from hmsa_ros.report.picture import draw_run
+from hmsa_ros.runs.levels import Level
+from hmsa_ros.runs.record import Run
 
 ROOT = Path(__file__).resolve().parent.parent
 # Coarse, so that drawing takes little time.
@@ -313,38 +317,30 @@ def test_a_file_that_cannot_be_written_is_refused_in_one_line(
     assert name in error
 
 
-def a_run() -> dict[str, Any]:
+@pytest.fixture
+def run() -> tuple[Run, Evaluation]:
+    """Return a run, made up, and its evaluation."""
     time = np.linspace(-0.005, 0.05, 60)
-    return {
-        'time': time, 'stretch': 1.0 + time, 'rate': np.ones(60),
-        'command_time': np.array([0.0, 0.006]), 'command': np.array([0.02, 0.034]),
-        'unshaped': (1.0 + 2.0 * time, 2.0 * np.ones(60)),
-        'targets': [(1.1, 0.0, 0.006, 0.05)]}
+    stamps = np.rint((time + 1.0) * NANOSECONDS).astype(np.int64)
+    nothing = np.full(60, np.nan)
+    return (
+        Run('a run', '', Path('bag'), stamps, stamps, 1.0 + time, np.ones(60), nothing),
+        Evaluation(
+            NANOSECONDS, time, 1.0,
+            (Level(NANOSECONDS, 0.02, 0), Level(NANOSECONDS + 6_000_000, 0.034, 0)), (),
+            (MoveResult(1.1, 0.5, 1.0, 0.6, 0.0, 0.006, 0.05, 0.0, 0.0, 0.5, True),),
+            (1.0 + 2.0 * time, 2.0 * np.ones(60)), (), (nothing, nothing)))
 
 
-def test_the_picture_of_a_run_is_written(tmp_path: Path) -> None:
-    path = tmp_path / 'run.png'
-    draw_run(path, **a_run(), title='a run')
-    check_picture(path)
+def test_the_picture_of_a_run_is_written(run: tuple[Run, Evaluation], tmp_path: Path) -> None:
+    draw_run(tmp_path / 'run.png', *run)
+    check_picture(tmp_path / 'run.png')
 
 
-@pytest.mark.parametrize('change', [
-    {'rate': np.ones(59)},
-    {'command': np.ones(3)},
-    {'unshaped': (np.ones(60), np.ones(2))},
-    {'time': np.array([]), 'stretch': np.array([]), 'rate': np.array([]),
-     'unshaped': (np.array([]), np.array([]))},
-])
-def test_a_run_whose_arrays_do_not_match_is_refused(
-        change: dict[str, Any], tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match='expected one-dimensional arrays of one length'):
-        draw_run(tmp_path / 'run.png', **{**a_run(), **change})
-    assert not (tmp_path / 'run.png').exists()
-
-
-def test_a_run_drawn_to_nowhere_is_refused(tmp_path: Path) -> None:
+def test_a_run_drawn_to_nowhere_is_refused(
+        run: tuple[Run, Evaluation], tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match='cannot write .*nowhere'):
-        draw_run(tmp_path / 'nowhere' / 'run.png', **a_run())
+        draw_run(tmp_path / 'nowhere' / 'run.png', *run)
 
 
 def test_the_comparison_with_the_paper_says_what_the_computation_says() -> None:

@@ -1,4 +1,4 @@
-"""A report as a picture for a paper: PNG, or PDF with lines instead of pixels."""
+"""Runs as pictures: PNG, or PDF with lines instead of pixels."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +21,8 @@ from hmsa_ros.report.charts import (
     TimeUnit,
     worst,
 )
+from hmsa_ros.report.evaluation import Evaluation
+from hmsa_ros.runs.record import Run
 
 # Panels of arrivals in a row.
 _PANELS = 3
@@ -63,6 +65,45 @@ def draw(path: Path, parts: Sequence[Part], kind: str) -> None:
             panel.set_title(_title(parts, i), loc='right', fontsize=8)
         figure.align_ylabels([axes['command'], axes['response']])
         style.legend_below(figure, axes['response'], axes['phase'], most=4)
+
+
+def draw_run(path: Path, run: Run, found: Evaluation) -> None:
+    """Draw a run with commands as PNG: command, response and phase plane, as Figs. 4 and 5."""
+    time = found.time * 1e3
+    begin, end = float(time[0]), float(time[-1])
+    with style.picture(path, 3.9) as figure:
+        # A row of its own for the one legend, so that it covers nothing.
+        panels = figure.subplot_mosaic(
+            [['command', 'phase'], ['response', 'phase']], width_ratios=[1.45, 1.0],
+            height_ratios=[1.0, 1.45])
+        command, response, phase = (panels[x] for x in ('command', 'response', 'phase'))
+        # Drawn to the end of the record: the last level holds.
+        stamps = [found.seconds(x.stamp) * 1e3 for x in found.levels]
+        levels = [x.flux_density * 1e3 for x in found.levels]
+        command.step(
+            [*stamps, max(end, stamps[-1])], [*levels, levels[-1]], where='post', **style.SHAPED)
+        for i, x in enumerate(found.results):
+            response.plot(
+                [x.begin * 1e3, min(x.end * 1e3, end)], [x.stretch, x.stretch], **style.TARGET,
+                label='target, arrival' if i == 0 else None)
+            for axes in (command, response):
+                axes.axvline(x.arrival * 1e3, **style.TARGET)
+        command.axhline(0.0, color=style.GREY, linewidth=0.6, zorder=1)
+        response.plot(time, found.unshaped[0], label='unshaped', **style.UNSHAPED)
+        response.plot(time, run.stretch, label='shaped (recorded)', **style.SHAPED)
+        for axes in (command, response):
+            axes.set_xlim(begin, end)
+        phase.plot(*found.unshaped, **style.UNSHAPED)
+        phase.plot(run.stretch, run.rate, **style.SHAPED)
+        phase.plot(
+            [x.stretch for x in found.results], [0.0] * len(found.results), label='equilibrium',
+            **style.EQUILIBRIUM)
+        style.finish(command, '', 'flux density $B$ [mT]', 'a')
+        command.tick_params(labelbottom=False)
+        style.finish(response, 'time $t$ [ms]', r'stretch $\lambda$ [1]', 'b')
+        style.finish(phase, r'stretch $\lambda$ [1]', r'stretch rate $\dot{\lambda}$ [1/s]', 'c')
+        figure.align_ylabels([command, response])
+        style.legend_below(figure, response, phase)
 
 
 def _styled(kind: dict[str, Any], colour: str) -> dict[str, Any]:

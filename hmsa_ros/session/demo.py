@@ -10,8 +10,6 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import numpy as np
-
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.report.evaluation import evaluate, MoveResult
@@ -82,7 +80,7 @@ def run_demo(
 
 def _evaluate(bag: Path, picture: Path) -> tuple[SetpointResult, ...]:
     """Read the run back from the bag, measure it and draw it."""
-    from hmsa_ros.figures.run import draw_run
+    from hmsa_ros.report.picture import draw_run
 
     run, = read_runs(bag)
     levels = without_repeats(run.commands)[0]
@@ -93,9 +91,5 @@ def _evaluate(bag: Path, picture: Path) -> tuple[SetpointResult, ...]:
     results = tuple(
         SetpointResult(**asdict(x), reached=max(x.error, x.residual) <= LARGEST_RESIDUAL)
         for x in evaluation.results)
-    draw_run(
-        picture, time=evaluation.time, stretch=run.stretch, rate=run.rate,
-        command_time=np.array([evaluation.seconds(x.stamp) for x in levels]),
-        command=np.array([x.flux_density for x in levels]), unshaped=evaluation.unshaped,
-        targets=[(x.stretch, x.begin, x.arrival, x.end) for x in results])
+    draw_run(picture, run, evaluation)
     return results
