@@ -273,13 +273,12 @@ def phase(parts: Sequence[Part]) -> tuple[Figure, float]:
             x, y, share = _orbit(stretch, rate)
             shown = min(shown, share)
             data.append(_curve(part, kind, x, y))
-        places = sorted({x.stretch for x in found.results})
-        data.append(_curve(
-            part, 'equilibrium', places, [0.0] * len(places), mode='markers',
-            marker={'symbol': 'circle', 'size': 8, 'color': part.colour or BLACK}))
-        data.append(_curve(
-            part, 'equilibrium', [found.start], [0.0], mode='markers',
-            marker={'symbol': 'circle-open', 'size': 9, 'color': part.colour or BLACK}))
+        for symbol, size, places in (
+                ('circle', 8, sorted({x.stretch for x in found.results})),
+                ('circle-open', 9, [found.start])):
+            data.append(_curve(
+                part, 'equilibrium', places, [0.0] * len(places), mode='markers',
+                marker={'symbol': symbol, 'size': size, 'color': part.colour or BLACK}))
     what = parts[0].run.plant.coordinate
     name, symbol = what.name, what.symbol
     return Figure(
@@ -392,9 +391,8 @@ def arrival(parts: Sequence[Part], number: int) -> Figure:
                     time, 100.0 * (stretch[inside] - result.stretch) / abs(step),
                     _PANEL_BUCKETS)))
     height = reach(parts, number)
-    title = _panel_title(parts, number)
     return Figure(
-        f'arrival{number}', f'Setpoint {title}', 300, _grouped(data), {
+        f'arrival{number}', f'Setpoint {_panel_title(parts, number)}', 300, _grouped(data), {
             # There is no room in every panel for the names of several runs.
             'showlegend': len(parts) == 1,
             'xaxis': _axis(f'time after arrival [{unit.name}]', range=numbers(view)),
