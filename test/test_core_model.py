@@ -153,12 +153,11 @@ def test_the_kernel_integrates_the_same_acceleration(states):
     for stretch, rate, load in zip(*(x[:40] for x in states), strict=True):
         ends = [
             kernels.step(
-                work, stretch, rate, 0.0, 0.0, load, 0.0, 0.0, 0.0, sign * h, material.packed,
-                1e-12)[1] for sign in (1.0, -1.0)]
+                work, stretch, rate, 0.0, 0.0, load, sign * h, material.packed, 1e-12)[1]
+            for sign in (1.0, -1.0)]
         half = [
             kernels.step(
-                work, stretch, rate, 0.0, 0.0, load, 0.0, 0.0, 0.0, sign * h / 2,
-                material.packed, 1e-12)[1]
+                work, stretch, rate, 0.0, 0.0, load, sign * h / 2, material.packed, 1e-12)[1]
             for sign in (1.0, -1.0)]
         slope = (8.0 * (half[0] - half[1]) - (ends[0] - ends[1])) / (6.0 * h)
         expected = float(model.acceleration(stretch, rate, load, material))

@@ -57,5 +57,5 @@ def test_after_the_warm_up_no_kernel_is_compiled_for_another_type_of_argument():
     done = subprocess.run(
         [sys.executable, '-c', PROGRAM], capture_output=True, text=True, check=True)
     before, after = json.loads(done.stdout)
-    assert before['two_step'] == before['advance'] == before['trajectory'] == 1
+    assert before['two_step'] == before['follow_one'] == before['trajectory'] == 1
     assert after == before

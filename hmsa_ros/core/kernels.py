@@ -6,8 +6,8 @@ All quantities are nondimensional: stretch ``l``, stretch rate ``v``, time in un
 `hmsa_ros.core.law`. Callers are the typed functions of `hmsa_ros.core`; nothing here checks its
 arguments.
 
-DOP853 integrates the equation together with its derivative with respect to one parameter of the
-load (the variational equations), so that a turning point and its derivative come out of one
+DOP853 integrates the equation, where it is asked for together with its derivative with respect to
+the load (the variational equations), so that a turning point and its derivative come out of one
 pass. ``s`` and ``r`` are the derivatives of stretch and rate.
 """
 
@@ -46,14 +46,10 @@ def work_space() -> NDArray[np.float64]:
 
 
 @compiled(inline=True)
-def _derivative(l, v, s, r, beta, p, material, family):  # noqa: E741
-    """
-    Right-hand side of Eq. 11 and of its variational equation.
-
-    ``p`` is the derivative of the load with respect to the parameter.
-    """
+def _derivative(l, v, s, r, beta, material, family):  # noqa: E741
+    """Right-hand side of Eq. 11 and of its variational equation."""
     a, a_l, a_v, a_beta = motion(l, v, beta, material, family)
-    return v, a, r, a_l * s + a_v * r + a_beta * p
+    return v, a, r, a_l * s + a_v * r + a_beta
 
 
 @compiled(inline=True)
@@ -70,50 +66,49 @@ def error_of(h, new_l, new_v, e5_l, e5_v, e3_l, e3_v, rtol):
 
 
 @compiled()
-def step(k, l, v, s, r, beta, slope, p, q, h, material, rtol):  # noqa: E741
+def step(k, l, v, s, r, beta, h, material, rtol):  # noqa: E741
     """
-    One DOP853 step of length ``h``; ``k`` (12, 4) is working space.
+    One DOP853 step of length ``h`` under a constant load; ``k`` (12, 4) is working space.
 
-    The load is ``beta + slope t`` and its parameter derivative ``p + q t`` from the start of
-    the step. Returns the new state and the error in units of the tolerance.
+    Returns the new state and the error in units of the tolerance.
     """
     if material[KIND] <= NEO_HOOKEAN:
-        return _step(k, l, v, s, r, beta, slope, p, q, h, material, rtol, GENT)
+        return _step(k, l, v, s, r, beta, h, material, rtol, GENT)
     if material[KIND] == POLYNOMIAL:
-        return _polynomial_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol)
+        return _polynomial_step(k, l, v, s, r, beta, h, material, rtol)
     if material[KIND] == OGDEN:
-        return _ogden_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol)
+        return _ogden_step(k, l, v, s, r, beta, h, material, rtol)
     if material[KIND] == BEAM:
-        return _beam_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol)
-    return _table_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol)
+        return _beam_step(k, l, v, s, r, beta, h, material, rtol)
+    return _table_step(k, l, v, s, r, beta, h, material, rtol)
 
 
 @compiled()
-def _polynomial_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol):  # noqa: E741
+def _polynomial_step(k, l, v, s, r, beta, h, material, rtol):  # noqa: E741
     """Make a step, compiled by itself to keep the one for Gent short."""
-    return _step(k, l, v, s, r, beta, slope, p, q, h, material, rtol, POLYNOMIAL)
+    return _step(k, l, v, s, r, beta, h, material, rtol, POLYNOMIAL)
 
 
 @compiled()
-def _ogden_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol):  # noqa: E741
+def _ogden_step(k, l, v, s, r, beta, h, material, rtol):  # noqa: E741
     """Make a step, compiled by itself to keep the one for Gent short."""
-    return _step(k, l, v, s, r, beta, slope, p, q, h, material, rtol, OGDEN)
+    return _step(k, l, v, s, r, beta, h, material, rtol, OGDEN)
 
 
 @compiled()
-def _table_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol):  # noqa: E741
+def _table_step(k, l, v, s, r, beta, h, material, rtol):  # noqa: E741
     """Make a step, compiled by itself to keep the one for Gent short."""
-    return _step(k, l, v, s, r, beta, slope, p, q, h, material, rtol, TABLE)
+    return _step(k, l, v, s, r, beta, h, material, rtol, TABLE)
 
 
 @compiled()
-def _beam_step(k, l, v, s, r, beta, slope, p, q, h, material, rtol):  # noqa: E741
+def _beam_step(k, l, v, s, r, beta, h, material, rtol):  # noqa: E741
     """Make a step, compiled by itself to keep the one for Gent short."""
-    return _step(k, l, v, s, r, beta, slope, p, q, h, material, rtol, BEAM)
+    return _step(k, l, v, s, r, beta, h, material, rtol, BEAM)
 
 
 @compiled(inline=True)
-def _step(k, l, v, s, r, beta, slope, p, q, h, material, rtol, family):  # noqa: E741
+def _step(k, l, v, s, r, beta, h, material, rtol, family):  # noqa: E741
     """Make a step, compiled for a family of laws."""
     for i in range(STAGES):
         d0 = d1 = d2 = d3 = 0.0
@@ -123,10 +118,8 @@ def _step(k, l, v, s, r, beta, slope, p, q, h, material, rtol, family):  # noqa:
             d1 += w * k[j, 1]
             d2 += w * k[j, 2]
             d3 += w * k[j, 3]
-        t = h * NODES[i]
         k[i, 0], k[i, 1], k[i, 2], k[i, 3] = _derivative(
-            l + h * d0, v + h * d1, s + h * d2, r + h * d3,
-            beta + slope * t, p + q * t, material, family)
+            l + h * d0, v + h * d1, s + h * d2, r + h * d3, beta, material, family)
     d0 = d1 = d2 = d3 = 0.0
     e5_l = e5_v = e3_l = e3_v = 0.0
     for j in range(STAGES):
@@ -173,41 +166,6 @@ def resize(h, error):
 
 
 @compiled()
-def advance(k, l, v, s, r, beta, slope, p, q, duration, material, rtol, h):  # noqa: E741
-    """
-    Integrate over a duration under the load ``beta + slope t``.
-
-    ``h`` is the step length to begin with, 0 for none known. Motion that meets a limiting
-    stretch too hard to be resolved turns there, in no time and without loss. Returns status,
-    state, sensitivities and the step length to go on with.
-    """
-    if h <= 0.0:
-        h = first_step(l, v, beta, material, rtol)
-    done = 0.0
-    for _ in range(MAX_STEPS):
-        left = duration - done
-        if not left > 0.0:
-            return DONE, l, v, s, r, h
-        span = min(h, left)
-        rate = natural_frequency(l, material)
-        if attainable(0.0, l, v, rate) > RESOLVED and v * (l - at_rest(material)) > 0.0:
-            v, s, r = -v, -s, -r
-        new_l, new_v, new_s, new_r, error = step(
-            k, l, v, s, r, beta + slope * done, slope, p + q * done, q, span, material,
-            attainable(rtol, l, v, rate))
-        if error <= 1.0:
-            l, v, s, r = new_l, new_v, new_s, new_r  # noqa: E741
-            if abs(v) < _NOTHING:
-                v = 0.0
-            done = duration if span == left else done + span
-            if span == h or error > 0.5:
-                h = resize(span, error)
-        else:
-            h = resize(span, error)
-    return STUCK, l, v, s, r, h
-
-
-@compiled()
 def turning_point(k, l, v, direction, beta, move, material, rtol):  # noqa: E741
     """
     Follow a constant load to the first turning point that is reached in a direction.
@@ -227,8 +185,7 @@ def turning_point(k, l, v, direction, beta, move, material, rtol):  # noqa: E741
     rate = natural_frequency(l, material)
     for _ in range(_MAX_TURN_STEPS):
         new_l, new_v, new_s, new_r, error = step(
-            k, l, v, s, r, beta, 0.0, 1.0, 0.0, h, material,
-            attainable(rtol, l, v, rate))
+            k, l, v, s, r, beta, h, material, attainable(rtol, l, v, rate))
         if not error <= 1.0:
             h = resize(h, error)
             continue
@@ -249,6 +206,19 @@ def turning_point(k, l, v, direction, beta, move, material, rtol):  # noqa: E741
     return STUCK, t, l, s, 0.0
 
 
+@compiled(inline=True)
+def turn_of(h, v, end_v, a, direction):
+    """Return about when the rate turns in a step of length ``h``, from both rates and a slope."""
+    # The secant; where the start decelerates, the parabola through both rates and that slope.
+    dt = h * v / (v - end_v)
+    if direction * a < 0.0:
+        c = (end_v - v - a * h) / (h * h)
+        root = a * a - 4.0 * c * v
+        if root > 0.0:
+            dt = 2.0 * v / (-a + direction * math.sqrt(root))
+    return dt
+
+
 @compiled()
 def _land(k, l, v, s, r, t, direction, beta, h, end_v, material, rtol):  # noqa: E741
     """
@@ -257,23 +227,15 @@ def _land(k, l, v, s, r, t, direction, beta, h, end_v, material, rtol):  # noqa:
     Newton on the time, kept inside the step: each pass is a DOP853 step of its own from the
     same start. The last correction, far below rounding, is taken from the Taylor series.
     """
-    a = k[0, 1]
-    # The secant; where the start decelerates, the parabola through both rates and that slope.
-    dt = h * v / (v - end_v)
-    if direction * a < 0.0:
-        c = (end_v - v - a * h) / (h * h)
-        root = a * a - 4.0 * c * v
-        if root > 0.0:
-            dt = 2.0 * v / (-a + direction * math.sqrt(root))
+    dt = turn_of(h, v, end_v, k[0, 1], direction)
     before = 0.0
     after = h
     size = max(abs(v), abs(end_v))
     for _ in range(60):
         if not before < dt < after:
             dt = 0.5 * (before + after)
-        new_l, new_v, new_s, new_r, _ = step(
-            k, l, v, s, r, beta, 0.0, 1.0, 0.0, dt, material, rtol)
-        _, a, _, _ = _derivative(new_l, new_v, new_s, new_r, beta, 1.0, material, ANY)
+        new_l, new_v, new_s, new_r, _ = step(k, l, v, s, r, beta, dt, material, rtol)
+        _, a, _, _ = _derivative(new_l, new_v, new_s, new_r, beta, material, ANY)
         if abs(new_v) <= 1e-6 * size and direction * a < 0.0:
             break
         if direction * new_v > 0.0:
@@ -285,49 +247,12 @@ def _land(k, l, v, s, r, t, direction, beta, h, end_v, material, rtol):  # noqa:
     left = -new_v / a
     new_l += 0.5 * new_v * left
     new_s += new_r * left
-    _, a, _, slope = _derivative(new_l, 0.0, new_s, new_r, beta, 1.0, material, ANY)
+    _, a, _, slope = _derivative(new_l, 0.0, new_s, new_r, beta, material, ANY)
     new_r += slope * left
     return DONE, t + dt + left, new_l, new_s, -new_r / a
 
 
-@compiled()
-def trajectory(
-        l, v, switches, betas, slopes, times, material, rtol, stretch,  # noqa: E741
-        rates):
-    """
-    Sample the response to a piecewise linear load at increasing times.
-
-    The load is ``betas[m] + slopes[m] (t - switches[m])`` from ``switches[m]`` on; the motion
-    begins at ``switches[0]``, which is not later than ``times[0]``. ``stretch`` and ``rates``
-    (n,) take the samples. Returns the status of the integration.
-    """
-    k = np.empty((STAGES, 4))
-    t = switches[0]
-    piece = 0
-    h = 0.0
-    for i in range(times.size):
-        while True:
-            end = times[i]
-            if piece + 1 < switches.size and switches[piece + 1] <= end:
-                end = switches[piece + 1]
-            status, l, v, _, _, h = advance(  # noqa: E741
-                k, l, v, 0.0, 0.0,
-                betas[piece] + slopes[piece] * (t - switches[piece]), slopes[piece],
-                0.0, 0.0, end - t, material, rtol, h)
-            if status != DONE:
-                return status
-            t = end
-            if piece + 1 < switches.size and switches[piece + 1] <= times[i]:
-                piece += 1
-                h = 0.0
-            else:
-                break
-        stretch[i] = l
-        rates[i] = v
-    return DONE
-
-
-# -- the plant ----------------------------------------------------------------------------------
+# -- without sensitivities -----------------------------------------------------------------------
 
 
 @compiled()
@@ -381,7 +306,13 @@ def _bare_step(k, l, v, beta, slope, excess, decay, h, material, rtol, family): 
 
 @compiled()
 def follow_one(k, l, v, h, beta, slope, excess, decay, duration, material, rtol):  # noqa: E741
-    """Integrate one actuator as `advance` does; returns status, state and step length."""
+    """
+    Integrate over a duration under the load that `_plain_step` takes.
+
+    ``h`` is the step length to begin with, 0 for none known. Motion that meets a limiting
+    stretch too hard to be resolved turns there, in no time and without loss. Returns status,
+    state and the step length to go on with.
+    """
     if h <= 0.0:
         h = first_step(l, v, beta + excess, material, rtol)
     done = 0.0
@@ -401,12 +332,50 @@ def follow_one(k, l, v, h, beta, slope, excess, decay, duration, material, rtol)
             attainable(rtol, l, v, rate))
         if error <= 1.0:
             l, v = new_l, new_v  # noqa: E741
+            if abs(v) < _NOTHING:
+                v = 0.0
             done = duration if span == left else done + span
             if span == h or error > 0.5:
                 h = resize(span, error)
         else:
             h = resize(span, error)
     return STUCK, l, v, h
+
+
+@compiled()
+def trajectory(
+        l, v, switches, betas, slopes, times, material, rtol, stretch,  # noqa: E741
+        rates):
+    """
+    Sample the response to a piecewise linear load at increasing times.
+
+    The load is ``betas[m] + slopes[m] (t - switches[m])`` from ``switches[m]`` on; the motion
+    begins at ``switches[0]``, which is not later than ``times[0]``. ``stretch`` and ``rates``
+    (n,) take the samples. Returns the status of the integration.
+    """
+    k = np.empty((STAGES, 4))
+    t = switches[0]
+    piece = 0
+    h = 0.0
+    for i in range(times.size):
+        while True:
+            end = times[i]
+            if piece + 1 < switches.size and switches[piece + 1] <= end:
+                end = switches[piece + 1]
+            status, l, v, h = follow_one(  # noqa: E741
+                k, l, v, h, betas[piece] + slopes[piece] * (t - switches[piece]), slopes[piece],
+                0.0, 0.0, end - t, material, rtol)
+            if status != DONE:
+                return status
+            t = end
+            if piece + 1 < switches.size and switches[piece + 1] <= times[i]:
+                piece += 1
+                h = 0.0
+            else:
+                break
+        stretch[i] = l
+        rates[i] = v
+    return DONE
 
 
 @compiled()

@@ -16,6 +16,7 @@ Nothing here checks its arguments. Where there is no energy the results are NaN.
 and `UPPER` the force rises, so that each stretch can be held.
 """
 
+from collections.abc import Callable
 from functools import lru_cache
 import math
 from typing import Any
@@ -103,7 +104,7 @@ def held(elastic: Elastic) -> tuple[float, float]:
     """Return the stretches around that at rest between which the force of a law rises."""
     material = np.array([elastic.family, 0.0, 1.0, 0.0, *elastic.limits, *elastic.constants])
 
-    def boundary(end: float) -> float:
+    def rising(end: float) -> float:
         space = np.geomspace if elastic.rest else np.linspace
         path: Array = space(elastic.rest, end, _LOOK).astype(np.float64)
         path[-1] = end
@@ -112,17 +113,24 @@ def held(elastic: Elastic) -> tuple[float, float]:
         falls = np.flatnonzero(~(stiffness > 0.0))
         if not len(falls):
             return end
-        outside = float(path[falls[0]])
-        inside = float(path[max(falls[0] - 1, 0)])
-        for _ in range(_HALVINGS):
-            middle = 0.5 * (inside + outside)
-            if elastic_stiffness(middle, material) > 0.0:
-                inside = middle
-            else:
-                outside = middle
-        return inside
+        return boundary(
+            lambda x: elastic_stiffness(x, material) > 0.0,
+            float(path[max(falls[0] - 1, 0)]), float(path[falls[0]]))
 
-    return boundary(elastic.limits[0]), boundary(elastic.limits[1])
+    return rising(elastic.limits[0]), rising(elastic.limits[1])
+
+
+def boundary(holds: Callable[[float], bool], inside: float, outside: float) -> float:
+    """Return the last place on the way to ``outside`` at which a condition holds."""
+    if holds(outside):
+        return outside
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (inside + outside)
+        if holds(middle):
+            inside = middle
+        else:
+            outside = middle
+    return inside
 
 
 def stack(materials: Any) -> Array:

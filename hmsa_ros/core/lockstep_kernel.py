@@ -16,6 +16,7 @@ import numpy as np
 
 from hmsa_ros.core.compiling import compiled
 from hmsa_ros.core.dop853 import ERROR_3, ERROR_5, MATRIX, STAGES, WEIGHTS
+from hmsa_ros.core.kernels import turn_of
 from hmsa_ros.core.law import (
     at_rest,
     C1,
@@ -341,14 +342,7 @@ def _decide(w, x, i):
         if not (w[_STEPS * LANES + i] <= _MAX_STEPS and direction * v > 0.0
                 and direction * new_v <= 0.0):
             return _GIVEN_UP, 0.0, 0.0, 0.0
-        # The secant; where the start decelerates, the parabola through both rates and that slope.
-        a = w[_A * LANES + i]
-        dt = h * v / (v - new_v)
-        if direction * a < 0.0:
-            c = (new_v - v - a * h) / (h * h)
-            root = a * a - 4.0 * c * v
-            if root > 0.0:
-                dt = 2.0 * v / (-a + direction * math.sqrt(root))
+        dt = turn_of(h, v, new_v, w[_A * LANES + i], direction)
         x[i, _BEFORE], x[i, _AFTER] = 0.0, h
         x[i, _SIZE] = max(abs(v), abs(new_v))
         w[_INSIDE * LANES + i], w[_STEPS * LANES + i] = 1.0, 0.0

@@ -152,7 +152,7 @@ def _advance(
         k, h, beta, slope, excess, decay, d_line, d_rest, duration, material, branches, count,
         parameters, rtol):
     """
-    Integrate the state in ``k`` over a duration, as `hmsa_ros.core.kernels.advance` does.
+    Integrate the state in ``k`` over a duration, as `hmsa_ros.core.kernels.follow_one` does.
 
     Returns the status and the step length to go on with.
     """
@@ -258,9 +258,10 @@ def trajectory_late(
     """
     Sample the response to a piecewise linear amplifier at increasing times.
 
-    Arguments are those of `hmsa_ros.core.kernels.trajectory`, and the field and ``branches``
-    (n, 3) at the start, which go on with the state. ``out`` (3 + n, m) takes stretch, rate, field
-    and what the branches follow. Returns the status of the integration.
+    Its level is ``loads[m] + slopes[m] (t - switches[m])`` from ``switches[m]`` on; the motion
+    begins at ``switches[0]``, which is not later than ``times[0]``. The field and ``branches``
+    (n, 3) are at the start, and go on with the state. ``out`` (3 + n, m) takes stretch, rate,
+    field and what the branches follow. Returns the status of the integration.
     """
     count = branches.shape[0]
     k = np.empty((STAGES + 2, 2 + count))

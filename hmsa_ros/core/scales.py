@@ -1,11 +1,11 @@
 """What follows from an actuator's parameters: times, damping, flux densities and reach."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 import math
 
 import numpy as np
 
+from hmsa_ros.core.law import boundary
 from hmsa_ros.core.model import (
     critical_zeta,
     elastic_force,
@@ -23,9 +23,8 @@ STRETCHES = (0.6, 0.8, 0.9, 1.05, 1.1, 1.2, 1.4, 2.0)
 DEFLECTIONS = (0.05, 0.1, 0.2, 0.4, 0.6, 0.7, 0.78)
 #: Move from rest whose duration is given, where the coil allows it.
 USUAL_MOVE = 0.1
-# Search for the reach: points of the first look on either side, and halvings after it.
+# Points of the first look for the reach on either side.
 _LOOK = 400
-_HALVINGS = 50
 
 
 @dataclass(frozen=True)
@@ -98,7 +97,7 @@ def scales(actuator: ActuatorParameters, coil: Coil) -> Scales:
             return home
         last = int(found[-1])
         beyond = targets[last + 1] if last + 1 < len(targets) else end
-        return _boundary(
+        return boundary(
             lambda x: math.isfinite(duration(x)), float(targets[last]), float(beyond))
 
     reached = tuple(reach(x) if abs(x - home) > 1e-12 else home for x in held)
@@ -128,16 +127,3 @@ def _shown(least: float, largest: float, home: float) -> tuple[float, ...]:
     return usual or tuple(
         home + share * (end - home) for end, share in (
             (least, 1.0), (least, 0.5), (largest, 0.5), (largest, 1.0)) if end != home)
-
-
-def _boundary(holds: Callable[[float], bool], inside: float, outside: float) -> float:
-    """Return the last place on the way to ``outside`` at which a condition holds."""
-    if holds(outside):
-        return outside
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (inside + outside)
-        if holds(middle):
-            inside = middle
-        else:
-            outside = middle
-    return inside

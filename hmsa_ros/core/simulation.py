@@ -173,9 +173,8 @@ def _endpoint(
     work = kernels.work_space()
     for i, (begin, load, slope) in enumerate(pieces):
         until = pieces[i + 1][0] if i + 1 < len(pieces) else end
-        status, stretch, rate, *_ = kernels.advance(
-            work, stretch, rate, 0.0, 0.0, load, slope, 0.0, 0.0, until - begin,
-            material.packed, RTOL, 0.0)
+        status, stretch, rate, _ = kernels.follow_one(
+            work, stretch, rate, 0.0, load, slope, 0.0, 0.0, until - begin, material.packed, RTOL)
         if status != kernels.DONE:
             raise HmsaError(_STUCK)
     return stretch, rate

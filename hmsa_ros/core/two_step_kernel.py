@@ -78,8 +78,7 @@ def crosses(k, l, v, target, material, rtol):  # noqa: E741
             return (v - fast * x) * x < 0.0
         if h <= 0.0:
             h = first_step(l, v, beta, material, rtol)
-        new_l, new_v, _, _, error = step(
-            k, l, v, 0.0, 0.0, beta, 0.0, 0.0, 0.0, h, material, rtol)
+        new_l, new_v, _, _, error = step(k, l, v, 0.0, 0.0, beta, h, material, rtol)
         if error <= 1.0:
             l, v = new_l, new_v  # noqa: E741
         h = resize(h, error)

@@ -21,6 +21,7 @@ import numpy as np
 from hmsa_ros.core import law
 from hmsa_ros.core.compiling import compiled
 from hmsa_ros.core.dop853 import ERROR_3, ERROR_5, MATRIX, NODES, STAGES, WEIGHTS
+from hmsa_ros.core.kernels import resize
 from hmsa_ros.core.law import (
     acceleration_slopes,
     at_rest,
@@ -264,8 +265,7 @@ def _follow(
             k, y, new, n, count, t - begins[piece], step, drive, theta, unit, material,
             wanted, slots, partial, slopes, rtol, fastest)
         if not error <= 1.0:
-            h = 0.2 * step if not error < math.inf else step * max(
-                0.2, 0.9 * error ** -0.125)
+            h = resize(step, error)
             if not h > 1e-12 / fastest:
                 return False
             continue
@@ -288,7 +288,7 @@ def _follow(
             k[0, c] = k[STAGES, c]
         t = after
         if step == h or error > 0.5:
-            h = step * min(6.0, max(0.2, 0.9 * max(error, 1e-12) ** -0.125))
+            h = resize(step, error)
         while piece + 1 < begins.size and begins[piece + 1] <= t:
             before, before_lag = _field(
                 begins[piece + 1] - begins[piece], drive[0], drive[1], drive[2], drive[3], lag)

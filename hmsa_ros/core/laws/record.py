@@ -25,68 +25,30 @@ ENDLESS = (1e-3, 1e3)
 
 @dataclass(frozen=True)
 class Constant:
-    """
-    One constant of a law.
+    """One constant of a law."""
 
-    Attributes
-    ----------
-    name : str
-        Of the parameter, as in ``'law.c10'``.
-    symbol : str
-        What it is in the energy.
-    unit : str
-        ``'Pa'`` for what scales with the shear modulus, ``'T'`` for what scales with the flux
-        density of load 1; empty for a number or a file.
-    kind : type
-        ``float``, ``list`` or ``str``.
-    minimum, maximum : float
-        Closed range of the number, or of each in a list.
-    fixed : bool
-        Whether it is read once, when a node starts.
-
-    """
-
-    name: str
-    symbol: str
+    name: str  #: of the parameter, as in ``'law.c10'``
+    symbol: str  #: what it is in the energy
+    #: Pa scales with the shear modulus, T with the flux density of load 1; empty for others.
     unit: str = 'Pa'
-    kind: type = float
-    minimum: float = -1e12
+    kind: type = float  #: float, list or str
+    minimum: float = -1e12  #: of the number, or of each in a list; closed range
     maximum: float = 1e12
-    fixed: bool = False
+    fixed: bool = False  #: whether it is read once, when a node starts
 
 
 @dataclass(frozen=True)
 class Elastic:
-    """
-    An elastic energy in units of its shear modulus at small strain.
+    """An elastic energy in units of its shear modulus at small strain."""
 
-    Attributes
-    ----------
-    law : str
-        Name of the law.
-    family : float
-        Which of the kernels has it.
-    constants : tuple of float
-        Those of the family.
-    given : tuple of (str, object)
-        Parameters that gave it, those in Pa and in T in units of the block.
-    limits : tuple of float
-        Stretches beyond which nothing is known; those that can be held are in
-        `hmsa_ros.core.model.stretch_limits`.
-    shape : float, optional
-        c1 in place of that of a block.
-    section : float
-        Width times thickness of a beam over its length squared; 0 for a block.
-
-    """
-
-    law: str
-    family: float
-    constants: tuple[float, ...]
+    law: str  #: name
+    family: float  #: which of the kernels has it
+    constants: tuple[float, ...]  #: those of the family
+    #: Parameters that gave it, those in Pa and in T in units of the block.
     given: tuple[tuple[str, Any], ...]
-    limits: tuple[float, float] = ENDLESS
-    shape: float | None = None
-    section: float = 0.0
+    limits: tuple[float, float] = ENDLESS  #: beyond which nothing is known
+    shape: float | None = None  #: c1 in place of that of a block
+    section: float = 0.0  #: width times thickness of a beam over its length squared; 0 for a block
 
     @property
     def rest(self) -> float:
@@ -101,64 +63,25 @@ class Elastic:
 
 @dataclass(frozen=True)
 class Law:
-    """
-    A law that may be chosen.
+    """A law that may be chosen."""
 
-    Attributes
-    ----------
-    name : str
-        Value of the parameter ``law``.
-    energy : str
-        W per reference volume.
-    source : str
-        Where it was published.
-    constants : tuple of Constant
-        What it takes besides those of the actuator.
-    scaled : callable, optional
-        From the values of the constants, and of the actuator, to the shear modulus at small
-        strain and what is left of the law in units of it. None for Gent and its limit, which
-        shear modulus and chain limit describe.
-    endless : bool
-        Whether the chain limit is infinite, whatever the parameter says.
-    completed : callable, optional
-        From the values of the constants to those that are in a file which they name.
-
-    """
-
-    name: str
-    energy: str
-    source: str
-    constants: tuple[Constant, ...] = ()
+    name: str  #: value of the parameter ``law``
+    energy: str  #: W per reference volume
+    source: str  #: where it was published
+    constants: tuple[Constant, ...] = ()  #: besides those of the actuator
+    #: From the values of the constants, and of the actuator, to the shear modulus at small strain
+    #: and what is left of the law in units of it; none for Gent and its limit.
     scaled: Callable[[Mapping[str, Any]], tuple[float, Elastic]] | None = None
-    endless: bool = False
+    endless: bool = False  #: whether the chain limit is infinite, whatever the parameter says
+    #: From the values of the constants to those that are in a file which they name.
     completed: Callable[[Mapping[str, Any]], dict[str, Any]] | None = None
 
 
 def positive_modulus(law: str, modulus: float, words: str, values: Sequence[Any]) -> float:
     """
-    Return a shear modulus at small strain, checked.
+    Return a shear modulus at small strain in Pa, which follows from constants as the words say.
 
-    Parameters
-    ----------
-    law : str
-        Name of the law.
-    modulus : float
-        In Pa.
-    words : str
-        How it follows from the constants.
-    values : sequence
-        The constants.
-
-    Returns
-    -------
-    float
-        The same.
-
-    Raises
-    ------
-    BadInputError
-        If it is not positive: at rest such a block would not be stable.
-
+    If it is not positive, at rest such a block would not be stable: `BadInputError`.
     """
     if not 1e-3 <= modulus <= 1e12:
         raise BadInputError(
@@ -171,26 +94,10 @@ def polynomial(
         law: Law, values: Mapping[str, Any], modulus: float, powers: Sequence[float],
         second: float = 0.0) -> Elastic:
     """
-    Return a law that is a polynomial of I1 - 3, and linear in I2 - 3.
+    Return a law that is a polynomial of I1 - 3, and linear in I2 - 3, in units of the modulus.
 
-    Parameters
-    ----------
-    law : Law
-        Which.
-    values : mapping of str to object
-        Of its constants.
-    modulus : float
-        Shear modulus at small strain in Pa.
-    powers : sequence of float
-        Factors of the powers 1, 2, ... of I1 - 3 in Pa, at most `POWERS`.
-    second : float
-        Factor of I2 - 3 in Pa.
-
-    Returns
-    -------
-    Elastic
-        In units of the modulus.
-
+    All but the values are in Pa: the modulus at small strain, factors of the ``powers`` 1, 2, ...,
+    at most `POWERS`, of I1 - 3, and the factor of I2 - 3.
     """
     filled = (*powers, *(0.0,) * (POWERS - len(powers)))
     return Elastic(

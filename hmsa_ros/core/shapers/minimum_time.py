@@ -167,9 +167,8 @@ def _durations(
     packed = material.packed
 
     def follow(start: State, time: float) -> State:
-        _, stretch, rate, _, _, _ = kernels.advance(
-            work, start.stretch, start.rate, 0.0, 0.0, push, 0.0, 0.0, 0.0, time, packed,
-            _RTOL, 0.0)
+        _, stretch, rate, _ = kernels.follow_one(
+            work, start.stretch, start.rate, 0.0, push, 0.0, 0.0, 0.0, time, packed, _RTOL)
         return State(stretch, rate)
 
     def turn(start: State) -> tuple[float, float]:
