@@ -82,7 +82,10 @@ def test_command_is_read_only_if_finite_along_z_and_after_the_epoch(x, y, z, sta
 def read(message):
     """Return what is read of a trajectory as it arrives, and its points."""
     request = read_trajectory(serialize_message(message))
-    return request, list(request.points)
+    found = list(request.points)
+    # Anew, as where they are planned again.
+    assert list(request.points) == found
+    return request, found
 
 
 @given(POINTS, NAMES, STAMPS, NAMES)

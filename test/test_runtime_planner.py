@@ -614,14 +614,15 @@ def test_clock_that_is_set_back_drops_the_plan_and_tells_so_once():
     assert rig.planner.plan.levels[0].stretch == 1.0
 
 
+@pytest.mark.parametrize('again', [Target('a', 1.2), trajectory((1.2, HOLD))])
 @pytest.mark.parametrize('reading', range(4))
-def test_a_request_is_planned_again_where_the_clock_is_set_back_meanwhile(reading):
+def test_a_request_is_planned_again_where_the_clock_is_set_back_meanwhile(reading, again):
     rig = Rig()
     rig.runtime.request(Target('a', 1.1))
     rig.run(START + 300 * MS)
     before = len(rig.sent)
     rig.set_back_at = reading, START
-    assert rig.runtime.request(Target('a', 1.2)).code == 'accepted'
+    assert rig.runtime.request(again).code == 'accepted'
     assert rig.set_back_at is None
     rig.run(rig.now + 100 * MS)
     assert rig.codes()[-4:].count('clock_jumped') == 1

@@ -24,9 +24,9 @@ class TopicSummary:
     name: str
     type: str
     count: int
-    rate: float | None  # a second over the length of the bag; None where that is not defined
-    lost: int | None  # None if the recorder did not count
-    reliability: str  # of the publishers, several separated by a slash; empty if unknown
+    rate: float | None  #: a second over the length of the bag; None where that is not defined
+    lost: int | None  #: None if the recorder did not count
+    reliability: str  #: of the publishers, several separated by a slash; empty if unknown
     durability: str
 
 
@@ -34,15 +34,15 @@ class TopicSummary:
 class BagSummary:
     """A bag in figures."""
 
-    path: str  # as given
-    files: tuple[tuple[str, int], ...]  # name and size in bytes
-    start_ns: int | None  # first log time; None without a message
+    path: str  #: as given
+    files: tuple[tuple[str, int], ...]  #: name and size in bytes
+    start_ns: int | None  #: first log time; None without a message
     end_ns: int | None
-    topics: tuple[TopicSummary, ...]  # in order of name
-    parameters: Mapping[str, str]  # of the recorded nodes, values as JSON
-    custom_data: Mapping[str, str]  # everything else that was stored with the bag
-    complete: bool  # whether every file was closed by its writer
-    problems: tuple[str, ...]  # what could not be read, one sentence each
+    topics: tuple[TopicSummary, ...]  #: in order of name
+    parameters: Mapping[str, str]  #: of the recorded nodes, values as JSON
+    custom_data: Mapping[str, str]  #: everything else that was stored with the bag
+    complete: bool  #: whether every file was closed by its writer
+    problems: tuple[str, ...]  #: what could not be read, one sentence each
 
     @property
     def duration(self) -> float:

@@ -38,18 +38,18 @@ class ScannedFile:
     """What a file holds; records by their id, metadata records by name."""
 
     path: Path
-    number: int  # its place in the bag
-    size: int  # in bytes
-    complete: bool = False  # whether it was closed by its writer
-    damaged: bool = False  # whether something in it does not agree with the rest
-    counted: bool = False  # whether `counts` were counted, and not only read
+    number: int  #: its place in the bag
+    size: int  #: in bytes
+    complete: bool = False  #: whether it was closed by its writer
+    damaged: bool = False  #: whether something in it does not agree with the rest
+    counted: bool = False  #: whether `counts` were counted, and not only read
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
-    blocks: list[Block] = field(default_factory=list)  # its parts with messages, in their order
+    blocks: list[Block] = field(default_factory=list)  #: its parts with messages, in their order
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
-    counts: dict[int, int] = field(default_factory=dict)  # messages by channel
+    counts: dict[int, int] = field(default_factory=dict)  #: messages by channel
     data_end: int = 0
-    data_crc: int = 0  # CRC-32 of the data; 0 for none
+    data_crc: int = 0  #: CRC-32 of the data; 0 for none
 
 
 class Intake:

@@ -27,8 +27,8 @@ class TopicMetadata:
     name: str
     type: str
     serialization_format: str = 'cdr'
-    profiles: tuple[qos.Qos, ...] = ()  # what the publishers offered
-    type_hash: str = ''  # RIHS01 hash, empty if unknown
+    profiles: tuple[qos.Qos, ...] = ()  #: what the publishers offered
+    type_hash: str = ''  #: RIHS01 hash, empty if unknown
     message_count: int = 0
 
 
@@ -46,17 +46,17 @@ class FileMetadata:
 class BagMetadata:
     """What ``metadata.yaml`` says of a bag."""
 
-    start_ns: int = NO_TIME  # first log time; `NO_TIME` without a message
+    start_ns: int = NO_TIME  #: first log time; `NO_TIME` without a message
     duration_ns: int = 0
     message_count: int = 0
     topics: tuple[TopicMetadata, ...] = ()
-    files: tuple[FileMetadata, ...] = ()  # in order of writing
-    # What the user and the recorder noted.
+    files: tuple[FileMetadata, ...] = ()  #: in order of writing
+    #: What the user and the recorder noted.
     custom_data: Mapping[str, str] = field(default_factory=dict)
-    ros_distro: str = 'jazzy'  # that wrote it
-    version: int = VERSION  # of the file's layout
+    ros_distro: str = 'jazzy'  #: that wrote it
+    version: int = VERSION  #: of the file's layout
     storage: str = 'mcap'
-    compression_format: str = ''  # rosbag2's own, none if empty; MCAP's of chunks is not told here
+    compression_format: str = ''  #: rosbag2's own, none if empty; not MCAP's of chunks
     compression_mode: str = ''
 
 

@@ -31,13 +31,13 @@ LATER = 'offered_qos_profiles.'
 class Qos:
     """One offered profile; durations in ns, `INFINITE_NS` for none."""
 
-    history: str = 'unknown'  # one of `HISTORIES`
-    depth: int = 0  # 0 where it was not discovered
-    reliability: str = 'reliable'  # one of `RELIABILITIES`
-    durability: str = 'volatile'  # one of `DURABILITIES`
+    history: str = 'unknown'  #: one of `HISTORIES`
+    depth: int = 0  #: 0 where it was not discovered
+    reliability: str = 'reliable'  #: one of `RELIABILITIES`
+    durability: str = 'volatile'  #: one of `DURABILITIES`
     deadline_ns: int = INFINITE_NS
     lifespan_ns: int = INFINITE_NS
-    liveliness: str = 'automatic'  # one of `LIVELINESSES`
+    liveliness: str = 'automatic'  #: one of `LIVELINESSES`
     lease_ns: int = INFINITE_NS
     avoid_ros_namespace_conventions: bool = False
 

@@ -21,13 +21,13 @@ class RecordedTopic:
 
     name: str
     type: str
-    number: int  # of the topic in the bag
-    qos: Any  # with which it is subscribed to
-    offered: tuple[Qos, ...]  # by its publishers
-    publishers: int = 0  # at the last look
-    last: dict[bytes, int] = field(default_factory=dict)  # sequence number by publisher
+    number: int  #: of the topic in the bag
+    qos: Any  #: with which it is subscribed to
+    offered: tuple[Qos, ...]  #: by its publishers
+    publishers: int = 0  #: at the last look
+    last: dict[bytes, int] = field(default_factory=dict)  #: sequence number by publisher
     received: int = 0
-    missed: int = 0  # gaps in the sequence numbers
+    missed: int = 0  #: gaps in the sequence numbers
 
     def take(
             self, messages: Iterable[tuple[int, int, int, bytes, bytes]],

@@ -98,6 +98,7 @@ class Recording:
 
     def add_topic(self, topic: Topic) -> int:
         """Announce a topic, or new offers of a known one; return its number for the messages."""
+        topic.check()
         with self._condition:
             number = number_of(topic, self._topics)
             if number == len(self._topics):
@@ -192,7 +193,7 @@ class Recording:
             self._condition.notify()
         try:
             return answer.result()
-        except (OSError, BagError) as error:
+        except Exception as error:
             raise BagError(str(error)) from error
 
     # In the thread ---------------------------------------------------------------------------

@@ -57,14 +57,14 @@ _CLASSES: dict[int, type[Any]] = {
 class Block:
     """A chunk, or a run of messages outside chunks, and where its stored bytes lie."""
 
-    file: int  # number of the file
+    file: int  #: number of the file
     offset: int
     length: int
-    size: int  # of the content
-    start: int  # lowest log time
-    end: int  # highest log time
-    compression: str = ''  # ``''``, ``'lz4'`` or ``'zstd'``
-    crc: int = 0  # CRC-32 of the content; 0 for none
+    size: int  #: of the content
+    start: int  #: lowest log time
+    end: int  #: highest log time
+    compression: str = ''  #: ``''``, ``'lz4'`` or ``'zstd'``
+    crc: int = 0  #: CRC-32 of the content; 0 for none
 
     @classmethod
     def of_chunk(cls, file: int, offset: int, head: bytes, length: int) -> 'Block':

@@ -19,11 +19,12 @@ FILE_SECONDS = 1.0
 class Limits:
     """When to flush, when to split and how much to keep in memory."""
 
-    flush_period: float = 0.5  # s after which the operating system has a message at the latest
-    max_size: int = 0  # bytes at which a file is split; 0 for never, else at least 1024
-    max_duration_ns: int = 0  # time span at which a file is split; 0 for never
-    cache_size: int = 100 * 2**20  # bytes of queued messages at which new ones are counted as lost
-    snapshot_ns: int = 0  # above 0, messages are kept for so long, written for a snapshot
+    flush_period: float = 0.5  #: s after which the operating system has a message at the latest
+    max_size: int = 0  #: bytes at which a file is split; 0 for never, else at least 1024
+    max_duration_ns: int = 0  #: time span at which a file is split; 0 for never
+    #: bytes of queued messages at which new ones are counted as lost
+    cache_size: int = 100 * 2**20
+    snapshot_ns: int = 0  #: above 0, messages are kept for so long, written for a snapshot
 
     def __post_init__(self) -> None:
         if not self.flush_period > 0.0:

@@ -8,20 +8,27 @@ from mcap.records import Channel, Schema
 from hmsa_ros.bag import limits, qos
 from hmsa_ros.bag.intake import Problems, ScannedFile
 from hmsa_ros.bag.metadata import TopicMetadata
-from hmsa_ros.errors import BagError
+from hmsa_ros.errors import BadInputError, BagError
 
 
 @dataclass(frozen=True)
 class Topic:
     """A topic of a bag, read or to be written."""
 
-    name: str  # for example ``'/joint_states'``
-    type: str  # for example ``'sensor_msgs/msg/JointState'``; empty if a bag does not have it
-    definition: str = ''  # with its dependencies; empty if not known
-    definition_encoding: str = 'ros2msg'  # or ``'ros2idl'``, empty
-    profiles: tuple[qos.Qos, ...] = ()  # what the publishers offer
-    type_hash: str = ''  # RIHS01 hash, empty if not known
-    encoding: str = 'cdr'  # of the messages
+    name: str  #: for example ``'/joint_states'``
+    type: str  #: for example ``'sensor_msgs/msg/JointState'``; empty if a bag does not have it
+    definition: str = ''  #: with its dependencies; empty if not known
+    definition_encoding: str = 'ros2msg'  #: or ``'ros2idl'``, empty
+    profiles: tuple[qos.Qos, ...] = ()  #: what the publishers offer
+    type_hash: str = ''  #: RIHS01 hash, empty if not known
+    encoding: str = 'cdr'  #: of the messages
+
+    def check(self) -> None:
+        """Raise `BadInputError` for a topic that nobody could name or decode."""
+        if not self.name:
+            raise BadInputError('a topic has an empty name: expected a name such as /stretch')
+        if not self.type:
+            raise BadInputError(f'topic {self.name} has an empty type: expected a message type')
 
 
 def number_of(topic: Topic, known: Sequence[Topic]) -> int:

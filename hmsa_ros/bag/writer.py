@@ -143,7 +143,7 @@ class BagWriter:
 
     def add_topic(self, topic: Topic) -> int:
         """Announce a topic and return its number, or raise `BagError` beyond `MAX_CHANNELS`."""
-        _check(topic)
+        topic.check()
         contents = self._contents
         number = number_of(topic, contents.topics)
         if number < len(contents.topics):
@@ -310,14 +310,6 @@ class BagWriter:
         """Bring ``metadata.yaml`` up to date."""
         self._contents.ended = self._closed
         metadata.write(self.folder, self._contents.describe(self._file))
-
-
-def _check(topic: Topic) -> None:
-    """Refuse a topic that nobody could name or decode."""
-    if not topic.name:
-        raise BadInputError('a topic has an empty name: expected a name such as /stretch')
-    if not topic.type:
-        raise BadInputError(f'topic {topic.name} has an empty type: expected a message type')
 
 
 def _make(folder: Path) -> None:

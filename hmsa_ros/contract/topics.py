@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 @dataclass(frozen=True)
 class Quality:
-    """Quality of service: how many messages are kept, and also for late subscribers if latched."""
+    """How many messages are kept, if lost ones are sent again, if late subscribers get them."""
 
     depth: int
     reliable: bool = True

@@ -14,7 +14,11 @@ _SAMPLES_A_PERIOD = 10.0
 def judge_commands(
         *, late: int = 0, refused: int = 0, refused_source: int = 0, failed: int = 0,
         silent: Sequence[str] = (), crowded: Sequence[str] = ()) -> tuple[int, str]:
-    """Return level and message for /diagnostics: of counts, and joints nobody or many command."""
+    """
+    Return the verdict for /diagnostics: level (0 OK, 1 WARN, 2 ERROR) and message.
+
+    Of counts, and of the joints that nobody (``silent``) or several (``crowded``) command.
+    """
     level, notes = _OK, []
     if late or refused or refused_source:
         level = _WARN

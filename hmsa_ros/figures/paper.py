@@ -35,10 +35,10 @@ class PaperFigure:
     """A figure of the paper."""
 
     number: int
-    title: str  # what it shows
-    compute: Callable[[int], Data]  # its data from the number of samples, or points of a sweep
+    title: str  #: what it shows
+    compute: Callable[[int], Data]  #: its data from the number of samples, or points of a sweep
     draw: Callable[[Figure, Any], None]
-    height: float  # in inches
+    height: float  #: in inches
 
     @property
     def default_points(self) -> int:

@@ -55,13 +55,13 @@ _FASTER = 5
 class Run:
     """A response of the actuator."""
 
-    name: str  # what sets it apart in its figure, for instance ``zeta 0.02``
-    command: str  # ``shaped``, ``unshaped`` or ``b_p alone``
+    name: str  #: what sets it apart in its figure, for instance ``zeta 0.02``
+    command: str  #: ``shaped``, ``unshaped`` or ``b_p alone``
     material: NondimensionalParameters
     targets: tuple[float, ...]
-    switches: Array  # shape (m,): times at which a level of the load begins
-    loads: Array  # shape (m,): the levels beta
-    time: Array  # shape (n,), as stretch and rate; every switch is among them
+    switches: Array  #: shape (m,): times at which a level of the load begins
+    loads: Array  #: shape (m,): the levels beta
+    time: Array  #: shape (n,), as stretch and rate; every switch is among them
     stretch: Array
     rate: Array
 
@@ -83,13 +83,13 @@ class Sweep:
 
     start: float
     target: float
-    zeta: Array  # shape (n,), as all arrays
+    zeta: Array  #: shape (n,), as all arrays
     j_lim: Array
-    status: tuple[str, ...]  # ``two_step`` where there is a plan
-    tau_p: Array  # NaN without a plan, as the loads
+    status: tuple[str, ...]  #: ``two_step`` where there is a plan
+    tau_p: Array  #: NaN without a plan, as the loads
     beta_p: Array
     beta_1: Array
-    critical: float  # linearised critical zeta at the target; NaN where zeta does not vary
+    critical: float  #: linearised critical zeta at the target; NaN where zeta does not vary
 
 
 Data = tuple[Run, ...] | Sweep

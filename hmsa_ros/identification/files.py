@@ -108,7 +108,8 @@ def errors_of(belief: Belief, others: tuple[float, float, float]) -> Uncertainty
 
     Where the block is with a probability of 95 %, in shares of its values: the ellipsoid of G,
     damping coefficient, J_lim and remanence by their covariance, or intervals if no two of them
-    were identified. Others are those of the first three, for what was not identified.
+    were identified. ``others`` are the shares of G, damping coefficient and J_lim that hold for
+    those that were not identified.
     """
     sizes = [*others, 0.0]
     covariance = np.diag(np.square(sizes))

@@ -114,8 +114,10 @@ def identify(
     if 'chain_limit' in free:
         # Endless chains are no start: the derivative by their inverse is taken of the limit.
         values['chain_limit'] = min(values['chain_limit'], 1e9)
-    if not _begins_at_rest(recording) or {'initial_stretch', 'initial_rate'} & set(free):
-        recording = replace(recording, at_rest=False)
+    at_rest = _begins_at_rest(recording) and not {'initial_stretch', 'initial_rate'} & set(free)
+    if at_rest != recording.at_rest:
+        recording = replace(recording, at_rest=at_rest)
+    if not at_rest:
         values['initial_stretch'] = float(np.median(recording.stretch[:3]))
         free = tuple(dict.fromkeys((*free, 'initial_stretch', 'initial_rate')))
     if len(recording.time) < 2 * len(free):

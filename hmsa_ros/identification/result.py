@@ -168,7 +168,7 @@ class Identification:
             if abs(matrix[i, j]) >= CONFOUNDED]
 
     def record(self) -> dict[str, Any]:
-        """Return it as ``hmsa identify --json`` prints it."""
+        """Return what ``hmsa identify --json`` prints, with NaN where that has null."""
         parameters = dict([self.shown('shear_modulus')]) | self.parameters
         return {
             'verdict': self.verdict, 'reason': self.reason, 'warnings': list(self.warnings),

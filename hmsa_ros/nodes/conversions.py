@@ -71,8 +71,12 @@ def from_command(message: MagneticField) -> tuple[int, float]:
 def to_trajectory(
         setpoints: Iterable[tuple[float | Sequence[float], int]], joints: str | Sequence[str], *,
         stamp: int = 0, frame: str = '', raw: bool = False) -> JointTrajectory:
-    """Return stretches (until ns from the start), or raw levels (T, from ns on), as a message."""
-    # Of all joints or one a joint. Stamp 0 ns is now; the planner's verdict repeats the frame.
+    """
+    Return a request: stretches, of all joints or one a joint, each until a time from the start.
+
+    Times are in ns. If raw, they are levels in T, each from a time on. The stamp is the start, 0
+    for now; the planner's verdict repeats the frame.
+    """
     names = [joints] if isinstance(joints, str) else list(joints)
     return JointTrajectory(
         header=Header(stamp=to_time(stamp), frame_id=frame), joint_names=names,

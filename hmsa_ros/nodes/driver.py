@@ -80,6 +80,10 @@ class DriverNode(DeviceNode):
         self.device = HardwareWorker(_make_device(self.values), time_ns)
         self._open(DeviceJoint)
 
+    def now(self) -> int:
+        """Return the machine's time in ns."""
+        return time_ns()
+
     def deactivate(self) -> None:
         """Switch the coils off."""
         self.device.switch_off()

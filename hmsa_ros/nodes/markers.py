@@ -61,9 +61,9 @@ class Block:
     joint : str
         Its name, the namespace of its markers.
     half_length, half_thickness : float
-        L and H in m.
+        L and H in m, greater than 0.
     remanence : float
-        Br in T.
+        Br in T, greater than 0.
     width : float
         Width of a beam in m; 0 for a block.
     per_tesla : float
@@ -99,8 +99,11 @@ class Block:
             per_tesla=2.0 * actuator.half_length / (3.0 * actuator.flux_density_unit))
 
     def bent(self, deflection: float) -> list[tuple[float, float, float]]:
-        """Return the triangles, by their corners in m, of a beam bent by a share of its length."""
-        # About the middle of the straight one.
+        """
+        Return triangles, corners in m, of a beam whose tip is deflected by a share of its length.
+
+        The origin is the middle of the straight beam.
+        """
         along, across = (2.0 * self.half_length * x for x in centreline(deflection, _STATIONS))
         angle = tangent(deflection, np.linspace(0.0, 1.0, _STATIONS))
         x, z = along - self.half_length, across

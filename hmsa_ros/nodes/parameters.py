@@ -92,8 +92,6 @@ def from_files(node: Node, values: Mapping[str, Any], joint: str = '') -> Mappin
     """Return constants of the law out of a file which the start values name, by plain name."""
     # As parameters they are recorded with the rest: a bag can be verified without the file. Of a
     # joint, own values go before those for all; nothing is read where it has none.
-    # As parameters they are recorded with the rest: a bag can be verified without the file. Of a
-    # joint, own values go before those for all; nothing is read where it has none.
     given = {spec.name: found.value for spec in LAW if (found := node._parameter_overrides.get(
         f'{joint}.{spec.name}' if joint else spec.name)) is not None}
     if joint and not given:
@@ -113,7 +111,6 @@ def check_names(node: Node) -> None:
         If a name is unknown; the nearest one is suggested.
 
     """
-    # Files may have sections for several nodes: names of other nodes of the package pass.
     # Files may have sections for several nodes: names of other nodes of the package pass.
     unknown = [x for x in node._parameter_overrides
                if not node.has_parameter(x) and not x.startswith('qos_overrides.')]

@@ -7,6 +7,8 @@ when they are asked for.
 """
 
 from collections.abc import Iterator, Sequence
+from copy import copy
+from dataclasses import dataclass
 import struct
 
 from hmsa_ros.core.status import Code, RefusedError
@@ -96,8 +98,21 @@ def read_trajectory(data: bytes) -> Trajectory:
         raise BadInputError(_TOO_SHORT)
     raw = bool(count) and _raw(cursor, names)
     return Trajectory(
-        names, _points(cursor, names, count, 'effort' if raw else 'positions'), count,
+        names, _Points(cursor, names, count, 'effort' if raw else 'positions'), count,
         stamp or None, name, raw)
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Points behind a cursor, read anew each time that they are asked for."""
+
+    cursor: _Cursor
+    names: Sequence[str]
+    count: int
+    wanted: str
+
+    def __iter__(self) -> Iterator[tuple[Sequence[float], int]]:
+        return _points(copy(self.cursor), self.names, self.count, self.wanted)
 
 
 def _raw(cursor: _Cursor, names: Sequence[str]) -> bool:

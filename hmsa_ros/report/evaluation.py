@@ -47,16 +47,23 @@ _MOVED = 0.1
 
 @dataclass(frozen=True)
 class Move:
-    """One setpoint, as it was commanded; stamps in ns."""
+    """
+    One setpoint, as it was commanded; stamps in ns.
 
-    stretch: float  # target
-    begin: int  # of the first command
-    arrival: int  # of planned rest at the target
-    end: int  # until when the target was held
-    flux_densities: tuple[float, ...]  # levels in T, the last one holds the target
+    Raises
+    ------
+    BadInputError
+        If the times are not in order, or there is no level.
+
+    """
+
+    stretch: float  #: target
+    begin: int  #: of the first command
+    arrival: int  #: of planned rest at the target
+    end: int  #: until when the target was held
+    flux_densities: tuple[float, ...]  #: levels in T, the last one holds the target
 
     def __post_init__(self) -> None:
-        """Check the order."""
         if not self.begin <= self.arrival <= self.end or not self.flux_densities:
             raise BadInputError(
                 f'a move from {self.begin} to {self.arrival} until {self.end} ns with '
@@ -419,14 +426,14 @@ def _predict(run: Run, plan: Sequence[Level]) -> tuple[Array, Array]:
 class PlanPoint:
     """A change of level in the plan, and what was recorded there; NaN for what is not."""
 
-    time: float  # in s of the run
-    planned: float  # flux density in T
-    commanded: float  # with the same stamp, in T
-    stretch: float  # predicted for the first sample from then on
-    rate: float  # likewise, in 1/s
-    recorded_stretch: float  # that sample
+    time: float  #: in s of the run
+    planned: float  #: flux density in T
+    commanded: float  #: with the same stamp, in T
+    stretch: float  #: predicted for the first sample from then on
+    rate: float  #: likewise, in 1/s
+    recorded_stretch: float  #: that sample
     recorded_rate: float
-    deviation: float  # largest of the recorded from the predicted stretch until the next
+    deviation: float  #: largest of the recorded from the predicted stretch until the next
 
 
 def plan_points(run: Run, evaluation: Evaluation) -> list[PlanPoint]:

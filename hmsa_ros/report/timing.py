@@ -20,19 +20,19 @@ _SAME_CLOCK = 60.0
 class Timing:
     """When commands and samples came; all arrays are in s."""
 
-    commands: tuple[Level, ...]  # those that change something, in the order received
-    repeats: int  # how many commands changed nothing
-    # Shape (m,): how far ahead of its stamp each command was recorded; below 0 for a late one.
-    # Empty if the recorder kept another clock than the stamps.
+    commands: tuple[Level, ...]  #: those that change something, in the order received
+    repeats: int  #: how many commands changed nothing
+    #: Shape (m,): how far ahead of its stamp each command was recorded; below 0 for a late one.
+    #: Empty if the recorder kept another clock than the stamps.
     lead: Array
-    # Shape (k,): how long after its stamp each change of level took effect, as the plant or the
-    # driver reported; NaN for one that it did not report. Empty if it reported none.
+    #: Shape (k,): how long after its stamp each change of level took effect, as the plant or the
+    #: driver reported; NaN for one that it did not report. Empty if it reported none.
     lateness: Array
-    delay: Array  # shape (n,): how long after its stamp each sample was recorded; or empty
-    interval: Array  # shape (n - 1,): between the stamps of two samples
-    arrival_interval: Array  # shape (n - 1,): between the times of recording
-    missing: int  # samples that gaps in the stamps have room for
-    unapplied: int  # changes of level that were due and did not take effect as reported
+    delay: Array  #: shape (n,): how long after its stamp each sample was recorded; or empty
+    interval: Array  #: shape (n - 1,): between the stamps of two samples
+    arrival_interval: Array  #: shape (n - 1,): between the times of recording
+    missing: int  #: samples that gaps in the stamps have room for
+    unapplied: int  #: changes of level that were due and did not take effect as reported
 
     @property
     def late(self) -> int:

@@ -13,7 +13,11 @@ _REMEMBERED = 4096
 
 
 class Cycles:
-    """Measures the cycles of a loop, a context manager around each; all times are in ns."""
+    """
+    Measures the cycles of a loop, a context manager around each; all times are in ns.
+
+    ``late`` counts the cycles that began more than a period after they were due.
+    """
 
     def __init__(
             self, period: int, *, steady: Clock = monotonic_ns,

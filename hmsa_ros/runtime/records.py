@@ -53,7 +53,8 @@ class Trajectory:
 
     A point has the stretch of each joint, and the time in ns from the start until which it lasts;
     if raw, the flux density in T of each joint, and the time from which it applies. Points are
-    read bit by bit, and may raise `RefusedError` where they cannot be read.
+    read bit by bit, and again where they are planned again; they may raise `RefusedError` where
+    they cannot be read.
     """
 
     joints: tuple[str, ...]

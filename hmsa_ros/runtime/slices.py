@@ -74,7 +74,7 @@ def in_time(
         joints: frozenset[str], clock: Clock,
         size: int = 1) -> Steps[tuple[Mapping[str, Draft], int]]:
     """
-    Plan for a time in ns that has not come yet when the plan is ready, and return it too.
+    Return drafts, and the time in ns they are for, which has not come yet when they are ready.
 
     If what is going to happen to the joints changes meanwhile, it begins anew. The size is about
     how many pauses it makes.

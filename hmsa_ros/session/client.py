@@ -167,7 +167,8 @@ class PlannerClient:
         setpoints : sequence of (float or sequence of float, float)
             Stretch, of all joints or one a joint, and span in s.
         levels : sequence of (float, float)
-            In their place: time in s from now, and flux density in T of all joints from then on.
+            Instead, with no setpoints: time in s from now, and flux density in T of all joints
+            from then on.
 
         Returns
         -------

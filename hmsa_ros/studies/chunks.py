@@ -112,7 +112,7 @@ class Chunks:
                 'folder or that of this study; name another with --out')
 
     def prepare(self) -> None:
-        """Make the folder, unless it is there or belongs to something else."""
+        """Make the folder unless it is there; raise `BadInputError` if it is of something else."""
         self.check()
         make_folder(self.folder / 'chunks')
         if not self._described.exists():

@@ -34,9 +34,9 @@ class DampedStudy:
     start: float
     target: float
     zetas: Array
-    step: Array  # (n,), settling time of the plain step
-    arrival: Array  # (m, n), of the minimum-time command under each of LIMITS
-    settled: Array  # (m, n), its settling time
+    step: Array  #: (n,), settling time of the plain step
+    arrival: Array  #: (m, n), of the minimum-time command under each of LIMITS
+    settled: Array  #: (m, n), its settling time
 
 
 def limits_of(target: float, material: NondimensionalParameters, number: int) -> Limits:

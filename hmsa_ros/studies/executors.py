@@ -69,7 +69,17 @@ def local_processes(workers: int) -> Iterator[tuple[Executor, int]]:
 
 
 def local(workers: int) -> Start:
-    """Return what makes an executor of so many processes; of one, of this process."""
+    """
+    Return what makes an executor of so many processes; of one, of this process.
+
+    Raises
+    ------
+    BadInputError
+        If there is to be none.
+
+    """
+    if workers < 1:
+        raise BadInputError(f'--workers is {workers}: expected at least 1')
     return here if workers == 1 else partial(local_processes, workers)
 
 

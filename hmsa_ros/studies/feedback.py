@@ -45,15 +45,15 @@ class Scenario:
     """Actuator and sensor; times in s."""
 
     name: str
-    period: float  # between two samples
-    delay: float  # until a sample is there
-    noise: float  # standard deviation of a sample of stretch
-    half_length: float = 0.01  # m; sets the unit of time, 4.4 ms for 0.01 m
-    truth: Mapping[str, float] = field(default_factory=dict)  # factors beside that of G
-    coil_time_constant: float = 0.0  # unknown to the model
+    period: float  #: between two samples
+    delay: float  #: until a sample is there
+    noise: float  #: standard deviation of a sample of stretch
+    half_length: float = 0.01  #: m; sets the unit of time, 4.4 ms for 0.01 m
+    truth: Mapping[str, float] = field(default_factory=dict)  #: factors beside that of G
+    coil_time_constant: float = 0.0  #: unknown to the model
     free: tuple[str, ...] = TRACKED
     weights: Mapping[str, Weights] = field(default_factory=lambda: _WEIGHTS)
-    nominal: ActuatorParameters | None = None  # in place of the example block
+    nominal: ActuatorParameters | None = None  #: in place of the example block
 
     @property
     def targets(self) -> tuple[float, ...]:
@@ -102,8 +102,8 @@ class Strategy:
     name: str
     shaper: str
     order: int = 1
-    # What samples do: nothing; 'adapt' corrects moves that take longer where much is expected to
-    # be left; 'lqr' and 'mpc' set a level after each; 'learning' tries the first move again.
+    #: What samples do: nothing; 'adapt' corrects moves that take longer where much is expected to
+    #: be left; 'lqr' and 'mpc' set a level after each; 'learning' tries the first move again.
     kind: str = 'open'
 
 
@@ -118,10 +118,10 @@ STRATEGIES = (
 class Left:
     """What would be left if the course in force were carried to its end, as shares of the step."""
 
-    # Of a controller that commands a level after each sample, as seen in the cycle that follows.
-    vibration: float  # peak to peak
-    offset: float  # rest less target
-    motion: float = 0.0  # peak to peak in the cycle that follows, in which the loop stays closed
+    #: Of a controller that commands a level after each sample, as seen in the cycle that follows.
+    vibration: float  #: peak to peak
+    offset: float  #: rest less target
+    motion: float = 0.0  #: peak to peak in the cycle that follows, in which the loop stays closed
 
     def watched(self, seen: Sequence[float], *, steadily: bool) -> 'Left':
         """Return it with what was seen in the cycle that follows, as shares of the step."""

@@ -33,10 +33,10 @@ _HORIZON = 6.0
 class Weights:
     """How eager a controller is; the error weighs 1."""
 
-    rate: float  # by units of time
-    effort: float  # of the level
-    integral: float = 0.0  # of the sum of errors over a unit of time, of a regulator alone
-    wander: float = 0.1  # of a load that acts besides the level, in a unit of time
+    rate: float  #: by units of time
+    effort: float  #: of the level
+    integral: float = 0.0  #: of the sum of errors over a unit of time, of a regulator alone
+    wander: float = 0.1  #: of a load that acts besides the level, in a unit of time
 
 
 @dataclass(frozen=True, eq=False)

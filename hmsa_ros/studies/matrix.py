@@ -38,12 +38,12 @@ class Row:
 
     scenario: str
     strategy: str
-    error: float  # of G, as a share
-    # Root mean square over both signs and all seeds: after the first move, a cycle later, two
-    # cycles later, and after the next move; of learning, after each of four trials.
+    error: float  #: of G, as a share
+    #: Root mean square over both signs and all seeds: after the first move, a cycle later, two
+    #: cycles later, and after the next move; of learning, after each of four trials.
     left: 'tuple[Left, ...]'
-    worst: tuple[float, ...]  # largest vibration of all
-    no_worse: bool | None = None  # whether no run leaves more than `allowed`; None for open loop
+    worst: tuple[float, ...]  #: largest vibration of all
+    no_worse: bool | None = None  #: whether no run leaves more than `allowed`; None for open loop
 
 
 def rms(trials: Iterable[Sequence[Left]]) -> list[Left]:
@@ -56,7 +56,7 @@ def rms(trials: Iterable[Sequence[Left]]) -> list[Left]:
 class Matrix:
     """All strategies in all scenarios."""
 
-    seeds: int  # of the noise, for each error, on which open loop does not depend
+    seeds: int  #: of the noise, for each error, on which open loop does not depend
     scenarios: Sequence[Scenario] = SCENARIOS
     strategies: Sequence[Strategy] = STRATEGIES
 

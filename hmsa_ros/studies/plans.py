@@ -31,8 +31,8 @@ _TWO_STEP, _LIMIT, _BAD = (
 class Plans:
     """Plans of n rows, nondimensional; NaN where there is no such level or duration."""
 
-    codes: NDArray[np.int64]  # (n,), places in STATUS
-    numbers: Array  # (3, n): first level, duration and last level
+    codes: NDArray[np.int64]  #: (n,), places in STATUS
+    numbers: Array  #: (3, n): first level, duration and last level
 
     @classmethod
     def none(cls, size: int) -> 'Plans':

@@ -61,10 +61,10 @@ class Actual:
     """An actuator that carries out moves planned with, and in the units of, another model."""
 
     model: NondimensionalParameters
-    material: NondimensionalParameters  # of the actuator, in its own units
-    time: float = 1.0  # the actuator's units in those of the model
+    material: NondimensionalParameters  #: of the actuator, in its own units
+    time: float = 1.0  #: the actuator's units in those of the model
     load: float = 1.0
-    delivery: Delivery = IDEAL  # in the actuator's units; commands are those of the move
+    delivery: Delivery = IDEAL  #: in the actuator's units; commands are those of the move
 
     @classmethod
     def off(

@@ -55,7 +55,7 @@ class Candidate:
     """A shaper to be compared."""
 
     shaper: str
-    order: int = 2  # of those in ORDERED
+    order: int = 2  #: of those in ORDERED
 
     def __post_init__(self) -> None:
         """Check both."""
@@ -91,8 +91,8 @@ class Case:
     material: NondimensionalParameters = field(default_factory=NondimensionalParameters)
     limits: Limits = field(default_factory=Limits)
     delivery: Delivery = IDEAL
-    box: float = 0.1  # half the width of the box of errors, above 0
-    span: float = 0.2  # largest error in the curves, at least that of the box
+    box: float = 0.1  #: half the width of the box of errors, above 0
+    span: float = 0.2  #: largest error in the curves, at least that of the box
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -138,7 +138,7 @@ class Case:
 class Worst:
     """The largest residual among errors, and where."""
 
-    residual: float  # as a share of the step; NaN if a motion could not be followed
+    residual: float  #: as a share of the step; NaN if a motion could not be followed
     errors: Errors
 
 
@@ -147,14 +147,14 @@ class Result:
     """One shaper in one case."""
 
     candidate: Candidate
-    code: Code  # another one than the shaper's own where it fell back or refused
-    reason: str  # why it did
-    move: Move | None  # None if refused; what follows is empty then, and the numbers NaN
-    arrival: float  # time from which the residual counts, nominal
-    nominal: float  # residual without errors
-    curves: dict[str, Array]  # by parameter: residual at `Case.errors` of it alone
-    alone: dict[str, Worst]  # by parameter: the worst of it alone, up to the box's edges
-    worst: Worst  # in the box of all three
+    code: Code  #: another one than the shaper's own where it fell back or refused
+    reason: str  #: why it did
+    move: Move | None  #: None if refused; what follows is empty then, and the numbers NaN
+    arrival: float  #: time from which the residual counts, nominal
+    nominal: float  #: residual without errors
+    curves: dict[str, Array]  #: by parameter: residual at `Case.errors` of it alone
+    alone: dict[str, Worst]  #: by parameter: the worst of it alone, up to the box's edges
+    worst: Worst  #: in the box of all three
 
 
 def candidates(

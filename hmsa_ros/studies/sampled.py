@@ -31,12 +31,12 @@ class SampledStudy:
     start: float
     target: float
     material: NondimensionalParameters
-    tau_p: float  # of the ideal command
-    periods: Floats  # as shares of tau_p
-    solved: Array  # of the command solved on the grid; NaN where there is none
-    rounded: Array  # of the ideal command with its switch on the nearest point of the grid
-    # The worse of the ideal command with its switch half a period early and late: what rounding
-    # can do where the period is not tuned to tau_p.
+    tau_p: float  #: of the ideal command
+    periods: Floats  #: as shares of tau_p
+    solved: Array  #: of the command solved on the grid; NaN where there is none
+    rounded: Array  #: of the ideal command with its switch on the nearest point of the grid
+    #: The worse of the ideal command with its switch half a period early and late: what rounding
+    #: can do where the period is not tuned to tau_p.
     bound: Array
 
 

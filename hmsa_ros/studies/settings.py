@@ -52,7 +52,7 @@ class Setting:
     limits: Limits = field(default_factory=Limits)
     delivery: Delivery = field(default_factory=Delivery)
     units: Units = field(default_factory=Units)
-    errors: Uncertainty = ERRORS  # for which minimax plans
+    errors: Uncertainty = ERRORS  #: for which minimax plans
 
 
 @dataclass(frozen=True)
@@ -109,8 +109,8 @@ class InSI:
     delivery = frozenset({'command_period', 'slew_limit', 'coil_time_constant'})
     roots = False
 
-    known: Mapping[str, Any]  # of PLANNED and of creep, and points of a law from a file
-    errors: Uncertainty = ERRORS  # for which minimax plans
+    known: Mapping[str, Any]  #: of PLANNED and of creep, and points of a law from a file
+    errors: Uncertainty = ERRORS  #: for which minimax plans
 
     @classmethod
     def of(cls, values: Mapping[str, Any], errors: Uncertainty = ERRORS) -> 'InSI':

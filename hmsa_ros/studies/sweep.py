@@ -46,11 +46,11 @@ Places = tuple[NDArray[np.int64], ...]
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of a sweep, planned: columns by name, in order."""
+    """Rows of a sweep, planned: columns of shape (n,) by name, in order."""
 
     inputs: dict[str, Column]
-    codes: NDArray[np.int64]  # places in STATUS
-    results: dict[str, Array]  # NaN where there is no such number
+    codes: NDArray[np.int64]  #: places in `hmsa_ros.studies.plans.STATUS`
+    results: dict[str, Array]  #: NaN where there is no such number
 
     @property
     def status(self) -> NDArray[np.str_]:
@@ -167,7 +167,7 @@ class Sweep:
         return ('tau_p', 'beta_p') if self._system.roots else ('time_p', 'flux_density_p')
 
     def view(self) -> View:
-        """Return how the sweep is drawn; it is refused where there is no picture of it."""
+        """Return how the sweep is drawn; raise `BadInputError` where there is no picture of it."""
         return View.of([
             Axis.of(axis, samples=i == self._sampled) for i, axis in enumerate(self._axes)
             if self._shape[i] > 1])

@@ -29,10 +29,10 @@ _FEW = 5
 class Axis:
     """One axis of a sweep that has more than one value."""
 
-    name: str  # of its column, or of all columns of a table
+    name: str  #: of its column, or of all columns of a table
     size: int
-    values: Array | None = None  # of a column of numbers
-    labels: tuple[str, ...] = ()  # of a few values without an order that are no samples
+    values: Array | None = None  #: of a column of numbers
+    labels: tuple[str, ...] = ()  #: of a few values without an order that are no samples
     sampled: bool = False
 
     @classmethod
@@ -65,8 +65,8 @@ class View:
 
     x: Axis | None
     y: Axis | None
-    labels: tuple[str, ...]  # of each curve or map
-    samples: int  # at each point; 1 for none
+    labels: tuple[str, ...]  #: of each curve or map
+    samples: int  #: at each point; 1 for none
     _sizes: tuple[int, ...]
     _order: tuple[int, ...]
 
