@@ -72,15 +72,6 @@ class HardwareJoint:
     """
     A real actuator.
 
-    Attributes
-    ----------
-    hardware : Hardware
-        What writes and reads.
-    limit : float
-        Largest level in T, above 0; what exceeds it is refused.
-    fallback : Fallback
-        What to do after a silence.
-
     Raises
     ------
     BadInputError
@@ -88,8 +79,9 @@ class HardwareJoint:
 
     """
 
-    hardware: Hardware
-    limit: float
+    hardware: Hardware  #: what writes and reads
+    limit: float  #: largest level in T, above 0; what exceeds it is refused
+    #: what to do after a silence
     fallback: Fallback = field(default_factory=lambda: Fallback(safe_flux='zero'))
 
     def __post_init__(self) -> None:

@@ -19,13 +19,6 @@ class SensorErrors:
     The measured stretch is the bias plus the gain times the true one; the measured rate, which
     is its derivative, has the gain alone.
 
-    Attributes
-    ----------
-    stretch_noise, rate_noise : float
-        Standard deviations, the latter in 1/s; at least 0.
-    stretch_bias, stretch_gain : float
-        Finite, the gain above 0.
-
     Raises
     ------
     BadInputError
@@ -33,8 +26,10 @@ class SensorErrors:
 
     """
 
+    #: standard deviations, the latter in 1/s; at least 0
     stretch_noise: float = 0.0
     rate_noise: float = 0.0
+    #: finite, the gain above 0
     stretch_bias: float = 0.0
     stretch_gain: float = 1.0
 

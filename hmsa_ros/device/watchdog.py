@@ -22,15 +22,6 @@ class Fallback:
     """
     What to do after a silence.
 
-    Attributes
-    ----------
-    timeout : float
-        Longest silence in s; 0 for any.
-    safe_flux : str
-        One of `SAFE_FLUX`.
-    ramp_rate : float
-        Of a ramp to zero, in T/s, above 0.
-
     Raises
     ------
     BadInputError
@@ -38,9 +29,9 @@ class Fallback:
 
     """
 
-    timeout: float = 1.0
-    safe_flux: str = 'hold'
-    ramp_rate: float = 1.0
+    timeout: float = 1.0  #: longest silence in s; 0 for any
+    safe_flux: str = 'hold'  #: one of `SAFE_FLUX`
+    ramp_rate: float = 1.0  #: of a ramp to zero, in T/s, above 0
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.timeout < math.inf:

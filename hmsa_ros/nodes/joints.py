@@ -58,24 +58,13 @@ def joint_names(values: Mapping[str, Any]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class JointParameters:
-    """
-    Values of a node's parameters, for all joints and for each.
+    """Values of a node's parameters, for all joints and for each."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        The joints.
-    specs, values : mapping of str
-        What is declared, and set: an override that is not is missing; by full name.
-    own : frozenset of str
-        Parameters that a joint may have a value of its own for.
-
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  #: the joints
+    #: what is declared, and set: an override that is not is missing; by full name
     specs: Mapping[str, ParameterSpec]
     values: Mapping[str, Any]
-    own: frozenset[str]
+    own: frozenset[str]  #: parameters that a joint may have a value of its own for
 
     def __getitem__(self, name: str) -> Any:
         """Return the value for all joints."""

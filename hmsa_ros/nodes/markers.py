@@ -56,19 +56,6 @@ class Block:
     """
     What stays the same of a joint while it moves.
 
-    Attributes
-    ----------
-    joint : str
-        Its name, the namespace of its markers.
-    half_length, half_thickness : float
-        L and H in m, greater than 0.
-    remanence : float
-        Br in T, greater than 0.
-    width : float
-        Width of a beam in m; 0 for a block.
-    per_tesla : float
-        Length of the arrow of a beam's field in m/T.
-
     Raises
     ------
     BadInputError
@@ -76,12 +63,13 @@ class Block:
 
     """
 
-    joint: str
+    joint: str  #: its name, the namespace of its markers
+    #: L and H in m, greater than 0
     half_length: float
     half_thickness: float
-    remanence: float
-    width: float = 0.0
-    per_tesla: float = 0.0
+    remanence: float  #: Br in T, greater than 0
+    width: float = 0.0  #: width of a beam in m; 0 for a block
+    per_tesla: float = 0.0  #: length of the arrow of a beam's field in m/T
 
     def __post_init__(self) -> None:
         if not self.joint:
@@ -138,25 +126,12 @@ class State:
 
 @dataclass(frozen=True)
 class Scene:
-    """
-    Where and how large joints are shown.
+    """Where and how large joints are shown."""
 
-    Attributes
-    ----------
-    blocks : tuple of Block
-        One a joint, in the order of the parameter ``joints``.
-    frame : str
-        Frame of the markers.
-    scale : float
-        Metres shown for a metre, greater than 0; 1 is true to size.
-    lifetime : float
-        Seconds after which a viewer drops what was not sent again, 0 for never.
-
-    """
-
-    blocks: tuple[Block, ...]
-    frame: str
-    scale: float = 1.0
+    blocks: tuple[Block, ...]  #: one a joint, in the order of the parameter ``joints``
+    frame: str  #: frame of the markers
+    scale: float = 1.0  #: metres shown for a metre, greater than 0; 1 is true to size
+    #: seconds after which a viewer drops what was not sent again, 0 for never
     lifetime: float = 0.0
 
     def places(self) -> list[tuple[float, float]]:

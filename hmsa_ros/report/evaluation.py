@@ -72,79 +72,42 @@ class Move:
 
 @dataclass(frozen=True)
 class MoveResult:
-    """
-    The result of one setpoint.
+    """The result of one setpoint."""
 
-    Attributes
-    ----------
-    stretch : float
-        Target.
-    b_p, tau_p, b_1 : float
-        First and last level and the time between begin and arrival, nondimensional as in the
-        paper.
-    begin, arrival, end : float
-        In s of the run.
-    error : float
-        Largest distance from the target after arrival, as a share of the step.
-    residual, residual_unshaped : float
-        Peak-to-peak stretch after arrival as a share of the step: recorded, and simulated for
-        plain steps on the same plant. NaN where there are no samples, and of a block that did
-        not move.
-    moved : bool
-        Whether the block covered a tenth of the step at least, on the mean after arrival.
-
-    """
-
-    stretch: float
+    stretch: float  #: target
+    #: first and last level and the time between begin and arrival, nondimensional as in the paper
     b_p: float
     tau_p: float
     b_1: float
+    #: in s of the run
     begin: float
     arrival: float
     end: float
-    error: float
+    error: float  #: largest distance from the target after arrival, as a share of the step
+    #: peak-to-peak stretch after arrival as a share of the step: recorded, and simulated for
+    #: plain steps on the same plant; NaN where there are no samples, and of a block that did not
+    #: move
     residual: float
     residual_unshaped: float
+    #: whether the block covered a tenth of the step at least, on the mean after arrival
     moved: bool
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """
-    A run, measured.
+    """A run, measured."""
 
-    Attributes
-    ----------
-    zero : int
-        Stamp in ns of time 0: the first command, or the first sample without one.
-    time : ndarray, shape (n,)
-        Times of the samples in s.
-    start : float
-        Stretch at rest before the first move.
-    levels : tuple of Level
-        Commands that came into force and changed the level, by stamp.
-    moves : tuple of Move
-        Setpoints.
-    results : tuple of MoveResult
-        One a move.
-    unshaped : tuple of ndarray, shape (n,)
-        Stretch, and stretch rate in 1/s, simulated for plain steps; NaN without a move, and
-        where they are too large to follow.
-    plan : tuple of Level
-        Changes of level that were planned and not replanned, by stamp.
-    predicted : tuple of ndarray, shape (n,)
-        Stretch, and stretch rate in 1/s, by the plan; NaN before and without one.
-
-    """
-
-    zero: int
-    time: Array
-    start: float
-    levels: tuple[Level, ...]
-    moves: tuple[Move, ...]
-    results: tuple[MoveResult, ...]
+    zero: int  #: stamp in ns of time 0: the first command, or the first sample without one
+    time: Array  #: times of the samples in s, shape (n,)
+    start: float  #: stretch at rest before the first move
+    levels: tuple[Level, ...]  #: commands that came into force and changed the level, by stamp
+    moves: tuple[Move, ...]  #: setpoints
+    results: tuple[MoveResult, ...]  #: one a move
+    #: stretch, and stretch rate in 1/s, simulated for plain steps; NaN without a move, and where
+    #: they are too large to follow, shape (n,)
     unshaped: tuple[Array, Array]
-    plan: tuple[Level, ...]
+    plan: tuple[Level, ...]  #: changes of level that were planned and not replanned, by stamp
+    #: stretch, and stretch rate in 1/s, by the plan; NaN before and without one, shape (n,)
     predicted: tuple[Array, Array]
 
     def seconds(self, stamp: int) -> float:

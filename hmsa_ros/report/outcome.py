@@ -23,36 +23,18 @@ _ENOUGH_SAMPLES, _THIRD_DIFFERENCE, _PEAK_TO_PEAK = 20.0, math.sqrt(20.0), 8.0
 
 @dataclass(frozen=True)
 class Arrival:
-    """
-    One setpoint, measured.
+    """One setpoint, measured."""
 
-    Attributes
-    ----------
-    joint : str
-        Empty if it is not known.
-    stretch : float
-        Target.
-    reached, offset : float
-        Mean stretch after arrival, and how far it is from the target; NaN if not measured.
-    residual : float
-        Peak-to-peak stretch after arrival; NaN likewise.
-    allowed : float
-        Offset and residual of a setpoint that counts as reached, noise apart.
-    arrival : float
-        Time of planned rest in s from the first command; NaN if it was not carried out.
-    verdict : str
-        ``arrived``, ``off_target``, ``vibrating`` or ``not_carried_out``.
-
-    """
-
-    joint: str
-    stretch: float
+    joint: str  #: empty if it is not known
+    stretch: float  #: target
+    #: mean stretch after arrival, and how far it is from the target; NaN if not measured
     reached: float
     offset: float
-    residual: float
-    allowed: float
+    residual: float  #: peak-to-peak stretch after arrival; NaN likewise
+    allowed: float  #: offset and residual of a setpoint that counts as reached, noise apart
+    #: time of planned rest in s from the first command; NaN if it was not carried out
     arrival: float
-    verdict: str
+    verdict: str  #: ``arrived``, ``off_target``, ``vibrating`` or ``not_carried_out``
 
     def sentence(self) -> str:
         """Return the verdict in words, with the figures."""
@@ -108,31 +90,15 @@ def _measure(
 
 @dataclass(frozen=True)
 class LevelResult:
-    """
-    A level of the field, measured.
+    """A level of the field, measured."""
 
-    Attributes
-    ----------
-    joint : str
-        Empty if it is not known.
-    flux_density : float
-        In T.
-    times : int
-        How often it was in force; the one at the end of the run counts apart.
-    duration : float
-        In s, of all times.
-    rest : float
-        Stretch that it holds by the parameters in the run; NaN beyond the law of the block.
-    mean, least, greatest : float
-        Measured stretch while it was in force; NaN without samples.
-
-    """
-
-    joint: str
-    flux_density: float
-    times: int
-    duration: float
+    joint: str  #: empty if it is not known
+    flux_density: float  #: in T
+    times: int  #: how often it was in force; the one at the end of the run counts apart
+    duration: float  #: in s, of all times
+    #: stretch that it holds by the parameters in the run; NaN beyond the law of the block
     rest: float
+    #: measured stretch while it was in force; NaN without samples
     mean: float
     least: float
     greatest: float

@@ -41,33 +41,19 @@ _SAME = 1e-9
 
 @dataclass(frozen=True)
 class Experiment:
-    """
-    What is done.
+    """What is done."""
 
-    Attributes
-    ----------
-    folder : Path
-        Existing folder for the bag ``run`` and the logs.
-    setpoints : sequence of (sequence of float, float)
-        Stretch of all joints, or one a joint, and span in s; empty where there are levels.
-    nodes : tuple of NodeProcess
-        To start besides the recorder, among them a paused plant that leads time, or none.
-    namespace, joints : str, tuple of str
-        Of planner and plant.
-    expected : mapping of str to object
-        Parameters of running nodes by ``'node.name'``, from a parameter file.
-    levels : sequence of (float, float)
-        Time in s, and flux density in T from then on.
-
-    """
-
-    folder: Path
+    folder: Path  #: existing folder for the bag ``run`` and the logs
+    #: stretch of all joints, or one a joint, and span in s; empty where there are levels
     setpoints: Setpoints
+    #: to start besides the recorder, among them a paused plant that leads time, or none
     nodes: tuple[NodeProcess, ...] = ()
+    #: of planner and plant
     namespace: str = ''
     joints: tuple[str, ...] = ('actuator',)
+    #: parameters of running nodes by ``'node.name'``, from a parameter file
     expected: Mapping[str, object] = field(default_factory=dict)
-    levels: Sequence[tuple[float, float]] = ()
+    levels: Sequence[tuple[float, float]] = ()  #: time in s, and flux density in T from then on
 
     @property
     def duration(self) -> float:

@@ -50,26 +50,12 @@ class Study(Protocol):
 
 @dataclass(frozen=True)
 class Chunks:
-    """
-    The chunks of a study, and the folder that they are in.
+    """The chunks of a study, and the folder that they are in."""
 
-    Attributes
-    ----------
-    folder : Path
-        Absolute.
-    digest : str
-        Of the study and of the code that computes it.
-    size : int
-        Rows of the study, at least 1.
-    bounds : tuple of int
-        Rows of a chunk, least and most.
-
-    """
-
-    folder: Path
-    digest: str
-    size: int
-    bounds: tuple[int, int] = (LEAST_ROWS, MOST_ROWS)
+    folder: Path  #: absolute
+    digest: str  #: of the study and of the code that computes it
+    size: int  #: rows of the study, at least 1
+    bounds: tuple[int, int] = (LEAST_ROWS, MOST_ROWS)  #: rows of a chunk, least and most
 
     @classmethod
     def of(cls, study: Study, folder: Path) -> 'Chunks':

@@ -41,21 +41,12 @@ class Weights:
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """
-    A block about a stretch at which it rests, sampled: x(k + 1) = a x(k) + b u(k).
+    """A block about a stretch at which it rests, sampled: x(k + 1) = a x(k) + b u(k)."""
 
-    Attributes
-    ----------
-    a : ndarray, shape (n, n)
-        On stretch from the target, rate by units of time, and the levels still on their way, the
-        newest first.
-    b : ndarray, shape (n,)
-        Of a level, as a load above the one that holds the target.
-
-    """
-
+    #: on stretch from the target, rate by units of time, and the levels still on their way, the
+    #: newest first, shape (n, n)
     a: Array
-    b: Array
+    b: Array  #: of a level, as a load above the one that holds the target, shape (n,)
 
     @classmethod
     def at(
