@@ -380,7 +380,7 @@ class RosSide:
         client = self.node.create_client(service_type, name)
         self.spin_until(client.service_is_ready, f'service {name}')
         call = ServiceCall(
-            client, service_type.Request() if request is None else request, patience=10.0)
+            client, service_type.Request() if request is None else request, timeout=10.0)
         response = self.spin_until(call.answer, f'the answer of {name}')
         self.node.destroy_client(client)
         return response

@@ -419,7 +419,7 @@ def test_a_dumb_terminal_and_a_pipe_get_lines(start, terminal, wait_until):
     newest = json.loads(objects.stdout.splitlines()[-1])
     assert newest['joints'][0]['stretch'] == 1.0
     assert newest['request'] is None
-    # There is no planner, which both wait for until their patience ends.
+    # There is no planner, which both wait for until their time is over.
     once = start.hmsa('watch', '--once', '--timeout', '10')
     missed = start.hmsa('watch', '--once', '--json', '--joint', 'thumb', '--timeout', '10')
     assert once.wait() == 0

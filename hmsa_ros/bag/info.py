@@ -11,7 +11,7 @@ from hmsa_ros.bag.experiment import node_parameters, parameter_key
 from hmsa_ros.bag.reader import BagReader
 from hmsa_ros.errors import BagError, printable
 
-# What is told as JSON, in this order.
+# What is printed as JSON, in this order.
 _SHOWN = (
     'path', 'files', 'start_ns', 'end_ns', 'duration', 'message_count', 'lost', 'topics',
     'parameters', 'custom_data', 'complete', 'problems')

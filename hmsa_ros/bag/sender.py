@@ -126,7 +126,7 @@ class Sender:
         """Wait until a time of the bag; return why it did not come, or an empty string."""
         while True:
             outcome = self._transport.wait(
-                when, message=message, patience=CLOCK_WHILE_WAITING_SECONDS)
+                when, message=message, timeout=CLOCK_WHILE_WAITING_SECONDS)
             if outcome != 'paused':
                 return outcome
             if self._clock is not None:

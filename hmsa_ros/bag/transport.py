@@ -112,8 +112,8 @@ class Transport:
         with self.change:
             return self.change.wait_for(lambda: self.stopped, max(0.0, seconds))
 
-    def wait(self, when: int, *, message: bool, patience: float) -> str:
-        """Wait until a time of the bag (ns) is due, while paused at most ``patience`` s."""
+    def wait(self, when: int, *, message: bool, timeout: float) -> str:
+        """Wait until a time of the bag (ns) is due, while paused at most ``timeout`` s."""
         # Empty if it is due, otherwise 'stop', 'seek' or 'paused'; a message may be what a step
         # asks for.
         while True:
@@ -128,7 +128,7 @@ class Transport:
                             self._steps -= 1
                             self._anchor = (when, time.monotonic())
                         return ''
-                    if not self.change.wait(patience):
+                    if not self.change.wait(timeout):
                         return 'paused'
                     continue
                 since, began = self._anchor

@@ -71,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _once(
         listener: 'Listener', console: 'Console', arguments: argparse.Namespace) -> int:
-    """Print one view as soon as everything is there, or when patience ends."""
+    """Print one view as soon as everything is there, or when the time is over."""
     end = monotonic() + arguments.timeout
     scene = listener.look()
     # Two looks, so that the samples' rate can be told.

@@ -102,7 +102,7 @@ def expect(
     return math.sqrt(float(misses @ misses) + max(spread, 0.0))
 
 
-def patience(
+def lengthening(
         estimate: Estimate, course: Course, step: float, slew_limit: float = math.inf,
         tolerance: float = TOLERANCE) -> float:
     """
@@ -144,7 +144,7 @@ class Corrector:
         found = _placed(move, model, estimate.time, target)
         if math.isinf(tolerance):
             return found
-        longer = patience(
+        longer = lengthening(
             estimate, found, max(abs(target - estimate.stretch), estimate.noise),
             self.options.slew_limit, tolerance)
         return replace(found, arrival=estimate.time + round(

@@ -278,7 +278,7 @@ class Player(ManagedNode):
     def _wait_for_audience(self, transport: Transport) -> None:
         """Wait until who is to receive the messages is there."""
         begin = next_clock = time.monotonic()
-        patience = self._values['play.wait_for_subscribers_timeout']
+        timeout = self._values['play.wait_for_subscribers_timeout']
         # Discovery may take three seconds, the period at which participants announce
         # themselves; who has not been found by then is not there.
         settled = begin + self._values['play.discovery_time']
@@ -290,9 +290,9 @@ class Player(ManagedNode):
             missing = self._audience.missing()
             if not missing and (now >= settled or self._audience.found(self._clock_publisher)):
                 return
-            if missing and now >= begin + patience:
+            if missing and now >= begin + timeout:
                 raise HmsaError(
-                    f'no {", no ".join(missing)} within {patience:g} s: expected one; start it, '
+                    f'no {", no ".join(missing)} within {timeout:g} s: expected one; start it, '
                     'or remove it from play.wait_for_subscribers and play.wait_for_nodes')
 
     def _finish(self, transport: Transport) -> None:

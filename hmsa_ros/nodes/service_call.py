@@ -10,14 +10,14 @@ class ServiceCall:
 
     A server answers a client that it has just discovered before the way back is known to all: the
     answer is lost then, and its client would wait for ever. So a request must do no harm when it
-    is carried out twice. An answer counts as lost after ``patience`` in s; meanwhile the client's
+    is carried out twice. An answer counts as lost after ``timeout`` in s; meanwhile the client's
     node must be served.
     """
 
-    def __init__(self, client: Any, request: Any, patience: float = 2.0) -> None:
+    def __init__(self, client: Any, request: Any, timeout: float = 2.0) -> None:
         self._client = client
         self._request = request
-        self._patience = patience
+        self._timeout = timeout
         self._futures: list[Any] = []
         self._sent = 0.0
 
@@ -35,7 +35,7 @@ class ServiceCall:
         if not self.ready:
             # Whoever was asked is gone: the next server is asked from the beginning.
             self._drop()
-        elif not self._futures or monotonic() - self._sent > self._patience:
+        elif not self._futures or monotonic() - self._sent > self._timeout:
             self._futures.append(self._client.call_async(self._request))
             self._sent = monotonic()
         return None

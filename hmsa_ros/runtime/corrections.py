@@ -12,7 +12,7 @@ from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.timeline import Draft, Model, Plan
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.estimation import Estimate
-from hmsa_ros.estimation.correction import Course, expect, patience, worthwhile
+from hmsa_ros.estimation.correction import Course, expect, lengthening, worthwhile
 from hmsa_ros.runtime.feedback import Feedback
 from hmsa_ros.runtime.records import Severity, Verdict
 from hmsa_ros.runtime.slices import Clock, in_time, Work
@@ -51,7 +51,7 @@ class Corrections:
         estimate = self._feedback.foreseen(name, draft.begin)
         if estimate is None or segment.arrival is None or segment.code is Code.LEVELS:
             return draft
-        longer = patience(
+        longer = lengthening(
             estimate, _drafted(draft),
             max(abs(segment.stretch - draft.levels[0].stretch), _LEAST_STEP),
             self._group.planners[name].options.slew_limit, self._feedback.tolerance)

@@ -44,7 +44,7 @@ class PlannerRuntime:
     Plans requests in slices, sends commands in time and follows their effects.
 
     Two clocks return ns: `clock` the time of the stamps and of `tick`, `steady` the one that
-    patience and the length of a slice are measured by. `observable` returns whether somebody may
+    timeouts and the length of a slice are measured by. `observable` returns whether somebody may
     give samples, and `unheard` why nobody carries out commands (empty where somebody does): the
     first request waits for both.
     """

@@ -13,7 +13,7 @@ class Takeover:
     """
     Waits for samples of where the joints are before the first request, and goes on from there.
 
-    `clock` returns the time of the stamps in ns, `steady` one that patience is measured by,
+    `clock` returns the time of the stamps in ns, `steady` one that timeouts are measured by,
     `observable` whether somebody may give samples, and `unheard` why nobody carries out commands.
     """
 

@@ -95,11 +95,11 @@ class PlannerClient:
             If a signal that was noted asks for the end.
 
         """
-        patience = self._timeout if timeout is None else timeout
-        deadline = time() + patience
+        timeout = self._timeout if timeout is None else timeout
+        deadline = time() + timeout
         while not condition():
             if time() > deadline:
-                raise HmsaError(f'waited {patience:g} s: {failure}')
+                raise HmsaError(f'waited {timeout:g} s: {failure}')
             ENDING.check()
             self._executor.spin_once(timeout_sec=_SLICE_SECONDS)
             if each is not None:
@@ -148,7 +148,7 @@ class PlannerClient:
             recorded, f'no recorder of {self._publisher.topic_name}; start one with hmsa recorder')
 
     def find_plant(self) -> None:
-        """Wait until the commands reach somebody, with little patience: the planner reports it."""
+        """Wait until the commands reach somebody, for a short time: the planner reports it."""
         with suppress(HmsaError):
             self.spin_until(lambda: not self.unheard(), 'no plant', timeout=_UNHEARD_SECONDS)
 
@@ -282,7 +282,7 @@ class PlannerClient:
 
 
 @contextmanager
-def _slower_time(node: Node, patience: float) -> Iterator[Callable[[], float]]:
+def _slower_time(node: Node, timeout: float) -> Iterator[Callable[[], float]]:
     """Give a clock in s of simulated time that is no faster than the wall's; silence counts."""
     if not node.count_publishers(topics.CLOCK_TOPIC.name):
         yield monotonic
@@ -300,7 +300,7 @@ def _slower_time(node: Node, patience: float) -> Iterator[Callable[[], float]]:
                     passed += min(seconds - before, now - heard)
                 heard, before = now, seconds
         # Where nobody publishes it any more the wall's counts.
-        return passed + max(now - heard - patience, 0.0)
+        return passed + max(now - heard - timeout, 0.0)
 
     try:
         yield time
