@@ -390,7 +390,8 @@ def _timing(parts: Sequence[Part]) -> str:
             if len(values):
                 rows.append([
                     part.run.label, name, Cell(str(len(values)), len(values)),
-                    *np.quantile(values, [0.0, 0.5, 0.99, 1.0]) * 1e3, np.std(values) * 1e3])
+                    *np.quantile(values, [0.0, 0.5, 0.99, 1.0]) * 1e3,
+                    float(np.std(values)) * 1e3])
     return _table('timing-table', 'Jitter is the standard deviation.', {
         'run': '', 'quantity': '', 'count': '', 'least [ms]': '.4f', 'median [ms]': '.4f',
         '99 % [ms]': '.4f', 'largest [ms]': '.4f', 'jitter [ms]': '.4f'}, rows)
