@@ -210,7 +210,7 @@ def draw_sampled(path: str | Path, study: SampledStudy, *, period: float = 0.28)
         if solved is not None:
             moves.append((solved, style.SHAPED))
         end = 4.5 * study.tau_p
-        _draw_moves(panels, study, study.material, moves, np.linspace(0.0, end, 1200))
+        _draw_moves(panels, study, study.material, moves, end, 1200)
         axes = panels['command']
         for number in range(int(1.6 * study.tau_p / size) + 1):
             axes.axvline(number * size, **style.TARGET)
@@ -226,8 +226,9 @@ def draw_sampled(path: str | Path, study: SampledStudy, *, period: float = 0.28)
 def _draw_moves(
         panels: Mapping[str, Axes], study: SampledStudy | DampedStudy,
         material: NondimensionalParameters, moves: Sequence[tuple[Move, dict[str, Any]]],
-        times: Array, unit: float = 1.0) -> None:
+        end: float, count: int, unit: float = 1.0) -> None:
     """Draw commands, their loads over a unit, and the responses to them, each in its look."""
+    times: Array = np.linspace(0.0, end, count)
     for move, look in moves:
         loads = [x.load / unit for x in move.levels]
         panels['command'].step(
@@ -273,7 +274,7 @@ def draw_damped(path: str | Path, study: DampedStudy, *, zeta: float = 4.0) -> N
              {'color': colour, 'linewidth': 1.6})
             for row, colour in enumerate(colours)]
         end = float(np.interp(zeta, study.zetas, study.step)) * 1.1
-        _draw_moves(panels, study, material, moves, np.linspace(0.0, end, 800), holding)
+        _draw_moves(panels, study, material, moves, end, 800, holding)
         axes = panels['command']
         axes.set_xlim(-0.02 * end, end)
         style.finish(axes, '', r'load $\beta/\beta_1$ [1]', 'b')

@@ -185,7 +185,7 @@ def respond(
             theta, material, branches, wanted, start, begins, levels, slopes, float(levels[0]),
             0.0, times, rtol, stretch, rate, raw, np.empty((0, len(wanted)))):
         return None
-    raw = values['stretch_gain'] * raw
+    raw *= values['stretch_gain']
     shown, jacobian = sensed(values, free, stretch, rate, raw[:, :inner_count] @ setup.mixing)
     return Response(shown, rate, jacobian, raw[:, inner_count:])
 
