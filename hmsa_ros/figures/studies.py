@@ -228,7 +228,7 @@ def _draw_moves(
         material: NondimensionalParameters, moves: Sequence[tuple[Move, dict[str, Any]]],
         end: float, count: int, unit: float = 1.0) -> None:
     """Draw commands, their loads over a unit, and the responses to them, each in its look."""
-    times: Array = np.linspace(0.0, end, count)
+    times = np.linspace(0.0, end, count, dtype=np.float64)
     for move, look in moves:
         loads = [x.load / unit for x in move.levels]
         panels['command'].step(
