@@ -8,7 +8,7 @@ from typing import Any
 from matplotlib.axes import Axes
 import numpy as np
 
-from hmsa_ros.core.model import Array, critical_zeta, elastic_force
+from hmsa_ros.core.model import critical_zeta, elastic_force
 from hmsa_ros.core.moves import Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.shapers.linear import step
