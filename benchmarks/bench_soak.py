@@ -70,7 +70,7 @@ _SAME = 1e-9
 
 @dataclass
 class Cycle:
-    """What became of one cycle and its bag."""
+    """The result of one cycle and its bag."""
 
     kind: str  # 'calm' or 'rough'
     killed: str  # node that was killed in it; empty for none
