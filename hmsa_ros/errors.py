@@ -35,10 +35,12 @@ class BagError(HmsaError):
     """A recording that cannot be read or written."""
 
 
-def complain(error: Exception, status: int) -> int:
-    """Print an error as one line on standard error and return the exit status given."""
+def complain(error: Exception, status: int | None = None) -> int:
+    """Print an error as one line; return the exit status, by default 2 for bad input, else 1."""
     line = ' '.join(str(error).split())
     print(f'hmsa: error: {printable(line)}', file=sys.stderr)
+    if status is None:
+        return 2 if isinstance(error, BadInputError) else 1
     return status
 
 

@@ -160,7 +160,7 @@ def main(args: Sequence[str] | None = None) -> int:
             # Only then does the file get its index.
             recording.disconnect()
     except HmsaError as error:
-        return complain(error, 2 if isinstance(error, BadInputError) else 1)
+        return complain(error)
     return 0
 
 

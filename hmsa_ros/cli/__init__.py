@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 from hmsa_ros import __version__
 from hmsa_ros.cli.node import NODES
 from hmsa_ros.ending import ENDING
-from hmsa_ros.errors import BadInputError, complain, HmsaError
+from hmsa_ros.errors import complain, HmsaError
 
 COMMANDS = (
     'demo', 'init', 'excite', 'identify', 'plan', 'node', 'send', 'run', 'watch', 'bag', 'report',
@@ -85,7 +85,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return status
     except HmsaError as error:
-        return complain(error, 2 if isinstance(error, BadInputError) else 1)
+        return complain(error)
     except KeyboardInterrupt:
         return ENDING.status
     except BrokenPipeError:

@@ -152,7 +152,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for path in pictures(arguments.out):
             print(path)
     except HmsaError as error:
-        return complain(error, 2 if isinstance(error, BadInputError) else 1)
+        return complain(error)
     return 0
 
 
