@@ -4,7 +4,8 @@ from typing import Any
 
 import pytest
 from rcl_interfaces.msg import ParameterValue
-from rcl_interfaces.srv import GetParameters, ListParameters
+from rcl_interfaces.srv import GetParameters, GetParameterTypes, ListParameters
+from rclpy.parameter import Parameter
 
 from hmsa_ros.bag.experiment import parameter_key
 from hmsa_ros.nodes.remote_parameters import RemoteParameters
@@ -14,6 +15,11 @@ pytestmark = pytest.mark.ros
 
 def answer_list(_: Any, response: Any) -> Any:
     response.result.names = ['lead_time']
+    return response
+
+
+def answer_types(_: Any, response: Any) -> Any:
+    response.types = [3]
     return response
 
 
@@ -37,6 +43,19 @@ def test_what_nobody_answers_is_asked_again(ros, make_ros):
 
     ros.spin_until(asked, 'the question')
     ros.node.create_service(ListParameters, '/planner/list_parameters', answer_list)
+    ros.node.create_service(GetParameterTypes, '/planner/get_parameter_types', answer_types)
     ros.node.create_service(GetParameters, '/planner/get_parameters', answer_get)
     ros.spin_until(lambda: asking.poll(found.append) or found, 'the answer')
     assert found == [{parameter_key('/planner', 'lead_time'): '0.05'}]
+
+
+def test_a_parameter_without_a_value_hides_no_other(ros):
+    ros.node.declare_parameter('density', 1900.0)
+    # As a joint has that is one of several.
+    ros.node.declare_parameter('left.density', Parameter.Type.DOUBLE)
+    name = ros.node.get_fully_qualified_name()
+    asking = RemoteParameters(ros.node, name)
+    found: list[dict[str, str]] = []
+    ros.spin_until(lambda: asking.poll(found.append) or found, 'the answer')
+    assert found[0][parameter_key(name, 'density')] == '1900.0'
+    assert parameter_key(name, 'left.density') not in found[0]

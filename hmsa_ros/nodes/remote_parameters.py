@@ -4,7 +4,8 @@ from collections.abc import Callable, Iterable
 import json
 from typing import Any
 
-from rcl_interfaces.srv import GetParameters, ListParameters
+from rcl_interfaces.msg import ParameterType
+from rcl_interfaces.srv import GetParameters, GetParameterTypes, ListParameters
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 
@@ -18,6 +19,7 @@ class RemoteParameters:
     def __init__(self, node: Node, name: str) -> None:
         self._name = name
         self._list = node.create_client(ListParameters, f'{name}/list_parameters')
+        self._types = node.create_client(GetParameterTypes, f'{name}/get_parameter_types')
         self._get = node.create_client(GetParameters, f'{name}/get_parameters')
         self._names: list[str] = []
         self._call: ServiceCall | None = None
@@ -36,6 +38,11 @@ class RemoteParameters:
             return
         elif hasattr(answer, 'result'):
             self._names = list(answer.result.names)
+            self._call = ServiceCall(self._types, GetParameterTypes.Request(names=self._names))
+        elif hasattr(answer, 'types'):
+            # A joint may have none of its own: rclpy gives none at all where one has no value.
+            self._names = [x for x, kind in zip(self._names, answer.types, strict=False)
+                           if kind != ParameterType.PARAMETER_NOT_SET]
             self._call = ServiceCall(self._get, GetParameters.Request(names=self._names))
         else:
             self._call, self._done = None, True
