@@ -30,6 +30,7 @@ from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.report import charts
 from hmsa_ros.report.evaluation import evaluate, period_of, plan_points
+from hmsa_ros.report.outcome import level_results
 from hmsa_ros.report.page import page
 from hmsa_ros.report.picture import draw
 from hmsa_ros.report.timing import timing
@@ -45,6 +46,7 @@ from hmsa_ros.runs.topics import (
     TRAJECTORY,
     TYPES,
 )
+from hmsa_ros.runs.verify import verify
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 ACTUATOR = paper_actuator()
@@ -542,6 +544,23 @@ def test_a_change_that_never_took_effect_is_told(tmp_path):
     assert part.timing.unapplied == 1
     assert np.isnan(part.timing.lateness).tolist() == [False] * 2 + [True] + [False] * 3
     assert '1 changes of level did not take effect' in ' '.join(Page(page([part])).words)
+
+
+def test_a_recording_that_begins_while_the_field_is_on_is_verified(tmp_path):
+    messages = simulated(period=500_000)
+    begin = START + LEAD + round(15.0 * UNIT * NANOSECONDS)
+    # Who subscribes late is told what has taken effect so far, from time 0 on.
+    applied = [(0, 0.0), *((x.header.stamp.sec * NANOSECONDS + x.header.stamp.nanosec,
+                            x.magnetic_field.z) for _, topic, _, x in messages
+                           if topic.endswith('command'))]
+    late = [x for x in messages if x[0] >= begin] + [
+        (max(at, begin), '/flux_density_applied', TYPES[APPLIED], command(at, value))
+        for at, value in applied]
+    found, = verify(write(
+        tmp_path / 'bag', late, **parameters(planner=ACTUATOR, plant=ACTUATOR)))
+    assert found.largest_difference < SAME
+    assert found.unapplied_count == 0
+    assert level_results(read_runs(tmp_path / 'bag')[0])[0].duration < 1.0
 
 
 def test_the_field_of_a_driver_that_measures_none_is_what_it_applied(tmp_path):

@@ -66,6 +66,20 @@ def test_a_command_that_nobody_applied_is_said_though_the_motion_fits():
     assert found.largest_difference < 1e-12
 
 
+def test_a_recording_that_begins_in_the_middle_begins_with_what_it_shows():
+    # Held at 10 mT when the recording begins, moved to 20 mT later; both are sent again.
+    run = moved(commands=((0, 0.01), (60, 0.01), (80, 0.02)))
+    run = replace(run, commands=run.commands[1:], applied=run.applied[-1:], **{
+        x: getattr(run, x)[50:] for x in ('time', 'logged', 'stretch', 'rate', 'flux_density')})
+    found = verify_run(run)
+    assert (found.unapplied_count, found.largest_difference < 1e-12) == (0, True)
+    # A driver that measures no field, and one that reports no level.
+    flux_density = np.full(len(run.time), np.nan)
+    held = replace(run, applied=(), flux_density=flux_density, stretch=np.full(
+        len(run.time), run.stretch[0]), rate=0.0 * run.rate, commands=())
+    assert verify_run(held).largest_difference < 1e-9
+
+
 CREEP = Creep((0.1, 0.2), (0.005, 0.05))
 TOLD = {'plant.viscoelastic.ratio': [0.1, 0.2], 'plant.viscoelastic.time': [0.005, 0.05]}
 

@@ -6,7 +6,7 @@ bag may come from this package's recorder, from rosbag2, from a simulated plant 
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import math
 from pathlib import Path
 from typing import Any
@@ -215,8 +215,9 @@ class _Collected:
             vector = content.magnetic_field
             kept = self.commands if role == COMMAND else self.applied
             if obeyed(vector.x, vector.y, vector.z):
+                stamp = nanoseconds_of(content.header.stamp)
                 kept.setdefault(joint, []).append(Level(
-                    nanoseconds_of(content.header.stamp) or sent, float(vector.z), sent))
+                    stamp or (sent if role == COMMAND else 0), float(vector.z), sent))
             else:
                 self.refused[joint] = self.refused.get(joint, 0) + 1
         elif role == FORCE:
@@ -299,11 +300,20 @@ class _Collected:
         return Run(
             label, named, reader.path, samples.time, samples.logged, samples.stretch, samples.rate,
             samples.flux_density, tuple(self.commands.get(key, ())),
-            tuple(self.applied.get(key, ())), tuple(self.forces.get(key, ())),
-            tuple(self._plans(joint)), tuple(self._requests(joint, key)),
+            _begun(self.applied.get(key, ()), int(samples.time[0])),
+            tuple(self.forces.get(key, ())), tuple(self._plans(joint)),
+            tuple(self._requests(joint, key)),
             tuple(self._verdicts(joint, list(dict.fromkeys(planned)))), {**parameters, **given},
             plant, planner, known, self.left_out + refused + samples.left_out,
             (*notes, *samples.notes, *more), topics, summary)
+
+
+def _begun(levels: Sequence[Level], first: int) -> tuple[Level, ...]:
+    """Return what took effect, where time 0 is before a recording whose first sample is given."""
+    known = any(0 < x.stamp <= first for x in levels)
+    return tuple(
+        x if x.stamp else replace(x, stamp=min(x.sent, first)) for x in levels
+        if x.stamp or not known)
 
 
 def _number(text: str | None) -> float:

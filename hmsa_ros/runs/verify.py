@@ -23,7 +23,7 @@ from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.runs.bags import read_runs
-from hmsa_ros.runs.levels import in_force, lateness_of, without_repeats
+from hmsa_ros.runs.levels import in_force, lateness_of, Level, without_repeats
 from hmsa_ros.runs.parameters import creep_of, number_of, of_joint
 from hmsa_ros.runs.record import Run
 from hmsa_ros.runs.topics import APPLIED, COMMAND, FORCE, JOINT_STATES
@@ -159,6 +159,7 @@ def _one_run(run: Run) -> slice:
 
 def _start(run: Run, first: int, creep: Creep) -> 'ActuatorSimulation':
     """Return the simulation of the recorded actuator as it is at its first sample."""
+    from hmsa_ros.core.model import elastic_force
     from hmsa_ros.core.simulation import ActuatorSimulation
 
     stamp = int(run.time[first])
@@ -172,7 +173,9 @@ def _start(run: Run, first: int, creep: Creep) -> 'ActuatorSimulation':
     field = float(run.flux_density[first])
     if math.isnan(field):
         before = [x.flux_density for x in run.levels if x.stamp <= stamp]
-        field = before[-1] if before else 0.0
+        # Else what holds the actuator there: it may have been held so before the recording began.
+        field = before[-1] if before else run.plant.flux_density_unit * float(
+            elastic_force(float(run.stretch[first]), run.plant.nondimensional))
     try:
         simulation.set_state(
             float(run.stretch[first]), float(run.rate[first]), field, past[-1] if past else None)
@@ -194,9 +197,13 @@ def _unapplied(run: Run) -> int:
     if APPLIED not in run.topics:
         return 0
     commands, last = without_repeats(run.commands)[0], int(run.time[-1])
-    if not run.applied:
+    # What is in force as the recording begins may be sent again without a change.
+    known = run.applied
+    if math.isfinite(field := float(run.flux_density[0])):
+        known = Level(int(run.time[0]), field, int(run.logged[0])), *known
+    if not known:
         return sum(x.stamp < last for x in in_force((x,) for x in commands))
-    return lateness_of(commands, run.applied, last)[1]
+    return lateness_of(commands, known, last)[1]
 
 
 def _notes(run: Run, left_out: int, unapplied: int) -> Iterator[str]:
