@@ -40,7 +40,7 @@ def modules(package: str) -> list[str]:
 
 
 PACKAGES = ('core', 'device', 'runtime', 'bag', 'studies', 'contract', 'runs', 'report',
-            'identification', 'estimation')
+            'identification', 'estimation', 'judge')
 
 
 def test_physics_runtime_bags_and_studies_import_without_ros():

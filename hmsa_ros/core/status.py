@@ -10,7 +10,7 @@ class Code(str, Enum):
     """
     The outcome of a move or a request; the value is what messages and files carry.
 
-    The first eleven are plans that can be carried out, the next ones refusals, and the last four
+    The first eleven are plans that can be carried out, the next ones refusals, and the last seven
     what was measured.
     """
 
@@ -43,6 +43,9 @@ class Code(str, Enum):
     ARRIVED = 'arrived'
     OFF_TARGET = 'off_target'
     VIBRATING = 'vibrating'
+    LATE = 'late'
+    MISSED = 'missed'
+    UNDECIDED = 'undecided'
     UNOBSERVED = 'unobserved'
 
     def __str__(self) -> str:
@@ -125,9 +128,21 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
     Code.VIBRATING: (
         'Measured: the stretch vibrates about the setpoint by more than vibration_tolerance.',
         "Correct the actuator's parameters, as with hmsa identify, or raise the tolerance."),
+    Code.LATE: (
+        'The stretch came to rest at the setpoint only after its time, as commands took effect '
+        'late.',
+        'Raise lead_time, or see what delays commands.'),
+    Code.MISSED: (
+        'The setpoint was not carried out: a plan that was made anew left it out.',
+        'Raise lead_time, or see what delays or drops commands.'),
+    Code.UNDECIDED: (
+        'Measured, but the samples show neither that the stretch rests within the tolerances nor '
+        'that it does not.',
+        'Hold the setpoint longer, or sample faster or with less noise, as the message says.'),
     Code.UNOBSERVED: (
-        'Predicted, not measured: no samples came while the setpoint was held, or too few.',
-        'Publish joint_states to have it measured; or hold the setpoint longer.'),
+        'Predicted, not measured: no samples came while the setpoint was held, or none that '
+        'count.',
+        'Publish joint_states to have it measured; or repair the sensor that the message names.'),
 }
 
 

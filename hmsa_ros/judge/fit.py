@@ -1,0 +1,243 @@
+"""
+Bounds of an offset and of a vibration that samples allow, by profile likelihood.
+
+An offset with a drift and a decaying sinusoid are fitted for each frequency and decay of a grid.
+Each fit that leaves little more than the best is possible, and the bounds hold for all of these:
+what samples do not tell apart widens them.
+"""
+
+from dataclasses import dataclass
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+from hmsa_ros.core.model import Array
+
+#: Fewer samples, or fewer periods of the vibration, say nothing about it.
+FEWEST, SHORTEST = 8, 1.5
+# Standard deviations within which the truth is taken to be: one of 700 is beyond, on one side.
+_SURE, _BEYOND = 3.0, 0.00135
+# Samples nearer together than this share of a period show the vibration as it is; with others it
+# is looked for near the frequency of the model, of which they show an alias.
+_DENSE = 0.4
+_NEAR, _MIDDLE, _WIDE = (0.75, 1.3), (0.6, 1.6), (0.3, 2.5)
+# Periods from which on a frequency far from the model's is told from a drift, and a drift at all.
+_FAR, _DRIFTS = 3.0, 3.0
+# Frequencies tried in the time of one period over the span, and around the best one.
+_TRIED, _REFINED, _ROUNDS = 4, 9, 3
+# Decays tried, as shares of the largest, which is this many times the model's, as a ratio to the
+# frequency between these.
+_DECAYS = np.array([0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.55, 0.75, 1.0])
+_FASTER, _LEAST, _MOST = 2.5, 0.1, 0.7
+# Figures that are fitted: offset, drift, two of the sinusoid, frequency and decay.
+_FITTED = 6
+# Phases at which a vibration is looked at, and how many possible ones.
+_PHASES = np.linspace(0.0, 2.0 * math.pi, 48)
+_MOST_POSSIBLE = 600
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure, its standard deviation and its bounds."""
+
+    value: float
+    std: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What samples show."""
+
+    offset: Figure
+    vibration: Figure  #: peak to peak in the period after time 0
+    frequency: float  #: in rad/s
+    noise: float  #: standard deviation of a sample
+    independent: float  #: share of the samples that noise which is not white leaves
+
+
+def fit(time: Array, rest: Array, frequency: float, decay: float) -> Fit | None:
+    """
+    Fit samples: times in s, from 0 on and increasing, and how far from the target.
+
+    Frequency (rad/s) and decay (1/s) are the model's. None where samples are too few.
+    """
+    count, span = len(time), float(time[-1] - time[0]) if len(time) else 0.0
+    periods = span * frequency / (2.0 * math.pi)
+    if count < FEWEST or not periods >= SHORTEST:
+        return None
+    problem = _Problem(time, rest, drifts=periods >= _DRIFTS)
+    interval = float(np.median(np.diff(time)))
+    dense = interval * frequency < 2.0 * math.pi * _DENSE
+    low, high = (x * frequency for x in (
+        (_WIDE if periods >= _FAR else _MIDDLE) if dense else _NEAR))
+    if dense:
+        high = min(high, 0.9 * math.pi / interval)
+    omegas = np.linspace(
+        low, high, max(int((high - low) * span * _TRIED / (2.0 * math.pi)), _REFINED))
+    decays = _DECAYS * min(max(_FASTER * decay, _LEAST * frequency), _MOST * frequency)
+    tried = problem.solve(omegas, decays)
+    searched = 2.0 * math.log(max((high - low) * span / (2.0 * math.pi), 1.0))
+    width, spread = float(omegas[1] - omegas[0]), float(decays[1])
+    for _ in range(_ROUNDS):
+        best = tried.best
+        near = problem.solve(
+            np.clip(best.omega + width * np.linspace(-1.0, 1.0, _REFINED), low, high),
+            np.clip(best.decay + spread * np.linspace(-2.0, 2.0, 5), 0.0, decays[-1]))
+        tried = tried.joined(near)
+        width, spread = 2.0 * width / (_REFINED - 1), 0.5 * spread
+    return _bounds(problem, tried, searched)
+
+
+# -- fits of a grid -----------------------------------------------------------------------------
+
+@dataclass(frozen=True)
+class _One:
+    omega: float
+    decay: float
+
+
+class _Solved(NamedTuple):
+    """Fits, one an element: their residuals, sinusoids, offsets and covariances of unit noise."""
+
+    omega: Array
+    decay: Array
+    squares: Array  # sum of the squares of what is left
+    pair: Array  # factors of cosine and sine, shape (2, n)
+    offset: Array
+    offset_variance: Array
+    pair_variance: Array  # the larger of the two
+
+    @property
+    def best(self) -> _One:
+        place = int(np.argmin(self.squares))
+        return _One(float(self.omega[place]), float(self.decay[place]))
+
+    def joined(self, other: '_Solved') -> '_Solved':
+        return _Solved(*(
+            np.concatenate(x, axis=-1) for x in zip(self, other, strict=True)))
+
+    def taken(self, places: NDArray[np.intp]) -> '_Solved':
+        return _Solved(*(x[..., places] for x in self))
+
+
+class _Problem:
+    """Samples, with what an offset and a drift explain taken out."""
+
+    def __init__(self, time: Array, rest: Array, *, drifts: bool) -> None:
+        self.time, self._rest = time, rest
+        middle = 0.5 * (time[0] + time[-1])
+        columns = [np.ones(len(time)), time - middle][:1 + drifts]
+        self._straight, upper = np.linalg.qr(np.stack(columns, axis=1))
+        self._explained = self._straight.T @ rest
+        self._left = rest - self._straight @ self._explained
+        # What an offset in the middle is of the coordinates of the straight line.
+        row = np.zeros(len(columns))
+        row[0] = 1.0
+        self._middle = np.linalg.solve(upper.T, row)
+
+    def solve(self, omegas: Array, decays: Array) -> _Solved:
+        """Fit sinusoids of each frequency and decay."""
+        turning = np.exp(1j * np.outer(omegas, self.time))
+        fading = np.exp(-np.outer(self.time, decays))
+        plain = np.sum(fading**2, axis=0)
+        twice = turning**2 @ fading**2
+        mixed = [turning @ (fading * x[:, None]) for x in (*self._straight.T, self._left)]
+        *overlaps, right = mixed
+        one = 0.5 * (plain + twice.real) - sum(x.real**2 for x in overlaps)
+        two = 0.5 * (plain - twice.real) - sum(x.imag**2 for x in overlaps)
+        cross = 0.5 * twice.imag - sum(x.real * x.imag for x in overlaps)
+        determinant = np.maximum(one * two - cross**2, 1e-12 * plain**2)
+        cosine = (two * right.real - cross * right.imag) / determinant
+        sine = (one * right.imag - cross * right.real) / determinant
+        squares = float(self._left @ self._left) - (cosine * right.real + sine * right.imag)
+        # How far the sinusoid moves the offset, by its two factors.
+        by_cosine = sum(x.real * y for x, y in zip(overlaps, self._middle, strict=True))
+        by_sine = sum(x.imag * y for x, y in zip(overlaps, self._middle, strict=True))
+        offset = float(self._middle @ self._explained) - by_cosine * cosine - by_sine * sine
+        variance = float(self._middle @ self._middle) + (
+            two * by_cosine**2 - 2.0 * cross * by_cosine * by_sine + one * by_sine**2
+        ) / determinant
+        larger = (0.5 * (one + two) + np.sqrt(
+            0.25 * (one - two)**2 + cross**2)) / determinant
+        shape = determinant.shape
+        return _Solved(
+            np.broadcast_to(omegas[:, None], shape).ravel(),
+            np.broadcast_to(decays, shape).ravel(), np.maximum(squares, 0.0).ravel(),
+            np.stack((cosine.ravel(), sine.ravel())), offset.ravel(), variance.ravel(),
+            larger.ravel())
+
+    def residuals(self, one: _One, pair: Array) -> Array:
+        """Return what a sinusoid leaves with the best offset and drift."""
+        fading = np.exp(-one.decay * self.time)
+        wave = fading * (pair[0] * np.cos(one.omega * self.time)
+                         + pair[1] * np.sin(one.omega * self.time))
+        left = self._rest - wave
+        return np.asarray(left - self._straight @ (self._straight.T @ left))
+
+
+def _bounds(problem: _Problem, tried: _Solved, searched: float) -> Fit:
+    """Return the figures of the best fit, and their bounds by all that are possible."""
+    count = len(problem.time)
+    place = int(np.argmin(tried.squares))
+    least = float(tried.squares[place])
+    left = problem.residuals(tried.best, tried.pair[:, place])
+    together = _together(left)
+    freedom = max(count - _FITTED, 1)
+    variance = least / freedom
+    # Of samples that are not independent there are fewer.
+    of_few = max(freedom / together, 1.0)
+    sure = float(stdtrit(of_few, 1.0 - _BEYOND))
+    scale = variance * together
+    slack = sure**2 + searched - (tried.squares - least) / max(scale, 1e-300)
+    possible = np.flatnonzero(slack >= 0.0)
+    if len(possible) > _MOST_POSSIBLE:
+        possible = np.sort(possible[np.argsort(-slack[possible])[:_MOST_POSSIBLE]])
+    within = tried.taken(possible)
+    # One that was only found by searching is not shown, but it may be.
+    reach = np.sqrt(np.maximum(slack[possible], 0.0) * scale)
+    near = np.sqrt(np.maximum(slack[possible] - searched, 0.0) * scale)
+    swing, factor = _swing(within)
+    deviation = np.sqrt(within.pair_variance) * factor
+    shift = np.sqrt(within.offset_variance)
+    mine = int(np.flatnonzero(possible == place)[0])
+    unit = math.sqrt(scale)
+    usual = slack[possible] >= searched
+    return Fit(
+        Figure(
+            float(within.offset[mine]), unit * float(shift[mine]),
+            float(np.min((within.offset - near * shift)[usual])),
+            float(np.max((within.offset + near * shift)[usual]))),
+        Figure(
+            float(swing[mine]), unit * float(deviation[mine]),
+            float(max(np.min(swing - reach * deviation), 0.0)),
+            float(np.max((swing + near * deviation)[usual]))),
+        float(within.omega[mine]), math.sqrt(variance), 1.0 / together)
+
+
+def _swing(fits: _Solved) -> tuple[Array, Array]:
+    """Return the vibration, peak to peak in a period from time 0 on, and that of one of size 1."""
+    fading = np.exp(-np.outer(fits.decay / fits.omega, _PHASES))
+    waves = fading * (np.outer(fits.pair[0], np.cos(_PHASES))
+                      + np.outer(fits.pair[1], np.sin(_PHASES)))
+    # The largest that any phase has.
+    factor = 1.0 + np.exp(-math.pi * fits.decay / fits.omega)
+    return np.ptp(waves, axis=1), factor
+
+
+def _together(left: Array) -> float:
+    """Return of how many samples one is independent: 1 of white noise."""
+    size = float(left @ left)
+    if size <= 0.0:
+        return 1.0
+    total = 1.0
+    for lag in range(1, len(left) // 4 + 1):
+        share = float(left[lag:] @ left[:-lag]) / size
+        if share <= 0.0:
+            break
+        total += 2.0 * share
+    return total

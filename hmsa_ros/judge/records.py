@@ -1,0 +1,170 @@
+"""What is judged, by what, and what is found."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+import math
+
+from hmsa_ros.core.status import Code
+
+#: Verdicts on a setpoint, the better ones first.
+VERDICTS = (
+    Code.ARRIVED, Code.UNOBSERVED, Code.UNDECIDED, Code.LATE, Code.VIBRATING, Code.OFF_TARGET,
+    Code.MISSED)
+# Smaller steps have no percentage.
+_NO_STEP = 1e-9
+
+
+@dataclass(frozen=True)
+class Setpoint:
+    """
+    A setpoint as it was requested; times in ns.
+
+    Frequency and decay of vibration about the target are those of a model: they say where to look.
+    """
+
+    target: float  #: stretch to rest at
+    start: float  #: stretch of the setpoint before
+    begins: int  #: from which it holds
+    arrival: int | None  #: planned rest at the target; None where it is only approached
+    end: int | None = None  #: until which it holds; None for the last one, held on
+    frequency: float = math.nan  #: in rad/s
+    decay: float = 0.0  #: in 1/s
+    joint: str = ''  #: empty where there is one
+    number: int = 1  #: in the request, from 1
+    count: int = 1  #: of setpoints in the request
+    #: Arrival by a plan that was made anew, where it is another.
+    moved: int | None = None
+    #: What a position of the actuator can be.
+    possible: tuple[float, float] = (-math.inf, math.inf)
+
+    @property
+    def step(self) -> float:
+        """How far the target is from the setpoint before."""
+        return abs(self.target - self.start)
+
+    @property
+    def where(self) -> str:
+        """Name it in a sentence."""
+        joint = f'joint {self.joint}, ' if self.joint else ''
+        return f'{joint}setpoint {self.number} of {self.count}'
+
+    def percent(self, difference: float) -> float:
+        """Return a difference of stretch in % of the step; NaN where there is none."""
+        return 100.0 * difference / self.step if self.step > _NO_STEP else math.nan
+
+    def words(self, difference: float) -> str:
+        """Return a size in stretch and in % of the step."""
+        percent = self.percent(difference)
+        share = '' if math.isnan(percent) else f' ({percent:.3g} %)'
+        return f'{difference:.3g}{share}'
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """What counts as having arrived."""
+
+    arrival: float = 0.02  #: largest offset as a share of the step
+    vibration: float = 0.02  #: largest vibration, peak to peak, as a share of the step
+    stretch: float = 1e-3  #: either may be this large in any case, for small steps
+
+    def of(self, setpoint: Setpoint) -> tuple[float, float]:
+        """Return the largest offset and the largest vibration at a setpoint in stretch."""
+        return (max(self.arrival * setpoint.step, self.stretch),
+                max(self.vibration * setpoint.step, self.stretch))
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """
+    What is known of the sensor: it shows the bias plus the gain times the stretch, later.
+
+    What is not known of these is a standard deviation each, and counts; ``together`` is the
+    correlation of bias and gain.
+    """
+
+    bias: float = 0.0
+    bias_std: float = 0.0
+    gain: float = 1.0
+    gain_std: float = 0.0
+    latency: float = 0.0  #: in s
+    latency_std: float = 0.0
+    together: float = 0.0
+    resolution: float = 0.0  #: step between values that it can show; 0 where not known
+
+    def std(self, stretch: float) -> float:
+        """Return how far off a stretch that it shows may be, as a standard deviation."""
+        by_gain = stretch * self.gain_std
+        return math.sqrt(max(
+            self.bias_std**2 + by_gain**2 + 2.0 * self.together * self.bias_std * by_gain,
+            0.0)) / self.gain
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What samples show of a setpoint; figures in stretch, NaN where they cannot be told."""
+
+    verdict: Code  #: one of `VERDICTS`
+    message: str
+    setpoint: Setpoint
+    samples: int = 0
+    offset: float = math.nan  #: mean stretch less the target
+    offset_std: float = math.nan
+    vibration: float = math.nan  #: peak to peak in the period after the arrival
+    vibration_std: float = math.nan
+    frequency: float = math.nan  #: of the vibration in Hz
+    noise: float = math.nan  #: standard deviation of a sample
+
+    @property
+    def arrived(self) -> bool:
+        """Whether the setpoint was shown to be arrived at."""
+        return self.verdict is Code.ARRIVED
+
+    @property
+    def failed(self) -> bool:
+        """Whether the setpoint was shown not to be arrived at in time."""
+        return VERDICTS.index(self.verdict) > VERDICTS.index(Code.UNDECIDED)
+
+    @property
+    def rank(self) -> int:
+        """How bad it is, by `VERDICTS`."""
+        return VERDICTS.index(self.verdict)
+
+    def to_dict(self) -> dict[str, object]:
+        """Return it as status, reports and ``--json`` carry it; None for what cannot be told."""
+        percent = self.setpoint.percent
+        figures = {
+            'offset': self.offset, 'offset_std': self.offset_std,
+            'vibration': self.vibration, 'vibration_std': self.vibration_std}
+        figures |= {f'{key}_percent': percent(x) for key, x in figures.items()}
+        figures |= {'frequency': self.frequency, 'noise': self.noise}
+        return {
+            'verdict': str(self.verdict), 'joint': self.setpoint.joint,
+            'setpoint': self.setpoint.number, 'setpoints': self.setpoint.count,
+            'target': self.setpoint.target, 'message': self.message, 'samples': self.samples,
+            **{key: x if math.isfinite(x) else None for key, x in figures.items()}}
+
+
+def worst(findings: Iterable[Finding]) -> Finding | None:
+    """Return the worst finding, the first of equal ones; None of none."""
+    return max(findings, key=lambda x: x.rank, default=None)
+
+
+def unobserved(setpoint: Setpoint, reason: str = '', samples: int = 0) -> Finding:
+    """Return the finding where no samples count, which a reason says."""
+    return Finding(
+        Code.UNOBSERVED,
+        f'{setpoint.where}: {setpoint.target:.6g} is predicted, not measured'
+        f'{reason and ": "}{reason}', setpoint, samples)
+
+
+def missed(setpoint: Setpoint, reason: str) -> Finding:
+    """Return the finding of a setpoint that was not carried out, which a reason says."""
+    return Finding(
+        Code.MISSED, f'{setpoint.where}: {setpoint.target:.6g} was missed: {reason}', setpoint)
+
+
+def judged_late(found: Finding, after: int) -> Finding:
+    """Return a finding of an arrival so many ns after the setpoint's end."""
+    return replace(
+        found, verdict=Code.LATE,
+        message=f'{found.message}, but {after / 1e6:.3g} ms after its time')
