@@ -213,7 +213,7 @@ def beam(path: Path) -> None:
     youngs, length, width, thickness, density, remanence, damping = (
         1e6, 0.025, 0.005, 0.001, 2000.0, 0.1, 2.27e-4)
     strip = actuator_from({x.name: x.default for x in BLOCK} | {
-        'law': 'beam', 'law.youngs_modulus': youngs, 'law.width': width,
+        'law.name': 'beam', 'law.youngs_modulus': youngs, 'law.width': width,
         'actuator.half_length': length / 2, 'actuator.half_thickness': thickness / 2,
         'actuator.density': density, 'actuator.remanence': remanence,
         'actuator.damping_coefficient': damping})

@@ -22,7 +22,7 @@ AREA, BENDING = WIDTH * THICKNESS, YOUNGS * WIDTH * THICKNESS ** 3 / 12.0
 def silicone(**changes: float) -> ActuatorParameters:
     """Return the strip, with some parameters of another value."""
     return actuator_from({x.name: x.default for x in BLOCK} | {
-        'law': 'beam', 'law.youngs_modulus': YOUNGS, 'law.width': WIDTH,
+        'law.name': 'beam', 'law.youngs_modulus': YOUNGS, 'law.width': WIDTH,
         'actuator.half_length': LENGTH / 2, 'actuator.half_thickness': THICKNESS / 2,
         'actuator.density': DENSITY, 'actuator.remanence': REMANENCE,
         'actuator.damping_coefficient': DAMPING} | changes)

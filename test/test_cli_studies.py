@@ -155,7 +155,7 @@ def test_robustness_of_what_creeps_compares_the_shapers_that_know_of_it(run, tmp
 def test_robustness_takes_the_actuator_of_a_file_with_its_law_and_its_coil(
         run, refused, tmp_path):
     file = tmp_path / 'own.yaml'
-    file.write_text('/**:\n  ros__parameters:\n    law: yeoh\n    law.c10: 5000.0\n'
+    file.write_text('/**:\n  ros__parameters:\n    law.name: yeoh\n    law.c10: 5000.0\n'
                     '    law.c20: 500.0\n    coil_time_constant: 0.0005\n')
     status, out, _ = run(
         'robustness', '--params-file', file, '--move', '1:1.3', '--shapers', 'two_step', '--json')

@@ -17,7 +17,7 @@ from hmsa_ros.errors import BadInputError
 MS = 1_000_000
 GENT = paper_actuator()
 YEOH = actuator_from({
-    **parameters_of(GENT), 'law': 'yeoh', 'law.c10': 5e3, 'law.c20': -200.0, 'law.c30': 40.0})
+    **parameters_of(GENT), 'law.name': 'yeoh', 'law.c10': 5e3, 'law.c20': -200.0, 'law.c30': 40.0})
 UNIT = GENT.time_unit
 # One as fast as the actuator, one slower, one that is much slower.
 THREE = Creep((0.1, 0.3, 0.05), (0.4 * UNIT, 3.0 * UNIT, 0.5))

@@ -30,6 +30,7 @@ from hmsa_ros.core.two_step import plan_two_step, plan_two_step_batch
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification import identify
 from hmsa_ros.identification.files import read_belief
+from hmsa_ros.runs.parameters import read_parameter_file, recorded
 
 L = sympy.Symbol('l', positive=True)
 I1, I2 = L ** 2 + 2 / L, 2 * L + L ** -2
@@ -59,7 +60,7 @@ every_law = pytest.mark.parametrize('name', CASES)
 
 def block(name, constants=None):
     """Return the block of a law."""
-    return actuator_from({x.name: x.default for x in BLOCK} | {'law': name} | (
+    return actuator_from({x.name: x.default for x in BLOCK} | {'law.name': name} | (
         CASES[name][0] if constants is None else constants))
 
 
@@ -245,9 +246,21 @@ def test_gent_has_no_constants_of_a_law():
     assert block('neo_hookean').chain_limit == math.inf
 
 
+def test_file_and_bag_with_the_former_name_of_the_parameter_are_read(tmp_path):
+    file = tmp_path / 'old.yaml'
+    file.write_text(
+        '/**:\n  ros__parameters:\n    law: neo_hookean\n    left.law: yeoh\n    law.c10: 1.0\n')
+    assert read_parameter_file(file) == {
+        f'{node}.{name}': value for node in ('planner', 'plant') for name, value in (
+            ('law.name', 'neo_hookean'), ('left.law.name', 'yeoh'), ('law.c10', 1.0))}
+    assert read_belief(file).actuator.chain_limit == math.inf
+    stored = {'/plant.use_sim_time': 'false', '/plant.law': '"neo_hookean"'}
+    assert recorded(stored, '/')['plant.law.name'] == 'neo_hookean'
+
+
 def test_a_plan_as_json_has_null_for_a_chain_limit_that_there_is_not(tmp_path, capsys):
     file = tmp_path / 'law.yaml'
-    file.write_text('/**:\n  ros__parameters:\n    law: neo_hookean\n    law.c10: 5000.0\n')
+    file.write_text('/**:\n  ros__parameters:\n    law.name: neo_hookean\n    law.c10: 5000.0\n')
     assert main(['plan', '1.1:10', '--params-file', str(file), '--json']) == 0
     assert json.loads(capsys.readouterr().out)['j_lim'] is None
 
@@ -267,7 +280,7 @@ def test_identification_scales_a_law_and_keeps_the_ratios_of_its_constants(tmp_p
         f'{t!r},{x!r},{b!r}\n' for t, x, b in zip(
             times.tolist(), noisy.tolist(), level.tolist(), strict=True)))
     known.write_text(
-        '/**:\n  ros__parameters:\n    law: ogden\n    law.mu: [7200.0, -1800.0, 12.0]\n'
+        '/**:\n  ros__parameters:\n    law.name: ogden\n    law.mu: [7200.0, -1800.0, 12.0]\n'
         '    law.alpha: [1.5, -3.0, 8.0]\n')
     assert main([
         'identify', str(data), '--params-file', str(known), '--out', str(made)]) == 0

@@ -51,7 +51,7 @@ def text_of(stretch, flux, header='stretch,flux_density'):
 def block(**values):
     """Return the block of a table."""
     names = {'file': 'law.file', 'stretch': 'law.stretch', 'flux': 'law.flux_density'}
-    return actuator_from({x.name: x.default for x in BLOCK} | {'law': 'table'} | {
+    return actuator_from({x.name: x.default for x in BLOCK} | {'law.name': 'table'} | {
         names[key]: value for key, value in values.items()})
 
 
@@ -262,7 +262,7 @@ def test_a_plan_and_an_identification_take_a_table_from_a_parameter_file(tmp_pat
     (tmp_path / 'table.csv').write_text(text_of(stretch, flux))
     known, made, data = (tmp_path / x for x in ('known.yaml', 'found.yaml', 'data.csv'))
     known.write_text(
-        f'/**:\n  ros__parameters:\n    law: table\n    law.file: {tmp_path}/table.csv\n')
+        f'/**:\n  ros__parameters:\n    law.name: table\n    law.file: {tmp_path}/table.csv\n')
     assert main(['plan', '1.2:0.1', '--params-file', str(known)]) == 0
     assert '1.2' in capsys.readouterr().out
     # A block of another mass and damping: the table is known, these two are not.
@@ -294,7 +294,7 @@ def test_a_plan_and_an_identification_take_a_table_from_a_parameter_file(tmp_pat
 def test_the_bag_of_a_table_is_verified_and_reported_without_its_file(start, tmp_path):
     table, file, out = tmp_path / 'table.csv', tmp_path / 'block.yaml', tmp_path / 'out'
     table.write_text(text_of(*sampled()))
-    file.write_text(f'/**:\n  ros__parameters:\n    law: table\n    law.file: {table}\n')
+    file.write_text(f'/**:\n  ros__parameters:\n    law.name: table\n    law.file: {table}\n')
     run = start.hmsa('run', '1.10:0.1', '1.30:0.1', '1.00:0.1', '--simulate', '--params-file',
                      str(file), '--out', str(out), '--json')
     assert run.wait(300.0) == 0, run.output

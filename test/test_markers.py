@@ -221,7 +221,7 @@ def test_rate_zero_shows_nothing(ros, serve):
 @pytest.mark.parametrize('deflection', [0.0, 0.4, -0.7])
 def test_a_bent_beam_is_closed_keeps_its_volume_and_ends_where_its_tip_is(deflection):
     beam = actuator_from({x.name: x.default for x in contract.BLOCK} | {
-        'law': 'beam', 'law.youngs_modulus': 1e6, 'law.width': 0.005,
+        'law.name': 'beam', 'law.youngs_modulus': 1e6, 'law.width': 0.005,
         'actuator.half_length': 0.0125, 'actuator.half_thickness': 0.0005})
     markers = Scene((Block.of('actuator', beam),), 'coil').states(0, [State(deflection, 0.001)])
     body = of(markers, BLOCK)

@@ -41,6 +41,9 @@ BAD = {
     'mistyped_name': (
         ['--ros-args', '-p', 'actuator.remanance:=0.1'],
         'parameter actuator.remanance does not exist: expected one of the '),
+    'former_name': (
+        ['--ros-args', '-p', 'law:=yeoh', '-p', 'law.c10:=5000.0'],
+        'parameter law has been renamed: expected law.name'),
     'unknown_argument': (['--speed', '3'], '--speed'),
     'unknown_ros_argument': (['--ros-args', '--speed'], "'--ros-args --speed'"),
     'malformed_remapping': (['--ros-args', '-r', 'nonsense'], "'-r nonsense'"),

@@ -9,10 +9,10 @@ import re
 from typing import Any
 
 import pytest
-from rcl_interfaces.msg import ParameterType
-from rcl_interfaces.srv import DescribeParameters, ListParameters
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
 from rclpy.node import Node
-from rclpy.parameter import Parameter
+from rclpy.parameter import get_parameter_value, Parameter, parameter_value_to_python
 import yaml
 
 from hmsa_ros.contract.actuator import actuator_from
@@ -21,7 +21,9 @@ from hmsa_ros.contract.topics import NODES
 from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.errors import BadInputError
 import hmsa_ros.nodes
-from hmsa_ros.nodes.parameters import check_names, declare
+from hmsa_ros.nodes import planning, plant_joint
+from hmsa_ros.nodes.joints import declare_joints
+from hmsa_ros.nodes.parameters import check_names, declare, type_of
 from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.plant import PlantNode
 
@@ -41,9 +43,8 @@ DIMENSIONLESS = {
     'identification.values', 'identification.covariance',
     'arrival_tolerance', 'feedback_tolerance', 'stretch_tolerance', 'vibration_tolerance',
     *(f'mismatch.{x.name.partition(".")[2]}' for x in ACTUATOR)}
-TYPES = {
-    bool: ParameterType.PARAMETER_BOOL, int: ParameterType.PARAMETER_INTEGER,
-    float: ParameterType.PARAMETER_DOUBLE, str: ParameterType.PARAMETER_STRING}
+
+OWN = {'planner': planning.OWN, 'plant': plant_joint.OWN}
 
 every_node = pytest.mark.parametrize('node', DECLARED)
 
@@ -169,9 +170,8 @@ def test_descriptors_say_what_the_declaration_does(ros, serve, node):
             f'{spec.description} [{spec.unit}]' if spec.unit else spec.description)
         assert bool(descriptor.additional_constraints) == bool(spec.choices)
         assert all(x in descriptor.additional_constraints for x in spec.choices)
-        if not isinstance(spec.default, list):
-            assert descriptor.type == TYPES[type(spec.default)]
-            assert not descriptor.dynamic_typing
+        assert descriptor.type == type_of(spec).value
+        assert not descriptor.dynamic_typing
         ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
         assert len(ranges) == is_number(spec)
         for found in ranges:
@@ -187,6 +187,75 @@ def test_node_offers_what_is_declared_and_nothing_else_of_its_own(ros, serve, fa
     answer = ros.call(ListParameters, f'{node}/list_parameters')
     of_ros = {'use_sim_time', 'start_type_description_service'}
     assert set(answer.result.names) - of_ros == {x.name for x in DECLARED[node]}
+
+
+def dumped(ros: Any, node: str) -> str:
+    """Return the parameters of a node as ``ros2 param dump`` writes them."""
+    names = sorted(ros.call(ListParameters, f'{node}/list_parameters').result.names)
+    values = ros.call(
+        GetParameters, f'{node}/get_parameters', GetParameters.Request(names=names)).values
+    tree: dict[str, Any] = {}
+    for name, value in zip(names, values, strict=True):
+        place = tree
+        *groups, last = name.split('.')
+        for group in groups:
+            place = place.setdefault(group, {})
+            assert isinstance(place, dict), f'{name}: {group} is a value and a group'
+        assert last not in place
+        place[last] = parameter_value_to_python(value)
+    return yaml.dump({f'/{node}': {'ros__parameters': tree}})
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize('joints', [
+    (), ('-p', 'joints:=[left, right]', '-p', 'left.actuator.remanence:=0.2')])
+def test_dump_of_a_node_is_a_file_that_it_takes_again(ros, serve, make_ros, tmp_path, joints):
+    nodes = serve(
+        PlannerNode, PlantNode, *joints, '-p', 'law.name:=ogden', '-p', 'law.mu:=[1e4]', '-p',
+        'law.alpha:=[2.0]', '-p', 'feedback:=off').nodes
+    for node in nodes:
+        name = node.get_name()
+        file = tmp_path / f'{name}.yaml'
+        file.write_text(dumped(ros, name))
+        side = make_ros(
+            cli_args=['--ros-args', '-r', f'__node:={name}', '--params-file', str(file)])
+        again = declare_joints(side.node, DECLARED[name], OWN[name])
+        before = node._settings if name == 'planner' else node.values
+        assert again.values == {**before.values, 'autostart': True}
+        check_names(side.node)
+        for spec in DECLARED[name]:
+            assert node.get_parameter(spec.name).type_ == type_of(spec)
+
+
+@pytest.mark.ros
+def test_unquoted_word_that_yaml_reads_as_a_truth_value_is_the_choice(ros, serve, tmp_path):
+    file = tmp_path / 'off.yaml'
+    file.write_text('/**:\n  ros__parameters:\n    feedback: off\n    viscoelastic.ratio: []\n')
+    node, = serve(PlannerNode, '--params-file', str(file)).nodes
+    assert node.get_parameter('feedback').value == 'off'
+    # As ros2 param set reads its argument.
+    for text, expected in (('observe', 'observe'), ('off', 'off'), ('"off"', 'off')):
+        parameter = Parameter.from_parameter_msg(
+            ParameterMessage(name='feedback', value=get_parameter_value(text)))
+        result, = ros.set_parameters('planner', [parameter])
+        assert result.successful, result.reason
+        assert node.get_parameter('feedback').value == expected
+    assert not ros.set_parameters('planner', [Parameter('feedback', value=True)])[0].successful
+
+
+@pytest.mark.ros
+def test_small_number_as_ros2_param_load_reads_it_is_taken(ros, serve):
+    node, = serve(PlannerNode).nodes
+    result, = ros.set_parameters('planner', [Parameter('lateness_tolerance', value='5e-05')])
+    assert result.successful, result.reason
+    assert node.get_parameter('lateness_tolerance').value == 5e-5
+
+
+@pytest.mark.ros
+def test_former_name_is_refused_with_the_present_one(ros, serve):
+    node, = serve(PlannerNode).nodes
+    result, = ros.set_parameters('planner', [Parameter('law', value='yeoh')])
+    assert result.reason == 'parameter law has been renamed: expected law.name'
 
 
 @pytest.mark.ros

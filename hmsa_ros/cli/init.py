@@ -19,7 +19,7 @@ from hmsa_ros.cli.quantities import (
     QUANTITIES,
     Quantity,
 )
-from hmsa_ros.contract.parameters import PUBLISH_RATE
+from hmsa_ros.contract.parameters import LAW_NAME, PUBLISH_RATE
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text, write_text
 
@@ -225,7 +225,7 @@ def _beam(given: Mapping[str, float]) -> 'ActuatorParameters':
     from hmsa_ros.core.model import critical_zeta
 
     beam = actuator_from({x.name: x.default for x in BLOCK} | {
-        'law': 'beam', 'actuator.damping_coefficient': 0.0} | {
+        LAW_NAME.name: 'beam', 'actuator.damping_coefficient': 0.0} | {
         x.parameter: given[x.key] * (0.5 if x.parameter.startswith('actuator.half_') else 1.0)
         for x in BEAM if x.parameter and not x.parameter.startswith(('flux', 'slew'))})
     damping = given.get(DAMPING.key)
@@ -334,7 +334,7 @@ def file_text(
         texts |= {
             x.parameter: (('half of the ' if 'half_' in x.parameter else '') + x.text, x.unit)
             for x in BEAM} | {
-            'law': ('a beam: positions are deflections of the tip over the length', ''),
+            LAW_NAME.name: ('a beam: positions are deflections of the tip over the length', ''),
             DAMPING.parameter: ('damping coefficient of the tip', DAMPING.unit)}
     for name, value in _parameters(actuator, coil).items():
         text, unit = texts[name]

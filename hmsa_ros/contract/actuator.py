@@ -5,7 +5,7 @@ from dataclasses import replace
 import math
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.contract.parameters import ACTUATOR_FIELDS, LAW, VISCOELASTIC
+from hmsa_ros.contract.parameters import ACTUATOR_FIELDS, LAW, LAW_NAME, VISCOELASTIC
 from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.laws import LAWS
 from hmsa_ros.core.parameters import ActuatorParameters
@@ -25,7 +25,7 @@ def completed(values: Mapping[str, Any]) -> dict[str, Any]:
 
     """
     values = {**{x.name: x.default for x in LAW}, **values}
-    law = LAWS[values['law']]
+    law = LAWS[values[LAW_NAME.name]]
     return law.completed(values) if law.completed is not None else {}
 
 
@@ -37,7 +37,7 @@ def actuator_from(
     A modulus takes the place of the one that follows from the constants of a law.
     """
     numbers = {name: values[f'actuator.{name}'] for name in ACTUATOR_FIELDS}
-    law, elastic = LAWS[values.get('law', 'gent')], None
+    law, elastic = LAWS[values.get(LAW_NAME.name, 'gent')], None
     if law.endless:
         numbers['chain_limit'] = math.inf
     if law.scaled is not None:
@@ -87,5 +87,5 @@ def parameters_of(actuator: ActuatorParameters) -> dict[str, Any]:
             return [factor * x for x in value]
         return value if isinstance(value, str) else factor * value
 
-    return values | {'law': actuator.law.law} | {
+    return values | {LAW_NAME.name: actuator.law.law} | {
         name: in_si(name, value) for name, value in actuator.law.given}

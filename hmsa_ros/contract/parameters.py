@@ -12,6 +12,9 @@ from typing import Any
 from hmsa_ros.core.laws import LAWS
 from hmsa_ros.errors import BadInputError, excerpt
 
+#: Words that YAML reads as false or true where nobody quotes them.
+WORDS = {False: ('off', 'no'), True: ('on', 'yes')}
+
 Value = bool | int | float | str | list[str] | list[float]
 
 
@@ -39,6 +42,8 @@ class ParameterSpec:
         """
         Return a value of ROS or a file, checked, as the nodes use it; one item is a list of one.
 
+        An unquoted word that YAML reads as a truth value is the choice of that name.
+
         Raises
         ------
         BadInputError
@@ -50,6 +55,8 @@ class ParameterSpec:
             for item in value:
                 self.check(item)
             return value
+        if isinstance(value, bool):
+            value = next((x for x in self.choices if x in WORDS[value]), value)
         if isinstance(self.default, str) and not isinstance(value, str):
             raise BadInputError(
                 f'parameter {self.name} is {excerpt(value)}: expected a text')
@@ -149,14 +156,23 @@ def _of_laws() -> tuple[ParameterSpec, ...]:
     return tuple(found.values())
 
 
+LAW_NAME = ParameterSpec(
+    'law.name', next(iter(LAWS)),
+    'Elastic law of the block. All but gent and neo_hookean have constants law.*, from which '
+    'the shear modulus follows.', choices=tuple(LAWS))
+
 #: The elastic law of the block and its constants.
-LAW = (
-    ParameterSpec(
-        'law', next(iter(LAWS)),
-        'Elastic law of the block. All but gent and neo_hookean have constants law.*, from which '
-        'the shear modulus follows.', choices=tuple(LAWS)),
-    *_of_laws(),
-)
+LAW = (LAW_NAME, *_of_laws())
+
+# Names of earlier versions. ROS tools cannot show a value and a group of values of one name.
+_FORMER = {'law': LAW_NAME.name}
+
+
+def present_name(name: str) -> str:
+    """Return the name of a parameter, perhaps of one joint, that older files may have another."""
+    joint, dot, rest = name.rpartition('.')
+    return f'{joint}{dot}{_FORMER.get(rest, rest)}'
+
 
 #: Constants of laws that are read once, when a node starts.
 FIXED = frozenset(x.name for law in LAWS.values() for x in law.constants if x.fixed)

@@ -25,9 +25,6 @@ JOINTS = ParameterSpec(
 
 # A token of a ROS name: the joint is a part of the names of its topics.
 _TOKEN = re.compile(r'[A-Za-z][A-Za-z0-9_]*')
-_TYPES = {
-    bool: Parameter.Type.BOOL, int: Parameter.Type.INTEGER, float: Parameter.Type.DOUBLE,
-    str: Parameter.Type.STRING}
 
 
 def joint_names(values: Mapping[str, Any]) -> tuple[str, ...]:
@@ -131,9 +128,7 @@ def declare_joints(
         for general in own:
             spec = replace(general, name=f'{joint}.{general.name}')
             declared[spec.name] = spec
-            # A list, whose type is dynamic, is declared by the lack of a value.
-            value = declare_one(
-                node, spec, filled.get(general.name, _TYPES.get(type(spec.default))))
+            value = declare_one(node, spec, filled.get(general.name))
             if value is not None:
                 values[spec.name] = spec.taken(value)
     return JointParameters(

@@ -10,7 +10,12 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
-from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rcl_interfaces.srv import (
+    GetParameters,
+    ListParameters,
+    SetParameters,
+    SetParametersAtomically,
+)
 from rclpy.clock import Clock as RclpyClock
 from rclpy.clock import ClockType
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -26,7 +31,7 @@ from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import to_diagnostics
 from hmsa_ros.nodes.message_types import interface_class
-from hmsa_ros.nodes.parameters import check_names, declare
+from hmsa_ros.nodes.parameters import check_former_names, check_names, declare
 
 AUTOSTART = ParameterSpec(
     'autostart', True,
@@ -50,6 +55,7 @@ class ManagedNode(LifecycleNode):
         self._guard_clock()
         self.active = False
         self.finished = False
+        check_former_names(self._parameter_overrides)
         self._autostart: bool = declare(self, [AUTOSTART])[AUTOSTART.name]
         self._refusal: Exception | None = None
         self._kept: set[object] = set()
@@ -244,8 +250,27 @@ class _CarefulParameterService(ParameterService):
     The parameter services of rclpy, which refuse what they cannot read.
 
     Those of rclpy raise an error on a value whose type does not exist, and with it end the
-    node: anybody in the domain could end it with one message.
+    node: anybody in the domain could end it with one message. They list parameters that have no
+    value, and answer nothing at all where the value of one of them is asked for.
     """
+
+    def _list_parameters_callback(
+            self, request: ListParameters.Request,
+            response: ListParameters.Response) -> ListParameters.Response:
+        found = super()._list_parameters_callback(request, response)
+        node = self._get_node()
+        found.result.names = [
+            x for x in found.result.names if node.get_parameter_or(x).value is not None]
+        return found
+
+    def _get_parameters_callback(
+            self, request: GetParameters.Request,
+            response: GetParameters.Response) -> GetParameters.Response:
+        node = self._get_node()
+        if all(node.has_parameter(x) for x in request.names):
+            response.values = [
+                node.get_parameter_or(x).get_parameter_value() for x in request.names]
+        return response
 
     def _set_parameters_callback(
             self, request: SetParameters.Request,
@@ -255,6 +280,7 @@ class _CarefulParameterService(ParameterService):
         for parameter in request.parameters:
             # One at a time: what cannot be read is no reason to refuse the others.
             try:
+                check_former_names([parameter.name])
                 one = change(
                     SetParameters.Request(parameters=[parameter]), SetParameters.Response())
                 response.results.append(one.results[0])
@@ -266,6 +292,7 @@ class _CarefulParameterService(ParameterService):
             self, request: SetParametersAtomically.Request,
             response: SetParametersAtomically.Response) -> SetParametersAtomically.Response:
         try:
+            check_former_names(x.name for x in request.parameters)
             return super()._set_parameters_atomically_callback(request, response)
         except Exception as error:  # as above
             response.result = _refused(error)
@@ -273,5 +300,5 @@ class _CarefulParameterService(ParameterService):
 
 
 def _refused(error: Exception) -> SetParametersResult:
-    return SetParametersResult(
-        successful=False, reason=f'{error}: expected a declared parameter of its own type')
+    return SetParametersResult(successful=False, reason=str(error) if isinstance(
+        error, HmsaError) else f'{error}: expected a declared parameter of its own type')

@@ -8,31 +8,34 @@ from collections.abc import Iterable, Mapping
 import difflib
 from importlib import import_module
 import math
+import re
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 from hmsa_ros.contract import topics
 from hmsa_ros.contract.actuator import completed
-from hmsa_ros.contract.parameters import FIXED, LAW, ParameterSpec
+from hmsa_ros.contract.parameters import FIXED, LAW, ParameterSpec, present_name
 from hmsa_ros.errors import BadInputError
 
 # What hmsa identify once wrote beside the rest.
 _ONCE = {'identification.verdict', 'identification.noise_std'}
+# What PyYAML takes for a text.
+_POWER = re.compile(r'[+-]?\d+e[+-]\d+')
+_DECLARED: WeakKeyDictionary[Node, dict[str, ParameterSpec]] = WeakKeyDictionary()
 
 
 def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
     """Return the descriptor that ``ros2 param describe`` shows."""
     text = f'{spec.description} [{spec.unit}]' if spec.unit else spec.description
     descriptor = ParameterDescriptor(description=text, read_only=spec.read_only)
-    # An empty list says nothing of its type: rclpy would take it for one of bytes and
-    # refuse every other. `declare` checks instead.
-    descriptor.dynamic_typing = isinstance(spec.default, list)
     if spec.choices:
         descriptor.additional_constraints = 'one of: ' + ', '.join(spec.choices)
-    if descriptor.dynamic_typing or (spec.minimum is None and spec.maximum is None):
+    if isinstance(spec.default, list) or (spec.minimum is None and spec.maximum is None):
         return descriptor
     if isinstance(spec.default, int):
         descriptor.integer_range = [IntegerRange(
@@ -65,9 +68,35 @@ def declare(node: Node, specs: Iterable[ParameterSpec]) -> Mapping[str, Any]:
     return values
 
 
-def declare_one(node: Node, spec: ParameterSpec, default: Any) -> Any:
+def type_of(spec: ParameterSpec) -> Parameter.Type:
+    """Return the type of a parameter in ROS."""
+    if not isinstance(spec.default, list):
+        return Parameter.Type.from_parameter_value(spec.default)
+    return Parameter.Type.DOUBLE_ARRAY if spec.items is float else Parameter.Type.STRING_ARRAY
+
+
+def typed(spec: ParameterSpec, given: Parameter) -> Parameter:
     """
-    Declare a parameter with a default, or with a type and without a value; return its value.
+    Return what is given as a parameter of the type declared, or as it is if it cannot be one.
+
+    The tools of ROS guess the type from the text: that of an empty list is unknown, ``off`` is a
+    truth value, and 5e-05 a text.
+    """
+    value = given.value
+    if type(spec.default) is float and isinstance(value, str) and _POWER.fullmatch(value):
+        return Parameter(spec.name, value=float(value))
+    try:
+        value = spec.taken(value)
+    except BadInputError:
+        return given
+    if isinstance(spec.default, (list, str)):
+        return Parameter(spec.name, type_of(spec), value)
+    return given
+
+
+def declare_one(node: Node, spec: ParameterSpec, default: Any = None) -> Any:
+    """
+    Declare a parameter with a default, or without one and then perhaps a value; return its value.
 
     Raises
     ------
@@ -75,17 +104,40 @@ def declare_one(node: Node, spec: ParameterSpec, default: Any) -> Any:
         If a value from the command line or a file has the wrong type.
 
     """
+    specs, overrides = _declared(node), node._parameter_overrides
+    specs[spec.name] = spec
+    if spec.name in overrides:
+        overrides[spec.name] = typed(spec, overrides[spec.name])
+    if isinstance(spec.default, list):
+        node.declare_parameter(
+            spec.name, type_of(spec), descriptor(spec), ignore_override=True)
+        value = overrides[spec.name].value if spec.name in overrides else default
+        if value is None:
+            return None
+        # rclpy would take an empty list for one of bytes.
+        node._parameters[spec.name] = Parameter(spec.name, type_of(spec), spec.taken(value))
+        return value
     try:
         # The range is checked by `ParameterSpec`, whose message names what was expected; rclpy's
         # does not.
-        return node.declare_parameter(spec.name, default, descriptor(spec)).value
+        return node.declare_parameter(
+            spec.name, type_of(spec) if default is None else default, descriptor(spec)).value
     except ParameterException as error:
-        override = node._parameter_overrides.get(spec.name)
+        override = overrides.get(spec.name)
         got = 'a value of another kind' if override is None else repr(override.value)
         expected = type(spec.default).__name__
         if spec.minimum is not None or spec.maximum is not None:
             expected += f', {spec.range_text()}'
         raise BadInputError(f'parameter {spec.name} is {got}: expected {expected}') from error
+
+
+def _declared(node: Node) -> dict[str, ParameterSpec]:
+    """Return what is declared on a node by name; what is set later gets the types of these."""
+    if node not in _DECLARED:
+        specs = _DECLARED[node] = {}
+        node.add_pre_set_parameters_callback(lambda given: [
+            typed(specs[x.name], x) if x.name in specs else x for x in given])
+    return _DECLARED[node]
 
 
 def from_files(node: Node, values: Mapping[str, Any], joint: str = '') -> Mapping[str, Any]:
@@ -99,6 +151,13 @@ def from_files(node: Node, values: Mapping[str, Any], joint: str = '') -> Mappin
     lists = {x.name for x in LAW if isinstance(x.default, list)}
     return completed({
         name: value for name, value in values.items() if not joint or name not in lists} | given)
+
+
+def check_former_names(names: Iterable[str]) -> None:
+    """Refuse names that parameters had in earlier versions by `BadInputError`."""
+    for name in names:
+        if (new := present_name(name)) != name:
+            raise BadInputError(f'parameter {name} has been renamed: expected {new}')
 
 
 def check_names(node: Node) -> None:

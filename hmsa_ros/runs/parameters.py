@@ -14,6 +14,7 @@ from hmsa_ros.contract.parameters import (
     JOINT,
     LAW,
     ParameterSpec,
+    present_name,
     VISCOELASTIC,
 )
 from hmsa_ros.contract.topics import PLANNER, PLANT
@@ -54,9 +55,9 @@ def recorded(custom_data: Mapping[str, str], space: str) -> dict[str, object]:
     for node in (PLANNER, PLANT):
         for name, text in parameters_of(custom_data, node, space).items():
             try:
-                parameters[f'{node}.{name}'] = json.loads(text)
+                parameters[f'{node}.{present_name(name)}'] = json.loads(text)
             except (ValueError, RecursionError):
-                parameters[f'{node}.{name}'] = text
+                parameters[f'{node}.{present_name(name)}'] = text
     return parameters
 
 
@@ -208,7 +209,8 @@ def entries_of(path: Path) -> Entries:
     for name, value in flat.items():
         whole, _, parameter = name.rpartition('ros__parameters.')
         node = whole.rstrip('.').rpartition('/')[2]
-        entries.append(('' if node in ('*', '**') else node, parameter, value))
+        entries.append((
+            '' if node in ('*', '**') else node, present_name(parameter), value))
     return entries
 
 

@@ -17,7 +17,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 
 from hmsa_ros.contract import topics
-from hmsa_ros.contract.parameters import BLOCK
+from hmsa_ros.contract.parameters import BLOCK, WORDS
 from hmsa_ros.contract.status import Verdict, whole
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.ending import ENDING
@@ -386,4 +386,4 @@ class _Watch:
 def _same(own: object, other: object) -> bool:
     if isinstance(own, (int, float)) and isinstance(other, (int, float)):
         return own == other or abs(own - other) <= _SAME * max(abs(own), abs(other))
-    return own == other
+    return own == other or isinstance(other, bool) and own in WORDS[other]

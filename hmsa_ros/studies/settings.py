@@ -13,7 +13,7 @@ import sys
 from typing import Any
 
 from hmsa_ros.contract.actuator import completed, model_from
-from hmsa_ros.contract.parameters import LAW, ParameterSpec, PLANNED
+from hmsa_ros.contract.parameters import LAW, LAW_NAME, ParameterSpec, PLANNED
 from hmsa_ros.core.delivery import Delivery
 from hmsa_ros.core.laws import LAWS
 from hmsa_ros.core.mismatch import Errors, Uncertainty
@@ -79,7 +79,7 @@ class Nondimensional:
 
     def setting(self, values: Mapping[str, Any]) -> Setting:
         """Return what a row is planned with; only the ratios of a law's constants count."""
-        law, elastic = LAWS[values.get('law', 'gent')], None
+        law, elastic = LAWS[values.get(LAW_NAME.name, 'gent')], None
         if law.scaled is not None:
             _, elastic = law.scaled(
                 {'actuator.remanence': 1.0, **{x.name: x.default for x in LAW}, **values})

@@ -16,6 +16,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hmsa_ros.contract.parameters import LAW_NAME, present_name
 from hmsa_ros.core.laws import LAWS
 from hmsa_ros.core.model import Array, signed_root
 from hmsa_ros.core.shapers import get_shaper
@@ -138,7 +139,7 @@ class Sweep:
                     f'law {law!r} is unknown: expected one of {", ".join(LAWS)}')
             if not any(x.startswith('law.') for x in seen):
                 # Constants that no row can have are not left to the rows.
-                self._system.setting({**defaults, 'law': law})
+                self._system.setting({**defaults, LAW_NAME.name: law})
         for shaper in shapers:
             get_shaper(shaper)
         self._axes += [
@@ -230,6 +231,7 @@ class Sweep:
                 _, number = np.unique(number * size + place, return_inverse=True)
         _, first, which = np.unique(number, return_index=True, return_inverse=True)
         columns = [inputs[name][first].tolist() for name in names]
+        names = [present_name(x) for x in names]
         return [dict(zip(names, values, strict=True))
                 for values in (zip(*columns, strict=True) if names else [()])], which
 
