@@ -1,5 +1,6 @@
 """The benchmarks run and what they compare is right; how fast it is is not tested."""
 
+from dataclasses import replace
 from decimal import Decimal
 import json
 import math
@@ -10,7 +11,7 @@ from rich.console import Console
 from scipy.integrate import solve_ivp
 
 from benchmarks import __main__ as program
-from benchmarks import bench_plant, contenders
+from benchmarks import bench_judge, bench_plant, contenders
 from benchmarks.measure import Contender, loosest, race, Report, Row, text_of_time
 from benchmarks.reference import Actuator, response, two_step
 from benchmarks.sheet import Sheet
@@ -109,6 +110,15 @@ def test_loosest_tolerance_keeps_the_error_and_the_next_one_does_not():
 def test_loosest_tolerance_says_when_there_is_none():
     with pytest.raises(ArithmeticError, match='no tolerance'):
         loosest(lambda _: math.nan, 1e-9)
+
+
+@pytest.mark.parametrize(('within', 'verdict', 'said'), [
+    (False, 'arrived', 'wrong arrived'), (True, 'off_target', 'wrong missed'),
+    (True, 'arrived', ''), (False, 'vibrating', ''), (None, 'arrived', ''),
+    (True, 'undecided', ''), (False, 'unobserved', '')])
+def test_a_verdict_is_wrong_where_the_truth_is_the_reverse(within, verdict, said):
+    trial = replace(bench_judge.draw(1, 'white'), within=within)
+    assert bench_judge.wrong(trial, verdict) == said
 
 
 def test_table_compares_to_its_first_row_and_leaves_empty_columns_out():
