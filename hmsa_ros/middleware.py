@@ -9,7 +9,7 @@ RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 _DECIDED = (RANGE, 'ROS_STATIC_PEERS', 'ROS_DISCOVERY_SERVER', 'ROS_LOCALHOST_ONLY')
 #: What Fast DDS reads, in the version of ROS 2 Jazzy.
 PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
-_OWN_PROFILES = Path(__file__).with_name('fastdds.xml')
+_HERE = Path(__file__).parent
 
 
 def prepare_middleware() -> None:
@@ -22,9 +22,10 @@ def prepare_middleware() -> None:
 
     Where no other profiles are given to Fast DDS, what a subscriber has missed is sent to it again
     within 0.03 s, and a newcomer is found within 0.5 s. By default either may take 3 s, long
-    after a command was to apply.
+    after a command was to apply. Where other hosts take part, a send never waits for one of them.
     """
     if not any(os.environ.get(name) for name in _DECIDED):
         os.environ[RANGE] = 'LOCALHOST'
     if not os.environ.get(PROFILES):
-        os.environ[PROFILES] = str(_OWN_PROFILES)
+        local = os.environ.get(RANGE) == 'LOCALHOST' or os.environ.get('ROS_LOCALHOST_ONLY') == '1'
+        os.environ[PROFILES] = str(_HERE / f'fastdds{"_localhost" if local else ""}.xml')

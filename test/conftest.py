@@ -177,7 +177,7 @@ def ros_env(
         'ROS_DOMAIN_ID': str(ros_domain_id),
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
         # What is lost before a match is made comes again at once, from the tests' nodes too.
-        PROFILES: str(ROOT / 'hmsa_ros' / 'fastdds.xml'),
+        PROFILES: str(ROOT / 'hmsa_ros' / 'fastdds_localhost.xml'),
         'ROS_LOG_DIR': str(tmp_path_factory.mktemp('ros_log')),
         'PYTHONPATH': os.pathsep.join(
             [str(ROOT), *filter(None, [os.environ.get('PYTHONPATH')])]),

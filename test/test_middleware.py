@@ -1,6 +1,7 @@
 """What our processes ask of the middleware."""
 
 import os
+from pathlib import Path
 import signal
 from time import monotonic
 
@@ -71,6 +72,16 @@ def test_who_names_others_is_left_alone(monkeypatch, name):
     monkeypatch.setenv(name, '1')
     prepare_middleware()
     assert not os.environ[RANGE]
+
+
+@pytest.mark.parametrize(('reach', 'waits'), [('LOCALHOST', True), ('SUBNET', False)])
+def test_no_send_waits_for_another_host(monkeypatch, reach, waits):
+    monkeypatch.setenv(RANGE, reach)
+    prepare_middleware()
+    profiles = Path(os.environ[PROFILES]).read_text()
+    assert ('<non_blocking_send>true</non_blocking_send>' in profiles) is not waits
+    # On one host ROS 2 adds its own transports to any named here.
+    assert ('<userTransports>' in profiles) is not waits
 
 
 def test_who_has_profiles_of_his_own_keeps_them(monkeypatch):

@@ -25,6 +25,8 @@ COMMAND = Quality(1000)
 # Samples at 1 kHz and more: deep enough for a reader that pauses for some seconds.
 SAMPLES = Quality(5000)
 LATCHED = Quality(1, latched=True)
+# News that is of no use any more when it is late.
+NEWEST = Quality(1, reliable=False)
 # The changes of level that took effect last, for late subscribers.
 CHANGES = Quality(100, latched=True)
 CLOCK = Quality(1, reliable=False)
@@ -104,6 +106,15 @@ FLUX_DENSITY_APPLIED = Topic(
     'flux_density_applied', _FIELD, CHANGES,
     'The applied level: one message per change of level, stamped with the time at which it took '
     'effect; z is the level from then on, in tesla.',
+    publishers=(PLANT, DRIVER), subscribers=(PLANNER,))
+FLUX_DENSITY_RECEIVED = Topic(
+    'flux_density_received', 'sensor_msgs/msg/TimeReference', NEWEST,
+    'A receipt for a command, and a sign of life five times a second: `header.stamp` is when the '
+    'newest command came, or the present time, by the clock of the sender; `time_ref` is the '
+    'stamp of that command (0 before the first), `source` the joint. `frame_id` is `cut_off` '
+    'while commands of before a cut-off of the coil are refused. The planner sees from it that '
+    'its commands arrive, and how far the two clocks are apart. Optional for a driver of your '
+    'own.',
     publishers=(PLANT, DRIVER), subscribers=(PLANNER,))
 DISTURBANCE_FORCE = Topic(
     'disturbance_force', 'geometry_msgs/msg/WrenchStamped', RELIABLE,

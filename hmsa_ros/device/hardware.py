@@ -148,6 +148,9 @@ class HardwareDevice(Device):
         limit = self._joints[joint].limit
         if not abs(level) <= limit:  # not a number is refused, too
             raise BadInputError(f'flux density is {level:g} T: expected at most {limit:g} T')
+        self._check_clock(stamp)
+        if self._refuses(joint, stamp, level, self._schedules[joint].current):
+            return
         changed = self._schedules[joint].insert(stamp, level)
         self._heard[joint] = True
         late = self._time - stamp

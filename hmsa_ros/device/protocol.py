@@ -29,6 +29,7 @@ class Kind(Enum):
     LATE = 'late'
     SILENT = 'silent'
     HEARD = 'heard'
+    REFUSED = 'refused'
     FAILED = 'failed'
 
 

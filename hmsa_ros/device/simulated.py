@@ -93,6 +93,7 @@ class SimulatedDevice(Device):
 
     def receive(self, joint: int, stamp: int, level: float) -> None:
         """Have a command in T take effect at its stamp in ns (0 for now), or its delay later."""
+        self._check_clock(stamp)
         if self._transit.delay:
             self._actuators.setups[joint].check_level(level)
             self._transit.send(self.time, (joint, stamp, level))
@@ -104,6 +105,9 @@ class SimulatedDevice(Device):
         self._actuators.force(joint, stamp or self.time, force)
 
     def _obey(self, joint: int, stamp: int, level: float) -> None:
+        self._actuators.setups[joint].check_level(level)
+        if self._refuses(joint, stamp, level, self.level(joint)):
+            return
         late = self._actuators.command(joint, stamp or self.time, level)
         self._feed(joint, self.time)
         if late:
@@ -176,6 +180,7 @@ class SimulatedDevice(Device):
         self._actuators.reset(joint, stretch, rate)
         # A first command arms it again.
         self._watchdogs[joint].disarm()
+        self._cut_offs[joint].end()
         self._sensor.forget()
 
     def drop_commands(self) -> None:

@@ -1,6 +1,7 @@
 """Devices, and their watchdogs: what a coil does when nobody commands it any more."""
 
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 import math
@@ -15,6 +16,10 @@ _REASONS = {
     'hold': 'what is commanded stays (safe_flux hold)', 'zero': 'the field goes to zero',
     'ramp': 'the field ramps to zero'}
 _RAMP_STEP_NS = 1_000_000
+# Levels of before a cut-off that are remembered.
+_REMEMBERED = 8
+#: Times that are further apart, in ns, are of clocks that began at different times.
+ANOTHER_CLOCK = 100_000_000 * NANOSECONDS
 
 
 @dataclass(frozen=True)
@@ -58,6 +63,11 @@ class Watchdog:
         self._ramp: tuple[int, float] | None = None
         self.tripped = False
         self.trips = 0
+
+    @property
+    def cuts_off(self) -> bool:
+        """Whether the coil is off after an alarm."""
+        return self._fallback.safe_flux != 'hold'
 
     @property
     def alarm(self) -> str:
@@ -121,6 +131,55 @@ class Watchdog:
         self.tripped = False
 
 
+class CutOff:
+    """
+    What a joint refuses after its coil was cut off: levels that were meant for before.
+
+    Whoever was out of reach repeats its last level as soon as it is back, and what it sent in vain
+    is sent again: either would put the field on in one step that nobody has asked for.
+    """
+
+    def __init__(self) -> None:
+        self._before: deque[float] = deque(maxlen=_REMEMBERED)
+        self._since: int | None = None
+
+    @property
+    def in_force(self) -> bool:
+        """Whether levels are refused."""
+        return self._since is not None
+
+    def begin(self, now: int) -> None:
+        """Refuse what was commanded before a time in ns, if anything was."""
+        if self._before:
+            self._since = now
+
+    def end(self) -> None:
+        """Forget it, and what was commanded."""
+        self._since = None
+        self._before.clear()
+
+    def refusal(self, stamp: int, level: float, now: int, current: float) -> str:
+        """Return why a level in T from a stamp in ns on is refused now; empty if it is obeyed."""
+        if self._since is None:
+            self._remember(level)
+            return ''
+        off = f'the coil was cut off {(now - self._since) / NANOSECONDS:.3f} s ago'
+        if stamp and stamp < max(now, self._since):
+            self._remember(level)
+            return (f'{level:g} T applied {(now - stamp) / NANOSECONDS:.3f} s ago, and {off}: '
+                    'expected a command for a time that has not passed')
+        if level != current and level in self._before:
+            return (f'{level:g} T was commanded before, and {off}: expected another level, or '
+                    f'the one in force, {current:g} T, first')
+        self.end()
+        self._remember(level)
+        return ''
+
+    def _remember(self, level: float) -> None:
+        if not self._before or level != self._before[-1]:
+            self._before.append(level)
+
+
 class Device(ABC):
     """
     Actuators with their amplifiers, sensors and watchdogs.
@@ -131,6 +190,7 @@ class Device(ABC):
 
     def __init__(self, fallbacks: Iterable[Fallback]) -> None:
         self._watchdogs = [Watchdog(x) for x in fallbacks]
+        self._cut_offs = [CutOff() for _ in self._watchdogs]
         self._changes: list[Change] = []
         self._samples: list[Sample] = []
         self._notices: list[Notice] = []
@@ -173,6 +233,30 @@ class Device(ABC):
         """How often a joint fell silent."""
         return sum(x.trips for x in self._watchdogs)
 
+    @property
+    def cut_offs(self) -> list[int]:
+        """Joints whose coil was cut off, and whose levels of before are refused."""
+        return [i for i, x in enumerate(self._cut_offs) if x.in_force]
+
+    def cut_off(self, joint: int, now: int) -> None:
+        """From a time in ns on, refuse levels of before, since the coil is off or unknown."""
+        self._cut_offs[joint].begin(now)
+
+    def _refuses(self, joint: int, stamp: int, level: float, current: float) -> bool:
+        """Return whether a level in T, other than the current one, is one of before a cut-off."""
+        why = self._cut_offs[joint].refusal(stamp, level, self.time, current)
+        if why:
+            self._notices.append(Notice(Kind.REFUSED, joint, why))
+        return bool(why)
+
+    def _check_clock(self, stamp: int) -> None:
+        """Refuse a stamp in ns of a clock that began at another time, before it is obeyed."""
+        if stamp and self.time and abs(stamp - self.time) > ANOTHER_CLOCK:
+            raise BadInputError(
+                f'command stamped {stamp / NANOSECONDS:.3f} s, and the time is '
+                f'{self.time / NANOSECONDS:.3f} s: expected one clock for both (use_sim_time the '
+                'same on both sides, no time since a start beside the time of day)')
+
     def _feed(self, joint: int, now: int) -> None:
         """Take a sign of life at a time in ns."""
         if self._watchdogs[joint].feed(now):
@@ -185,6 +269,8 @@ class Device(ABC):
         trips = watchdog.trips
         yield from watchdog.watch(now, until, level)
         if watchdog.trips > trips:
+            if watchdog.cuts_off:
+                self.cut_off(joint, now)
             self._notices.append(Notice(Kind.SILENT, joint, watchdog.alarm))
 
     def _note_late(self, joint: int, late: int) -> None:

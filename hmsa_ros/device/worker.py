@@ -42,6 +42,11 @@ class HardwareWorker:
         return self._device.silent
 
     @property
+    def cut_offs(self) -> list[int]:
+        """Joints whose levels of before a cut-off are refused."""
+        return self._device.cut_offs
+
+    @property
     def trips(self) -> int:
         """How often a joint fell silent."""
         return self._device.trips

@@ -8,7 +8,7 @@ from builtin_interfaces.msg import Duration, Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import MagneticField
+from sensor_msgs.msg import MagneticField, TimeReference
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     # Numba comes along with the planner, which a recorder has no use for.
     from hmsa_ros.runtime.records import StatusChanged
 
+#: What a receipt says while commands of before a cut-off are refused.
+CUT_OFF = 'cut_off'
 # Encapsulation and stamp: bytes at the beginning of a message with a header.
 _STAMPED = 12
 
@@ -66,6 +68,13 @@ def from_command(message: MagneticField) -> tuple[int, float]:
     if stamp < 0:
         raise BadInputError(f'flux density command stamped {stamp} ns: expected at least 0')
     return stamp, float(field.z)
+
+
+def to_receipt(joint: str, time: int, command: int, *, cut_off: bool) -> TimeReference:
+    """Return that the newest command of a joint is one of a stamp, at a time; both in ns."""
+    return TimeReference(
+        header=Header(stamp=to_time(time), frame_id=CUT_OFF if cut_off else ''),
+        time_ref=to_time(command), source=joint)
 
 
 def to_trajectory(

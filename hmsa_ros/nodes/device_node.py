@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from time import monotonic_ns
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -48,6 +49,8 @@ PUBLISH_SCALARS = ParameterSpec(
 
 #: How often the time is looked at.
 TICK_SECONDS = 0.001
+# Receipts of a joint, in ns: apart at least where commands come, and at most where none do.
+_RECEIPTS, _SIGNS_OF_LIFE = 20_000_000, 200_000_000
 
 
 def fallback_from(values: Mapping[str, Any]) -> Fallback:
@@ -71,8 +74,12 @@ class DeviceJoint:
         self._crowded = False
         self._tell_refused, self._tell_late = Seldom(), Seldom()
         self.received = self.refused = self.late = self.latest = self.failed = 0
-        self._applied = interface.publisher(
-            node, topics.of_joint(topics.FLUX_DENSITY_APPLIED, self.name, names))
+        self._applied, self._received = (
+            interface.publisher(node, topics.of_joint(x, self.name, names))
+            for x in (topics.FLUX_DENSITY_APPLIED, topics.FLUX_DENSITY_RECEIVED))
+        # Stamp of the newest command, when it came if that was not told yet, both in ns; and when
+        # something was told by a clock that is never set.
+        self._newest, self._came, self._told = 0, 0, 0
         self.commands = CommandInput(
             node, topics.of_joint(topics.FLUX_DENSITY_COMMAND, self.name, names),
             self._on_command, node.values['command_source'], node.companion)
@@ -83,6 +90,16 @@ class DeviceJoint:
         """Publish that a level has taken effect."""
         self._applied.publish(conversions.to_command(change.stamp, change.level, ''))
 
+    def publish_receipt(self) -> None:
+        """Publish which command came last, where that is news or nothing was said for long."""
+        steady = monotonic_ns()
+        if steady - self._told < (_RECEIPTS if self._came else _SIGNS_OF_LIFE):
+            return
+        self._received.publish(conversions.to_receipt(
+            self.name, self._came or self._node.now(), self._newest,
+            cut_off=self._number in self._device.cut_offs))
+        self._came, self._told = 0, steady
+
     def log(self, notice: Notice) -> None:
         """Count and log what the device has noticed."""
         logger = self._node.get_logger()
@@ -92,6 +109,8 @@ class DeviceJoint:
             self.latest = max(self.latest, notice.late)
             if self._tell_late():
                 logger.warning(text)
+        elif notice.kind == Kind.REFUSED:
+            self._refuse(notice.text)
         elif notice.kind == Kind.HEARD:
             logger.info(text)
         else:
@@ -112,12 +131,17 @@ class DeviceJoint:
             return
         self.received += 1
         try:
-            self._device.receive(self._number, *read())
+            stamp, level = read()
+            self._newest, self._came = stamp, self._node.now()
+            self._device.receive(self._number, stamp, level)
         except BadInputError as error:
-            self.refused += 1
-            if self._tell_refused():
-                self._node.get_logger().error(
-                    f'{self._of_me}command refused, the previous one stays in force: {error}')
+            self._refuse(str(error))
+
+    def _refuse(self, why: str) -> None:
+        self.refused += 1
+        if self._tell_refused():
+            self._node.get_logger().error(
+                f'{self._of_me}command refused, the previous one stays in force: {why}')
 
     def crowded(self) -> bool:
         """Return whether several publishers command this joint, and log it once."""
@@ -162,6 +186,11 @@ class DeviceNode(ManagedNode):
         """Time in ns, if this device is the authority on it."""
         return None
 
+    def now(self) -> int:
+        """Return the time in ns that stamps of commands are held against."""
+        leading = self.leading_time
+        return super().now() if leading is None else leading
+
     def _open(self, joint: type[DeviceJoint]) -> None:
         """Create the topics of samples and joints, and look at the time from now on."""
         scalars, names = self.values[PUBLISH_SCALARS.name], self.values.names
@@ -190,6 +219,9 @@ class DeviceNode(ManagedNode):
 
     def _publish_news(self) -> None:
         """Publish what has come of the device since the last time."""
+        if self.active and not self.companion:
+            for joint in self._joints:
+                joint.publish_receipt()
         for notice in self.device.notices():
             self._joints[notice.joint].log(notice)
         for change in self.device.changes():
