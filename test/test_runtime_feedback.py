@@ -7,7 +7,7 @@ import math
 from beam_oracle import silicone
 import numpy as np
 import pytest
-from test_runtime_measured import Loop, MS, START
+from test_runtime_watch import Loop, MS, START
 
 from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.parameters import paper_actuator

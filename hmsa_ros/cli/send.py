@@ -21,8 +21,8 @@ def add_parser(subparsers: Any) -> None:
     add_options(
         parser,
         ('--wait',
-         'report progress until the sequence has been carried out, and fail if a setpoint was '
-         'measured to be missed'),
+         'report progress until the sequence has been carried out, and fail unless all setpoints '
+         'were measured to be arrived at, or nobody measures'),
         ('--recorded', 'wait until a recorder has subscribed, then send'),
         NAMESPACE,
         ('--joint', 'NAMES', str, 'joint, or several separated by commas (default actuator)',

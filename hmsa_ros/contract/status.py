@@ -9,6 +9,9 @@ from hmsa_ros.errors import printable
 
 # Anybody may send a status; Python refuses to read numbers of thousands of digits.
 _WHOLE = re.compile('[0-9]{1,18}')
+_WARN = 1
+# Warnings of a plan that ends as requested.
+_HARMLESS = (Code.TOO_DAMPED, Code.INDISTINGUISHABLE)
 
 
 def texts(status: Any) -> dict[str, str]:
@@ -29,7 +32,9 @@ class Verdict:
     The level is 0 OK, 1 WARN or 2 ERROR, the code one of `Code`. ``state`` is idle, waiting,
     moving, holding, settling or at_rest, on the way to ``setpoint``, from 1. While ``watching``,
     setpoints that have begun are still to be judged by samples; the worst that was ``measured``
-    is a code, with its sentence ``finding``. ``unheard`` says why nobody carries out commands.
+    is a code, with its sentence ``finding``. Samples have come lately while ``measuring``, and
+    so many commands were ``late`` since the planner began. ``unheard`` says why nobody carries
+    out commands.
     """
 
     level: int
@@ -43,11 +48,22 @@ class Verdict:
     measured: str = ''
     finding: str = ''
     unheard: str = ''
+    measuring: bool = False
+    late: int = 0
 
     @property
     def failure(self) -> str:
-        """Why what was measured counts as a failure; empty if it does not."""
-        return self.finding if self.measured in (Code.OFF_TARGET, Code.VIBRATING) else ''
+        """Why a request that has come to its end counts as failed; empty if it does not."""
+        if self.level > _WARN:
+            return self.message
+        if self.measured == Code.ARRIVED:
+            return ''
+        if self.measured and (self.measured != Code.UNOBSERVED or self.measuring):
+            return self.finding
+        # Nobody measures: a prediction counts as long as it is kept to.
+        if self.level == _WARN and self.code not in _HARMLESS:
+            return f'{self.message}; what comes of it is not measured'
+        return ''
 
     @property
     def basis(self) -> str:
@@ -65,4 +81,5 @@ class Verdict:
             values.get('request', ''), values.get('state', ''),
             whole(values.get('setpoint')), whole(values.get('setpoints')),
             values.get('watching') == 'True', values.get('worst', ''),
-            values.get('worst_message', ''), values.get('unheard', ''))
+            values.get('worst_message', ''), values.get('unheard', ''),
+            values.get('measuring') == 'True', whole(values.get('late')))

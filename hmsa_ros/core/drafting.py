@@ -315,7 +315,8 @@ def _placed(
     return levels, PlannedSegment(
         segment.setpoint.stretch, start,
         None if math.isinf(duration) else start + model.ns(duration),
-        segment.move.code, segment.move.reason, start, segment.move.vibration)
+        segment.move.code, segment.move.reason, start, segment.move.vibration,
+        None if math.isinf(segment.setpoint.span) else start + model.ns(segment.setpoint.span))
 
 
 def _over(

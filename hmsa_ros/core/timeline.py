@@ -208,6 +208,7 @@ class PlannedSegment:
     since: int  #: from which the setpoint holds; the move may begin later
     #: Bound of what levels that follow creep leave of it in stretch, peak to peak.
     vibration: float = 0.0
+    until: int | None = None  #: end as requested; None for one that is held on
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ Whether an actuator arrived: samples, a setpoint and tolerances in, one finding 
 Status, commands, reports, studies and benchmarks all show what `judge` finds.
 """
 
-from hmsa_ros.judge.judging import judge
+from hmsa_ros.judge.judging import ENOUGH, judge, look_length, rests_from
 from hmsa_ros.judge.records import (
     Finding,
     missed,
@@ -17,5 +17,5 @@ from hmsa_ros.judge.records import (
 )
 
 __all__ = [
-    'Finding', 'judge', 'missed', 'Sensor', 'Setpoint', 'Tolerances', 'unobserved', 'VERDICTS',
-    'worst']
+    'ENOUGH', 'Finding', 'judge', 'look_length', 'missed', 'rests_from', 'Sensor', 'Setpoint',
+    'Tolerances', 'unobserved', 'VERDICTS', 'worst']

@@ -18,8 +18,8 @@ from hmsa_ros.core.model import Array
 
 #: Fewer samples, or fewer periods of the vibration, say nothing about it.
 FEWEST, SHORTEST = 8, 1.5
-# Standard deviations within which the truth is taken to be: one of 700 is beyond, on one side.
-_SURE, _BEYOND = 3.0, 0.00135
+# How often the truth may be beyond a bound.
+_BEYOND = 0.005
 # Samples nearer together than this share of a period show the vibration as it is; with others it
 # is looked for near the frequency of the model, of which they show an alias.
 _DENSE = 0.4
@@ -27,16 +27,16 @@ _NEAR, _MIDDLE, _WIDE = (0.75, 1.3), (0.6, 1.6), (0.3, 2.5)
 # Periods from which on a frequency far from the model's is told from a drift, and a drift at all.
 _FAR, _DRIFTS = 3.0, 3.0
 # Frequencies tried in the time of one period over the span, and around the best one.
-_TRIED, _REFINED, _ROUNDS = 4, 9, 3
+_TRIED, _REFINED, _ROUNDS = 3, 7, 2
 # Decays tried, as shares of the largest, which is this many times the model's, as a ratio to the
 # frequency between these.
-_DECAYS = np.array([0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.55, 0.75, 1.0])
-_FASTER, _LEAST, _MOST = 2.5, 0.1, 0.7
+_DECAYS = np.array([0.0, 0.07, 0.15, 0.27, 0.4, 0.6, 1.0])
+_FASTER, _LEAST, _MOST = 2.0, 0.1, 0.7
 # Figures that are fitted: offset, drift, two of the sinusoid, frequency and decay.
 _FITTED = 6
 # Phases at which a vibration is looked at, and how many possible ones.
-_PHASES = np.linspace(0.0, 2.0 * math.pi, 48)
-_MOST_POSSIBLE = 600
+_PHASES = np.linspace(0.0, 2.0 * math.pi, 32)
+_MOST_POSSIBLE = 200
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ missed where they show one to be outside, and undecided otherwise.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 import math
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.status import Code
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.judge.fit import Figure, Fit, fit
+from hmsa_ros.judge.fit import FEWEST, Figure, Fit, fit
 from hmsa_ros.judge.records import (
     Finding,
     judged_late,
@@ -22,16 +23,25 @@ from hmsa_ros.judge.records import (
     Setpoint,
     Tolerances,
     unobserved,
-    worst,
+    VERDICTS,
 )
 
 Stamps = NDArray[np.int64]
 
 #: Periods of the vibration in one look, and samples where they are rare.
-PERIODS, ENOUGH = 8, 24
-# Samples kept of each period at most.
+PERIODS, ENOUGH = 6, 24
+# Samples that count of each period at most.
 _KEPT = 40
+# Whatever stays nearer to the target than this share of a tolerance, as a root mean square, is
+# within it.
+_QUIET = 0.3
+# Changes from sample to sample of so small a share of the step are those of a motion that fades.
+_FADED = 1e-9
+# Fewer changes do not show whether a sensor rounds.
+_FEW_CHANGES = 3
 _NO_SENSOR = Sensor()
+# Verdicts that more samples may change.
+_OPEN = (Code.UNOBSERVED, Code.UNDECIDED)
 
 
 def judge(
@@ -62,35 +72,63 @@ def judge(
 
     """
     stamps, values, complaint = _usable(time, stretch, setpoint, sensor)
-    begin = rests_from(setpoint)
+    if complaint:
+        return unobserved(setpoint, complaint, len(stamps))
+    begin, moved = rests_from(setpoint), setpoint.moved
+    found = _judged(stamps, values, setpoint, tolerances, sensor, begin)
+    if found.arrived or moved is None:
+        return found
+    # Not as it was planned at first; perhaps as it was planned anew.
+    again = _judged(stamps, values, setpoint, tolerances, sensor, moved)
+    if again.verdict in _OPEN and found.verdict not in _OPEN:
+        return found
+    after = moved - (setpoint.end or moved + 1)
+    return judged_late(again, after) if again.arrived and after >= 0 else again
+
+
+def _judged(
+        stamps: Stamps, values: Array, setpoint: Setpoint, tolerances: Tolerances,
+        sensor: Sensor, begin: int) -> Finding:
+    """Judge usable samples of a setpoint from a time in ns on."""
     held = stamps >= begin
     if setpoint.end is not None and begin < setpoint.end:
         held &= stamps <= setpoint.end
     count = int(np.count_nonzero(held))
-    if complaint or not count:
-        return unobserved(setpoint, complaint, count)
-    stamps, values = stamps[held], values[held]
-    found = worst(
-        _look(stamps[part], values[part], setpoint, tolerances, sensor, begin)
-        for part in _looks(stamps, begin, setpoint))
-    if found is None:
-        return unobserved(setpoint, '', count)
-    if found.arrived and setpoint.end is not None and begin >= setpoint.end:
-        return judged_late(found, begin - setpoint.end)
-    return found
+    if not count:
+        return unobserved(setpoint)
+    stamps, values = _thinned(stamps[held], values[held], begin, setpoint)
+    first, *later = _looks(stamps, begin, setpoint)
+    quiet = _QUIET * min(tolerances.of(setpoint))
+    looks = [first, *(
+        x for x in later if np.mean(np.square(values[x] - setpoint.target)) > quiet**2)]
+    findings = []
+    for number, part in enumerate(looks):
+        # Later looks see the vibration from their own beginning on.
+        origin = int(stamps[part][0]) if number else begin
+        seconds = ((stamps[part] - origin) / NANOSECONDS).astype(np.float64)
+        rest = values[part] - setpoint.target
+        shown = fit(seconds, rest, setpoint.frequency, setpoint.decay)
+        if shown is not None:
+            findings.append(_decided(
+                shown, len(rest), setpoint, tolerances, sensor, later=number > 0))
+        elif not number:
+            findings.append(_too_few(setpoint, stamps[part]))
+    return max(findings, key=lambda x: VERDICTS.index(x.verdict))
 
 
 def rests_from(setpoint: Setpoint) -> int:
-    """Return the time in ns from which on a setpoint is judged."""
-    if setpoint.moved is not None:
-        return setpoint.moved
+    """Return the time in ns from which on a setpoint is to rest, as it was requested."""
     if setpoint.arrival is not None:
         return setpoint.arrival
     # Approached: until a vibration of the step has faded to a thousandth.
     settled = setpoint.begins + round(7.0 / max(setpoint.decay, 1e-9) * NANOSECONDS)
-    last = settled if setpoint.end is None else setpoint.end - round(
-        PERIODS * period_of(setpoint) * NANOSECONDS)
+    last = settled if setpoint.end is None else setpoint.end - look_length(setpoint)
     return max(min(settled, last), setpoint.begins)
+
+
+def look_length(setpoint: Setpoint) -> int:
+    """Return the length in ns of one look at a setpoint."""
+    return round(PERIODS * period_of(setpoint) * NANOSECONDS)
 
 
 def period_of(setpoint: Setpoint) -> float:
@@ -122,12 +160,40 @@ def _usable(
             f'the sensor shows {value:.4g}, where nothing can be: expected {low:.4g} to '
             f'{high:.4g}')
     stamps, values = stamps[inside], values[inside]
-    return stamps, values, ''
+    return stamps, values, _frozen(values, setpoint)
+
+
+def _frozen(values: Array, setpoint: Setpoint) -> str:
+    """Say that a sensor shows the same in the end, however it moved before; empty if not."""
+    changes = np.abs(np.diff(values))
+    moved = np.flatnonzero(changes)
+    same = len(changes) - int(moved[-1] + 1 if len(moved) else 0) + 1
+    if same < FEWEST:
+        return ''
+    words = f'the sensor shows exactly {values[-1]:.6g} in the last {same} samples'
+    if len(moved) < _FEW_CHANGES:
+        off = abs(float(values[-1]) - setpoint.target) > _QUIET * setpoint.step
+        return f'{words}: it is frozen, or nothing moves' if off else ''
+    before = changes[:moved[-1] + 1][-FEWEST:]
+    # A motion that fades gets ever slower, and a sensor that rounds moves by whole steps.
+    step = float(np.min(changes[moved]))
+    rounds = np.all(np.abs(changes[moved] / step - np.round(changes[moved] / step)) < 0.01)
+    if rounds or np.median(before) < _FADED * setpoint.step:
+        return ''
+    return f'{words}: it is frozen'
+
+
+def _thinned(
+        stamps: Stamps, values: Array, begin: int, setpoint: Setpoint) -> tuple[Stamps, Array]:
+    """Return the first sample of each part of a period."""
+    cell = max(round(period_of(setpoint) * NANOSECONDS) // _KEPT, 1)
+    kept = np.diff((stamps - begin) // cell, prepend=-1) > 0
+    return stamps[kept], values[kept]
 
 
 def _looks(stamps: Stamps, begin: int, setpoint: Setpoint) -> Iterator[slice]:
     """Yield the samples of each look: of whole periods at once, then ever more seldom."""
-    length = round(PERIODS * period_of(setpoint) * NANOSECONDS)
+    length = look_length(setpoint)
     if len(stamps) > 1:
         length = max(length, ENOUGH * round(float(np.median(np.diff(stamps)))))
     last = int(stamps[-1])
@@ -143,42 +209,47 @@ def _looks(stamps: Stamps, begin: int, setpoint: Setpoint) -> Iterator[slice]:
         until = edge + length
         if number == len(edges) - 1 and last - until < length:
             until = last
-        yield slice(*np.searchsorted(stamps, (edge, until + 1)))
+        part = slice(*np.searchsorted(stamps, (edge, until + 1)).tolist())
+        if part.start < part.stop or not number:
+            yield part
 
 
-def _look(
-        stamps: Stamps, values: Array, setpoint: Setpoint, tolerances: Tolerances,
-        sensor: Sensor, begin: int) -> Finding:
-    """Judge the samples of one look."""
-    time = (stamps - begin) / NANOSECONDS
-    late = float(time[0]) if len(time) else 0.0
-    origin = 0.0 if late < period_of(setpoint) else late
-    found = fit(time - origin, values - setpoint.target, setpoint.frequency, setpoint.decay)
-    if found is None:
-        return Finding(
-            Code.UNDECIDED,
-            f'{setpoint.where}: {len(values)} samples while {setpoint.target:.6g} is held are '
-            'too few to judge', setpoint, len(values))
-    return _decided(found, len(values), setpoint, tolerances, sensor)
+def _too_few(setpoint: Setpoint, stamps: Stamps) -> Finding:
+    """Return the finding where there are samples, and what more there should be."""
+    span = float(stamps[-1] - stamps[0]) / NANOSECONDS if len(stamps) else 0.0
+    least = 2.0 * period_of(setpoint)
+    wanted = (f'a hold of {least:.2g} s' if span < least
+              else f'{FEWEST / span:.3g} samples a second')
+    return Finding(
+        Code.UNDECIDED,
+        f'{setpoint.where}: {len(stamps)} samples in {span:.2g} s after the arrival at '
+        f'{setpoint.target:.6g} do not show whether it rests: expected at least {wanted}',
+        setpoint, len(stamps))
 
 
 # -- the rule -----------------------------------------------------------------------------------
 
 def _decided(
         found: Fit, count: int, setpoint: Setpoint, tolerances: Tolerances,
-        sensor: Sensor) -> Finding:
+        sensor: Sensor, *, later: bool) -> Finding:
     offset, vibration = _widened(found.offset, sensor.std(setpoint.target)), found.vibration
     allowed, swing = tolerances.of(setpoint)
     off = offset.low > allowed or offset.high < -allowed
     vibrates = vibration.low > swing
-    within = max(-offset.low, offset.high) <= allowed and vibration.high <= swing
+    # What has come to rest is taken to do so until it is seen to vibrate.
+    within = max(-offset.low, offset.high) <= allowed and (later or vibration.high <= swing)
     code = (Code.OFF_TARGET if off else Code.VIBRATING if vibrates
             else Code.ARRIVED if within else Code.UNDECIDED)
     frequency = found.frequency / (2.0 * math.pi) if vibration.low > 0.0 else math.nan
+    if vibration.low == 0.0 and vibration.std > swing:
+        # It may be anything.
+        vibration = replace(vibration, value=math.nan, std=math.nan)
     message = f'{setpoint.where}: rests {_distance(offset.value, setpoint)}'
     if vibrates:
         message += (f' and rings at {frequency:.3g} Hz, {setpoint.words(vibration.value)} '
                     'peak to peak')
+    elif off and math.isnan(vibration.value):
+        message += f'; {count} samples at this rate do not show whether it vibrates'
     if code is Code.UNDECIDED:
         message += _open(offset, vibration, allowed, swing, setpoint)
     return Finding(

@@ -125,23 +125,35 @@ class Finding:
         return VERDICTS.index(self.verdict) > VERDICTS.index(Code.UNDECIDED)
 
     @property
-    def rank(self) -> int:
-        """How bad it is, by `VERDICTS`."""
-        return VERDICTS.index(self.verdict)
+    def rank(self) -> tuple[int, float]:
+        """How bad it is, by `VERDICTS`, and how far it is off for its step."""
+        figures = (abs(self.offset), self.vibration)
+        most = max((x for x in figures if math.isfinite(x)), default=0.0)
+        return VERDICTS.index(self.verdict), most / max(self.setpoint.step, _NO_STEP)
 
     def to_dict(self) -> dict[str, object]:
         """Return it as status, reports and ``--json`` carry it; None for what cannot be told."""
-        percent = self.setpoint.percent
-        figures = {
-            'offset': self.offset, 'offset_std': self.offset_std,
-            'vibration': self.vibration, 'vibration_std': self.vibration_std}
-        figures |= {f'{key}_percent': percent(x) for key, x in figures.items()}
-        figures |= {'frequency': self.frequency, 'noise': self.noise}
         return {
             'verdict': str(self.verdict), 'joint': self.setpoint.joint,
             'setpoint': self.setpoint.number, 'setpoints': self.setpoint.count,
             'target': self.setpoint.target, 'message': self.message, 'samples': self.samples,
-            **{key: x if math.isfinite(x) else None for key, x in figures.items()}}
+            **{key: x if math.isfinite(x) else None for key, x in self._figures().items()}}
+
+    def to_texts(self) -> dict[str, str]:
+        """Return it as a status carries it, by key; what cannot be told is missing."""
+        figures = {'vibration_p2p': self.vibration, **self._figures()}
+        return {
+            'measured': str(self.verdict), 'measured_setpoint': str(self.setpoint.number),
+            **{key: f'{x:.6g}' for key, x in figures.items() if math.isfinite(x)},
+            'samples': str(self.samples)}
+
+    def _figures(self) -> dict[str, float]:
+        figures = {
+            'offset': self.offset, 'offset_std': self.offset_std,
+            'vibration': self.vibration, 'vibration_std': self.vibration_std}
+        return figures | {
+            f'{key}_percent': self.setpoint.percent(x) for key, x in figures.items()} | {
+                'frequency': self.frequency, 'noise': self.noise}
 
 
 def worst(findings: Iterable[Finding]) -> Finding | None:

@@ -124,13 +124,13 @@ def to_planner_status(status: 'StatusChanged') -> DiagnosticStatus:
     values: dict[str, object] = {
         'code': verdict.code, 'request': verdict.request, 'plan': status.plan,
         **vars(progress), 'late': status.late, 'replanned': status.replanned, **verdict.figures,
-        'watching': status.watching}
+        'watching': status.watching, 'measuring': status.measuring}
     if status.worst is not None:
-        values |= {'worst': str(status.worst.code), 'worst_message': status.worst.message}
+        values |= {'worst': str(status.worst.verdict), 'worst_message': status.worst.message}
     for name, of_joint in each.items():
         prefix = f'{name}.' if len(each) > 1 else ''
         found = status.findings.get(name)
-        of_each = {**vars(of_joint), **({} if found is None else found.figures)}
+        of_each = {**vars(of_joint), **({} if found is None else found.to_texts())}
         values |= {f'{prefix}{key}': value for key, value in of_each.items()}
     values |= of_joints('coordinate', status.coordinates)
     severity, message = int(verdict.severity), verdict.message

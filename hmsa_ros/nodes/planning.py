@@ -32,11 +32,11 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.files import errors_from
 from hmsa_ros.identification.known import Known
 from hmsa_ros.identification.quantities import check_free
+from hmsa_ros.judge import Tolerances
 from hmsa_ros.nodes.joints import JointParameters, JOINTS
 from hmsa_ros.nodes.managed import AUTOSTART
 from hmsa_ros.nodes.marker_publisher import MARKER_SCALE
 from hmsa_ros.runtime.feedback import MODES
-from hmsa_ros.runtime.measured import Tolerances
 from hmsa_ros.runtime.records import Settings
 
 _OPTIONS = Options()

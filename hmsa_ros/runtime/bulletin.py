@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from hmsa_ros.core.group import PlannerGroup, Progress
 from hmsa_ros.core.status import Code
 from hmsa_ros.core.timeline import PlannedSegment
+from hmsa_ros.judge import Finding, VERDICTS
 from hmsa_ros.runtime.following import Following
-from hmsa_ros.runtime.measured import Finding
 from hmsa_ros.runtime.records import (
     Note,
     Output,
@@ -44,11 +44,17 @@ class Bulletin:
         self.tell()
 
     def give(self, verdict: Verdict, *, log: bool = False) -> None:
-        """Give a verdict."""
-        self.verdict = verdict
+        """Give a verdict; what went wrong is not taken back by a correction."""
+        if verdict.code != 'corrected' or not self._warned:
+            self.verdict = verdict
         if log:
             self.note(verdict.message)
         self.tell()
+
+    @property
+    def _warned(self) -> bool:
+        """Whether the verdict warns of something else than what was measured."""
+        return self.verdict.severity > Severity.OK and self.verdict.code not in VERDICTS
 
     def note(self, message: str) -> None:
         """Have a sentence logged."""
@@ -61,7 +67,7 @@ class Bulletin:
         self.outputs.append(StatusChanged(
             self.verdict, progress, each, self._group.number, self._following.lateness.count,
             self._following.replanned, self._watch.findings, self._watch.worst, watching,
-            self.unheard,
+            self.unheard, self._watch.measuring,
             {name: x.model.units.coordinate for name, x in self._group.planners.items()}))
 
     def tell_progress(self, now: int) -> None:
@@ -94,23 +100,22 @@ class Bulletin:
         self.outputs.append(PlanChanged(tuple(stamps), samples))
 
     def found(self, findings: Sequence[Finding]) -> None:
-        """Tell what was measured; the verdict is the worst since the request."""
-        worst, severity = self._watch.worst, self.verdict.severity
-        bad = worst is not None and worst.code not in (Code.ARRIVED, Code.UNOBSERVED)
-        if worst is None or severity is Severity.ERROR or not bad and (
-                not self._watch.finished
-                or worst.code == Code.UNOBSERVED and severity is Severity.WARN):
+        """Tell what was measured; the verdict is the worst of the request."""
+        worst = self._watch.worst
+        if worst is None or self.verdict.severity is Severity.ERROR or not worst.failed and (
+                self._warned or not self._watch.finished):
             self.tell()
             return
+        fine = worst.arrived or worst.verdict is Code.UNOBSERVED and not self._watch.measuring
         self.give(
             Verdict(
-                Severity.WARN if bad else Severity.OK, str(worst.code), worst.message,
-                self.verdict.request), log=bad and worst in findings)
+                Severity.OK if fine else Severity.WARN, str(worst.verdict), worst.message,
+                self.verdict.request), log=worst.failed and worst in findings)
 
-    def judge_again(self, names: Iterable[str]) -> None:
-        """Have the setpoints of joints judged anew."""
+    def corrected(self, names: Iterable[str]) -> None:
+        """Take in that the plans of joints have been corrected."""
         for name in names:
-            self._watch.again(name)
+            self._watch.corrected(name)
 
     def look_for_listeners(self) -> None:
         """Warn where nobody carries out what is sent, and say when somebody does."""

@@ -61,7 +61,7 @@ class PlannerRuntime:
         self.clock_jumps = 0
         self._clock, self._steady, self._observable = clock, steady, observable
         self._takeover = Takeover(group, clock, steady, observable, unheard)
-        self._watch = Watch(group, steady)
+        self._watch = Watch(group, steady, clock)
         self._bulletin = Bulletin(group, self.following, self._watch, clock, steady, unheard)
         self.sending = Sending(group, self.following, self._bulletin.outputs)
         self.feedback = Feedback(group, settings, self._bulletin.outputs, clock)
@@ -114,7 +114,8 @@ class PlannerRuntime:
         if self._takeover.waiting or not self._takeover.engaged:
             self._takeover.observe(joint, stamp, stretch, rate, flux_density)
         self._watch.add(joint, stamp, stretch)
-        self.feedback.add(joint, stamp, stretch)
+        if self.feedback.looks_at(stamp):
+            self.feedback.add(joint, stamp, stretch)
 
     def clock_set_back(self, back: int) -> None:
         """

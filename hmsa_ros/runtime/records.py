@@ -10,7 +10,7 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation.correction import TOLERANCE
 from hmsa_ros.estimation.prior import TRACKED
 from hmsa_ros.identification.known import Known
-from hmsa_ros.runtime.measured import Finding, Tolerances
+from hmsa_ros.judge import Finding, Tolerances
 
 
 @dataclass(frozen=True)
@@ -134,9 +134,10 @@ class StatusChanged:
     late: int  # late commands
     replanned: int  # plans made anew
     findings: Mapping[str, Finding] = field(default_factory=dict)  # at the newest setpoint judged
-    worst: Finding | None = None  # since the last request
+    worst: Finding | None = None  # of the last request
     watching: bool = False  # whether setpoints that have begun are still to be judged
     unheard: str = ''  # why nobody carries out commands; empty where somebody does
+    measuring: bool = False  # whether samples have come lately
     # What each joint's position is called.
     coordinates: Mapping[str, str] = field(default_factory=dict)
 

@@ -1,114 +1,125 @@
-"""Which samples show whether setpoints are arrived at, and what they show."""
+"""The setpoints of a request as they were requested, and what samples show of each."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-import math
-
-import numpy as np
+from bisect import bisect_left, insort
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 
 from hmsa_ros.core.group import PlannerGroup
 from hmsa_ros.core.law import critical_zeta
+from hmsa_ros.core.model import stretch_limits
 from hmsa_ros.core.timeline import Plan, PlannedSegment
-from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.runtime.measured import CODES, Expected, Finding, judge, Tolerances, unobserved
+from hmsa_ros.judge import Finding, missed, Sensor, Setpoint, Tolerances, worst
+from hmsa_ros.runtime.holds import Hold
 from hmsa_ros.runtime.slices import Clock
 
-# Periods of vibration that are looked at after an arrival, and time in ns if samples are rare.
-_PERIODS = 6
-_RARE = NANOSECONDS // 4
-# Samples of the first periods that are enough, and how many are kept of each period at most.
-_ENOUGH = 24
-_KEPT = 40
-# Windows of a joint that wait for their samples.
-_OPEN = 8
-# How long samples may stay away, by the steady clock, before it is judged without them.
-_PATIENCE = NANOSECONDS // 2
-
-
-@dataclass
-class _Window:
-    """A time in ns in which samples show how a setpoint is held."""
-
-    segment: PlannedSegment
-    expected: Expected
-    begin: int
-    # First periods, all of it, and length of the grid of which one sample a cell is kept.
-    early: int
-    end: int
-    cell: int
-    samples: dict[int, tuple[int, float]] = field(default_factory=dict)
-    # Newest sample of the joint by its stamp; of all that were looked at before the end, and when
-    # that was.
-    newest: int = 0
-    seen: int = 0
-    heard: int = 0
-
-    def lacks(self, stamp: int, steady: int) -> bool:
-        """Return whether a sample of a time is of use; old ones show that newer ones may come."""
-        if self.seen < stamp <= self.end:
-            self.seen, self.heard = stamp, steady
-        return stamp >= self.begin and (
-            stamp > self.newest or (stamp - self.begin) // self.cell not in self.samples)
-
-    def add(self, stamp: int, stretch: float, now: int) -> None:
-        """Take a sample; the first of each cell counts, and none is from the future."""
-        if stamp < self.begin:
-            return
-        self.newest = max(self.newest, min(stamp, now))
-        if stamp <= self.end and math.isfinite(stretch):
-            self.samples.setdefault((stamp - self.begin) // self.cell, (stamp, stretch))
-
-    def chosen(self) -> list[tuple[int, float]]:
-        """Return the samples to be judged: those of the first periods, if they are enough."""
-        samples = sorted(self.samples.values())
-        early = [x for x in samples if x[0] <= self.early]
-        return early if len(early) >= _ENOUGH else samples
-
-    def complete(self) -> bool:
-        """Return whether there are all samples that count."""
-        return self.newest >= self.end or self.newest >= self.early and (
-            sum(x <= self.early for x, _ in self.samples.values()) >= _ENOUGH)
+# How long ago a sample may have come for samples to be expected, by the steady clock.
+_RECENT = 10_000_000_000
+_LEFT_OUT = 'commands came late, and there was no time left for it'
+_STOPPED = 'the joint came to rest instead'
 
 
 @dataclass
 class _Joint:
-    """What is watched of a joint, and what was found since its last request."""
+    """The setpoints of a joint as they were requested, and what was found of them."""
 
-    number: int = 0
-    plan: Plan | None = None
-    # Place of the next setpoint to watch.
-    place: int = 0
-    windows: list[_Window] = field(default_factory=list)
+    asked: Plan  # as it was accepted
+    plan: Plan  # as it is now
+    request: int  # its number in the group
+    following: int = 0  # number, from 0, of the next setpoint to watch
+    left_out: list[int] = field(default_factory=list)  # numbers that new plans left out
+    holds: list[Hold] = field(default_factory=list)  # the last one stays when it is over
+    news: list[Finding] = field(default_factory=list)  # of setpoints that need no samples
+    corrected: bool = False  # whether the plan that is to come corrects the one in force
     newest: Finding | None = None
-    worst: Finding | None = None
+    closed: Finding | None = None  # the worst of the setpoints that are over
+
+    @property
+    def count(self) -> int:
+        """How many setpoints were requested."""
+        return len(self.asked.segments) - self.asked.kept
+
+    @property
+    def open(self) -> bool:
+        """Whether setpoints that have begun are still to be judged."""
+        return bool(self.news) or any(not x.over for x in self.holds)
+
+    @property
+    def worst(self) -> Finding | None:
+        return worst(x for x in (self.closed, *(y.found for y in self.holds)) if x is not None)
+
+    def close(self, found: Finding | None) -> None:
+        """Take in what was found of a setpoint that is over."""
+        self.closed = worst(x for x in (self.closed, found) if x is not None)
+
+    def segment(self, number: int) -> PlannedSegment | None:
+        """Return a setpoint as it is planned now; None for one that was left out."""
+        place = bisect_left(self.left_out, number)
+        if self.left_out[place:place + 1] == [number]:
+            return None
+        # All plans reach to the last setpoint.
+        back = self.count - number - (len(self.left_out) - place)
+        return self.plan.segments[-back] if back <= len(self.plan.segments) else None
+
+    def leave_out(self, plan: Plan, now: int) -> list[int]:
+        """Go over to a plan that was made anew, and return the numbers that it leaves out."""
+        before, after = self.plan.segments, plan.segments
+        # What is over stays as it is.
+        place = max(self.plan.under_way(now), 0)
+        while place < min(len(before), len(after)) and before[place] is after[place]:
+            place += 1
+        self.plan = plan
+        number = place - (len(before) - self.count + len(self.left_out))
+        for left in self.left_out:
+            number += left <= number
+        gone: list[int] = []
+        while len(gone) < len(before) - len(after) and number < self.count:
+            if number >= 0 and number not in self.left_out:
+                gone.append(number)
+                insort(self.left_out, number)
+            number += 1
+        return gone
 
 
 class Watch:
-    """Looks at samples after each arrival, and judges them."""
+    """Looks at samples of each setpoint as it was requested, and judges them."""
 
-    def __init__(self, group: PlannerGroup, steady: Clock) -> None:
-        self._group, self._steady = group, steady
+    def __init__(self, group: PlannerGroup, steady: Clock, clock: Clock) -> None:
+        self._group, self._steady, self._clock = group, steady, clock
+        #: Returns what is known of the sensor of a joint.
+        self.sensor: Callable[[str], Sensor] = lambda name: Sensor()
         self._joints: dict[str, _Joint] = {}
         # Reading a clock for each sample of each joint would take longer than all else.
         self._now = 0
+        self._heard: int | None = None
         self.restart()
 
     def restart(self) -> None:
         """Forget everything; what is planned by now is not judged."""
-        self._joints = {
-            name: _Joint(x.plan.number, x.plan, len(x.plan.segments))
-            for name, x in self._group.planners.items()}
+        self._joints = {}
+        for name, planner in self._group.planners.items():
+            plan = planner.plan
+            self._joints[name] = _Joint(
+                replace(plan, kept=len(plan.segments)), plan, self._group.number)
+
+    def _asked(self) -> list[_Joint]:
+        """Return the joints of the newest request."""
+        newest = max(x.request for x in self._joints.values())
+        return [x for x in self._joints.values() if x.request == newest]
 
     @property
     def open(self) -> bool:
         """Whether setpoints that hold have not been judged yet."""
-        return any(x.windows for x in self._joints.values())
+        return any(x.open for x in self._joints.values())
 
     @property
     def finished(self) -> bool:
-        """Whether the last setpoints have been judged."""
-        return not self.open and all(
-            x.expected.setpoint == x.expected.setpoints for x in self.findings.values())
+        """Whether all setpoints have been judged."""
+        return not self.open and all(x.following >= x.count for x in self._asked())
+
+    @property
+    def measuring(self) -> bool:
+        """Whether samples have come lately."""
+        return self._heard is not None and self._steady() - self._heard < _RECENT
 
     @property
     def findings(self) -> dict[str, Finding]:
@@ -118,135 +129,134 @@ class Watch:
 
     @property
     def worst(self) -> Finding | None:
-        """Return the worst that was found since the last request of each joint."""
-        found = [x.worst for x in self._joints.values() if x.worst is not None]
-        return max(found, key=_rank, default=None)
-
-    def again(self, name: str) -> None:
-        """Judge the setpoint of a joint that is under way anew, since its plan was corrected."""
-        joint = self._joints[name]
-        newest = joint.newest
-        if newest is None or joint.plan is None or newest.expected.setpoint != (
-                joint.place - joint.plan.kept):
-            return
-        joint.newest = None
-        if joint.worst is newest:
-            joint.worst = None
+        """Return the worst that was found of the newest request."""
+        return worst(x.worst for x in self._asked() if x.worst is not None)
 
     def wake(self, now: int) -> int | None:
         """Return when to judge next, a time in ns; None for never, 0 for now."""
-        times = [
-            x.begin if now < x.begin else x.early if now < x.early else 0
-            for joint in self._joints.values() for x in joint.windows]
+        times = [0 for x in self._joints.values() if x.news]
+        times += [
+            y.wake(now)
+            for x in self._joints.values() for y in x.holds if not y.over]
         return min(times, default=None)
 
-    # -- windows -------------------------------------------------------------------------------
+    # -- setpoints -----------------------------------------------------------------------------
+
+    def corrected(self, name: str) -> None:
+        """Take in that the plan of a joint has been corrected, and not made anew in need."""
+        self._joints[name].corrected = True
 
     def follow(self, now: int) -> None:
-        """Watch the setpoints that have begun by a time in ns, as planned by now."""
+        """Watch the setpoints that have begun by a time in ns, as they were requested."""
         for name, planner in self._group.planners.items():
             joint, plan = self._joints[name], planner.plan
-            if plan is not joint.plan:
-                self._change(joint, plan, now)
-            elif joint.place >= len(plan.segments) or plan.segments[joint.place].since > now:
-                continue
-            last = plan.under_way(now)
-            for place in range(max(joint.place, last - _OPEN, plan.kept), last + 1):
-                joint.windows += self._windows(name, plan, place)
-            joint.place = max(joint.place, last + 1)
+            if plan.number != joint.plan.number:
+                joint = self._begin(name, joint, plan)
+            elif plan.segments is not joint.plan.segments:
+                self._change(name, joint, plan, now)
+            segments, kept = joint.asked.segments, joint.asked.kept
+            while joint.following < joint.count and (
+                    segments[kept + joint.following].since <= now):
+                self._open(name, joint)
 
-    def _change(self, joint: _Joint, plan: Plan, now: int) -> None:
-        """Go over to another plan; what it leaves out is not judged."""
-        if plan.number != joint.number:
-            joint.number, joint.newest, joint.worst = plan.number, None, None
-            joint.place = plan.kept
+    def _begin(self, name: str, joint: _Joint, plan: Plan) -> _Joint:
+        """Take in a request, or that a joint came to rest in place of the rest of one."""
+        if self._group.number != joint.request:
+            self._joints[name] = begun = _Joint(plan, plan, self._group.number)
+            return begun
         joint.plan = plan
-        current = plan.segments[plan.kept:]
-        judged = [x.segment for x in joint.windows]
-        joint.windows = [x for x in joint.windows if x.segment in current]
-        if len(judged) > len(joint.windows):
-            joint.place = min(joint.place, max(plan.under_way(now), plan.kept))
+        for hold in joint.holds:
+            hold.miss(_STOPPED)
+        joint.news += [
+            missed(self._setpoint(name, joint, x), _STOPPED)
+            for x in range(joint.following, joint.count) if x not in joint.left_out]
+        joint.following = joint.count
+        return joint
 
-    def _windows(self, name: str, plan: Plan, place: int) -> Iterator[_Window]:
-        segment = plan.segments[place]
-        if segment.arrival is None:
+    def _change(self, name: str, joint: _Joint, plan: Plan, now: int) -> None:
+        """Go over to a plan that was made anew; what it leaves out is missed."""
+        begun = {x.setpoint.number: x for x in joint.holds}
+        for number in joint.leave_out(plan, now):
+            if number + 1 in begun:
+                begun[number + 1].miss(_LEFT_OUT)
+            elif number >= joint.following:
+                joint.news.append(missed(self._setpoint(name, joint, number), _LEFT_OUT))
+        for hold in joint.holds:
+            _keep_up(hold, joint)
+        joint.corrected = False
+
+    def _open(self, name: str, joint: _Joint) -> None:
+        """Watch the next setpoint."""
+        number, joint.following = joint.following, joint.following + 1
+        if number in joint.left_out:
             return
-        end = plan.segments[place + 1].begin if place + 1 < len(plan.segments) else None
-        model = plan.level(segment.arrival).model
+        for hold in joint.holds:
+            if hold.over:
+                joint.close(hold.found)
+        joint.holds = [x for x in joint.holds if not x.over]
+        hold = Hold(self._setpoint(name, joint, number), last=number + 1 == joint.count)
+        _keep_up(hold, joint)
+        joint.holds.append(hold)
+
+    def _setpoint(self, name: str, joint: _Joint, number: int) -> Setpoint:
+        """Return a setpoint as it was requested."""
+        asked, place = joint.asked, joint.asked.kept + number
+        segment = asked.segments[place]
+        level = asked.level(segment.begin if segment.arrival is None else segment.arrival)
+        model = level.model
         omega = model.frequency(segment.stretch) / model.units.time
         ratio = model.material.zeta / critical_zeta(segment.stretch, model.material.packed)
-        start = plan.segments[place - 1].stretch if place > plan.kept else (
-            plan.level(segment.begin).stretch)
-        expected = Expected(
-            segment.stretch, start, omega, ratio * omega,
-            name if len(self._joints) > 1 else '', place - plan.kept + 1,
-            len(plan.segments) - plan.kept)
-        period = round(2 * math.pi / omega * NANOSECONDS)
-        length = max(_PERIODS * period, _RARE)
-        begins = [segment.arrival]
-        if end is not None and end - segment.arrival > 3 * length:
-            # Whether it has stayed there.
-            begins.append(end - length)
-        for begin in begins:
-            last = begin + length if end is None else min(begin + length, end)
-            yield _Window(
-                segment, expected, begin, min(begin + _PERIODS * period, last), last,
-                max(period // _KEPT, length // 1000, 1))
+        return Setpoint(
+            segment.stretch, asked.segments[place - 1].stretch if number
+            else asked.level(segment.begin).stretch,
+            segment.since, segment.arrival, segment.until if number + 1 == joint.count
+            else asked.segments[place + 1].since, omega, ratio * omega,
+            name if len(self._joints) > 1 else '', number + 1, joint.count,
+            possible=stretch_limits(model.material))
 
     # -- samples -------------------------------------------------------------------------------
 
     def wants(self, stamp: int) -> bool:
         """Return whether a sample of a time in ns is of use for one of the joints."""
         steady, wanted = self._steady(), False
+        self._heard = steady
         for joint in self._joints.values():
-            for window in joint.windows:
-                wanted |= window.lacks(stamp, steady)
+            for hold in joint.holds:
+                wanted |= hold.lacks(stamp, steady)
         return wanted
 
     def add(self, name: str, stamp: int, stretch: float) -> None:
         """Take in a stretch measured at a stamp in ns; samples may come in any order."""
-        if name in self._joints:
-            for window in self._joints[name].windows:
-                window.add(stamp, stretch, self._now)
+        if name not in self._joints:
+            return
+        if stamp > self._now:
+            self._now = self._clock()
+        for hold in self._joints[name].holds:
+            hold.add(stamp, stretch, self._now)
 
     def judge(self, now: int, tolerances: Tolerances, *, observable: bool) -> Finding | None:
         """Judge one setpoint, if one can be judged by a time in ns and changes what is known."""
         self._now = now
-        for joint in self._joints.values():
-            for window in list(joint.windows):
-                if not self._over(window, now, observable):
-                    continue
-                joint.windows.remove(window)
-                found = _judged(window, tolerances)
-                again = joint.newest is not None and joint.newest.expected == found.expected
-                if again and _rank(found) <= _rank(joint.newest):
-                    continue
-                joint.newest = found
-                joint.worst = max(
-                    (x for x in (found, joint.worst) if x is not None), key=_rank)
-                return found
+        for name, joint in self._joints.items():
+            if joint.news:
+                joint.newest = joint.news.pop(0)
+                joint.close(joint.newest)
+                return joint.newest
+            for hold in joint.holds:
+                found = hold.judge(
+                    now, self._steady(), tolerances, self.sensor(name), observable=observable)
+                if found is not None:
+                    joint.newest = found
+                    return found
         return None
 
-    def _over(self, window: _Window, now: int, observable: bool) -> bool:
-        """Return whether no samples of a window are to be waited for any more."""
-        if now < window.begin:
-            return False
-        if window.complete() or not observable:
-            return True
-        if now < window.end:
-            return False
-        window.heard = window.heard or self._steady()
-        return self._steady() - window.heard > _PATIENCE
 
-
-def _judged(window: _Window, tolerances: Tolerances) -> Finding:
-    samples = window.chosen()
-    if not samples:
-        return unobserved(window.expected)
-    stamps, stretches = zip(*samples, strict=True)
-    time = (np.array(stamps, dtype=np.int64) - window.begin) / NANOSECONDS
-    return judge(time, np.array(stretches), window.expected, tolerances)
-
-
-def _rank(found: Finding | None) -> int:
-    return -1 if found is None else CODES.index(found.code)
+def _keep_up(hold: Hold, joint: _Joint) -> None:
+    """Have a setpoint judged from when it is reached by the plan in force."""
+    segment = joint.segment(hold.setpoint.number - 1)
+    if segment is None:
+        hold.miss(_LEFT_OUT)
+    elif segment.arrival is not None:
+        hold.move(segment.arrival, corrected=joint.corrected)
+    elif hold.setpoint.arrival is not None:
+        hold.miss('its time ended before the move to it')

@@ -15,6 +15,7 @@ from std_srvs.srv import Trigger
 
 from hmsa_ros.contract import topics
 from hmsa_ros.contract.status import Verdict
+from hmsa_ros.core.status import Code
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, HmsaError
@@ -215,7 +216,7 @@ class PlannerClient:
             self, verdict: Verdict, *, each: Callable[[Verdict], None] | None = None,
             timeout: float) -> Verdict:
         """
-        Wait until a sequence has been carried out, and judged where it is measured.
+        Wait until a sequence has been carried out, and all of it judged where it is measured.
 
         Parameters
         ----------
@@ -229,7 +230,7 @@ class PlannerClient:
         Returns
         -------
         Verdict
-            The last one.
+            The last one; its ``failure`` says whether all setpoints arrived.
 
         Raises
         ------
@@ -260,6 +261,11 @@ class PlannerClient:
             self.spin_until(
                 done, 'the sequence has not finished',
                 None if each is None else lambda: each(self._verdict), timeout, time)
+        late = self._verdict.late - verdict.late
+        if late > 0 and not self._verdict.failure and self._verdict.measured != Code.ARRIVED:
+            raise HmsaError(
+                f'{late} commands came late, and what comes of it is not measured: expected '
+                'commands in time (lead_time), or samples (joint_states)')
         return self._verdict
 
     def stop(self) -> bool:
