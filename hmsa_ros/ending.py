@@ -8,14 +8,18 @@ dying. So an entry point takes all three over before it imports anything slow, a
 has something to put in order only notes them, and looks where it is safe to end.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 import ctypes
 import os
 import signal
+import threading
 
 _NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # How long a process may take to end when all is done, in s.
 _LAST_SECONDS = 10
+# How long writing a sentence may take, in s.
+_WRITTEN = 0.05
 
 
 class Ending:
@@ -39,6 +43,20 @@ class Ending:
     def note(self) -> None:
         """Only note signals from now on; the process calls `check`, or looks at `asked`."""
         self._take_over(None)
+
+    @contextmanager
+    def by_default(self) -> Iterator[None]:
+        """Have signals end the process at once meanwhile, even where no Python runs."""
+        if not self._taken or threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        before = [(x, signal.signal(x, signal.SIG_DFL)) for x in _NUMBERS
+                  if signal.getsignal(x) == self._on_signal]
+        try:
+            yield
+        finally:
+            for number, handler in before:
+                signal.signal(number, handler)
 
     def ignore(self) -> None:
         """Pass over signals from now on: the process is about to end anyway."""
@@ -87,6 +105,57 @@ class _Event(ctypes.Structure):
         ('function', ctypes.c_void_p), ('rest', ctypes.c_byte * 40))
 
 
+class _Timer:
+    """Calls a function of the C library with one argument in a thread that needs no Python."""
+
+    def __init__(self, function: str, argument: int | None) -> None:
+        # With Python's lock kept: giving it away and getting it back takes much longer.
+        libc = ctypes.PyDLL(None)
+        self._timer: ctypes.c_void_p | None = None
+        if not hasattr(libc, 'timer_create'):
+            return
+        in_thread, monotonic = 2, 1
+        event = _Event(
+            value=argument, notify=in_thread,
+            function=ctypes.cast(getattr(libc, function), ctypes.c_void_p).value)
+        timer = ctypes.c_void_p()
+        if libc.timer_create(monotonic, ctypes.byref(event), ctypes.byref(timer)) == 0:
+            # struct itimerspec: interval and time to go, each in seconds and nanoseconds.
+            self._span = (ctypes.c_long * 4)()
+            self._timer, self._set = timer, libc.timer_settime
+            self._at = ctypes.byref(self._span)
+
+    def set(self, seconds: float) -> None:
+        """Call it after some seconds; 0 for not at all."""
+        if self._timer is not None:
+            whole = int(seconds)
+            self._span[2], self._span[3] = whole, int((seconds - whole) * 1e9)
+            self._set(self._timer, 0, self._at, None)
+
+
+class Deadline:
+    """Ends the process with a sentence, even where no Python runs: something took too long."""
+
+    def __init__(self) -> None:
+        """Wait for `set`."""
+        self._text = ctypes.create_string_buffer(500)
+        with suppress(ValueError):  # another C library
+            # What warnx() writes before a text; that of the interpreter otherwise.
+            ctypes.c_char_p.in_dll(
+                ctypes.PyDLL(None), 'program_invocation_short_name').value = b'hmsa'
+        self._say = _Timer('warnx', ctypes.addressof(self._text))
+        self._exit = _Timer('_exit', 1)
+
+    def say(self, text: str) -> None:
+        """Say this when the time is over."""
+        self._text.value = f'error: {text}'.replace('%', '%%').encode()[:499]
+
+    def set(self, seconds: float) -> None:
+        """Say it, and end the process with status 1, after some seconds; 0 for not at all."""
+        self._say.set(seconds)
+        self._exit.set(seconds + _WRITTEN if seconds else 0.0)
+
+
 def _exit_after(seconds: int, status: int) -> None:
     """
     Call ``_exit`` with a status after some seconds, from a thread that needs no Python.
@@ -94,16 +163,7 @@ def _exit_after(seconds: int, status: int) -> None:
     Fast DDS 2.14 may never come back from the end of a participant: it waits, without letting
     go, for a thread that has just received the end of another one.
     """
-    libc = ctypes.CDLL(None)
-    if not hasattr(libc, 'timer_create'):
-        return
-    in_thread, monotonic = 2, 1
-    event = _Event(
-        value=status, notify=in_thread, function=ctypes.cast(libc._exit, ctypes.c_void_p).value)
-    timer = ctypes.c_void_p()
-    if libc.timer_create(monotonic, ctypes.byref(event), ctypes.byref(timer)) == 0:
-        # struct itimerspec: interval and time to go, each in seconds and nanoseconds.
-        libc.timer_settime(timer, 0, ctypes.byref((ctypes.c_long * 4)(0, 0, seconds, 0)), None)
+    _Timer('_exit', status).set(seconds)
 
 
 #: Of this process.

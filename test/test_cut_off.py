@@ -4,7 +4,7 @@ import pytest
 
 from hmsa_ros.core.actuators import Setup
 from hmsa_ros.core.parameters import paper_actuator
-from hmsa_ros.device.hardware import HardwareDevice, HardwareJoint
+from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
 from hmsa_ros.device.protocol import Kind
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.device.watchdog import Fallback
@@ -31,7 +31,9 @@ def plant(fallback=ZERO, **settings):
 
 
 def driver(fallback=ZERO):
-    return HardwareDevice([HardwareJoint(Coil(), 0.5, fallback)], time=START)
+    device = HardwareDevice([HardwareJoint(Coil(), 0.5, fallback)], time=START)
+    assert device.switch_off(START) == ''
+    return device
 
 
 BOTH = pytest.mark.parametrize('make', [plant, driver])

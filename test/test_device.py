@@ -1,10 +1,8 @@
-"""Devices without ROS: the simulated plant's decisions, and a driver of hardware."""
+"""The simulated plant without ROS: what it decides and what it says."""
 
 from dataclasses import replace
 import math
-from time import monotonic_ns
 
-from conftest import wait_until
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -13,14 +11,12 @@ import pytest
 from hmsa_ros.core.actuators import Setup
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.simulation import ActuatorSimulation
-from hmsa_ros.device.hardware import HardwareDevice, HardwareJoint
 from hmsa_ros.device.health import enough_samples, judge_commands, too_few_samples
 from hmsa_ros.device.protocol import Kind, Sample
 from hmsa_ros.device.sensor import Sensor, SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.device.transport import Transport
 from hmsa_ros.device.watchdog import Fallback, Watchdog
-from hmsa_ros.device.worker import HardwareWorker
 from hmsa_ros.errors import BadInputError
 
 ACTUATOR = paper_actuator()
@@ -276,8 +272,7 @@ def test_bias_and_gain_are_those_of_the_sensor_alone():
     (lambda: Fallback(-1.0), 'timeout is -1 s'),
     (lambda: Fallback(safe_flux='full'), "'full': expected one of hold, zero, ramp"),
     (lambda: Fallback(ramp_rate=0.0), 'ramp rate is 0 T/s'),
-    (lambda: Transport(-1), 'delay is -1 ns'),
-    (lambda: HardwareJoint(Bench(), 0.0), 'limit is 0 T')])
+    (lambda: Transport(-1), 'delay is -1 ns')])
 def test_settings_out_of_range_are_refused(make, sentence):
     with pytest.raises(BadInputError, match=sentence):
         make()
@@ -341,167 +336,3 @@ def test_the_verdict_on_commands_names_what_is_wrong():
     assert judge_commands(failed=1, silent=['a']) == (
         2, '1 times started again after a load too large to follow; no command and no '
            'heartbeat for a')
-
-
-# -- a driver of hardware -----------------------------------------------------------------------
-
-
-class Bench:
-    """An amplifier that takes 2 us, and a sensor; notes what it is asked."""
-
-    def __init__(self):
-        self.writes = []
-
-    def write(self, level, now):
-        self.writes.append((now, level))
-        return now + 2000
-
-    def read(self, now):
-        return 1.25, float(len(self.writes))
-
-
-def driver(period=0, **settings):
-    bench = Bench()
-    device = HardwareDevice([HardwareJoint(bench, 0.5, **settings)], time=START, period=period)
-    assert bench.writes == [(START, 0.0)]
-    assert [(x.stamp, x.level) for x in device.changes()] == [(START + 2000, 0.0)]
-    return bench, device
-
-
-def test_a_driver_writes_each_level_when_it_is_due_and_repetitions_not_at_all():
-    bench, device = driver()
-    assert device.due is None
-    for stamp, level in ((10, 0.1), (20, 0.2), (30, 0.3), (20, 0.25), (40, 0.25)):
-        device.receive(0, START + stamp * MS, level)
-    assert device.due == START + 10 * MS
-    device.advance(START + 9 * MS)
-    device.advance(START + 10 * MS)
-    device.advance(START + 21 * MS)
-    device.advance(START + 50 * MS)
-    assert bench.writes[1:] == [(START + 10 * MS, 0.1), (START + 21 * MS, 0.25)]
-    # What is told is when the amplifier had done it.
-    assert [(x.stamp, x.level) for x in device.changes()] == [
-        (START + 10 * MS + 2000, 0.1), (START + 21 * MS + 2000, 0.25)]
-    device.receive(0, 0, 0.4)
-    device.advance(START + 51 * MS)
-    assert bench.writes[-1] == (START + 51 * MS, 0.4)
-
-
-def test_a_driver_that_comes_too_late_for_several_levels_writes_the_last():
-    bench, device = driver()
-    for k in (1, 2, 3):
-        device.receive(0, START + k * MS, 0.1 * k)
-    device.advance(START + 10 * MS)
-    assert bench.writes[1:] == [(START + 10 * MS, pytest.approx(0.3))]
-
-
-@pytest.mark.parametrize('level', [0.6, -0.6, math.nan, math.inf])
-def test_a_driver_refuses_what_is_beyond_its_limit(level):
-    bench, device = driver()
-    with pytest.raises(BadInputError, match='expected at most 0.5 T'):
-        device.receive(0, START, level)
-    device.advance(START + MS)
-    assert len(bench.writes) == 1
-
-
-def test_a_driver_switches_the_coil_off_after_a_silence():
-    bench, device = driver()
-    device.receive(0, START + MS, 0.1)
-    device.receive(0, START + 3000 * MS, 0.3)
-    device.advance(START + MS)
-    assert device.due == START + 1001 * MS + 1
-    device.advance(device.due)
-    assert bench.writes[1:] == [(START + MS, 0.1), (START + 1001 * MS + 1, 0.0)]
-    assert [x.kind for x in device.notices()] == [Kind.SILENT]
-    # Nothing is left to be done until somebody speaks again.
-    assert device.due is None
-    device.receive(0, 0, 0.2)
-    device.advance(START + 5000 * MS)
-    assert bench.writes[-1] == (START + 5000 * MS, 0.2)
-    assert [x.kind for x in device.notices()] == [Kind.HEARD]
-    device.switch_off(START + 5001 * MS)
-    assert bench.writes[-1] == (START + 5001 * MS, 0.0)
-
-
-def test_a_driver_ramps_down_where_that_is_wanted():
-    bench, device = driver(fallback=Fallback(0.01, 'ramp', 10.0))
-    device.receive(0, 0, 0.05)
-    now = START
-    device.advance(now)
-    while device.due is not None:
-        now = device.due
-        device.advance(now)
-    assert [x for _, x in bench.writes[1:]] == pytest.approx(
-        [0.05, 0.04, 0.03, 0.02, 0.01, 0.0], abs=1e-12)
-
-
-def test_a_driver_reads_its_sensor_on_a_grid():
-    bench, device = driver(period=2 * MS)
-    for time in (START, START + MS, START + 2 * MS, START + 7 * MS, START + 8 * MS):
-        device.advance(time)
-    samples = device.samples()
-    assert [x.time - START for x in samples] == [0, 2 * MS, 7 * MS, 8 * MS]
-    assert (samples[0].stretch[0], samples[0].rate[0]) == (1.25, 1.0)
-    # Also when the clock is set back.
-    device.advance(START - 1000 * MS)
-    assert device.samples()[0].time == device.time
-    assert device.due == device.time + 2 * MS
-
-
-@pytest.mark.parametrize('make', [plant, lambda: driver()[1]])
-def test_both_are_devices(make):
-    device = make()
-    device.receive(0, START + MS, 0.05)
-    device.advance(START + 2 * MS)
-    (change,) = device.changes()
-    assert (change.joint, change.level) == (0, 0.05)
-    assert device.time == START + 2 * MS
-
-
-def test_a_worker_writes_each_level_at_its_stamp_and_switches_off_in_the_end():
-    bench = Bench()
-    device = HardwareDevice([HardwareJoint(bench, 0.5)], time=monotonic_ns(), period=MS)
-    worker = HardwareWorker(device, monotonic_ns)
-    begin = monotonic_ns()
-    stamps = [begin + 20 * MS, begin + 40 * MS]
-    for stamp, level in zip(stamps, (0.1, 0.2), strict=True):
-        worker.receive(0, stamp, level)
-    with pytest.raises(BadInputError, match='expected at most 0.5 T'):
-        worker.receive(0, begin + 60 * MS, 0.6)
-    wait_until(lambda: len(bench.writes) >= 3, 'both levels')
-    worker.close()
-    worker.close()
-    assert [level for _, level in bench.writes] == [0.0, 0.1, 0.2, 0.0]
-    assert all(now >= stamp for (now, _), stamp in zip(bench.writes[1:], stamps, strict=False))
-    assert [x.level for x in worker.changes()] == [0.0, 0.1, 0.2, 0.0]
-    times = [x.time for x in worker.samples()]
-    assert len(times) > 2
-    assert times == sorted(times)
-    assert worker.failure is None
-
-
-def test_a_worker_whose_hardware_breaks_switches_the_other_coils_off():
-    class Broken(Bench):
-        def write(self, level, now):
-            if self.writes:
-                raise OSError('no answer')
-            return super().write(level, now)
-
-    benches = [Broken(), Bench()]
-    worker = HardwareWorker(HardwareDevice(
-        [HardwareJoint(x, 0.5) for x in benches], time=monotonic_ns()), monotonic_ns)
-    worker.receive(1, 0, 0.3)
-    worker.receive(0, 0, 0.2)
-    wait_until(lambda: worker.failure is not None, 'the failure')
-    assert str(worker.failure) == (
-        "the hardware failed (OSError: 'no answer') and is switched off: mend it, then start the "
-        'driver again')
-    assert [level for _, level in benches[1].writes] == [0.0, 0.3, 0.0]
-    worker.close()
-
-
-def test_a_level_that_a_driver_gets_after_its_stamp_is_told():
-    bench, device = driver()
-    device.advance(START + 5 * MS)
-    device.receive(0, START + 2 * MS, 0.1)
-    assert [(x.kind, x.late) for x in device.notices()] == [(Kind.LATE, 3 * MS)]

@@ -85,9 +85,11 @@ def test_hardware_that_breaks_ends_the_driver_with_all_coils_switched_off(start,
     ros.spin_until(lambda: applied, 'the level at the start')
     command.publish(to_command(0, 0.25, 'coil'))
     assert driver.wait() == 1
-    assert "the hardware failed (OSError: 'the cable is out') and is switched off" \
-        in driver.stderr
-    assert (tmp_path / 'actuator').read_text().split() == ['0.0', '0.25', '0.0']
+    assert driver.stderr.splitlines()[-1] == (
+        "hmsa: error: Coil.read of joint actuator raised OSError: 'the cable is out': the coil is "
+        'switched off; mend it, then start the driver again')
+    written = (tmp_path / 'actuator').read_text().split()
+    assert (written[:2], written[-1]) == (['0.0', '0.25'], '0.0')
 
 
 @pytest.mark.ros
@@ -98,6 +100,8 @@ def test_hardware_that_breaks_ends_the_driver_with_all_coils_switched_off(start,
     (('hardware:=hardware:Coil',), "hardware 'hardware:Coil' cannot be loaded (AttributeError"),
     (('hardware:=math:sqrt',), "hardware 'math:sqrt' of joint actuator does not start"),
     (('hardware:=builtins:str',), 'expected something with the methods write and read'),
+    (('hardware.name:=hardware:Bench', 'hardware.prot:=/dev/x'),
+     "does not start (TypeError: \"Bench.__init__() got an unexpected keyword argument 'prot'\""),
     (('hardware:=hardware:Bench', 'use_sim_time:=true'), 'use_sim_time is true: expected false')])
 def test_hardware_that_cannot_be_had_refuses_the_start(start, arguments, expected):
     given = [x for argument in arguments for x in ('-p', argument)]

@@ -1,10 +1,19 @@
 """All faults of the table, in its order."""
 
-from benchmarks.faults import bags, delivery, inputs, model, processes, samples, timing
+from benchmarks.faults import (
+    bags,
+    delivery,
+    hardware,
+    inputs,
+    model,
+    processes,
+    samples,
+    timing,
+)
 
 FAULTS = (
     *delivery.FAULTS, *processes.FAULTS, *timing.FAULTS, *inputs.FAULTS, *model.FAULTS,
-    *samples.FAULTS, *bags.FAULTS)
+    *samples.FAULTS, *hardware.FAULTS, *bags.FAULTS)
 
 #: What the tests inject: one of each kind.
 QUICK = ('none', 'twice', 'planner_restarted', 'stranger_first', 'parameter_refused')

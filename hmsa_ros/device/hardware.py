@@ -1,34 +1,69 @@
-"""Real hardware as a device: levels written at their stamps, a watchdog, and samples."""
+"""Hardware as a laboratory writes it: found by its name, and called with care."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from importlib import import_module
+import inspect
 import math
+from numbers import Real
 import os
 import sys
-from typing import cast, Protocol
+from time import monotonic
+from typing import Any, cast, NamedTuple, Protocol
 
-import numpy as np
+from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.device.protocol import StateLostError
+from hmsa_ros.ending import Deadline
+from hmsa_ros.errors import BadInputError, excerpt, HmsaError
 
-from hmsa_ros.core.schedule import CommandSchedule
-from hmsa_ros.device.protocol import Change, Sample
-from hmsa_ros.device.watchdog import Device, Fallback
-from hmsa_ros.errors import BadInputError
+# What cannot be when a level took effect, in ns from now.
+_ABSURD = 10 * NANOSECONDS
+# A call that blocks lets Python run, or the process ends so many s after its time.
+_GRACE = 1.5
+# Of the limit: less than this is rounding where the hardware names no resolution, and no field
+# that a coil is left on with.
+_ROUNDING, _OFF = 1e-6, 0.01
 
 
 class Hardware(Protocol):
-    """A coil's amplifier, and the sensor of its actuator; both calls must be quick."""
+    """A coil's amplifier, and the sensor of its actuator; all calls must be quick."""
 
-    def write(self, level: float, now: int) -> int:
-        """Set the coil to a level in T at a time in ns; return when that took effect."""
+    # It may have `limit` (T), `resolution` (T), `slew` (T/s), `open()`, which connects again, and
+    # `close()` too. All calls come from one thread, also that of the class, unless one blocks.
 
-    def read(self, now: int) -> tuple[float, float]:
-        """Return stretch and stretch rate in 1/s; NaN for what is not measured."""
+    def write(self, level: float, now: int) -> int | tuple[int, float] | None:
+        """
+        Set the coil to a level in T at a time in ns.
+
+        Return when that took effect, that and the level really set, or None for ``now``.
+        """
+
+    def read(self, now: int) -> Any:
+        """Return stretch, rate in 1/s and stamp in ns, or a list of those; see `Reading`."""
 
 
-def load(text: str) -> Callable[[str], Hardware]:
+class Reading(NamedTuple):
+    """What a sensor saw; NaN is not measured, and None is the time of the call."""
+
+    stretch: float
+    rate: float = math.nan
+    stamp: int | None = None  #: in ns
+
+
+class HardwareError(HmsaError):
+    """Hardware that raised an error, or answered what cannot be used."""
+
+
+def told(error: BaseException) -> str:
+    """Return an exception for a sentence."""
+    return f'{type(error).__name__}: {excerpt(str(error))}'
+
+
+def load(text: str) -> Callable[[str, Mapping[str, Any]], Hardware]:
     """
     Return what makes the hardware of a joint by its name, found by ``'MODULE:NAME'``.
+
+    It also takes settings, which are keyword arguments.
 
     Raises
     ------
@@ -46,19 +81,20 @@ def load(text: str) -> Callable[[str], Hardware]:
         sys.path.append(os.getcwd())
     try:
         make = getattr(import_module(module), name)
-    except Exception as error:  # whatever a laboratory's module raises
+    except BaseException as error:  # whatever a laboratory's module raises, sys.exit too
         raise BadInputError(
-            f'hardware {text!r} cannot be loaded ({type(error).__name__}: {error}): expected a '
-            'module that Python finds, or in the working directory, with that name in it'
-        ) from error
+            f'hardware {text!r} cannot be loaded ({told(error)}): expected a module that Python '
+            'finds, or in the working directory, with that name in it') from error
 
-    def made(joint: str) -> Hardware:
+    def made(joint: str, settings: Mapping[str, Any]) -> Hardware:
         try:
-            found = make(joint)
-        except Exception as error:
+            found = make(joint, **settings)
+        except BaseException as error:
+            takes = ' and the settings ' + ', '.join(
+                f'hardware.{x}' for x in settings) if settings else ''
             raise BadInputError(
-                f'hardware {text!r} of joint {joint} does not start ({type(error).__name__}: '
-                f'{error}): expected it to take the name of a joint') from error
+                f'hardware {text!r} of joint {joint} does not start ({told(error)}): expected it '
+                f'to take the name of a joint{takes}') from error
         if not all(callable(getattr(found, x, None)) for x in ('write', 'read')):
             raise BadInputError(
                 f'hardware {text!r} made a {type(found).__name__}: expected something with the '
@@ -67,144 +103,233 @@ def load(text: str) -> Callable[[str], Hardware]:
     return made
 
 
-@dataclass(frozen=True)
-class HardwareJoint:
+class Calls:
     """
-    A real actuator.
+    What is called, one at a time, and for how long; ``longest`` has the longest time in s.
+
+    Parameters
+    ----------
+    limit : float
+        Time in s that a call may take.
+    deadline : Deadline, optional
+        Ends the process if a call lets no Python run for that time and some more.
+
+    """
+
+    def __init__(self, limit: float, deadline: Deadline | None = None) -> None:
+        self.limit = limit
+        self.longest: dict[str, float] = {}
+        self._deadline = deadline
+        self._armed = False
+        self._begun: tuple[str, float] | None = None
+
+    def make_ready(self) -> None:
+        """Do what takes some microseconds before a call."""
+        if self._deadline is not None and not self._armed:
+            self._deadline.set(self.limit + _GRACE)
+            self._armed = True
+
+    def __call__(self, name: str, act: Callable[..., Any], *arguments: object) -> Any:
+        """Call a method of hardware; ``name`` is its name for a sentence."""
+        self.make_ready()
+        if self._deadline is not None:
+            self._deadline.say(
+                f'{name} lets nothing else run for {self.limit + _GRACE:g} s: the driver ends, '
+                'and whether the coil is off is not known; release the GIL in what it calls')
+        begun = monotonic()
+        self._begun = name, begun
+        try:
+            return act(*arguments)
+        finally:
+            self._begun = None
+            self.relax()
+            self.longest[name] = max(self.longest.get(name, 0.0), monotonic() - begun)
+
+    def relax(self) -> None:
+        """Take back `make_ready`: no call is under way."""
+        if self._deadline is not None and self._armed:
+            self._deadline.set(0.0)
+            self._armed = False
+
+    def give_up(self, seconds: float) -> None:
+        """End the process after some seconds, unless the call returns that hangs."""
+        if self._deadline is not None:
+            self._deadline.say('the driver hangs while it ends')
+            self._deadline.set(seconds)
+
+    @property
+    def current(self) -> str:
+        """Name of the call that is under way; empty if none is."""
+        begun = self._begun
+        return '' if begun is None else begun[0]
+
+    @property
+    def overdue(self) -> str:
+        """Name of the call that takes too long; empty if none does."""
+        begun = self._begun
+        return begun[0] if begun is not None and monotonic() - begun[1] > self.limit else ''
+
+
+class Instrument:
+    """
+    The hardware of a joint, with what it returns checked, and ``name`` for sentences.
 
     Raises
     ------
     BadInputError
-        If the limit is out of range.
+        If it is not as `Hardware` says.
 
     """
 
-    hardware: Hardware  #: what writes and reads
-    limit: float  #: largest level in T, above 0; what exceeds it is refused
-    #: what to do after a silence
-    fallback: Fallback = field(default_factory=lambda: Fallback(safe_flux='zero'))
+    def __init__(self, hardware: Hardware, joint: str, calls: Calls) -> None:
+        self._hardware, self._calls = hardware, calls
+        self.name, self._joint = type(hardware).__name__, joint
+        for method, arguments in (
+                ('write', (0.0, 0)), ('read', (0,)), ('open', ()), ('close', ())):
+            self._check_signature(method, arguments)
+        self.limit, self.resolution, self.slew = (
+            self._number(x) for x in ('limit', 'resolution', 'slew'))
 
-    def __post_init__(self) -> None:
-        if not 0.0 < self.limit < math.inf:
-            raise BadInputError(f'limit is {self.limit:g} T: expected a number above 0')
+    def _check_signature(self, method: str, arguments: Sequence[object]) -> None:
+        try:
+            inspect.signature(getattr(self._hardware, method, lambda *_: 0)).bind(*arguments)
+        except ValueError:  # of something that is no Python
+            pass
+        except TypeError as error:
+            raise BadInputError(
+                f'{self.name}.{method} does not take what it is given ({error}): expected '
+                f'{method}({", ".join(("level", "now")[-len(arguments):] if arguments else ())})'
+            ) from error
 
+    def _number(self, name: str) -> float | None:
+        value = getattr(self._hardware, name, None)
+        if value is not None and not (_is_number(value) and value > 0.0):
+            raise BadInputError(
+                f'{self.name}.{name} is {excerpt(value)}: expected a number above 0, or None')
+        return None if value is None else float(value)
 
-class HardwareDevice(Device):
-    """
-    Real actuators.
+    def has(self, method: str) -> bool:
+        """Return whether it has a method."""
+        return callable(getattr(self._hardware, method, None))
 
-    Parameters
-    ----------
-    joints : sequence of HardwareJoint
-        At least one; their coils are switched off at the start.
-    time : int
-        Time at the start in ns.
-    period : int
-        Between samples, in ns; 0 for none.
+    def tolerance(self, limit: float) -> float:
+        """Return which difference in T between levels asked and set is none."""
+        return max(self.resolution or 0.0, _ROUNDING * limit)
 
-    """
+    def off(self, level: float, limit: float) -> bool:
+        """Return whether a coil with a level in T is off."""
+        return abs(level) <= max(self.resolution or 0.0, _OFF * limit)
 
-    def __init__(
-            self, joints: Sequence[HardwareJoint], *, time: int, period: int = 0) -> None:
-        super().__init__(x.fallback for x in joints)
-        self._joints = tuple(joints)
-        self._time = time
-        self._period = period
-        self._next_sample = time
-        self._schedules = [CommandSchedule(0.0) for _ in joints]
-        self._heard = [False for _ in joints]
-        self._levels = [math.nan for _ in joints]
-        self.switch_off(time)
+    # -- calls ---------------------------------------------------------------------------------
 
-    @property
-    def time(self) -> int:
-        """Time in ns that it has been advanced to."""
-        return self._time
+    def _call(self, method: str, *arguments: object) -> Any:
+        name = f'{self.name}.{method} of joint {self._joint}'
+        try:
+            return self._calls(name, getattr(self._hardware, method), *arguments)
+        except StateLostError:
+            raise
+        except BaseException as error:  # whatever a laboratory's code raises, sys.exit too
+            raise HardwareError(f'{name} raised {told(error)}') from error
 
-    @property
-    def next_level(self) -> int | None:
-        """Stamp of the next level, in ns; None if there is none ahead."""
-        return min((x.next_stamp for x in self._schedules if x.next_stamp is not None),
-                   default=None)
-
-    @property
-    def due(self) -> int | None:
-        """When to advance it next, in ns; None for not before a command comes."""
-        times = [self.next_level, *(x.due(self._time) for x in self._watchdogs)]
-        if self._period:
-            times.append(self._next_sample)
-        return min((x for x in times if x is not None), default=None)
-
-    def receive(self, joint: int, stamp: int, level: float) -> None:
+    def write(self, level: float, now: int) -> tuple[int, float]:
         """
-        Take a level in T that applies from a stamp in ns on; a past one, or 0, at once.
+        Set a level in T at a time in ns; return when it took effect, and the one really set.
 
         Raises
         ------
-        BadInputError
-            If the level is beyond the limit.
+        HardwareError
+            If it fails.
+        StateLostError
+            If the hardware says so.
 
         """
-        limit = self._joints[joint].limit
-        if not abs(level) <= limit:  # not a number is refused, too
-            raise BadInputError(f'flux density is {level:g} T: expected at most {limit:g} T')
-        self._check_clock(stamp)
-        if self._refuses(joint, stamp, level, self._schedules[joint].current):
-            return
-        changed = self._schedules[joint].insert(stamp, level)
-        self._heard[joint] = True
-        late = self._time - stamp
-        if changed and stamp and late > 0:
-            self._note_late(joint, late)
+        return self._written(self._call('write', level, now), level, now)
 
-    def advance(self, time: int) -> None:
-        """Write what is due at a time in ns, which is now, and read if that is due."""
-        if time < self._time:
-            # The clock was set back.
-            self._next_sample = min(self._next_sample, time)
-        self._time = time
-        for i, schedule in enumerate(self._schedules):
-            self._watch(i)
-            self._write(i, schedule.apply_until(self._time))
-        if self._period and self._time >= self._next_sample:
-            self._next_sample = (self._time // self._period + 1) * self._period
-            read = np.array([x.hardware.read(self._time) for x in self._joints])
-            self._samples.append(
-                Sample(self._time, read[:, 0], read[:, 1], np.array(self._levels)))
+    def _written(self, answer: Any, level: float, now: int) -> tuple[int, float]:
+        pair = isinstance(answer, (tuple, list)) and len(answer) == 2
+        when, really = (answer[0], answer[1]) if pair else (answer, level)
+        when = now if when is None else when
+        if not (_is_number(when) and abs(when - now) <= _ABSURD and _is_number(really)):
+            raise HardwareError(
+                f'{self.name}.write of joint {self._joint} returned {excerpt(answer)}: expected '
+                'when the level took effect in ns, as now is, that and the level really set in '
+                'T, or None')
+        return int(when), float(really)
 
-    def _watch(self, i: int) -> None:
-        schedule = self._schedules[i]
-        if self._heard[i]:
-            self._heard[i] = False
-            self._feed(i, self._time)
-        for stamp, level in self._safe_levels(i, self._time, self._time, schedule.current):
-            schedule.insert(stamp, level)
-
-    def _write(self, i: int, level: float) -> None:
-        if level != self._levels[i]:
-            # Not known while an error may leave it anywhere.
-            self._levels[i] = math.nan
-            stamp = self._joints[i].hardware.write(level, self._time)
-            self._levels[i] = level
-            self._changes.append(Change(i, stamp, level))
-
-    def switch_off(self, time: int) -> None:
+    def read(self, now: int) -> list[Reading]:
         """
-        Switch all coils off at a time in ns, which is now; nothing is ahead.
+        Return what is new at a time in ns.
 
         Raises
         ------
-        Exception
-            What the hardware of one has raised, when the others are off.
+        HardwareError
+            If it fails.
+        StateLostError
+            If the hardware says so.
 
         """
-        self._time = time
-        self._schedules = [CommandSchedule(0.0) for _ in self._joints]
-        errors = []
-        for i in range(len(self._joints)):
-            try:
-                self._write(i, 0.0)
-            except Exception as error:
-                errors.append(error)
-        if errors:
-            raise errors[0]
+        answer = self._call('read', now)
+        try:
+            if isinstance(answer, (str, bytes)):
+                raise TypeError
+            values = (answer,) if _is_number(answer, finite=False) else (*answer,)
+            if any(_is_number(x, finite=False) for x in values):
+                return [_reading(values)]
+            return [_reading(x) for x in values]
+        except (TypeError, ValueError) as error:
+            raise HardwareError(
+                f'{self.name}.read of joint {self._joint} returned {excerpt(answer)}: expected '
+                'stretch, (stretch, rate), (stretch, rate, stamp in ns) or a list of the latter, '
+                'with NaN for what is not measured') from error
+
+    def open(self) -> None:
+        """Connect again, where it can; an error is passed over, as the next `write` shows."""
+        if self.has('open'):
+            with suppress(HardwareError, StateLostError):
+                self._call('open')
+
+    def close(self) -> None:
+        """
+        End with it, where it can.
+
+        Raises
+        ------
+        HardwareError
+            If it fails.
+
+        """
+        if self.has('close'):
+            with suppress(StateLostError):
+                self._call('close')
+
+    def cut(self, now: int) -> bool:
+        """Write 0 past the call that blocks, at a time in ns; return whether that is done."""
+        try:
+            self._written(self._hardware.write(0.0, now), 0.0, now)
+        except BaseException:
+            return False
+        return True
+
+    def drop(self) -> None:
+        """Close it past the call that blocks."""
+        with suppress(BaseException):
+            getattr(self._hardware, 'close', lambda: None)()
+
+
+def _reading(values: Sequence[Any]) -> Reading:
+    """Return stretch, rate and stamp; raise TypeError or ValueError if they are none."""
+    if len(values) > 3:
+        raise TypeError
+    stretch, rate, stamp = [*values, None, None][:3]
+    if not _is_number(stretch, finite=False) or not (
+            rate is None or _is_number(rate, finite=False)) or not (
+            stamp is None or _is_number(stamp)):
+        raise TypeError
+    return Reading(
+        float(stretch), math.nan if rate is None else float(rate),
+        None if stamp is None else int(stamp))
+
+
+def _is_number(value: Any, *, finite: bool = True) -> bool:
+    real = type(value) is not bool and isinstance(value, Real)
+    return real and (not finite or math.isfinite(value))

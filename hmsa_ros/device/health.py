@@ -25,17 +25,27 @@ def judge_commands(
         notes.append(f'{late} commands late, {refused + refused_source} refused')
     if crowded:
         level = _WARN
-        notes.append(f'several publishers command {_listed(crowded)}')
+        notes.append(f'several publishers command {listed(crowded)}')
     if failed:
         level = _ERROR
         notes.append(f'{failed} times started again after a load too large to follow')
     if silent:
         level = _ERROR
-        notes.append(f'no command and no heartbeat for {_listed(silent)}')
+        notes.append(f'no command and no heartbeat for {listed(silent)}')
     return level, '; '.join(notes) or 'commands in time'
 
 
-def _listed(names: Sequence[str]) -> str:
+def judge_hardware(trouble: str, *, saturated: int, state_lost: int) -> tuple[int, str]:
+    """Return the verdict on hardware, of what keeps it from obeying and of counts."""
+    if trouble:
+        return _ERROR, trouble
+    notes = [text for count, text in (
+        (saturated, f'{saturated} levels not reached: the amplifier is saturated'),
+        (state_lost, f'{state_lost} times its state was lost')) if count]
+    return (_WARN, '; '.join(notes)) if notes else (_OK, 'hardware obeys')
+
+
+def listed(names: Sequence[str]) -> str:
     """Return names for a sentence, the first few of many."""
     return ', '.join(names[:4]) + (f' and {len(names) - 4} more' if len(names) > 4 else '')
 

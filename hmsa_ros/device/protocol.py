@@ -1,4 +1,4 @@
-"""What a device answers."""
+"""What a device answers, and what hardware may raise."""
 
 from enum import Enum
 from typing import NamedTuple
@@ -6,8 +6,16 @@ from typing import NamedTuple
 from hmsa_ros.core.model import Array
 
 
+class StateLostError(Exception):
+    """
+    Raised by ``write`` or ``read`` of hardware that has lost its state, as a rebooted board has.
+
+    Its coil is off then, and whatever was commanded is forgotten.
+    """
+
+
 class Change(NamedTuple):
-    """A level in T that took effect on a joint, at a time in ns."""
+    """A level in T that took effect on a joint, at a time in ns; NaN where it is not known."""
 
     joint: int
     stamp: int
@@ -31,6 +39,8 @@ class Kind(Enum):
     HEARD = 'heard'
     REFUSED = 'refused'
     FAILED = 'failed'
+    SATURATED = 'saturated'
+    LOST = 'lost'
 
 
 class Notice(NamedTuple):

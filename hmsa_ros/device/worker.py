@@ -1,125 +1,291 @@
-"""A thread that tells a driver of hardware the time, whenever something is due."""
+"""
+A thread that looks after hardware, so that whoever else there is never waits for it.
 
+Commands go in and news comes out through queues; no lock is held while hardware is called. The
+thread publishes nothing: what hangs there would keep the coil waiting.
+"""
+
+from collections import deque
 from collections.abc import Callable
 import sys
-from threading import Condition, Thread
+from threading import Condition, Event, Thread
+from time import monotonic
+from typing import NamedTuple, TypeVar
 
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.device.hardware import HardwareDevice
+from hmsa_ros.device.driven import HardwareDevice
+from hmsa_ros.device.hardware import told
 from hmsa_ros.device.protocol import Change, Notice, Sample
-from hmsa_ros.errors import excerpt, HmsaError
+from hmsa_ros.errors import BadInputError, HmsaError
+
+T = TypeVar('T')
 
 # In ns: a thread that sleeps wakes up late, by some 50 us, and then waits for Python's lock. It
 # gets that within the switch interval, and keeps it as long: both are this time before a level.
 _WATCHED = 250_000
+# In s: between attempts to switch off, and how long they go on when the end has been asked for.
+_PAUSE, _LONGEST_PAUSE, _LAST_ATTEMPTS = 0.05, 1.0, 0.7
+# In s, of an end with a call that does not return: waiting for it, for each call past it, and
+# for all that follows.
+_PATIENCE, _PAST, _HANGING = 0.8, 0.4, 2.5
+_MEND = 'mend it, then start the driver again'
+
+
+class _Command(NamedTuple):
+    """A level in T from a stamp in ns on, and when it came."""
+
+    joint: int
+    stamp: int
+    level: float
+    came: int
 
 
 class HardwareWorker:
     """
     A device of hardware that lets time run by itself, by a clock in ns, for one other thread.
 
-    ``failure`` says why it has ended by itself: an error of the hardware. The coils are switched
-    off then, as far as the hardware still obeys.
+    ``make`` is called in its thread, as all of the hardware is. ``failure`` says why it has ended
+    by itself, and ``trouble`` what keeps it from obeying: an error, while it goes on trying to
+    switch off. That other thread calls `look_after` at times, and may look at the ``device``.
     """
 
-    def __init__(self, device: HardwareDevice, clock: Callable[[], int]) -> None:
-        self._device, self._clock = device, clock
+    device: HardwareDevice  # since it has `started`
+
+    def __init__(self, make: Callable[[], HardwareDevice], clock: Callable[[], int]) -> None:
+        self._make, self._clock = make, clock
         self._turn = Condition()
+        self._ready = Event()
         self._ended = False
+        self._saver: Thread | None = None
+        self._commands: deque[_Command | None] = deque()
+        self._changes: deque[Change] = deque()
+        self._samples: deque[Sample] = deque()
+        self._notices: deque[Notice] = deque()
         self.failure: HmsaError | None = None
+        self.trouble = ''
         sys.setswitchinterval(_WATCHED / NANOSECONDS)
         self._thread = Thread(target=self._work, name='hardware', daemon=True)
         self._thread.start()
 
+    # -- for the other thread ------------------------------------------------------------------
+
+    def started(self, seconds: float) -> bool:
+        """
+        Wait at most some seconds until the coils are off for a start; return whether they are.
+
+        Raises
+        ------
+        HmsaError
+            If the hardware does not start.
+
+        """
+        if not self._ready.wait(seconds):
+            return False
+        if self.failure is not None:
+            raise self.failure
+        return True
+
     @property
     def time(self) -> int:
         """Time in ns at which it last looked after the hardware."""
-        return self._device.time
+        return self.device.time
 
     @property
     def silent(self) -> list[int]:
         """Joints that nobody commands any more."""
-        return self._device.silent
+        return self.device.silent
 
     @property
     def cut_offs(self) -> list[int]:
         """Joints whose levels of before a cut-off are refused."""
-        return self._device.cut_offs
+        return self.device.cut_offs
 
     @property
     def trips(self) -> int:
         """How often a joint fell silent."""
-        return self._device.trips
+        return self.device.trips
 
     def receive(self, joint: int, stamp: int, level: float) -> None:
-        """Have the device take a level in T that applies from a stamp in ns on."""
+        """
+        Have the device take a level in T that applies from a stamp in ns on.
+
+        Raises
+        ------
+        BadInputError
+            If the level is beyond the limit, or the hardware has failed.
+
+        """
+        if self.trouble:
+            raise BadInputError(self.trouble)
+        self.device.check(joint, stamp, level)
+        self._put(_Command(joint, stamp, level, self._clock()))
+
+    def switch_off(self) -> None:
+        """Have all coils switched off, with nothing ahead."""
+        self._put(None)
+
+    def _put(self, command: _Command | None) -> None:
+        self._commands.append(command)
         with self._turn:
-            self._advance()
-            self._device.receive(joint, stamp, level)
             self._turn.notify()
 
     def changes(self) -> list[Change]:
         """Return which levels took effect."""
-        with self._turn:
-            return self._device.changes()
+        return _emptied(self._changes)
 
     def samples(self) -> list[Sample]:
         """Return what was measured."""
-        with self._turn:
-            return self._device.samples()
+        return _emptied(self._samples)
 
     def notices(self) -> list[Notice]:
         """Return what there is to log."""
-        with self._turn:
-            return self._device.notices()
+        return _emptied(self._notices)
 
-    def switch_off(self) -> None:
-        """Switch all coils off; nothing is ahead."""
-        with self._turn:
-            self._guarded(lambda: self._device.switch_off(self._clock()))
+    def look_after(self) -> None:
+        """See whether the thread lives and its calls return; if not, switch off without it."""
+        if self.failure is not None or self._saver is not None:
+            return
+        if not self._thread.is_alive():
+            self._save('the thread that serves the hardware has ended')
+        elif overdue := self.device.calls.overdue:
+            self._save(f'{overdue} has not returned for {self.device.calls.limit:g} s '
+                       '(hardware.timeout)')
 
     def close(self) -> None:
         """Switch all coils off and end; may be called again."""
         with self._turn:
             self._ended = True
             self._turn.notify()
-        self._thread.join()
-        self.switch_off()
+        if self._saver is None:
+            self._thread.join(_PATIENCE)
+            if self._thread.is_alive():
+                self._save(f'{self.device.calls.current or "the hardware"} does not return')
+        if self._saver is not None:
+            self._saver.join(3.0 * _PAST)
+
+    # -- in its own thread ---------------------------------------------------------------------
 
     def _work(self) -> None:
         """Look after the hardware whenever something is due, and sleep until then."""
-        with self._turn:
+        try:
+            self.device = self._make()
+            if left := self.device.switch_off(self._clock()):
+                raise HmsaError(
+                    f'{left}: the coil could NOT be switched off at the start; {_MEND}')
+            self._hand_over()
+        except BaseException as error:  # whatever it is, nobody else would hear of it
+            self.failure = error if isinstance(error, HmsaError) else HmsaError(
+                f'the driver does not start ({told(error)})')
+            return
+        finally:
+            self._ready.set()
+        try:
             while not self._ended:
-                self._advance()
+                self._hear()
+                self.device.advance(self._clock())
+                self._hand_over()
                 self._wait()
+        except BaseException as error:
+            self._end(str(error) if isinstance(error, HmsaError) else
+                      f'the driver failed ({told(error)})')
+        else:
+            self._end('')
+
+    def _hear(self) -> None:
+        """Take what has come, with the time at which it came: calls may have blocked since."""
+        while self._commands:
+            command = self._commands.popleft()
+            if command is not None:
+                self.device.hear(*command)
+            elif left := self.device.switch_off(self._clock()):
+                raise HmsaError(left)
+
+    def _hand_over(self) -> None:
+        self._notices.extend(self.device.notices())
+        self._changes.extend(self.device.changes())
+        self._samples.extend(self.device.samples())
 
     def _wait(self) -> None:
         """Sleep until something is due; the last of the time to a level is watched instead."""
-        due, level = self._device.due, self._device.next_level
-        if due is None:
-            self._turn.wait()
-            return
-        left = due - self._clock()
-        if due != level:
-            self._turn.wait(max(left, 0) / NANOSECONDS)
-        elif left > _WATCHED:
-            self._turn.wait((left - _WATCHED) / NANOSECONDS)
-        else:
-            while self._clock() < due:
+        device = self.device
+        due, level = device.due, device.next_level
+        left = 0 if due is None else due - self._clock()
+        if due is not None and due == level and left <= _WATCHED:
+            device.calls.make_ready()
+            while self._clock() < due and not self._commands:
                 pass
+            return
+        device.calls.relax()
+        with self._turn:
+            if self._ended or self._commands:
+                return
+            if due == level:
+                left -= _WATCHED
+            self._turn.wait(None if due is None else max(left, 0) / NANOSECONDS)
 
-    def _advance(self) -> None:
-        if not self._ended:
-            self._guarded(lambda: self._device.advance(self._clock()))
+    def _end(self, why: str) -> None:
+        """Switch off and close; go on trying where that fails, until the end is asked for."""
+        begun, pause = monotonic(), _PAUSE
+        last = None
+        while left := self.device.switch_off(self._clock()):
+            if not self.trouble:
+                self.trouble = (
+                    f'{why or left}: the coil could NOT be switched off and may be on'
+                    f'{f" ({left})" if why and left != why else ""}; cut the power of the '
+                    'amplifier; the driver goes on trying')
+            self._hand_over()
+            if self._ended:
+                last = last or monotonic() + _LAST_ATTEMPTS
+                if monotonic() > last:
+                    break
+            with self._turn:
+                self._turn.wait(_PAUSE if self._ended else pause)
+            pause = min(2.0 * pause, _LONGEST_PAUSE)
+            self.device.open()
+        self._hand_over()
+        closed = '' if left else self.device.close()
+        if self._saver is not None or not (why or left or closed or self.trouble):
+            return
+        after = f' at last, after {monotonic() - begun:.1f} s' if self.trouble else ''
+        self.failure = HmsaError(
+            f'{why or left}: the coil was NOT switched off and may be on; cut the power of the '
+            'amplifier' if left else
+            f'{why or closed or "the hardware failed"}: the coil is switched off{after}; {_MEND}')
 
-    def _guarded(self, work: Callable[[], None]) -> None:
-        """Do something with the hardware; at its first error end, with the coils switched off."""
-        try:
-            work()
-        except Exception as error:  # whatever a laboratory's code raises
-            self._ended = True
-            if self.failure is None:
-                self.failure = HmsaError(
-                    f'the hardware failed ({type(error).__name__}: {excerpt(str(error))}) and is '
-                    'switched off: mend it, then start the driver again')
-                self.switch_off()
+    # -- without its own thread ----------------------------------------------------------------
+
+    def _save(self, why: str) -> None:
+        """Begin to end without the thread, which hangs in a call."""
+        self.trouble = f'{why}: trying to switch the coil off from another thread'
+        self._ended = True
+        self.device.calls.give_up(_HANGING)
+        self._saver = Thread(target=self._switch_off_past, args=(why,), daemon=True)
+        self._saver.start()
+
+    def _switch_off_past(self, why: str) -> None:
+        """Write 0 and close past the call that hangs, each as long as there is patience."""
+        device, now = self.device, self._clock()
+        done: dict[int, bool] = {}
+        for act in (
+                lambda i, x: done.update({i: x.cut(now)}), lambda _, x: x.drop()):
+            threads = [Thread(target=act, args=x, daemon=True)
+                       for x in enumerate(device.instruments)]
+            for x in threads:
+                x.start()
+            until = monotonic() + _PAST
+            for x in threads:
+                x.join(max(until - monotonic(), 0.0))
+        for i in range(len(device.instruments)):
+            device.forget(i, 0.0 if done.get(i) else float('nan'))
+        self._changes.extend(device.changes())
+        self.failure = HmsaError(
+            f'{why}: ' + (
+                f'the coil is switched off from another thread; {_MEND}'
+                if len(done) == len(device.instruments) and all(done.values()) else
+                'the coil could NOT be switched off and may be on; cut the power of the '
+                'amplifier'))
+
+
+def _emptied(queue: deque[T]) -> list[T]:
+    """Return what is in a queue, which another thread may be filling."""
+    return [queue.popleft() for _ in range(len(queue))]

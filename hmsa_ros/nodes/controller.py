@@ -17,7 +17,7 @@ from hmsa_ros.contract import topics
 from hmsa_ros.device.protocol import Change, Sample
 from hmsa_ros.nodes import conversions, interface
 from hmsa_ros.nodes.device_node import DeviceNode, TICK_SECONDS
-from hmsa_ros.nodes.driver import DriverNode, HARDWARE
+from hmsa_ros.nodes.driver import DriverNode, HARDWARE, SHORT
 from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.plant import PlantNode
 from hmsa_ros.nodes.runner import run
@@ -42,8 +42,8 @@ class LinkedPlanner(PlannerNode):
     @property
     def drives_hardware(self) -> bool:
         """Whether parameters for all nodes of the process name hardware."""
-        given = self._parameter_overrides.get(HARDWARE.name)
-        return given is not None and bool(given.value)
+        return any(given is not None and bool(given.value) for given in (
+            self._parameter_overrides.get(x) for x in (HARDWARE.name, SHORT)))
 
     def send(self) -> None:
         """Give the plant the commands that are due."""
@@ -94,7 +94,7 @@ class LinkedPlanner(PlannerNode):
 
     def _unheard(self) -> str:
         if self.plant is not None and self.plant.active:
-            return ''
+            return self.plant.trouble
         return 'the plant or driver of this process is not active: activate it'
 
     def cleanup(self) -> None:

@@ -111,6 +111,8 @@ class DeviceJoint:
                 logger.warning(text)
         elif notice.kind == Kind.REFUSED:
             self._refuse(notice.text)
+        elif notice.kind == Kind.SATURATED:
+            logger.warning(text)
         elif notice.kind == Kind.HEARD:
             logger.info(text)
         else:
@@ -163,6 +165,7 @@ class DeviceNode(ManagedNode):
     """
 
     companion = ''
+    trouble = ''  # why no command is obeyed
     values: JointParameters
     device: Any
     _joints: Sequence[DeviceJoint] = ()
@@ -200,7 +203,7 @@ class DeviceNode(ManagedNode):
         self._publish_news()
         if not self.companion:
             self.every(TICK_SECONDS, self.on_tick)
-        self.diagnose(self._report)
+        self._diagnose = self.diagnose(self._report)
 
     def _report(self) -> Iterable[DiagnosticStatus]:
         yield self._status_of_commands()
@@ -219,7 +222,7 @@ class DeviceNode(ManagedNode):
 
     def _publish_news(self) -> None:
         """Publish what has come of the device since the last time."""
-        if self.active and not self.companion:
+        if self.active and not self.trouble and not self.companion:
             for joint in self._joints:
                 joint.publish_receipt()
         for notice in self.device.notices():

@@ -1,15 +1,24 @@
 """Driver node: real hardware in the place of the plant, written to at the stamps of commands."""
 
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from time import time_ns
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from rcl_interfaces.msg import ParameterDescriptor
 
 from hmsa_ros.contract import topics
 from hmsa_ros.contract.parameters import JOINT, ParameterSpec, PUBLISH_RATE
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.device.hardware import HardwareDevice, HardwareJoint, load
+from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
+from hmsa_ros.device.hardware import Calls, Hardware, load
+from hmsa_ros.device.health import judge_hardware, listed
 from hmsa_ros.device.worker import HardwareWorker
+from hmsa_ros.ending import Deadline, ENDING
 from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.nodes import conversions
 from hmsa_ros.nodes.device_node import (
     COMMAND_SOURCE,
     DeviceJoint,
@@ -22,6 +31,9 @@ from hmsa_ros.nodes.joints import declare_joints, JointParameters, JOINTS
 from hmsa_ros.nodes.managed import AUTOSTART
 from hmsa_ros.nodes.runner import run
 
+# How long hardware may take to start before that is said, in s.
+_PATIENCE = 5.0
+
 #: Parameters that each joint may have values of its own for.
 OWN = (
     ParameterSpec(
@@ -33,14 +45,24 @@ OWN = (
 )
 
 HARDWARE = ParameterSpec(
-    'hardware', '',
+    'hardware.name', '',
     'What writes and reads, as MODULE:NAME: called with the name of a joint, it returns an object '
     'with the methods write and read. The module is found as an import finds it, or in the '
-    'working directory.')
+    'working directory. `hardware` alone is short for it. Other parameters hardware.* are given '
+    'to it as keyword arguments, those of a joint (left.hardware.*) before those for all.')
+
+TIMEOUT = ParameterSpec(
+    'hardware.timeout', 1.0,
+    'Longest time that a call of the hardware may take; past it the driver tries to switch off '
+    'from another thread, and ends.', 's', 0.01, 1e3)
+
+#: What a start value of `HARDWARE` may be called as well.
+SHORT = 'hardware'
 
 PARAMETERS = (
     AUTOSTART,
     HARDWARE,
+    TIMEOUT,
     *OWN,
     JOINT,
     JOINTS,
@@ -59,10 +81,27 @@ class DriverNode(DeviceNode):
 
     def __init__(self) -> None:
         super().__init__(topics.DRIVER)
+        given = self._parameter_overrides
+        if SHORT in given:
+            # A name that is a value and a namespace breaks ``ros2 param dump``.
+            given.setdefault(HARDWARE.name, given.pop(SHORT))
         self.values = declare_joints(
             self, [x for x in PARAMETERS if x is not AUTOSTART], OWN)
+        self._settings = {x: self._settings_of(x) for x in self.values.names}
         self.failure: HmsaError | None = None
         self.autostart()
+
+    def _settings_of(self, joint: str) -> dict[str, Any]:
+        """Declare the parameters that a class of hardware takes itself; return their values."""
+        found = {}
+        for prefix in ('hardware.', f'{joint}.hardware.'):
+            for name, parameter in self._parameter_overrides.items():
+                if name.startswith(prefix) and name not in (HARDWARE.name, TIMEOUT.name):
+                    if not self.has_parameter(name):
+                        self.declare_parameter(
+                            name, parameter.value, ParameterDescriptor(read_only=True))
+                    found[name.removeprefix(prefix)] = parameter.value
+        return found
 
     def configure(self) -> None:
         """
@@ -70,15 +109,23 @@ class DriverNode(DeviceNode):
 
         Raises
         ------
-        BadInputError
-            If parameters are out of range, or there is no such hardware.
+        HmsaError
+            If parameters are out of range, there is no such hardware, or it does not obey.
 
         """
         if self.get_parameter('use_sim_time').value:
             raise BadInputError(
                 'use_sim_time is true: expected false, hardware follows the clock of the machine')
-        self.device = HardwareWorker(_make_device(self.values), time_ns)
+        name = self.values[HARDWARE.name]
+        self.trouble = ''
+        with ENDING.by_default():
+            self.device = HardwareWorker(
+                partial(_make_device, load(name), self.values, self._settings), time_ns)
+            while not self.device.started(_PATIENCE):
+                self.get_logger().warning(
+                    f'waiting for {name}: it has not started yet, or its first write not returned')
         self._open(DeviceJoint)
+        self.get_logger().info(_described(self.device.device, self.values))
 
     def now(self) -> int:
         """Return the machine's time in ns."""
@@ -92,21 +139,63 @@ class DriverNode(DeviceNode):
         """Switch the coils off, and leave the hardware alone."""
         if self._joints:
             self.device.close()
+            self.failure = self.device.failure
         super().cleanup()
 
     def _go_on(self) -> None:
+        self.device.look_after()
+        if self.device.trouble != self.trouble:
+            self.trouble = self.device.trouble
+            self.get_logger().error(self.trouble)
+            for joint in self._joints:
+                # Nobody takes commands any more, and planners can see that.
+                joint.commands.close()
+            self._diagnose()
         if self.device.failure is not None:
             self.failure, self.finished = self.device.failure, True
 
+    def _report(self) -> Iterable[DiagnosticStatus]:
+        yield from super()._report()
+        device = self.device.device
+        level, message = judge_hardware(self.device.trouble, **device.counts)
+        yield conversions.to_status(
+            f'{self.get_name()}: hardware', ', '.join(self.values.names), level, message,
+            {**device.counts, **{
+                f'longest {name} in ms': f'{seconds * 1e3:.3f}'
+                for name, seconds in [*device.calls.longest.items()]}})
 
-def _make_device(values: JointParameters) -> HardwareDevice:
-    """Return the device that parameters describe, with its coils switched off."""
-    make = load(values[HARDWARE.name])
+
+def _make_device(
+        make: Callable[[str, Mapping[str, Any]], Hardware], values: JointParameters,
+        settings: Mapping[str, Mapping[str, Any]]) -> HardwareDevice:
+    """Return the device that parameters describe."""
     rate = values[PUBLISH_RATE.name]
     return HardwareDevice(
-        [HardwareJoint(make(name), own['flux_density_limit'], fallback_from(own))
+        [HardwareJoint(
+            make(name, settings[name]), own['flux_density_limit'], fallback_from(own), name)
          for name, own in ((x, values.of(x)) for x in values.names)],
-        time=time_ns(), period=max(round(NANOSECONDS / rate), 1) if rate else 0)
+        time=time_ns(), period=max(round(NANOSECONDS / rate), 1) if rate else 0,
+        calls=Calls(values[TIMEOUT.name], Deadline()))
+
+
+def _described(device: HardwareDevice, values: JointParameters) -> str:
+    """Return what was found, in a line."""
+    each = []
+    for name, coil, limit in zip(values.names, device.instruments, device.limits, strict=True):
+        own = values.of(name)
+        rate, safe = own[PUBLISH_RATE.name], own['safe_flux']
+        optional = [x for x in ('open', 'close') if coil.has(x)]
+        each.append(
+            f'{coil.name} for joint {name}'
+            f'{f" with {listed(optional)}" if optional else ""}: limit {limit:g} T, resolution '
+            f'{_known(coil.resolution, "T")}, slew {_known(coil.slew, "T/s")}, '
+            + (f'read at {rate:g} Hz' if rate else 'not read') + f', {safe} after '
+            f'{own["command_timeout"]:g} s without a command')
+    return f'{"; ".join(each)}; {TIMEOUT.name} {values[TIMEOUT.name]:g} s'
+
+
+def _known(value: float | None, unit: str) -> str:
+    return 'not given' if value is None else f'{value:g} {unit}'
 
 
 #: Run by ``hmsa driver`` with the command line's arguments; returns the exit status.

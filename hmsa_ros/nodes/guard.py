@@ -71,8 +71,8 @@ class CommandInput:
             self._allegiance = Allegiance()
         if source == 'first' or companion:
             self._raw = interface.listen(node, topic)
-        else:
-            interface.subscribe(node, topic, take)
+        self._subscription = None if self._raw is not None else interface.subscribe(
+            node, topic, take)
 
     @property
     def refused(self) -> int:
@@ -134,3 +134,6 @@ class CommandInput:
         if self._raw is not None:
             self._raw.destroy()
             self._raw = None
+        if self._subscription is not None:
+            self._node.destroy_subscription(self._subscription)
+            self._subscription = None

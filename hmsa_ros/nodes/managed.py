@@ -118,8 +118,9 @@ class ManagedNode(LifecycleNode):
 
         self.create_service(interface_class(service.type), service.name, answer)
 
-    def diagnose(self, report: Callable[[], Iterable[DiagnosticStatus]]) -> None:
-        """Publish statuses once a second."""
+    def diagnose(
+            self, report: Callable[[], Iterable[DiagnosticStatus]]) -> Callable[[], None]:
+        """Publish statuses once a second; return what publishes them at once."""
         publisher = interface.publisher(self, topics.DIAGNOSTICS)
 
         def publish() -> None:
@@ -127,6 +128,7 @@ class ManagedNode(LifecycleNode):
             publisher.publish(to_diagnostics(self.now(), *statuses))
 
         self.every(1.0, publish)
+        return publish
 
     def on_change(self, take: Callable[[Sequence[Parameter]], None]) -> None:
         """Have parameters that are set taken together, or refused by `BadInputError`."""

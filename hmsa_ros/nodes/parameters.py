@@ -172,7 +172,9 @@ def check_names(node: Node) -> None:
     """
     # Files may have sections for several nodes: names of other nodes of the package pass.
     unknown = [x for x in node._parameter_overrides
-               if not node.has_parameter(x) and not x.startswith('qos_overrides.')]
+               if not node.has_parameter(x) and not x.startswith('qos_overrides.')
+               # Of the driver, which gives them to a laboratory's class.
+               and 'hardware' not in x.split('.')[:2]]
     if not unknown:
         return
     others = {spec.name for name in topics.NODES

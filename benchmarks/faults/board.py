@@ -1,0 +1,126 @@
+"""A board on a serial line: holds the level of a coil, measures, and fails as boards do."""
+
+from collections.abc import Callable
+import os
+from pathlib import Path
+import select
+import threading
+from time import monotonic
+import tty
+
+_POLL = 0.005
+
+
+class Board:
+    """
+    A thread on a pseudo-terminal that answers lines.
+
+    ``L level`` sets a level in T, which ``K level boots`` answers; ``R`` asks for ``S stretch rate
+    boots``. Stretch is 1 + level here.
+
+    Parameters
+    ----------
+    port : Path
+        Where the line is to be found; made new at each `plug`.
+    watchdog : float
+        Time in s without a level after which the firmware switches off; 0 for never.
+
+    Attributes
+    ----------
+    record : list of (float, float)
+        What really flows: time in s of `time.monotonic`, and level in T from then on.
+    largest : float
+        Level in T at which the amplifier saturates.
+    answer : callable
+        Makes the answer out of what would be right; an empty one is not sent.
+
+    """
+
+    def __init__(self, port: Path, watchdog: float = 0.0) -> None:
+        """Switch it on and plug it in."""
+        self._port, self._watchdog = port, watchdog
+        self.record: list[tuple[float, float]] = [(monotonic(), 0.0)]
+        self.largest = 1.0
+        self.answer: Callable[[str], str] = str
+        self._boots = 1
+        self._fed = monotonic()
+        self._fds: tuple[int, int] | None = None
+        self._turn = threading.RLock()
+        self._ended = False
+        self.plug()
+        threading.Thread(target=self._work, daemon=True).start()
+
+    @property
+    def level(self) -> float:
+        """Level in T that flows."""
+        return self.record[-1][1]
+
+    def off_since(self, time: float) -> float:
+        """Return how long after a time it was off, in s; infinite if it is not."""
+        if self.level:
+            return float('inf')
+        return max(next((x for x, level in self.record if x > time and not level), time) - time,
+                   0.0)
+
+    def largest_since(self, time: float) -> float:
+        """Return the largest level that began after a time."""
+        return max((abs(level) for x, level in self.record if x > time), default=0.0)
+
+    def plug(self) -> None:
+        """Plug the cable in: a new line in the same place."""
+        with self._turn:
+            self.unplug()
+            controller, line = os.openpty()
+            tty.setraw(line)
+            self._fds = controller, line
+            self._port.unlink(missing_ok=True)
+            self._port.symlink_to(os.ttyname(line))
+
+    def unplug(self) -> None:
+        """Pull the cable out; what flows goes on flowing."""
+        with self._turn:
+            if self._fds is not None:
+                self._port.unlink(missing_ok=True)
+                for fd in self._fds:
+                    os.close(fd)
+                self._fds = None
+
+    def reboot(self) -> None:
+        """Lose the level, and count."""
+        self._set(0.0)
+        self._boots += 1
+
+    def end(self) -> None:
+        """Switch it off."""
+        self._ended = True
+        self.unplug()
+
+    def _set(self, level: float) -> None:
+        if level != self.level:
+            self.record.append((monotonic(), level))
+
+    def _work(self) -> None:
+        waiting = b''
+        while not self._ended:
+            with self._turn:
+                fds = self._fds
+                if fds is None:
+                    waiting = b''
+                elif select.select([fds[0]], [], [], 0.0)[0]:
+                    waiting += os.read(fds[0], 1000)
+                    *lines, waiting = waiting.split(b'\n')
+                    for line in lines:
+                        if answer := self.answer(self._obey(line.decode())):
+                            os.write(fds[0], answer.encode() + b'\n')
+                    continue
+            if self._watchdog and monotonic() - self._fed > self._watchdog:
+                self._set(0.0)
+            select.select([], [], [], _POLL)
+
+    def _obey(self, line: str) -> str:
+        word, _, level = line.partition(' ')
+        if word != 'L':
+            return f'S {1.0 + self.level!r} 0.0 {self._boots}'
+        self._fed = monotonic()
+        self._set(max(-self.largest, min(float(level), self.largest)))
+        return f'K {self.level!r} {self._boots}'

@@ -1,0 +1,315 @@
+"""Faults of drivers, told from the board's own record of what flowed."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+import math
+import signal
+from time import monotonic
+from typing import Any
+
+from benchmarks.faults.board import Board
+from benchmarks.faults.common import Register
+from benchmarks.faults.rig import Child, Rig
+from benchmarks.faults.table import Seen
+from hmsa_ros.contract import topics
+from hmsa_ros.nodes.conversions import to_command
+
+FAULTS = Register()
+_LEVEL = 0.02
+_BEAT = 0.05
+# As a planner's, in ns: what is stamped before a cut-off is refused.
+_LEAD = 200_000_000
+# Parameters: the watchdog of the driver, the limit of a call, and that of the firmware, in s.
+_TIMEOUT, _CALL, _FIRMWARE = 0.5, 0.5, 0.4
+# What a driver may take that is told to end, and one whose call hangs, in s.
+_PROMPT, _SOON = 3.0, 5.0
+
+
+class _Bench:
+    """A board, its driver, and commands that are repeated while somebody waits."""
+
+    def __init__(self, rig: Rig, board: Board, **parameters: object) -> None:
+        self.rig, self.board = rig, board
+        self.driver: Child = rig.start('driver', {
+            'hardware': 'benchmarks.faults.serial_coil:SerialCoil',
+            'hardware.port': rig.folder / 'port', 'hardware.timeout': _CALL,
+            'command_timeout': _TIMEOUT, 'publish_rate': 50.0, **parameters})
+        self._command = rig.publisher(topics.FLUX_DENSITY_COMMAND)
+
+    def ready(self) -> None:
+        """Wait until the driver takes commands."""
+        self.rig.spin_until(
+            lambda: self.rig.applied and self._command.get_subscription_count(), 'the driver')
+
+    def switch_on(self) -> None:
+        """Have a level flow."""
+        self.ready()
+        self.beat_until(lambda: self.board.level == _LEVEL, 'the level')
+
+    def beat_until(
+            self, condition: Callable[[], Any], what: str, level: float = _LEVEL) -> None:
+        """Repeat a level until a condition holds."""
+        due = 0.0
+
+        def look() -> Any:
+            nonlocal due
+            if monotonic() >= due:
+                due = monotonic() + _BEAT
+                now = self.rig.node.get_clock().now().nanoseconds
+                self._command.publish(to_command(now + _LEAD, level, ''))
+            return condition()
+
+        self.rig.spin_until(look, what)
+
+    def ends(self) -> int:
+        """Wait for the driver to end; return its status."""
+        self.beat_until(lambda: not self.driver.alive, 'the end of the driver')
+        status = self.driver.popen.poll()
+        return -1 if status is None else status
+
+    @property
+    def last(self) -> str:
+        """What the driver said last."""
+        lines = self.driver.said.strip().splitlines()
+        return lines[-1] if lines else ''
+
+
+@contextmanager
+def _bench(rig: Rig, watchdog: float = 0.0, **parameters: object) -> Iterator[_Bench]:
+    board = Board(rig.folder / 'port', watchdog)
+    try:
+        yield _Bench(rig, board, **parameters)
+    finally:
+        board.end()
+
+
+def _raised(rig: Rig, name: str, word: str) -> Seen:
+    """Have one call raise something."""
+    with _bench(rig) as bench:
+        bench.switch_on()
+        board = bench.board
+
+        def answer(right: str) -> str:
+            if right[0] != word:
+                return right
+            board.answer = str
+            return f'RAISE {name}'
+
+        begin = monotonic()
+        board.answer = answer
+        status = bench.ends()
+        method = {'K': 'write', 'S': 'read'}[word]
+        said = f'SerialCoil.{method} of joint actuator raised {name}' in bench.last \
+            and 'the coil is switched off' in bench.last
+        off = board.off_since(begin)
+        return Seen(f'exit {status}, "{bench.last}"', f'off after {off:.2f} s',
+                    status == 1 and said and off < _TIMEOUT)
+
+
+for _name, _word, _call in (
+        ('OSError', 'K', 'write'), ('SystemExit', 'K', 'write'),
+        ('KeyboardInterrupt', 'S', 'read'), ('MemoryError', 'S', 'read')):
+    FAULTS.fault(
+        f'driver_{_name.lower()}', f'a driver whose {_call} raises {_name}',
+        'a board on a serial line, 20 mT flow',
+        'the coil is off within command_timeout, the call and the error are named, exit 1')(
+            lambda rig, name=_name, word=_word: _raised(rig, name, word))
+
+
+@FAULTS.fault(
+    'driver_garbage', 'a driver whose board answers garbage',
+    'half a line, then right answers again', 'the coil is off within command_timeout, exit 1')
+def _garbage(rig: Rig) -> Seen:
+    with _bench(rig) as bench:
+        bench.switch_on()
+        board = bench.board
+
+        def answer(_: str) -> str:
+            board.answer = str
+            return '#*;S 1.'
+
+        begin = monotonic()
+        board.answer = answer
+        status = bench.ends()
+        off = board.off_since(begin)
+        return Seen(f'exit {status}, "{bench.last}"', f'off after {off:.2f} s',
+                    status == 1 and 'SerialCoil.' in bench.last and off < _TIMEOUT)
+
+
+@FAULTS.fault(
+    'driver_cable', 'cable of a driver out, later in again',
+    'the line is closed while 20 mT flow; the board has no watchdog',
+    'the coil could NOT be switched off: said, ERROR in diagnostics, the level reported is not '
+    'known; off once the cable is in again, exit 1')
+def _cable(rig: Rig) -> Seen:
+    with _bench(rig) as bench:
+        bench.switch_on()
+        bench.board.unplug()
+        bench.beat_until(lambda: 'could NOT be switched off' in bench.driver.said, 'the alarm')
+        bench.beat_until(lambda: rig.level('driver') == 2, 'ERROR in diagnostics')
+        bench.beat_until(lambda: math.isnan(rig.applied[-1][1]), 'the report')
+        level, applied = bench.board.level, rig.applied[-1][1]
+        begin = monotonic()
+        bench.board.plug()
+        status = bench.ends()
+        off = bench.board.off_since(begin)
+        return Seen(
+            f'{level:g} T flowed, {applied:g} T were reported; exit {status}, "{bench.last}"',
+            f'off after {off:.2f} s of cable',
+            level == _LEVEL and math.isnan(applied) and status == 1 and math.isfinite(off)
+            and 'switched off at last' in bench.last)
+
+
+@FAULTS.fault(
+    'driver_cable_ended', 'cable of a driver out, and the driver told to end',
+    'SIGTERM after the alarm', 'it ends within 3 s and says that the coil was not switched off')
+def _cable_ended(rig: Rig) -> Seen:
+    with _bench(rig) as bench:
+        bench.switch_on()
+        bench.board.unplug()
+        bench.beat_until(lambda: 'could NOT be switched off' in bench.driver.said, 'the alarm')
+        return _terminated(bench, 'was NOT switched off')
+
+
+def _terminated(bench: _Bench, text: str) -> Seen:
+    """Have the driver end by SIGTERM and judge how it does."""
+    begin = monotonic()
+    bench.driver.send(signal.SIGTERM)
+    status = bench.ends()
+    spent = monotonic() - begin
+    return Seen(f'exit {status}, "{bench.last}"', f'ended after {spent:.1f} s',
+                spent < _PROMPT and text in bench.last and status != 0)
+
+
+@FAULTS.fault(
+    'driver_reboot', 'board of a driver reboots',
+    'its level is gone, its count of boots one higher; the old level goes on being repeated',
+    'said, 0 T reported, the old level refused, another one obeyed; the driver goes on')
+def _reboot(rig: Rig) -> Seen:
+    with _bench(rig) as bench:
+        bench.switch_on()
+        begin = monotonic()
+        bench.board.reboot()
+        bench.beat_until(lambda: 'has lost its state' in bench.driver.said, 'the alarm')
+        bench.beat_until(lambda: rig.applied[-1][1] == 0.0, 'the report')
+        bench.beat_until(lambda: monotonic() > begin + 2.0 * _TIMEOUT, 'time to pass')
+        again = bench.board.largest_since(begin)
+        bench.beat_until(lambda: bench.board.level == 0.01, 'another level', 0.01)
+        return Seen(f'said; another level obeyed, {again:g} T without it', '-',
+                    again == 0.0 and bench.driver.alive)
+
+
+@FAULTS.fault(
+    'driver_saturated', 'amplifier of a driver saturated', '20 mT asked for, 12 mT possible',
+    'the level reported is the one that flows, WARN in diagnostics names saturation')
+def _saturated(rig: Rig) -> Seen:
+    with _bench(rig) as bench:
+        bench.board.largest = 0.012
+        bench.ready()
+        bench.beat_until(
+            lambda: any('saturated' in x['message'] for x in rig.diagnostics.values()), 'WARN')
+        _, values = rig.samples()
+        return Seen(
+            f'{rig.applied[-1][1]:g} T reported, {values[-1, 2]:g} T in samples', '-',
+            rig.applied[-1][1] == values[-1, 2] == bench.board.level == 0.012
+            and 'was asked for 0.02 T and set 0.012 T' in bench.driver.said)
+
+
+def _blocked(bench: _Bench, word: str) -> float:
+    """Have answers to a kind of call cease; return when."""
+    bench.switch_on()
+    begin = monotonic()
+    bench.board.answer = lambda right: '' if right[0] == word else right
+    return begin
+
+
+def _hung(rig: Rig, word: str, method: str) -> Seen:
+    with _bench(rig) as bench:
+        begin = _blocked(bench, word)
+        status = bench.ends()
+        spent, off = monotonic() - begin, bench.board.off_since(begin)
+        return Seen(
+            f'exit {status} after {spent:.1f} s, "{bench.last}"', f'off after {off:.2f} s',
+            status == 1 and spent < _SOON + _CALL and off < _SOON
+            and f'SerialCoil.{method} of joint actuator has not returned for' in bench.last)
+
+
+for _word, _call in (('K', 'write'), ('S', 'read')):
+    FAULTS.fault(
+        f'driver_{_call}_blocks', f'a {_call} of a driver that does not return',
+        'the board does what it is told, but does not answer',
+        'alarm after hardware.timeout, off from another thread, exit 1 within 5 s')(
+            lambda rig, word=_word, call=_call: _hung(rig, word, call))
+
+
+@FAULTS.fault(
+    'driver_blocked_ended', 'a driver told to end while a call does not return',
+    'SIGTERM at once, hardware.timeout 60 s', 'it ends within 3 s, and the coil is off')
+def _blocked_ended(rig: Rig) -> Seen:
+    with _bench(rig, **{'hardware.timeout': 60.0}) as bench:
+        begin = _blocked(bench, 'S')
+        seen = _terminated(bench, 'SerialCoil.read of joint actuator does not return')
+        off = bench.board.off_since(begin)
+        return Seen(seen.text, f'{seen.figure}, off after {off:.2f} s',
+                    seen.met and math.isfinite(off))
+
+
+@FAULTS.fault(
+    'driver_gil', 'a call of a driver that lets no Python run',
+    'a C function that keeps the GIL; the firmware has a watchdog',
+    'the process ends within 5 s and names the call; the firmware switches off')
+def _held(rig: Rig) -> Seen:
+    with _bench(rig, _FIRMWARE) as bench:
+        bench.switch_on()
+        begin = monotonic()
+        bench.board.answer = lambda _: 'HANG 0 0'
+        status = bench.ends()
+        spent = monotonic() - begin
+        rig.spin_until(lambda: not bench.board.level, 'the firmware')
+        return Seen(
+            f'exit {status} after {spent:.1f} s, "{bench.last}"',
+            f'off after {bench.board.off_since(begin):.2f} s',
+            status == 1 and spent < _SOON and 'lets nothing else run' in bench.last)
+
+
+@FAULTS.fault(
+    'driver_constructor', 'a driver told to end while its class does not start',
+    'a constructor that sleeps for 60 s, SIGTERM', 'it ends within 3 s')
+def _constructor(rig: Rig) -> Seen:
+    with _bench(rig, **{'hardware.sleep': 60.0}) as bench:
+        rig.spin_until(lambda: 'it has not started yet' in bench.driver.said, 'that it is said')
+        return _terminated(bench, 'it has not started yet')
+
+
+@FAULTS.fault(
+    'driver_planner_killed', 'planner of a driver killed', 'kill -9 while it holds 1.1',
+    'the coil is off within command_timeout of its last heartbeat, said by the driver')
+def _planner_killed(rig: Rig) -> Seen:
+    with _bench(rig) as bench:
+        planner = rig.start('planner')
+        rig.spin_until(lambda: rig.applied, 'the driver')
+        rig.ready('planner')
+        rig.setpoint(1.1)
+        rig.spin_until(lambda: bench.board.level, 'a level')
+        planner.end(signal.SIGKILL)
+        begin = monotonic()
+        rig.spin_until(lambda: not bench.board.level, 'the watchdog')
+        off = bench.board.off_since(begin)
+        rig.spin_until(lambda: 'no heartbeat' in bench.driver.said, 'that it is said')
+        return Seen('said', f'off after {off:.2f} s', off < _TIMEOUT + 0.1)
+
+
+@FAULTS.fault(
+    'driver_killed', 'a driver killed', 'kill -9; firmware with a watchdog, publish_rate 0',
+    'heartbeats have fed that watchdog before; it switches off after')
+def _killed(rig: Rig) -> Seen:
+    with _bench(rig, _FIRMWARE, publish_rate=0.0) as bench:
+        bench.switch_on()
+        begin = monotonic()
+        bench.beat_until(lambda: monotonic() > begin + 3.0 * _FIRMWARE, 'time to pass')
+        fed = bench.board.off_since(begin) == math.inf and bench.board.record[-1][0] < begin
+        bench.driver.end(signal.SIGKILL)
+        begin = monotonic()
+        rig.spin_until(lambda: not bench.board.level, 'the firmware')
+        off = bench.board.off_since(begin)
+        return Seen(f'fed: {fed}', f'off after {off:.2f} s', fed and off < _FIRMWARE + 0.1)

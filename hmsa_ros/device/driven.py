@@ -1,0 +1,330 @@
+"""Real hardware as a device: levels written at their stamps, a watchdog, and samples."""
+
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+import math
+
+import numpy as np
+
+from hmsa_ros.core.schedule import CommandSchedule
+from hmsa_ros.device.hardware import Calls, Hardware, HardwareError, Instrument
+from hmsa_ros.device.protocol import Change, Kind, Notice, Sample, StateLostError
+from hmsa_ros.device.watchdog import Device, Fallback
+from hmsa_ros.errors import BadInputError
+
+# Of the levels that took effect last, which tell at what level an older sample was taken.
+_REMEMBERED = 64
+# A level is not written again where the next one is due within so many of the longest writes.
+_ROOM = 2.0
+
+
+@dataclass(frozen=True)
+class HardwareJoint:
+    """
+    A real actuator.
+
+    Raises
+    ------
+    BadInputError
+        If the limit is out of range.
+
+    """
+
+    hardware: Hardware  #: what writes and reads
+    limit: float  #: largest level in T, above 0; what exceeds it is refused
+    #: what to do after a silence
+    fallback: Fallback = field(default_factory=lambda: Fallback(safe_flux='zero'))
+    name: str = 'actuator'  #: for sentences
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.limit < math.inf:
+            raise BadInputError(f'limit is {self.limit:g} T: expected a number above 0')
+
+
+class _Coil:
+    """What is known of a coil; NaN where a level in T is not known."""
+
+    def __init__(self, joint: HardwareJoint, calls: Calls) -> None:
+        self.instrument = Instrument(joint.hardware, joint.name, calls)
+        self.limit = min(joint.limit, self.instrument.limit or math.inf)
+        self.schedule = CommandSchedule(0.0)
+        self.heard: int | None = None  # when, in ns, since the watchdog was last looked at
+        self.repeat = False  # whether a sign of life is to be passed on
+        self.asked = self.level = math.nan
+        self.history: deque[tuple[int, float]] = deque(maxlen=_REMEMBERED)
+        self.saturated = self.lost = 0
+
+    def at(self, stamp: int) -> float:
+        """Return the level that was in force at a time in ns."""
+        known = bisect_right(self.history, stamp, key=lambda x: x[0])
+        return self.history[known - 1][1] if known else math.nan
+
+
+class HardwareDevice(Device):
+    """
+    Real actuators; their coils are not known to be off before `switch_off`.
+
+    Parameters
+    ----------
+    joints : sequence of HardwareJoint
+        At least one.
+    time : int
+        Time at the start in ns.
+    period : int
+        Between samples, in ns; 0 for none.
+    calls : Calls
+        What is told of each call of hardware.
+
+    Raises
+    ------
+    BadInputError
+        If hardware is not as `Hardware` says.
+
+    """
+
+    def __init__(
+            self, joints: Sequence[HardwareJoint], *, time: int, period: int = 0,
+            calls: Calls | None = None) -> None:
+        super().__init__(x.fallback for x in joints)
+        self.calls = Calls(1.0) if calls is None else calls
+        self._time = time
+        self._period = period
+        self._next_sample = time
+        self._coils = [_Coil(x, self.calls) for x in joints]
+
+    @property
+    def time(self) -> int:
+        """Time in ns that it has been advanced to."""
+        return self._time
+
+    @property
+    def next_level(self) -> int | None:
+        """Stamp of the next level, in ns; None if there is none ahead."""
+        return min((x.schedule.next_stamp for x in self._coils
+                    if x.schedule.next_stamp is not None), default=None)
+
+    @property
+    def due(self) -> int | None:
+        """When to advance it next, in ns; None for not before a command comes."""
+        times = [self.next_level, *(x.due(self._time) for x in self._watchdogs)]
+        if self._period:
+            times.append(self._next_sample)
+        return min((x for x in times if x is not None), default=None)
+
+    @property
+    def instruments(self) -> list[Instrument]:
+        """The hardware of each joint."""
+        return [x.instrument for x in self._coils]
+
+    @property
+    def limits(self) -> list[float]:
+        """Largest level in T of each joint, as given or as the hardware says."""
+        return [x.limit for x in self._coils]
+
+    @property
+    def levels(self) -> list[float]:
+        """Level in T that is in force on each joint; NaN where it is not known."""
+        return [x.level for x in self._coils]
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How often a level was not reached, and hardware lost its state."""
+        return {'saturated': sum(x.saturated for x in self._coils),
+                'state_lost': sum(x.lost for x in self._coils)}
+
+    # -- commands ------------------------------------------------------------------------------
+
+    def check(self, joint: int, stamp: int, level: float) -> None:
+        """
+        Refuse a level in T that is beyond the limit, or a stamp in ns of another clock.
+
+        Raises
+        ------
+        BadInputError
+            If it is.
+
+        """
+        limit = self._coils[joint].limit
+        if not abs(level) <= limit:  # not a number is refused, too
+            raise BadInputError(f'flux density is {level:g} T: expected at most {limit:g} T')
+        self._check_clock(stamp)
+
+    def receive(self, joint: int, stamp: int, level: float) -> None:
+        """
+        Take a level in T that applies from a stamp in ns on; a past one, or 0, at once.
+
+        Raises
+        ------
+        BadInputError
+            If the level is beyond the limit, or the stamp of another clock.
+
+        """
+        self.check(joint, stamp, level)
+        coil = self._coils[joint]
+        if self._refuses(joint, stamp, level, coil.schedule.current):
+            return
+        coil.heard = self._time
+        changed = coil.schedule.insert(stamp, level)
+        coil.repeat = coil.repeat or not changed
+        late = self._time - stamp
+        if changed and stamp and late > 0:
+            self._note_late(joint, late)
+
+    def hear(self, joint: int, stamp: int, level: float, now: int) -> None:
+        """Take a level that came at a time in ns (see `receive`), after any silence before it."""
+        self._pass_to(now)
+        self._watch(joint)
+        self.receive(joint, stamp, level)
+        self._watch(joint)
+
+    # -- time ----------------------------------------------------------------------------------
+
+    def _pass_to(self, time: int) -> None:
+        if time < self._time:
+            # The clock was set back.
+            self._next_sample = min(self._next_sample, time)
+        self._time = time
+
+    def advance(self, time: int) -> None:
+        """
+        Write what is due at a time in ns, which is now, and read if that is due.
+
+        Raises
+        ------
+        HardwareError
+            If a call fails.
+
+        """
+        self._pass_to(time)
+        for i, coil in enumerate(self._coils):
+            self._watch(i)
+            level = coil.schedule.apply_until(self._time)
+            if level != coil.asked or coil.repeat and self._has_room(coil):
+                self._write(i, level)
+        if self._period and self._time >= self._next_sample:
+            self._next_sample = (self._time // self._period + 1) * self._period
+            self._read()
+
+    def _watch(self, i: int) -> None:
+        coil = self._coils[i]
+        if coil.heard is not None:
+            self._feed(i, self._time)
+            coil.heard = None
+        for stamp, level in self._safe_levels(i, self._time, self._time, coil.schedule.current):
+            coil.schedule.insert(stamp, level)
+
+    def _has_room(self, coil: _Coil) -> bool:
+        """Return whether there is time to write before the next level, which will do as well."""
+        ahead = coil.schedule.next_stamp
+        longest = max(self.calls.longest.values(), default=0.0)
+        return ahead is None or ahead - self._time > _ROOM * longest * 1e9
+
+    # -- calls of the hardware -----------------------------------------------------------------
+
+    def _write(self, i: int, level: float) -> None:
+        coil = self._coils[i]
+        try:
+            when, really = coil.instrument.write(level, self._time)
+        except StateLostError as error:
+            self._lose(i, error)
+            return
+        except HardwareError:
+            self._set(i, self._time, math.nan, math.nan)
+            raise
+        if abs(really - level) > coil.instrument.tolerance(coil.limit):
+            coil.saturated += 1
+            if coil.saturated == 1:
+                self._notices.append(Notice(
+                    Kind.SATURATED, i, f'{coil.instrument.name}.write was asked for {level:g} T '
+                    f'and set {really:g} T, and moves will not end where they should: lower '
+                    'flux_density_max of the planner and flux_density_limit of the driver to '
+                    'what the amplifier gives'))
+        self._set(i, when, level, really)
+        coil.repeat = False
+
+    def _set(self, i: int, when: int, asked: float, level: float) -> None:
+        """Note the level that is in force from a time in ns on; NaN if it is not known."""
+        coil = self._coils[i]
+        known = not math.isnan(level)
+        if asked != coil.asked and (known or not math.isnan(coil.level)) or (
+                known and level != coil.level):
+            self._changes.append(Change(i, when, level))
+            coil.history.append((when, level))
+        coil.asked, coil.level = asked, level
+
+    def _lose(self, i: int, error: StateLostError) -> None:
+        """Take in that hardware has lost its state; it must obey again, or has failed."""
+        coil = self._coils[i]
+        coil.lost += 1
+        why = f' ({error})' if str(error) else ''
+        self._notices.append(Notice(
+            Kind.LOST, i, f'{coil.instrument.name} has lost its state{why} and its coil is off: '
+            'what was commanded is forgotten, send a new request'))
+        self._set(i, self._time, 0.0, 0.0)
+        coil.schedule = CommandSchedule(0.0)
+        coil.repeat = False
+        self.cut_off(i, self._time)
+        try:
+            when, level = coil.instrument.write(0.0, self._time)
+        except StateLostError as again:
+            raise HardwareError(
+                f'{coil.instrument.name}.write lost its state twice in a row') from again
+        self._set(i, when, 0.0, level)
+
+    def _read(self) -> None:
+        """Take what is new; readings of several joints with one stamp are one sample."""
+        found: dict[int, dict[int, tuple[float, float]]] = {}
+        for i, coil in enumerate(self._coils):
+            try:
+                for x in coil.instrument.read(self._time):
+                    stamp = self._time if x.stamp is None else x.stamp
+                    found.setdefault(stamp, {})[i] = x.stretch, x.rate
+            except StateLostError as error:
+                self._lose(i, error)
+        for stamp, values in sorted(found.items()):
+            read = np.array([
+                values.get(i, (math.nan, math.nan)) for i in range(len(self._coils))])
+            self._samples.append(Sample(
+                stamp, read[:, 0], read[:, 1], np.array([x.at(stamp) for x in self._coils])))
+
+    # -- the end -------------------------------------------------------------------------------
+
+    def switch_off(self, time: int) -> str:
+        """Switch all coils off at a time in ns; return what could not be, in words."""
+        self._pass_to(time)
+        return '; '.join(filter(None, (
+            self._switch_off(i) for i in range(len(self._coils)))))
+
+    def _switch_off(self, i: int) -> str:
+        coil = self._coils[i]
+        coil.schedule = CommandSchedule(0.0)
+        try:
+            self._write(i, 0.0)
+        except HardwareError as error:
+            return str(error)
+        if coil.instrument.off(coil.level, coil.limit):
+            return ''
+        return f'{coil.instrument.name}.write says that {coil.level:g} T are left'
+
+    def open(self) -> None:
+        """Have the hardware connect again, where it can."""
+        for x in self._coils:
+            x.instrument.open()
+
+    def close(self) -> str:
+        """Have the hardware end; return what has gone wrong, in words."""
+        return '; '.join(filter(None, (_said(x.instrument.close) for x in self._coils)))
+
+    def forget(self, joint: int, level: float) -> None:
+        """Take a level in T, NaN for unknown, that somebody else has brought about."""
+        self._set(joint, self._time, level, level)
+
+
+def _said(act: Callable[[], None]) -> str:
+    try:
+        act()
+    except HardwareError as error:
+        return str(error)
+    return ''

@@ -1,0 +1,503 @@
+"""Drivers of hardware without ROS: what is written when, what fails, and what is said of it."""
+
+import math
+from threading import Event
+from time import monotonic_ns
+
+from conftest import wait_until
+import pytest
+
+from hmsa_ros.device import StateLostError
+from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
+from hmsa_ros.device.hardware import Calls
+from hmsa_ros.device.protocol import Kind
+from hmsa_ros.device.watchdog import Fallback
+from hmsa_ros.device.worker import HardwareWorker
+from hmsa_ros.errors import BadInputError, HmsaError
+
+MS = 1_000_000
+START = 1000 * MS
+
+
+class Bench:
+    """An amplifier that takes 2 us, and a sensor; notes what it is asked."""
+
+    def __init__(self):
+        self.writes = []
+
+    @property
+    def levels(self):
+        return [level for _, level in self.writes]
+
+    def write(self, level, now):
+        self.writes.append((now, level))
+        return now + 2000
+
+    def read(self, now):
+        return 1.25, float(len(self.writes))
+
+
+def driver(period=0, bench=None, **settings):
+    bench = bench or Bench()
+    device = HardwareDevice([HardwareJoint(bench, 0.5, **settings)], time=START, period=period)
+    assert device.switch_off(START) == ''
+    assert bench.writes == [(START, 0.0)]
+    assert [(x.stamp, x.level) for x in device.changes()] == [(START + 2000, 0.0)]
+    return bench, device
+
+
+def serve(*benches, period=0, **calls):
+    """Return a worker that has started."""
+    worker = HardwareWorker(lambda: HardwareDevice(
+        [HardwareJoint(x, 0.5, name=f'joint_{i}') for i, x in enumerate(benches)],
+        time=monotonic_ns(), period=period, calls=Calls(**{'limit': 60.0, **calls})),
+        monotonic_ns)
+    assert worker.started(60.0)
+    return worker
+
+
+def test_a_driver_writes_each_level_when_it_is_due():
+    bench, device = driver()
+    assert device.due is None
+    for stamp, level in ((10, 0.1), (20, 0.2), (30, 0.3), (20, 0.25)):
+        device.receive(0, START + stamp * MS, level)
+    assert device.due == START + 10 * MS
+    device.advance(START + 9 * MS)
+    device.advance(START + 10 * MS)
+    device.advance(START + 21 * MS)
+    device.advance(START + 50 * MS)
+    assert bench.writes[1:] == [(START + 10 * MS, 0.1), (START + 21 * MS, 0.25)]
+    # What is reported is when the amplifier had done it.
+    assert [(x.stamp, x.level) for x in device.changes()] == [
+        (START + 10 * MS + 2000, 0.1), (START + 21 * MS + 2000, 0.25)]
+    device.receive(0, 0, 0.4)
+    device.advance(START + 51 * MS)
+    assert bench.writes[-1] == (START + 51 * MS, 0.4)
+
+
+def test_a_driver_that_comes_too_late_for_several_levels_writes_the_last():
+    bench, device = driver()
+    for k in (1, 2, 3):
+        device.receive(0, START + k * MS, 0.1 * k)
+    device.advance(START + 10 * MS)
+    assert bench.writes[1:] == [(START + 10 * MS, pytest.approx(0.3))]
+
+
+@pytest.mark.parametrize('level', [0.6, -0.6, math.nan, math.inf])
+def test_a_driver_refuses_what_is_beyond_its_limit(level):
+    bench, device = driver()
+    with pytest.raises(BadInputError, match='expected at most 0.5 T'):
+        device.receive(0, START, level)
+    device.advance(START + MS)
+    assert len(bench.writes) == 1
+
+
+def test_a_driver_switches_the_coil_off_after_a_silence():
+    bench, device = driver()
+    device.receive(0, START + MS, 0.1)
+    device.receive(0, START + 3000 * MS, 0.3)
+    device.advance(START + MS)
+    assert device.due == START + 1001 * MS + 1
+    device.advance(device.due)
+    assert bench.writes[1:] == [(START + MS, 0.1), (START + 1001 * MS + 1, 0.0)]
+    assert [x.kind for x in device.notices()] == [Kind.SILENT]
+    # Nothing is left to be done until somebody speaks again.
+    assert device.due is None
+    device.receive(0, 0, 0.2)
+    device.advance(START + 5000 * MS)
+    assert bench.writes[-1] == (START + 5000 * MS, 0.2)
+    assert [x.kind for x in device.notices()] == [Kind.HEARD]
+    device.switch_off(START + 5001 * MS)
+    assert bench.writes[-1] == (START + 5001 * MS, 0.0)
+
+
+def test_a_driver_ramps_down_where_that_is_wanted():
+    bench, device = driver(fallback=Fallback(0.01, 'ramp', 10.0))
+    device.receive(0, 0, 0.05)
+    now = START
+    device.advance(now)
+    while device.due is not None:
+        now = device.due
+        device.advance(now)
+    assert [x for _, x in bench.writes[1:]] == pytest.approx(
+        [0.05, 0.04, 0.03, 0.02, 0.01, 0.0], abs=1e-12)
+
+
+def test_a_driver_reads_its_sensor_on_a_grid():
+    bench, device = driver(period=2 * MS)
+    for time in (START, START + MS, START + 2 * MS, START + 7 * MS, START + 8 * MS):
+        device.advance(time)
+    samples = device.samples()
+    assert [x.time - START for x in samples] == [0, 2 * MS, 7 * MS, 8 * MS]
+    assert (samples[0].stretch[0], samples[0].rate[0]) == (1.25, 1.0)
+    # Also when the clock is set back.
+    device.advance(START - 1000 * MS)
+    assert device.samples()[0].time == device.time
+    assert device.due == device.time + 2 * MS
+
+
+def test_a_level_that_a_driver_gets_after_its_stamp_is_told():
+    bench, device = driver()
+    device.advance(START + 5 * MS)
+    device.receive(0, START + 2 * MS, 0.1)
+    assert [(x.kind, x.late) for x in device.notices()] == [(Kind.LATE, 3 * MS)]
+
+
+def test_a_sign_of_life_is_passed_on_unless_the_next_level_is_near():
+    bench, device = driver()
+    device.receive(0, 0, 0.1)
+    device.advance(START + MS)
+    device.receive(0, START + 60 * MS, 0.1)
+    assert device.due == START + 1001 * MS + 1
+    device.advance(START + 2 * MS)
+    assert bench.writes[1:] == [(START + MS, 0.1), (START + 2 * MS, 0.1)]
+    # What repeats is no change.
+    assert [x.level for x in device.changes()] == [0.1]
+    device.calls.longest['slow'] = 0.02
+    device.receive(0, START + 30 * MS, 0.2)
+    device.receive(0, START + 60 * MS, 0.2)
+    device.advance(START + 3 * MS)
+    assert bench.levels == [0.0, 0.1, 0.1]
+    device.advance(START + 30 * MS)
+    assert bench.levels == [0.0, 0.1, 0.1, 0.2]
+
+
+# -- what hardware says -------------------------------------------------------------------------
+
+
+class Amplifier(Bench):
+    """Gives at most 0.2 T, in steps, and answers as it is told to."""
+
+    resolution = 1e-3
+    limit = 0.4
+
+    def __init__(self):
+        super().__init__()
+        self.answer = self.readings = None
+
+    def write(self, level, now):
+        super().write(level, now)
+        if callable(self.answer):
+            return self.answer()
+        return now + 2000, min(round(level, 3), 0.2)
+
+    def read(self, now):
+        return self.readings
+
+
+def test_what_is_reported_is_what_was_really_set_and_saturation_is_named_once():
+    amplifier, device = driver(bench=Amplifier())
+    for k, level in enumerate((0.1004, 0.3, 0.35, 0.15)):
+        device.receive(0, 0, level)
+        device.advance(START + k * MS)
+    assert [x.level for x in device.changes()] == [0.1, 0.2, 0.2, 0.15]
+    (notice,) = device.notices()
+    assert notice.kind == Kind.SATURATED
+    assert 'Amplifier.write was asked for 0.3 T and set 0.2 T' in notice.text
+    assert device.counts == {'saturated': 2, 'state_lost': 0}
+    with pytest.raises(BadInputError, match='expected at most 0.4 T'):
+        device.receive(0, 0, 0.45)
+
+
+@pytest.mark.parametrize(('answer', 'stamp'), [
+    (None, 0), (START + 5, 5), ((None, 0.1), 0), ((float(START), 0.1), 0)])
+def test_write_may_say_when_or_nothing(answer, stamp):
+    amplifier, device = driver(bench=Amplifier())
+    amplifier.answer = lambda: answer
+    device.receive(0, 0, 0.1)
+    device.advance(START)
+    assert [(x.stamp, x.level) for x in device.changes()] == [(START + stamp, 0.1)]
+
+
+@pytest.mark.parametrize('answer', [
+    'done', math.nan, (START, math.nan), (START, 0.1, 3), [], 1e9 + 5.0, True, object()])
+def test_what_write_must_not_return_is_said_and_the_level_is_not_known(answer):
+    amplifier, device = driver(bench=Amplifier())
+    amplifier.answer = lambda: answer
+    device.receive(0, 0, 0.1)
+    with pytest.raises(HmsaError, match='Amplifier.write of joint actuator returned .*: expected'):
+        device.advance(START + 5 * 1000 * MS * 3)
+    assert [str(x.level) for x in device.changes()] == ['nan']
+
+
+NAN = math.nan
+
+
+@pytest.mark.parametrize(('readings', 'expected'), [
+    (1.1, [(9, 1.1, NAN)]), ((1.1,), [(9, 1.1, NAN)]), ((1.1, 2), [(9, 1.1, 2.0)]),
+    ([1.1, None], [(9, 1.1, NAN)]), ((NAN, 2.0), [(9, NAN, 2.0)]),
+    ((1.1, 2.0, START + 7 * MS), [(7, 1.1, 2.0)]), ([], []),
+    ([(1.2, NAN, START + 8 * MS), (1.1, 2.0, START + 6 * MS)], [(6, 1.1, 2.0), (8, 1.2, NAN)])])
+def test_read_returns_what_is_new(readings, expected):
+    amplifier, device = driver(period=MS, bench=Amplifier())
+    amplifier.readings = readings
+    device.receive(0, START + 7 * MS, 0.1)
+    device.advance(START + 9 * MS)
+    samples = device.samples()
+    assert [((x.time - START) / MS, x.stretch[0], x.rate[0]) for x in samples] == [
+        tuple(pytest.approx(x, nan_ok=True) for x in each) for each in expected]
+    # The level that was in force when it was taken: it was written at 9 ms.
+    assert all(x.flux_density[0] == 0.0 for x in samples)
+
+
+@pytest.mark.parametrize('readings', [
+    None, 'ok', b'ok', (1.0, 'x'), (1.0, 0.0, NAN), (1.0, 0.0, 3, 4), [(1.0, 'x', 5)],
+    (None, 1.0), object()])
+def test_what_read_must_not_return_is_said(readings):
+    amplifier, device = driver(period=MS, bench=Amplifier())
+    amplifier.readings = readings
+    with pytest.raises(
+            HmsaError, match='Amplifier.read of joint actuator returned .*: expected stretch'):
+        device.advance(START)
+
+
+def test_hardware_that_has_lost_its_state_begins_without_a_field():
+    bench, device = driver()
+    device.receive(0, 0, 0.1)
+    device.receive(0, START + 5 * MS, 0.2)
+    device.advance(START + MS)
+    taken = bench.write
+
+    def write(level, now):
+        bench.write = taken
+        raise StateLostError('brown-out')
+
+    bench.write = write
+    device.advance(START + 5 * MS)
+    assert bench.levels == [0.0, 0.1, 0.0]
+    assert [x.level for x in device.changes()] == [0.1, 0.0]
+    (notice,) = device.notices()
+    assert 'Bench has lost its state (brown-out) and its coil is off' in notice.text
+    # What was ahead is forgotten, and what was in force is not put on again.
+    for level, expected in ((0.1, 0.0), (0.2, 0.0), (0.15, 0.15)):
+        device.receive(0, START + 9 * MS, level)
+        device.advance(START + 9 * MS)
+        assert bench.levels[-1] == expected
+    assert device.counts['state_lost'] == 1
+
+
+@pytest.mark.parametrize(('change', 'expected'), [
+    ({'write': lambda level: None}, r'Coil.write does not take .*: expected write\(level, now\)'),
+    ({'read': lambda: (1.0, 0.0)}, r'Coil.read does not take .*: expected read\(now\)'),
+    ({'close': lambda x: None}, r'Coil.close does not take'),
+    ({'limit': 'much'}, "Coil.limit is 'much': expected a number above 0"),
+    ({'slew': 0.0}, 'Coil.slew is 0.0: expected a number above 0')])
+def test_a_class_that_cannot_be_called_is_refused(change, expected):
+    class Coil(Bench):
+        pass
+
+    coil = Coil()
+    for name, value in change.items():
+        setattr(coil, name, value)
+    with pytest.raises(BadInputError, match=expected):
+        HardwareDevice([HardwareJoint(coil, 0.5)], time=START)
+
+
+# -- the thread ---------------------------------------------------------------------------------
+
+
+def test_a_worker_writes_each_level_at_its_stamp_and_switches_off_in_the_end():
+    bench = Bench()
+    bench.closed = []
+    bench.close = lambda: bench.closed.append(bench.levels[-1])
+    worker = serve(bench, period=MS)
+    begin = monotonic_ns()
+    stamps = [begin + 20 * MS, begin + 40 * MS]
+    for stamp, level in zip(stamps, (0.1, 0.2), strict=True):
+        worker.receive(0, stamp, level)
+    with pytest.raises(BadInputError, match='expected at most 0.5 T'):
+        worker.receive(0, begin + 60 * MS, 0.6)
+    wait_until(lambda: len(bench.writes) >= 3, 'both levels')
+    worker.close()
+    worker.close()
+    assert bench.levels == [0.0, 0.1, 0.2, 0.0]
+    assert bench.closed == [0.0]
+    assert all(now >= stamp for (now, _), stamp in zip(bench.writes[1:], stamps, strict=False))
+    assert [x.level for x in worker.changes()] == [0.0, 0.1, 0.2, 0.0]
+    times = [x.time for x in worker.samples()]
+    assert len(times) > 2
+    assert times == sorted(times)
+    assert worker.failure is None
+
+
+class Odd(BaseException):
+    """What nobody expects."""
+
+
+@pytest.mark.parametrize('error', [
+    OSError('no answer'), SystemExit(3), KeyboardInterrupt(), MemoryError(), Odd('who?'),
+    GeneratorExit(), RecursionError('deep')], ids=lambda x: type(x).__name__)
+@pytest.mark.parametrize('method', ['write', 'read'])
+def test_whatever_hardware_raises_ends_the_worker_with_all_coils_switched_off(method, error):
+    benches = [Bench(), Bench()]
+    worker = serve(*benches, period=MS)
+    worker.receive(1, 0, 0.3)
+    wait_until(lambda: 0.3 in benches[1].levels, 'the level')
+    taken = getattr(benches[0], method)
+
+    def fail(*_):
+        setattr(benches[0], method, taken)
+        raise error
+
+    setattr(benches[0], method, fail)
+    worker.receive(0, 0, 0.2)
+    wait_until(lambda: worker.failure is not None, 'the failure')
+    assert str(worker.failure).startswith(
+        f'Bench.{method} of joint joint_0 raised {type(error).__name__}')
+    assert 'the coil is switched off; mend it' in str(worker.failure)
+    assert [x.levels[-1] for x in benches] == [0.0, 0.0]
+    worker.close()
+
+
+class Cable(Bench):
+    """Can be pulled out; a new connection works once it is in again."""
+
+    def __init__(self):
+        super().__init__()
+        self.out = self.cut = False
+        self.tries = 0
+
+    def write(self, level, now):
+        self.tries += 1
+        if self.out or self.cut:
+            raise OSError('no device')
+        return super().write(level, now)
+
+    def read(self, now):
+        return self.write(0.1, now), 0.0
+
+    def open(self):
+        self.cut = self.out
+
+
+def test_a_coil_that_could_not_be_switched_off_is_said_to_be_and_tried_until_it_is():
+    cable = Cable()
+    worker = serve(cable)
+    worker.receive(0, 0, 0.1)
+    wait_until(lambda: 0.1 in cable.levels, 'the level')
+    cable.out = cable.cut = True
+    worker.receive(0, 0, 0.2)
+    wait_until(lambda: worker.trouble, 'the trouble')
+    assert worker.trouble.startswith(
+        "Cable.write of joint joint_0 raised OSError: 'no device': the coil could NOT be switched "
+        'off and may be on')
+    assert worker.failure is None
+    with pytest.raises(BadInputError, match='could NOT be switched off'):
+        worker.receive(0, 0, 0.1)
+    tries = cable.tries
+    wait_until(lambda: cable.tries > tries + 2, 'more attempts')
+    # What flows is not known.
+    assert [str(x.level) for x in worker.changes()] == ['0.0', '0.1', 'nan']
+    cable.out = False
+    wait_until(lambda: worker.failure is not None, 'the end')
+    assert 'the coil is switched off at last, after' in str(worker.failure)
+    assert [x.level for x in worker.changes()] == [0.0]
+    assert cable.levels == [0.0, 0.1, 0.0]
+
+
+def test_a_worker_that_is_ended_meanwhile_says_that_the_coil_was_not_switched_off():
+    cable = Cable()
+    worker = serve(cable)
+    worker.receive(0, 0, 0.1)
+    wait_until(lambda: 0.1 in cable.levels, 'the level')
+    cable.out = True
+    worker.close()
+    assert 'the coil was NOT switched off and may be on' in str(worker.failure)
+
+
+class Gate(Bench):
+    """Blocks where it is asked to, until it is let go or a call comes from another thread."""
+
+    def __init__(self):
+        super().__init__()
+        self.blocks, self.blocked, self.go = '', Event(), Event()
+
+    def write(self, level, now):
+        self.pass_through('write')
+        return super().write(level, now)
+
+    def read(self, now):
+        self.pass_through('read')
+        return super().read(now)
+
+    def pass_through(self, method):
+        if self.blocks == method:
+            self.blocks = ''
+            self.blocked.set()
+            assert self.go.wait(60.0)
+
+
+def test_nobody_waits_for_a_call_that_blocks_and_then_only_the_newest_level_is_written():
+    gate = Gate()
+    worker = serve(gate)
+    gate.blocks = 'write'
+    worker.receive(0, 0, 0.1)
+    assert gate.blocked.wait(60.0)
+    # With a lock around the call, none of these would return.
+    for k in range(2, 5):
+        worker.receive(0, 0, k / 10)
+    assert (worker.samples(), worker.notices(), worker.silent) == ([], [], [])
+    assert [x.level for x in worker.changes()] == [0.0]
+    gate.go.set()
+    wait_until(lambda: 0.4 in gate.levels, 'the newest level')
+    assert gate.levels == [0.0, 0.1, 0.4]
+    worker.close()
+
+
+@pytest.mark.parametrize('method', ['write', 'read'])
+def test_a_call_that_does_not_return_in_time_ends_the_worker_from_another_thread(method):
+    gate, other = Gate(), Bench()
+    worker = serve(gate, other, period=MS, limit=0.01)
+    worker.receive(1, 0, 0.3)
+    wait_until(lambda: 0.3 in other.levels, 'the level')
+    gate.blocks = method
+    worker.receive(0, 0, 0.1)
+    assert gate.blocked.wait(60.0)
+
+    def ended():
+        worker.look_after()
+        return worker.failure
+
+    wait_until(ended, 'the end')
+    assert f'Gate.{method} of joint joint_0 has not returned for 0.01 s' in str(worker.failure)
+    assert 'the coil is switched off from another thread' in str(worker.failure)
+    assert [x.levels[-1] for x in (gate, other)] == [0.0, 0.0]
+    gate.go.set()
+    worker.close()
+    # What blocked may have been a level; nothing but off has followed it.
+    assert gate.levels[-1] == 0.0
+
+
+def test_a_level_of_before_a_cut_off_is_not_written_when_a_call_returns_late():
+    gate = Gate()
+    now = [START]
+    worker = HardwareWorker(lambda: HardwareDevice(
+        [HardwareJoint(gate, 0.5)], time=START, calls=Calls(60.0)), lambda: now[0])
+    assert worker.started(60.0)
+    gate.blocks = 'write'
+    worker.receive(0, START, 0.1)
+    assert gate.blocked.wait(60.0)
+    # It came in time, and then nothing did for longer than the watchdog waits.
+    now[0] = START + 500 * MS
+    worker.receive(0, START + 600 * MS, 0.2)
+    now[0] = START + 2000 * MS
+    worker.receive(0, START + 1900 * MS, 0.1)
+    gate.go.set()
+    wait_until(lambda: gate.levels == [0.0, 0.1, 0.0], 'the coil to be off')
+    worker.close()
+    assert [x.kind for x in worker.notices()] == [Kind.SILENT, Kind.REFUSED]
+    assert [x.level for x in worker.changes()] == [0.0, 0.1, 0.0]
+
+
+def test_hardware_that_does_not_start_says_why():
+    class Silent(Bench):
+        def write(self, level, now):
+            raise OSError('no device')
+
+    class Stuck(Bench):
+        def write(self, level, now):
+            return now, 0.1
+
+    for bench, text in ((Silent(), "raised OSError: 'no device'"), (Stuck(), '0.1 T are left')):
+        with pytest.raises(HmsaError, match=f'{text}: the coil could NOT be switched off'):
+            serve(bench)
