@@ -104,7 +104,7 @@ def test_a_field_that_has_not_settled_is_no_rest():
 
 def test_limits_that_leave_no_room_to_settle_the_field_are_named():
     held = float(elastic_force(1.3, PAPER))
-    with pytest.raises(RefusedError, match='coil time constant.*wider limits') as refusal:
+    with pytest.raises(RefusedError, match='coil time constant.*flux density limits') as refusal:
         get_shaper('two_step')(Request(
             State(1.0), 1.3, PAPER, Limits(-1.0, held), Delivery(lag=0.1)))
     assert refusal.value.code is Code.FLUX_LIMIT

@@ -1,6 +1,9 @@
 """Shapers against an integration of their own: at rest at the target, or a reason."""
 
+from collections import Counter
+from dataclasses import replace
 import math
+import re
 
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
@@ -194,16 +197,87 @@ def test_too_little_room_for_the_grid_or_the_ramps_is_refused_with_what_is_neede
     tight = Limits(-0.011, 0.805)
     moving = State(0.9998, 0.3189)
     assert get_shaper('two_step')(Request(moving, 1.32375, PAPER, tight)).code is Code.TWO_STEP
-    with pytest.raises(RefusedError, match='expected a shorter command period'):
+    with pytest.raises(RefusedError, match='or a command period of 0.4'):
         get_shaper('two_step')(Request(moving, 1.32375, PAPER, tight, Delivery(period=4.0)))
-    with pytest.raises(RefusedError, match='expected a slew limit of about'):
+    with pytest.raises(RefusedError, match='expected a slew limit of'):
         get_shaper('two_step')(Request(
             State(1.0), 0.6, PAPER, WIDE, Delivery(slew=0.02)))
     with pytest.raises(RefusedError, match='needs a flux density of'):
         get_shaper('zvd')(Request(State(1.0), 1.4, PAPER, Limits(-0.1, 0.5)))
     holding = get_shaper('step')(Request(State(1.0), 1.1, PAPER)).levels[-1].load
+    assert get_shaper('minimum_time')(
+        Request(State(1.0), 1.1, PAPER, Limits(-1.0, holding))).code is Code.TWO_STEP
     with pytest.raises(RefusedError, match='room on both sides'):
-        get_shaper('minimum_time')(Request(State(1.0), 1.1, PAPER, Limits(-1.0, holding)))
+        get_shaper('minimum_time')(Request(State(1.0, 2.0), 1.1, PAPER, Limits(-1.0, holding)))
+
+
+def drawn(random: np.random.Generator) -> Request:
+    """Return a move drawn at random, with limits of which some are tight."""
+    start, target = random.uniform(0.7, 1.8, 2)
+    material = NondimensionalParameters(zeta=float(random.choice([0.05, 0.2, 1.0, 2.5])))
+    loads = sorted(float(elastic_force(x, material)) for x in (start, target))
+    span = loads[1] - loads[0]
+    room = span * random.choice([0.02, 0.1, 0.5, 2.0, 10.0], 2) + 1e-3
+    half = np.pi / float(natural_frequency(target, material))
+    period, slew, lag = random.integers(0, 2, 3)
+    rate = random.normal() * 0.3 * (target - start) * random.integers(0, 2)
+    return Request(
+        State(start, rate, float(elastic_force(start, material))), target, material,
+        Limits(loads[0] - room[0], loads[1] + room[1]),
+        Delivery(
+            period * half * random.uniform(0.02, 1.2),
+            span / half * np.exp(random.uniform(-1.5, 4.0)) if slew else math.inf,
+            1e-6 * random.integers(0, 2), lag * half * random.uniform(0.01, 0.3)))
+
+
+def test_minimum_time_finds_what_two_step_finds_and_is_never_slower():
+    random = np.random.default_rng(1)
+    for _ in range(500):
+        request = drawn(random)
+        (slow, refusal), (fast, _) = (
+            plan_or_reason(name, request) for name in ('two_step', 'minimum_time'))
+        if refusal is None:
+            assert fast.levels
+            assert fast.duration <= slow.duration
+            assert request.keeps(fast.levels)
+            assert fast.reason or fast.code in (Code.MINIMUM_TIME, Code.HOLD)
+
+
+def eased(request: Request, advice: str) -> Request:
+    """Return a request with the limits that a refusal advises."""
+    limits, delivery = request.limits, request.delivery
+    for part in advice.split(' and '):
+        numbers = [float(x) for x in re.findall(r'-?\d[\d.e+-]*', part)]
+        if 'flux' in part:
+            limits = Limits(*numbers)
+        elif 'slew' in part:
+            delivery = replace(delivery, slew=(*numbers, math.inf)[0])
+        else:
+            name = 'period' if part.startswith('a command period of') else 'lag'
+            delivery = replace(delivery, **{name: numbers[0]})
+    return replace(request, limits=limits, delivery=delivery)
+
+
+def test_a_refusal_names_limits_with_each_of_which_a_command_is_found():
+    random = np.random.default_rng(2)
+    named: Counter[str] = Counter()
+    refused = 0
+    while refused < 50:
+        request = drawn(random)
+        if not (request.delivery.period and request.delivery.slew < math.inf):
+            continue  # seldom refused
+        _, refusal = plan_or_reason('two_step', request)
+        if refusal is None:
+            continue
+        refused += 1
+        first, *others = str(refusal).partition(': expected ')[2].split(', or ')
+        for advice in (first, *others):
+            assert plan_or_reason('two_step', eased(request, advice))[1] is None, refusal
+            named[advice.partition(' of ')[0]] += 1
+        by_word = {'flux': Code.FLUX_LIMIT, 'slew': Code.SLEW_LIMIT}
+        assert refusal.code is next(
+            (code for word, code in by_word.items() if word in first), Code.NO_TWO_STEP)
+    assert len(named) >= 3
 
 
 @pytest.mark.parametrize('name', list(SHAPERS))

@@ -5,31 +5,23 @@ A shaper takes a `Request` and answers with a `Move`, or refuses with a reason. 
 nondimensional; `Units` only words the messages.
 """
 
-from collections.abc import Callable
+import math
 
-from hmsa_ros.core.moves import Move
+from hmsa_ros.core.shapers.advice import advised, Shaper
 from hmsa_ros.core.shapers.linear import ei, step, zv, zvd
 from hmsa_ros.core.shapers.minimax import minimax
 from hmsa_ros.core.shapers.minimum_time import minimum_time
-from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.shapers.robust import robust
 from hmsa_ros.core.shapers.smooth import smooth
 from hmsa_ros.core.shapers.two_step import two_step
 from hmsa_ros.errors import BadInputError
 
-Shaper = Callable[[Request], Move]
-
 #: Shapers by name.
 SHAPERS: dict[str, Shaper] = {
-    'two_step': two_step,
-    'robust': robust,
-    'minimax': minimax,
-    'minimum_time': minimum_time,
-    'smooth': smooth,
-    'step': step,
-    'zv': zv,
-    'zvd': zvd,
-    'ei': ei,
+    **{x.__name__: advised(x) for x in (two_step, robust, minimax, minimum_time)},
+    # Whose search for a path that is not there takes long: what to ease, but not how much.
+    'smooth': advised(smooth, (math.inf,)),
+    **{x.__name__: x for x in (step, zv, zvd, ei)},
 }
 
 

@@ -168,11 +168,8 @@ def _refusal(request: Request) -> tuple[Code, str]:
     if not math.isinf(delivery.slew):
         return Code.SLEW_LIMIT, text + (
             f'ramps of {units.slew_text(delivery.slew)} and flux densities of '
-            f'{_limits_text(request, limits)}: expected faster ramps, wider limits or a smaller '
-            'move')
-    return Code.FLUX_LIMIT, text + (
-        f'flux densities of {_limits_text(request, limits)}: expected wider limits, a smaller '
-        'move or several setpoints')
+            f'{_limits_text(request, limits)}')
+    return Code.FLUX_LIMIT, f'{text}flux densities of {_limits_text(request, limits)}'
 
 
 def _limits_text(request: Request, limits: Limits) -> str:

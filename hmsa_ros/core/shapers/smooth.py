@@ -282,5 +282,4 @@ def _refusal(request: Request) -> tuple[Code, str]:
     return code, (
         f'no smooth path of up to {MOST_PERIODS:g} natural periods leads to rest at '
         f'{request.named_target} within flux densities of {units.load_text(limits.minimum)} to '
-        f'{units.load_text(limits.maximum)}{ramps} and the largest rate: expected wider '
-        'limits or a smaller move')
+        f'{units.load_text(limits.maximum)}{ramps} and the largest rate')

@@ -10,7 +10,7 @@ import numpy as np
 from hmsa_ros.core.moves import Level, Limits, Move
 from hmsa_ros.core.shapers.creeping import free_levels, two_levels
 from hmsa_ros.core.shapers.lagged import at_rest, settle, three_levels
-from hmsa_ros.core.shapers.minimum_time import minimum_time
+from hmsa_ros.core.shapers.push_brake import push_brake
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.shooting import approach, Attempt, first_kept, solve, Template
 from hmsa_ros.core.status import Code, RefusedError
@@ -73,7 +73,7 @@ def _without(request: Request, code: Code, holding: float) -> Move:
             code,
             f'zeta {zeta:g} is too damped for the response to cross {request.named_target}: no '
             'two-step command exists, the plain step approaches without overshoot (shaper '
-            'minimum_time arrives in finite time)')
+            'minimum_time can arrive in finite time)')
     return request.plain(
         code,
         f'zeta {zeta:g} is so close to critical damping at {request.named_target} that beta_p '
@@ -169,8 +169,7 @@ def _sampled(request: Request, first: Level, last: Level) -> Move:
     raise RefusedError(
         Code.NO_TWO_STEP,
         f'no command on a grid of {request.units.time_text(period)} within the limits brings '
-        f'{request.named_target} to rest: expected a shorter command period (the ideal '
-        f'move takes {request.units.time_text(tau_p)})')
+        f'{request.named_target} to rest, which takes {request.units.time_text(tau_p)} without')
 
 
 def _ramped(request: Request, first: Level, last: Level) -> Move:
@@ -215,8 +214,7 @@ def _ramped(request: Request, first: Level, last: Level) -> Move:
     raise RefusedError(
         Code.SLEW_LIMIT,
         f'no command through ramps of {request.units.slew_text(slew)} brings '
-        f'{request.named_target} to rest: expected a slew limit of about '
-        f'{request.units.slew_text(abs(change) / last.time)}')
+        f'{request.named_target} to rest')
 
 
 def _searched(request: Request, holding: float) -> Attempt:
@@ -255,7 +253,7 @@ def _two_levels(request: Request, holding: float) -> Move:
         found = _searched(request, holding)
         if found is not None:
             return Move(Code.TWO_STEP, *found)
-    return minimum_time(request, _no_single(request))
+    return push_brake(request, _no_single(request))
 
 
 def _swings(request: Request, holding: float) -> Attempt:
