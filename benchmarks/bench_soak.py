@@ -143,7 +143,7 @@ class Result:
 
 def check_bag(folder: Path, kind: str, killed: str, step: int = _STEP_NS) -> Cycle:
     """Look for gaps in a bag, integrate its commands anew, and remove it if all is well."""
-    from hmsa_ros.bag.info import lost_messages
+    from hmsa_ros.bag.info import missing_messages
     from hmsa_ros.bag.reader import BagReader
     from hmsa_ros.bag.recover import recover
     from hmsa_ros.errors import HmsaError
@@ -157,7 +157,7 @@ def check_bag(folder: Path, kind: str, killed: str, step: int = _STEP_NS) -> Cyc
             bag = folder.with_name(folder.name + '_recovered')
             recover(folder, bag)
         reader = BagReader(bag)
-        lost = lost_messages(reader.custom_data)
+        lost = missing_messages(reader.custom_data, 'lost')
         found.lost = -1 if lost is None else sum(lost.values())
         before = 0
         for message in reader.messages(('/joint_states',)):

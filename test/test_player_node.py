@@ -20,8 +20,10 @@ from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
 from hmsa_ros.bag.definitions import message_definition, type_hash
+from hmsa_ros.bag.info import summarize
 from hmsa_ros.bag.qos import Qos
 from hmsa_ros.bag.writer import BagWriter, Topic
+from hmsa_ros.session.launching import REPLAY
 
 pytestmark = pytest.mark.ros
 FLOAT = 'std_msgs/msg/Float64'
@@ -332,6 +334,24 @@ def test_it_waits_for_the_node_that_obeys_and_not_for_a_listener(ros, start, pla
     start.hmsa('plant')
     finish(ros, process, got, 50)
     ros.spin_until(lambda: applied, 'the level in force')
+
+
+def test_a_replay_begins_when_the_recorder_has_found_what_the_plant_sends(start, tmp_path):
+    bag = write_bag(tmp_path / 'bag', [
+        ('/flux_density_command', i, 1e-3 * i) for i in range(100)])
+    file = tmp_path / 'slow.yaml'
+    file.write_text(
+        'recorder:\n  ros__parameters:\n    record.topic_polling_interval.sec: 4\n')
+    processes = {x.name: start(*x.command()) for x in REPLAY.evaluate({
+        'bag': str(bag), 'record_to': str(tmp_path / 'again'), 'params_file': str(file)},
+        tmp_path).nodes}
+    assert processes['player'].wait() == 0, processes['player'].output
+    assert processes['recorder'].stop() == 0, processes['recorder'].output
+    summary = summarize(tmp_path / 'again')
+    samples, = (x for x in summary.topics if x.name == '/joint_states')
+    # The first one shows the plant at rest, whenever it is there.
+    assert (samples.sent_before <= 1, samples.lost) == (True, 0), summary
+    assert samples.count > 1
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from hmsa_ros.bag import metadata
 from hmsa_ros.bag.definitions import message_definition, type_hash
-from hmsa_ros.bag.info import lost_messages, summarize
+from hmsa_ros.bag.info import missing_messages, summarize, to_text
 from hmsa_ros.bag.qos import Qos
 from hmsa_ros.bag.reader import BagReader, read_messages
 from hmsa_ros.bag.recover import recover
@@ -50,7 +50,7 @@ class Recorder:
         for message in reversed(self.diagnostics):
             for status in message.status:
                 if status.name == 'recorder: bag':
-                    return {item.key: item.value for item in status.values}[key]
+                    return {item.key: item.value for item in status.values}.get(key, '')
         return ''
 
     def wait_for(self, key, value):
@@ -100,7 +100,7 @@ def test_everything_sent_is_in_the_bag_after_a_clean_end(record, talk, ending):
         assert 0 <= message.log_time - message.publish_time < 60e9
     stored = metadata.read(recorder.folder / 'metadata.yaml')
     assert stored.message_count == 2000
-    assert lost_messages(stored.custom_data) == {'/a': 0}
+    assert missing_messages(stored.custom_data, 'lost') == {'/a': 0}
     assert '2000 messages of 1 topics' in recorder.process.stdout
     with AnyReader([recorder.folder]) as other:
         assert [other.deserialize(data, connection.msgtype).data
@@ -133,12 +133,32 @@ def test_lost_messages_are_counted_to_the_last_one(record, ros):
                    'all 1001 messages to be received or counted as lost')
     reader = recorder.end()
     got = values(reader)
-    lost = lost_messages(reader.custom_data)['/a']
+    lost = missing_messages(reader.custom_data, 'lost')['/a']
     assert got[0] == -1.0
     assert got[-1] == 999.0
     assert lost > 0
     assert len(got) + lost == 1001
     assert f'{lost} lost' in recorder.process.stdout
+
+
+def test_what_was_sent_before_it_was_matched_is_counted_apart(record, ros):
+    publisher = ros.publisher(Float64, '/a', 100, subscribers=0)
+    for i in range(20):
+        publisher.publish(Float64(data=float(i)))
+    recorder = record(topics='[/a, /b]')
+    ros.spin_until(lambda: publisher.get_subscription_count() == 1, 'the recorder')
+    for i in range(20, 25):
+        publisher.publish(Float64(data=float(i)))
+    recorder.wait_for('received', '5')
+    recorder.wait_for('sent_before./a', '20')
+    reader = recorder.end()
+    assert values(reader) == [20.0, 21.0, 22.0, 23.0, 24.0]
+    assert missing_messages(reader.custom_data, 'lost') == {'/a': 0}
+    assert '0 lost, 20 sent before the recorder was matched' in recorder.process.stdout
+    assert 'nothing was received of /b' in recorder.process.stdout
+    summary = summarize(recorder.folder)
+    assert (summary.sent_before, summary.topics[0].sent_before) == (20, 20)
+    assert 'complete  yes, but for 20 messages' in to_text(summary)
 
 
 @pytest.mark.slow
@@ -153,7 +173,7 @@ def test_several_publishers_of_one_topic_are_counted_apart(record, start):
     for i in range(2):
         assert [value for value in got if value // 10_000 == i] == list(
             range(10_000 * i, 10_000 * i + 3000))
-    assert lost_messages(reader.custom_data) == {'/a': 0}
+    assert missing_messages(reader.custom_data, 'lost') == {'/a': 0}
 
 
 def test_a_bag_is_recovered_after_kill_9(record, ros, tmp_path):
@@ -218,7 +238,7 @@ def test_a_full_disk_is_told_and_nothing_is_lost_when_there_is_room_again(
     recorder.wait_for('written', str(sent + 1))
     reader = recorder.end()
     assert values(reader) == list(range(sent + 1))
-    assert lost_messages(reader.custom_data) == {'/a': 0}
+    assert missing_messages(reader.custom_data, 'lost') == {'/a': 0}
     assert reader.complete
 
 
@@ -319,7 +339,7 @@ def test_pause_and_resume(record, ros):
     recorder.wait_for('received', '2')
     reader = recorder.end()
     assert values(reader) == [2.0, 4.0]
-    assert lost_messages(reader.custom_data) == {'/a': 0}
+    assert missing_messages(reader.custom_data, 'lost') == {'/a': 0}
 
 
 def test_files_are_split_by_service_and_by_size(record, ros):

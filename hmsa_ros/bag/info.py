@@ -1,6 +1,6 @@
 """What is in a bag, in figures and in words."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 import datetime
 import json
@@ -13,8 +13,10 @@ from hmsa_ros.errors import BagError, printable
 
 # What is printed as JSON, in this order.
 _SHOWN = (
-    'path', 'files', 'start_ns', 'end_ns', 'duration', 'message_count', 'lost', 'topics',
-    'parameters', 'custom_data', 'complete', 'problems')
+    'path', 'files', 'start_ns', 'end_ns', 'duration', 'message_count', 'lost', 'sent_before',
+    'topics', 'parameters', 'custom_data', 'complete', 'problems')
+# What custom data count by topic.
+_LOST, _BEFORE = 'lost', 'sent_before'
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,7 @@ class TopicSummary:
     count: int
     rate: float | None  #: a second over the length of the bag; None where that is not defined
     lost: int | None  #: None if the recorder did not count
+    sent_before: int | None  #: sent before the recorder was matched; None as for lost
     reliability: str  #: of the publishers, several separated by a slash; empty if unknown
     durability: str
 
@@ -59,8 +62,18 @@ class BagSummary:
     @property
     def lost(self) -> int | None:
         """Return the number of lost messages, None if the recorder did not count."""
-        counts = [topic.lost for topic in self.topics if topic.lost is not None]
-        return sum(counts) if counts else None
+        return _sum(topic.lost for topic in self.topics)
+
+    @property
+    def sent_before(self) -> int | None:
+        """Return how many messages were sent before the recorder was matched, None as above."""
+        return _sum(topic.sent_before for topic in self.topics)
+
+
+def _sum(counts: Iterable[int | None]) -> int | None:
+    """Return the sum of the counts that there are, None without any."""
+    counted = [x for x in counts if x is not None]
+    return sum(counted) if counted else None
 
 
 def summarize(
@@ -72,11 +85,12 @@ def summarize(
     counts = reader.counts()
     start, end = reader.start_time, reader.end_time
     seconds = 0.0 if start is None or end is None else (end - start) * 1e-9
-    lost = lost_messages(reader.custom_data)
+    lost, before = (missing_messages(reader.custom_data, key) for key in (_LOST, _BEFORE))
     topics = tuple(TopicSummary(
         info.name, info.type, counts[name],
         (counts[name] - 1) / seconds if seconds > 0.0 and counts[name] > 1 else None,
         None if lost is None else lost.get(name, 0),
+        None if before is None else before.get(name, 0),
         '/'.join(sorted({profile.reliability for profile in info.profiles})),
         '/'.join(sorted({profile.durability for profile in info.profiles})))
         for name, info in sorted(reader.topics.items()))
@@ -88,14 +102,18 @@ def summarize(
         str(path), tuple((file.name, file.stat().st_size) for file in reader.files), start, end,
         topics, parameters,
         {key: value for key, value in reader.custom_data.items()
-         if key not in parameters and key != 'lost' and not key.startswith(qos.LATER)},
+         if key not in {*parameters, _LOST, _BEFORE} and not key.startswith(qos.LATER)},
         reader.complete, tuple(reader.problems))
 
 
-def lost_messages(custom_data: Mapping[str, str]) -> dict[str, int] | None:
-    """Return the lost messages by topic that a bag's custom data name; None if they name none."""
+def missing_messages(custom_data: Mapping[str, str], key: str) -> dict[str, int] | None:
+    """
+    Return counts by topic of a bag's custom data; None if it has none.
+
+    The key is ``lost``, or ``sent_before`` for messages sent before the recorder was matched.
+    """
     try:
-        counts = limits.load_json(custom_data['lost'])
+        counts = limits.load_json(custom_data[key])
     except (KeyError, BagError):
         return None
     good = isinstance(counts, dict) and all(
@@ -121,7 +139,9 @@ def _lines(summary: BagSummary) -> Iterator[str]:
     yield f'bag       {summary.path}'
     for name, size in summary.files:
         yield f'file      {name}  {size / 1024:.1f} KiB'
-    yield f'complete  {"yes" if summary.complete else "no, see hmsa bag recover"}'
+    late = (f', but for {summary.sent_before} messages sent before the recorder was matched'
+            if summary.sent_before else '')
+    yield f'complete  {"yes" + late if summary.complete else "no, see hmsa bag recover"}'
     if summary.start_ns is not None:
         yield f'start     {_time(summary.start_ns)}'
     yield f'duration  {summary.duration:.3f} s'
@@ -148,6 +168,10 @@ def _lines(summary: BagSummary) -> Iterator[str]:
             yield title
             for key, value in values.items():
                 yield f'  {key} = {value if len(value) <= 200 else value[:200] + " ..."}'
+    for topic in summary.topics:
+        if topic.sent_before:
+            yield (f'note: {topic.sent_before} messages of {topic.name} were sent before the '
+                   'recorder was matched')
     for problem in summary.problems:
         yield f'note: {problem}'
 

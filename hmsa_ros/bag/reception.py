@@ -28,6 +28,12 @@ class RecordedTopic:
     last: dict[bytes, int] = field(default_factory=dict)  #: sequence number by publisher
     received: int = 0
     missed: int = 0  #: gaps in the sequence numbers
+    before: int = 0  #: sent by publishers before they were matched
+
+    @property
+    def latched(self) -> bool:
+        """Return whether a publisher may keep its last messages for who is late."""
+        return any(x.durability == 'transient_local' for x in self.offered)
 
     def take(
             self, messages: Iterable[tuple[int, int, int, bytes, bytes]],
@@ -39,11 +45,13 @@ class RecordedTopic:
         size = 0
         for source, received, sequence, publisher, data in messages:
             before = self.last.get(publisher)
-            if before is not None:
-                if sequence <= before:
-                    continue  # seen already, through the subscription this one replaces
-                if not paused:
-                    self.missed += sequence - before - 1
+            if before is not None and sequence <= before:
+                continue  # seen already, through the subscription this one replaces
+            if before is not None and not paused:
+                self.missed += sequence - before - 1
+            elif not paused and not self.latched:
+                # Volatile publishers count from 1, and send nothing again to who is late.
+                self.before += sequence - 1
             self.last[publisher] = sequence
             if paused:
                 continue
@@ -75,13 +83,16 @@ def judge(
     return (WARN if reasons else OK), text
 
 
-def figures(status: Status, lost: Mapping[str, int]) -> dict[str, str]:
+def figures(
+        status: Status, lost: Mapping[str, int], before: Mapping[str, int]) -> dict[str, str]:
     """Return what a recorder's diagnostics say of its recording, by key; ``behind`` in seconds."""
     return {
         'file': status.file,
         'written': str(sum(status.written.values())),
         'lost': str(sum(lost.values())),
+        'sent_before': str(sum(before.values())),
         'queued_bytes': str(status.queued_bytes),
         'behind': f'{status.behind:.3f}',
         'files_refused': str(status.crowded),
-        **{f'lost.{name}': str(count) for name, count in lost.items() if count}}
+        **{f'lost.{name}': str(count) for name, count in lost.items() if count},
+        **{f'sent_before.{name}': str(count) for name, count in before.items() if count}}

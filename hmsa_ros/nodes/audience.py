@@ -1,13 +1,18 @@
 """Who is to receive what is sent, and whether they are all there."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from lifecycle_msgs.msg import State
 from lifecycle_msgs.srv import GetState
-from rclpy.node import Node
+from rcl_interfaces.srv import GetParameters
+from rclpy.expand_topic_name import expand_topic_name
+from rclpy.node import Node, NodeNameNonExistentError
+from rclpy.parameter import parameter_value_to_python
 
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.nodes.selection import Selection
 from hmsa_ros.nodes.senders import listed
 from hmsa_ros.nodes.service_call import ServiceCall
 
@@ -17,12 +22,13 @@ class Audience:
     Subscribers of what a node sends; the node must be served while ``missing`` is asked.
 
     Each of ``topics`` needs a subscriber. If ``nodes`` (full names) are given, it must be one of
-    these managed nodes, and active. A topic that is not sent raises `BadInputError`.
+    these managed nodes, and active. A topic that is not sent raises `BadInputError`. A
+    ``recorder`` must be active too, and subscribe to what it is to record of the nodes.
     """
 
     def __init__(
             self, node: Node, senders: Mapping[str, Any], topics: Sequence[str],
-            nodes: Sequence[str]) -> None:
+            nodes: Sequence[str], recorder: str = '') -> None:
         unsent = [name for name in topics if name not in senders]
         if unsent:
             raise BadInputError(
@@ -33,14 +39,46 @@ class Audience:
         self._topics = topics
         self._states = {
             x: ServiceCall(node.create_client(GetState, f'{x}/get_state'), GetState.Request())
-            for x in nodes}
+            for x in (*nodes, *filter(None, [recorder]))}
         self._active: set[str] = set()
+        self._nodes = nodes
+        self._recorder = recorder
+        self._selects: Selection | None = None
+        self._selection = ServiceCall(
+            node.create_client(GetParameters, f'{recorder}/get_parameters'),
+            GetParameters.Request(names=Selection.parameters)) if recorder else None
 
     def missing(self) -> list[str]:
         """Return in words who is not there yet, of those that must be."""
         return [
             *(f'active node {name}' for name in self._states if not self._has_been_active(name)),
-            *(f'subscriber of {name}' for name in self._topics if not self._subscribed(name))]
+            *(f'subscriber of {name}' for name in self._topics if not self._subscribed(name)),
+            *(f'recorder of {name}' for name in self._unrecorded())]
+
+    def _unrecorded(self) -> list[str]:
+        """Return topics of the nodes that the recorder is to record and does not subscribe to."""
+        if self._selection is None:
+            return []
+        if self._selects is None:
+            answer = self._selection.answer()
+            if answer is None:
+                return ['anything']
+            space, _, name = self._recorder.rpartition('/')
+            self._selects = Selection.of(
+                dict(zip(Selection.parameters, map(parameter_value_to_python, answer.values),
+                         strict=True)),
+                partial(expand_topic_name, node_name=name, node_namespace=space or '/'))
+        names: set[str] = set()
+        for node in self._nodes:
+            space, _, name = node.rpartition('/')
+            try:
+                names |= {x for x, _ in self._node.get_publisher_names_and_types_by_node(
+                    name, space or '/')}
+            except NodeNameNonExistentError:
+                return [f'topics of {node}']
+        return [x for x in sorted(names) if self._selects.wants(x) and not any(
+            _name(info) == self._recorder
+            for info in self._node.get_subscriptions_info_by_topic(x))]
 
     def _has_been_active(self, name: str) -> bool:
         """Return whether a managed node has said that it is active; ask until it has."""
@@ -53,10 +91,10 @@ class Audience:
     def _subscribed(self, topic: str) -> bool:
         """Return whether somebody who counts subscribes to a topic."""
         sender = self._senders[topic]
-        if not self._states:
+        if not self._nodes:
             return bool(sender.get_subscription_count() > 0)
         return any(
-            f'{x.node_namespace.rstrip("/")}/{x.node_name}' in self._states
+            _name(x) in self._nodes
             for x in self._node.get_subscriptions_info_by_topic(sender.topic_name))
 
     def found(self, also: Any) -> bool:
@@ -67,3 +105,8 @@ class Audience:
             return False
         return bool(self._topics or self._states) or all(
             x.get_subscription_count() for x in self._senders.values())
+
+
+def _name(endpoint: Any) -> str:
+    """Return the full name of the node that has an endpoint."""
+    return f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'

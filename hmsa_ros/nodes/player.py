@@ -97,6 +97,10 @@ PARAMETERS = (
         'Managed nodes that must be active before anything is sent; if there are any, one of '
         'them must subscribe to each topic in play.wait_for_subscribers.'),
     ParameterSpec(
+        'play.wait_for_recorder', '',
+        'Recorder that must be active, and subscribe to what it is to record of the nodes in '
+        'play.wait_for_nodes, before anything is sent; empty for none.'),
+    ParameterSpec(
         'play.wait_for_subscribers_timeout', 60.0, 'How long to wait for subscribers and nodes.',
         's', 0.0, 1e6),
     ParameterSpec(
@@ -164,7 +168,7 @@ class Player(ManagedNode):
             self, self._reader, self._filter(), own_clock=self._clock_out is not None)
         self._audience = Audience(
             self, self._senders, self._names('play.wait_for_subscribers'),
-            self._names('play.wait_for_nodes'))
+            self._names('play.wait_for_nodes'), self._recorder())
         # While inactive it is paused.
         self._resumes = not values['play.start_paused']
         self._transport = Transport(
@@ -204,6 +208,11 @@ class Player(ManagedNode):
         """Return the full names of topics or nodes in a parameter."""
         return tuple(expand_topic_name(name, self.get_name(), self.get_namespace())
                      for name in self._values[parameter])
+
+    def _recorder(self) -> str:
+        """Return the full name of the recorder to wait for, empty for none."""
+        name = self._values['play.wait_for_recorder']
+        return name and expand_topic_name(name, self.get_name(), self.get_namespace())
 
     def _filter(self) -> Filter:
         values = self._values
@@ -293,7 +302,8 @@ class Player(ManagedNode):
             if missing and now >= begin + timeout:
                 raise HmsaError(
                     f'no {", no ".join(missing)} within {timeout:g} s: expected one; start it, '
-                    'or remove it from play.wait_for_subscribers and play.wait_for_nodes')
+                    'or remove it from play.wait_for_subscribers, play.wait_for_nodes and '
+                    'play.wait_for_recorder')
 
     def _finish(self, transport: Transport) -> None:
         """Wait for reliable subscribers and say what was sent."""

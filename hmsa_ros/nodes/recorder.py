@@ -125,10 +125,7 @@ class Recorder(ManagedNode):
     def configure(self) -> None:
         """Open the bag and start receiving."""
         values = self._parameters_in
-        selection = Selection(
-            tuple(map(self._full_name, values['record.topics'])), values['record.regex'],
-            tuple(map(self._full_name, values['record.exclude_topics'])),
-            values['record.exclude_regex'], values['record.all_topics'])
+        selection = Selection.of(values, self._full_name)
         # While inactive it is paused.
         self._paused = True
         self._resumes = not values['record.start_paused']
@@ -292,10 +289,15 @@ class Recorder(ManagedNode):
         missed = {topic.name: topic.missed for topic in list(self._recorded.topics.values())}
         return lost_by_topic(missed, status.overflowed, status.dropped)
 
+    def _before(self) -> dict[str, int]:
+        """Return how many messages were sent before the recorder was matched, by topic."""
+        return {topic.name: topic.before for topic in list(self._recorded.topics.values())}
+
     def _lost_note(self, lost: Mapping[str, int]) -> dict[str, str]:
-        """Return the number of lost messages of every topic as it is stored."""
-        return {'lost': json.dumps({
-            **dict.fromkeys(list(self._recorded.topics), 0), **lost})}
+        """Return what is not in the bag of every topic as it is stored."""
+        return {
+            'lost': json.dumps({**dict.fromkeys(list(self._recorded.topics), 0), **lost}),
+            'sent_before': json.dumps(self._before())}
 
     def _status_of_bag(self) -> Iterable[DiagnosticStatus]:
         status = self._recording.status()
@@ -318,7 +320,7 @@ class Recorder(ManagedNode):
             'state': state,
             'subscribed': f'{len(self._recorded.topics)}/{self._recorded.wanted_count}',
             'received': sum(topic.received for topic in self._recorded.topics.values()),
-            **figures(status, lost),
+            **figures(status, lost, self._before()),
             **({} if self._sim_time is None else {
                 'time_jumps': self._sim_time.jumps, 'clock_ignored': self._sim_time.ignored}),
         }
@@ -348,11 +350,20 @@ class Recorder(ManagedNode):
         status = self._recording.close(lambda last: self._lost_note(self._lost(last)))
         lost = self._lost(status)
         written = sum(status.written.values())
+        before = self._before()
         print(f'hmsa recorder: {written} messages of {len(self._recorded.topics)} topics in '
-              f'{self.folder}, {sum(lost.values())} lost', flush=True)
+              f'{self.folder}, {sum(lost.values())} lost'
+              + f', {sum(before.values())} sent before the recorder was matched' * any(
+                  before.values()), flush=True)
         for name, count in sorted(lost.items()):
             if count:
                 print(f'hmsa recorder: lost {count} of {name}', flush=True)
+        for name, count in sorted(before.items()):
+            if count:
+                print(f'hmsa recorder: {count} of {name} were sent before the recorder was '
+                      'matched', flush=True)
+        for name in self._recorded.silent():
+            print(f'hmsa recorder: nothing was received of {name}', flush=True)
         if status.error and self.failure is None:
             self.failure = BagError(status.error)
 

@@ -1,8 +1,9 @@
 """Which topics are recorded, and which are played."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 import re
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
 
@@ -62,6 +63,17 @@ class Selection(_Choice):
 
     all_topics: bool = False
     expressions = ('record.regex', 'record.exclude_regex')
+    #: Parameters of a recorder that `of` takes.
+    parameters: ClassVar[tuple[str, ...]] = (
+        'record.topics', 'record.regex', 'record.exclude_topics', 'record.exclude_regex',
+        'record.all_topics')
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any], full_name: Callable[[str], str]) -> 'Selection':
+        """Return what a recorder with these parameters selects; names are made full ones."""
+        topics, regex, excluded, exclude_regex, all_topics = (values[x] for x in cls.parameters)
+        return cls(tuple(map(full_name, topics)), regex, tuple(map(full_name, excluded)),
+                   exclude_regex, all_topics)
 
     def wants(self, topic: str) -> bool:
         """Return whether to record a topic; one in ``topics`` is, unless it is excluded."""

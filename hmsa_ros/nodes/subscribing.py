@@ -46,6 +46,11 @@ class Subscriptions:
         missing = [name for name in self._selection.topics if name not in self.topics]
         return len(self.topics) + len(missing)
 
+    def silent(self) -> list[str]:
+        """Return the topics asked for by name of which nothing was received."""
+        heard = {name for name, topic in self.topics.items() if topic.received}
+        return sorted({*self._selection.topics} - heard)
+
     def look(self, found: Iterable[tuple[str, Sequence[str]]]) -> None:
         """Subscribe to what is new of the topics found, with their types."""
         self._looks += 1

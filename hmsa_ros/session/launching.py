@@ -143,8 +143,8 @@ def _start_replay(values: Mapping[str, str], share: Path) -> Started:
             'play.topics_to_filter': command,
             # Not any subscriber: a recorder hears the commands too.
             'play.wait_for_subscribers': command,
-            'play.wait_for_nodes': [
-                'plant', *(['recorder'] if values['record'] == 'true' else [])],
+            'play.wait_for_nodes': ['plant'],
+            'play.wait_for_recorder': 'recorder' if values['record'] == 'true' else '',
             'play.wait_for_subscribers_timeout': _START_SECONDS,
             'play.delay.nsec': _RECORDER_NANOSECONDS}}
     return Started(

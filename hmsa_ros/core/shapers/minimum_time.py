@@ -34,5 +34,6 @@ def minimum_time(request: Request) -> Move:
             'no full push and full brake within the limits are found that are sooner at rest at '
             f'{request.target:g} than the two-step command, which is used'))
     if refusals and math.isinf(fastest.duration):
-        return replace(fastest, reason=f'{refusals[0]}: the plain step approaches without overshoot')
+        return replace(
+            fastest, reason=f'{refusals[0]}: the plain step approaches without overshoot')
     return fastest
