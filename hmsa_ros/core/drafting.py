@@ -16,7 +16,7 @@ from hmsa_ros.core.kernels import work_space
 from hmsa_ros.core.moves import Level, Move, State
 from hmsa_ros.core.sequence import Segment, segments
 from hmsa_ros.core.setpoint import impossible, Setpoint
-from hmsa_ros.core.shapers import Shaper
+from hmsa_ros.core.shapers.request import Shaper
 from hmsa_ros.core.shapers.through import through
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.stopping import brake, holdable

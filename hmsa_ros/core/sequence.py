@@ -14,9 +14,9 @@ from hmsa_ros.core.model import elastic_force, natural_frequency
 from hmsa_ros.core.moves import Level, Limits, Move, State
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.setpoint import Setpoint
-from hmsa_ros.core.shapers import creeping, get_shaper, Shaper
+from hmsa_ros.core.shapers import creeping, get_shaper
 from hmsa_ros.core.shapers.pace import PACE, Pace
-from hmsa_ros.core.shapers.request import ERRORS, Request
+from hmsa_ros.core.shapers.request import ERRORS, Request, Shaper
 from hmsa_ros.core.simulation import check_stretch, follow, longest_motion, simulate
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.core.units import Units

@@ -212,7 +212,7 @@ class Player(ManagedNode):
     def _recorder(self) -> str:
         """Return the full name of the recorder to wait for, empty for none."""
         name = self._values['play.wait_for_recorder']
-        return name and expand_topic_name(name, self.get_name(), self.get_namespace())
+        return str(expand_topic_name(name, self.get_name(), self.get_namespace())) if name else ''
 
     def _filter(self) -> Filter:
         values = self._values

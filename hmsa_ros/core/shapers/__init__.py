@@ -7,10 +7,11 @@ nondimensional; `Units` only words the messages.
 
 import math
 
-from hmsa_ros.core.shapers.advice import advised, Shaper
+from hmsa_ros.core.shapers.advice import advised
 from hmsa_ros.core.shapers.linear import ei, step, zv, zvd
 from hmsa_ros.core.shapers.minimax import minimax
 from hmsa_ros.core.shapers.minimum_time import minimum_time
+from hmsa_ros.core.shapers.request import Shaper
 from hmsa_ros.core.shapers.robust import robust
 from hmsa_ros.core.shapers.smooth import smooth
 from hmsa_ros.core.shapers.two_step import two_step

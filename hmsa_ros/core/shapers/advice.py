@@ -1,16 +1,14 @@
 """What to change where no command is found: limits with whose other values there is one."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import wraps
 from itertools import combinations
 import math
 
 from hmsa_ros.core.moves import Limits, Move
-from hmsa_ros.core.shapers.request import Request
+from hmsa_ros.core.shapers.request import Request, Shaper
 from hmsa_ros.core.status import Code, RefusedError
-
-Shaper = Callable[[Request], Move]
 
 # Codes of refusals that a limit may be to blame for.
 _SEARCHED = (Code.FLUX_LIMIT, Code.SLEW_LIMIT, Code.NO_TWO_STEP, Code.NOT_CONVERGED)

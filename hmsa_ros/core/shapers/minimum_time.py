@@ -16,7 +16,8 @@ def minimum_time(request: Request) -> Move:
     Push with the load limit on one side, brake with the other, then hold.
 
     On a grid, through ramps and with a field that lags, the two-step command can be sooner at
-    rest, or the only one within the limits: it is used then, and the move's reason says so.
+    rest, or the only one within the limits: it is used then, and the move's reason says so. Where
+    neither is found: `RefusedError`.
     """
     check(request.material, 'minimum_time')
     found: list[Move] = []

@@ -1,6 +1,6 @@
 """What a shaper gets, and the checks that all shapers share."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 import math
 
@@ -108,3 +108,7 @@ class Request:
     def plain(self, code: Code, reason: str) -> Move:
         """Return the plain step instead, which approaches the target, with code and reason why."""
         return Move(code, (Level(0.0, self.holding_load()),), math.inf, reason)
+
+
+#: Answers a request with a move, or refuses with a reason.
+Shaper = Callable[[Request], Move]
