@@ -1,6 +1,7 @@
 """What may be imported from where: the physics and the bags know no ROS, help is quick."""
 
 from pathlib import Path
+import re
 import subprocess
 import sys
 
@@ -70,6 +71,50 @@ def test_nodes_do_not_import_without_ros_so_the_blocking_works():
     result = run(BLOCKED.format(blocked=ROS) + 'import hmsa_ros.nodes.interface')
     assert result.returncode == 1
     assert 'ModuleNotFoundError: blocked: ' in result.stderr
+
+
+@pytest.mark.parametrize('arguments', [
+    *([x] for x in ('planner', 'plant', 'driver', 'recorder', 'player', 'controller')),
+    ['demo'], ['run', '1.1:0.1'], ['run', '1.1:0.1', '--simulate'], ['send', '1.1:0.1'],
+    ['watch', '--once']], ids=' '.join)
+def test_command_that_needs_ros_says_how_to_get_it_where_there_is_none(arguments, tmp_path):
+    result = run(BLOCKED.format(blocked=ROS) + f"""
+import os
+os.chdir({str(tmp_path)!r})
+from hmsa_ros.entry import main
+sys.exit(main({arguments!r}))
+""")
+    assert (result.returncode, result.stdout) == (1, '')
+    assert re.fullmatch(
+        f'hmsa: error: hmsa {arguments[0]} needs ROS 2 Jazzy .*source /opt/ros/jazzy.*'
+        r'pip install "hmsa_ros\[ros\]"\)\n', result.stderr)
+    assert not [*tmp_path.iterdir()]
+
+
+def test_command_that_needs_no_ros_works_without_it(tmp_path):
+    result = run(BLOCKED.format(blocked=ROS) + f"""
+import os
+os.chdir({str(tmp_path)!r})
+from hmsa_ros.cli import main
+from hmsa_ros.core.parameters import paper_actuator
+from hmsa_ros.core.simulation import ActuatorSimulation
+plant, rows = ActuatorSimulation(paper_actuator()), ['time,stretch,flux_density']
+for i in range(300):
+    level = 0.01 * (i // 60 % 3)
+    plant.command(i * 10**6, level)
+    plant.advance(i * 10**6)
+    rows.append(f'{{0.001 * i}},{{plant.stretch + 1e-4 * (i * 7919 % 13 - 6)}},{{level}}')
+from pathlib import Path
+Path('run.csv').write_text('\\n'.join(rows))
+for words in (
+        ['plan', '1.1:10'], ['identify', 'run.csv', '--free', 'shear_modulus'], ['excite'],
+        ['sweep', '--target', '1.1', '--out', 'sweep.csv']):
+    assert main(words) == 0, words
+# As far as the file, which is no bag.
+assert main(['report', 'run.csv']) == 2
+""")
+    assert result.returncode == 0, result.stderr
+    assert re.search(r'\nhmsa: error: run.csv is not an MCAP file.*\n', result.stderr)
 
 
 @pytest.mark.parametrize(

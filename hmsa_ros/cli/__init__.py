@@ -86,6 +86,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         return status
     except HmsaError as error:
         return complain(error)
+    except ImportError as error:
+        if not of_ros(error):
+            raise
+        return complain(HmsaError(
+            f'{arguments.parser.prog} needs ROS 2 Jazzy ({error}): source its setup file (source '
+            '/opt/ros/jazzy/setup.bash), or install it with this package (pip install '
+            '"hmsa_ros[ros]")'))
     except KeyboardInterrupt:
         return ENDING.status
     except BrokenPipeError:
@@ -99,6 +106,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return complain(HmsaError(
             f'cannot write to standard output ({error.strerror}): expected free space'), 1)
+
+
+def of_ros(error: ImportError) -> bool:
+    """Return whether a module of ROS is missing, or cannot find its libraries."""
+    name = (error.name or '').partition('.')[0]
+    return name.endswith(('_msgs', '_srvs', '_interfaces')) or name.startswith(
+        ('rcl', 'rosidl', 'ament_', 'rpyutils')) or 'rclpy' in str(error)
 
 
 def split_ros_args(words: list[str]) -> list[str]:
