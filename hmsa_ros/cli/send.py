@@ -45,6 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
             namespace=arguments.namespace, joints=arguments.joint.split(','),
             timeout=arguments.timeout) as client:
         client.find_planner()
+        client.check_alone()
         if arguments.recorded:
             client.find_recorder()
         client.find_plant()

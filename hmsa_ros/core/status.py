@@ -39,6 +39,7 @@ class Code(str, Enum):
     TOO_LONG = 'too_long'
     NO_TIME = 'no_time'
     INACTIVE = 'inactive'
+    SEVERAL_PLANTS = 'several_plants'
 
     ARRIVED = 'arrived'
     OFF_TARGET = 'off_target'
@@ -120,6 +121,10 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
     Code.INACTIVE: (
         'The planner is a managed node and is not active.',
         'Activate it: ros2 lifecycle set /planner activate.'),
+    Code.SEVERAL_PLANTS: (
+        'Several plants or drivers move one joint or measure it, such as a simulator beside the '
+        'real one: what the samples show is not one actuator.',
+        'Stop all but one of the nodes that the message names.'),
     Code.ARRIVED: (
         'Measured: the stretch rests at the setpoint, within the tolerances.', ''),
     Code.OFF_TARGET: (

@@ -13,11 +13,13 @@ _SAMPLES_A_PERIOD = 10.0
 
 def judge_commands(
         *, late: int = 0, refused: int = 0, refused_source: int = 0, failed: int = 0,
-        silent: Sequence[str] = (), crowded: Sequence[str] = ()) -> tuple[int, str]:
+        silent: Sequence[str] = (), crowded: Sequence[str] = (),
+        rivals: str = '') -> tuple[int, str]:
     """
     Return the verdict for /diagnostics: level (0 OK, 1 WARN, 2 ERROR) and message.
 
-    Of counts, and of the joints that nobody (``silent``) or several (``crowded``) command.
+    Of counts, of the joints that nobody (``silent``) or several (``crowded``) command, and of what
+    other devices there are (``rivals``).
     """
     level, notes = _OK, []
     if late or refused or refused_source:
@@ -32,6 +34,9 @@ def judge_commands(
     if silent:
         level = _ERROR
         notes.append(f'no command and no heartbeat for {listed(silent)}')
+    if rivals:
+        level = _ERROR
+        notes.insert(0, rivals)
     return level, '; '.join(notes) or 'commands in time'
 
 

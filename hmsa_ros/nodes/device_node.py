@@ -18,6 +18,7 @@ from hmsa_ros.nodes import conversions, interface
 from hmsa_ros.nodes.guard import COMMAND_SOURCES, CommandInput
 from hmsa_ros.nodes.joints import JointParameters
 from hmsa_ros.nodes.managed import ManagedNode
+from hmsa_ros.nodes.presence import Presence
 from hmsa_ros.nodes.samples import SamplePublisher
 from hmsa_ros.runtime.seldom import Seldom
 
@@ -169,6 +170,7 @@ class DeviceNode(ManagedNode):
     values: JointParameters
     device: Any
     _joints: Sequence[DeviceJoint] = ()
+    _rivals = ''
 
     def on_tick(self) -> None:
         """Take in the commands that have come, do what is due, and publish what comes of it."""
@@ -203,6 +205,7 @@ class DeviceNode(ManagedNode):
         self._publish_news()
         if not self.companion:
             self.every(TICK_SECONDS, self.on_tick)
+        self._presence = Presence(self, samples=False)
         self._diagnose = self.diagnose(self._report)
 
     def _report(self) -> Iterable[DiagnosticStatus]:
@@ -212,6 +215,8 @@ class DeviceNode(ManagedNode):
         """Close the inputs that no executor serves."""
         for joint in self._joints:
             joint.commands.close()
+        if self._joints:
+            self._presence.close()
         self._joints = ()
 
     def close(self) -> None:
@@ -238,6 +243,15 @@ class DeviceNode(ManagedNode):
     def _publish_sample(self, sample: Sample) -> None:
         self._samples.publish(sample)
 
+    def _find_rivals(self) -> str:
+        """Return that other devices have a joint of this one, and log it once."""
+        self._presence.look()
+        rivals = self._presence.devices(self.values.names)
+        if rivals and rivals != self._rivals:
+            self.get_logger().error(rivals)
+        self._rivals = rivals
+        return rivals
+
     def _status_of_commands(self, **values: object) -> DiagnosticStatus:
         """Return how commands fare, with more values."""
         joints = self._joints
@@ -248,7 +262,8 @@ class DeviceNode(ManagedNode):
             'failed': sum(x.failed for x in joints)}
         silent = [joints[i].name for i in self.device.silent]
         level, message = judge_commands(
-            **counts, silent=silent, crowded=[x.name for x in joints if x.crowded()])
+            **counts, silent=silent, crowded=[x.name for x in joints if x.crowded()],
+            rivals=self._find_rivals())
         return conversions.to_status(
             f'{self.get_name()}: commands', ', '.join(x.name for x in joints),
             level, message,

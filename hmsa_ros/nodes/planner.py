@@ -29,6 +29,7 @@ from hmsa_ros.nodes.marker_publisher import TargetMarkers
 from hmsa_ros.nodes.newest_clock import NewestClock
 from hmsa_ros.nodes.parameters import check_names
 from hmsa_ros.nodes.planning import group_from, models_from, OWN, settings_from, SPECS
+from hmsa_ros.nodes.presence import Presence
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.nodes.timekeeping import StepWatch
 from hmsa_ros.nodes.trajectories import read_trajectory
@@ -73,7 +74,7 @@ class PlannerNode(ManagedNode):
         self._channels: dict[str, JointChannel] = {}
         self._samples: Subscription | None = None
         self._listen_until = 0
-        self._several_clocks = False
+        self._crowded = ''
         check_names(self)
         seconds = warm_up(self.get_logger().info, creep=any(
             x.model.material.creep for x in self._runtime.group.planners.values()))
@@ -115,6 +116,7 @@ class PlannerNode(ManagedNode):
         self._poll = self.every(_POLL_NS / NANOSECONDS, self._serve)
         if self.linked:
             self._poll.cancel()
+        self._presence = Presence(self)
         self.diagnose(self._report)
         self._jump = self.get_clock().create_jump_callback(
             JumpThreshold(
@@ -135,6 +137,7 @@ class PlannerNode(ManagedNode):
     def cleanup(self) -> None:
         """Forget the plans."""
         self._jump.unregister()
+        self._presence.close()
         self._poll.cancel()
         self._channels = {}
         self._samples = None
@@ -156,8 +159,9 @@ class PlannerNode(ManagedNode):
         return verdict.severity < Severity.ERROR, verdict.message
 
     def _on_sample(self, data: bytes) -> None:
-        # Most of a thousand samples a second are of no use, and reading them takes time.
-        if not self._runtime.looks_at(conversions.stamp_of(data)):
+        # Most of a thousand samples a second are of no use, and reading them takes time. Those of
+        # two plants are not of one actuator.
+        if self._runtime.crowded or not self._runtime.looks_at(conversions.stamp_of(data)):
             return
         try:
             message = decode(data, JointState)
@@ -260,16 +264,22 @@ class PlannerNode(ManagedNode):
 
     def _report(self) -> Iterable[DiagnosticStatus]:
         severity, message, values = self._runtime.report()
-        clocks = self.count_publishers('/clock') if self._clock_reader.simulated else 1
-        if clocks > 1:
-            severity = Severity.WARN
-            message = f'{clocks} publishers on /clock, and time may go back and forth: ' \
-                'expected one'
-            if not self._several_clocks:
-                self.get_logger().warning(message)
-        self._several_clocks = clocks > 1
+        if crowded := self._crowd():
+            severity, message = Severity.ERROR, crowded
+            if crowded != self._crowded:
+                self.get_logger().error(crowded)
+        self._crowded = crowded
         yield conversions.to_status(
             f'{self.get_name()}: commands', ', '.join(self._channels), severity, message, values)
+
+    def _crowd(self) -> str:
+        """Return of what there is more than one; empty if there is not."""
+        self._presence.look()
+        self._runtime.crowded = self._presence.devices(self._settings.names)
+        clocks = self.count_publishers('/clock') if self._clock_reader.simulated else 1
+        return self._presence.planners() or self._runtime.crowded or (
+            f'{clocks} publishers on /clock, and time may go back and forth: expected one'
+            if clocks > 1 else '')
 
     # -- parameters ----------------------------------------------------------------------------
 

@@ -57,6 +57,8 @@ class PlannerRuntime:
         self.group = group
         self.settings = settings
         self.active = False
+        #: That several plants carry out the commands, which is refused; empty otherwise.
+        self.crowded = ''
         self.following = Following(group)
         self.clock_jumps = 0
         self._clock, self._steady, self._observable = clock, steady, observable
@@ -82,7 +84,7 @@ class PlannerRuntime:
         yet.
         """
         try:
-            check_ready(self._clock(), active=self.active)
+            check_ready(self._clock(), active=self.active, crowded=self.crowded)
             check_joints(request, tuple(self.group.planners), self.settings)
         except RefusedError as error:
             return self.planning.refuse(error, request)

@@ -22,6 +22,7 @@ from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.capture import decode
 from hmsa_ros.nodes.conversions import from_time, to_trajectory
+from hmsa_ros.nodes.presence import LATELY_SECONDS, Presence
 from hmsa_ros.nodes.service_call import ServiceCall
 from hmsa_ros.nodes.visitor import leave, visit
 from hmsa_ros.session import graph
@@ -34,6 +35,8 @@ _STOP_SECONDS = 15.0
 _GONE_SECONDS = 3.0
 # How long a recorder is seen before it is taken to hear.
 _SETTLED_SECONDS = 1.0
+# Until all nodes of the host are seen.
+_DISCOVERY_SECONDS = 0.6
 # Whoever carries out commands may not have been found yet.
 _UNHEARD_SECONDS = 3.0
 
@@ -59,7 +62,7 @@ class PlannerClient:
     def __init__(
             self, *, namespace: str = '', joints: Sequence[str] = ('actuator',),
             timeout: float = 10.0) -> None:
-        self._timeout = timeout
+        self._timeout, self._begin = timeout, monotonic()
         self._joints = tuple(joints)
         self._namespace = namespace
         self.node = visit('client', namespace)
@@ -128,6 +131,36 @@ class PlannerClient:
     def _planner_starts(self) -> bool:
         return (topics.PLANNER, f'/{self._namespace.strip("/")}') in (
             self.node.get_node_names_and_namespaces())
+
+    def check_alone(self) -> None:
+        """
+        Make sure that there are no two planners, plants or drivers, as far as can be seen.
+
+        Raises
+        ------
+        HmsaError
+            If there are; it names them.
+
+        """
+        self.pass_time(self._begin + _DISCOVERY_SECONDS - monotonic())
+        presence = Presence(self.node)
+        try:
+            end = monotonic() + LATELY_SECONDS
+            # Killed ones are still seen, but not heard.
+            while presence.crowded(self._joints, topics.PLANNER) and monotonic() < end:
+                presence.look()
+                if found := presence.planners(topics.PLANNER) or presence.devices(self._joints):
+                    raise HmsaError(found)
+                self.pass_time(_SLICE_SECONDS)
+        finally:
+            presence.close()
+
+    def pass_time(self, seconds: float) -> None:
+        """Serve callbacks for some time."""
+        end = monotonic() + seconds
+        while monotonic() < end:
+            ENDING.check()
+            self._executor.spin_once(timeout_sec=_SLICE_SECONDS)
 
     def find_recorder(self) -> None:
         """Wait until somebody who records subscribes to what is sent, and with it to all else."""

@@ -180,6 +180,7 @@ def _begin(experiment: Experiment, session: Session, watch: '_Watch') -> None:
     if experiment.nodes:
         session.start(_recorder(experiment, True))
     watch.client.find_planner(session.check)
+    watch.client.check_alone()
     watch.read_parameters()
     if not experiment.nodes:
         watch.check()

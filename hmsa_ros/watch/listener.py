@@ -25,6 +25,7 @@ from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.capture import decode, RawSubscription, Taken
 from hmsa_ros.nodes.conversions import from_time
 from hmsa_ros.nodes.message_types import interface_class
+from hmsa_ros.nodes.presence import Presence
 from hmsa_ros.nodes.visitor import leave, visit
 from hmsa_ros.watch.scene import History, Joint, Report, Scene
 
@@ -101,6 +102,7 @@ class Listener:
         self._begin = self._looked = monotonic()
         self._graph_at = -math.inf
         self._senders = {'samples': 0, 'planner': 0}
+        self._presence, self._crowd = Presence(self._node), list[str]()
         self._stamp: int | None = None
         self._arrived = -math.inf
         self._rate = math.nan
@@ -112,6 +114,7 @@ class Listener:
     def __exit__(self, *_: object) -> None:
         for source in self._sources:
             source.subscription.destroy()
+        self._presence.close()
         leave(self._node)
 
     def _subscribe(self, topic: topics.Topic, qos: topics.Quality | None = None) -> _Source:
@@ -151,6 +154,10 @@ class Listener:
 
     def _look_at_graph(self) -> None:
         node = self._node
+        self._presence.look()
+        self._crowd = [x for x in (
+            self._presence.planners(topics.PLANNER),
+            self._presence.devices(self._planned_joints or tuple(self._joints))) if x]
         self._senders = {
             'samples': node.count_publishers(self._samples.topic),
             'planner': node.count_publishers(self._status.topic)}
@@ -291,13 +298,13 @@ class Listener:
     def _waiting(self, now: float, shown: int) -> list[str]:
         """Return what is missing, with what may be the reason."""
         if now - self._begin < _DISCOVERY_SECONDS:
-            return [] if shown or self._request else ['looking around']
+            return self._crowd or ([] if shown or self._request else ['looking around'])
         where = f'on domain {self._domain}'
         if self._node.get_namespace() != '/':
             where += f' in namespace {self._node.get_namespace()}'
         mend = ('is it running, with the same ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE '
                 'as here?')
-        sentences = []
+        sentences = self._crowd.copy()
         if not self._senders['samples']:
             sentences.append(f'no plant or driver that sends joint states seen {where}: {mend}')
         elif now - self._arrived > _QUIET_SECONDS:

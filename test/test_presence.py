@@ -1,0 +1,85 @@
+"""Two planners, plants or drivers of one joint are noticed, refused and named."""
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+import pytest
+from sensor_msgs.msg import JointState
+
+from hmsa_ros.cli import main
+from hmsa_ros.contract import topics
+from hmsa_ros.contract.status import Verdict
+from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.planner import PlannerNode
+from hmsa_ros.nodes.plant import PlantNode
+from hmsa_ros.watch.listener import Listener
+
+pytestmark = pytest.mark.ros
+
+TWO_PLANTS = '2 plants or drivers of joint actuator (/plant and /plant): stop one'
+TWO_PLANNERS = '2 planners (/planner and /planner): stop one'
+
+
+class Asking:
+    """Asks a planner for a stretch again and again, and reads verdicts and diagnostics."""
+
+    def __init__(self, ros):
+        self.verdicts, self.reports = [], {}
+        self._ros = ros
+        interface.subscribe(
+            ros.node, topics.STATUS, lambda x: self.verdicts.append(Verdict.read(x)),
+            topics.PLANNER)
+        interface.subscribe(ros.node, topics.DIAGNOSTICS, self._on_diagnostics)
+        self._setpoint = interface.publisher(ros.node, topics.SETPOINT, topics.PLANNER)
+        ros.spin_until(self._setpoint.get_subscription_count, 'the planner')
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        self.reports |= {x.name.partition(': commands')[0]: x for x in message.status}
+
+    def until(self, *, refused: bool) -> Verdict:
+        """Ask until it is refused, as there are several plants, or until it is not."""
+        del self.verdicts[:]
+
+        def got() -> bool:
+            if self.verdicts and (self.verdicts[-1].code == 'several_plants') == refused:
+                return True
+            self._setpoint.publish(interface.interface_class(topics.SETPOINT.type)(data=1.1))
+            return False
+
+        self._ros.spin_until(got, f'refused {refused}')
+        return self.verdicts[-1]
+
+
+def test_second_plant_of_a_joint_is_refused_until_it_is_gone(ros, serve, start):
+    serve(PlannerNode, PlantNode)
+    asking = Asking(ros)
+    other = interface.publisher(ros.node, topics.JOINT_STATES)
+    other.publish(JointState(name=['elbow'], position=[1.0]))
+    asking.until(refused=False)
+    second = start.hmsa('plant')
+    assert asking.until(refused=True).message == TWO_PLANTS
+    ros.spin_until(lambda: all(
+        x in asking.reports and asking.reports[x].level == DiagnosticStatus.ERROR
+        and asking.reports[x].message.startswith(TWO_PLANTS) for x in ('planner', 'plant')),
+        'both say so first')
+    with Listener() as listener:
+        ros.spin_until(lambda: listener.look().waiting == [TWO_PLANTS], 'the watch says so')
+    second.popen.kill()
+    second.popen.wait()
+    asking.until(refused=False)
+    # The middleware believes for some 20 s that it runs.
+    assert ros.node.count_publishers(topics.FLUX_DENSITY_APPLIED.name) == 2
+
+
+def test_second_planner_is_named_before_anything_is_sent(ros, serve, start, capfd):
+    serve(PlannerNode, PlantNode)
+    asking = Asking(ros)
+    second = start.hmsa('planner')
+    ros.spin_until(lambda: 'planner' in asking.reports and (
+        asking.reports['planner'].message == TWO_PLANNERS), 'the planner says so')
+    assert main(['send', '1.1:0.1']) == 1
+    out, err = capfd.readouterr()
+    assert out == ''
+    assert err.endswith(f'hmsa: error: {TWO_PLANNERS}\n')
+    second.popen.kill()
+    second.popen.wait()
+    assert main(['send', '1.1:0.1']) == 0
+    assert ros.node.count_publishers('planner/status') == 2
