@@ -13,6 +13,7 @@ import math
 from time import time_ns
 from typing import NamedTuple
 
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
@@ -116,7 +117,11 @@ class Presence:
             self._heard[one.publisher[:_PROCESS_BYTES]] = one.received_ns
 
     def _publishers(self, topic: str) -> list[Publisher]:
-        name = self._node.resolve_topic_name(topic)
+        try:
+            name = self._node.resolve_topic_name(topic)
+        except rclpy_implementation.RCLError:
+            # Joints that messages name may have any name.
+            return []
         return [Publisher(f'{x.node_namespace.rstrip("/")}/{x.node_name}', bytes(x.endpoint_gid))
                 for x in self._node.get_publishers_info_by_topic(name)]
 
