@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hmsa_ros.judge import judge, missed, Setpoint, Tolerances, worst
+from hmsa_ros.judge import judge, missed, Sensor, Setpoint, Tolerances, worst
 
 MS = 1_000_000
 OMEGA, DECAY = 540.0, 54.0
@@ -56,3 +56,55 @@ def test_the_worst_counts():
     left_out = missed(setpoint(number=2, count=2), 'left out')
     assert worst([arrived, left_out]) is left_out
     assert left_out.message == 'setpoint 2 of 2: 1.4 was missed: left out'
+
+
+def test_the_rest_of_the_hold_counts():
+    time, stretch = held(seconds=2.0)
+    creeping = stretch + 0.05 * STEP * time / time[-1]
+    found = judge(time, creeping, setpoint(end=2000 * MS))
+    assert (found.verdict, found.offset > 0.04 * STEP) == ('off_target', True)
+    kicked = stretch + np.where(time > 1700 * MS, 0.05 * STEP * np.sin(OMEGA * time / 1e9), 0.0)
+    assert judge(time, kicked, setpoint(end=2000 * MS)).verdict == 'vibrating'
+    assert judge(time, kicked, setpoint(end=1600 * MS)).arrived
+
+
+def test_a_plan_made_anew_is_judged_where_the_first_one_is_not_kept_to():
+    time, stretch = held()
+    moved = np.where(time < 100 * MS, 1.2, stretch)
+    assert judge(time, stretch, setpoint(moved=100 * MS)).arrived
+    assert judge(time, moved, setpoint()).verdict == 'off_target'
+    assert judge(time, moved, setpoint(moved=100 * MS)).arrived
+    late = judge(time, moved, setpoint(moved=100 * MS, end=90 * MS))
+    assert late.verdict == 'late'
+    assert 'but 10 ms after its time' in late.message
+
+
+def test_what_is_known_of_the_sensor_counts():
+    time, stretch = held(offset=5.0)
+    biased = Sensor(bias=0.05 * STEP, bias_std=1e-4)
+    assert judge(time, stretch, setpoint(), sensor=biased).arrived
+    assert judge(time, stretch, setpoint()).verdict == 'off_target'
+    unsure = Sensor(bias=0.05 * STEP, bias_std=2e-3)
+    assert judge(time, stretch, setpoint(), sensor=unsure).verdict == 'undecided'
+    time, stretch = held()
+    assert judge(time, 1.1 * stretch, setpoint(), sensor=Sensor(gain=1.1)).arrived
+    assert judge(time + 30 * MS, stretch, setpoint(end=None), sensor=Sensor(latency=0.03)).arrived
+
+
+@pytest.mark.parametrize(('samples', 'words'), [
+    ({'seconds': 0.01}, 'expected at least a hold of 0.023 s'),
+    ({'rate': 100, 'seconds': 0.05}, 'expected at least 200 samples a second'),
+    ({'noise': 4.0}, 'times as many samples')])
+def test_undecided_says_what_would_decide(samples, words):
+    found = judge(*held(**samples), setpoint())
+    assert found.verdict == 'undecided'
+    assert words in found.message
+
+
+def test_a_sensor_that_rounds_at_rest_is_not_frozen():
+    time, stretch = held(vibration=1.5)
+    before = np.linspace(-20, -1, 20).astype(np.int64) * MS
+    time = np.concatenate((before, time))
+    stretch = np.concatenate((np.linspace(1.2, 1.38, 20), stretch))
+    assert judge(time, np.round(stretch, 3), setpoint()).arrived
+    assert 'frozen' in judge(time, np.minimum(stretch, 1.3), setpoint()).message

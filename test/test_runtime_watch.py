@@ -45,6 +45,8 @@ class Loop:
         self.runtime.active = True
         self.outputs = []
         self.spoil = lambda samples: samples
+        # Until when the device hears nothing of what is sent.
+        self.deaf, self._waiting = 0, []
 
     def run(self, *setpoints):
         points, end = [], 0
@@ -58,7 +60,11 @@ class Loop:
             for x in self.runtime.tick(self.now):
                 self.outputs.append(x)
                 if isinstance(x, Send):
+                    self._waiting.append(x)
+            if self.now >= self.deaf:
+                for x in self._waiting:
                     self.device.receive(0, x.stamp, x.flux_density)
+                self._waiting.clear()
             self.now += MS
             self.device.advance(self.now)
             for x in self.device.changes():
@@ -199,3 +205,65 @@ def test_silence_of_all_drivers_is_warned_of_at_once_and_taken_back():
     loop.unheard = ''
     loop.run((1.2, HOLD))
     assert loop.status.unheard == ''
+
+
+def findings(loop):
+    """Return the findings that were reported, each once."""
+    seen = []
+    for status in loop.outputs:
+        if isinstance(status, StatusChanged):
+            seen += [x for x in status.findings.values() if x not in seen]
+    return seen
+
+
+def rested(truth, begin, end, target, step):
+    """Whether the true stretch stays at a target between two times in ms after the start."""
+    seen = truth[(truth[:, 0] >= START + begin * MS) & (truth[:, 0] < START + end * MS), 1]
+    return np.max(np.abs(seen - target)) < 0.03 * step
+
+
+@pytest.mark.parametrize('deaf', [60, 130, 170, 240, 280, 330])
+def test_setpoints_that_late_commands_spoil_are_never_forgotten(deaf):
+    loop = Loop(heartbeat_period=0)
+    spans = [(1.1, 100 * MS), (1.2, 100 * MS), (1.3, 100 * MS), (1.4, 200 * MS)]
+    loop.deaf = START + deaf * MS
+    truth = loop.run(*spans)
+    last = {x.setpoint.number: x for x in findings(loop)}
+    assert sorted(last) == [1, 2, 3, 4]
+    for number, found in last.items():
+        begin = 50 + 100 * (number - 1)
+        kept = rested(truth, begin + 80, begin + 100, 1.0 + 0.1 * number, 0.1)
+        assert found.arrived <= kept, found.message
+        assert found.setpoint.step == pytest.approx(0.1)
+    assert (loop.status.worst.verdict == 'arrived') == all(x.arrived for x in last.values())
+    if loop.status.replanned:
+        assert loop.status.verdict.severity == 1
+
+
+def test_a_correction_counts_against_the_step_that_was_requested():
+    loop = Loop(1.05, 1e-4, feedback='adapt', heartbeat_period=0)
+    truth = loop.run((1.2, HOLD), (1.4, HOLD), (1.4, HOLD))
+    assert any(
+        x.verdict.code == 'corrected' for x in loop.outputs if isinstance(x, StatusChanged))
+    for found in findings(loop):
+        at = found.setpoint
+        assert (at.start, at.target) == {1: (1.0, 1.2), 2: (1.2, 1.4), 3: (1.4, 1.4)}[at.number]
+    assert abs(truth[-1, 1] - 1.4) < 0.01 * STEP
+    assert loop.status.findings['a'].arrived
+
+
+@pytest.mark.parametrize(('spoil', 'reason'), [
+    (lambda now, t, x: (t, math.nan), 'no numbers'),
+    (lambda now, t, x: (t, 7.2), 'shows 7.2, where nothing can be'),
+    (lambda now, t, x: (t, 1.0 if t < START + 54 * MS else x), ''),
+    (lambda now, t, x: (t, min(x, 1.15)), 'exactly 1.15 in the last'),
+    (lambda now, t, x: (t + 300 * MS, x), 'ahead of the clock')])
+def test_a_sensor_that_is_out_is_named_and_no_miss(spoil, reason):
+    loop = Loop(noise=1e-5)
+    loop.spoil = lambda samples: [spoil(loop.now, *x) for x in samples]
+    loop.run((1.2, HOLD // 2))
+    found = loop.status.worst
+    assert reason in found.message
+    assert found.verdict == ('unobserved' if reason else 'arrived')
+    assert loop.status.verdict.severity == bool(reason)
+    assert loop.status.measuring

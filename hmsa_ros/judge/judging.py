@@ -101,7 +101,7 @@ def _judged(
     quiet = _QUIET * min(tolerances.of(setpoint))
     looks = [first, *(
         x for x in later if np.mean(np.square(values[x] - setpoint.target)) > quiet**2)]
-    findings = []
+    findings: list[Finding] = []
     for number, part in enumerate(looks):
         # Later looks see the vibration from their own beginning on.
         origin = int(stamps[part][0]) if number else begin
@@ -113,7 +113,9 @@ def _judged(
                 shown, len(rest), setpoint, tolerances, sensor, later=number > 0))
         elif not number:
             findings.append(_too_few(setpoint, stamps[part]))
-    return max(findings, key=lambda x: VERDICTS.index(x.verdict))
+    # Of equal ones the first look, which shows the vibration; else the one that is farthest off.
+    return max(
+        findings, key=lambda x: (VERDICTS.index(x.verdict), x is findings[0], x.rank[1]))
 
 
 def rests_from(setpoint: Setpoint) -> int:
@@ -251,7 +253,7 @@ def _decided(
     elif off and math.isnan(vibration.value):
         message += f'; {count} samples at this rate do not show whether it vibrates'
     if code is Code.UNDECIDED:
-        message += _open(offset, vibration, allowed, swing, setpoint)
+        message += _open(offset, vibration, (allowed, swing), setpoint, sensor)
     return Finding(
         code, message, setpoint, count, offset.value, offset.std, vibration.value, vibration.std,
         frequency, found.noise)
@@ -268,19 +270,25 @@ def _widened(figure: Figure, std: float) -> Figure:
 
 
 def _open(
-        offset: Figure, vibration: Figure, allowed: float, swing: float,
-        setpoint: Setpoint) -> str:
-    """Say what is not shown, the rest of a sentence."""
-    parts = []
-    if max(-offset.low, offset.high) > allowed:
-        parts.append(
-            f'an offset of up to {setpoint.words(max(-offset.low, offset.high))} is not ruled '
-            'out')
-    if vibration.high > swing:
-        parts.append(
-            f'a vibration of up to {setpoint.words(vibration.high)} peak to peak is not ruled '
-            'out')
-    return ', but ' + ' and '.join(parts)
+        offset: Figure, vibration: Figure, limits: tuple[float, float], setpoint: Setpoint,
+        sensor: Sensor) -> str:
+    """Say what is not shown and what would show it, the rest of a sentence."""
+    parts, more = [], 1.0
+    for figure, limit, name in zip(
+            (offset, vibration), limits, ('an offset', 'a vibration, peak to peak,'), strict=True):
+        most = max(-figure.low, figure.high)
+        if most <= limit:
+            continue
+        parts.append(f'{name} of up to {setpoint.words(most)}')
+        # Bounds shrink with the root of the number of samples.
+        value = 0.0 if math.isnan(figure.value) else abs(figure.value)
+        more = max(more, ((most - value) / max(abs(limit - value), 1e-2 * limit))**2)
+    mend = (f'{max(more, 1.1):.2g} times as many samples a second, or '
+            f'{max(math.sqrt(more), 1.1):.2g} times less noise, would decide it')
+    if 3.0 * sensor.std(setpoint.target) > 0.5 * limits[0]:
+        mend = ('a calibrated sensor would decide it: what it shows may be off by '
+                f'{setpoint.words(3.0 * sensor.std(setpoint.target))}')
+    return f', but {" and ".join(parts)} cannot be ruled out: {mend}'
 
 
 def _distance(offset: float, setpoint: Setpoint) -> str:

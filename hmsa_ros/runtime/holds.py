@@ -42,6 +42,7 @@ class Hold:
         self.over = False
         self._last = last
         self._samples: dict[int, float] = {}
+        self._moving: set[int] = set()  # parts of the move of which there is one
         # Newest sample by its stamp; newest of all that were looked at, and when that was.
         self._newest = self._seen = self._heard = 0
         # Largest that a stamp was ahead of the clock.
@@ -101,17 +102,23 @@ class Hold:
         self._newest = max(self._newest, stamp)
         if self._counts(stamp):
             self._samples.setdefault(stamp, stretch)
+            if stamp < self._asked:
+                self._moving.add(self._cell(stamp))
 
     def _counts(self, stamp: int) -> bool:
         """Return whether a sample of a time is in one of the looks."""
         begins, asked = self.setpoint.begins, self._asked
         if stamp < min(asked, self._begin):
-            cell = max((asked - begins) // _MOVING, 1)
-            return stamp >= begins and (stamp - begins) % cell < cell // 2
+            return stamp >= begins and self._cell(stamp) not in self._moving
         if stamp > self._closes:
             return False
         return stamp >= self._closes - 2 * self._length or any(
             self._looks_at(stamp - x) for x in {asked, self._begin} if x <= stamp)
+
+    def _cell(self, stamp: int) -> int:
+        """Return which part of the move a time is in."""
+        begins = self.setpoint.begins
+        return (stamp - begins) // max((self._asked - begins) // _MOVING, 1)
 
     def _looks_at(self, after: int) -> bool:
         """Return whether a time in ns after an arrival is in one of the looks."""
