@@ -10,14 +10,16 @@ import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from hmsa_ros.contract.status import whole
-from hmsa_ros.core.group import PlannerGroup
+from hmsa_ros.contract.status import Verdict, whole
+from hmsa_ros.core.group import PlannerGroup, Progress
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.planner import Options, Planner
 from hmsa_ros.core.status import Code, RefusedError
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.judge import Finding, missed, Setpoint, unobserved
 from hmsa_ros.nodes import conversions
 from hmsa_ros.nodes.trajectories import read_trajectory
+from hmsa_ros.runtime import records
 
 SECOND = 10**9
 # What the fields of a stamp can hold, in ns.
@@ -201,3 +203,38 @@ def test_diagnostics_have_their_statuses_and_stamp(stamp, count):
     message = sent(conversions.to_diagnostics(stamp, *statuses))
     assert conversions.from_time(message.header.stamp) == stamp
     assert message.status == statuses
+
+
+SETPOINT = Setpoint(1.4, 1.2, 0, SECOND, 2 * SECOND, 500.0, number=2, count=3)
+ARRIVED = Finding(Code.ARRIVED, 'rests', SETPOINT, 100, 1e-3, 1e-5, 2e-3, 1e-5, 80.0, 1e-4)
+
+
+@pytest.mark.parametrize(('code', 'severity', 'finding', 'measuring', 'failure'), [
+    ('arrived', 0, ARRIVED, True, ''),
+    ('replanned', 1, ARRIVED, True, ''),
+    ('accepted', 0, None, False, ''),
+    ('unobserved', 0, unobserved(SETPOINT), False, ''),
+    ('too_damped', 1, unobserved(SETPOINT), False, ''),
+    ('unobserved', 1, unobserved(SETPOINT), True, 'setpoint 2 of 3: 1.4 is predicted'),
+    ('replanned', 1, unobserved(SETPOINT), False, 'a sentence; what comes of it is not measured'),
+    ('late', 1, None, False, 'a sentence; what comes of it is not measured'),
+    ('stopped', 2, ARRIVED, True, 'a sentence'),
+    ('missed', 1, missed(SETPOINT, 'left out'), True, 'setpoint 2 of 3: 1.4 was missed: left')])
+def test_only_what_arrived_or_nobody_measures_is_no_failure(
+        code, severity, finding, measuring, failure):
+    progress = Progress('at_rest', 3, 3, '1.4')
+    status = sent(conversions.to_planner_status(records.StatusChanged(
+        records.Verdict(records.Severity(severity), code, 'a sentence', 'x'), progress,
+        {'a': progress}, 1, 0, 0, {} if finding is None else {'a': finding}, finding,
+        measuring=measuring)))
+    read = Verdict.read(status)
+    assert read.failure.startswith(failure)
+    assert bool(read.failure) == bool(failure)
+    values = {x.key: x.value for x in status.values}
+    if finding is ARRIVED:
+        assert (values['measured'], values['measured_setpoint'], values['worst']) == (
+            'arrived', '2', 'arrived')
+        assert (values['offset'], values['offset_percent']) == ('0.001', '0.5')
+        assert (values['vibration'], values['vibration_percent']) == ('0.002', '1')
+        assert read.basis == 'measured'
+        assert read.figures == ARRIVED.to_dict()

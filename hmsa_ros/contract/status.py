@@ -1,6 +1,9 @@
 """What diagnostics say, and the planner's verdict among them."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+import json
 import re
 from typing import Any
 
@@ -24,6 +27,15 @@ def whole(text: str | None) -> int:
     return int(text) if text and _WHOLE.fullmatch(text) else 0
 
 
+def _object(text: str) -> Mapping[str, object]:
+    """Return a JSON object, empty where a text is none."""
+    with suppress(ValueError, RecursionError):
+        found = json.loads(text)
+        if isinstance(found, dict):
+            return found
+    return {}
+
+
 @dataclass(frozen=True)
 class Verdict:
     """
@@ -32,9 +44,9 @@ class Verdict:
     The level is 0 OK, 1 WARN or 2 ERROR, the code one of `Code`. ``state`` is idle, waiting,
     moving, holding, settling or at_rest, on the way to ``setpoint``, from 1. While ``watching``,
     setpoints that have begun are still to be judged by samples; the worst that was ``measured``
-    is a code, with its sentence ``finding``. Samples have come lately while ``measuring``, and
-    so many commands were ``late`` since the planner began. ``unheard`` says why nobody carries
-    out commands.
+    is a code, with its sentence ``finding`` and its ``figures``. Samples have come lately while
+    ``measuring``, and so many commands were ``late`` since the planner began. ``unheard`` says
+    why nobody carries out commands.
     """
 
     level: int
@@ -50,6 +62,7 @@ class Verdict:
     unheard: str = ''
     measuring: bool = False
     late: int = 0
+    figures: Mapping[str, object] = field(default_factory=dict)
 
     @property
     def failure(self) -> str:
@@ -82,4 +95,5 @@ class Verdict:
             whole(values.get('setpoint')), whole(values.get('setpoints')),
             values.get('watching') == 'True', values.get('worst', ''),
             values.get('worst_message', ''), values.get('unheard', ''),
-            values.get('measuring') == 'True', whole(values.get('late')))
+            values.get('measuring') == 'True', whole(values.get('late')),
+            _object(values.get('finding', '')))

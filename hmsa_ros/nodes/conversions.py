@@ -1,6 +1,7 @@
 """Conversion between messages and the records of `hmsa_ros.core`."""
 
 from collections.abc import Iterable, Mapping, Sequence
+import json
 from struct import unpack_from
 from typing import TYPE_CHECKING
 
@@ -126,7 +127,9 @@ def to_planner_status(status: 'StatusChanged') -> DiagnosticStatus:
         **vars(progress), 'late': status.late, 'replanned': status.replanned, **verdict.figures,
         'watching': status.watching, 'measuring': status.measuring}
     if status.worst is not None:
-        values |= {'worst': str(status.worst.verdict), 'worst_message': status.worst.message}
+        values |= {
+            'worst': str(status.worst.verdict), 'worst_message': status.worst.message,
+            'finding': json.dumps(status.worst.to_dict())}
     for name, of_joint in each.items():
         prefix = f'{name}.' if len(each) > 1 else ''
         found = status.findings.get(name)

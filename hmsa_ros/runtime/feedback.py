@@ -4,6 +4,8 @@ from collections.abc import Iterator, Mapping
 from functools import partial
 import math
 
+import numpy as np
+
 from hmsa_ros.core.group import PlannerGroup
 from hmsa_ros.core.planner import Planner
 from hmsa_ros.core.timeline import Model
@@ -14,6 +16,7 @@ from hmsa_ros.estimation.estimator import warm_up
 from hmsa_ros.estimation.motion import followed
 from hmsa_ros.estimation.words import differences
 from hmsa_ros.identification.known import Known
+from hmsa_ros.judge import Sensor
 from hmsa_ros.runtime.learnt import differs, learnt_model, save
 from hmsa_ros.runtime.records import EstimateChanged, Output, Settings, Severity
 from hmsa_ros.runtime.slices import Clock
@@ -28,6 +31,10 @@ _UPDATE, _RESTING, _TELL = 20_000_000, 200_000_000, 200_000_000
 _DENSE, _SPARSE = 40, 10
 # Periods after the last change of level from which on a joint rests.
 _QUIET = 12.0
+# What the judge calls figures of a sensor, and the share of what was not known of one before
+# below which it has been found.
+_SENSOR = {'stretch_bias': 'bias', 'stretch_gain': 'gain', 'sensor_latency': 'latency'}
+_FOUND = 0.3
 # States further ahead than so many units of time are those of rest.
 _AHEAD = 100.0
 
@@ -226,6 +233,24 @@ class Feedback:
         if joint is None or joint.latest is not None:
             return self.state(name, time)
         return self._predicted(name, joint, time)
+
+    def sensor(self, name: str) -> Sensor:
+        """Return what was found of the sensor of a joint; one as given where nothing was."""
+        joint = self._joints.get(name)
+        found = None if joint is None else joint.latest
+        if joint is None or found is None or not found.trusted:
+            return Sensor()
+        prior = np.diag(joint.estimator.prior.covariance)
+        known = [x for i, x in enumerate(found.free) if x in _SENSOR and (
+            found.covariance[i, i] < _FOUND**2 * prior[i])]
+        figures = {_SENSOR[x]: found.values[x] for x in known} | {
+            f'{_SENSOR[x]}_std': found.deviations[x] for x in known}
+        together = 0.0
+        if 'stretch_bias' in known and 'stretch_gain' in known:
+            pair = [found.free.index(x) for x in ('stretch_bias', 'stretch_gain')]
+            (one, both), (_, two) = found.covariance[np.ix_(pair, pair)]
+            together = float(both / math.sqrt(one * two))
+        return Sensor(**figures, together=together)
 
     @property
     def trim(self) -> float:

@@ -67,6 +67,7 @@ class PlannerRuntime:
         self._bulletin = Bulletin(group, self.following, self._watch, clock, steady, unheard)
         self.sending = Sending(group, self.following, self._bulletin.outputs)
         self.feedback = Feedback(group, settings, self._bulletin.outputs, clock)
+        self._watch.sensor = self.feedback.sensor
         self.planning = Planning(
             group, self.following, Corrections(group, self.feedback, clock), self._bulletin,
             clock, steady, lambda: self.sending.send(clock()))

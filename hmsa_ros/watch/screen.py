@@ -9,6 +9,7 @@ from rich.cells import cell_len
 from rich.text import Text
 
 from hmsa_ros.core.laws.coordinate import shared_name
+from hmsa_ros.core.status import Code
 from hmsa_ros.watch.chart import dots, limits, strip
 from hmsa_ros.watch.scene import Joint, LEVELS, Report, Scene
 
@@ -88,6 +89,10 @@ class Screen:
                 line.append(f' {100.0 * scene.progress:.0f} %')
             lines.append(line)
             lines += _judged('verdict', request.level, request.message, width, rows)
+            if request.finding and request.finding not in request.message:
+                lines += _judged(
+                    'measured', int(request.measured != Code.ARRIVED), request.finding, width,
+                    rows)
         for report in scene.reports[:_MOST_REPORTS]:
             silent = report.age > SILENT_AFTER
             lines += _judged(
@@ -243,7 +248,8 @@ def as_json(scene: Scene) -> Mapping[str, Any]:
         'request': None if scene.request is None else {
             'level': LEVELS[min(scene.request.level, 3)], 'message': scene.request.message,
             'code': scene.request.code, 'state': scene.request.state,
-            'setpoint': scene.request.setpoint, 'setpoints': scene.request.setpoints},
+            'setpoint': scene.request.setpoint, 'setpoints': scene.request.setpoints,
+            'finding': dict(scene.request.figures) or None},
         'progress': known(scene.progress),
         'reports': [{
             'name': x.name, 'level': LEVELS[min(x.level, 3)], 'message': x.message,
