@@ -38,6 +38,7 @@ class RunningPlan:
         self.model = model
         self._initial = stretch
         self.plan = Plan(0, (), ())
+        self._history = History(())
         self.revision = 0
         self.restart()
 
@@ -47,19 +48,24 @@ class RunningPlan:
         self._begin_with(PlannedLevel(
             ALWAYS, flux_density, self._initial, 0.0, flux_density, self.model))
 
-    def _begin_with(self, level: PlannedLevel) -> None:
-        self._history = History((level,))
-        self.plan = Plan(self.plan.number, (level,), ())
+    def _begin_with(self, level: PlannedLevel, *, keep: bool = False) -> None:
+        """Begin anew from a level; if its setpoints are kept, so is what was not sent yet."""
+        old, ahead = self.plan, self._history.levels[self._history.sent:] if keep else ()
+        self._history = History((level, *ahead), stale=1 if ahead else None)
+        self.plan = Plan(
+            old.number, self._history.levels, old.segments if keep else (),
+            old.kept if keep else 0)
         self.revision += 1
 
     def take_over(
             self, stamp: int, stretch: float, rate: float, in_force: float,
-            flux_density: float | None = None) -> None:
+            flux_density: float | None = None, *, keep: bool = False) -> None:
         """
         Drop plans and go on from a state measured at a stamp in ns, with the rate in 1/s.
 
         ``in_force`` is the field in T, ``flux_density`` the level that a slew limit still ramps
-        to. A state that the block cannot have is a `BadInputError`.
+        to. A state that the block cannot have is a `BadInputError`. The setpoints ahead may be
+        kept, to be planned anew.
         """
         model = self.model
         check_stretch(stretch, model.material, 'stretch in force')
@@ -73,7 +79,16 @@ class RunningPlan:
         at_rest = abs(rate) * model.units.time <= _SAMPLED_AT_REST * self.model.frequency(stretch)
         if at_rest and level == in_force and abs(float(held) - stretch) > _AGREES:
             begin = replace(begin, stamp=ALWAYS, rate=0.0)
-        self._begin_with(begin)
+        self._begin_with(begin, keep=keep)
+
+    def abandon(self, now: int) -> None:
+        """Drop what is ahead at a time in ns, sent or not, and the setpoints: nobody obeys."""
+        self._remember(self._history.predicted(self.plan.place(now) + 1))
+        place = self.plan.place(now)
+        self._history = History(
+            self._history.levels[:place + 1], place + 1, min(self._history.known, place))
+        self.plan = Plan(self.plan.number, self._history.levels, ())
+        self.revision += 1
 
     def take(self, draft: Draft | None, now: int) -> Plan:
         """Replace everything from a draft of the present revision on; return the plan in force."""
@@ -111,6 +126,11 @@ class RunningPlan:
         end = bisect_right(history.levels, latest, history.sent, key=lambda x: x.stamp)
         self._remember(history.handed_out(end))
         return self._history.levels[history.sent:end]
+
+    def moves(self, now: int) -> bool:
+        """Return whether setpoints are under way at a time in ns."""
+        segments = self.plan.segments
+        return bool(segments) and (segments[-1].arrival is None or now < segments[-1].arrival)
 
     @property
     def pending(self) -> bool:

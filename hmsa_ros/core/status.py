@@ -40,6 +40,9 @@ class Code(str, Enum):
     NO_TIME = 'no_time'
     INACTIVE = 'inactive'
     SEVERAL_PLANTS = 'several_plants'
+    CLOCKS_DIFFER = 'clocks_differ'
+    UNSEEN = 'unseen'
+    CUT_OFF = 'cut_off'
 
     ARRIVED = 'arrived'
     OFF_TARGET = 'off_target'
@@ -125,6 +128,20 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'Several plants or drivers move one joint or measure it, such as a simulator beside the '
         'real one: what the samples show is not one actuator.',
         'Stop all but one of the nodes that the message names.'),
+    Code.CLOCKS_DIFFER: (
+        'The clocks of planner and plant, driver or sensor are too far apart: stamps do not say '
+        'when something was or is to be.',
+        'Set the clocks of all hosts by one source, as with chrony; use_sim_time must agree on '
+        'all sides.'),
+    Code.UNSEEN: (
+        'Samples of the actuator came before and do not come any more, while joint_states has a '
+        'publisher: where the actuator is may not be what is predicted.',
+        'Mend the sensor, or end what publishes; without samples moves start as predicted.'),
+    Code.CUT_OFF: (
+        'The coil was cut off, by the watchdog of plant or driver or since the hardware had lost '
+        'its state, and the rest of the sequence was dropped.',
+        'Send the request again: it starts from where the actuator is by then. With '
+        'after_cut_off resume the planner goes on by itself.'),
     Code.ARRIVED: (
         'Measured: the stretch rests at the setpoint, within the tolerances.', ''),
     Code.OFF_TARGET: (

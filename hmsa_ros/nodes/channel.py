@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 
 from rclpy.node import Node
-from sensor_msgs.msg import MagneticField
+from sensor_msgs.msg import MagneticField, TimeReference
 from std_msgs.msg import Float64
 
 from hmsa_ros.contract import topics
@@ -27,9 +27,14 @@ class JointChannel:
             node, topics.of_joint(topics.FLUX_DENSITY_COMMAND, joint, joints))
         interface.subscribe(
             node, topics.of_joint(topics.SETPOINT, joint, joints), self._on_setpoint)
-        self._applied = '' if linked else interface.subscribe(
-            node, topics.of_joint(topics.FLUX_DENSITY_APPLIED, joint, joints),
-            self._on_applied).topic_name
+        self._applied = self._received = ''
+        if not linked:
+            self._applied, self._received = (
+                interface.subscribe(
+                    node, topics.of_joint(topic, joint, joints), take).topic_name
+                for topic, take in (
+                    (topics.FLUX_DENSITY_APPLIED, self._on_applied),
+                    (topics.FLUX_DENSITY_RECEIVED, self._on_received)))
 
     def send(self, command: Send, frame: str) -> None:
         """Publish a command in the frame of the coil."""
@@ -42,6 +47,9 @@ class JointChannel:
             return ''
         if not self._command.get_subscription_count():
             return f'nobody subscribes to {self._command.topic_name}: start a plant or a driver'
+        if not self._node.count_publishers(self._received):
+            # Who listens now gives no receipts.
+            self._runtime.hearing.receipts.forget(self._joint)
         if not self._node.count_publishers(self._applied) and not self._node.count_publishers(
                 topics.JOINT_STATES.name):
             return (
@@ -52,6 +60,14 @@ class JointChannel:
     def _on_setpoint(self, message: Float64) -> None:
         self._runtime.request(Target(self._joint, message.data))
         self._serve()
+
+    def _on_received(self, message: TimeReference) -> None:
+        self._runtime.received(
+            self._joint, conversions.from_time(message.header.stamp),
+            conversions.from_time(message.time_ref),
+            cut_off=message.header.frame_id == conversions.CUT_OFF)
+        if message.header.frame_id:
+            self._serve()
 
     def _on_applied(self, message: MagneticField) -> None:
         try:

@@ -7,7 +7,7 @@ planned comes after it, while nothing else is due.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 import gc
 
@@ -23,6 +23,7 @@ from hmsa_ros.nodes.plant import PlantNode
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.runtime.cycles import Cycles
 from hmsa_ros.runtime.records import Output, Send
+from hmsa_ros.runtime.takeover import Seen
 
 # Time in ns that must be left of a period to publish one more message, and how many wait at most.
 _ENOUGH, _CROWDED = 400_000, 50
@@ -36,6 +37,7 @@ class LinkedPlanner(PlannerNode):
     def __init__(self) -> None:
         self.plant: Linked | None = None
         self._last = 0
+        self._seen: tuple[Sequence[str], Sample] | None = None
         self._waiting: deque[Output] = deque()
         super().__init__()
 
@@ -71,12 +73,22 @@ class LinkedPlanner(PlannerNode):
 
     def take_sample(self, joints: Sequence[str], sample: Sample) -> None:
         """Take in what was measured of all joints."""
+        self._seen = joints, sample
         if not self._runtime.looks_at(sample.time):
             return
-        for name, *values in zip(
-                joints, sample.stretch.tolist(), sample.rate.tolist(),
-                sample.flux_density.tolist(), strict=True):
+        for name, *values in _each(joints, sample):
             self._runtime.observed(name, sample.time, *values)
+
+    def take_cut_off(self, joint: str, *, in_force: bool) -> None:
+        """Take in whether the coil of a joint was cut off."""
+        self._runtime.cut_off(joint, in_force=in_force)
+
+    def _glance(self) -> Iterator[tuple[str, Seen]]:
+        if self._seen is not None:
+            joints, sample = self._seen
+            self._seen = None
+            for name, stretch, rate, flux_density in _each(joints, sample):
+                yield name, Seen(sample.time, stretch, rate, flux_density)
 
     def now(self) -> int:
         """Return the time in ns, which a plant that leads it knows best."""
@@ -88,6 +100,9 @@ class LinkedPlanner(PlannerNode):
         if time < last:
             self._runtime.clock_set_back(last - time)
         return time
+
+    def _one_clock(self) -> bool:
+        return True
 
     def _observable(self) -> bool:
         return self.plant is not None and self.plant.active
@@ -142,6 +157,9 @@ class Linked(DeviceNode):
         if self._joints:
             self._hear()
             self._publish_news()
+            cut_off = self.device.cut_offs
+            for number, joint in enumerate(self._joints):
+                self._planner.take_cut_off(joint.name, in_force=number in cut_off)
         self._planner.serve(lambda: self.cycles.left > _ENOUGH)
         self.cycles.note_rest()
 
@@ -174,6 +192,13 @@ class LinkedPlant(Linked, PlantNode):
 
 class LinkedDriver(Linked, DriverNode):
     """A driver of hardware that a planner in the same process commands."""
+
+
+def _each(joints: Sequence[str], sample: Sample) -> Iterator[tuple[str, float, float, float]]:
+    """Yield what was measured of each joint."""
+    return zip(
+        joints, sample.stretch.tolist(), sample.rate.tolist(), sample.flux_density.tolist(),
+        strict=True)
 
 
 def make() -> Sequence[Node]:

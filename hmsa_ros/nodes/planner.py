@@ -1,11 +1,11 @@
 """Planner node: setpoints in, the shaped stream of stamped flux density commands out."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import zip_longest
 import math
-from time import monotonic_ns
+from time import monotonic_ns, time_ns
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import JumpThreshold, TimeJump
@@ -21,7 +21,7 @@ from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.core.warmup import warm_up
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import conversions, interface
-from hmsa_ros.nodes.capture import decode
+from hmsa_ros.nodes.capture import decode, RawSubscription
 from hmsa_ros.nodes.channel import JointChannel
 from hmsa_ros.nodes.joints import declare_joints
 from hmsa_ros.nodes.managed import AUTOSTART, ManagedNode
@@ -45,6 +45,7 @@ from hmsa_ros.runtime.records import (
     Stop,
     Trajectory,
 )
+from hmsa_ros.runtime.takeover import Seen
 
 PARAMETERS = SPECS
 
@@ -54,6 +55,8 @@ _POLL_NS = 2_000_000
 _LONGEST_POLL_NS = 100_000_000
 # Whoever publishes samples, reliably or not, is understood.
 _SAMPLES = replace(topics.JOINT_STATES, qos=topics.Quality(1000, reliable=False))
+# The newest of some joints, each of which may have a publisher of its own.
+_NEWEST = replace(topics.JOINT_STATES, qos=topics.Quality(20, reliable=False))
 # How long samples are listened to after they were wanted last: a subscription takes time to match.
 _LINGER_NS = 2 * NANOSECONDS
 
@@ -73,6 +76,7 @@ class PlannerNode(ManagedNode):
         self._runtime = self._new_runtime()
         self._channels: dict[str, JointChannel] = {}
         self._samples: Subscription | None = None
+        self._newest: RawSubscription | None = None
         self._listen_until = 0
         self._crowded = ''
         check_names(self)
@@ -84,9 +88,11 @@ class PlannerNode(ManagedNode):
         self.autostart()
 
     def _new_runtime(self) -> PlannerRuntime:
-        return PlannerRuntime(
+        runtime = PlannerRuntime(
             group_from(self._settings), settings_from(self._settings), clock=self.now,
-            observable=self._observable, unheard=self._unheard)
+            observable=self._observable, unheard=self._unheard, glance=self._glance)
+        runtime.one_clock = self._one_clock
+        return runtime
 
     # -- states --------------------------------------------------------------------------------
 
@@ -99,6 +105,8 @@ class PlannerNode(ManagedNode):
                 self.get_logger().warning(f'joint {name}: {lost}')
         self._channels = {x: JointChannel(
             self, x, names, self._runtime, self._serve, linked=self.linked) for x in names}
+        if not self.linked:
+            self._newest = interface.listen(self, _NEWEST)
         self._plan, self._status, self._estimate = (
             interface.publisher(self, x) for x in (topics.PLAN, topics.STATUS, topics.ESTIMATE))
         self._targets = TargetMarkers(self, self._settings)
@@ -141,6 +149,9 @@ class PlannerNode(ManagedNode):
         self._poll.cancel()
         self._channels = {}
         self._samples = None
+        if self._newest is not None:
+            self._newest.destroy()
+            self._newest = None
 
     # -- in ------------------------------------------------------------------------------------
 
@@ -168,12 +179,30 @@ class PlannerNode(ManagedNode):
         except BadInputError as error:
             self.get_logger().error(f'sample ignored: {error}', throttle_duration_sec=1.0)
             return
-        stamp = conversions.from_time(message.header.stamp)
-        # A field that is not measured is empty.
-        for name, *values in zip_longest(
-                message.name, message.position, message.velocity, message.effort,
-                fillvalue=math.nan):
-            self._runtime.observed(str(name), stamp, *values)
+        for name, stamp, values in _read(message):
+            self._runtime.observed(name, stamp, *values)
+
+    def _glance(self) -> Iterator[tuple[str, Seen]]:
+        """Yield the newest samples, if there are new ones, without having to read them all."""
+        missing = set(self._channels)
+        for taken in reversed([] if self._newest is None else self._newest.take()):
+            if not missing:
+                return
+            try:
+                message = decode(taken.data, JointState)
+            except BadInputError:
+                continue
+            for name, stamp, values in _read(message):
+                if name in missing:
+                    missing.discard(name)
+                    yield name, Seen(
+                        stamp, *values,
+                        lag=None if self._one_clock() else (
+                            self.now() - (time_ns() - taken.received_ns) - stamp))
+
+    def _one_clock(self) -> bool:
+        """Return whether one clock tells the times of all nodes."""
+        return self._clock_reader.simulated
 
     def _observable(self) -> bool:
         """Return whether somebody may give samples."""
@@ -288,6 +317,16 @@ class PlannerNode(ManagedNode):
         settings, models = settings_from(changed), models_from(changed, self._runtime.group)
         self._settings = changed
         self._runtime.change(settings, models, simultaneous=changed['simultaneous_arrival'])
+
+
+def _read(message: JointState) -> Iterator[tuple[str, int, tuple[float, float, float]]]:
+    """Yield joint, stamp in ns, and stretch, rate in 1/s and flux density in T of samples."""
+    stamp = conversions.from_time(message.header.stamp)
+    # A field that is not measured is empty.
+    for name, stretch, rate, flux_density in zip_longest(
+            message.name, message.position, message.velocity, message.effort,
+            fillvalue=math.nan):
+        yield str(name), stamp, (stretch, rate, flux_density)
 
 
 #: Run by ``hmsa planner`` with the command line's arguments; returns the exit status.

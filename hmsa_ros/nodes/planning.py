@@ -37,7 +37,7 @@ from hmsa_ros.nodes.joints import JointParameters, JOINTS
 from hmsa_ros.nodes.managed import AUTOSTART
 from hmsa_ros.nodes.marker_publisher import MARKER_SCALE
 from hmsa_ros.runtime.feedback import MODES
-from hmsa_ros.runtime.records import Settings
+from hmsa_ros.runtime.records import AFTER_CUT_OFF, Settings
 
 _OPTIONS = Options()
 _SETTINGS = Settings()
@@ -174,9 +174,15 @@ SPECS = (
         'File that ~/save_estimate writes what was learnt to; planner and plant take it as a '
         'parameter file.', read_only=False),
     ParameterSpec(
+        'after_cut_off', _SETTINGS.after_cut_off,
+        'What to do when plant or driver has cut off the coil: drop the rest of the sequence and '
+        'wait for a request, or resume it with a shaped move from where the actuator is by then.',
+        choices=AFTER_CUT_OFF, read_only=False),
+    ParameterSpec(
         'takeover_timeout', _SETTINGS.takeover_timeout / NANOSECONDS,
         'How long the first request waits for a plant or a driver, and for a sample of the '
-        'current state if samples are published; 0 for no wait.', 's', 0.0, 60.0),
+        'current state if samples are published, and a later one for samples that have ceased; '
+        '0 for no wait.', 's', 0.0, 60.0),
     ParameterSpec(
         'takeover_max_age', _SETTINGS.takeover_max_age / NANOSECONDS,
         'Largest age of a sample that is used for this.', 's', 0.0, 1e6),
@@ -219,8 +225,9 @@ def _nanoseconds(seconds: float) -> int:
 def settings_from(values: JointParameters) -> Settings:
     """Return how a runtime deals with time, as parameters for all joints say."""
     plain: dict[str, Any] = {x: values[x] for x in (
-        'replan_late', 'max_points', 'allow_partial_joints', 'feedback', 'feedback_cautious',
-        'feedback_tolerance', 'feedback_trim', 'feedback_frozen', 'feedback_file')}
+        'replan_late', 'after_cut_off', 'max_points', 'allow_partial_joints', 'feedback',
+        'feedback_cautious', 'feedback_tolerance', 'feedback_trim', 'feedback_frozen',
+        'feedback_file')}
     times: dict[str, Any] = {x: _nanoseconds(values[x]) for x in (
         'heartbeat_period', 'lateness_tolerance', 'takeover_timeout', 'takeover_max_age')}
     return Settings(

@@ -20,8 +20,8 @@ from hmsa_ros.runtime.watching import Watch
 
 # Changes of level in one preview.
 _PREVIEW = 500
-# How often it is looked whether somebody listens, in ns.
-_LOOK = 200_000_000
+#: How often it is looked whether somebody listens, in ns.
+LOOK = 200_000_000
 
 
 class Bulletin:
@@ -122,7 +122,7 @@ class Bulletin:
         now = self._steady()
         if now < self._look_again:
             return
-        self._look_again = now + _LOOK
+        self._look_again = now + LOOK
         before, self.unheard = self.unheard, self._look()
         if self.unheard == before:
             return

@@ -221,6 +221,10 @@ class Feedback:
             return None
         return self._predicted(name, joint, time)
 
+    def follows(self, name: str) -> bool:
+        """Return whether plans for a joint begin from what is estimated."""
+        return self.state(name, self._clock()) is not None
+
     def _predicted(self, name: str, joint: Joint, time: int) -> Estimate | None:
         """Return what is believed of a time in ns under the plan in force by now."""
         joint.estimator.set_levels(

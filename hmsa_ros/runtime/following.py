@@ -1,6 +1,6 @@
 """Late, lost and foreign commands, and the new plans that they call for."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 
 from hmsa_ros.core.drafting import Steps
 from hmsa_ros.core.group import PlannerGroup, Resumption
@@ -27,6 +27,8 @@ class Following:
         # Joints that may have left their plan, and the stamp of what was not heard of.
         self._suspected: dict[str, int] = {}
         self._found: dict[str, Resumption] = {}
+        #: Returns how the clocks of plant or driver and planner differ; empty where they do not.
+        self.clocks: Callable[[], str] = str
         self._tell_late, self._tell_foreign, self.tell_replanned = Seldom(), Seldom(), Seldom()
 
     def restart(self) -> None:
@@ -60,12 +62,14 @@ class Following:
                 f'joint {joint}: {flux_density:g} T took effect but was not commanded'))]
         return []
 
-    def drop_missed(self, now: int, tolerance: int) -> list[Note]:
+    def drop_missed(
+            self, now: int, tolerance: int, but: Collection[str] = ()) -> list[Note]:
         """Take out of the plans what is too late to be sent, as after a jump of the clock."""
         notes = []
         for name, planner in self._group.planners.items():
             stamp = planner.next_stamp
-            if stamp is None or stamp >= now - tolerance or not self._group.may_resume(name):
+            if name in but or stamp is None or stamp >= now - tolerance or (
+                    not self._group.may_resume(name)):
                 continue
             notes += self._late(now - stamp, name, stamp)
             self.lateness.count += planner.drop_missed(now, tolerance) - 1
@@ -99,6 +103,8 @@ class Following:
     @property
     def advice(self) -> str:
         """What helps where commands come late; all joints have the same lead time."""
+        if clocks := self.clocks():
+            return clocks
         planner = next(iter(self._group.planners.values()))
         return self.lateness.advice(planner.options.lead_time)
 

@@ -6,18 +6,20 @@ enough, at the latest when `PlannerRuntime.wake` says so, and passes on what tha
 to topics, a loop that has the coil at hand to the coil.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from time import monotonic_ns
 
 from hmsa_ros.core.group import PlannerGroup
 from hmsa_ros.core.status import RefusedError
 from hmsa_ros.core.timeline import Model
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.runtime.bulletin import Bulletin
+from hmsa_ros.runtime.bulletin import Bulletin, LOOK
 from hmsa_ros.runtime.checks import check_joints, check_ready
 from hmsa_ros.runtime.corrections import Corrections
 from hmsa_ros.runtime.feedback import Feedback
 from hmsa_ros.runtime.following import Following
+from hmsa_ros.runtime.hearing import Hearing
 from hmsa_ros.runtime.planning import Planning, SLICE
 from hmsa_ros.runtime.records import (
     Output,
@@ -30,7 +32,7 @@ from hmsa_ros.runtime.records import (
 )
 from hmsa_ros.runtime.sending import Sending
 from hmsa_ros.runtime.slices import Clock, work_on
-from hmsa_ros.runtime.takeover import Takeover
+from hmsa_ros.runtime.takeover import Seen, Takeover
 from hmsa_ros.runtime.watching import Watch
 
 # Clock jumps nearer to each other than this make one verdict.
@@ -46,26 +48,35 @@ class PlannerRuntime:
     Two clocks return ns: `clock` the time of the stamps and of `tick`, `steady` the one that
     timeouts and the length of a slice are measured by. `observable` returns whether somebody may
     give samples, and `unheard` why nobody carries out commands (empty where somebody does): the
-    first request waits for both.
+    first request waits for both. `glance` returns the newest samples by joint, if there are new
+    ones: later requests are held against them.
     """
 
     def __init__(
             self, group: PlannerGroup, settings: Settings, *, clock: Clock,
             steady: Clock = monotonic_ns,
             observable: Callable[[], bool] = lambda: True,
-            unheard: Callable[[], str] = str) -> None:
+            unheard: Callable[[], str] = str,
+            glance: Callable[[], Iterable[tuple[str, Seen]]] = tuple) -> None:
         self.group = group
         self.settings = settings
         self.active = False
         #: That several plants carry out the commands, which is refused; empty otherwise.
         self.crowded = ''
+        #: Returns whether one clock tells the times of all nodes, as simulated time does.
+        self.one_clock: Callable[[], bool] = bool
         self.following = Following(group)
         self.clock_jumps = 0
         self._clock, self._steady, self._observable = clock, steady, observable
+        self._glance = glance
         self._takeover = Takeover(group, clock, steady, observable, unheard)
         self._watch = Watch(group, steady, clock)
-        self._bulletin = Bulletin(group, self.following, self._watch, clock, steady, unheard)
-        self.sending = Sending(group, self.following, self._bulletin.outputs)
+        self.hearing = Hearing(group, self.following, self._takeover, clock, steady)
+        self._bulletin = Bulletin(
+            group, self.following, self._watch, clock, steady,
+            lambda: unheard() or self.hearing.receipts.words)
+        self.sending = Sending(
+            group, self.following, self.hearing.receipts, self._bulletin.outputs)
         self.feedback = Feedback(group, settings, self._bulletin.outputs, clock)
         self._watch.sensor = self.feedback.sensor
         self.planning = Planning(
@@ -87,20 +98,58 @@ class PlannerRuntime:
         try:
             check_ready(self._clock(), active=self.active, crowded=self.crowded)
             check_joints(request, tuple(self.group.planners), self.settings)
+            if not isinstance(request, Stop):
+                self.hearing.check_clocks()
         except RefusedError as error:
             return self.planning.refuse(error, request)
         self._begin_anew()
+        self._check(request)
         work = self.planning.add(request, engaged=self._takeover.engaged)
         self._engage(begin=True)
-        self._work_on()
-        while (self._takeover.engaged and work in self.planning
-               and not isinstance(request, Trajectory)):
+        sure = self._work_on()
+        while sure and work in self.planning and not isinstance(request, Trajectory):
             # Short work, which whoever asks wants to be done.
-            self._work_on()
+            sure = self._work_on()
         if self._set_back:
             # While it was planned, for times that are not to come.
             return self.request(request)
         return _WAITING if work in self.planning else self._bulletin.verdict
+
+    def _check(self, request: Request) -> None:
+        """Have joints looked at that are to move now; to stop nothing is waited for."""
+        self.hearing.until = None
+        if isinstance(request, Stop) or not self._takeover.engaged:
+            return
+        names = request.joints if isinstance(request, Trajectory) else (request.joint,)
+        later = isinstance(request, Trajectory) and request.stamp is not None
+        now = self._clock()
+        self._look_at_samples()
+        self._takeover.check(
+            x for x in names if not (later and self.group.planners[x].moves(now)))
+
+    def _look_at_samples(self) -> None:
+        for joint, seen in self._glance():
+            self._takeover.observe(joint, seen)
+
+    def received(
+            self, joint: str, time: int, command: int, *, cut_off: bool) -> None:
+        """
+        Take in a receipt: by its time in ns a device has received a command of a stamp.
+
+        A device that was cut off refuses commands of before.
+        """
+        self.hearing.receipts.received(
+            joint, time, command, self._clock(), comparable=not self.one_clock())
+        self.cut_off(joint, in_force=cut_off)
+
+    def cut_off(self, joint: str, *, in_force: bool) -> None:
+        """Take in whether a joint's device was cut off and refuses commands of before."""
+        verdict = self.hearing.cut_off(joint, self.settings, in_force=in_force)
+        if verdict is not None:
+            self._bulletin.show()
+            self._bulletin.give(replace(verdict, request=self._bulletin.verdict.request), log=True)
+        if in_force and self.active and self.hearing.may_acknowledge(joint):
+            self.sending.acknowledge(joint, self._clock())
 
     def applied(self, joint: str, stamp: int, flux_density: float) -> None:
         """Take in that a joint's level in T has really been in force from a stamp in ns on."""
@@ -115,7 +164,9 @@ class PlannerRuntime:
             flux_density: float) -> None:
         """Take in a sample: stamp in ns, stretch, rate in 1/s and flux density in T."""
         if self._takeover.waiting or not self._takeover.engaged:
-            self._takeover.observe(joint, stamp, stretch, rate, flux_density)
+            self._takeover.observe(joint, Seen(
+                stamp, stretch, rate, flux_density,
+                None if self.one_clock() else self._clock() - stamp))
         self._watch.add(joint, stamp, stretch)
         if self.feedback.looks_at(stamp):
             self.feedback.add(joint, stamp, stretch)
@@ -140,6 +191,7 @@ class PlannerRuntime:
         self.planning.clear()
         self._watch.restart()
         self.feedback.restart()
+        self.hearing.receipts.clock_set_back()
         self._takeover.drop()
         self._takeover.engaged = False
         last, self._last_jump = self._last_jump, self._steady()
@@ -204,12 +256,15 @@ class PlannerRuntime:
             return None
         now = self._clock()
         times = [
-            self.group.next_command(), self._bulletin.next_change, self._bulletin.preview_again,
-            self._watch.wake(now), self.feedback.wake]
+            None if self.hearing.deaf else self.group.next_command(),
+            self._bulletin.next_change, self._bulletin.preview_again, self._watch.wake(now),
+            self.feedback.wake]
         if self.settings.heartbeat_period:
             times.append(self.sending.next_beat)
         if self.following.astray:
             times.append(0)
+        if self.hearing.receipts:
+            times.append(now + LOOK)
         return min((x for x in times if x is not None), default=None)
 
     def send(self, now: int) -> list[Output]:
@@ -228,7 +283,7 @@ class PlannerRuntime:
         if self._bulletin.preview_again is not None and now >= self._bulletin.preview_again:
             self._bulletin.show()
         self._bulletin.tell_progress(now)
-        if self.active and (self._watch.open or self._bulletin.unheard
+        if self.active and (self._watch.open or self._bulletin.unheard or self.hearing.receipts
                             or self._bulletin.next_change is not None):
             self._bulletin.look_for_listeners()
             self._judge(now)
@@ -239,14 +294,15 @@ class PlannerRuntime:
         """Send what is due, if commands are sent at all."""
         if not (self._takeover.engaged and self.active):
             return False
+        self.hearing.look()
         if self.settings.replan_late:
             self._bulletin.outputs += self.following.drop_missed(
-                now, self.settings.lateness_tolerance)
+                now, self.settings.lateness_tolerance, self.hearing.receipts.silent)
         if self.following.astray:
             # Before more of a plan is sent that does not hold.
             self._work_on()
         self.sending.send(now)
-        self.sending.beat(now, self.settings)
+        self.sending.beat(now, self.settings, self.hearing.cut)
         return True
 
     def _taken(self) -> list[Output]:
@@ -259,14 +315,47 @@ class PlannerRuntime:
         engaged = self._takeover.engaged
         if begin:
             self._takeover.begin(self.settings)
-        for note in self._takeover.go_on(self.settings, self.following.newest):
+        if self._takeover.waiting:
+            self._look_at_samples()
+        try:
+            notes = self._takeover.go_on(self.settings, self.following.newest)
+        except RefusedError as error:
+            self._takeover.drop()
+            self.planning.refuse_all(error)
+            return
+        for note in notes:
             self._bulletin.note(note)
         if self._takeover.engaged and not engaged:
             self.sending.next_beat = self._clock() + self.settings.heartbeat_period
 
-    def _work_on(self) -> None:
-        if self._takeover.engaged:
-            self.planning.work_on()
+    def _work_on(self) -> bool:
+        """Plan what waits, if it is known where the joints are; return whether it is."""
+        if not self._takeover.engaged or not self._sure():
+            return False
+        self.planning.work_on()
+        return True
+
+    def _sure(self) -> bool:
+        """Return whether joints are where they are predicted, or seen, as far as that matters."""
+        requests = self.planning.requests
+        if not requests and not self.following.astray:
+            return True
+        if any(not isinstance(x, Stop) for x in requests) or not requests:
+            if self.hearing.holds(self.settings):
+                return False
+            self._look_at_samples()
+            try:
+                notes = self._takeover.look(
+                    self.settings, self.following.newest, self.feedback.follows,
+                    keep=not requests)
+            except RefusedError as error:
+                self.planning.refuse_all(error)
+                return not requests
+            if notes is None:
+                return False
+            for note in notes:
+                self._bulletin.note(note)
+        return True
 
     def _judge(self, now: int) -> None:
         """Judge arrivals by what was measured."""
@@ -284,11 +373,23 @@ class PlannerRuntime:
 
     def report(self) -> tuple[Severity, str, dict[str, object]]:
         """Return how commands fare: severity, a sentence and counters."""
-        late, message = self.following.lateness, 'commands sent in time'
+        late, severity, message = self.following.lateness, Severity.OK, 'commands sent in time'
+        offset, limit = self.hearing.offset, self.hearing.limit()
         if late.count:
+            severity = Severity.WARN
             message = f'{late.count} commands late: {self.following.advice}'
-        return Severity.WARN if late.count else Severity.OK, message, {
+        elif offset is not None and offset.beyond(limit):
+            severity, message = Severity.WARN, offset.words
+        if self.hearing.receipts.words:
+            severity, message = Severity.ERROR, self.hearing.receipts.words
+        note = self.hearing.clocks_changed(limit)
+        if note:
+            self._bulletin.note(note)
+        values: dict[str, object] = {} if offset is None else {
+            'clock_offset_ms': f'{offset.ahead / 1e6:.3f}',
+            'clock_offset_error_ms': f'{offset.error / 1e6:.3f}'}
+        return severity, message, {
             'sent': self.sending.sent, 'late': late.count, 'replanned': self.following.replanned,
             'heartbeats': self.sending.heartbeats,
             'largest_lateness_ms': f'{late.largest / 1e6:.3f}',
-            'refused': self.planning.refused, 'clock_jumps': self.clock_jumps}
+            'refused': self.planning.refused, 'clock_jumps': self.clock_jumps, **values}

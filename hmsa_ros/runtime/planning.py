@@ -36,6 +36,18 @@ class Planning:
     def __bool__(self) -> bool:
         return bool(self._queue or self._leftovers)
 
+    @property
+    def requests(self) -> list[Request]:
+        """What was asked for and is not answered yet."""
+        return [x.request for x in self._queue if x.request is not None]
+
+    def refuse_all(self, error: HmsaError) -> None:
+        """Answer all that waits by the same refusal."""
+        for work in list(self._queue):
+            if work.request is not None:
+                self._queue.remove(work)
+                self.refuse(error, work.request)
+
     def __contains__(self, work: Work) -> bool:
         return work in self._queue
 

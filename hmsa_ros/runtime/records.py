@@ -12,6 +12,9 @@ from hmsa_ros.estimation.prior import TRACKED
 from hmsa_ros.identification.known import Known
 from hmsa_ros.judge import Finding, Tolerances
 
+#: What to do when a coil was cut off: wait for a request, or go on with a shaped move.
+AFTER_CUT_OFF = ('wait', 'resume')
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -23,6 +26,7 @@ class Settings:
     lateness_tolerance: int = 5000  # how late a command may be without a new plan
     takeover_timeout: int = NANOSECONDS // 2  # wait for plant and sample at first; 0 for not
     takeover_max_age: int = NANOSECONDS // 2  # largest age of such a sample
+    after_cut_off: str = 'wait'  # one of `AFTER_CUT_OFF`
     max_points: int = 100_000  # setpoints of one request, of all joints together
     allow_partial_joints: bool = False  # whether a trajectory may lack joints
     tolerances: Tolerances = field(default_factory=Tolerances)

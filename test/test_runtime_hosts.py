@@ -1,0 +1,234 @@
+"""A planner and a device on another host, without ROS: silence, cut-offs, clocks, lost states."""
+
+from dataclasses import replace
+
+import pytest
+from test_runtime_planner import HOLD, LEAD, MS, PATIENT, QUIET, Rig, SEQUENCE, START, trajectory
+
+from hmsa_ros.runtime.records import Severity, Stop, Target
+from hmsa_ros.runtime.takeover import Seen
+
+BEATING = replace(QUIET, heartbeat_period=200 * MS)
+
+
+class Bench(Rig):
+    """A rig whose device gives receipts, has a clock of its own, and may be cut off."""
+
+    def __init__(self, *, settings=BEATING, **options):
+        super().__init__(settings=settings, **options)
+        self.runtime._glance = self.glance
+        self.ahead = 0  # of the device's clock
+        self.linked = True
+        self.cut = False
+        self.refused = []
+        self.lost = False  # whether the samples show the actuator at rest without a field
+        self.samples = True
+        self._newest = 0
+        self._next = START
+
+    def glance(self):
+        if self.samples:
+            stretch = 1.0 if self.lost else self.plant.stretch
+            yield 'a', Seen(
+                self.now + self.ahead, stretch, 0.0 if self.lost else self.plant.rate,
+                self.plant.flux_density, -self.ahead)
+
+    def deliver(self):
+        if not self.linked:
+            return
+        for _, x in self.wire:
+            self._newest = x.stamp
+        if self.cut:
+            self.refused += [x.flux_density for _, x in self.wire if x.flux_density != 0.0]
+            self.cut = all(x.flux_density != 0.0 for _, x in self.wire)
+            self.wire = []
+        super().deliver()
+        if self.now >= self._next:
+            self._next = self.now + 100 * MS
+            self.runtime.received('a', self.now + self.ahead, self._newest, cut_off=self.cut)
+
+    def cut_off(self):
+        """Lose the device, whose watchdog switches the coil off."""
+        self.linked, self.cut = False, True
+        self.plant.command(self.now, 0.0)
+        self.plant.advance(self.now)
+
+    def come_back(self):
+        """Have the link again, and what the device has told about its coil."""
+        self.linked, self.wire = True, []
+        self.runtime.applied('a', self.plant.time - 1, 0.0)
+
+    def run(self, end, step=2 * MS):
+        while self.now < end:
+            self.steady += step
+            super().run(min(self.now + step, end), step)
+
+    def advance(self):
+        if self.linked:
+            super().advance()
+        else:
+            for plant in self.plants.values():
+                plant.advance(self.now)
+
+
+def test_a_device_that_is_not_heard_any_more_is_sent_nothing_and_named():
+    rig = Bench()
+    rig.runtime.request(trajectory((1.2, HOLD)))
+    rig.run(START + 400 * MS)
+    assert (rig.status.unheard, rig.runtime.report()[0]) == ('', Severity.OK)
+    rig.linked = False
+    rig.run(START + 1500 * MS)
+    assert 'no receipt of joint a from the plant or driver' in rig.status.unheard
+    assert rig.runtime.report()[0] is Severity.ERROR
+    sent = len(rig.sent)
+    rig.run(START + 4000 * MS)
+    assert len(rig.sent) == sent
+    rig.linked = True
+    rig.run(START + 5000 * MS)
+    assert (rig.status.unheard, rig.runtime.report()[0]) == ('', Severity.OK)
+    assert len(rig.sent) > sent
+    assert rig.residual(1.2) < 1e-6
+
+
+def test_a_device_without_receipts_is_sent_everything():
+    rig = Rig(settings=BEATING)
+    rig.runtime.request(trajectory((1.2, HOLD)))
+    rig.steady += 10_000 * MS
+    rig.run(START + 3000 * MS)
+    assert rig.status.unheard == ''
+    assert len(rig.sent) > 12
+
+
+def test_commands_that_do_not_arrive_at_a_device_that_is_heard_are_named():
+    rig = Bench()
+    rig.runtime.request(trajectory((1.2, HOLD)))
+    rig.run(START + 400 * MS)
+    while rig.now < START + 1500 * MS:
+        rig.wire = []
+        rig.run(rig.now + 10 * MS)
+        rig.sent.clear()
+    rig.hold_back = True
+    newest = rig._newest
+    while rig.now < START + 3000 * MS:
+        rig.wire = []
+        rig._newest = newest
+        rig.run(rig.now + 2 * MS)
+    assert 'commands of joint a do not arrive' in rig.status.unheard
+
+
+@pytest.mark.parametrize('outage', [2000, 30_000])
+def test_after_a_cut_off_the_planner_waits_and_then_starts_from_where_the_actuator_is(outage):
+    rig = Bench()
+    rig.runtime.request(trajectory((1.2, 400 * MS), (1.4, 60_000 * MS), (1.3, 90_000 * MS)))
+    rig.run(START + 1500 * MS)
+    assert rig.residual(1.4) < 1e-6
+    rig.cut_off()
+    rig.run(rig.now + outage * MS)
+    rig.come_back()
+    rig.run(rig.now + 1000 * MS)
+    assert (rig.status.verdict.code, rig.status.verdict.severity) == ('cut_off', Severity.ERROR)
+    assert rig.status.progress.state == 'idle'
+    assert rig.refused == []
+    assert not rig.cut
+    # It waits to be asked, and gives signs of life with the level in force.
+    assert {x.flux_density for t, x in rig.sent if t > rig.now - 800 * MS} == {0.0}
+    assert rig.residual(1.0) < 1e-6
+    assert rig.runtime.request(Target('a', 1.4)).code == 'accepted'
+    rig.run(rig.now + 500 * MS)
+    assert rig.residual(1.4) < 1e-6
+
+
+def test_after_a_cut_off_the_planner_may_go_on_by_itself_with_a_shaped_move():
+    rig = Bench(settings=replace(BEATING, after_cut_off='resume', takeover_timeout=500 * MS))
+    rig.runtime.request(trajectory((1.2, 400 * MS), (1.4, 10_000 * MS)))
+    rig.run(START + 1500 * MS)
+    rig.cut_off()
+    rig.run(rig.now + 2000 * MS)
+    rig.come_back()
+    rig.run(rig.now + 1000 * MS)
+    assert rig.status.verdict.code == 'replanned'
+    assert rig.residual(1.4) < 1e-6
+
+
+def test_a_move_does_not_start_from_a_state_that_samples_contradict():
+    rig = Bench(settings=replace(BEATING, takeover_timeout=500 * MS))
+    rig.runtime.request(Target('a', 1.2))
+    rig.run(START + 800 * MS)
+    # The board has begun anew with its coil off, and nobody has noticed.
+    rig.plant.set_state(1.0, 0.0, 0.0)
+    rig.runtime.request(Target('a', 1.05))
+    rig.run(START + 1600 * MS)
+    assert any('is at 1 on joint_states, where 1.2 was predicted' in x for x in rig.notes())
+    assert rig.residual(1.05) < 1e-6
+    assert max(x.flux_density for t, x in rig.sent if t > START + 800 * MS) < 0.06
+
+
+def test_a_wrong_model_is_no_contradiction():
+    rig = Bench()
+    rig.runtime.request(Target('a', 1.4))
+    rig.run(START + 500 * MS)
+    rig.plant.set_state(1.33, 0.0, rig.plant.flux_density)
+    assert rig.runtime.request(Target('a', 1.3)).code == 'accepted'
+    assert not any('on joint_states' in x for x in rig.notes())
+
+
+def test_a_move_does_not_start_where_samples_have_ceased():
+    rig = Bench(settings=replace(BEATING, takeover_timeout=500 * MS))
+    rig.runtime.request(Target('a', 1.2))
+    rig.run(START + 500 * MS)
+    rig.runtime.request(Target('a', 1.3))
+    rig.run(START + 1000 * MS)
+    rig.samples = False
+    rig.run(START + 8000 * MS)
+    assert rig.runtime.request(Target('a', 1.1)).code == 'waiting'
+    rig.run(START + 9000 * MS)
+    assert (rig.status.verdict.code, rig.status.verdict.severity) == ('unseen', Severity.ERROR)
+    assert rig.runtime.request(Stop()).severity is Severity.OK
+    # Whoever has no sensor any more is not refused.
+    rig.observable = False
+    assert rig.runtime.request(Target('a', 1.1)).code == 'accepted'
+
+
+@pytest.mark.parametrize(('lag', 'text'), [
+    (600, 'come 0.600 s after their stamps'), (-600, 'come 0.600 s before their stamps'),
+    (-100, 'stamped 0.100 s ahead of the clock of the planner'),
+    (1_700_000_000_000, 'simulated time, or time since a start')])
+def test_samples_of_another_clock_are_refused_and_the_clocks_are_named(lag, text):
+    rig = Rig(settings=PATIENT)
+    rig.now += 2_000_000_000_000 * MS
+    assert rig.runtime.request(Target('a', 1.2)).code == 'waiting'
+    for _ in range(300):
+        rig.runtime.observed('a', rig.now - lag * MS, 1.3, 0.0, 0.05)
+        rig.steady += 2 * MS
+        rig.tick()
+    assert rig.status.verdict.code == 'clocks_differ'
+    assert text in rig.status.verdict.message
+    assert rig.sent == []
+    # Times that are decades apart are named at once.
+    assert rig.codes().count('clocks_differ') == 1
+
+
+@pytest.mark.parametrize('ahead', [-200 * MS, 3 * MS, 30 * MS, 80 * MS])
+def test_the_offset_of_clocks_is_measured_and_named_where_commands_are_late(ahead):
+    rig = Bench()
+    rig.samples = False
+    rig.ahead = ahead
+    rig.runtime.request(Target('a', 1.2))
+    rig.run(START + 1500 * MS)
+    severity, message, values = rig.runtime.report()
+    assert float(values['clock_offset_ms']) == pytest.approx(ahead / MS, abs=2.5)
+    assert severity is Severity.WARN
+    assert 'ahead of' in message if ahead > 0 else 'behind' in message
+    again = rig.runtime.request(Target('a', 1.3))
+    assert again.code == ('clocks_differ' if ahead > LEAD else 'accepted')
+    if ahead > LEAD:
+        assert 'every command would come too late' in again.message
+
+
+def test_clocks_that_agree_are_not_warned_of():
+    rig = Bench()
+    rig.runtime.request(trajectory(*SEQUENCE))
+    rig.run(START + 1500 * MS)
+    severity, message, values = rig.runtime.report()
+    assert (severity, message) == (Severity.OK, 'commands sent in time')
+    assert abs(float(values['clock_offset_ms'])) <= float(values['clock_offset_error_ms'])
