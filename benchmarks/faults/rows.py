@@ -1,6 +1,7 @@
 """All faults of the table, in its order."""
 
 from benchmarks.faults import (
+    apart,
     bags,
     delivery,
     hardware,
@@ -13,7 +14,7 @@ from benchmarks.faults import (
 
 FAULTS = (
     *delivery.FAULTS, *processes.FAULTS, *timing.FAULTS, *inputs.FAULTS, *model.FAULTS,
-    *samples.FAULTS, *hardware.FAULTS, *bags.FAULTS)
+    *samples.FAULTS, *hardware.FAULTS, *bags.FAULTS, *apart.FAULTS)
 
 #: What the tests inject: one of each kind.
 QUICK = ('none', 'twice', 'planner_restarted', 'stranger_first', 'parameter_refused')

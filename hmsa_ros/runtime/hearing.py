@@ -103,7 +103,15 @@ class Hearing:
         return self.receipts.worst(self._group.planners)
 
     def check_clocks(self) -> None:
-        """Refuse to move by clocks between which every command comes too late."""
+        """
+        Look at the clocks before a move.
+
+        Raises
+        ------
+        RefusedError
+            If they are so far apart that every command would come too late.
+
+        """
         offset = self.offset
         if offset is not None and offset.ahead - offset.error > max(
                 x.options.lead_time for x in self._group.planners.values()):

@@ -1,0 +1,130 @@
+"""Faults of hosts that are apart: outages between planner and plant, a recorder that goes away."""
+
+from collections.abc import Callable
+import os
+import sys
+from time import monotonic, sleep
+
+import numpy as np
+
+from benchmarks.faults.common import Register
+from benchmarks.faults.hosts import ACROSS, Hosts, hosts, unavailable
+from benchmarks.faults.rig import Child, PATIENCE, Rig, ROOT
+from benchmarks.faults.table import Seen
+from hmsa_ros.errors import HmsaError
+
+FAULTS = Register()
+_ONLOOKER = ROOT / 'test' / 'onlooker.py'
+
+
+class _Apart:
+    """Nodes on hosts of their own; the rig keeps their logs, and ends them."""
+
+    def __init__(self, rig: Rig, made: Hosts) -> None:
+        self._rig, self.hosts = rig, made
+        self._seen = rig.folder / 'seen.npy'
+        rig.environment |= {**ACROSS, 'FASTRTPS_DEFAULT_PROFILES_FILE': ''}
+
+    def run(self, host: str, name: str, *words: str) -> Child:
+        """Start this Python with arguments on a host."""
+        child = Child(
+            self.hosts.on(host, sys.executable, *words), self._rig.folder / f'{name}.log',
+            self._rig.environment)
+        self._rig.children.append(child)
+        return child
+
+    def node(self, host: str, name: str, *words: str) -> Child:
+        """Start a node or a command of the package on a host."""
+        return self.run(host, name, '-m', 'hmsa_ros', name, *words)
+
+    def look_on(self, host: str, name: str = 'onlooker') -> Child:
+        """Have samples written down on a host."""
+        child = self.run(
+            host, name, str(_ONLOOKER), str(self._seen if name == 'onlooker' else os.devnull))
+        wait(lambda: 'sees' in child.said, 'a sample')
+        return child
+
+    def seen(self, onlooker: Child) -> np.ndarray:
+        """Return rows of stamps and times of arrival in s, stretches and fields in T."""
+        onlooker.end(15)
+        found: np.ndarray = np.load(self._seen).T
+        return found
+
+    def send(self, host: str, *words: str) -> int:
+        """Send setpoints, and return the exit status."""
+        return self.node(host, 'send', *words).popen.wait(PATIENCE)
+
+
+def wait(condition: Callable[[], bool], what: str) -> None:
+    """Wait until a condition holds."""
+    end = monotonic() + PATIENCE
+    while not condition():
+        if monotonic() > end:
+            raise HmsaError(f'waited {PATIENCE:g} s for {what}')
+        sleep(0.05)
+
+
+def _outage(rig: Rig, seconds: float) -> Seen:
+    if why := unavailable():
+        return Seen(f'not tried: {why}', '-', met=True)
+    with hosts('bench', 'desk') as made:
+        apart = _Apart(rig, made)
+        plant = apart.node('bench', 'plant', '--ros-args', '-p', 'safe_flux:=zero')
+        planner = apart.node('desk', 'planner')
+        onlooker = apart.look_on('bench')
+        apart.send('desk', '1.1:1', '--wait')
+        apart.send('desk', '1.1:1', '1.35:600')
+        sleep(3.0)
+        made.cut('desk')
+        begin = monotonic()
+        wait(lambda: 'the field goes to zero' in plant.said, 'the watchdog')
+        sleep(max(begin + seconds - monotonic(), 0.0))
+        told = 'no receipt' in planner.said
+        made.join('desk')
+        wait(lambda: 'was cut off by the plant or driver' in planner.said, 'the planner')
+        sleep(1.0)
+        status = apart.send('desk', '1.2:1', '--wait')
+        _, _, stretches, fields = apart.seen(onlooker)
+        off = int(np.flatnonzero(fields[1:] == 0.0)[-1])
+        back = int(np.flatnonzero(fields[:off])[-1]) + 1
+        still = stretches[(back + off) // 2:off]
+        peak = float(stretches[off:].max())
+    return Seen(
+        f'{"told" if told else "not told"} during the outage; at rest at {still[-1]:.4f} until '
+        f'asked again, then at most {peak:.4f} on the way to 1.2, exit {status}',
+        f'{float(np.ptp(still)):.1e}',
+        told and status == 0 and peak < 1.202 and float(np.ptp(still)) < 1e-3)
+
+
+for _seconds in (2.0, 25.0):
+    FAULTS.fault(
+        f'hosts_outage_{_seconds:g}', f'hosts apart for {_seconds:g} s',
+        'planner and plant in network namespaces, link down at 1.35, ARP entries removed; '
+        'safe_flux zero',
+        'the field goes to zero and stays there until asked again; the planner tells of the '
+        'outage and of the cut-off; the next move is shaped')(
+            lambda rig, seconds=_seconds: _outage(rig, seconds))
+
+
+@FAULTS.fault(
+    'hosts_recorder', "a subscriber's host goes away",
+    'link of the host of a subscriber to joint_states down, ARP entries removed, five moves',
+    'all moves arrive, and samples never stop for a second')
+def _recorder(rig: Rig) -> Seen:
+    if why := unavailable():
+        return Seen(f'not tried: {why}', '-', met=True)
+    with hosts('bench', 'desk') as made:
+        apart = _Apart(rig, made)
+        plant = apart.node('bench', 'plant')
+        apart.node('bench', 'planner')
+        apart.look_on('desk', 'recorder')
+        onlooker = apart.look_on('bench')
+        made.cut('desk')
+        status = apart.send(
+            'bench', *(f'{x}:1' for x in (1.2, 1.4, 1.1, 1.3, 1.0)), '--wait')
+        sleep(5.0)
+        gap = float(np.diff(apart.seen(onlooker)[1]).max())
+        jumped = 'clock' in plant.said
+    return Seen(
+        f'exit {status}, longest gap between samples {gap:.2f} s', '-',
+        status == 0 and gap < 1.0 and not jumped)
