@@ -18,6 +18,7 @@ from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation.motion import behind, follow, Levels, rest
 from hmsa_ros.estimation.prior import Prior
+from hmsa_ros.estimation.scatter import Scatter
 from hmsa_ros.estimation.screening import Screening
 from hmsa_ros.estimation.window import coordinates, Solution, Window
 from hmsa_ros.identification.fit import robust_scale
@@ -36,6 +37,8 @@ _FIXED = 1e-12
 # Deviation of stretch and, in natural frequencies, of rate of a block at rest, and of one whose
 # state is not known; and the units of time after a change of level from which on it rests.
 _AT_REST, _ANYWHERE, _SETTLED = 2e-6, 0.3, 25.0
+# Units of time after the last change of level from which on samples show how they scatter at rest.
+_CALM = 12.0
 # So many windows of samples wait at most for an update.
 _WAITING = 10
 # Window, as a share, that is left when it moves on, its longest span in units of time, and the
@@ -95,6 +98,7 @@ class Estimator:
         self.options = options or Options()
         self.noise = self.options.noise or _FIRST_NOISE
         self.screening = Screening(self.options.gate, prior.coordinate)
+        self._scatter = Scatter()
         # Else parameters stay as they are from the next update on.
         self.learning = self.options.learn
         # Covariance of the parameters while they stay as they are.
@@ -104,6 +108,25 @@ class Estimator:
         self._origin = 0
         self._window: Window | None = None
         self._solution: Solution | None = None
+
+    def restart(self) -> None:
+        """Begin with nothing learnt; counts, levels, and how samples scatter at rest stay."""
+        self.screening.restart()
+        self._scatter.trouble = ''
+        if not (self.options.noise or math.isnan(self._scatter.at_rest)):
+            self.noise = self._scatter.at_rest
+        self._pending.clear()
+        self._fixed = self._window = self._solution = None
+
+    @property
+    def since(self) -> int:
+        """Time in ns from which on levels count."""
+        return self._origin
+
+    def count_since(self, stamp: int) -> int:
+        """Return how many samples from a stamp in ns on count."""
+        window = self._window
+        return 0 if window is None else int(np.sum(window.time >= self._seconds(stamp)))
 
     def level(self, stamp: int, flux_density: float) -> None:
         """Take in a level in T from a stamp in ns on; it supersedes what comes at or after it."""
@@ -141,6 +164,7 @@ class Estimator:
 
         Levels until then have been taken in. None before the first sample.
         """
+        self._leave_behind(time)
         if self._window is None and not self._pending:
             return None
         window = self._window or self._new_window(*self._pending[0])
@@ -155,6 +179,8 @@ class Estimator:
             return None
         self._solution = found
         self._follow_noise(found)
+        self._scatter.look(found, window.stretch, _LEAST_NOISE, resting=self._unchanged(
+            self._origin + round(window.begin * NANOSECONDS), time, _CALM))
         estimate = self._estimate(time, found, window)
         self._go_along(window, found, until)
         return estimate
@@ -182,20 +208,47 @@ class Estimator:
         return self._estimate(
             time, replace(found, motion=motion, residual=np.zeros(0)), window)
 
-    def _new_window(self, stamp: int, shown: float) -> Window:
+    def _leave_behind(self, time: int) -> None:
+        """Let samples of long before a time in ns go, and a window that nothing came after."""
+        oldest = time - round(_LONGEST * self.prior.values['time_unit'] * NANOSECONDS)
+        place = bisect_left(self._pending, oldest, key=lambda x: x[0])
+        self.screening.late += place
+        del self._pending[:place]
+        window = self._window
+        if window is None or self._origin + round(NANOSECONDS * (
+                float(window.time[-1]) if len(window.time) else window.begin)) >= oldest:
+            return
+        prior = self._so_far(time)
+        self._solution = None
+        self._window = self._new_window(
+            *(self._pending or [(time, prior.coordinate.rest)])[0], prior)
+
+    def _so_far(self, time: int) -> Prior:
+        """Return what is known of parameters at a time in ns, as a prior."""
+        found = self._solution
+        if found is None:
+            return self.prior
+        known, prior = self._fixed, self.prior
+        if known is None:
+            gone = min(_DRIFT ** 2 * max(self._seconds(time), 0.0), 1.0)
+            known = found.covariance[:-2, :-2] + np.diag(gone * prior.spread ** 2)
+        values = {x: y for x, y in found.values.items() if x != 'behind'}
+        return replace(prior, values=values, covariance=known)
+
+    def _new_window(self, stamp: int, shown: float, prior: Prior | None = None) -> Window:
         """Return a window at rest under the level in force, or at what is shown if none is."""
         if not self._levels or self._levels[0][0] > stamp:
             self._levels.insert(0, (stamp, 0.0))
         self._origin = stamp
-        prior = self.prior
+        prior = prior or self.prior
         mean = coordinates(prior.values, prior.free)
         self._fixed = None if self.learning else prior.covariance
         known = prior.covariance * (1.0 if self.learning else _FIXED)
         at = rest(prior.values, prior.free, self._in_force(stamp))
         stretch, frequency, by = at or (
             shown, 1.0 / prior.values['time_unit'], np.zeros(len(mean)))
-        off = _AT_REST if at is not None and _settled(
-            self._levels, stamp, prior.values['time_unit']) else _ANYWHERE
+        off = _AT_REST if at is not None and self._unchanged(
+            stamp, stamp, _SETTLED) else _ANYWHERE
         covariance = np.zeros((len(mean) + 2, len(mean) + 2))
         covariance[:-2, :-2] = known
         covariance[:-2, -2] = covariance[-2, :-2] = known @ by
@@ -203,7 +256,7 @@ class Estimator:
         covariance[-1, -1] = (off * frequency) ** 2
         return Window(
             dict(prior.values), prior.free, np.append(mean, [stretch, 0.0]), covariance,
-            _bounds(prior, mean), 0.0, np.zeros(0), np.zeros(0))
+            _bounds(self.prior), 0.0, np.zeros(0), np.zeros(0))
 
     def _take(self, window: Window) -> None:
         """Take what waits into the window, as far as it fits the motion believed."""
@@ -247,7 +300,7 @@ class Estimator:
         deviations = {
             name: abs(derivative(name, found.values[name])) * math.sqrt(covariance[i, i])
             for i, name in enumerate(self.prior.free)}
-        trouble = self.screening.trouble
+        trouble = self.screening.trouble or self._scatter.trouble
         return Estimate(
             time, float(state[-2]), float(state[-1]), values, self.prior.free, deviations,
             covariance, self.noise, not trouble, trouble)
@@ -317,17 +370,16 @@ class Estimator:
         place = bisect_right(self._levels, stamp, key=lambda x: x[0]) - 1
         return self._levels[max(place, 0)][1]
 
+    def _unchanged(self, begin: int, end: int, units: float) -> bool:
+        """Return whether no level changed from so many units of time before a begin to an end."""
+        before = begin - round(units * self.prior.values['time_unit'] * NANOSECONDS)
+        return all(
+            x[1] == y[1] or not before < y[0] <= end for x, y in itertools.pairwise(self._levels))
+
     def _as_levels(self) -> Levels:
         return Levels(
             np.array([self._seconds(x) for x, _ in self._levels]),
             np.array([x for _, x in self._levels]), self.options.slew_limit)
-
-
-def _settled(levels: Sequence[tuple[int, float]], stamp: int, time_unit: float) -> bool:
-    """Return whether at a stamp the last change of level was long ago; the unit is in s."""
-    before = stamp - round(_SETTLED * time_unit * NANOSECONDS)
-    return all(
-        x[1] == y[1] or not before < y[0] <= stamp for x, y in itertools.pairwise(levels))
 
 
 @cache
@@ -340,8 +392,9 @@ def warm_up() -> None:
     estimator.predict(2_000_000)
 
 
-def _bounds(prior: Prior, mean: Array) -> Array:
+def _bounds(prior: Prior) -> Array:
     """Return the least and the largest coordinate of each parameter that is tracked."""
+    mean = coordinates(prior.values, prior.free)
     bounds: Array = np.stack([mean - _BOUND * prior.spread, mean + _BOUND * prior.spread], axis=1)
     for i, name in enumerate(prior.free):
         if QUANTITIES[name].scale == 'linear':

@@ -20,16 +20,29 @@ class Screening:
     """
     Rejects samples from so many deviations of the innovation on, and says what is wrong.
 
-    Counts are those of values that are no number, came twice, came after their time was over, did
-    not fit, or were repeated while the actuator moved.
+    Counts are those of values that are no number, came twice, came after their time was over, had
+    a timestamp that was still to come, did not fit, or were repeated while the actuator moved.
     """
 
     def __init__(self, gate: float, coordinate: Coordinate) -> None:
         self._gate, self._conceivable = gate, coordinate.conceivable
         self.unreadable = self.repeated = self.late = self.rejected = self.frozen = 0
+        self.ahead = 0
+        self.lost = 0  # times that so many in a row did not fit
+        self.last_trouble = ''  # and why
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget what was seen; counts stay."""
         self.trouble = ''  # why nothing should be built on samples
         self._in_a_row = self._fitted = 0
         self._last: list[tuple[float, float]] = []
+
+    def refuse_ahead(self, seconds: float) -> None:
+        """Refuse a sample whose timestamp lies so far ahead of the clock."""
+        self.ahead += 1
+        self._reject(
+            f'timestamps of samples lie {seconds:.3g} s ahead of the clock of the planner')
 
     def readable(self, stretch: float) -> bool:
         """Return whether a value can be a stretch, or what the coordinate is."""
@@ -83,4 +96,5 @@ class Screening:
         self._in_a_row += 1
         self._fitted = 0
         if self._in_a_row >= _LOST or 'repeats' in why:
-            self.trouble = why
+            self.lost += not self.trouble
+            self.trouble = self.last_trouble = why

@@ -34,6 +34,7 @@ class Solution:
     z: Array  # coordinates, stretch and rate at the begin, shape (q,)
     values: dict[str, Any]  # of all quantities
     motion: Motion  # at the samples, and at the time asked for last
+    by: Array  # derivatives of what the sensor shows by z, shape (n, q)
     residual: Array  # measured less simulated, shape (n,)
     weights: Array  # how far each counts, 0 to 1
     covariance: Array  # of z
@@ -114,7 +115,7 @@ class Window:
         matrix = prior + by.T @ (weights[:, None] * by) / noise ** 2
         covariance = np.linalg.inv(matrix)
         return Solution(
-            z, values, motion, residual, weights, 0.5 * (covariance + covariance.T))
+            z, values, motion, by, residual, weights, 0.5 * (covariance + covariance.T))
 
     def _bounded(self, z: Array) -> Array:
         kept: Array = z.copy()
@@ -147,8 +148,7 @@ class Window:
         It begins at the time of the next sample, or at the time asked for last. The drift is the
         variance that parameters and state gain on the way, shape (q,).
         """
-        _, by = solution.motion.measured(solution.values, self.free)
-        by, weights = by[:count], solution.weights[:count, None]
+        by, weights = solution.by[:count], solution.weights[:count, None]
         prior: Array = np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
         matrix = prior + by.T @ (weights * by) / noise ** 2
         gradient = by.T @ (solution.weights[:count] * solution.residual[:count]) / noise ** 2

@@ -61,14 +61,13 @@ def differences(estimate: Estimate, nominal: Mapping[str, Any]) -> list[str]:
 
 def sentence(
         estimate: Estimate, nominal: Mapping[str, Any], holding: float, target: float,
-        start: float, amplitude: float, *, adapting: bool) -> str:
+        start: float, amplitude: float, use: str) -> str:
     """
-    Return what is wrong, and what mends it, in a sentence without its stop.
+    Return what is wrong, and what is made of it, in a sentence without its stop.
 
     The level in T holds the target as planned; the amplitude is that of the vibration about rest.
+    What plans make of other parameters is said in so many words, empty where they make nothing.
     """
-    if not estimate.trusted:
-        return f'{estimate.trouble}: open loop until samples fit again'
     wrong = []
     at = held(estimate.values, estimate.stretch, holding)
     step = target - start
@@ -85,8 +84,8 @@ def sentence(
         return apart or 'as known'
     words = ' and '.join(wrong)
     words += f'{": " if words and found else ""}{found}'
-    if not adapting:
+    if not use:
         words += '; `hmsa identify` or feedback: adapt mends it'
     elif found:
-        words += '; plans use it'
+        words += f'; {use}'
     return f'{words}; {apart}' if apart else words

@@ -1,6 +1,7 @@
 """Feedback: what samples say of the actuators, and models that are learnt from them."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 import math
 
@@ -17,10 +18,11 @@ from hmsa_ros.estimation.motion import followed
 from hmsa_ros.estimation.words import differences
 from hmsa_ros.identification.known import Known
 from hmsa_ros.judge import Sensor
-from hmsa_ros.runtime.learnt import differs, learnt_model, save
+from hmsa_ros.runtime.learnt import alike, differs, learnt_model, save
 from hmsa_ros.runtime.records import EstimateChanged, Output, Settings, Severity
 from hmsa_ros.runtime.slices import Clock
 from hmsa_ros.runtime.tracked import Joint
+from hmsa_ros.runtime.trust import Trust
 
 #: What the parameter `feedback` can be.
 MODES = ('off', 'observe', 'adapt')
@@ -77,9 +79,12 @@ class Feedback:
         if self.on:
             warm_up()
             self._joints = {
-                name: Joint(Estimator(self._prior(name, model), Options(
-                    slew_limit=model.options.slew_limit,
-                    learn=not self._settings.feedback_frozen)), model.actuator.rest)
+                name: Joint(
+                    Estimator(self._prior(name, model), Options(
+                        slew_limit=model.options.slew_limit,
+                        learn=not self._settings.feedback_frozen)),
+                    Trust(self._clock(), at_once=self._settings.feedback_cautious),
+                    model.actuator.rest)
                 for name, model in self._nominal.items()}
 
     def change(self, settings: Settings, models: Mapping[str, Model]) -> Mapping[str, Model]:
@@ -111,12 +116,19 @@ class Feedback:
                 self._settings.known.get(name, Known()))
 
     def _learnt(self, name: str, model: Model) -> Model:
-        """Return a model with what is known better by now."""
-        estimate = self._joints[name].latest
-        if estimate is None or not estimate.trusted:
-            return model
-        return learnt_model(
-            model, estimate, self._group.planners[name].plan.levels[-1].stretch)
+        """Return a model with what is known better by now, or was when samples fitted last."""
+        joint = self._joints[name]
+        if joint.acts and joint.latest is not None:
+            return learnt_model(
+                model, joint.latest, self._group.planners[name].plan.levels[-1].stretch)
+        confirmed = joint.trust.confirmed
+        return model if confirmed is None else Model(confirmed.actuator, replace(
+            model.options, coil_time_constant=confirmed.options.coil_time_constant))
+
+    def latest(self, name: str) -> Estimate | None:
+        """Return what is believed of a joint, where a whole move has shown that samples fit."""
+        joint = self._joints.get(name)
+        return joint.latest if joint is not None and joint.acts else None
 
     def reset(self) -> str:
         """Forget what was learnt and say so; refused where nothing is learnt at all."""
@@ -145,7 +157,7 @@ class Feedback:
     def _cell(self, name: str, joint: Joint) -> int:
         """Return how far apart in ns samples are to be."""
         cell = round(self._nominal[name].units.time * NANOSECONDS) * 2 // _DENSE
-        return cell * _SPARSE if self._quiet(name, joint) else cell
+        return cell * _SPARSE if joint.latest and self._quiet(name, joint) else cell
 
     def _quiet(self, name: str, joint: Joint) -> bool:
         planner = self._group.planners[name]
@@ -158,9 +170,7 @@ class Feedback:
         joint = self._joints.get(name)
         if joint is None:
             return
-        joint.estimator.sample(stamp, stretch)
-        joint.newest = max(joint.newest, min(stamp, self._clock()))
-        joint.fresh = True
+        joint.add(stamp, stretch, self._clock())
 
     @property
     def wake(self) -> int | None:
@@ -172,27 +182,20 @@ class Feedback:
         for name, joint in self._joints.items():
             if not joint.fresh or now < joint.next_update:
                 continue
-            joint.fresh = False
             joint.next_update = now + (_RESTING if self._quiet(name, joint) else _UPDATE)
-            planner = self._group.planners[name]
-            joint.estimator.set_levels([(x.stamp, x.flux_density) for x in planner.plan.levels])
-            found = joint.estimator.update(now)
-            joint.note_start(planner.plan, now)
-            joint.latest, joint.news = found, True
-            if found is not None:
-                joint.look_at_vibration(planner.plan, found)
-            if found is not None and now >= joint.next_tell:
+            joint.update(self._group.planners[name].plan, now)
+            if now >= joint.next_tell:
                 joint.next_tell = now + _TELL
-                self._tell(name, joint, found, now)
+                self._tell(name, joint, now)
 
-    def _tell(self, name: str, joint: Joint, found: Estimate, now: int) -> None:
-        prior = joint.estimator.prior.values
-        bad = not found.trusted or (
-            self.mode == 'observe' and bool(differences(found, prior)))
+    def _tell(self, name: str, joint: Joint, now: int) -> None:
+        found = joint.latest
+        bad = joint.trust.why or found is not None and self.mode == 'observe' and differences(
+            found, joint.estimator.prior.values)
         self._outputs.append(EstimateChanged(
             now, name, Severity.WARN if bad else Severity.OK, self.words(name, now),
-            {'mode': self.mode, **joint.figures(found),
-             'used_by_plans': self.mode == 'adapt' and found.trusted,
+            {'mode': self.mode, **joint.figures(),
+             'used_by_plans': self.mode == 'adapt' and joint.acts,
              'corrections': self.corrections}))
 
     def words(self, name: str, now: int) -> str:
@@ -213,11 +216,10 @@ class Feedback:
     def state(self, name: str, time: int) -> Estimate | None:
         """Return what plans may begin from at a time in ns; None where predictions count."""
         joint = self._joints.get(name)
-        if joint is None or self.mode != 'adapt' or joint.latest is None:
+        if joint is None or self.mode != 'adapt' or joint.latest is None or not joint.acts:
             return None
         latest = joint.latest
-        if not latest.trusted or time - latest.time > (
-                _AHEAD * latest.values['time_unit'] * NANOSECONDS):
+        if time - latest.time > _AHEAD * latest.values['time_unit'] * NANOSECONDS:
             return None
         return self._predicted(name, joint, time)
 
@@ -227,8 +229,7 @@ class Feedback:
 
     def _predicted(self, name: str, joint: Joint, time: int) -> Estimate | None:
         """Return what is believed of a time in ns under the plan in force by now."""
-        joint.estimator.set_levels(
-            [(x.stamp, x.flux_density) for x in self._group.planners[name].plan.levels])
+        joint.take_levels(self._group.planners[name].plan, time)
         return joint.estimator.predict(time)
 
     def foreseen(self, name: str, time: int) -> Estimate | None:
@@ -268,13 +269,19 @@ class Feedback:
         return self._settings.feedback_tolerance if cautious else math.inf
 
     def news(self) -> Iterator[tuple[str, Planner]]:
-        """Learn from new estimates that are trusted, and yield their joints and planners."""
+        """Plan with what is known best by now, and yield joints with new estimates to act upon."""
         if self.mode != 'adapt':
             return
         for name, joint in self._joints.items():
-            if joint.news and joint.latest is not None and joint.latest.trusted:
-                joint.news = False
-                planner = self._group.planners[name]
+            if not joint.news:
+                continue
+            joint.news = False
+            planner = self._group.planners[name]
+            if joint.acts and joint.latest is not None:
                 if differs(planner.model, joint.latest):
                     planner.take_model(self._learnt(name, planner.model))
                 yield name, planner
+            else:
+                model = self._learnt(name, self._nominal[name])
+                if not alike(model, planner.model):
+                    planner.take_model(model)

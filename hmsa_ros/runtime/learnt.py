@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from datetime import datetime
+import math
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from hmsa_ros.estimation import Estimate
 from hmsa_ros.files import write_text
 from hmsa_ros.identification.files import known_lines, yaml_text
 from hmsa_ros.identification.known import Known
-from hmsa_ros.identification.quantities import derivative, QUANTITIES
+from hmsa_ros.identification.quantities import derivative, QUANTITIES, values_of
 
 # A model is another one from this share of a parameter, and this many of its deviations, on.
 _NEWS, _SURE = 1e-3, 0.5
@@ -41,6 +42,16 @@ def differs(model: Model, estimate: Estimate) -> bool:
         if abs(value - before) > max(_NEWS * abs(value), _SURE * estimate.deviations[key]):
             return True
     return False
+
+
+def alike(model: Model, other: Model) -> bool:
+    """Return whether two models are of the same actuator but for what is no news."""
+    one, two = (
+        values_of(x.actuator, {'coil_time_constant': x.options.coil_time_constant})
+        for x in (model, other))
+    return all(
+        math.isclose(one[x], two[x], rel_tol=_NEWS) if isinstance(one[x], float)
+        else one[x] == two[x] for x in one)
 
 
 def known_of(estimate: Estimate) -> Known:

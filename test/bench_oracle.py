@@ -1,0 +1,166 @@
+"""A laboratory in virtual time: a planner's runtime, and an actuator that SciPy integrates."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+import math
+
+from identification_oracle import force_of
+import numpy as np
+from scipy.constants import mu_0
+from scipy.integrate import solve_ivp
+
+from hmsa_ros.core.group import PlannerGroup
+from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
+from hmsa_ros.core.planner import Options, Planner
+from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.runtime.records import EstimateChanged, Send, Settings, Target
+
+MS = 1_000_000
+START = 1000 * MS
+# How far ahead the motion is integrated, in ns.
+_AHEAD = 200 * MS
+
+
+def slow(block: ActuatorParameters) -> ActuatorParameters:
+    """Return a block of ten times the size: its unit of time is 44 ms."""
+    return replace(
+        block, half_length=10.0 * block.half_length, half_thickness=10.0 * block.half_thickness,
+        damping_coefficient=100.0 * block.damping_coefficient)
+
+
+@dataclass
+class Plant:
+    """An actuator; times in ns."""
+
+    block: ActuatorParameters
+    time: int = START
+    lag: float = 0.0  # of the coil in s
+    ratio: float = 0.0  # of a branch that creeps
+    tau: float = 0.1  # its relaxation time in s
+    limit: float = math.inf  # of the amplifier in T
+
+    def __post_init__(self):
+        self.levels = [(self.time, 0.0)]  # that are or will be in force
+        self.state = np.array([1.0, 0.0, 0.0, 0.0])
+        self.begin, self.end, self.solution = self.time, self.time, None
+
+    def command(self, stamp, level):
+        stamp = max(stamp, self.time)
+        self.levels = [x for x in self.levels if x[0] < stamp]
+        self.levels.append((stamp, float(np.clip(level, -self.limit, self.limit))))
+        self.end = min(self.end, stamp) if self.solution is not None else self.end
+
+    def advance(self, time):
+        """Return the stretch at a time, and the levels that took effect until then."""
+        before, now = self.time, self.time
+        while now < time:
+            if self.solution is None or now >= self.end:
+                self._integrate(now)
+            now = min(self.end, time)
+            self.state = self.solution(now / 1e9)
+        self.time = time
+        changes = [x for x in self.levels if before < x[0] <= time]
+        return float(self.state[0]), changes
+
+    def _integrate(self, now):
+        level = [x[1] for x in self.levels if x[0] <= now][-1]
+        self.end = min([x[0] for x in self.levels if x[0] > now] + [now + _AHEAD])
+        block = self.block
+        inertia = block.density * block.half_length ** 2
+        c1 = 2.0 * (block.half_thickness / block.half_length) ** 2
+        damping = block.damping_coefficient * block.half_thickness / (8.0 * block.half_length ** 2)
+
+        def slope(_, state):
+            stretch, rate, relaxed, field = state
+            elastic = force_of(stretch, block.chain_limit)
+            acting = field if self.lag else level
+            total = (
+                block.remanence * acting / mu_0 - block.shear_modulus * (
+                    elastic + self.ratio * (elastic - relaxed)) - damping * rate
+                + 0.25 * inertia * rate ** 2 / stretch ** 4)
+            return [rate, total / (inertia * (stretch ** -3 + c1) / 6.0),
+                    (elastic - relaxed) / self.tau,
+                    (level - field) / self.lag if self.lag else 0.0]
+
+        self.solution = solve_ivp(
+            slope, (now / 1e9, self.end / 1e9), self.state, method='DOP853', rtol=1e-9,
+            atol=1e-10, dense_output=True).sol
+
+
+class Bench:
+    """A runtime, a plant and a sensor; `sense` makes samples (stamp, stretch) of what is true."""
+
+    def __init__(
+            self, plant: Plant, nominal: ActuatorParameters, noise: float, *, lead: int = 2 * MS,
+            delay: int = 2 * MS, seed: int = 0, limit: float = 0.5, report=True, **settings):
+        self.plant, self.now, self.noise, self.delay = plant, START, noise, delay
+        self.random = np.random.default_rng(seed)
+        self.sense: Callable = lambda time, stretch: [(time, stretch)]
+        self.report = report
+        self.wire = []
+        self.estimates, self.sent, self.reported = [], [], []
+        self.runtime = PlannerRuntime(
+            PlannerGroup({'a': Planner(nominal, Options(
+                flux_density_min=-limit, flux_density_max=limit, lead_time=lead))}),
+            Settings(**{'takeover_timeout': 0, 'heartbeat_period': 0, 'feedback': 'adapt',
+                        **settings}),
+            clock=lambda: self.now, steady=lambda: self.now)
+        self.runtime.active = True
+
+    @property
+    def planner(self):
+        return self.runtime.group.planners['a']
+
+    @property
+    def message(self):
+        return self.estimates[-1].message
+
+    def rest(self, span):
+        """Let time pass in which nothing moves, nobody looks and no samples come."""
+        self.now += span
+        self.plant.time, self.plant.solution = self.now, None
+
+    def pass_time(self, span):
+        """Let time pass in steps of 1 ms; return times in ns and true stretches."""
+        seen, end = [], self.now + span
+        while self.now < end:
+            for x in self.runtime.tick(self.now):
+                if isinstance(x, Send):
+                    self.sent.append((x.stamp, x.flux_density))
+                    self.plant.command(x.stamp, x.flux_density)
+                elif isinstance(x, EstimateChanged):
+                    self.estimates.append(x)
+            self.now += MS
+            stretch, changes = self.plant.advance(self.now)
+            seen.append((self.now, stretch))
+            if self.report:
+                for stamp, level in changes:
+                    self.runtime.applied('a', stamp, level)
+            noisy = stretch + self.noise * self.random.standard_normal()
+            self.wire += [(self.now + self.delay, *x) for x in self.sense(self.now, noisy)]
+            while self.wire and self.wire[0][0] <= self.now:
+                _, stamp, value = self.wire.pop(0)
+                if self.runtime.looks_at(stamp):
+                    self.runtime.observed('a', stamp, value, math.nan, math.nan)
+        return np.array(seen)
+
+    def move(self, target, hold):
+        """Go to a target; return vibration and offset in % of the step."""
+        planner, before = self.planner, self.now
+        start = planner.plan.segments[-1].stretch if planner.plan.segments else 1.0
+        self.runtime.request(Target('a', target))
+        segment = planner.plan.segments[-1]
+        seen = self.pass_time(hold)
+        arrival = max(segment.arrival or 0, before)
+        unit = planner.model.units.time
+        cycle = round(3.0 * unit * 1e9)
+        early = seen[(seen[:, 0] >= arrival) & (seen[:, 0] < arrival + cycle), 1]
+        late = seen[seen[:, 0] >= self.now - cycle, 1]
+        step = 100.0 / abs(target - start)
+        return step * np.ptp(early), step * (np.mean(late) - target)
+
+
+def paper(t44: bool, **factors):
+    """Return nominal and true block."""
+    block = slow(paper_actuator()) if t44 else paper_actuator()
+    return block, replace(block, **{x: y * getattr(block, x) for x, y in factors.items()})

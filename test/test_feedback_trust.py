@@ -1,0 +1,179 @@
+"""Feedback that does no harm: what samples cannot show is not learnt, and can be unlearnt."""
+
+import math
+
+from bench_oracle import Bench, MS, paper, Plant
+import numpy as np
+import pytest
+
+from hmsa_ros.estimation import estimator, window
+from hmsa_ros.estimation.motion import follow
+
+MOVES = (1.4, 1.1, 1.4, 1.1, 1.4)
+
+
+def low_pass(tau):
+    seen = []
+
+    def sense(time, stretch):
+        before = seen[-1] if seen else stretch
+        seen.append(before + (stretch - before) * -math.expm1(-1e-3 / tau))
+        return [(time, seen[-1])]
+    return sense
+
+
+FAULTS = {
+    'low-pass': low_pass(5e-3), 'clipped': lambda time, x: [(time, min(x, 1.25))],
+    'scaled': lambda time, x: [(time, 2.0 * x - 1.0)],
+    'ahead': lambda time, x: [(time + 10 * MS, x)]}
+
+
+def bench(slow=True, noise=1e-4, plant=None, factors=None, **more):
+    """Return a bench; a slow block has a unit of time of 44 ms, the other one of 4.4 ms."""
+    nominal, true = paper(slow, **(factors or {}))
+    found = Bench(
+        Plant(true, **(plant or {})), nominal, noise, lead=(2 if slow else 50) * MS, **more)
+    found.pass_time(100 * MS)
+    return found
+
+
+def moves(it, targets=MOVES):
+    """Return vibration and offset of moves in % of the step."""
+    slow = it.planner.model.units.time > 0.01
+    return np.array([it.move(x, (1200 if slow else 400) * MS) for x in targets])
+
+
+def check_unlearnt(fault, slow, noise):
+    it = bench(slow, noise)
+    healthy, it.sense = it.sense, FAULTS[fault]
+    moves(it, MOVES[:2])
+    it.sense = healthy
+    # With the parameters given it would leave nothing.
+    assert np.max(np.abs(moves(it, (1.4, 1.1, 1.3))[2:])) < 0.5
+    assert np.max(np.abs(moves(it, (1.15,)))) < 0.5
+
+
+@pytest.mark.parametrize('fault', FAULTS)
+def test_what_a_faulty_sensor_taught_is_forgotten_with_a_healthy_one(fault):
+    check_unlearnt(fault, slow=False, noise=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('noise', [1e-4, 1e-3])
+@pytest.mark.parametrize('slow', [True, False])
+@pytest.mark.parametrize('fault', FAULTS)
+def test_all_faults_of_a_sensor_are_forgotten_by_all_actuators(fault, slow, noise):
+    check_unlearnt(fault, slow, noise)
+
+
+def check_harmless(slow, plant, factors, late):
+    left = {}
+    for mode in ('off', 'adapt'):
+        it = bench(slow, plant=plant, factors=factors, feedback=mode)
+        it.sense = lambda time, x: [(time + late * MS, x)]
+        left[mode] = moves(it, MOVES[:3])
+    assert np.all(np.abs(left['adapt']) < np.abs(left['off']) + 0.5)
+    assert 'with the parameters given' in it.message
+    assert '~/reset_estimate' in it.message
+
+
+NOT_ESTIMATED = pytest.mark.parametrize(('plant', 'factors', 'late'), [
+    ({}, {'remanence': 1.05}, 0), ({'lag': 5e-4}, {}, 0), ({'lag': 5e-3}, {}, 0),
+    ({'ratio': 0.05}, {}, 0), ({}, {}, 2)])
+
+
+@NOT_ESTIMATED
+def test_what_is_not_estimated_leaves_no_more_than_open_loop(plant, factors, late):
+    check_harmless(False, plant, factors, late)
+
+
+@pytest.mark.slow
+@NOT_ESTIMATED
+def test_nor_does_it_with_a_slow_actuator(plant, factors, late):
+    check_harmless(True, plant, factors, late)
+
+
+@pytest.mark.parametrize('factors', [
+    {'shear_modulus': 1.2}, {'shear_modulus': 0.8, 'damping_coefficient': 2.0}])
+def test_modulus_and_damping_are_learnt_from_the_first_move(factors):
+    it = bench(False, noise=1e-3, factors=factors)
+    left = moves(it, MOVES[:2])
+    assert abs(left[0, 1]) < 0.2
+    assert np.max(np.abs(left[1])) < 0.2
+    assert 'plans use it' in it.message
+
+
+def test_a_fault_after_a_healthy_move_leaves_what_that_move_confirmed():
+    it = bench(False, factors={'shear_modulus': 1.1})
+    moves(it, MOVES[:2])
+    it.sense = lambda time, x: [(time, x + 0.05)]
+    assert np.max(np.abs(moves(it))) < 0.5
+    assert 'with the parameters that samples confirmed last' in it.message
+
+
+# -- time ----------------------------------------------------------------------------------------
+
+def test_one_sample_from_the_future_does_not_count():
+    it = bench(False, factors={'shear_modulus': 1.1})
+    it.runtime.observed('a', it.now + 3600 * 10 ** 9, 1.3, math.nan, math.nan)
+    left = moves(it, MOVES[:3])
+    assert np.max(np.abs(left[1:])) < 0.5
+    assert it.estimates[-1].values['ahead_of_clock'] == 1
+    assert 'G about +10 %; plans use it' in it.message
+
+
+@pytest.mark.parametrize('ahead', [2e-3, 0.3, 5.0])
+def test_a_clock_that_is_ahead_is_named_and_leaves_no_vibration(ahead):
+    it = bench(False)
+    it.sense = lambda time, x: [(time + round(ahead * 1e9), x)]
+    it.pass_time(100 * MS)
+    assert np.max(np.abs(moves(it, MOVES[:3]))) < 0.5
+    assert f'{ahead - 2e-3:.3g} s ahead of the clock of the planner' in it.message or ahead < 0.1
+    assert 'open loop until samples fit again' in it.message
+    if ahead > 0.1:
+        assert it.estimates[-1].values['ahead_of_clock'] > 100
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_an_update_costs_no_more_whatever_timestamps_come(seed, monkeypatch):
+    random, work = np.random.default_rng(seed), []
+    it = bench(False, seed=seed)
+    unit = it.planner.model.units.time
+
+    def counted(values, free, state, levels, begin, times):
+        work.append((
+            (float(np.max(times)) - begin) / unit if len(times) else 0.0, len(times),
+            len(levels.times)))
+        return follow(values, free, state, levels, begin, times)
+
+    for module in (estimator, window):
+        monkeypatch.setattr(module, 'follow', counted)
+    ends = (-2 ** 63, 2 ** 63 - 1, 0, -1, 2 ** 62)
+
+    def sense(time, stretch):
+        found = [(time, stretch)]
+        kind = random.integers(8)
+        if kind == 0:
+            found.append((int(random.choice(ends)), stretch))
+        elif kind == 1:
+            found.append((time + int(random.integers(-10 ** 13, 10 ** 13)), stretch))
+        elif kind == 2:
+            found = [(time - i * MS // 7, stretch) for i in range(30)]
+        elif kind == 3:
+            found += found * 5
+        return found
+
+    it.sense = sense
+    most = 0
+    for i, target in enumerate((1.4, 1.1, 1.3, 1.2)):
+        work.clear()
+        it.move(target, 200 * MS)
+        if i == 1:
+            it.rest(3 * 3600 * 10 ** 9)
+        span, count, levels = np.max(work, axis=0)
+        assert span < 450.0
+        assert count < 1500
+        assert levels < 200
+        most = max(most, len(work))
+    # Six passes of four halvings at most for each of the updates, which come every 20 ms.
+    assert most < 25 * (200 / 20 + 5) * 3
