@@ -241,11 +241,10 @@ class Feedback:
 
     def sensor(self, name: str) -> Sensor:
         """Return what was found of the sensor of a joint; one as given where nothing was."""
-        joint = self._joints.get(name)
-        found = None if joint is None else joint.latest
-        if joint is None or found is None or not found.trusted:
+        found = self.latest(name)
+        if found is None:
             return Sensor()
-        prior = np.diag(joint.estimator.prior.covariance)
+        prior = np.diag(self._joints[name].estimator.prior.covariance)
         known = [x for i, x in enumerate(found.free) if x in _SENSOR and (
             found.covariance[i, i] < _FOUND**2 * prior[i])]
         figures = {_SENSOR[x]: found.values[x] for x in known} | {
