@@ -9,7 +9,8 @@ import pytest
 
 from hmsa_ros.device import StateLostError
 from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
-from hmsa_ros.device.hardware import Calls
+from hmsa_ros.device.hardware import Calls, load
+from hmsa_ros.device.health import judge_hardware
 from hmsa_ros.device.protocol import Kind
 from hmsa_ros.device.watchdog import Fallback
 from hmsa_ros.device.worker import HardwareWorker
@@ -501,3 +502,30 @@ def test_hardware_that_does_not_start_says_why():
     for bench, text in ((Silent(), "raised OSError: 'no device'"), (Stuck(), '0.1 T are left')):
         with pytest.raises(HmsaError, match=f'{text}: the coil could NOT be switched off'):
             serve(bench)
+
+
+def test_whatever_a_module_or_a_class_raises_refuses_the_start(tmp_path, monkeypatch):
+    (tmp_path / 'ends_here.py').write_text('import sys\nsys.exit("no licence")\n')
+    (tmp_path / 'a_lab.py').write_text("""\
+class Coil:
+    def __init__(self, joint, port=''):
+        if not port:
+            raise SystemExit('no port')
+        self.port = port
+
+    write = read = lambda self, *_: None
+""")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(BadInputError, match="'ends_here:Coil' cannot be loaded .SystemExit: 'no "):
+        load('ends_here:Coil')
+    make = load('a_lab:Coil')
+    assert make('left', {'port': 'x'}).port == 'x'
+    with pytest.raises(BadInputError, match=r"joint left does not start \(SystemExit: 'no port'"):
+        make('left', {})
+
+
+def test_the_verdict_on_hardware_names_what_is_wrong():
+    assert judge_hardware('', saturated=0, state_lost=0) == (0, 'hardware obeys')
+    assert judge_hardware('', saturated=3, state_lost=1) == (
+        1, '3 levels not reached: the amplifier is saturated; its state was lost, times: 1')
+    assert judge_hardware('the cable', saturated=3, state_lost=1) == (2, 'the cable')

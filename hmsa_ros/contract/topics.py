@@ -105,7 +105,8 @@ FLUX_DENSITY_COMMAND = Topic(
 FLUX_DENSITY_APPLIED = Topic(
     'flux_density_applied', _FIELD, CHANGES,
     'The applied level: one message per change of level, stamped with the time at which it took '
-    'effect; z is the level from then on, in tesla.',
+    'effect; z is the level from then on, in tesla: the one really set, and NaN where it is not '
+    'known.',
     publishers=(PLANT, DRIVER), subscribers=(PLANNER,))
 FLUX_DENSITY_RECEIVED = Topic(
     'flux_density_received', 'sensor_msgs/msg/TimeReference', NEWEST,

@@ -49,6 +49,7 @@ class _Coil:
     def __init__(self, joint: HardwareJoint, calls: Calls) -> None:
         self.instrument = Instrument(joint.hardware, joint.name, calls)
         self.limit = min(joint.limit, self.instrument.limit or math.inf)
+        self.tolerance = self.instrument.tolerance(self.limit)
         self.schedule = CommandSchedule(0.0)
         self.heard: int | None = None  # when, in ns, since the watchdog was last looked at
         self.repeat = False  # whether a sign of life is to be passed on
@@ -233,7 +234,7 @@ class HardwareDevice(Device):
         except HardwareError:
             self._set(i, self._time, math.nan, math.nan)
             raise
-        if abs(really - level) > coil.instrument.tolerance(coil.limit):
+        if abs(really - level) > coil.tolerance:
             coil.saturated += 1
             if coil.saturated == 1:
                 self._notices.append(Notice(
@@ -249,10 +250,11 @@ class HardwareDevice(Device):
         coil = self._coils[i]
         known = not math.isnan(level)
         if asked != coil.asked and (known or not math.isnan(coil.level)) or (
-                known and level != coil.level):
+                abs(level - coil.level) > coil.tolerance):
             self._changes.append(Change(i, when, level))
             coil.history.append((when, level))
-        coil.asked, coil.level = asked, level
+            coil.level = level
+        coil.asked = asked
 
     def _lose(self, i: int, error: StateLostError) -> None:
         """Take in that hardware has lost its state; it must obey again, or has failed."""

@@ -46,7 +46,7 @@ def judge_hardware(trouble: str, *, saturated: int, state_lost: int) -> tuple[in
         return _ERROR, trouble
     notes = [text for count, text in (
         (saturated, f'{saturated} levels not reached: the amplifier is saturated'),
-        (state_lost, f'{state_lost} times its state was lost')) if count]
+        (state_lost, f'its state was lost, times: {state_lost}')) if count]
     return (_WARN, '; '.join(notes)) if notes else (_OK, 'hardware obeys')
 
 

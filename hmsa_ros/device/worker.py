@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeVar
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.device.driven import HardwareDevice
 from hmsa_ros.device.hardware import told
-from hmsa_ros.device.protocol import Change, Notice, Sample
+from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
 from hmsa_ros.errors import BadInputError, HmsaError
 
 T = TypeVar('T')
@@ -196,7 +196,10 @@ class HardwareWorker:
         while self._commands:
             command = self._commands.popleft()
             if command is not None:
-                self.device.hear(*command)
+                try:
+                    self.device.hear(*command)
+                except BadInputError as error:
+                    self._notices.append(Notice(Kind.REFUSED, command.joint, str(error)))
             elif left := self.device.switch_off(self._clock()):
                 raise HmsaError(left)
 

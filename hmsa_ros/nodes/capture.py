@@ -66,7 +66,7 @@ class _Allocator(ctypes.Structure):
         'allocate', 'deallocate', 'reallocate', 'zero_allocate', 'state')]
 
 
-class _Buffer(ctypes.Structure):
+class Buffer(ctypes.Structure):
     """rcutils_uint8_array_t."""
 
     _fields_ = [
@@ -100,7 +100,7 @@ class _Taker:
         utils = ctypes.PyDLL('librcutils.so')
         utils.rcutils_get_default_allocator.restype = _Allocator
         allocator = utils.rcutils_get_default_allocator()
-        self._array = _Buffer()
+        self._array = Buffer()
         self._info = _Info()
         init = utils.rcutils_uint8_array_init
         init.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p]

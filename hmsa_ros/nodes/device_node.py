@@ -18,6 +18,7 @@ from hmsa_ros.nodes import conversions, interface
 from hmsa_ros.nodes.guard import COMMAND_SOURCES, CommandInput
 from hmsa_ros.nodes.joints import JointParameters
 from hmsa_ros.nodes.managed import ManagedNode
+from hmsa_ros.nodes.outlet import Outlet
 from hmsa_ros.nodes.presence import Presence
 from hmsa_ros.nodes.samples import SamplePublisher
 from hmsa_ros.runtime.seldom import Seldom
@@ -76,7 +77,7 @@ class DeviceJoint:
         self._tell_refused, self._tell_late = Seldom(), Seldom()
         self.received = self.refused = self.late = self.latest = self.failed = 0
         self._applied, self._received = (
-            interface.publisher(node, topics.of_joint(x, self.name, names))
+            Outlet(interface.publisher(node, topics.of_joint(x, self.name, names)))
             for x in (topics.FLUX_DENSITY_APPLIED, topics.FLUX_DENSITY_RECEIVED))
         # Stamp of the newest command, when it came if that was not told yet, both in ns; and when
         # something was told by a clock that is never set.

@@ -1,6 +1,6 @@
 """Driver node: real hardware in the place of the plant, written to at the stamps of commands."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from time import time_ns
@@ -13,7 +13,7 @@ from hmsa_ros.contract import topics
 from hmsa_ros.contract.parameters import JOINT, ParameterSpec, PUBLISH_RATE
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
-from hmsa_ros.device.hardware import Calls, Hardware, load
+from hmsa_ros.device.hardware import Calls, load
 from hmsa_ros.device.health import judge_hardware, listed
 from hmsa_ros.device.worker import HardwareWorker
 from hmsa_ros.ending import Deadline, ENDING
@@ -120,7 +120,7 @@ class DriverNode(DeviceNode):
         self.trouble = ''
         with ENDING.by_default():
             self.device = HardwareWorker(
-                partial(_make_device, load(name), self.values, self._settings), time_ns)
+                partial(_make_device, name, self.values, self._settings), time_ns)
             while not self.device.started(_PATIENCE):
                 self.get_logger().warning(
                     f'waiting for {name}: it has not started yet, or its first write not returned')
@@ -166,14 +166,15 @@ class DriverNode(DeviceNode):
 
 
 def _make_device(
-        make: Callable[[str, Mapping[str, Any]], Hardware], values: JointParameters,
+        name: str, values: JointParameters,
         settings: Mapping[str, Mapping[str, Any]]) -> HardwareDevice:
-    """Return the device that parameters describe."""
+    """Return the device that parameters and the name of its hardware describe."""
+    make = load(name)
     rate = values[PUBLISH_RATE.name]
     return HardwareDevice(
         [HardwareJoint(
-            make(name, settings[name]), own['flux_density_limit'], fallback_from(own), name)
-         for name, own in ((x, values.of(x)) for x in values.names)],
+            make(joint, settings[joint]), own['flux_density_limit'], fallback_from(own), joint)
+         for joint, own in ((x, values.of(x)) for x in values.names)],
         time=time_ns(), period=max(round(NANOSECONDS / rate), 1) if rate else 0,
         calls=Calls(values[TIMEOUT.name], Deadline()))
 

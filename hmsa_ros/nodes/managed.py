@@ -31,6 +31,7 @@ from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.nodes import interface
 from hmsa_ros.nodes.conversions import to_diagnostics
 from hmsa_ros.nodes.message_types import interface_class
+from hmsa_ros.nodes.outlet import Outlet
 from hmsa_ros.nodes.parameters import check_former_names, check_names, declare
 
 AUTOSTART = ParameterSpec(
@@ -121,7 +122,7 @@ class ManagedNode(LifecycleNode):
     def diagnose(
             self, report: Callable[[], Iterable[DiagnosticStatus]]) -> Callable[[], None]:
         """Publish statuses once a second; return what publishes them at once."""
-        publisher = interface.publisher(self, topics.DIAGNOSTICS)
+        publisher = Outlet(interface.publisher(self, topics.DIAGNOSTICS))
 
         def publish() -> None:
             statuses = [*report()]

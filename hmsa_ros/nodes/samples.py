@@ -12,6 +12,7 @@ from hmsa_ros.contract import topics
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.device.protocol import Sample
 from hmsa_ros.nodes import interface
+from hmsa_ros.nodes.outlet import Outlet
 
 _STAMP = Struct('<iI')
 _NUMBER = Struct('<d')
@@ -30,9 +31,9 @@ class SamplePublisher:
     """
 
     def __init__(self, node: Node, names: Sequence[str], *, scalars: bool) -> None:
-        self._states = interface.publisher(node, topics.JOINT_STATES)
+        self._states = Outlet(interface.publisher(node, topics.JOINT_STATES))
         self._scalars = [
-            tuple(interface.publisher(node, topics.of_joint(x, name, names))
+            tuple(Outlet(interface.publisher(node, topics.of_joint(x, name, names)))
                   for x in (topics.STRETCH, topics.STRETCH_RATE))
             for name in names] if scalars else []
         count = len(names)
