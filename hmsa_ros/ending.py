@@ -20,6 +20,8 @@ _NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _LAST_SECONDS = 10
 # How long writing a sentence may take, in s.
 _WRITTEN = 0.05
+# Sentence of a process that is ended, in bytes.
+_LONGEST = 500
 
 
 class Ending:
@@ -133,12 +135,17 @@ class _Timer:
             self._set(self._timer, 0, self._at, None)
 
 
+def encoded(text: str) -> bytes:
+    """Return a sentence as `Deadline` takes it."""
+    return f'error: {text}'.replace('%', '%%').encode()[:_LONGEST - 1]
+
+
 class Deadline:
     """Ends the process with a sentence, even where no Python runs: something took too long."""
 
     def __init__(self) -> None:
         """Wait for `set`."""
-        self._text = ctypes.create_string_buffer(500)
+        self._text = ctypes.create_string_buffer(_LONGEST)
         with suppress(ValueError):  # another C library
             # What warnx() writes before a text; that of the interpreter otherwise.
             ctypes.c_char_p.in_dll(
@@ -146,9 +153,9 @@ class Deadline:
         self._say = _Timer('warnx', ctypes.addressof(self._text))
         self._exit = _Timer('_exit', 1)
 
-    def say(self, text: str) -> None:
-        """Say this when the time is over."""
-        self._text.value = f'error: {text}'.replace('%', '%%').encode()[:499]
+    def say(self, text: bytes) -> None:
+        """Say this, as `encoded` makes it, when the time is over."""
+        self._text.value = text
 
     def set(self, seconds: float) -> None:
         """Say it, and end the process with status 1, after some seconds; 0 for not at all."""

@@ -51,8 +51,9 @@ def test_driver_of_the_tutorial_keeps_the_contract_of_a_driver(start, ros):
         topics.FLUX_DENSITY_COMMAND.qos)
     ros.spin_until(lambda: applied and states, 'the level at the start')
     assert applied[0].magnetic_field.z == 0.0
-    assert ('Bench for joint actuator: limit 0.5 T, resolution not given, slew not given, read at '
-            '1000 Hz, zero after 1 s without a command; hardware.timeout 1 s') in driver.stderr
+    driver.wait_for_output(
+        'Bench for joint actuator: limit 0.5 T, resolution not given, slew not given, read at '
+        '1000 Hz, zero after 1 s without a command; hardware.timeout 1 s')
 
     now = ros.node.get_clock().now().nanoseconds
     stamps = [now + SECOND * 4 // 10, now + SECOND * 6 // 10]

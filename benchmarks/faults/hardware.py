@@ -287,7 +287,7 @@ def _constructor(rig: Rig) -> Seen:
 def _planner_killed(rig: Rig) -> Seen:
     with _bench(rig) as bench:
         planner = rig.start('planner')
-        rig.spin_until(lambda: rig.applied, 'the driver')
+        bench.ready()
         rig.ready('planner')
         rig.setpoint(1.1)
         rig.spin_until(lambda: bench.board.level, 'a level')

@@ -13,7 +13,7 @@ from typing import Any, cast, NamedTuple, Protocol
 
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.device.protocol import StateLostError
-from hmsa_ros.ending import Deadline
+from hmsa_ros.ending import Deadline, encoded
 from hmsa_ros.errors import BadInputError, excerpt, HmsaError
 
 # What cannot be when a level took effect, in ns from now.
@@ -56,7 +56,8 @@ class HardwareError(HmsaError):
 
 def told(error: BaseException) -> str:
     """Return an exception for a sentence."""
-    return f'{type(error).__name__}: {excerpt(str(error))}'
+    name, text = type(error).__name__, str(error)
+    return f'{name}: {excerpt(text)}' if text else name
 
 
 def load(text: str) -> Callable[[str, Mapping[str, Any]], Hardware]:
@@ -120,6 +121,7 @@ class Calls:
         self.limit = limit
         self.longest: dict[str, float] = {}
         self._deadline = deadline
+        self._texts: dict[str, bytes] = {}
         self._armed = False
         self._begun: tuple[str, float] | None = None
 
@@ -133,9 +135,12 @@ class Calls:
         """Call a method of hardware; ``name`` is its name for a sentence."""
         self.make_ready()
         if self._deadline is not None:
-            self._deadline.say(
-                f'{name} lets nothing else run for {self.limit + _GRACE:g} s: the driver ends, '
-                'and whether the coil is off is not known; release the GIL in what it calls')
+            if name not in self._texts:
+                self._texts[name] = encoded(
+                    f'{name} lets nothing else run for {self.limit + _GRACE:g} s: the driver '
+                    'ends, and whether the coil is off is not known; release the GIL in what it '
+                    'calls')
+            self._deadline.say(self._texts[name])
         begun = monotonic()
         self._begun = name, begun
         try:
@@ -154,7 +159,7 @@ class Calls:
     def give_up(self, seconds: float) -> None:
         """End the process after some seconds, unless the call returns that hangs."""
         if self._deadline is not None:
-            self._deadline.say('the driver hangs while it ends')
+            self._deadline.say(encoded('the driver hangs while it ends'))
             self._deadline.set(seconds)
 
     @property
@@ -184,6 +189,8 @@ class Instrument:
     def __init__(self, hardware: Hardware, joint: str, calls: Calls) -> None:
         self._hardware, self._calls = hardware, calls
         self.name, self._joint = type(hardware).__name__, joint
+        self._names = {x: f'{self.name}.{x} of joint {joint}'
+                       for x in ('write', 'read', 'open', 'close')}
         for method, arguments in (
                 ('write', (0.0, 0)), ('read', (0,)), ('open', ()), ('close', ())):
             self._check_signature(method, arguments)
@@ -223,7 +230,7 @@ class Instrument:
     # -- calls ---------------------------------------------------------------------------------
 
     def _call(self, method: str, *arguments: object) -> Any:
-        name = f'{self.name}.{method} of joint {self._joint}'
+        name = self._names[method]
         try:
             return self._calls(name, getattr(self._hardware, method), *arguments)
         except StateLostError:

@@ -124,8 +124,8 @@ class DriverNode(DeviceNode):
             while not self.device.started(_PATIENCE):
                 self.get_logger().warning(
                     f'waiting for {name}: it has not started yet, or its first write not returned')
-        self._open(DeviceJoint)
         self.get_logger().info(_described(self.device.device, self.values))
+        self._open(DeviceJoint)
 
     def now(self) -> int:
         """Return the machine's time in ns."""

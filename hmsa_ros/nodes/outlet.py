@@ -36,7 +36,7 @@ class Outlet:
     def publish(self, message: Any) -> None:
         """Publish a message, or bytes that are one already."""
         data = message if isinstance(message, bytes) else serialize_message(message)
-        self._buffer.buffer = ctypes.cast(data, ctypes.c_void_p).value
+        self._buffer.buffer = ctypes.cast(ctypes.c_char_p(data), ctypes.c_void_p).value
         self._buffer.length = self._buffer.capacity = len(data)
         handle = self._publisher.handle
         with handle:
