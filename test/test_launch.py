@@ -8,6 +8,7 @@ launch is installed, it runs the files for real, too.
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+import re
 import signal
 import sys
 
@@ -202,3 +203,13 @@ if REAL:
         launch.run('demo', **{
             key: value.format(there=tmp_path / 'run') for key, value in given.items()})
         assert expected in launch.wait(1)
+
+
+def test_page_has_the_arguments_of_each_file():
+    page = (ROOT / 'docs' / 'desktop.md').read_text()
+    table = page.partition('| argument | of |')[2].partition('\n\n')[0]
+    rows = re.findall(r'^\| ([^|]+) \| (both|demo|replay) \|', table, re.M)
+    for file, name in ((DEMO, 'demo'), (REPLAY, 'replay')):
+        found = [x for cell, of in rows if of in ('both', name)
+                 for x in re.findall(r'`(\w+)`', cell)]
+        assert sorted(found) == sorted(x.name for x in file.arguments)

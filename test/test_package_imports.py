@@ -1,5 +1,6 @@
 """What may be imported from where: the physics and the bags know no ROS, help is quick."""
 
+import ast
 from pathlib import Path
 import re
 import subprocess
@@ -52,6 +53,29 @@ for name in {names!r}:
     importlib.import_module(name)
 """)
     assert (result.returncode, result.stderr) == (0, '')
+
+
+def imported(package: str) -> set[str]:
+    """Return which other packages of ours the modules of a package import anywhere."""
+    found = set()
+    for path in (ROOT / 'hmsa_ros' / package).rglob('*.py'):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, (ast.Import, ast.ImportFrom)):
+                found |= {x.partition('.')[0] for x in re.findall(
+                    r'\bhmsa_ros\.([\w.]+)', ast.unparse(node))}
+    return {x for x in found if (ROOT / 'hmsa_ros' / x).is_dir()} - {package}
+
+
+def test_table_of_the_layout_has_every_package_with_what_it_imports():
+    rows = re.findall(
+        r'^\| `(\w+)` \| [^|]+ \| ([^|]+) \|$', (ROOT / 'CONTRIBUTING.md').read_text().partition(
+            '## Where to add')[0], re.M)
+    names = {x.parent.name for x in (ROOT / 'hmsa_ros').glob('*/__init__.py')}
+    assert {x for x, _ in rows} == names
+    for name, said in rows:
+        listed = set(re.findall(r'`(\w+)`', said))
+        found = imported(name)
+        assert not found & listed if said.startswith('all but') else found == listed, name
 
 
 @pytest.mark.slow

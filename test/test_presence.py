@@ -83,3 +83,14 @@ def test_second_planner_is_named_before_anything_is_sent(ros, serve, start, capf
     second.popen.wait()
     assert main(['send', '1.1:0.1']) == 0
     assert ros.node.count_publishers('planner/status') == 2
+
+
+@pytest.mark.parametrize(('change', 'sentence'), [
+    ((), 'the planner is not configured and takes no requests'),
+    (('configure',), 'the planner refused: the planner is inactive')])
+def test_planner_that_is_not_active_yet_is_named_by_who_sends(serve, capfd, change, sentence):
+    served = serve(PlannerNode, PlantNode, '-p', 'autostart:=false')
+    for name in change:
+        getattr(served.nodes[0], f'trigger_{name}')()
+    assert main(['send', '1.1:0.1']) in (1, 2)
+    assert f'hmsa: error: {sentence}' in capfd.readouterr().err

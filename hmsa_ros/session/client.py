@@ -7,6 +7,7 @@ from time import monotonic, sleep
 from uuid import uuid4
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from lifecycle_msgs.srv import GetState
 import numpy as np
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
@@ -122,8 +123,23 @@ class PlannerClient:
 
         # One whose node is there but does not listen yet is compiling its kernels.
         self.spin_until(lambda: found() or self._planner_starts(), failure, each)
+        state = ServiceCall(self.node.create_client(
+            GetState, f'{topics.PLANNER}/get_state'), GetState.Request())
+
+        def settled() -> bool:
+            if found() or not self._planner_starts():
+                return True
+            # It answers as soon as it is not busy with its start.
+            answer = state.answer()
+            if answer is not None and answer.current_state.label == 'unconfigured':
+                raise HmsaError(
+                    'the planner is not configured and takes no requests: expected it active '
+                    f'(ros2 lifecycle set {where.rstrip("/")}/{topics.PLANNER} configure, then '
+                    'activate)')
+            return False
+
         self.spin_until(
-            lambda: found() or not self._planner_starts(), 'the planner does not subscribe to '
+            settled, 'the planner does not subscribe to '
                                                            'requests', each,
             max(self._timeout, _COMPILE_SECONDS))
         self.spin_until(found, failure, each)
