@@ -1,8 +1,8 @@
 """
 Compile or load what plans and simulates, before the first request.
 
-The first use after an installation compiles for some seconds, and the first use in a process
-loads for some tenths of one.
+The first use after an installation compiles for about a minute, and the first use in a process
+loads for some tenths of a second.
 """
 
 from collections.abc import Callable
@@ -29,6 +29,10 @@ _DELIVERIES = (
     Options(shaper='zvd', period=_MILLISECOND),
     Options(coil_time_constant=5e-4),
 )
+# Measured on two cores: 40 s, and 100 s beside nodes.
+_COMPILING = (
+    'compiling the numerical kernels: once after an installation, for about a minute, and longer '
+    'on a busy machine')
 _CREEP = Creep((0.1,), (0.1,))
 
 
@@ -44,7 +48,7 @@ def warm_up(
     `KeyboardInterrupt`.
     """
     begin = perf_counter()
-    with announced(say):
+    with announced(lambda _: say(_COMPILING)):
         if planning:
             _run(batch=batch)
         else:
