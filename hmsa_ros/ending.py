@@ -13,7 +13,9 @@ from contextlib import contextmanager, suppress
 import ctypes
 import os
 import signal
+import sys
 import threading
+from typing import Any
 
 _NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # How long a process may take to end when all is done, in s.
@@ -41,6 +43,8 @@ class Ending:
         """Raise KeyboardInterrupt from now on, if the signals have been taken over."""
         if self._taken:
             self._take_over(_raise)
+            signal.signal(signal.SIGALRM, lambda *_: _raise())
+            sys.unraisablehook = _raise_again
 
     def note(self) -> None:
         """Only note signals from now on; the process calls `check`, or looks at `asked`."""
@@ -97,6 +101,14 @@ class Ending:
 
 def _raise() -> None:
     raise KeyboardInterrupt
+
+
+def _raise_again(dropped: Any) -> None:
+    """Raise an interrupt that Python has dropped a little later; show what else it drops."""
+    if issubclass(dropped.exc_type, KeyboardInterrupt):
+        signal.setitimer(signal.ITIMER_REAL, 0.001)
+    else:
+        sys.__unraisablehook__(dropped)
 
 
 class _Event(ctypes.Structure):

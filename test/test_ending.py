@@ -109,6 +109,18 @@ def test_a_computation_is_given_up_in_order(number, status):
     assert (done.returncode, done.stdout, done.stderr) == (status, '', '')
 
 
+def test_an_interrupt_that_python_drops_still_ends_a_computation():
+    code = AT_IMPORT.replace('entry.{entry}()', "entry.main(['plan', '1.1:10'])").replace(
+        'os.kill(os.getpid(), {number})', 'Trap()').replace('class Sender', """class Trap:
+    def __del__(self):
+        os.kill(os.getpid(), {number})
+class Sender""")
+    done = subprocess.run(
+        [sys.executable, '-c', code.format(module='numba', number=int(signal.SIGINT))],
+        capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
+
+
 @pytest.mark.parametrize('number', NUMBERS, ids=lambda x: x.name)
 def test_a_recorder_told_to_end_again_and_again_closes_its_bag(
         tmp_path, start: Starter, number):
