@@ -9,7 +9,9 @@ import pytest
 import yaml
 
 from hmsa_ros.cli import main
+from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.files import read_belief
+from hmsa_ros.identification.tables import read_csv
 
 TIMES = np.arange(500) * 1e-3
 LEVELS = steps((1.1, 1.4, 1.0), 0.0444, 3)
@@ -241,3 +243,12 @@ def test_numbers_of_no_elastomer_are_refused_with_the_unit_that_would_explain_th
     assert (status, out, err.count('\n')) == (2, '', 1)
     assert re.search(message.replace('[', r'\['), err)
     assert not (folder / 'page.html').exists()
+
+
+def test_times_of_the_day_beside_levels_that_begin_at_zero_are_named_as_clocks(tmp_path):
+    samples, levels = tmp_path / 'camera.csv', tmp_path / 'levels.csv'
+    samples.write_text('time,stretch\n' + ''.join(
+        f'{1.7e9 + 0.001 * k:.3f},{1.0 + 0.01 * (k % 7)}\n' for k in range(2000)))
+    levels.write_text('time,flux_density\n0.0,0.0\n0.5,0.05\n1.0,0.02\n')
+    with pytest.raises(BadInputError, match='expected times of one clock, not seconds since'):
+        read_csv(samples, levels)

@@ -23,6 +23,8 @@ _MEASURED_FIELD = 0.3
 _FEW_LEVELS = 8
 # More unknown times of switches than this take too long.
 _MOST_SWITCHES = 300
+# Times further apart, in s, are of clocks that began at different times.
+_ANOTHER_CLOCK = 1e8
 # Levels whose times fit the motion so much better in another unit are in that unit.
 _OTHER_UNITS = {1e3: 'ms', 1e6: 'us', 1e9: 'ns'}
 _BETTER = 0.5
@@ -75,6 +77,11 @@ def read_csv(
     if commands is not None:
         times, levels, more = read_levels(commands)
         notes += more
+        if time[0] - times[-1] > _ANOTHER_CLOCK:
+            raise BadInputError(
+                f'{commands} ends at {times[-1]:.9g} s, and the first sample of {path} is at '
+                f'{time[0]:.9g} s: expected times of one clock, not seconds since a start '
+                'beside the time of day')
         _check_units(path, time, stretch, commands, times, levels)
         if times[0] > time[-1]:
             raise BadInputError(
