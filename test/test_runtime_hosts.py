@@ -208,6 +208,19 @@ def test_samples_of_another_clock_are_refused_and_the_clocks_are_named(lag, text
     assert rig.codes().count('clocks_differ') == 1
 
 
+def test_samples_that_are_late_by_a_clock_that_agrees_are_gone_on_from():
+    rig = Rig(settings=PATIENT)
+    rig.plant.set_state(1.3, 0.0, 0.05)
+    rig.runtime.request(Target('a', 1.2))
+    for _ in range(300):
+        rig.runtime.received('a', rig.now - MS, 0, cut_off=False)
+        rig.runtime.observed('a', rig.now - 600 * MS, 1.3, 0.0, 0.05)
+        rig.steady += 2 * MS
+        rig.tick()
+    assert rig.status.verdict.code == 'accepted'
+    assert rig.planner.plan.levels[0].stretch == 1.3
+
+
 @pytest.mark.parametrize('ahead', [-200 * MS, 3 * MS, 30 * MS, 80 * MS])
 def test_the_offset_of_clocks_is_measured_and_named_where_commands_are_late(ahead):
     rig = Bench()

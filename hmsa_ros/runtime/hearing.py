@@ -36,6 +36,7 @@ class Hearing:
         self._acknowledged: dict[str, int] = {}
         self._warned = False
         following.clocks = self._clocks
+        takeover.lag = self.receipts.lag
 
     # -- silence -------------------------------------------------------------------------------
 

@@ -48,6 +48,8 @@ class _Joint:
     # By stamp, when a command was sent by our clock.
     sent: dict[int, int] = field(default_factory=dict)
     exchanges: deque[Offset] = field(default_factory=lambda: deque(maxlen=_COMPARED))
+    # How old receipts were when they came, by our clock.
+    lags: deque[int] = field(default_factory=lambda: deque(maxlen=_COMPARED))
 
 
 class Receipts:
@@ -95,6 +97,7 @@ class Receipts:
         if known.silent and time - known.time < steady - known.heard - _STALE:
             return
         known.heard, known.time = steady, time
+        known.lags.append(now - time)
         sent = known.sent.pop(command, None)
         if sent is None:
             return
@@ -117,6 +120,7 @@ class Receipts:
         for known in self._joints.values():
             known.sent.clear()
             known.exchanges.clear()
+            known.lags.clear()
 
     def look(self) -> tuple[list[str], list[str]]:
         """Return joints whose device has fallen silent, and those that it is heard of again."""
@@ -157,6 +161,11 @@ class Receipts:
         if known is None:
             return None
         return min(known.exchanges, key=lambda x: x.error, default=None)
+
+    def lag(self, joint: str) -> int | None:
+        """Return in ns how old the quickest receipt of a joint was by our clock; None for none."""
+        known = self._joints.get(joint)
+        return None if known is None else min(known.lags, key=abs, default=None)
 
     def worst(self, joints: Iterable[str]) -> Offset | None:
         """Return the largest offset of the clocks of several joints."""

@@ -14,6 +14,8 @@ from hmsa_ros.runtime.slices import Clock
 
 # How long ago, in ns by the steady clock, a sample may have come to show where a joint is.
 _RECENT = 2 * NANOSECONDS
+# Samples that are older, in ns, are not the newest there are.
+_OLDEST = 60 * NANOSECONDS
 # Times that are further apart, in ns, are of clocks that began at different times.
 _ANOTHER_CLOCK = 100_000_000 * NANOSECONDS
 # How far a sample may be off the prediction: a stretch, a share of the way from rest without a
@@ -47,6 +49,8 @@ class Takeover:
             observable: Callable[[], bool], unheard: Callable[[], str]) -> None:
         self._group, self._clock, self._steady = group, clock, steady
         self._observable, self._unheard = observable, unheard
+        #: Returns how old in ns what a device says of itself is when it comes; None if unknown.
+        self.lag: Callable[[str], int | None] = lambda joint: None
         self._until: int | None = None
         # Whether it is known where the joints are, or they are taken to rest.
         self.engaged = False
@@ -108,6 +112,8 @@ class Takeover:
             elif (over and seen.came >= self._until - settings.takeover_timeout
                   or abs(now - seen.stamp) > _ANOTHER_CLOCK):
                 self._check_age(name, seen, settings)
+                # Old indeed, and still the newest there is.
+                samples[name] = seen
         if not over and (len(samples) < len(self._group.planners) or self._unheard()):
             return []
         self._until, self.engaged = None, True
@@ -142,7 +148,10 @@ class Takeover:
         if seen.lag is None and abs(self._clock() - seen.stamp) <= _ANOTHER_CLOCK:
             return
         lag = self._clock() - seen.stamp if seen.lag is None else seen.lag
-        if abs(lag) <= settings.takeover_max_age:
+        known = self.lag(name)
+        if abs(lag) <= settings.takeover_max_age or (
+                0 < lag <= _OLDEST and known is not None and abs(known) <= settings.takeover_max_age):
+            # In time, or the clocks agree and it is the sample that is late.
             return
         raise RefusedError(
             Code.CLOCKS_DIFFER,
@@ -151,7 +160,8 @@ class Takeover:
             f'expected at most {settings.takeover_max_age / NANOSECONDS:g} s (takeover_max_age). '
             + ('One side has simulated time, or time since a start: set use_sim_time alike'
                if abs(lag) > _ANOTHER_CLOCK else
-               'The clocks differ: set those of planner, plant and sensor by one source'))
+               'The clocks differ, or samples are that late: set the clocks of planner, plant and '
+               'sensor by one source, or see what delays samples'))
 
     def _check_ahead(self, name: str, seen: Seen) -> None:
         """Refuse to command a device whose clock is so far ahead that all commands are late."""
