@@ -148,9 +148,9 @@ class Takeover:
         if seen.lag is None and abs(self._clock() - seen.stamp) <= _ANOTHER_CLOCK:
             return
         lag = self._clock() - seen.stamp if seen.lag is None else seen.lag
-        known = self.lag(name)
-        if abs(lag) <= settings.takeover_max_age or (
-                0 < lag <= _OLDEST and known is not None and abs(known) <= settings.takeover_max_age):
+        known, most = self.lag(name), settings.takeover_max_age
+        agrees = known is not None and abs(known) <= most
+        if abs(lag) <= most or 0 < lag <= _OLDEST and agrees:
             # In time, or the clocks agree and it is the sample that is late.
             return
         raise RefusedError(
