@@ -50,9 +50,10 @@ class Joint:
 
     def news(self, stamp, flux_density):
         found = self.group.applied('x', stamp, flux_density, TOLERANCE)
-        if found is not None:
-            self.deviations.append(found)
-            self.delay = 0 if self.once else self.delay
+        if found is None or not found.beyond(TOLERANCE):
+            return None
+        self.deviations.append(found)
+        self.delay = 0 if self.once else self.delay
         return found
 
     def wait(self, milliseconds, *, resume=True, step=MS // 4):

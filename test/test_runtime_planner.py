@@ -30,6 +30,8 @@ LEAD = 50 * MS
 HOLD = 44 * MS
 SEQUENCE = ((1.1, HOLD), (1.2, 2 * HOLD), (1.4, 3 * HOLD))
 RESIDUAL = 1e-6
+# A block that vibrates for long.
+SLENDER = replace(paper_actuator(), damping_coefficient=1e-3)
 QUIET = Settings(heartbeat_period=0, takeover_timeout=0)
 
 
@@ -229,10 +231,10 @@ def test_some_joints_only_if_allowed_and_one_by_its_own_target():
 # -- long trajectories --------------------------------------------------------------------------
 
 
-def zigzag(count, name='long', **more):
+def zigzag(count, name='long', hold=HOLD, **more):
     """Return a long request that makes its points one by one."""
     return Trajectory(
-        ('a',), (((1.1 + 0.1 * (k % 2),), (k + 1) * HOLD) for k in range(count)), count,
+        ('a',), (((1.1 + 0.1 * (k % 2),), (k + 1) * hold) for k in range(count)), count,
         name=name, **more)
 
 
@@ -306,21 +308,21 @@ def test_trajectory_beyond_the_limit_is_refused_before_a_point_is_read():
 
 
 def test_late_command_in_a_long_plan_makes_only_the_next_setpoints_anew():
-    rig = Rig()
-    rig.runtime.request(zigzag(300))
+    rig = Rig(blocks={'a': SLENDER})
+    rig.runtime.request(zigzag(300, hold=3 * HOLD))
     while rig.runtime.wake == 0:
         rig.tick()
     before = rig.planner.plan
-    rig.run(before.segments[1].since + MS)
+    rig.run(before.segments[2].since + MS)
     rig.hold_back = True
     rig.run(before.segments[3].since + 9 * MS)
     rig.hold_back = False
-    rig.run(before.segments[7].since)
+    rig.run(before.segments[5].since)
     after = rig.planner.plan
     assert rig.status.replanned >= 1
     assert len(after.segments) == 300
-    assert all(x is y for x, y in zip(after.segments[6:], before.segments[6:], strict=True))
-    assert rig.residual(after.segments[6].stretch) < 0.1 * RESIDUAL
+    assert all(x is y for x, y in zip(after.segments[5:], before.segments[5:], strict=True))
+    assert rig.residual(after.segments[4].stretch) < 0.1 * RESIDUAL
     state = rig.planner.state(rig.now)
     assert state.stretch == pytest.approx(rig.plant.stretch, abs=1e-7)
 
@@ -461,13 +463,13 @@ def test_impossible_sample_is_ignored_with_a_note():
 
 
 def test_late_command_is_noticed_and_the_rest_planned_anew():
-    rig = Rig()
-    rig.runtime.request(trajectory(*SEQUENCE, name='x'))
+    rig = Rig(blocks={'a': SLENDER})
+    rig.runtime.request(trajectory(*((x, 4 * t) for x, t in SEQUENCE), name='x'))
     rig.run(START + 20 * MS)
     rig.hold_back = True
-    rig.run(START + LEAD + HOLD + 9 * MS)
+    rig.run(START + LEAD + 4 * HOLD + 9 * MS)
     rig.hold_back = False
-    rig.run(START + LEAD + 4 * HOLD)
+    rig.run(START + LEAD + 13 * HOLD)
     status = rig.status
     assert (status.verdict.code, status.verdict.request) == ('replanned', 'x')
     assert status.verdict.severity is Severity.WARN
@@ -477,8 +479,7 @@ def test_late_command_is_noticed_and_the_rest_planned_anew():
 
 
 def test_commands_that_come_late_together_change_nothing_and_are_found_out():
-    slender = replace(paper_actuator(), damping_coefficient=1e-3)
-    rig = Rig(blocks={'a': slender})
+    rig = Rig(blocks={'a': SLENDER})
     rig.runtime.request(trajectory((1.2, HOLD)))
     rig.run(START + 3 * MS)
     rig.hold_back = True
@@ -506,11 +507,10 @@ def test_lead_time_too_short_is_told_and_not_planned_for_again_and_again():
     rig.transport = 5 * MS
     rig.runtime.request(trajectory((1.2, HOLD)))
     rig.run(START + 120 * MS, step=MS // 2)
-    verdict = rig.status.verdict
-    assert (verdict.code, verdict.severity) == ('late', Severity.WARN)
-    assert 'raise lead_time to more than 0.00' in verdict.message
-    assert verdict.figures['largest_lateness'] > 1e-3
-    assert 1 <= rig.status.replanned <= 3
+    severity, message, _ = rig.runtime.report()
+    assert severity is Severity.WARN
+    assert 'raise lead_time to more than 0.00' in message
+    assert rig.status.replanned <= 3
     assert len(rig.sent) < 20
 
 
@@ -529,7 +529,7 @@ def test_slow_driver_and_slow_transport_are_told_apart(transport, driver, advice
     assert severity is Severity.WARN
     assert counts['late'] >= 12
     assert advice in message
-    assert ('lateness_tolerance' in message) is bool(driver)
+    assert 'lateness_tolerance' not in message
 
 
 def test_driver_that_rounds_to_its_own_steps_is_early_and_not_foreign():
@@ -539,8 +539,9 @@ def test_driver_that_rounds_to_its_own_steps_is_early_and_not_foreign():
     rig.run(START + LEAD + 4 * HOLD)
     assert not any('not commanded' in x for x in rig.notes())
     said = rig.status.verdict.message
-    assert 'commands are repeatedly applied early, by up to 0.040 ms, and leave' in said
-    assert 'lateness_tolerance' in said
+    assert said == 'accepted'
+    assert rig.status.replanned == 0
+    assert rig.residual(1.4) < 0.2 * RESIDUAL
 
 
 def test_jump_ahead_while_a_plan_runs_is_planned_anew():

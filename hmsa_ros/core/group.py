@@ -42,6 +42,7 @@ class Resumption:
 
     draft: Draft | None
     refusal: str = ''
+    left: float = 0.0  #: vibration that the plan leaves that stays, as a share of the step
 
 
 class PlannerGroup:
@@ -115,14 +116,11 @@ class PlannerGroup:
     def applied(
             self, name: str, stamp: int, flux_density: float,
             tolerance: int) -> Deviation | None:
-        """Take in a joint's change of level; return the deviation that calls for a new plan."""
+        """Take in a joint's change of level as `RunningPlan.applied` does."""
         found = self.planners[name].applied(stamp, flux_density, tolerance)
-        if found is None:
-            return None
-        if found.foreign or found.lost or abs(found.late) > tolerance:
-            return found
-        self._attempts[name] = 0
-        return None
+        if found is not None and not found.beyond(tolerance):
+            self._attempts[name] = 0
+        return found
 
     def _each(
             self, names: Iterable[str],

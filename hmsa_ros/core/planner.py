@@ -176,13 +176,19 @@ class Planner(RunningPlan):
         return replace(draft, segments=(anew,), resumed=place)
 
     def _outset(self, begin: int) -> Outset:
-        state = self.state(begin)
-        believed = self.believed(begin)
+        state = self._delayed(begin)
+        believed = self.believed(begin + self.delay)
         if believed is not None:
             state = replace(
                 state, stretch=believed[0], rate=believed[1] * self.model.units.time,
                 followed=believed[2] or state.followed)
         return Outset(self.plan, self.model, begin, state, self._history.stale)
+
+    def as_sent(self, time: int) -> bool:
+        """Whether levels are in force at a time in ns that are to be as somebody sent them."""
+        found = self.segment(time)
+        return found is not None and found[1].code is Code.LEVELS and (
+            found[1].arrival is None or time < found[1].arrival)
 
     def soonest(self, now: int) -> int:
         """Return the first time that a command can still reach in time."""

@@ -10,7 +10,7 @@ import math
 
 from hmsa_ros.core.drafting import on_grid
 from hmsa_ros.core.history import Deviation, History
-from hmsa_ros.core.model import equilibrium_stretch
+from hmsa_ros.core.model import elastic_stiffness, equilibrium_stretch
 from hmsa_ros.core.moves import State
 from hmsa_ros.core.simulation import check_stretch
 from hmsa_ros.core.timeline import ALWAYS, Draft, Model, Plan, PlannedLevel, PlannedSegment
@@ -21,6 +21,8 @@ from hmsa_ros.errors import BadInputError
 _SAMPLED_AT_REST = 1e-4
 # How far the model may be off a sample at rest to be believed nevertheless.
 _AGREES = 1e-3
+# Amplitude of stretch up to which drafts hold that were begun before news came.
+_LITTLE = 1e-4
 # Levels that are kept for news of when they took effect.
 _REMEMBERED = 32
 
@@ -36,6 +38,9 @@ class RunningPlan:
         """Start at rest."""
         check_stretch(stretch, model.material, 'initial stretch')
         self.model = model
+        #: How late, in ns, levels to come are expected to take effect, all of them.
+        self.delay = 0
+        self._strayed = 0.0
         self._initial = stretch
         self.plan = Plan(0, (), ())
         self._history = History(())
@@ -178,9 +183,46 @@ class RunningPlan:
         """Take in a change of level as `History.with_news` does; None if it is no news."""
         history, deviation = self._history.with_news(stamp, flux_density, tolerance)
         self._remember(history)
-        self.revision += bool(
-            deviation and (deviation.foreign or deviation.lost or abs(deviation.late) > tolerance))
+        if deviation is not None:
+            deviation = replace(deviation, effect=self._effect(deviation, tolerance))
+            self._strayed += deviation.effect
+            if self._strayed > _LITTLE:
+                self._strayed = 0.0
+                self.revision += 1
         return deviation
+
+    def _effect(self, deviation: Deviation, tolerance: int) -> float:
+        """Return how far off the plan news leave the actuator, as a stretch."""
+        punctual = replace(deviation, late=deviation.late - self.delay)
+        if not punctual.beyond(tolerance):
+            return 0.0
+        return math.inf if replace(punctual, late=0).beyond(0) else self.vibration(
+            punctual.late, deviation.change)
+
+    def vibration(self, late: int, change: float) -> float:
+        """Return the amplitude of stretch that a change in T leaves which is so many ns late."""
+        # It has had as much less momentum: omega times the delay, of the change of its rest.
+        level = self._history.levels[self._history.known]
+        model = level.model
+        stretch = equilibrium_stretch(level.flux_density / model.units.load, model.material)
+        stiffness = elastic_stiffness(stretch, model.material)
+        return float(
+            abs(model.time(late) * change / model.units.load / stiffness)
+            * model.frequency(float(stretch)))
+
+    @property
+    def awaiting(self) -> bool:
+        """Whether there is no news yet of levels that have been handed out."""
+        return self._history.sent > self._history.known + 1
+
+    def unknown(self, now: int) -> tuple[PlannedLevel, tuple[PlannedLevel, ...]]:
+        """Return what is in force at a time in ns, as far as there is news, and what follows."""
+        history = self._history
+        known, rest = history.levels[history.known], history.levels[history.known + 1:]
+        time = min(now, rest[0].stamp) if self.awaiting else now
+        if time > known.stamp:
+            known = PlannedLevel.of(time, known.flux_density, known.at(time), known.model)
+        return known, rest
 
     def _remember(self, history: History) -> None:
         if history.levels is not self._history.levels:
@@ -192,6 +234,17 @@ class RunningPlan:
         self._remember(self._history.predicted(self.plan.place(time) + 1))
         level = self.plan.level(time)
         return self.model.taken_from(level.at(time), level.model)
+
+    def _delayed(self, time: int) -> State:
+        """Predict the state `delay` after a time in ns, with levels to come as late as that."""
+        state, rest = self.unknown(ALWAYS)
+        late = [x for x in rest[:_REMEMBERED + 1] if x.stamp <= time]
+        if not self.delay or len(late) > _REMEMBERED:
+            return self.state(time)
+        for level in late:
+            state = replace(
+                level, stamp=max(level.due + self.delay, state.stamp)).after(state)
+        return self.model.taken_from(state.at(time + self.delay), state.model)
 
     def segment(self, now: int) -> tuple[int, PlannedSegment] | None:
         """Return place and record of the setpoint under way, None before the first begins."""

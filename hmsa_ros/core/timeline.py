@@ -138,6 +138,13 @@ class PlannedLevel:
     amplifier: float | None = None  #: its output in T; None where the field does not lag behind it
     #: By Maxwell branches, in units of G; empty where they have relaxed.
     followed: tuple[float, ...] = ()
+    #: Stamp in ns with which it was sent, where what was sent before it has come later.
+    sent_for: int | None = None
+
+    @property
+    def due(self) -> int:
+        """Stamp in ns with which it is sent."""
+        return self.stamp if self.sent_for is None else self.sent_for
 
     def at(self, time: int) -> State:
         """Predict the nondimensional state at a time in ns; before the stamp, as at the stamp."""
@@ -193,7 +200,7 @@ class PlannedLevel:
     def after(self, level: 'PlannedLevel') -> 'PlannedLevel':
         """Return this level with what is predicted at its stamp if another one precedes it."""
         found = self.of(self.stamp, self.flux_density, level.at(self.stamp), level.model)
-        return replace(found, model=self.model)
+        return replace(found, model=self.model, sent_for=self.sent_for)
 
 
 @dataclass(frozen=True, slots=True)

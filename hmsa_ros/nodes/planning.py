@@ -121,12 +121,13 @@ SPECS = (
         0.0, 1e3, read_only=False),
     ParameterSpec(
         'replan_late', _SETTINGS.replan_late,
-        'Whether to replan the rest of a sequence after a late command.',
+        'Whether to replan the rest of a sequence after a late command, where that leaves less '
+        'vibration.',
         read_only=False),
     ParameterSpec(
         'lateness_tolerance', _SETTINGS.lateness_tolerance / NANOSECONDS,
-        'How late a command may take effect without replanning. The default exceeds the jitter '
-        'of a good driver.', 's',
+        'Lateness of a command that never counts; more counts by the vibration that it leaves.',
+        's',
         0.0, 1.0, read_only=False),
     ParameterSpec(
         'arrival_tolerance', _SETTINGS.tolerances.arrival,

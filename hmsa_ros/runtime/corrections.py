@@ -66,7 +66,7 @@ class Corrections:
     def due(self, now: int) -> Iterator[Work]:
         """Yield what may be worth correcting by a time in ns; the results are for `take`."""
         for name, planner in self._feedback.news():
-            if not planner.plan.segments or _as_sent(planner, now):
+            if not planner.plan.segments or planner.as_sent(planner.soonest(now)):
                 continue
             estimate = self._feedback.state(name, planner.soonest(now))
             if estimate is None:
@@ -125,15 +125,6 @@ class Corrections:
             return Verdict(
                 Severity.OK, 'corrected', f'corrected from samples: {words}', request)
         return None
-
-
-def _as_sent(planner: Planner, now: int) -> bool:
-    """Whether levels are being carried out that are not to be changed."""
-    found = planner.segment(planner.soonest(now))
-    if found is None:
-        return False
-    _, segment = found
-    return segment.code is Code.LEVELS and (segment.arrival is None or now < segment.arrival)
 
 
 def _drafted(draft: Draft) -> Course:

@@ -104,6 +104,9 @@ class PlannerRuntime:
             return self.planning.refuse(error, request)
         self._begin_anew()
         self._check(request)
+        if not isinstance(request, Stop):
+            self.following.asked(
+                request.joints if isinstance(request, Trajectory) else [request.joint])
         work = self.planning.add(request, engaged=self._takeover.engaged)
         self._engage(begin=True)
         sure = self._work_on()
@@ -138,6 +141,7 @@ class PlannerRuntime:
 
         A device that was cut off refuses commands of before.
         """
+        self.following.seen(time)
         self.hearing.receipts.received(
             joint, time, command, self._clock(), comparable=not self.one_clock())
         self.cut_off(joint, in_force=cut_off)
@@ -155,7 +159,7 @@ class PlannerRuntime:
         """Take in that a joint's level in T has really been in force from a stamp in ns on."""
         if self._takeover.engaged:
             self._bulletin.outputs += self.following.applied(
-                joint, stamp, flux_density, self.settings)
+                joint, stamp, flux_density, self.settings, self._clock())
         else:
             self.following.newest[joint] = stamp, flux_density
 
@@ -243,6 +247,7 @@ class PlannerRuntime:
 
     def looks_at(self, stamp: int) -> bool:
         """Return whether a sample with a stamp in ns is of use; most are not."""
+        self.following.seen(stamp)
         return (self._takeover.waiting or self._watch.wants(stamp)
                 or self.feedback.looks_at(stamp))
 
@@ -261,7 +266,7 @@ class PlannerRuntime:
             self.feedback.wake]
         if self.settings.heartbeat_period:
             times.append(self.sending.next_beat)
-        if self.following.astray:
+        if self.following.astray or self.following.verdicts:
             times.append(0)
         if self.hearing.receipts:
             times.append(now + LOOK)
@@ -376,7 +381,7 @@ class PlannerRuntime:
         late, severity, message = self.following.lateness, Severity.OK, 'commands sent in time'
         offset, limit = self.hearing.offset, self.hearing.limit()
         if late.count:
-            severity = Severity.WARN
+            severity = Severity.WARN if late.harms or self.following.clocks() else Severity.OK
             message = f'{late.count} commands late: {self.following.advice}'
         elif offset is not None and offset.beyond(limit):
             severity, message = Severity.WARN, offset.words

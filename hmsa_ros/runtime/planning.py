@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 from hmsa_ros.core.group import PlannerGroup
 from hmsa_ros.core.status import Code, RefusedError
@@ -88,10 +89,9 @@ class Planning:
             work = self._queue[0]
             if self.advance(work) and work in self._queue:
                 self._queue.remove(work)
-        if self._following.given_up:
-            self._bulletin.give(
-                self._following.give_up(self._bulletin.verdict.request),
-                log=self._following.tell_replanned())
+        while self._following.verdicts:
+            self._bulletin.give(replace(
+                self._following.verdicts.pop(0), request=self._bulletin.verdict.request))
 
     def advance(self, work: Work) -> bool:
         """Go on with one piece of work; say whether it is done."""
@@ -127,7 +127,7 @@ class Planning:
 
     def _answer(self, request: Request, drafts: Mapping[str, Draft], now: int) -> None:
         """Begin to carry out a request."""
-        self._following.astray -= drafts.keys()
+        self._following.dropped(drafts)
         if not isinstance(request, Stop):
             drafts = self._corrections.cautious(drafts)
         changed = self._group.take(drafts, now)

@@ -1,0 +1,256 @@
+"""What late, rounded and saturated levels cost, and what the planner does about it."""
+
+from dataclasses import replace
+import math
+import random
+
+from core_oracle import follow
+import numpy as np
+import pytest
+
+from hmsa_ros.core.group import PlannerGroup
+from hmsa_ros.core.parameters import paper_actuator
+from hmsa_ros.core.planner import Options, Planner
+from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.runtime.records import Note, Send, Settings, Severity, StatusChanged, Trajectory
+
+MS = 1_000_000
+START = 1000 * MS
+LIMIT = 0.5
+QUIET = Settings(heartbeat_period=0, takeover_timeout=0)
+# A move that begins from rest, two more, and times to come to rest in, in units of time.
+TARGETS, SPAN = (1.2, 1.4, 1.1, 1.3), 8.0
+
+
+class Bench:
+    """A runtime before a coil that writes late; SciPy says what the actuator does."""
+
+    def __init__(self, unit, lead, settings=QUIET, write=lambda number, level: (0, level)):
+        paper = paper_actuator()
+        slow = unit / paper.time_unit
+        self.block = replace(
+            paper, density=paper.density * slow ** 2, damping_coefficient=1e-3 * slow)
+        self.span = round(SPAN * unit * 1e9)
+        self.now, self.lead, self.write = START, lead, write
+        self.group = PlannerGroup({'a': Planner(self.block, Options(
+            flux_density_min=-LIMIT, flux_density_max=LIMIT, lead_time=lead))})
+        self.runtime = PlannerRuntime(
+            self.group, settings, clock=lambda: self.now, steady=lambda: 0)
+        self.runtime.active = True
+        self.ahead, self.applied, self.outputs, self.sent = [], [(0, 0.0)], [], []
+        self.number = 0
+        # How late news come.
+        self.lag = 0
+        self.news = []
+
+    def go(self, targets=TARGETS, raw=False, spans=None):
+        points = spans or [(x, (i + 1) * self.span) for i, x in enumerate(targets)]
+        self.begin = self.now + self.lead
+        return self.runtime.request(Trajectory(
+            ('a',), [((x,), t) for x, t in points], len(points), raw=raw))
+
+    def run(self, span):
+        end = self.now + span
+        while self.now < end:
+            new = self.runtime.tick(self.now)
+            self.outputs += new
+            for x in new:
+                if isinstance(x, Send):
+                    self._take(x)
+            due = [x.stamp for x in self.ahead] + [x[0] for x in self.news]
+            wake = self.group.next_command()
+            self.now = min([end, self.now + self.span // 40] + [
+                x for x in (*due, *([wake] if wake is not None else [])) if x > self.now])
+            while self.ahead and self.ahead[0].stamp <= self.now:
+                x = self.ahead.pop(0)
+                if x.flux_density != self.applied[-1][1]:
+                    self.applied.append((x.stamp, x.flux_density))
+                    self.news.append((x.stamp + self.lag, self.applied[-1]))
+            while self.news and self.news[0][0] <= self.now:
+                self.runtime.applied('a', *self.news.pop(0)[1])
+
+    def _take(self, command):
+        late, level = 0, command.flux_density
+        if not self.sent or level != self.sent[-1].flux_density:
+            late, level = self.write(self.number, level)
+            self.number += 1
+        self.sent.append(command)
+        last = self.ahead[-1].stamp if self.ahead else self.applied[-1][0]
+        self.ahead.append(replace(
+            command, stamp=max(command.stamp + late, self.now, last), flux_density=level))
+
+    def left(self, target, step, at=None):
+        """Return residual vibration and distance from a target, peak to peak, in % of a step."""
+        group, at = self.block.nondimensional, self.now if at is None else at
+        unit, load = self.block.time_unit, self.block.flux_density_unit
+        stamps = [START, *(max(x, START) for x, _ in self.applied if x < at), at]
+        pieces = [((b - a) / 1e9 / unit, level / load) for a, b, (_, level) in zip(
+            stamps, stamps[1:], [(0, 0.0), *self.applied], strict=False)]
+        stretch, rate = follow(
+            (1.0, 0.0), pieces, group.zeta, group.j_lim, group.c1, tolerance=1e-9)
+        frequency = self.group.planners['a'].model.frequency(target)
+        return 200.0 * math.hypot(stretch - target, rate / frequency) / step
+
+    def mean(self, targets=TARGETS):
+        starts = (1.0, *targets)
+        return float(np.mean([
+            self.left(x, abs(x - start), self.begin + (i + 1) * self.span - 1)
+            for i, (x, start) in enumerate(zip(targets, starts, strict=False))]))
+
+    @property
+    def status(self):
+        return [x for x in self.outputs if isinstance(x, StatusChanged)][-1]
+
+    def notes(self):
+        return [x.message for x in self.outputs if isinstance(x, Note)]
+
+
+def sequence(unit, lead, write, **more):
+    bench = Bench(unit, lead, write=write, **more)
+    assert bench.go().severity is Severity.OK
+    bench.run(lead + 4 * bench.span)
+    return bench
+
+
+# -- doing nothing competes ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('lead', [5 * MS, 50 * MS])
+def test_constant_delay_leaves_no_vibration_and_calls_for_no_plan(lead):
+    bench = sequence(0.0044, lead, lambda number, level: (9 * MS, level))
+    assert bench.status.replanned == 0
+    assert bench.mean() < 1e-4
+    severity, message, _ = bench.runtime.report()
+    assert (severity, 'all alike' in message) == (Severity.OK, True)
+
+
+def test_one_late_write_among_punctual_ones_is_planned_for():
+    bench = sequence(
+        0.044, 50 * MS, lambda number, level: (30 * MS if number == 2 else 0, level))
+    assert bench.status.replanned >= 1
+    assert bench.left(1.3, 0.2) < 0.1
+
+
+def _delays(kind, lead, seed):
+    chance = random.Random(seed)
+    if kind == 'constant':
+        late = round(chance.uniform(0, 20) * MS)
+        return lambda number, level: (late, level)
+    if kind == 'burst':
+        first, late = chance.randrange(1, 6), round(chance.uniform(1, 20) * MS)
+        return lambda number, level: (late if number in (first, first + 1) else 0, level)
+    if kind == 'lost':
+        # The level that was in force goes on.
+        first, levels = chance.randrange(1, 6), [0.0]
+
+        def write(number, level):
+            levels.append(level)
+            return (0, levels[-2] if number == first else level)
+        return write
+    largest = float(kind)
+    return lambda number, level: (round(chance.uniform(0, largest) * MS), level)
+
+
+def _policies(kind, unit, lead, count, monkeypatch):
+    """Return what is left, in % of the step, by doing nothing, deciding, and always replanning."""
+    left = {}
+    for policy in ('nothing', 'decide', 'always'):
+        with monkeypatch.context() as patch:
+            if policy == 'always':
+                patch.setattr(
+                    'hmsa_ros.runtime.following.compared', lambda *_: (math.inf, 0.0))
+                patch.setattr('hmsa_ros.runtime.following.expected', lambda *_: math.inf)
+                patch.setattr('hmsa_ros.runtime.lateness.Lateness.known', True)
+                patch.setattr('hmsa_ros.runtime.lateness.Lateness.expected', 0)
+            settings = replace(QUIET, replan_late=policy != 'nothing')
+            left[policy] = float(np.mean([
+                sequence(unit, lead, _delays(kind, lead, seed), settings=settings).mean()
+                for seed in range(count)]))
+    return left
+
+
+def test_jitter_is_not_made_worse(monkeypatch):
+    left = _policies('5', 0.0044, 50 * MS, 3, monkeypatch)
+    assert left['decide'] <= left['nothing'] + 0.5
+    assert left['decide'] < left['always']
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('unit', [0.0044, 0.044, 0.2])
+@pytest.mark.parametrize('kind', ['constant', '0.05', '0.4', '5', 'burst', 'lost'])
+def test_deciding_is_as_good_as_doing_nothing_at_least(kind, unit, monkeypatch):
+    left = [_policies(kind, unit, x * MS, 10, monkeypatch) for x in (5, 50)]
+    for x in left:
+        print(kind, unit, {key: round(value, 2) for key, value in x.items()})
+        assert x['decide'] <= x['nothing'] + 0.5
+
+
+# -- lateness by its cost -----------------------------------------------------------------------
+
+
+def test_levels_of_an_excitation_are_sent_as_requested_however_late_they_are():
+    chance = random.Random(1)
+    bench = Bench(0.044, 50 * MS, write=lambda number, level: (
+        round(chance.uniform(0.1, 0.4) * MS), level))
+    levels = [(0.02 + 0.01 * (i % 3), i * 60 * MS) for i in range(42)]
+    assert bench.go(raw=True, spans=levels).severity is Severity.OK
+    bench.run(bench.span + 42 * 60 * MS)
+    # A shaped move takes the place of the last one.
+    assert [x.flux_density for x in bench.sent[:41]] == [x for x, _ in levels[:41]]
+    assert bench.status.replanned == 0
+    assert 'of the step of residual vibration' in bench.runtime.report()[1]
+    assert bench.runtime.report()[2]['late'] >= 42
+
+
+# -- saturation and rounding --------------------------------------------------------------------
+
+
+def test_amplifier_that_saturates_is_named_and_never_asked_for_more():
+    most = 0.05
+    bench = Bench(0.044, 50 * MS, write=lambda number, level: (0, min(level, most)))
+    bench.go((1.2, 1.3))
+    bench.run(bench.lead + 3 * bench.span)
+    first = max(x.flux_density for x in bench.sent)
+    saturated = [x.verdict for x in bench.outputs if isinstance(x, StatusChanged)
+                 and x.verdict.code == 'saturated']
+    assert saturated
+    for text in ('0.05 T took effect', f'{first:.4g} T was commanded', 'flux_density_max'):
+        assert text in saturated[0].message
+    known = next(i for i, x in enumerate(bench.sent) if x.flux_density > most)
+    later = [x.flux_density for x in bench.sent[known + 2:]]
+    assert later
+    assert max(later) <= most
+    # A shaped end as near as it gets, and what is reachable is reached exactly.
+    bench.go((1.1,))
+    bench.run(bench.lead + bench.span)
+    assert bench.left(1.1, 0.1) < 1e-3
+    assert bench.group.planners['a'].options.flux_density_max == LIMIT
+
+
+def test_levels_that_hardware_rounds_are_the_commanded_ones():
+    step = 2.0 * LIMIT / 2 ** 16
+    bench = sequence(
+        0.044, 50 * MS, lambda number, level: (0, round(level / step) * step))
+    assert not bench.notes()
+    assert bench.status.replanned == 0
+    assert bench.runtime.report()[2]['late'] == 0
+    predicted = bench.group.planners['a'].state(bench.now)
+    assert predicted.load * bench.block.flux_density_unit == bench.applied[-1][1]
+
+
+# -- a plant that lags --------------------------------------------------------------------------
+
+
+def test_reports_that_come_late_are_no_loss():
+    bench = Bench(0.044, 50 * MS, Settings(takeover_timeout=0))
+    bench.lag = 2000 * MS
+    bench.go()
+    bench.run(bench.lead + 4 * bench.span)
+    bench.run(4000 * MS)
+    # The next levels end at the one that is in force.
+    bench.go((1.1, 1.3))
+    bench.run(bench.lead + 2 * bench.span + 4000 * MS)
+    assert bench.status.replanned == 0
+    assert len({(x.stamp, x.flux_density) for x in bench.sent if x.stamp in {
+        y for y, _ in bench.applied}}) == 12
+    assert bench.left(1.3, 0.2) < 1e-3
