@@ -17,7 +17,7 @@ from scipy.special import stdtrit
 from hmsa_ros.core.model import Array
 
 #: Fewer samples, or fewer periods of the vibration, say nothing about it.
-FEWEST, SHORTEST = 8, 1.5
+FEWEST, SHORTEST = 8, 1.4
 # How often the truth may be beyond a bound.
 _BEYOND = 0.005
 # Samples nearer together than this share of a period show the vibration as it is; with others it
@@ -27,7 +27,7 @@ _NEAR, _MIDDLE, _WIDE = (0.75, 1.3), (0.6, 1.6), (0.3, 2.5)
 # Periods from which on a frequency far from the model's is told from a drift, and a drift at all.
 _FAR, _DRIFTS = 3.0, 3.0
 # Frequencies tried in the time of one period over the span, and around the best one.
-_TRIED, _REFINED, _ROUNDS = 3, 7, 2
+_TRIED, _REFINED, _ROUNDS = 3, 7, 3
 # Decays tried, as shares of the largest, which is this many times the model's, as a ratio to the
 # frequency between these.
 _DECAYS = np.array([0.0, 0.07, 0.15, 0.27, 0.4, 0.6, 1.0])
@@ -37,6 +37,8 @@ _FITTED = 6
 # Phases at which a vibration is looked at, and how many possible ones.
 _PHASES = np.linspace(0.0, 2.0 * math.pi, 32)
 _MOST_POSSIBLE = 200
+# Largest correlation of neighbours that counts.
+_MOST_ALIKE = 0.98
 
 
 @dataclass(frozen=True)
@@ -234,10 +236,16 @@ def _together(left: Array) -> float:
     size = float(left @ left)
     if size <= 0.0:
         return 1.0
-    total = 1.0
+    total, count = 1.0, len(left)
+    next_one = float(left[1:] @ left[:-1]) / size
+    if next_one > 2.0 / math.sqrt(count):
+        # What was fitted has taken part of it away.
+        next_one = min(next_one + (1.0 + _FITTED * next_one) / count, _MOST_ALIKE)
+        total = (1.0 + next_one) / (1.0 - next_one)
+    summed = 1.0
     for lag in range(1, len(left) // 4 + 1):
         share = float(left[lag:] @ left[:-lag]) / size
         if share <= 0.0:
             break
-        total += 2.0 * share
-    return total
+        summed += 2.0 * share
+    return max(total, summed)

@@ -35,6 +35,8 @@ _KEPT = 40
 # Whatever stays nearer to the target than this share of a tolerance, as a root mean square, is
 # within it.
 _QUIET = 0.3
+# How much wider than for an arrival the bounds are for a miss.
+_SURER = 1.5
 # Changes from sample to sample of so small a share of the step are those of a motion that fades.
 _FADED = 1e-9
 # Fewer changes do not show whether a sensor rounds.
@@ -236,8 +238,10 @@ def _decided(
         sensor: Sensor, *, later: bool) -> Finding:
     offset, vibration = _widened(found.offset, sensor.std(setpoint.target)), found.vibration
     allowed, swing = tolerances.of(setpoint)
-    off = offset.low > allowed or offset.high < -allowed
-    vibrates = vibration.low > swing
+    # One of several looks is enough for a miss, so that each has to be surer.
+    off = offset.value - _SURER * (offset.value - offset.low) > allowed or (
+        offset.value + _SURER * (offset.high - offset.value) < -allowed)
+    vibrates = vibration.value - _SURER * (vibration.value - vibration.low) > swing
     # What has come to rest is taken to do so until it is seen to vibrate.
     within = max(-offset.low, offset.high) <= allowed and (later or vibration.high <= swing)
     code = (Code.OFF_TARGET if off else Code.VIBRATING if vibrates
