@@ -11,7 +11,7 @@ from std_msgs.msg import Float64, UInt8MultiArray
 from hmsa_ros.nodes.outlet import Outlet
 
 _LARGE = 30_000_000
-_TIMES = 10
+_TIMES = 50
 
 
 @pytest.mark.ros
@@ -33,14 +33,16 @@ def test_what_is_published_arrives_and_other_threads_run_meanwhile(ros):
             next(ticks)
 
     Thread(target=run).start()
-    ran = 0
-    for _ in range(_TIMES):
+    ran = tried = 0
+    # On a busy machine the other thread may have no core at times.
+    while ran < 3 and tried < _TIMES:
         before = next(ticks)
         large.publish(message)
         # More than a switch of threads before or after the call.
         ran += next(ticks) - before > 5
+        tried += 1
     ended.set()
-    assert ran > _TIMES // 2
+    assert ran == 3
 
 
 @pytest.mark.ros
