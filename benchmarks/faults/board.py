@@ -15,8 +15,8 @@ class Board:
     """
     A thread on a pseudo-terminal that answers lines.
 
-    ``L level`` sets a level in T, which ``K level boots`` answers; ``R`` asks for ``S stretch rate
-    boots``. Stretch is 1 + level here.
+    ``L level boots`` sets a level in T, unless it is for another boot (0 for any), which ``K level
+    boots`` answers; ``R`` asks for ``S stretch rate boots``. Stretch is 1 + level here.
 
     Parameters
     ----------
@@ -118,9 +118,11 @@ class Board:
             select.select([], [], [], _POLL)
 
     def _obey(self, line: str) -> str:
-        word, _, level = line.partition(' ')
+        word, *values = line.split()
         if word != 'L':
             return f'S {1.0 + self.level!r} 0.0 {self._boots}'
-        self._fed = monotonic()
-        self._set(max(-self.largest, min(float(level), self.largest)))
+        level, boots = values
+        if boots in ('0', str(self._boots)):
+            self._fed = monotonic()
+            self._set(max(-self.largest, min(float(level), self.largest)))
         return f'K {self.level!r} {self._boots}'

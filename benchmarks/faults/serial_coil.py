@@ -52,7 +52,7 @@ class SerialCoil:
 
     def write(self, level: float, now: int) -> tuple[int, float]:
         """Set a level in T; return when and what was set."""
-        (really,) = self._ask(f'L {level!r}')
+        (really,) = self._ask(f'L {level!r} {self._boots or 0}')
         return time.time_ns(), float(really)
 
     def read(self, now: int) -> tuple[float, float]:
