@@ -97,6 +97,7 @@ class Bench:
         self.random = np.random.default_rng(seed)
         self.sense: Callable = lambda time, stretch: [(time, stretch)]
         self.report = report
+        self.effort: Callable = lambda: math.nan  # field in T that the device shows
         self.wire = []
         self.estimates, self.sent, self.reported = [], [], []
         self.runtime = PlannerRuntime(
@@ -141,7 +142,7 @@ class Bench:
             while self.wire and self.wire[0][0] <= self.now:
                 _, stamp, value = self.wire.pop(0)
                 if self.runtime.looks_at(stamp):
-                    self.runtime.observed('a', stamp, value, math.nan, math.nan)
+                    self.runtime.observed('a', stamp, value, math.nan, self.effort())
         return np.array(seen)
 
     def move(self, target, hold):

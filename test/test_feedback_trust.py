@@ -177,3 +177,38 @@ def test_an_update_costs_no_more_whatever_timestamps_come(seed, monkeypatch):
         most = max(most, len(work))
     # Six passes of four halvings at most for each of the updates, which come every 20 ms.
     assert most < 25 * (200 / 20 + 5) * 3
+
+
+# -- the field -----------------------------------------------------------------------------------
+
+def field_of(it, time):
+    """Return the level that is really in force."""
+    return [x[1] for x in it.plant.levels if x[0] <= time][-1]
+
+
+@pytest.mark.parametrize('shown', [True, False])
+def test_a_saturated_amplifier_is_neither_learnt_from_nor_asked_for_more(shown):
+    # Half of what holds 1.4 flows; only effort shows it.
+    it = bench(False, plant={'limit': 0.06}, report=False)
+    it.effort = lambda: field_of(it, it.now) if shown else math.nan
+    wanted = it.planner.model.holding(1.4) * it.planner.model.units.load
+    it.move(1.4, 400 * MS)
+    asked = max(abs(x) for _, x in it.sent)
+    if not shown:
+        return
+    assert asked <= 1.01 * wanted
+    assert f'the coil has 60 mT where {1e3 * wanted:.3g} mT were commanded' in it.message
+    assert it.planner.model.actuator.shear_modulus == 1e4
+
+
+def test_nothing_is_learnt_while_the_field_is_not_reported_any_more():
+    it = bench(False, report=False)
+    off = []
+    it.effort = lambda: math.nan if off else field_of(it, it.now)
+    it.move(1.4, 300 * MS)
+    off.append(True)
+    it.plant.command(it.now, 0.0)
+    it.plant.limit = 0.0
+    it.move(1.1, 400 * MS)
+    assert 'the field is not reported any more' in it.message
+    assert it.planner.model.actuator.shear_modulus == pytest.approx(1e4, rel=2e-3)

@@ -109,6 +109,9 @@ class Corrections:
         if draft is None or estimate is None or draft.missed:
             # A correction leaves no setpoint out.
             return {}
+        if max(abs(x.flux_density) for x in draft.levels) > self._feedback.possible(name):
+            # An amplifier that is saturated follows no larger level.
+            return {}
         slew = planner.options.slew_limit
         course, gain = _course(planner.plan, draft.begin, _LITTLE if arrival else _GAIN)
         segment = draft.segments[0]

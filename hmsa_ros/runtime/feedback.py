@@ -18,6 +18,7 @@ from hmsa_ros.estimation.motion import followed
 from hmsa_ros.estimation.words import differences
 from hmsa_ros.identification.known import Known
 from hmsa_ros.judge import Sensor
+from hmsa_ros.runtime.field import Field
 from hmsa_ros.runtime.learnt import alike, differs, learnt_model, save
 from hmsa_ros.runtime.records import EstimateChanged, Output, Settings, Severity
 from hmsa_ros.runtime.slices import Clock
@@ -83,7 +84,7 @@ class Feedback:
                     Estimator(self._prior(name, model), Options(
                         slew_limit=model.options.slew_limit,
                         learn=not self._settings.feedback_frozen)),
-                    Trust(self._clock(), at_once=self._settings.feedback_cautious),
+                    Trust(self._clock(), at_once=self._settings.feedback_cautious), Field(),
                     model.actuator.rest)
                 for name, model in self._nominal.items()}
 
@@ -165,12 +166,29 @@ class Feedback:
         span = round(2.0 * _QUIET * self._nominal[name].units.time * NANOSECONDS)
         return joint.newest > last + span
 
-    def add(self, name: str, stamp: int, stretch: float) -> None:
-        """Take in a stretch measured at a stamp in ns; samples may come in any order."""
+    def add(
+            self, name: str, stamp: int, stretch: float, flux_density: float = math.nan) -> None:
+        """Take in stretch and field in T measured at a stamp in ns; samples come in any order."""
         joint = self._joints.get(name)
         if joint is None:
             return
-        joint.add(stamp, stretch, self._clock())
+        now = self._clock()
+        lost = joint.field.measured(self._group.planners[name].plan, stamp, flux_density)
+        if lost and joint.trust.why != lost and joint.trust.doubt(lost, now, at_once=True):
+            joint.estimator.restart()
+            joint.latest, joint.news = None, True
+        joint.add(stamp, math.nan if lost else stretch, now)
+
+    def applied(self, name: str, stamp: int, flux_density: float) -> None:
+        """Take in that a level in T has taken effect at a stamp in ns, before the plan does."""
+        joint = self._joints.get(name)
+        if joint is not None:
+            joint.field.applied(self._group.planners[name].plan, stamp, flux_density)
+
+    def possible(self, name: str) -> float:
+        """Return the largest level in T that a joint's coil is known to follow."""
+        joint = self._joints.get(name)
+        return math.inf if joint is None else joint.field.largest
 
     @property
     def wake(self) -> int | None:

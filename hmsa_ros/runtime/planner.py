@@ -8,6 +8,7 @@ to topics, a loop that has the coil at hand to the coil.
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+import math
 from time import monotonic_ns
 
 from hmsa_ros.core.group import PlannerGroup
@@ -157,6 +158,10 @@ class PlannerRuntime:
 
     def applied(self, joint: str, stamp: int, flux_density: float) -> None:
         """Take in that a joint's level in T has really been in force from a stamp in ns on."""
+        if not math.isfinite(flux_density):
+            # Nobody knows what is in force.
+            return
+        self.feedback.applied(joint, stamp, flux_density)
         if self._takeover.engaged:
             self._bulletin.outputs += self.following.applied(
                 joint, stamp, flux_density, self.settings, self._clock())
@@ -173,7 +178,7 @@ class PlannerRuntime:
                 None if self.one_clock() else self._clock() - stamp))
         self._watch.add(joint, stamp, stretch)
         if self.feedback.looks_at(stamp):
-            self.feedback.add(joint, stamp, stretch)
+            self.feedback.add(joint, stamp, stretch, flux_density)
 
     def clock_set_back(self, back: int) -> None:
         """

@@ -8,6 +8,7 @@ from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.estimation import Estimate, Estimator
 from hmsa_ros.estimation.motion import held
 from hmsa_ros.estimation.words import sentence
+from hmsa_ros.runtime.field import Field
 from hmsa_ros.runtime.trust import Trust
 
 # Levels before those of the samples that count: the field of a coil that lags remembers them.
@@ -24,6 +25,7 @@ class Joint:
 
     estimator: Estimator
     trust: Trust
+    field: Field
     start: float  # stretch before the setpoint under way
     latest: Estimate | None = None
     newest: int = 0  # time of the newest sample

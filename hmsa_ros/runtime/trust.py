@@ -33,11 +33,11 @@ class Trust:
         # Estimates that moves had shown to fit, and which did not after all; moves still to fit.
         self._failures, self._moves = 0, 1
 
-    def doubt(self, why: str, now: int) -> bool:
+    def doubt(self, why: str, now: int, *, at_once: bool = False) -> bool:
         """Take in that samples do not fit at a time in ns; return whether to begin anew."""
         self.why = why
         self._doubts += 1
-        if self.acts and self._doubts < _PERSISTENT:
+        if self.acts and self._doubts < _PERSISTENT and not at_once:
             return False
         self._failures += self.acts
         if self._failures > 1:
