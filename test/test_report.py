@@ -1046,6 +1046,77 @@ def test_the_command_writes_page_and_pictures_and_names_them(bag, tmp_path, caps
     assert names[2].read_bytes() == drawn
 
 
+def rounded(messages):
+    """Return messages with the commands of hardware that sets steps of 1e-4 of 20 mT."""
+    for _, topic, _, x in messages:
+        if topic.endswith('command'):
+            x.magnetic_field.z = 2e-6 * round(x.magnetic_field.z / 2e-6)
+    return messages
+
+
+@pytest.mark.parametrize('missing', [(), ('plan',), ('plan', 'status')])
+def test_levels_that_hardware_rounds_reach_the_setpoints_that_were_requested(tmp_path, missing):
+    targets = 1.1, 1.2, 1.21, 1.4, 1.2, 1.1, 1.05, 1.0
+    part = one(tmp_path / 'bag', without(
+        rounded(simulated([(x, 40.0) for x in targets], period=500_000)), *missing),
+        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    found = part.evaluation.findings
+    assert [(x.setpoint.number, x.setpoint.target, x.verdict) for x in found] == [
+        (i, x, 'arrived') for i, x in enumerate(targets, 1)]
+    assert [x.stretch for x in part.evaluation.results] == list(targets)
+
+
+def test_noise_is_no_vibration_and_an_offset_is_named(tmp_path):
+    sequence = (1.3, 100.0), (1.05, 100.0)
+    for plant, verdict in (ACTUATOR, 'arrived'), (
+            replace(ACTUATOR, shear_modulus=1.1 * ACTUATOR.shear_modulus), 'off_target'):
+        part = one(tmp_path / verdict, simulated(
+            sequence, plant=plant, noise=1e-3, period=200_000),
+            **parameters(planner=ACTUATOR, plant=plant))
+        found = part.evaluation.findings
+        assert found[0].verdict == verdict
+        assert all(x.arrived if plant == ACTUATOR else x.failed for x in found)
+    report = Page(page([part]))
+    row = report.table('setpoint-table')[0]
+    assert row['verdict'][1] == 'off target'
+    assert float(row['offset [%]'][0]) == found[0].setpoint.percent(found[0].offset)
+    assert found[0].message in report.words
+    assert 'off target, residual' in ' '.join(report.words)
+
+
+def test_a_setpoint_that_a_new_plan_leaves_out_is_missed(tmp_path):
+    messages = simulated(((1.1, 40.0), (1.2, 40.0), (1.3, 40.0)), period=500_000)
+    plan, = (x for _, topic, _, x in messages if topic.endswith('plan'))
+    begin = plan.header.stamp.sec * NANOSECONDS + plan.header.stamp.nanosec
+    times = [begin + x.time_from_start.sec * NANOSECONDS + x.time_from_start.nanosec
+             for x in plan.points]
+    # From the first setpoint to the third, as if there were no time for the second.
+    anew = trajectory(times[1], [(0, 1.1, 0.0, 0.01), (times[4] - times[1], 1.1, 0.0, 0.02),
+                                 (times[5] - times[1], 1.3, 0.0, 0.03)])
+    # Neither this request, which is refused, nor its time counts.
+    refused = trajectory(0, [(10**9, 9.0)])
+    part = one(tmp_path / 'bag', [
+        *messages, (times[1] + 1000, '/planner/plan', TYPES[PLAN], anew),
+        (times[1] + 2000, '/planner/status', TYPES[STATUS], status(1, 'replanned', 'anew')),
+        (times[3], '/planner/joint_trajectory', TYPES[TRAJECTORY], refused),
+        (times[3] + 1, '/planner/status', TYPES[STATUS], status(2, 'out_of_range', 'too far'))],
+        **parameters(planner=ACTUATOR, plant=ACTUATOR))
+    assert [str(x.verdict) for x in part.evaluation.findings] == ['arrived', 'missed', 'arrived']
+    assert 'missed' in [x['verdict'][1] for x in Page(page([part])).table('setpoint-table')]
+
+
+def test_the_findings_of_a_bag_are_printed_as_json(bag, tmp_path, capsys):
+    out = str(tmp_path / 'x.html')
+    assert main(['report', str(bag), '--out', out, '--json']) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result['files'] == [out]
+    run, = result['runs']
+    assert [(x['setpoint'], x['target'], x['verdict']) for x in run['setpoints']] == [
+        (1, 1.1, 'arrived'), (2, 1.2, 'arrived'), (3, 1.4, 'arrived')]
+    assert {'offset', 'offset_std', 'vibration', 'vibration_std', 'frequency', 'offset_percent',
+            'vibration_percent'} <= set(run['setpoints'][0])
+
+
 def test_the_page_is_named_after_the_bag_and_bags_of_one_name_are_told_apart(
         bag, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

@@ -1,6 +1,7 @@
 """A whole experiment with one command: what it measures, what it refuses, and how it ends."""
 
 import json
+import re
 import signal
 
 from mcap.reader import make_reader
@@ -36,11 +37,14 @@ def test_a_simulated_experiment_arrives_and_leaves_its_bag_and_a_report(start, t
     assert run.wait(RUN_SECONDS) == 0, run.output
     result = json.loads(run.stdout)
     assert result['verdict'] == 'arrived'
-    assert [x['stretch'] for x in result['setpoints']] == [1.1, 1.2, 1.0]
-    for x in result['setpoints']:
+    assert [(x['setpoint'], x['target'], x['verdict']) for x in result['setpoints']] == [
+        (1, 1.1, 'arrived'), (2, 1.2, 'arrived'), (3, 1.0, 'arrived')]
+    for x, step in zip(result['setpoints'], (0.1, 0.1, 0.2), strict=True):
         assert abs(x['offset']) < 1e-6
-        assert x['residual'] < 1e-6
-        assert x['reached'] == pytest.approx(x['stretch'], abs=1e-6)
+        assert x['offset_percent'] == pytest.approx(100.0 * x['offset'] / step)
+        assert x['vibration'] < 1e-6
+        assert x['offset_std'] < 1e-6
+        assert x['vibration_std'] < 1e-6
     assert result['exits'] == {'plant': 0, 'planner': 0, 'recorder': 0}
     assert '<html' in (out / 'report.html').read_text()
     # The bag itself is held against rosbags behind each test.
@@ -56,10 +60,21 @@ def test_a_plant_that_is_not_as_the_planner_thinks_fails_with_the_figures(start,
                      '--out', str(tmp_path / 'out'))
     assert run.wait(RUN_SECONDS) == 1, run.output
     # A block that is a tenth stiffer stays a tenth of the way short.
-    assert 'setpoint 1.1 of actuator is off target by -0.009' in run.stdout, run.output
+    assert re.search(r'setpoint 1 of 1: rests 0\.009\S* \(9\.\S* %\) short of 1\.1', run.stdout), (
+        run.output)
     again = start.hmsa('run', '1.10:0.1', '--simulate', '--out', str(tmp_path / 'out'))
     assert again.wait(RUN_SECONDS) == 2
     assert 'earlier run' in again.stderr
+
+
+@pytest.mark.slow
+def test_noise_of_the_sensor_is_no_vibration(start, tmp_path):
+    file = tmp_path / 'noisy.yaml'
+    file.write_text(MISMATCHED.replace('mismatch.shear_modulus: 1.1', 'stretch_noise: 0.001'))
+    run = start.hmsa('run', '1.3:1', '1.05:1', '1.3:1', '--simulate', '--params-file', str(file),
+                     '--out', str(tmp_path / 'out'), '--json')
+    assert run.wait(RUN_SECONDS) == 0, run.output
+    assert {x['verdict'] for x in json.loads(run.stdout)['setpoints']} == {'arrived'}
 
 
 @pytest.mark.slow
@@ -72,7 +87,7 @@ def test_a_block_arrives_and_stays_though_it_creeps(start, tmp_path, feedback):
     assert run.wait(RUN_SECONDS) == 0, run.output
     for x, step in zip(json.loads(run.stdout)['setpoints'], (0.4, 0.3), strict=True):
         # Unknown to the planner, creep leaves a fifth of the step.
-        assert x['residual'] < 1e-3 * step
+        assert x['vibration'] < 1e-3 * step
         assert abs(x['offset']) < 1e-3 * step
 
 

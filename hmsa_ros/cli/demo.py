@@ -69,12 +69,12 @@ def _print_table(result: 'DemoResult') -> None:
     moves = table(
         'b and tau nondimensional as in the paper; residual: peak-to-peak stretch after '
         'arrival, share of the step; unshaped: simulated on the same plant',
-        ('target', 'b_p', 'tau_p', 'b_1', 'arrival ms', 'residual', 'unshaped'), 'held')
+        ('target', 'b_p', 'tau_p', 'b_1', 'arrival ms', 'residual', 'unshaped'), 'verdict')
     for x in result.setpoints:
         moves.add_row(
             f'{x.stretch:g}', f'{x.b_p:.5f}', f'{x.tau_p:.5f}', f'{x.b_1:.5f}',
             f'{x.arrival * 1e3:.3f}', f'{x.residual:.1e}', f'{x.residual_unshaped:.1%}',
-            'yes' if x.reached else 'no')
+            str(x.finding['verdict']).replace('_', ' '))
     console.print(moves)
     adapted = table(
         'a larger block, simulated in this process, whose shear modulus is 20 % above that '

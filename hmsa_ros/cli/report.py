@@ -7,7 +7,7 @@ from typing import Any, TYPE_CHECKING
 from hmsa_ros.cli.options import add_options
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.files import write_text
+from hmsa_ros.files import json_text, write_text
 
 if TYPE_CHECKING:
     from hmsa_ros.runs.record import Run
@@ -30,7 +30,8 @@ def add_parser(subparsers: Any) -> None:
          'page to write; an existing file is replaced (default: NAME_report.html in this folder, '
          'NAME being the first bag)'),
         ('--png', 'FILE', Path, 'picture to write as well'),
-        ('--pdf', 'FILE', Path, 'picture to write as well, for a paper'))
+        ('--pdf', 'FILE', Path, 'picture to write as well, for a paper'),
+        ('--json', 'print what was found of each setpoint, and the files, as JSON'))
     parser.add_argument(
         '--params-file', '--params', dest='params', type=Path, metavar='YAML',
         help='parameter file (YAML) of the real actuator (default: the parameters in the bag)')
@@ -72,6 +73,13 @@ def run(arguments: argparse.Namespace) -> int:
             if path is not None:
                 from hmsa_ros.report.picture import draw
                 draw(path, parts, kind)
+    if arguments.json:
+        print(json_text({
+            'runs': [{
+                'run': x.run.label, 'bag': str(x.run.path), 'joint': x.run.joint,
+                'setpoints': [y.to_dict() for y in x.evaluation.findings]} for x in parts],
+            'files': [str(x) for x in targets]}))
+        return 0
     for target in targets:
         print(target)
     return 0

@@ -19,7 +19,8 @@ from hmsa_ros.files import json_text
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from hmsa_ros.report.outcome import Arrival, LevelResult
+    from hmsa_ros.judge import Finding, Tolerances
+    from hmsa_ros.report.outcome import LevelResult
     from hmsa_ros.session.experiment import Conducted, Experiment
 
 NOT_MEASURED = 'predicted, not measured'
@@ -49,9 +50,9 @@ def add_parser(subparsers: Any) -> None:
          'already must be set to it (default as it is; off)',
          {'choices': ('off', 'observe', 'adapt')}),
         ('--tolerance', 'X', float,
-         'offset and residual vibration of a setpoint that counts as reached, as a share of the '
-         'step, noise of the sensor apart (default 0.02); the end of --levels is judged by the '
-         "planner's arrival_tolerance and vibration_tolerance"),
+         'offset and residual vibration of a setpoint that counts as arrived, as a share of the '
+         "step (default: the planner's arrival_tolerance, vibration_tolerance and "
+         'stretch_tolerance, by which the end of --levels is judged, too)'),
         ('--report', 'write report.html as well'),
         ('--out', 'DIR', Path, 'folder for the output (default hmsa_run/ and the time of day)'),
         ('--json', 'print the result as JSON'),
@@ -64,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Carry out the experiment."""
     from rich.console import Console
 
-    tolerance = _tolerance(arguments)
+    tolerances = _tolerances(arguments)
     folder = arguments.out or Path('hmsa_run') / datetime.now().strftime('%Y-%m-%d_%H-%M-%S')
     if arguments.simulate:
         from hmsa_ros.session.processes import local_environment
@@ -81,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
             done = conduct(experiment, dict(os.environ), update)
             ENDING.check()
             update('evaluating the bag', None)
-            measured, levels = _measure(experiment, tolerance) if done.measured else ([], [])
+            findings, levels = _measure(experiment, tolerances) if done.measured else ([], [])
             report = _report(experiment.bag, folder / 'report.html') if (
                 arguments.report and done.measured) else None
     except KeyboardInterrupt:
@@ -89,30 +90,32 @@ def run(arguments: argparse.Namespace) -> int:
             f'interrupted; the bag so far: {experiment.bag}' if experiment.bag.exists()
             else 'interrupted', highlight=False, soft_wrap=True)
         return ENDING.status
-    verdict, reason = _verdict(measured, done, levels=bool(experiment.levels))
+    verdict, reason = _verdict(experiment, findings, done)
     if arguments.json:
         print(json_text({
-            'verdict': verdict, 'reason': reason, 'setpoints': [asdict(x) for x in measured],
+            'verdict': verdict, 'reason': reason, 'setpoints': [x.to_dict() for x in findings],
             **({'levels': [asdict(x) for x in levels]} if experiment.levels else {}),
             'notes': done.notes, 'exits': done.exits, 'bag': str(experiment.bag),
             'report': None if report is None else str(report)}))
     else:
-        _print(measured, levels, reason, done, experiment.bag, report)
+        _print(findings, levels, reason, done, experiment.bag, report)
     return 0 if verdict in ('arrived', NOT_MEASURED) else 1
 
 
-def _tolerance(arguments: argparse.Namespace) -> float:
-    """Return the tolerance; refuse what cannot be used."""
-    from hmsa_ros.report.outcome import TOLERANCE
+def _tolerances(arguments: argparse.Namespace) -> 'Tolerances | None':
+    """Return the tolerances, None for the planner's; refuse what cannot be used."""
+    from hmsa_ros.judge import Tolerances
 
-    if arguments.tolerance is not None and arguments.levels is not None:
+    tolerance = arguments.tolerance
+    if tolerance is None:
+        return None
+    if arguments.levels is not None:
         raise BadInputError(
             '--tolerance is given with --levels: expected setpoints with it; the end of levels is '
             "judged by the planner's arrival_tolerance and vibration_tolerance")
-    tolerance = TOLERANCE if arguments.tolerance is None else arguments.tolerance
     if not 0.0 < tolerance < math.inf:
         raise BadInputError(f'tolerance is {tolerance:g}: expected a share above 0')
-    return float(tolerance)
+    return Tolerances(tolerance, tolerance, 0.0)
 
 
 def _experiment(arguments: argparse.Namespace, folder: Path) -> 'Experiment':
@@ -133,21 +136,17 @@ def _experiment(arguments: argparse.Namespace, folder: Path) -> 'Experiment':
 
 
 def _measure(
-        experiment: 'Experiment', tolerance: float) -> 'tuple[list[Arrival], list[LevelResult]]':
-    """Read the bag and measure the moves or the levels of each joint."""
-    from hmsa_ros.report.outcome import arrivals, level_results
+        experiment: 'Experiment',
+        tolerances: 'Tolerances | None') -> 'tuple[list[Finding], list[LevelResult]]':
+    """Read the bag and judge the setpoints or measure the levels of each joint."""
+    from hmsa_ros.report.outcome import findings_of, level_results
     from hmsa_ros.runs.bags import read_runs
 
-    several = len(experiment.joints) > 1
-    runs = read_runs(experiment.bag, joints=experiment.joints if several else ())
+    runs = read_runs(
+        experiment.bag, joints=experiment.joints if len(experiment.joints) > 1 else ())
     if experiment.levels:
         return [], [level for each in runs for level in level_results(each)]
-    moves = []
-    for each in runs:
-        place = experiment.joints.index(each.joint) if several else 0
-        targets = [x[place] if len(x) > 1 else x[0] for x, _ in experiment.setpoints]
-        moves += arrivals(each, targets, tolerance)
-    return moves, []
+    return [x for each in runs for x in findings_of(each, tolerances)], []
 
 
 def _report(bag: Path, path: Path) -> Path:
@@ -158,47 +157,64 @@ def _report(bag: Path, path: Path) -> Path:
     from hmsa_ros.report.timing import timing
     from hmsa_ros.runs.bags import read_runs
 
-    write_text(path, page([Part(x, evaluate(x), timing(x), '') for x in read_runs(bag)]))
+    write_text(path, page([Part(x, evaluate(x), timing(x)) for x in read_runs(bag)]))
     return path
 
 
 def _verdict(
-        measured: 'list[Arrival]', done: 'Conducted', *, levels: bool) -> tuple[str, str]:
+        experiment: 'Experiment', findings: 'list[Finding]', done: 'Conducted') -> tuple[str, str]:
     """Return the verdict on all setpoints, or on the end of levels, and why."""
-    if not done.measured:
-        return NOT_MEASURED, f'{NOT_MEASURED}: nobody publishes joint_states'
-    if levels:
+    from hmsa_ros.judge import worst
+
+    if experiment.levels or not done.measured:
+        nobody = 'nobody publishes joint_states' if not done.measured else 'the levels end at rest'
+        if done.verdict.failure:
+            return done.verdict.measured or done.verdict.code, done.verdict.failure
         return done.verdict.measured or NOT_MEASURED, (
-            done.verdict.finding or 'predicted, not measured: the levels end at rest')
-    missed = [x for x in measured if x.verdict != 'arrived']
-    if not missed:
-        return 'arrived', f'all {len(measured)} moves arrived and stayed within tolerance'
-    rest = f'; {len(missed) - 1} more of {len(measured)} failed' if len(missed) > 1 else ''
-    return missed[0].verdict, f'{missed[0].sentence()}{rest}'
+            done.verdict.finding or f'{NOT_MEASURED}: {nobody}')
+    count = len(experiment.setpoints) * len(experiment.joints)
+    found = worst(findings)
+    if found is None or len(findings) < count:
+        return 'unobserved', (
+            f'the bag shows {len(findings)} of {count} setpoints: expected all, with samples')
+    if found.arrived:
+        return 'arrived', f'all {count} moves arrived and stayed within tolerance'
+    others = sum(not x.arrived for x in findings) - 1
+    return str(found.verdict), found.message + (
+        f'; {others} more of {count} did not arrive' if others else '')
 
 
 def _print(
-        measured: 'list[Arrival]', levels: 'list[LevelResult]', reason: str, done: 'Conducted',
+        findings: 'list[Finding]', levels: 'list[LevelResult]', reason: str, done: 'Conducted',
         bag: Path, report: Path | None) -> None:
     from rich.console import Console
 
     console = Console()
     if levels:
         console.print(_level_table(levels))
-    if measured:
-        moves = table(
-            'measured after arrival: mean, its distance from the target, and vibration from peak '
-            'to peak', ('target', 'reached', 'offset', 'residual', 'arrival ms'), 'verdict')
-        for x in measured:
-            moves.add_row(
-                f'{x.joint} {x.stretch:g}' if len({y.joint for y in measured}) > 1
-                else f'{x.stretch:g}', f'{x.reached:.5f}', f'{x.offset:+.1e}',
-                f'{x.residual:.1e}', f'{x.arrival * 1e3:.3f}', x.verdict.replace('_', ' '))
-        console.print(moves)
+    if findings:
+        console.print(findings_table(findings))
     for line in (
             *(f'note     {x}' for x in done.notes), f'verdict  {reason}', f'bag      {bag}',
             *([] if report is None else [f'report   {report}'])):
         console.print(line, highlight=False, soft_wrap=True)
+
+
+def findings_table(findings: 'list[Finding]') -> 'Table':
+    """Return the table of what was found of setpoints."""
+    made = table(
+        'offset: mean stretch less the target; vibration: peak to peak; both in % of the step, '
+        'with their standard deviations',
+        ('setpoint', 'target', 'offset %', '+-', 'vibration %', '+-', 'Hz'), 'verdict')
+    for x in findings:
+        percent = x.setpoint.percent
+        made.add_row(
+            f'{x.setpoint.joint} {x.setpoint.number}'.strip(), f'{x.setpoint.target:g}', *(
+                f'{y:{form}}' if math.isfinite(y) else '-' for y, form in (
+                    (percent(x.offset), '+.3g'), (percent(x.offset_std), '.1g'),
+                    (percent(x.vibration), '.3g'), (percent(x.vibration_std), '.1g'),
+                    (x.frequency, '.3g'))), str(x.verdict).replace('_', ' '))
+    return made
 
 
 def _level_table(levels: 'list[LevelResult]') -> 'Table':

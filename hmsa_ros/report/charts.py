@@ -338,7 +338,16 @@ def results_of(parts: Sequence[Part], number: int) -> list[MoveResult]:
 def _panel_title(parts: Sequence[Part], number: int) -> str:
     results = results_of(parts, number)
     targets = ', '.join(dict.fromkeys(f'{x.stretch:.6g}' for x in results))
-    return f'{number + 1}. to {targets}: residual {residual_text(results, least=True)}'
+    return (f'{results[0].place + 1}. to {targets}: {verdicts(parts, number)}residual '
+            f'{residual_text(results, least=True)}')
+
+
+def verdicts(parts: Sequence[Part], number: int) -> str:
+    """Return what was found of one setpoint in all runs that have it, with a comma; or nothing."""
+    found = [x.evaluation.finding(x.evaluation.results[number]) for x in parts
+             if number < len(x.evaluation.results)]
+    return ''.join(f'{x}, ' for x in dict.fromkeys(
+        str(y.verdict).replace('_', ' ') for y in found if y is not None))
 
 
 def residual_text(results: Sequence[MoveResult], digits: int = 3, *, least: bool = False) -> str:

@@ -4,8 +4,7 @@ The evaluation of a run: its setpoints, residual vibration, and prediction.
 Times are in s from the first command of the run; stamps stay integer nanoseconds.
 """
 
-from bisect import bisect_left
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
 
@@ -16,7 +15,6 @@ from hmsa_ros.core.delivery import late, pieces
 from hmsa_ros.core.model import (
     Array,
     elastic_force,
-    equilibrium_stretch,
     natural_frequency,
     signed_root,
     stretch_limits,
@@ -28,15 +26,13 @@ from hmsa_ros.core.residual import residual_vibration
 from hmsa_ros.core.simulation import RTOL, sampled, simulate
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.judge import Finding
+from hmsa_ros.report.outcome import findings_of
 from hmsa_ros.runs.levels import in_force, Level, without_repeats
 from hmsa_ros.runs.parameters import creep_of
 from hmsa_ros.runs.record import Run
+from hmsa_ros.runs.setpoints import Requested, SAME, setpoints_of, start_of
 
-# Stretches that differ by less are one setpoint: what comes back from a flux density in double
-# precision is some 1e-12 off.
-_SAME = 1e-6
-# Stretch rates below this share of the natural frequency are rest, to a planner's precision.
-_AT_REST = 1e-3
 # Plain steps are simulated with this many points a period of the actuator at least, up to so many.
 _POINTS_A_PERIOD, _MOST_POINTS = 100, 2_000_000
 #: Samples a period below which peaks are missed.
@@ -62,6 +58,7 @@ class Move:
     arrival: int  #: of planned rest at the target
     end: int  #: until when the target was held
     flux_densities: tuple[float, ...]  #: levels in T, the last one holds the target
+    place: int = 0  #: of the setpoint among all that were requested, from 0
 
     def __post_init__(self) -> None:
         if not self.begin <= self.arrival <= self.end or not self.flux_densities:
@@ -91,6 +88,7 @@ class MoveResult:
     residual_unshaped: float
     #: whether the block covered a tenth of the step at least, on the mean after arrival
     moved: bool
+    place: int = 0  #: of the setpoint among all that were requested, from 0
 
 
 @dataclass(frozen=True)
@@ -109,18 +107,25 @@ class Evaluation:
     plan: tuple[Level, ...]  #: changes of level that were planned and not replanned, by stamp
     #: stretch, and stretch rate in 1/s, by the plan; NaN before and without one, shape (n,)
     predicted: tuple[Array, Array]
+    findings: tuple[Finding, ...] = ()  #: one a setpoint that was requested
+
+    def finding(self, result: MoveResult) -> Finding | None:
+        """Return what was found of a setpoint; None if it was not judged."""
+        return self.findings[result.place] if result.place < len(self.findings) else None
 
     def seconds(self, stamp: int) -> float:
         """Return a stamp in s of the run."""
         return (stamp - self.zero) / NANOSECONDS
 
 
-def evaluate(run: Run, moves: Sequence[Move] | None = None) -> Evaluation:
-    """Measure a run; the setpoints are what `find_moves` finds, unless they are given."""
+def evaluate(run: Run) -> Evaluation:
+    """Measure a run."""
     levels = in_force((x,) for x in without_repeats(run.commands)[0])
     plan = in_force(run.plans)
-    start = _start(run, levels, plan)
-    found = tuple(find_moves(run, levels, plan) if moves is None else moves)
+    asked = setpoints_of(run)
+    start = asked[0].setpoint.start if asked else start_of(
+        run, levels[0].stamp if levels else int(run.time[0]))
+    found = tuple(find_moves(run, levels, asked))
     zero = levels[0].stamp if levels else int(run.time[0])
     time = (run.time - zero) / NANOSECONDS
     *unshaped, grid, fine = _unshaped(run, time, found, zero, start)
@@ -131,126 +136,28 @@ def evaluate(run: Run, moves: Sequence[Move] | None = None) -> Evaluation:
         previous = move.stretch
     return Evaluation(
         zero, time, start, levels, found, tuple(results), (unshaped[0], unshaped[1]), plan,
-        _predict(run, plan))
+        _predict(run, plan), tuple(findings_of(run, asked=asked)))
 
 
-def find_moves(
-        run: Run, levels: Sequence[Level], plan: Sequence[Level]) -> list[Move]:
-    """Find the setpoints that the commands of a run reached before the recording ended."""
-    # A setpoint is reached with the level that holds it: the one whose equilibrium is a stretch
-    # that was asked for, or at which the plan is at rest at one (with what feedback has learnt,
-    # levels have another equilibrium). Where neither finds a setpoint, a level that lasts for a
-    # period of the actuator holds one.
+def find_moves(run: Run, levels: Sequence[Level], setpoints: Sequence[Requested]) -> list[Move]:
+    """Return how setpoints were commanded that were reached before the recording ended."""
     last = int(run.time[-1])
-    asked = _asked(run)
-    unit = run.planner.flux_density_unit
-    material = run.planner.nondimensional
-    balance = equilibrium_stretch([x.flux_density / unit for x in levels], material)
-    period = 2.0 * math.pi / natural_frequency(balance, material) * run.planner.time_unit
-    predicted = {x.stamp: x for x in plan}
-
-    def by_request(i: int, previous: float, begin: int) -> float | None:
-        held = _nearest(asked, float(balance[i]))
-        if held is not None:
-            return held
-        point = predicted.get(levels[i].stamp)
-        if point is None or abs(point.rate) * period[i] > 2.0 * math.pi * _AT_REST:
-            return None
-        near = _nearest(asked, point.stretch)
-        # The first level of a move begins at rest, too.
-        return None if near is None or i == begin and abs(near - previous) <= _SAME else near
-
-    def by_duration(i: int, *_: float) -> float | None:
-        until = levels[i + 1].stamp if i + 1 < len(levels) else last
-        lasts = (until - levels[i].stamp) / NANOSECONDS >= period[i]
-        return float(balance[i]) if lasts else None
-
-    for target_of in (by_request, by_duration):
-        moves = _group(run, levels, period, target_of, _start(run, levels, plan), last)
-        if moves:
-            return moves
-    return []
-
-
-def _group(
-        run: Run, levels: Sequence[Level], period: Array,
-        target_of: Callable[[int, float, int], float | None], start: float,
-        last: int) -> list[Move]:
-    """Return the moves that end with the levels that hold a target."""
-    corrections = [x.sent for x in run.verdicts if x.code == 'corrected']
-    found: list[tuple[int, int, float]] = []
-    begin, previous = 0, start
-    for i in range(len(levels)):
-        target = target_of(i, previous, begin)
-        if target is None:
-            continue
-        # The same level again, or one that holds what is held, is no move, but feedback may
-        # have made the move end there.
-        if abs(target - previous) > _SAME:
-            found.append((begin, i, target))
-        elif i > begin and found and any(
-                levels[found[-1][0]].stamp < x < levels[i].stamp for x in corrections):
-            found[-1] = found[-1][0], i, target
-        begin, previous = i + 1, target
-    slew = run.number('plant.slew_limit') or run.number('planner.slew_limit')
     moves = []
-    for n, (first, hold, target) in enumerate(found):
-        stamp = levels[first].stamp
-        end = levels[hold + 1].stamp if hold + 1 < len(levels) else _held_until(
-            run, stamp, target, len(found) - n, last)
-        arrival = levels[hold].stamp
-        if first == hold:
-            # A plain step has no arrival: half a period on, when a shaped one would arrive.
-            arrival += round(0.5 * period[hold] * NANOSECONDS)
-        elif slew:
-            change = abs(levels[hold].flux_density - levels[hold - 1].flux_density)
-            # A bag may contain any slew limit.
-            arrival += round(min(change / slew, 1e6) * NANOSECONDS)
-        if arrival < min(end, last):
-            moves.append(Move(target, stamp, arrival, end, tuple(
-                x.flux_density for x in levels[first:hold + 1])))
+    for place, asked in enumerate(setpoints):
+        setpoint, arrival = asked.setpoint, asked.arrival
+        end = last if asked.due is None else min(asked.due, last)
+        inside = [x for x in levels if setpoint.begins <= x.stamp <= (arrival or end)]
+        if asked.missed or setpoint.step <= SAME or not inside:
+            continue
+        if arrival is None:
+            # A plain step has none: half a period on, when a shaped one would arrive.
+            arrival = inside[0].stamp + round(math.pi / setpoint.frequency * NANOSECONDS)
+            inside = [x for x in inside if x.stamp <= arrival]
+        if arrival < end:
+            moves.append(Move(
+                setpoint.target, inside[0].stamp, arrival, end,
+                tuple(x.flux_density for x in inside), place))
     return moves
-
-
-def _held_until(run: Run, begin: int, target: float, left: int, last: int) -> int:
-    """Return until when the last setpoint was requested, at most the end of the record."""
-    for request in reversed(run.requests):
-        stretch, duration = request.points[-1] if request.points else (math.nan, None)
-        if request.sent <= begin and abs(stretch - target) < _SAME:
-            if duration is not None and request.stamp:
-                return min(request.stamp + duration, last)
-            if duration is not None and left == 1 and len(request.points) > 1:
-                # From the point before, which is when this move began.
-                return min(begin + duration - (request.points[-2][1] or 0), last)
-            if duration is not None and len(request.points) == 1:
-                return min(begin + duration, last)
-            break
-    return last
-
-
-def _asked(run: Run) -> list[float]:
-    """Return the requested stretches, sorted."""
-    asked = {x for request in run.requests for x, _ in request.points if math.isfinite(x)}
-    for verdict in run.verdicts:
-        # Rounded for the message: a request says it better.
-        if math.isfinite(verdict.stretch) and _nearest(sorted(asked), verdict.stretch) is None:
-            asked.add(verdict.stretch)
-    return sorted(asked)
-
-
-def _nearest(values: Sequence[float], value: float) -> float | None:
-    """Return the one of some sorted values that is the same to within rounding."""
-    i = bisect_left(values, value - _SAME)
-    return values[i] if i < len(values) and values[i] <= value + _SAME else None
-
-
-def _start(run: Run, levels: Sequence[Level], plan: Sequence[Level]) -> float:
-    """Return the stretch before the first move: planned if that is known, else recorded."""
-    if plan and levels and plan[0].stamp == levels[0].stamp:
-        return plan[0].stretch
-    stamp = levels[0].stamp if levels else int(run.time[0])
-    before = max(int(np.searchsorted(run.time, stamp, side='right')) - 1, 0)
-    return float(run.stretch[before])
 
 
 def _unshaped(
@@ -332,7 +239,8 @@ def _measure(
         stretch=move.stretch, b_p=float(signed_root(move.flux_densities[0] / unit)),
         tau_p=(arrival - begin) / run.planner.time_unit,
         b_1=float(signed_root(move.flux_densities[-1] / unit)), begin=begin, arrival=arrival,
-        end=end, error=error, residual=residual, residual_unshaped=plain, moved=moved)
+        end=end, error=error, residual=residual, residual_unshaped=plain, moved=moved,
+        place=move.place)
 
 
 def _predict(run: Run, plan: Sequence[Level]) -> tuple[Array, Array]:

@@ -1,91 +1,76 @@
-"""Whether a run arrived: each setpoint, measured against a tolerance; and each level."""
+"""What samples of a run show: of each setpoint as it was requested, and of each level."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
 
-from hmsa_ros.core.model import Array, equilibrium_stretch
+from hmsa_ros.core.model import equilibrium_stretch
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.report.evaluation import evaluate, MoveResult, period_of
+from hmsa_ros.judge import Finding, Sensor, Tolerances, unobserved
+from hmsa_ros.runs.parameters import number_of, of_joint
 from hmsa_ros.runs.record import Run
+from hmsa_ros.runs.setpoints import Requested, setpoints_of
+from hmsa_ros.runtime.holds import Hold
 
-ARRIVED, OFF_TARGET, VIBRATING, MISSED = 'arrived', 'off_target', 'vibrating', 'not_carried_out'
-#: Offset and residual vibration of a setpoint that counts as reached, as shares of the step.
-TOLERANCE = 0.02
-# Stretches that differ by less are one setpoint.
-_SAME = 1e-6
-# Third differences show noise alone with so many samples a period; their variance is 20 times
-# that of the noise. Noise of 1000 samples is so many standard deviations from peak to peak.
-_ENOUGH_SAMPLES, _THIRD_DIFFERENCE, _PEAK_TO_PEAK = 20.0, math.sqrt(20.0), 8.0
+_LEFT_OUT = 'no time was left for it'
+_SENSOR = Sensor()
+# Later than any stamp, in ns.
+_END = 2**62
 
 
-@dataclass(frozen=True)
-class Arrival:
-    """One setpoint, measured."""
-
-    joint: str  #: empty if it is not known
-    stretch: float  #: target
-    #: mean stretch after arrival, and how far it is from the target; NaN if not measured
-    reached: float
-    offset: float
-    residual: float  #: peak-to-peak stretch after arrival; NaN likewise
-    allowed: float  #: offset and residual of a setpoint that counts as reached, noise apart
-    #: time of planned rest in s from the first command; NaN if it was not carried out
-    arrival: float
-    verdict: str  #: ``arrived``, ``off_target``, ``vibrating`` or ``not_carried_out``
-
-    def sentence(self) -> str:
-        """Return the verdict in words, with the figures."""
-        place = f'setpoint {self.stretch:g}' + (f' of {self.joint}' if self.joint else '')
-        if self.verdict == MISSED:
-            return f'{place} was not carried out'
-        if self.verdict == ARRIVED:
-            return f'{place} arrived'
-        if self.verdict == OFF_TARGET:
-            return (f'{place} is off target by {self.offset:+.2g}: expected at most '
-                    f'{self.allowed:.2g}')
-        return (f'{place} vibrates by {self.residual:.2g} from peak to peak: expected at most '
-                f'{self.allowed:.2g}')
+def tolerances_of(run: Run) -> Tolerances:
+    """Return what counted as arrived for the planner of a run."""
+    own = {x: number_of(of_joint(run.parameters, run.joint, f'planner.{x}_tolerance'))
+           for x in ('arrival', 'vibration', 'stretch')}
+    return Tolerances(**{x: y for x, y in own.items() if y is not None and y >= 0.0})
 
 
-def arrivals(run: Run, targets: Sequence[float], tolerance: float) -> list[Arrival]:
-    """Measure the arrival at each target, one a move; the tolerance is a share of the step."""
-    found = evaluate(run)
-    noise = _noise(run)
-    results = list(found.results)
-    measured, previous = [], found.start
-    for target in targets:
-        step, previous = abs(target - previous), target
-        if step <= _SAME:
-            continue
-        place = next(
-            (i for i, x in enumerate(results) if abs(x.stretch - target) <= _SAME), None)
-        if place is None:
-            measured.append(Arrival(
-                run.joint, target, math.nan, math.nan, math.nan, tolerance * step, math.nan,
-                MISSED))
-            continue
-        measured.append(_measure(run, found.time, results[place], tolerance * step, noise))
-        del results[:place + 1]
-    return measured
+def findings_of(
+        run: Run, tolerances: Tolerances | None = None, *,
+        asked: Sequence[Requested] | None = None) -> list[Finding]:
+    """Judge each setpoint that was requested, by default as the planner of the run did."""
+    allowed = tolerances_of(run) if tolerances is None else tolerances
+    return [_judged(run, x, allowed) for x in (setpoints_of(run) if asked is None else asked)]
 
 
-def _measure(
-        run: Run, time: Array, result: MoveResult, allowed: float, noise: float) -> Arrival:
-    after = run.stretch[(time >= result.arrival) & (time <= result.end)]
-    reached = float(np.mean(after)) if len(after) else math.nan
-    residual = float(np.ptp(after)) if len(after) > 1 else math.nan
-    offset = reached - result.stretch
-    verdict = ARRIVED
-    # NaN is neither within a tolerance.
-    if not residual <= allowed + _PEAK_TO_PEAK * noise:
-        verdict = VIBRATING
-    if not abs(offset) <= allowed + _PEAK_TO_PEAK * noise / math.sqrt(max(len(after), 1)):
-        verdict = OFF_TARGET if len(after) > 1 else MISSED
-    return Arrival(
-        run.joint, result.stretch, reached, offset, residual, allowed, result.arrival, verdict)
+def _judged(run: Run, asked: Requested, tolerances: Tolerances) -> Finding:
+    """Judge a setpoint as the planner does while samples and plans come in."""
+    joints = run.parameters.get('planner.joints')
+    several = isinstance(joints, list) and len(joints) > 1
+    hold = Hold(
+        replace(asked.setpoint, joint=run.joint if several else ''), last=asked.last)
+    moves = list(asked.moves)
+
+    def move_until(sent: float) -> None:
+        while moves and moves[0][0] < sent:
+            _, arrival = moves.pop(0)
+            if arrival is None:
+                hold.miss(_LEFT_OUT)
+            else:
+                hold.move(arrival, corrected=asked.corrected)
+
+    if asked.left_out:
+        hold.miss(_LEFT_OUT)
+    part = slice(*np.searchsorted(run.time, (
+        asked.setpoint.begins, _END if asked.until is None else asked.until)))
+    for stamp, logged, stretch in zip(
+            run.time[part].tolist(), run.logged[part].tolist(), run.stretch[part].tolist(),
+            strict=True):
+        move_until(logged)
+        if hold.over and not moves:
+            break
+        hold.add(stamp, stretch, stamp)
+        if stamp >= hold.due:
+            hold.judge(stamp, logged, tolerances, _SENSOR, observable=True)
+    move_until(math.inf)
+    patience = _END
+    while not hold.over:
+        # No more samples are to come.
+        hold.judge(_END, patience, tolerances, _SENSOR, observable=False)
+        patience *= 2
+    return hold.found or unobserved(hold.setpoint)
 
 
 @dataclass(frozen=True)
@@ -124,15 +109,3 @@ def level_results(run: Run) -> list[LevelResult]:
             run.joint, flux_density, len(spans), sum(y - x for x, y in spans) / NANOSECONDS, rest,
             *figures))
     return results
-
-
-def _noise(run: Run) -> float:
-    """Return the standard deviation of the sensor's noise; 0 where samples are too few."""
-    if len(run.time) < 100:
-        return 0.0
-    interval = float(np.median(np.diff(run.time))) / NANOSECONDS
-    if period_of(run) < _ENOUGH_SAMPLES * interval:
-        return 0.0
-    # The median leaves out what moves and what jumps.
-    third = np.abs(np.diff(run.stretch, 3))
-    return float(np.median(third)) / 0.6745 / _THIRD_DIFFERENCE

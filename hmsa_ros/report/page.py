@@ -33,6 +33,8 @@ _POLICY = (
     'img-src data: blob:; font-src data:')
 # Plans and requests of long runs are cut here; the figures show all of them.
 _MOST_ROWS = 1000
+# Sentences on setpoints.
+_MOST_FINDINGS = 8
 # Longer tables scroll.
 _LONG_TABLE = 25
 # Stamps beyond this many seconds are dates.
@@ -199,10 +201,10 @@ def _tiles(parts: Sequence[Part]) -> str:
         return max((x for x in values if math.isfinite(x)), default=math.nan)
 
     header = [
-        'setpoints', 'largest residual, share of the step', 'the same with plain steps',
+        'setpoints arrived', 'largest residual, share of the step', 'the same with plain steps',
         'commands', 'samples a second', 'messages lost']
     rows = [[
-        str(len(x.evaluation.results)),
+        f'{sum(y.arrived for y in x.evaluation.findings)} of {len(x.evaluation.findings)}',
         charts.residual_text(x.evaluation.results),
         percent(largest(y.residual_unshaped for y in x.evaluation.results)),
         f'{len(x.timing.commands)}' + (
@@ -240,6 +242,10 @@ def _notes(parts: Sequence[Part]) -> str:
 def _notes_of(part: Part) -> Iterable[str]:
     """Return the notes on one run."""
     yield from part.run.notes
+    missed = [x.message for x in part.evaluation.findings if not x.arrived]
+    yield from missed[:_MOST_FINDINGS]
+    if len(missed) > _MOST_FINDINGS:
+        yield f'{len(missed) - _MOST_FINDINGS} more setpoints did not arrive: see the table.'
     if part.run.commands and not part.evaluation.results:
         yield ('No setpoint could be identified from the commands: none of them holds a '
                f'requested {part.run.plant.coordinate.name} or lasts a period of the actuator.')
@@ -316,21 +322,33 @@ def _setpoints(parts: Sequence[Part]) -> str:
     """Return the table of the setpoints and their results."""
     rows: list[_Values] = []
     for part in parts:
-        for i, (move, x) in enumerate(zip(
-                part.evaluation.moves, part.evaluation.results, strict=True), 1):
-            levels = len(move.flux_densities)
+        moves = {x.place: (x, y) for x, y in zip(
+            part.evaluation.moves, part.evaluation.results, strict=True)}
+        for i, found in enumerate(part.evaluation.findings):
+            move, x = moves.get(i, (None, None))
+            levels = 0 if move is None else len(move.flux_densities)
+            of_move = [math.nan] * 9 if x is None else [
+                x.b_p, x.tau_p, x.b_1, x.begin * 1e3, x.arrival * 1e3, x.end * 1e3,
+                100.0 * x.error, 100.0 * x.residual if x.moved else NOT_MOVED,
+                100.0 * x.residual_unshaped]
+            percent = found.setpoint.percent
             rows.append([
-                part.run.label, Cell(str(i), i), x.stretch, x.b_p, x.tau_p, x.b_1, x.begin * 1e3,
-                x.arrival * 1e3, x.end * 1e3, 100.0 * x.error,
-                100.0 * x.residual if x.moved else NOT_MOVED, 100.0 * x.residual_unshaped,
-                'plain step' if levels == 1 else f'{levels} levels'])
+                part.run.label, Cell(str(i + 1), i + 1), found.setpoint.target,
+                Cell(str(found.verdict).replace('_', ' ')), percent(found.offset),
+                percent(found.offset_std), percent(found.vibration),
+                percent(found.vibration_std), found.frequency, *of_move,
+                'plain step' if levels == 1 else f'{levels} levels' if levels else '–'])
     if not rows:
         return text('No setpoint was carried out while the samples were recorded.')
     return _table(
-        'setpoint-table', 'b and tau nondimensional as in the paper: of the first level, the '
-        'time until arrival, and of the level that holds the target. Error and residual in '
-        'percent of the step, from arrival on; times from the first command.', {
+        'setpoint-table', 'Verdict by the samples, with offset and vibration (peak to peak) and '
+        'their standard deviations. b and tau nondimensional as in the paper: of the first '
+        'level, the time until arrival, and of the level that holds the target. Error and '
+        'residual from arrival on, noise included. All in percent of the step; times from the '
+        'first command.', {
             'run': '', 'setpoint': '', f'target {parts[0].run.plant.coordinate.symbol} [1]': '.6g',
+            'verdict': '', 'offset [%]': '+.3g', '± [%]': '.1g', 'vibration [%]': '.3g',
+            '± of it [%]': '.1g', 'frequency [Hz]': '.3g',
             'b_p [1]': '.5f', 'tau_p [1]': '.5f', 'b_1 [1]': '.5f', 'begin [ms]': '.3f',
             'arrival [ms]': '.3f', 'until [ms]': '.3f', 'largest error [%]': '.3g',
             'residual [%]': '.3g', 'plain steps [%]': '.3g', 'command': ''}, rows)

@@ -19,6 +19,7 @@ from hmsa_ros.report.charts import (
     RUN_COLOURS,
     time_unit,
     TimeUnit,
+    verdicts,
     worst,
 )
 from hmsa_ros.report.evaluation import Evaluation
@@ -163,4 +164,4 @@ def _title(parts: Sequence[Part], number: int) -> str:
     targets = '/'.join(dict.fromkeys(f'{x.stretch:.5g}' for x in results))
     if len(parts) > 1:
         return f'to {targets}'
-    return f'to {targets}: residual {residual_text(results, 2)}'
+    return f'to {targets}: {verdicts(parts, number)}residual {residual_text(results, 2)}'

@@ -14,6 +14,7 @@ from typing import Any
 from hmsa_ros.bag import limits
 from hmsa_ros.bag.info import BagSummary, summarize
 from hmsa_ros.bag.reader import BagReader, Message
+from hmsa_ros.contract.status import whole
 from hmsa_ros.core.schedule import obeyed
 from hmsa_ros.errors import BadInputError, BagError
 from hmsa_ros.runs.levels import Level
@@ -269,7 +270,7 @@ class _Collected:
                 else status.values.get('stretch')
             yield Verdict(
                 status.sent, _LEVELS[min(status.level, 2)], status.values.get('code', ''),
-                status.message, _number(target))
+                status.message, _number(target), whole(status.values.get('plan')))
 
     def finish(
             self, label: str, reader: BagReader, summary: BagSummary, topics: Mapping[str, str],

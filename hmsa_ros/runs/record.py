@@ -38,6 +38,7 @@ class Verdict:
     code: str
     message: str
     stretch: float  # target of the setpoint under way; NaN if there is none
+    plan: int = 0  # number of the request that is carried out, from 1; 0 where not told
 
 
 @dataclass(frozen=True, eq=False)

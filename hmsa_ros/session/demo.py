@@ -7,12 +7,14 @@ silicone block of `paper_actuator`.
 """
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.errors import HmsaError
+from hmsa_ros.judge import Tolerances
 from hmsa_ros.report.evaluation import evaluate, MoveResult
+from hmsa_ros.report.outcome import findings_of
 from hmsa_ros.runs.bags import read_runs
 from hmsa_ros.runs.levels import without_repeats
 from hmsa_ros.session.adapting import second_act, SecondAct
@@ -36,9 +38,15 @@ _NODES = (
 
 @dataclass(frozen=True)
 class SetpointResult(MoveResult):
-    """The result of one setpoint from the bag; ``reached`` if within `LARGEST_RESIDUAL`."""
+    """The result of one setpoint from the bag, with what was found of it within a tolerance."""
 
-    reached: bool
+    finding: dict[str, object] = field(default_factory=dict)
+
+    @property
+    def reached(self) -> bool:
+        """Whether it arrived, and was held within `LARGEST_RESIDUAL`."""
+        return self.finding['verdict'] == 'arrived' and max(
+            self.error, self.residual) <= LARGEST_RESIDUAL
 
 
 @dataclass(frozen=True)
@@ -88,8 +96,9 @@ def _evaluate(bag: Path, picture: Path) -> tuple[SetpointResult, ...]:
         raise HmsaError(
             f'the bag holds {len(levels)} commands: expected {2 * len(SEQUENCE)}')
     evaluation = evaluate(run)
+    found = findings_of(run, Tolerances(LARGEST_RESIDUAL, LARGEST_RESIDUAL, 0.0))
     results = tuple(
-        SetpointResult(**asdict(x), reached=max(x.error, x.residual) <= LARGEST_RESIDUAL)
+        SetpointResult(**asdict(x), finding=found[x.place].to_dict())
         for x in evaluation.results)
     draw_run(picture, run, evaluation)
     return results

@@ -1,0 +1,122 @@
+"""The planner at work and whoever reads its record say the same of the same motion."""
+
+from dataclasses import replace
+import math
+from pathlib import Path
+import random
+
+import numpy as np
+import pytest
+
+from hmsa_ros.core.actuators import Setup
+from hmsa_ros.core.group import PlannerGroup
+from hmsa_ros.core.parameters import paper_actuator
+from hmsa_ros.core.planner import Options, Planner
+from hmsa_ros.device.sensor import SensorErrors
+from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
+from hmsa_ros.judge import VERDICTS
+from hmsa_ros.report.outcome import findings_of
+from hmsa_ros.runs.levels import Level
+from hmsa_ros.runs.record import RecordedRequest, Run, Verdict
+from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.runtime.records import PlanChanged, Send, Settings, StatusChanged, Trajectory
+
+MS = 1_000_000
+START = 1000 * MS
+LEVELS = ('ok', 'warning', 'error')
+
+
+class Drawn:
+    """A randomly drawn experiment: a planner and a simulated device in one loop of 1 ms."""
+
+    def __init__(self, seed: int) -> None:
+        draw = random.Random(seed)
+        block = paper_actuator()
+        real = replace(block, shear_modulus=block.shear_modulus * draw.choice(
+            [1.0, 1.0, 1.005, 1.02, 1.1]))
+        rate = draw.choice([100, 500, 1000])
+        self.device = SimulatedDevice(
+            [SimulatedJoint(Setup(real, real.rest), errors=SensorErrors(
+                stretch_noise=draw.choice([0.0, 1e-4, 1e-3, 3e-3])))],
+            period=1000 * MS // rate, time=START, seed=seed)
+        self.now = START
+        self.runtime = PlannerRuntime(
+            PlannerGroup({'a': Planner(block, Options(
+                flux_density_min=-0.5, flux_density_max=0.5, lead_time=50 * MS))}),
+            Settings(takeover_timeout=0), clock=lambda: self.now, steady=lambda: self.now)
+        self.runtime.active = True
+        hold = draw.choice([20, 60, 100, 200]) * MS
+        self.late_for = draw.choice([20, 100, 400]) * MS
+        self.points = [((round(draw.uniform(1.02, 1.4), 3),), hold * (i + 1))
+                       for i in range(draw.randint(1, 5))]
+        # For some time the way to the device takes longer than lead_time.
+        self.late = draw.choice([0, 0, draw.randint(1, 120)]) * MS
+        self.late_from = START + draw.randint(0, hold * len(self.points) // MS) * MS
+        self.online: dict[int, str] = {}
+        self.record = Run(
+            'run', 'a', Path('run'), *([np.zeros(1, dtype=np.int64)] * 2), *([np.zeros(1)] * 3),
+            requests=(RecordedRequest(START, 0, tuple((x, y) for (x,), y in self.points)),),
+            plant=block, planner=block, parameters_known=True)
+
+    def carry_out(self) -> Run:
+        """Carry it out and return what a recorder would have seen of it."""
+        self.runtime.request(Trajectory(('a',), self.points, len(self.points), name='x'))
+        plans, commands, verdicts, samples = [], [], [], []
+        under_way: list[tuple[int, Send]] = []
+        end = START + self.points[-1][1] + 1500 * MS
+        while self.now < end:
+            for x in self.runtime.tick(self.now):
+                if isinstance(x, Send):
+                    commands.append(Level(x.stamp, x.flux_density, self.now))
+                    late = self.late_from <= self.now < self.late_from + self.late_for
+                    under_way.append((self.now + self.late * late, x))
+                elif isinstance(x, PlanChanged):
+                    plans.append(tuple(
+                        Level(stamp, level, self.now, stretch, speed) for stamp, (
+                            stretch, speed, level) in zip(
+                                x.stamps, x.samples['a'], strict=True)))
+                elif isinstance(x, StatusChanged):
+                    verdicts.append(Verdict(
+                        self.now, LEVELS[x.verdict.severity], x.verdict.code, x.verdict.message,
+                        math.nan, x.plan))
+                    # Of several in one tick the newest is told, and the worst of all.
+                    self.online |= {
+                        y.setpoint.number: str(y.verdict) for y in (
+                            *x.findings.values(), *filter(None, [x.worst]))}
+            for x in [x for x in under_way if x[0] <= self.now]:
+                under_way.remove(x)
+                self.device.receive(0, x[1].stamp, x[1].flux_density)
+            self.now += MS
+            self.device.advance(self.now)
+            for x in self.device.changes():
+                self.runtime.applied('a', x.stamp, x.level)
+            for x in self.device.samples():
+                samples.append((x.time, x.stretch[0]))
+                if self.runtime.looks_at(x.time):
+                    self.runtime.observed('a', x.time, x.stretch[0], math.nan, math.nan)
+        time, stretch = map(np.array, zip(*samples, strict=True))
+        unknown = np.full(len(time), math.nan)
+        return replace(
+            self.record, time=time, logged=time, stretch=stretch, rate=unknown,
+            flux_density=unknown, commands=tuple(commands), plans=tuple(plans),
+            verdicts=tuple(verdicts))
+
+
+def said(seeds: range) -> set[str]:
+    """Hold what is said online against what is said of the record; return all verdicts."""
+    seen = set()
+    for seed in seeds:
+        drawn = Drawn(seed)
+        offline = {x.setpoint.number: str(x.verdict) for x in findings_of(drawn.carry_out())}
+        assert offline == drawn.online, seed
+        seen |= set(offline.values())
+    return seen
+
+
+def test_status_and_record_have_the_same_verdicts():
+    assert said(range(12)) >= {'arrived', 'off_target', 'undecided'}
+
+
+@pytest.mark.slow
+def test_status_and_record_have_the_same_verdicts_of_many_runs():
+    assert said(range(12, 160)) >= {str(x) for x in VERDICTS} - {'unobserved'}
