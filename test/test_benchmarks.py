@@ -112,6 +112,16 @@ def test_loosest_tolerance_says_when_there_is_none():
         loosest(lambda _: math.nan, 1e-9)
 
 
+def test_verdicts_on_runs_drawn_at_random_are_never_wrong_and_mostly_given():
+    sheet = bench_judge.compare(quick=True)
+    assert sheet.figures['failures'] == []
+    assert sheet.passed
+    kinds = sheet.figures['kinds'].values()
+    clear, undecided = (sum(x[key] for x in kinds) for key in ('clear', 'clear_undecided'))
+    assert clear > 50
+    assert undecided < 0.1 * clear
+
+
 @pytest.mark.parametrize(('within', 'verdict', 'said'), [
     (False, 'arrived', 'wrong arrived'), (True, 'off_target', 'wrong missed'),
     (True, 'arrived', ''), (False, 'vibrating', ''), (None, 'arrived', ''),
