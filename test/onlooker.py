@@ -21,6 +21,7 @@ def main():
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = Node('onlooker', start_parameter_services=False)
     rows = []
+    ends = []
 
     def take(message):
         if not rows:
@@ -29,9 +30,12 @@ def main():
         rows.append((
             stamp.sec + 1e-9 * stamp.nanosec, time.time(), message.position[0],
             message.effort[0]))
+        if ends and rows[-1][0] >= ends[0]:
+            raise KeyboardInterrupt
 
     def end(*_):
-        raise KeyboardInterrupt
+        # Once all is read that was measured by now.
+        ends.append(time.time())
 
     node.create_subscription(JointState, 'joint_states', take, 5000)
     signal.signal(signal.SIGTERM, end)

@@ -93,7 +93,7 @@ def _outage(rig: Rig, seconds: float) -> Seen:
         f'{"told" if told else "not told"} during the outage; at rest at {still[-1]:.4f} until '
         f'asked again, then at most {peak:.4f} on the way to 1.2, exit {status}',
         f'{float(np.ptp(still)):.1e}',
-        told and status == 0 and peak < 1.202 and float(np.ptp(still)) < 1e-3)
+        told and status == 0 and 1.199 < peak < 1.202 and float(np.ptp(still)) < 1e-3)
 
 
 for _seconds in (2.0, 25.0):

@@ -13,6 +13,8 @@ _PATIENCE = 800_000_000
 _PAUSE = 300_000_000
 # A receipt that is older than the silence that it ends was on its way all the time.
 _STALE = 300_000_000
+# How often nobody who gives receipts is found, five times a second, until none are expected.
+_MISSING = 25
 # Commands of a joint whose sending is remembered, and exchanges of which the quickest counts.
 _REMEMBERED, _COMPARED = 64, 32
 
@@ -45,6 +47,7 @@ class _Joint:
     time: int = 0  # when that was, by the clock of the device
     unanswered: int | None = None  # since when no command is known to have arrived
     silent: bool = False
+    missing: int = 0  # how often nobody was found since who gives any
     # By stamp, when a command was sent by our clock.
     sent: dict[int, int] = field(default_factory=dict)
     exchanges: deque[Offset] = field(default_factory=lambda: deque(maxlen=_COMPARED))
@@ -96,7 +99,7 @@ class Receipts:
             known = self._joints[joint] = _Joint(steady)
         if known.silent and time - known.time < steady - known.heard - _STALE:
             return
-        known.heard, known.time = steady, time
+        known.heard, known.time, known.missing = steady, time, 0
         known.lags.append(now - time)
         sent = known.sent.pop(command, None)
         if sent is None:
@@ -111,9 +114,18 @@ class Receipts:
         return known is None or known.silent or known.time >= time
 
     def forget(self, joint: str) -> None:
-        """Expect no receipts of a joint: whoever listens now gives none."""
-        self._joints.pop(joint, None)
-        self.silent.discard(joint)
+        """
+        Expect no receipts of a joint, since whoever listens now gives none.
+
+        That is to be said again and again: what is found anew is found one topic after the other.
+        """
+        known = self._joints.get(joint)
+        if known is None:
+            return
+        known.missing += 1
+        if known.missing >= _MISSING:
+            del self._joints[joint]
+            self.silent.discard(joint)
 
     def clock_set_back(self) -> None:
         """Forget what our clock has said before it was set back."""
