@@ -15,7 +15,7 @@ import numpy as np
 
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.report.evaluation import Evaluation, MoveResult
+from hmsa_ros.report.evaluation import Evaluation, MoveResult, verdicts
 from hmsa_ros.report.timing import Timing
 from hmsa_ros.runs.record import Run
 
@@ -31,7 +31,6 @@ DARK = {
 #: Intervals of a curve of which the least and the largest value are kept: more than a screen
 #: has columns.
 BUCKETS = 2000
-#: Panels of arrivals.
 MOST_PANELS = 12
 _PANEL_BUCKETS = 300
 _MOST_PHASE_POINTS = 8_000
@@ -45,7 +44,6 @@ BEFORE, AFTER, LEAST_PERCENT = 0.6, 3.0, 5.0
 _PANEL_SPAN = 20.0
 #: Instead of a residual, which would be 0.
 NOT_MOVED = 'did not move'
-# Runs shorter than this are drawn in ms.
 _LONGEST_IN_MS = 2.0
 _DIGITS = 9
 
@@ -338,16 +336,9 @@ def results_of(parts: Sequence[Part], number: int) -> list[MoveResult]:
 def _panel_title(parts: Sequence[Part], number: int) -> str:
     results = results_of(parts, number)
     targets = ', '.join(dict.fromkeys(f'{x.stretch:.6g}' for x in results))
-    return (f'{results[0].place + 1}. to {targets}: {verdicts(parts, number)}residual '
-            f'{residual_text(results, least=True)}')
-
-
-def verdicts(parts: Sequence[Part], number: int) -> str:
-    """Return what was found of one setpoint in all runs that have it, with a comma; or nothing."""
-    found = [x.evaluation.finding(x.evaluation.results[number]) for x in parts
-             if number < len(x.evaluation.results)]
-    return ''.join(f'{x}, ' for x in dict.fromkeys(
-        str(y.verdict).replace('_', ' ') for y in found if y is not None))
+    said = verdicts([x.evaluation for x in parts], number)
+    left = residual_text(results, least=True)
+    return f'{results[0].place + 1}. to {targets}: {said}residual {left}'
 
 
 def residual_text(results: Sequence[MoveResult], digits: int = 3, *, least: bool = False) -> str:

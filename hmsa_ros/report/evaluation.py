@@ -109,13 +109,17 @@ class Evaluation:
     predicted: tuple[Array, Array]
     findings: tuple[Finding, ...] = ()  #: one a setpoint that was requested
 
-    def finding(self, result: MoveResult) -> Finding | None:
-        """Return what was found of a setpoint; None if it was not judged."""
-        return self.findings[result.place] if result.place < len(self.findings) else None
-
     def seconds(self, stamp: int) -> float:
         """Return a stamp in s of the run."""
         return (stamp - self.zero) / NANOSECONDS
+
+
+def verdicts(evaluations: Sequence[Evaluation], number: int) -> str:
+    """Return the verdicts on a move in all runs that have it, each with a comma; or nothing."""
+    places = [(x.findings, x.results[number].place) for x in evaluations
+              if number < len(x.results)]
+    return ''.join(f'{x}, ' for x in dict.fromkeys(
+        str(found[i].verdict).replace('_', ' ') for found, i in places if i < len(found)))
 
 
 def evaluate(run: Run) -> Evaluation:

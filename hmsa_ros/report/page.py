@@ -33,9 +33,7 @@ _POLICY = (
     'img-src data: blob:; font-src data:')
 # Plans and requests of long runs are cut here; the figures show all of them.
 _MOST_ROWS = 1000
-# Sentences on setpoints.
 _MOST_FINDINGS = 8
-# Longer tables scroll.
 _LONG_TABLE = 25
 # Stamps beyond this many seconds are dates.
 _A_DATE = 1e8
@@ -242,10 +240,7 @@ def _notes(parts: Sequence[Part]) -> str:
 def _notes_of(part: Part) -> Iterable[str]:
     """Return the notes on one run."""
     yield from part.run.notes
-    missed = [x.message for x in part.evaluation.findings if not x.arrived]
-    yield from missed[:_MOST_FINDINGS]
-    if len(missed) > _MOST_FINDINGS:
-        yield f'{len(missed) - _MOST_FINDINGS} more setpoints did not arrive: see the table.'
+    yield from [x.message for x in part.evaluation.findings if not x.arrived][:_MOST_FINDINGS]
     if part.run.commands and not part.evaluation.results:
         yield ('No setpoint could be identified from the commands: none of them holds a '
                f'requested {part.run.plant.coordinate.name} or lasts a period of the actuator.')
@@ -344,8 +339,7 @@ def _setpoints(parts: Sequence[Part]) -> str:
         'setpoint-table', 'Verdict by the samples, with offset and vibration (peak to peak) and '
         'their standard deviations. b and tau nondimensional as in the paper: of the first '
         'level, the time until arrival, and of the level that holds the target. Error and '
-        'residual from arrival on, noise included. All in percent of the step; times from the '
-        'first command.', {
+        'residual from arrival on, noise included. All in percent of the step.', {
             'run': '', 'setpoint': '', f'target {parts[0].run.plant.coordinate.symbol} [1]': '.6g',
             'verdict': '', 'offset [%]': '+.3g', '± [%]': '.1g', 'vibration [%]': '.3g',
             '± of it [%]': '.1g', 'frequency [Hz]': '.3g',

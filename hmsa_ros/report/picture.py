@@ -19,10 +19,9 @@ from hmsa_ros.report.charts import (
     RUN_COLOURS,
     time_unit,
     TimeUnit,
-    verdicts,
     worst,
 )
-from hmsa_ros.report.evaluation import Evaluation
+from hmsa_ros.report.evaluation import Evaluation, verdicts
 from hmsa_ros.runs.record import Run
 
 # Panels of arrivals in a row.
@@ -164,4 +163,5 @@ def _title(parts: Sequence[Part], number: int) -> str:
     targets = '/'.join(dict.fromkeys(f'{x.stretch:.5g}' for x in results))
     if len(parts) > 1:
         return f'to {targets}'
-    return f'to {targets}: {verdicts(parts, number)}residual {residual_text(results, 2)}'
+    said = verdicts([x.evaluation for x in parts], number)
+    return f'to {targets}: {said}residual {residual_text(results, 2)}'
