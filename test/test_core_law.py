@@ -13,21 +13,9 @@ from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.simulation import simulate
 from hmsa_ros.core.status import Code
 from hmsa_ros.core.two_step import plan_two_step, plan_two_step_batch
+from hmsa_ros.motion import constant_slope
 
 NEO_HOOKEAN = NondimensionalParameters(j_lim=math.inf)
-STATES = ((1.3, 0.4, 0.2), (0.7, -0.8, -1.0), (2.1, 1.5, 3.0))
-
-
-def slopes(material, state):
-    found = np.empty(5)
-    law.acceleration_slopes(*state, material, found)
-    return found
-
-
-def accelerate(state, material):
-    out = np.empty(1)
-    law.accelerations(*(np.array([x]) for x in state), material, out)
-    return out[0]
 
 
 def test_without_a_chain_limit_the_law_is_neo_hookean():
@@ -76,39 +64,19 @@ def test_a_batch_plans_both_laws_side_by_side():
     assert batch.beta_p[1] == pytest.approx(batch.beta_p[2], rel=1e-11)
 
 
-@pytest.mark.parametrize('state', STATES)
-def test_slopes_by_the_constants_are_those_of_finite_differences(state):
-    zeta, j_lim, c1, step = 0.3, 5.0, 1.4, 1e-6
-    found = slopes(law.pack(zeta, j_lim, c1), state)
-
-    def difference(make):
-        high, low = (accelerate(*make(x)) for x in (step, -step))
-        return (high - low) / (2.0 * step)
-
-    pack = law.pack
-    stretch, rate, load = state
-    expected = [
-        difference(lambda x: ((stretch, rate, load + x), pack(zeta, j_lim, c1))),
-        # A stiffer block at the same acceleration of the rest: the force alone grows.
-        difference(lambda x: ((stretch, rate, load - x * float(elastic_force(stretch, j_lim))),
-                              pack(zeta, j_lim, c1))),
-        difference(lambda x: (state, pack(zeta + x, j_lim, c1))),
-        difference(lambda x: (state, pack(zeta, j_lim, c1 + x))),
-        difference(lambda x: (state, pack(zeta, 1.0 / (1.0 / j_lim + x), c1)))]
-    assert found == pytest.approx(expected, rel=1e-7, abs=1e-8)
+@pytest.mark.parametrize('stretch', [0.7, 1.3, 2.1])
+def test_the_slope_of_the_force_by_the_chain_limit_is_that_of_finite_differences(stretch):
+    high, low = (
+        law.elastic_force(stretch, law.pack(0.3, 1.0 / (0.2 + x), 1.4)) for x in (1e-6, -1e-6))
+    assert constant_slope(stretch, 0, law.pack(0.3, 5.0, 1.4)) == pytest.approx(
+        (high - low) / 2e-6, rel=1e-8)
 
 
-@pytest.mark.parametrize('j_lim', [5.0, math.inf])
-@pytest.mark.parametrize('state', STATES)
-def test_the_derivatives_of_the_motion_are_those_of_finite_differences(state, j_lim):
-    material = law.pack(0.3, j_lim, 1.4)
-    step = 1e-6
-    found = law.motion(*state, material, law.ANY)
-    for column in range(3):
-        ends = []
-        for sign in (1.0, -1.0):
-            moved = list(state)
-            moved[column] += sign * step
-            ends.append(accelerate(moved, material))
-        assert found[1 + column] == pytest.approx(
-            (ends[0] - ends[1]) / (2.0 * step), rel=1e-7, abs=1e-8)
+def test_arrays_of_another_type_are_refused():
+    packed = NEO_HOOKEAN.packed
+    with pytest.raises(TypeError, match='expected one of d'):
+        law.evaluate(law.FORCE, np.arange(3), packed, np.empty(3))
+    with pytest.raises(ValueError, match='fit each other'):
+        law.evaluate(law.FORCE, np.ones(2), packed, np.empty(3))
+    with pytest.raises(TypeError, match='expected 2 arguments'):
+        law.elastic_force(1.0)

@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 import sympy
 
+from hmsa_ros import motion
 from hmsa_ros.cli import main
 from hmsa_ros.contract.actuator import actuator_from, parameters_of
 from hmsa_ros.contract.parameters import BLOCK
-from hmsa_ros.core import law
 from hmsa_ros.core.actuators import check_stretch, unheld
 from hmsa_ros.core.laws import LAWS
 from hmsa_ros.core.model import (
-    acceleration,
     elastic_energy,
     elastic_force,
     elastic_stiffness,
@@ -90,18 +89,17 @@ def test_force_and_stiffness_are_derivatives_of_the_energy(name):
 
 
 @every_law
-def test_derivatives_of_the_motion_are_those_of_finite_differences(name):
-    group = block(name).nondimensional
-    for state in ((1.3, 0.4, 0.2), (0.7, -0.8, -1.0), (2.1, 1.5, 3.0)):
-        found = law.motion(*state, group.packed, law.ANY)
-        for column in range(3):
-            ends = []
-            for step in (1e-6, -1e-6):
-                moved = list(state)
-                moved[column] += step
-                ends.append(float(acceleration(*moved, group)))
-            assert found[1 + column] == pytest.approx(
-                (ends[0] - ends[1]) / 2e-6, rel=1e-7, abs=1e-7)
+def test_derivatives_of_a_turning_point_are_those_of_finite_differences(name):
+    packed = block(name).nondimensional.packed
+
+    def turn(load):
+        return motion.turning_point(1.1, 0.2, 1.0, load, 0.1, packed, 1e-13)
+
+    status, _, _, by_load, time_by_load = turn(0.5)
+    assert status == motion.DONE
+    high, low = (np.array(turn(0.5 + x)[1:3]) for x in (1e-5, -1e-5))
+    time, stretch = (high - low) / 2e-5
+    assert (by_load, time_by_load) == pytest.approx((stretch, time), rel=1e-7, abs=1e-8)
 
 
 @every_law

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from hmsa_ros.core import kernels
 from hmsa_ros.core.moves import State
 from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.core.simulation import simulate
@@ -20,7 +19,7 @@ def test_a_brake_leaves_nothing_of_the_motion(excursion):
         state = State(
             1.2 + excursion * np.cos(angle),
             excursion * np.sin(angle) * model.frequency(1.2))
-        found = brake(model, kernels.work_space(), state)
+        found = brake(model, state)
         assert model.limits.minimum <= found.load <= model.limits.maximum
         ns = model.ns(found.duration)
         assert found.duration == pytest.approx(model.time(ns), rel=1e-13)

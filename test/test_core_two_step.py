@@ -1,6 +1,5 @@
 """The two-step command against an independent solution, closed forms and invariants."""
 
-from itertools import pairwise
 import math
 
 from core_oracle import (
@@ -20,9 +19,8 @@ import mpmath
 import numpy as np
 import pytest
 
-from hmsa_ros.core import kernels, two_step_kernel
+from hmsa_ros import motion
 from hmsa_ros.core.law import gent_limits, pack
-from hmsa_ros.core.lockstep_kernel import two_step_batch
 from hmsa_ros.core.model import (
     critical_zeta,
     elastic_force,
@@ -30,6 +28,7 @@ from hmsa_ros.core.model import (
     stretch_limits,
 )
 from hmsa_ros.core.parameters import NondimensionalParameters
+from hmsa_ros.core.simulation import simulate
 from hmsa_ros.core.status import Code
 from hmsa_ros.core.two_step import CODES, plan_two_step, plan_two_step_batch, TwoStep
 from hmsa_ros.errors import BadInputError
@@ -40,6 +39,9 @@ AGREEMENT = 1e-9
 # Distance from rest at the target, as a share of the move.
 AT_REST = 1e-9
 INFINITE = (-math.inf, math.inf)
+# Of a search in one direction.
+MOST_PASSES = 80
+TWO_STEP = next(key for key, code in CODES.items() if code is Code.TWO_STEP)
 
 
 def group(zeta, j_lim=5.0, c1=2.0):
@@ -157,33 +159,23 @@ def test_vanishing_damping_leads_continuously_to_the_closed_form():
 
 
 @pytest.mark.parametrize('zeta', [0.0, 0.4])
-def test_the_integrator_is_of_order_eight(zeta):
-    duration, load = 2.0, 0.5
-    exact = follow((1.0, 0.3), [(duration, load)], zeta, 5.0, 2.0)
-    work = kernels.work_space()
-    errors = []
-    for count in (5, 10, 20):
-        state = (1.0, 0.3, 0.0, 0.0)
-        for _ in range(count):
-            state = kernels.step(
-                work, *state, load, duration / count, group(zeta).packed, 1e-12)[:4]
-        errors.append(math.hypot(state[0] - exact[0], state[1] - exact[1]))
-    assert errors[-1] > 1e-13
-    for coarse, fine in pairwise(errors):
-        assert 7.3 < math.log2(coarse / fine) < 9.2
+def test_the_integration_is_as_exact_as_asked(zeta):
+    times, loads = [0.0, 0.7], [0.5, 0.2]
+    exact = follow((1.0, 0.3), [(0.7, 0.5), (1.3, 0.2)], zeta, 5.0, 2.0)
+    for rtol in (1e-6, 1e-9, 1e-12):
+        end = simulate(
+            times, loads, [2.0], group(zeta), stretch=1.0, rate=0.3, rtol=rtol)
+        assert [float(x[0]) for x in end] == pytest.approx(exact, abs=20.0 * rtol)
 
 
 def test_sensitivities_are_derivatives_by_the_load():
-    step = 1e-5
-    for state, load, duration in (((1.0, 0.0), 0.3, 1.3), ((0.7, 2.0), -0.4, 2.1)):
-        ends = [
-            np.array(follow(state, [(duration, load + sign * step)], 0.2, 5.0, 2.0))
-            for sign in (1.0, -1.0)]
-        expected = (ends[0] - ends[1]) / (2.0 * step)
-        work, full = kernels.work_space(), (*state, 0.0, 0.0)
-        for _ in range(40):
-            full = kernels.step(work, *full, load, duration / 40.0, PAPER.packed, 1e-12)[:4]
-        assert full[2:] == pytest.approx(expected, rel=1e-7)
+    for state, load, direction in (((1.0, 0.0), 0.3, 1.0), ((0.7, 2.0), -0.4, 1.0)):
+        found = motion.turning_point(*state, direction, load, 0.1, PAPER.packed, 1e-13)
+        high, low = (
+            np.array(turning_point(state, load + x, direction, 0.2, 5.0, 2.0))
+            for x in (1e-5, -1e-5))
+        time, stretch = (high - low) / 2e-5
+        assert found[3:] == pytest.approx((stretch, time), rel=1e-6)
 
 
 def test_turning_points_are_those_of_the_independent_integration():
@@ -191,9 +183,9 @@ def test_turning_points_are_those_of_the_independent_integration():
             ((1.0, 0.0), 0.3, 1.0), ((1.0, 0.0), -0.8, -1.0), ((1.2, 1.0), 0.1, 1.0),
             ((1.2, 1.0), 0.1, -1.0), ((0.4, -3.0), 2.0, 1.0)):
         expected = turning_point(state, load, direction, 0.2, 5.0, 2.0)
-        status, time, stretch, _, _ = kernels.turning_point(
-            kernels.work_space(), *state, direction, load, 0.1, PAPER.packed, 1e-13)
-        assert status == kernels.DONE
+        status, time, stretch, _, _ = motion.turning_point(
+            *state, direction, load, 0.1, PAPER.packed, 1e-13)
+        assert status == motion.DONE
         assert (time, stretch) == pytest.approx(expected, rel=1e-11)
 
 
@@ -204,7 +196,7 @@ def test_turning_points_are_those_of_the_independent_integration():
 def test_the_intermediate_load_grows_with_the_target(zeta):
     targets = np.concatenate([np.linspace(0.26, 0.999, 300), np.linspace(1.001, 2.69, 300)])
     batch = plan_two_step_batch(1.0, targets, zeta=zeta)
-    assert np.all(batch.status == two_step_kernel.TWO_STEP)
+    assert np.all(batch.status == TWO_STEP)
     assert np.all(np.diff(batch.beta_p) > 0.0)
     assert np.all(np.diff(batch.beta_1) > 0.0)
     assert np.all(batch.tau_p > 0.0)
@@ -471,7 +463,7 @@ def test_huge_rates_end_in_a_plan_or_a_code_within_bounded_work(rate):
     for zeta in (0.0, 0.2, 50.0):
         for target in (0.9, 1.2, 2.6):
             plan = plan_two_step(1.2, target, group(zeta), rate=rate)
-            assert plan.passes <= 2 * two_step_kernel._MAX_ITERATIONS
+            assert plan.passes <= 2 * MOST_PASSES
             if plan.code is Code.TWO_STEP:
                 end = after_plan(1.2, rate, plan, group(zeta))
                 assert distance(end, target, group(zeta)) < 1e-6
@@ -599,43 +591,36 @@ def blocks_from_rest(count):
             np.exp(random.uniform(-3.0, 4.0, count)))
 
 
-def planned(rows, *, lockstep):
-    """Return the results of the kernel of batches, in lock-step or one move after the other."""
+def planned(rows, *, wide=True):
+    """Return the results of a batch, with the widest instructions or without."""
     start, target, zeta, j_lim, c1 = rows
     status, found = np.empty(len(start), np.int64), np.empty((3, len(start)))
-    two_step_batch(
-        start, np.zeros(len(start)), target, pack(zeta, j_lim, c1), *INFINITE, 1e-12, 1e-9, 64,
-        lockstep, status, *found)
+    materials = pack(zeta, j_lim, c1)
+    motion.two_step_batch(
+        start, np.zeros(len(start)), target, materials, materials.shape[1], *INFINITE, 1e-12, 1e-9,
+        wide, status, *found)
     return status, found
 
 
-def test_moves_in_lock_step_are_planned_as_one_after_the_other():
+def test_moves_in_lock_step_are_planned_to_the_bit_as_one_after_the_other():
     rows = blocks_from_rest(2000)
-    status, found = planned(rows, lockstep=True)
-    expected_status, expected = planned(rows, lockstep=False)
-    assert np.array_equal(status, expected_status)
+    status, found = planned(rows)
+    start, target, *materials = rows
+    alone = [
+        motion.two_step(x, 0.0, y, material, *INFINITE, 1e-12, 1e-9)
+        for x, y, material in zip(start, target, pack(*materials), strict=True)]
+    assert status.tolist() == [x[0] for x in alone]
     assert len(set(status.tolist())) >= 4
-    two = status == two_step_kernel.TWO_STEP
-    assert np.array_equal(found[:, ~two], expected[:, ~two], equal_nan=True)
-    found, expected = found[:, two], expected[:, two]
-    # Rounding counts against a small move, and near critical damping against small differences
-    # of the loads.
-    rounding = 1e-15 / np.abs(rows[1] - rows[0])[two] + 1e-15 * (
-        1.0 + np.abs(expected[2])) / np.abs(expected[2] - expected[0])
-    assert np.all(np.abs(found - expected) <= (1e-11 + rounding) * (1.0 + np.abs(expected)))
-    # Most were planned in lock-step: the last bits differ.
-    assert np.mean(found[0] == expected[0]) < 0.5
+    assert found.T.tobytes() == np.array([x[1:4] for x in alone]).tobytes()
 
 
 def test_the_plan_of_a_row_is_the_same_to_the_bit_in_any_batch():
     rows = blocks_from_rest(600)
-    _, found = planned(rows, lockstep=True)
+    _, found = planned(rows)
     order = np.random.default_rng(1).permutation(600)
-    _, mixed = planned([x[order] for x in rows], lockstep=True)
-    assert mixed.tobytes() == found[:, order].tobytes()
-    for i in range(0, 600, 3):
-        alone = planned([x[i:i + 1] for x in rows], lockstep=True)[1]
-        assert alone.tobytes() == found[:, i:i + 1].tobytes()
+    for wide in (True, False):
+        _, mixed = planned([x[order] for x in rows], wide=wide)
+        assert mixed.tobytes() == found[:, order].tobytes()
 
 
 def test_plans_of_a_batch_end_at_rest_by_an_integration_of_its_own():
@@ -649,7 +634,7 @@ def test_plans_of_a_batch_end_at_rest_by_an_integration_of_its_own():
             material = group(float(zeta[row]), float(j_lim[row]))
             end = after_plan(start[row], 0.0, plan, material)
             assert distance(end, target[row], material) < AT_REST * abs(target[row] - start[row])
-    assert np.mean(batch.status == two_step_kernel.TWO_STEP) > 0.4
+    assert np.mean(batch.status == TWO_STEP) > 0.4
 
 
 def test_batches_broadcast_their_arguments():

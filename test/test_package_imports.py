@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parent.parent
 ROS = ('rclpy', 'rcl_interfaces', 'ament_index_python', 'builtin_interfaces', 'diagnostic_msgs',
        'geometry_msgs', 'rosgraph_msgs', 'rosidl_runtime_py', 'sensor_msgs', 'std_msgs',
        'std_srvs', 'trajectory_msgs')
-SLOW = ('rclpy', 'numba', 'matplotlib', 'scipy', 'numpy')
+SLOW = ('rclpy', 'matplotlib', 'scipy', 'numpy')
 # Refuses some modules, as if they were not installed, then runs the rest of the arguments.
 BLOCKED = """
 import sys

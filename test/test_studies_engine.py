@@ -251,7 +251,7 @@ def test_a_missing_dask_is_said_with_how_to_get_it(run, monkeypatch):
 
 def test_chunks_of_other_code_have_other_names(sweep, tmp_path, monkeypatch):
     package = tmp_path / 'hmsa_ros'
-    for name in ('core', 'studies', 'contract', 'estimation', 'identification'):
+    for name in ('core', 'studies', 'contract', 'estimation', 'identification', 'motion'):
         shutil.copytree(
             Path(chunk_module.__file__).parent.parent / name, package / name,
             ignore=shutil.ignore_patterns('__pycache__'))
@@ -259,8 +259,8 @@ def test_chunks_of_other_code_have_other_names(sweep, tmp_path, monkeypatch):
     monkeypatch.setattr(chunk_module, '__file__', str(package / 'studies' / 'chunks.py'))
     for change in (False, True):
         if change:
-            with (package / 'core' / 'two_step_kernel.py').open('a') as kernels:
-                kernels.write('# changed\n')
+            with (package / 'motion' / 'hmsa' / 'law.hpp').open('a') as source:
+                source.write('// changed\n')
         chunk_module.code.cache_clear()
         assert (Chunks.of(sweep, tmp_path).digest == before) is not change
     chunk_module.code.cache_clear()

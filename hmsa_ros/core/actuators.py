@@ -6,7 +6,7 @@ its own, from change to change of what drives it: what happens to one leaves no 
 numbers of another, and one alone moves bit for bit as it does among others.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 import math
 import re
@@ -14,7 +14,8 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
-from hmsa_ros.core import kernels, law, response_kernel
+from hmsa_ros import motion
+from hmsa_ros.core import law
 from hmsa_ros.core.creep import Creep, MOST
 from hmsa_ros.core.laws.coordinate import STRETCH
 from hmsa_ros.core.model import Array, Material, stretch_limits
@@ -113,37 +114,17 @@ def _check_load(name: str, value: float, unit_name: str, unit: float) -> None:
             f'{_LARGEST_LOAD * unit:g} {unit_name}')
 
 
-class _Branches:
-    """The branches of several actuators, and the integration of all of them."""
-
-    def __init__(self, creeps: Sequence[Creep], time_units: Array) -> None:
-        """Begin with forces of 0; units of time are in s."""
-        self._creeping = np.array([bool(x) for x in creeps])
-        self._work = response_kernel.work_space(MOST)
-        self._branches = np.zeros((len(creeps), MOST, 3))
-        for branches, creep, unit in zip(
-                self._branches, creeps, time_units.tolist(), strict=True):
-            held = [x for x in zip(creep.ratios, creep.times, strict=True) if x[0] > 0.0]
-            for branch, (ratio, time) in zip(branches, held, strict=False):
-                branch[response_kernel.RATIO] = ratio
-                branch[response_kernel.SPEED] = unit / time
-
-    def relax(self, i: int, force: float) -> None:
-        """Have the branches of one hold nothing, as after a long time under an elastic force."""
-        self._branches[i, :, response_kernel.FOLLOWER] = force
-
-    def follow(
-            self, work: Array, first: int, last: int, wanted: NDArray[np.bool_], state: Array,
-            drive: Array, material: Array, durations: Array, rtol: float,
-            status: NDArray[np.int64]) -> int:
-        """Integrate as `hmsa_ros.core.kernels.follow`; return how many do not get through."""
-        failed: int = kernels.follow(
-            work, first, last, wanted & ~self._creeping, state, drive, material, durations, rtol,
-            status)
-        failed += response_kernel.follow_creeping(
-            self._work, first, last, wanted & self._creeping, state, drive, material,
-            self._branches, durations, rtol, status)
-        return failed
+def _branches_of(creeps: Sequence[Creep], time_units: Array) -> Array:
+    """Return the branches of several actuators as `motion.follow` takes them."""
+    if not any(creeps):
+        return np.zeros((0, MOST, 3))
+    rows = np.zeros((len(creeps), MOST, 3))
+    for branches, creep, unit in zip(rows, creeps, time_units.tolist(), strict=True):
+        held = [x for x in zip(creep.ratios, creep.times, strict=True) if x[0] > 0.0]
+        for branch, (ratio, time) in zip(branches, held, strict=False):
+            branch[motion.RATIO] = ratio
+            branch[motion.SPEED] = unit / time
+    return rows
 
 
 class Actuators:
@@ -177,12 +158,7 @@ class Actuators:
         self._durations = np.zeros(count)
         self._status = np.zeros(count, np.int64)
         self._all = np.ones(count, bool)
-        self._work = kernels.work_space()
-        self._kernel: Callable[..., int] = kernels.follow
-        self._branches = None
-        if any(x.creep for x in self.setups):
-            self._branches = _Branches([x.creep for x in self.setups], self._time_units)
-            self._kernel = self._branches.follow
+        self._branches = _branches_of([x.creep for x in self.setups], self._time_units)
         self.schedules = [CommandSchedule(0.0) for _ in blocks]
         self.forces = [CommandSchedule(0.0) for _ in blocks]
         self.changes: list[tuple[int, int, float]] = []
@@ -234,8 +210,9 @@ class Actuators:
             raise BadInputError(f'stretch rate is {rate:g} 1/s: expected a finite number')
         level = flux_density if level is None else level
         self._state[i] = stretch, rate * self._time_units[i], 0.0
-        if self._branches is not None:
-            self._branches.relax(i, law.elastic_force(stretch, self._material[i]))
+        if len(self._branches):
+            self._branches[i, :, motion.FOLLOWER] = law.elastic_force(
+                stretch, self._material[i])
         # A coil that lags is behind an amplifier that has arrived, another is not.
         behind = self._lags[i] > 0.0
         self._levels[i] = level if behind and math.isinf(self._slews[i]) else flux_density
@@ -323,11 +300,9 @@ class Actuators:
                     failed.append((int(i), reached))
         if time > self.time:
             np.divide((time - self.time) / NANOSECONDS, self._time_units, self._durations)
-            if self._kernel(
-                    self._work, 0, len(self.setups), ~due, self._state, self._drive,
-                    self._material, self._durations, RTOL, self._status):
+            if self._integrated(0, len(self.setups), ~due):
                 failed += [(int(i), self.time) for i in np.flatnonzero(
-                    ~due & (self._status != kernels.DONE))]
+                    ~due & (self._status != motion.DONE))]
             self.time = time
         return failed
 
@@ -387,6 +362,10 @@ class Actuators:
 
     def _follow(self, i: int, duration: float) -> bool:
         self._durations[i] = duration
-        return not self._kernel(
-            self._work, i, i + 1, self._all, self._state, self._drive, self._material,
+        return not self._integrated(i, i + 1, self._all)
+
+    def _integrated(self, first: int, last: int, wanted: NDArray[np.bool_]) -> int:
+        """Integrate actuators over their durations; return how many do not get through."""
+        return motion.follow(
+            first, last, wanted, self._state, self._drive, self._material, self._branches,
             self._durations, RTOL, self._status)

@@ -12,7 +12,6 @@ import math
 from typing import TypeVar
 
 from hmsa_ros.core.history import agree
-from hmsa_ros.core.kernels import work_space
 from hmsa_ros.core.moves import Level, Move, State
 from hmsa_ros.core.sequence import Segment, segments
 from hmsa_ros.core.setpoint import impossible, Setpoint
@@ -150,8 +149,7 @@ def draft_stop(outset: Outset) -> Steps[Draft]:
     # holds that stretch: a two-step command whose target is chosen by its beta_p. Where one
     # brake does not do, on a grid, through ramps or at a limit, it is a move to a stretch near by.
     model, state = outset.model, outset.state
-    work = work_space()
-    found = brake(model, work, state)
+    found = brake(model, state)
     # A coil that must not step brakes as the shaper smooth does, on from where it would turn.
     smooth = model.options.shaper == 'smooth'
     if (not smooth and holdable(model, found.stretch) == found.stretch
@@ -167,7 +165,7 @@ def draft_stop(outset: Outset) -> Steps[Draft]:
         return Draft(outset.begin, tuple(levels), (placed,))
     ways = [(0.0, 'smooth')] * smooth + [(x, 'two_step') for x in _BRAKE_SHARES]
     for share, shaper in ways:
-        stretch = holdable(model, brake(model, work, state, share).stretch)
+        stretch = holdable(model, brake(model, state, share).stretch)
         try:
             return (yield from draft_moves(outset, [Setpoint(stretch, math.inf)], shaper))
         except BadInputError:

@@ -1,7 +1,7 @@
 """
 Commands with free numbers, solved for rest at the target.
 
-The two-step command on ideal hardware has a solver of its own, `two_step_kernel.shoot`.
+The two-step command on ideal hardware has a search of its own, `hmsa_ros.motion.two_step`.
 Everything else, a command on a grid, through ramps, or with two intermediate levels of given
 height, has two unknowns as well, and they meet the same two conditions: stretch at the target,
 rate zero, at the instant at which the last level is in force. Where the field lags it has to
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hmsa_ros.core import shooting_kernel
+from hmsa_ros import motion
 from hmsa_ros.core.delivery import Delivery
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.moves import Level
@@ -85,12 +85,11 @@ def solve(
         if wait > 0.0:
             times, loads = np.append(times, times[-1] + wait), np.append(loads, loads[-1])
             d_times, d_loads = (np.concatenate([x, x[-1:]]) for x in (d_times, d_loads))
-    status, duration = shooting_kernel.solve(
-        times, loads, d_times, d_loads, float(state.stretch), float(state.rate),
-        float(request.field), float(request.load), float(request.target), float(delivery.slew),
-        float(delivery.lag), material.packed, material.branches,
-        np.array(followed_by(state, material)))
-    if status != shooting_kernel.SOLVED:
+    solved, duration = motion.solve(
+        times, loads, np.ascontiguousarray(d_times), np.ascontiguousarray(d_loads), state.stretch,
+        state.rate, request.field, request.load, request.target, delivery.slew, delivery.lag,
+        material.packed, material.branches, np.array(followed_by(state, material)))
+    if not solved:
         return None
     levels = tuple(Level(t, x) for t, x in zip(times.tolist(), loads.tolist(), strict=True))
     return levels, duration

@@ -11,7 +11,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hmsa_ros.core import kernels, law, response_kernel
+from hmsa_ros import motion
+from hmsa_ros.core import law
 from hmsa_ros.core.actuators import Actuators, check_stretch, RTOL, Setup
 from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.delivery import Delivery, Piece, ramps
@@ -91,18 +92,10 @@ def simulate(
             'switches and times must not decrease, and no time may lie before the first switch')
     stretch = material.rest if stretch is None else stretch
     check_stretch(stretch, material)
-    if material.creep or lag > 0.0:
-        both = sampled(
-            switches, loads, slope, times, State(stretch, rate, field, followed=tuple(followed)),
-            material, rtol, lag)
-        return both[0], both[1]
-    out = np.empty((2, times.size))
-    status = kernels.trajectory(
-        float(stretch), float(rate), switches, loads, slope, times, material.packed, float(rtol),
-        out[0], out[1])
-    if status != kernels.DONE:
-        raise HmsaError(_STUCK)
-    return out[0], out[1]
+    rows = sampled(
+        switches, loads, slope, times, State(stretch, rate, field, followed=tuple(followed)),
+        material, rtol, lag)
+    return rows[motion.STRETCH], rows[motion.RATE]
 
 
 def follow(
@@ -112,7 +105,9 @@ def follow(
     pieces, last = ramps(levels, state.ramps_from, end, delivery.slew)
     if material.creep or delivery.lag > 0.0:
         return _follow_slowly(pieces, last, state, end, material, delivery)
-    stretch, rate = _endpoint(pieces, end, material, state.stretch, state.rate)
+    switches, loads, slopes = np.array(pieces).T.copy()
+    stretch, rate, *_ = sampled(
+        switches, loads, slopes, np.array([float(end)]), state, material, RTOL)[:, 0].tolist()
     return State(stretch, rate, last)
 
 
@@ -129,12 +124,10 @@ def sampled(
         material: NondimensionalParameters, rtol: float, lag: float = 0.0) -> Array:
     """Return stretch, rate, field and what branches follow, (3 + n, m), or raise `HmsaError`."""
     branches = np.column_stack([material.branches, followed_by(state, material)])
-    out = np.empty((response_kernel.FOLLOWED + len(branches), times.size))
-    status = response_kernel.trajectory_late(
-        float(state.stretch), float(state.rate),
-        float(loads[0] if math.isnan(state.load) else state.load), switches, loads, slopes,
-        float(lag), times, material.packed, branches, float(rtol), out)
-    if status != kernels.DONE:
+    out = np.empty((motion.FOLLOWED + len(branches), times.size))
+    if not motion.sample(
+            state.stretch, state.rate, loads[0] if math.isnan(state.load) else state.load,
+            switches, loads, slopes, lag, times, material.packed, branches, rtol, out):
         raise HmsaError(_STUCK)
     return out
 
@@ -166,33 +159,17 @@ def _follow_slowly(
         tuple(relaxed.tolist()))
 
 
-def _endpoint(
-        pieces: Sequence[Piece], end: float, material: NondimensionalParameters,
-        stretch: float, rate: float) -> tuple[float, float]:
-    """Return stretch and rate to which a piecewise linear load leads."""
-    work = kernels.work_space()
-    for i, (begin, load, slope) in enumerate(pieces):
-        until = pieces[i + 1][0] if i + 1 < len(pieces) else end
-        status, stretch, rate, _ = kernels.follow_one(
-            work, stretch, rate, 0.0, load, slope, 0.0, 0.0, until - begin, material.packed, RTOL)
-        if status != kernels.DONE:
-            raise HmsaError(_STUCK)
-    return stretch, rate
-
-
 def _vector(values: ArrayLike) -> Array:
-    """Return a contiguous copy: any other layout would have the kernels compiled anew."""
+    """Return a contiguous copy."""
     return np.array(values, dtype=np.float64, ndmin=1, order='C')
 
 
 def longest_motion(load: float, material: NondimensionalParameters) -> float:
     """Return the time after which motion under a load beta has settled, or a bound for it."""
-    # Scalars by the kernels: each prediction asks for this.
-    stretch = law.equilibrium_stretch(float(load), material.packed)
-    frequency = float(law.natural_frequency(stretch, material.packed))
+    stretch = law.equilibrium_stretch(load, material.packed)
+    frequency = law.natural_frequency(stretch, material.packed)
     longest = _MOST_PERIODS * 2.0 * math.pi / frequency
-    decay = float(law.damping(stretch, material.packed)) / (
-        2.0 * float(law.mass(stretch, material.packed)))
+    decay = law.damping(stretch, material.packed) / (2.0 * law.mass(stretch, material.packed))
     if decay == 0.0:
         return longest
     if decay < frequency:

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 import math
 
-from hmsa_ros.core import kernels
-from hmsa_ros.core.model import Array, equilibrium_stretch
+from hmsa_ros import motion
+from hmsa_ros.core.model import equilibrium_stretch
 from hmsa_ros.core.moves import State
 from hmsa_ros.core.simulation import RTOL
 from hmsa_ros.core.timeline import Model
@@ -27,7 +27,7 @@ class Brake:
     stretch: float
 
 
-def brake(model: Model, work: Array, state: State, share: float = 1.0) -> Brake:
+def brake(model: Model, state: State, share: float = 1.0) -> Brake:
     """Return the load that stops a motion, and until when; a share of 1 brakes hardest."""
     # The share is of the way from the load that holds the stretch to the limit on the other side.
     # A brake of no duration is for a motion that cannot be followed to a turning point.
@@ -46,9 +46,9 @@ def brake(model: Model, work: Array, state: State, share: float = 1.0) -> Brake:
     direction = 1.0 if up else -1.0
 
     def turn(load: float) -> tuple[float, float, float] | None:
-        status, time, stretch, _, slope = kernels.turning_point(
-            work, state.stretch, state.rate, direction, load, 1.0, model.material.packed, RTOL)
-        return (time, stretch, slope) if status == kernels.DONE else None
+        status, time, stretch, _, slope = motion.turning_point(
+            state.stretch, state.rate, direction, load, 1.0, model.material.packed, RTOL)
+        return (time, stretch, slope) if status == motion.DONE else None
 
     found = turn(load)
     if found is None:

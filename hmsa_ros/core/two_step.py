@@ -5,15 +5,17 @@ A constant load beta_p brings the actuator to its turning point exactly at the t
 the load that holds the target, beta_1, takes over and nothing is left to oscillate.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 import math
+import os
+from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hmsa_ros.core import kernels, law
-from hmsa_ros.core import two_step_kernel as kernel
+from hmsa_ros import motion
+from hmsa_ros.core import law
 from hmsa_ros.core.laws.record import CONSTANTS, Elastic
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.status import Code
@@ -24,25 +26,18 @@ RTOL = 1e-12
 #: Deviation from the target below which the actuator counts as being there already.
 HOLD_TOLERANCE = 1e-9
 
-CODES = {
-    kernel.TWO_STEP: Code.TWO_STEP,
-    kernel.HOLD: Code.HOLD,
-    kernel.TOO_DAMPED: Code.TOO_DAMPED,
-    kernel.INDISTINGUISHABLE: Code.INDISTINGUISHABLE,
-    kernel.NO_TWO_STEP: Code.NO_TWO_STEP,
-    kernel.NOT_CONVERGED: Code.NOT_CONVERGED,
-    kernel.OUT_OF_RANGE: Code.OUT_OF_RANGE,
-    kernel.BAD_INPUT: Code.BAD_INPUT,
-}
+#: By the statuses of `hmsa_ros.motion.two_step`.
+CODES = dict(enumerate((
+    Code.TWO_STEP, Code.HOLD, Code.TOO_DAMPED, Code.INDISTINGUISHABLE, Code.NO_TWO_STEP,
+    Code.NOT_CONVERGED, Code.OUT_OF_RANGE, Code.BAD_INPUT)))
 
 # Numbers of packed materials that a batch keeps at a time; a table has some 330 a row.
 _MOST_NUMBERS = 1 << 20
+# Rows that are worth a thread of their own.
+_PART = 256
 
-_WORK = kernels.work_space()
 
-
-@dataclass(frozen=True)
-class TwoStep:
+class TwoStep(NamedTuple):
     """Result of `plan_two_step`; loads and times are NaN where there are none."""
 
     #: ``TWO_STEP`` or ``HOLD`` where the plan leaves no vibration, else why there is none.
@@ -99,10 +94,16 @@ def plan_two_step(
         raise BadInputError(
             'the group has Maxwell branches: expected one without, or plan_sequence for one that '
             'creeps')
-    status, beta_p, tau_p, beta_1, passes = kernel.two_step(
-        _WORK, float(start), float(rate), float(target), material.packed,
-        float(load_limits[0]), float(load_limits[1]), float(rtol), HOLD_TOLERANCE)
-    return TwoStep(CODES[status], beta_p, tau_p, beta_1, passes)
+    status, *found = motion.two_step(
+        start, rate, target, material.packed, *load_limits, rtol, HOLD_TOLERANCE)
+    return TwoStep(CODES[status], *found)
+
+
+def threads() -> int:
+    """Return how many cores this process may use."""
+    if hasattr(os, 'sched_getaffinity'):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,7 @@ def plan_two_step_batch(
         start: ArrayLike, target: ArrayLike, *, zeta: ArrayLike = 0.2,
         j_lim: ArrayLike = 5.0, c1: ArrayLike = 2.0, rate: ArrayLike = 0.0,
         load_limits: tuple[float, float] = (-math.inf, math.inf),
-        rtol: float = RTOL, elastic: Elastic | None = None) -> TwoStepBatch:
+        rtol: float = RTOL, elastic: Elastic | None = None, workers: int = 0) -> TwoStepBatch:
     """
     Plan many moves at once, over all cores.
 
@@ -133,6 +134,8 @@ def plan_two_step_batch(
         Relative tolerance, 1e-14 to 1e-4.
     elastic : Elastic, optional
         The law of all rows, in place of ``j_lim``.
+    workers : int
+        Threads; 0 for one a core.
 
     Returns
     -------
@@ -153,21 +156,25 @@ def plan_two_step_batch(
     except ValueError as error:
         raise BadInputError(f'the arrays do not broadcast against each other: {error}') from error
     shape = arrays[0].shape
-    # Copies: NumPy warns of a broadcast array that Numba asks whether it may write to.
     columns = [np.array(a).ravel() for a in arrays]
     status = np.empty(columns[0].size, dtype=np.int64)
     results = [np.empty(status.size) for _ in range(3)]
-    # No single plan needs it, and it takes a moment to load.
-    from hmsa_ros.core.lockstep_kernel import two_step_batch
-
     each = _MOST_NUMBERS // (CONSTANTS + (1 if elastic is None else len(elastic.constants)))
-    for begin in range(0, status.size, each):
-        part = slice(begin, begin + each)
+
+    def plan(part: slice) -> None:
         start, rate, target, zeta, j_lim, c1 = (x[part] for x in columns)
-        # Enough parts for all cores, each long enough that its last moves do not matter.
-        size = min(max(target.size // (4 * numba.get_num_threads()), 64), 1024)
-        two_step_batch(
-            start, rate, target, law.pack(zeta, j_lim, c1, elastic), float(load_limits[0]),
-            float(load_limits[1]), float(rtol), HOLD_TOLERANCE, size, True,
-            status[part], *(x[part] for x in results))
+        materials = np.ascontiguousarray(law.pack(zeta, j_lim, c1, elastic))
+        motion.two_step_batch(
+            start, rate, target, materials, materials.shape[1], *load_limits, rtol,
+            HOLD_TOLERANCE, True, status[part], *(x[part] for x in results))
+
+    count = max(min(workers or threads(), status.size // _PART), 1)
+    size = min(-(-status.size // count), each) or 1
+    parts = [slice(x, x + size) for x in range(0, status.size, size)]
+    if count == 1:
+        for part in parts:
+            plan(part)
+    else:
+        with ThreadPoolExecutor(count) as pool:
+            list(pool.map(plan, parts))
     return TwoStepBatch(status.reshape(shape), *(a.reshape(shape) for a in results))

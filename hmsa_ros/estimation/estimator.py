@@ -3,7 +3,6 @@
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 import itertools
 import math
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hmsa_ros.core.model import Array
-from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
+from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.core.timeline import Model
 from hmsa_ros.core.timeline import Options as PlannerOptions
 from hmsa_ros.core.units import NANOSECONDS
@@ -380,16 +379,6 @@ class Estimator:
         return Levels(
             np.array([self._seconds(x) for x, _ in self._levels]),
             np.array([x for _, x in self._levels]), self.options.slew_limit)
-
-
-@cache
-def warm_up() -> None:
-    """Load the compiled kernels, once a process: where they must be compiled that takes long."""
-    estimator = Estimator(Prior.nominal(paper_actuator()))
-    estimator.level(0, 0.01)
-    estimator.sample(0, 1.0)
-    estimator.update(1_000_000)
-    estimator.predict(2_000_000)
 
 
 def _bounds(prior: Prior) -> Array:

@@ -10,9 +10,10 @@ import numpy as np
 from hmsa_ros.core.delivery import late
 from hmsa_ros.core.law import elastic_force, evaluate, FORCE, natural_frequency
 from hmsa_ros.core.model import Array
-from hmsa_ros.identification import kernels
 from hmsa_ros.identification.recording import pieces
 from hmsa_ros.identification.response import sensed, set_rest, Setup
+from hmsa_ros.motion import respond
+from hmsa_ros.motion import theta as places
 
 # Relative tolerance: far below the noise of a sensor.
 _RTOL = 1e-7
@@ -73,9 +74,9 @@ def follow(
     """
     setup = Setup.of(values, free)
     theta = setup.theta
-    theta[kernels.STRETCH], theta[kernels.RATE] = state
+    theta[places.STRETCH], theta[places.RATE] = state
     inner = len(setup.wanted)
-    wanted = np.append(setup.wanted, [kernels.STRETCH, kernels.RATE])
+    wanted = np.append(setup.wanted, [places.STRETCH, places.RATE])
     start = np.zeros(inner + 2)
     start[inner] = 1.0
     starts, heights, slopes = pieces(levels.times, levels.values, levels.slew_limit, begin)
@@ -93,7 +94,7 @@ def follow(
             values, theta, float(times[-1]) - begin, starts, heights, slopes, field)
     stretch, rate = np.empty(n), np.empty(n)
     raw, raw_rate = np.empty((n, inner + 2)), np.empty((n, inner + 2))
-    if not kernels.respond(
+    if not respond(
             theta, setup.material, setup.branches, wanted, start, starts, heights, slopes, field,
             field_lag, times, _RTOL, stretch, rate, raw, raw_rate):
         return None
@@ -110,7 +111,7 @@ def _relaxing(
     creep, lag, begin = values['creep'], values['coil_time_constant'], float(starts[0])
     after: Array = np.unique(np.clip(np.outer(creep.times, _NODES), 0.0, max(span, 0.0)))
     strength = np.array(creep.ratios) * np.array(values['behind']) * (
-        theta[kernels.STIFFNESS] / theta[kernels.DRIVE])
+        theta[places.STIFFNESS] / theta[places.DRIVE])
     pull = np.exp(-after[:, None] / np.array(creep.times)) @ strength
     rises: Array = np.append(np.diff(pull) / np.diff(after), 0.0)
     both = np.union1d(starts, begin + after)
@@ -169,7 +170,7 @@ def held(
     by = followed(values, stretch)
     if not by:
         return rest(values, (), level)
-    a, k, f = Setup.of(values, ()).theta[[kernels.STIFFNESS, kernels.DRIVE, kernels.FORCE]]
+    a, k, f = Setup.of(values, ()).theta[[places.STIFFNESS, places.DRIVE, places.FORCE]]
     ratios = values['creep'].ratios
     pull = k * level + f + a * sum(x * y for x, y in zip(ratios, by, strict=True))
     found = rest(values, (), float((pull / (1.0 + sum(ratios)) - f) / k))
@@ -189,7 +190,7 @@ def rest(
     start = np.zeros(len(setup.wanted))
     if not set_rest(setup.theta, setup.material, level, setup.wanted, start):
         return None
-    stretch = float(setup.theta[kernels.STRETCH])
-    frequency = math.sqrt(setup.theta[kernels.STIFFNESS]) * float(
+    stretch = float(setup.theta[places.STRETCH])
+    frequency = math.sqrt(setup.theta[places.STIFFNESS]) * float(
         natural_frequency(stretch, setup.material))
     return stretch, frequency, start @ setup.mixing

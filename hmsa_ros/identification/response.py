@@ -9,21 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hmsa_ros import motion
 from hmsa_ros.core.creep import Creep
-from hmsa_ros.core.law import (
-    BY_CONSTANT,
-    elastic_force,
-    elastic_stiffness,
-    equilibrium_stretch,
-    KIND,
-)
-from hmsa_ros.core.laws.record import CONSTANTS, GENT
+from hmsa_ros.core.law import elastic_force, elastic_stiffness, equilibrium_stretch, KIND
+from hmsa_ros.core.laws.record import GENT
 from hmsa_ros.core.model import Array
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.units import MU_0
-from hmsa_ros.identification import kernels
 from hmsa_ros.identification.quantities import derivative, geometry_of, group_of, QUANTITIES
 from hmsa_ros.identification.recording import Course, pieces, Recording
+from hmsa_ros.motion import theta as places
 
 #: Relative tolerance of the integration: far below the noise of any sensor.
 RTOL = 1e-8
@@ -52,27 +47,27 @@ def _chain(
     k = values['remanence'] / (MU_0 * inertia)
     per_force = 1.0 / (geometry.loaded * inertia)
     f = per_force * values['constant_force']
-    theta = np.zeros(kernels.FIRST_BRANCH + 2 * branches)
-    theta[:kernels.FIRST_BRANCH] = (
+    theta = np.zeros(places.FIRST_BRANCH + 2 * branches)
+    theta[:places.FIRST_BRANCH] = (
         a, d, k, f, values['coil_time_constant'], values['initial_stretch'],
         values['initial_rate'])
     density = values['density']
     by_density = {
-        kernels.STIFFNESS: -a / density, kernels.DAMPING: -d / density,
-        kernels.DRIVE: -k / density, kernels.FORCE: -f / density}
-    by_modulus = {kernels.STIFFNESS: a / values['shear_modulus']}
+        places.STIFFNESS: -a / density, places.DAMPING: -d / density,
+        places.DRIVE: -k / density, places.FORCE: -f / density}
+    by_modulus = {places.STIFFNESS: a / values['shear_modulus']}
     chain = {
         'density': by_density, 'shear_modulus': by_modulus,
-        'remanence': {kernels.DRIVE: k / values['remanence']},
-        'damping_coefficient': {kernels.DAMPING: per_damping},
-        'constant_force': {kernels.FORCE: per_force},
-        'chain_limit': {kernels.CONSTANT: -1.0 / values['chain_limit'] ** 2},
-        'coil_time_constant': {kernels.LAG: 1.0},
-        'initial_stretch': {kernels.STRETCH: 1.0}, 'initial_rate': {kernels.RATE: 1.0}}
+        'remanence': {places.DRIVE: k / values['remanence']},
+        'damping_coefficient': {places.DAMPING: per_damping},
+        'constant_force': {places.FORCE: per_force},
+        'chain_limit': {places.CONSTANT: -1.0 / values['chain_limit'] ** 2},
+        'coil_time_constant': {places.LAG: 1.0},
+        'initial_stretch': {places.STRETCH: 1.0}, 'initial_rate': {places.RATE: 1.0}}
     if branches == 1:
-        theta[kernels.FIRST_BRANCH:] = values['viscoelastic_ratio'], values['viscoelastic_time']
-        chain['viscoelastic_ratio'] = {kernels.FIRST_BRANCH: 1.0}
-        chain['viscoelastic_time'] = {kernels.FIRST_BRANCH + 1: 1.0}
+        theta[places.FIRST_BRANCH:] = values['viscoelastic_ratio'], values['viscoelastic_time']
+        chain['viscoelastic_ratio'] = {places.FIRST_BRANCH: 1.0}
+        chain['viscoelastic_time'] = {places.FIRST_BRANCH + 1: 1.0}
     # The density that goes with a time unit, L sqrt(rho/G).
     chain['time_unit'] = {i: x * 2.0 * density / values['time_unit']
                           for i, x in by_density.items()}
@@ -125,8 +120,8 @@ class Setup:
             values['viscoelastic_ratio'] > 0.0 or 'viscoelastic_ratio' in free)
         theta, chain = _chain(values, branches)
         if given:
-            theta[kernels.FIRST_BRANCH::2] = given.ratios
-            theta[kernels.FIRST_BRANCH + 1::2] = given.times
+            theta[places.FIRST_BRANCH::2] = given.ratios
+            theta[places.FIRST_BRANCH + 1::2] = given.times
         if 'time_unit' in free and 'shear_modulus' in free:
             extra = values['density'] / values['shear_modulus']
             modulus = dict(chain['shear_modulus'])
@@ -173,15 +168,15 @@ def respond(
     if len(uncertain) and free:
         # Steps: a piece begins with each level.
         place = np.searchsorted(begins, level_times[uncertain])
-        wanted = np.append(wanted, kernels.SWITCH + place)
+        wanted = np.append(wanted, places.SWITCH + place)
     start = np.zeros(len(wanted))
     if not recording.at_rest:
-        start[wanted == kernels.STRETCH] = 1.0
+        start[wanted == places.STRETCH] = 1.0
     elif not set_rest(theta, material, float(levels[0]), wanted, start):
         return None
     n = len(times)
     stretch, rate, raw = np.empty(n), np.empty(n), np.empty((n, len(wanted)))
-    if not kernels.respond(
+    if not motion.respond(
             theta, material, branches, wanted, start, begins, levels, slopes, float(levels[0]),
             0.0, times, rtol, stretch, rate, raw, np.empty((0, len(wanted)))):
         return None
@@ -217,18 +212,17 @@ def set_rest(
     Stretch and rate are set in ``theta``, and in ``start``, shape (w,), the derivatives of the
     stretch by what is wanted.
     """
-    a, k, f = theta[[kernels.STIFFNESS, kernels.DRIVE, kernels.FORCE]]
+    a, k, f = theta[[places.STIFFNESS, places.DRIVE, places.FORCE]]
     rest = equilibrium_stretch((k * level + f) / a, material)
     force, stiffness = elastic_force(rest, material), elastic_stiffness(rest, material)
     if not math.isfinite(stiffness):
         return False
-    theta[kernels.STRETCH], theta[kernels.RATE] = rest, 0.0
-    slopes = {kernels.STIFFNESS: -force, kernels.DRIVE: level, kernels.FORCE: 1.0}
-    work = np.zeros(BY_CONSTANT + len(material) - CONSTANTS)
+    theta[places.STRETCH], theta[places.RATE] = rest, 0.0
+    slopes = {places.STIFFNESS: -force, places.DRIVE: level, places.FORCE: 1.0}
     for j, i in enumerate(wanted.tolist()):
         slope = slopes.get(i, 0.0)
-        if kernels.CONSTANT <= i < kernels.SWITCH:
-            slope = -a * kernels.constant_slope(rest, i - kernels.CONSTANT, material, work)
+        if places.CONSTANT <= i < places.SWITCH:
+            slope = -a * motion.constant_slope(rest, i - places.CONSTANT, material)
         start[j] = slope / (a * stiffness)
     return True
 

@@ -18,7 +18,6 @@ from hmsa_ros.contract import topics
 from hmsa_ros.contract.actuator import actuator_from
 from hmsa_ros.core.actuators import unheld
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.core.warmup import warm_up
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.nodes import conversions, interface
 from hmsa_ros.nodes.capture import decode, RawSubscription
@@ -80,10 +79,6 @@ class PlannerNode(ManagedNode):
         self._listen_until = 0
         self._crowded = ''
         check_names(self)
-        seconds = warm_up(self.get_logger().info, creep=any(
-            x.model.material.creep for x in self._runtime.group.planners.values()))
-        if seconds > 1.0:
-            self.get_logger().info(f'loaded the numerical kernels in {seconds:.1f} s')
         self.on_change(self._take_parameters)
         self.autostart()
 

@@ -14,7 +14,6 @@ from hmsa_ros.contract.parameters import JOINT, ParameterSpec, PUBLISH_RATE
 from hmsa_ros.core.actuators import unheld
 from hmsa_ros.core.pacer import Pacer
 from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.core.warmup import warm_up
 from hmsa_ros.device.health import too_few_samples
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.errors import BadInputError
@@ -282,7 +281,6 @@ def _make_device(values: JointParameters, start: int, logger: RcutilsLogger) -> 
             logger.warning(f'joint {name}: {few}')
         if lost := unheld(joint.setup.actuator.nondimensional):
             logger.warning(f'joint {name}: {lost}')
-    warm_up(logger.info, creep=any(x.setup.creep for x in joints.values()), planning=False)
     return SimulatedDevice(
         [*joints.values()], period=max(round(NANOSECONDS / values['publish_rate']), 1), time=start,
         command_delay=round(values['command_delay'] * NANOSECONDS),

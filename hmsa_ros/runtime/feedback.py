@@ -13,7 +13,6 @@ from hmsa_ros.core.timeline import Model
 from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.estimation import Estimate, Estimator, Options, Prior
-from hmsa_ros.estimation.estimator import warm_up
 from hmsa_ros.estimation.motion import followed
 from hmsa_ros.estimation.words import differences
 from hmsa_ros.identification.known import Known
@@ -78,7 +77,6 @@ class Feedback:
         """Begin with nothing seen."""
         self._joints = {}
         if self.on:
-            warm_up()
             self._joints = {
                 name: Joint(
                     Estimator(self._prior(name, model), Options(

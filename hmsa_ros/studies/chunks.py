@@ -30,6 +30,7 @@ from hmsa_ros.studies.tables import open_writer, repeating
 #: study whose rows take longer says so itself (``chunk_rows``).
 SHARE, LEAST_ROWS, MOST_ROWS = 1000, 40_000, 500_000
 
+_SOURCES = ('.py', '.hpp', '.cpp')
 _NAME = re.compile(r'(\d{7,})-([0-9a-f]{16})-([0-9a-f]{8})\.parquet')
 
 
@@ -219,7 +220,8 @@ def code() -> str:
     """Return a hash of the version, and of the sources that plan, simulate and estimate."""
     package = Path(__file__).resolve().parent.parent
     made = hashlib.sha256(__version__.encode())
-    for folder in ('contract', 'core', 'estimation', 'identification', 'studies'):
-        for path in sorted((package / folder).rglob('*.py')):
+    for folder in ('contract', 'core', 'estimation', 'identification', 'motion', 'studies'):
+        for path in sorted(
+                x for x in (package / folder).rglob('*') if x.suffix in _SOURCES):
             made.update(path.relative_to(package).as_posix().encode() + path.read_bytes())
     return made.hexdigest()

@@ -12,8 +12,8 @@ import math
 
 import numpy as np
 
+from hmsa_ros import motion
 from hmsa_ros.core import law
-from hmsa_ros.core import tail_kernel as kernel
 from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.delivery import IDEAL
 from hmsa_ros.core.model import Array
@@ -130,9 +130,9 @@ def held(request: Request, found: Move, span: float) -> Move:
     ratios, speeds = material.branches.T
     step = max(abs(request.target - request.state.stretch), _LEAST_MOVE)
     out = np.empty((_MOST, 5))
-    count, vibration = kernel.staircase(
-        ratios * (holding - np.array(end.followed)), material.branches, float(request.target),
-        material.packed, float(delivery.lag), float(delivery.period),
+    count, vibration = motion.staircase(
+        ratios * (holding - np.array(end.followed)), material.branches, request.target,
+        material.packed, delivery.lag, delivery.period,
         max(span - found.duration, _SHORTEST), delivery.ripple / _SURE * step, out)
     times, excess, deviation, rates, fields = out[:count].T
     loads = holding + excess

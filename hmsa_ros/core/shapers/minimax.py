@@ -18,7 +18,8 @@ import math
 
 import numpy as np
 
-from hmsa_ros.core import kernels, law, response_kernel
+from hmsa_ros import motion
+from hmsa_ros.core import law
 from hmsa_ros.core.delivery import late, ramps
 from hmsa_ros.core.mismatch import Ellipsoid, Errors
 from hmsa_ros.core.model import Array
@@ -138,6 +139,9 @@ def _case(request: Request, holding: float, errors: Errors) -> _Case | None:
         root * frequency, peaks / abs(request.target - state.stretch))
 
 
+_NO_BRANCHES = np.empty((0, 3))
+
+
 def left(
         request: Request, cases: Sequence[_Case], levels: Sequence[Level],
         arrival: float) -> Array:
@@ -151,14 +155,9 @@ def left(
     for row, x, end, *pieces in zip(
             found, cases, arrival * faster, switches * faster, loads / stiffer,
             slopes / (stiffer * faster), strict=True):
-        if delivery.lag > 0.0:
-            status = response_kernel.trajectory_late(
+        if not motion.sample(
                 x.stretch, x.rate, request.field / x.stiffer, *pieces, delivery.lag * x.faster,
-                end, x.packed, np.empty((0, 3)), _RTOL, out)
-        else:
-            status = kernels.trajectory(
-                x.stretch, x.rate, *pieces, end, x.packed, _RTOL, out[0], out[1])
-        if status != kernels.DONE:
+                end, x.packed, _NO_BRANCHES, _RTOL, out):
             row[:] = math.inf
             continue
         away = out[0, 0] - x.rest

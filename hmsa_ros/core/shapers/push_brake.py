@@ -5,8 +5,10 @@ import contextlib
 from dataclasses import replace
 import math
 
-from hmsa_ros.core import kernels, law
-from hmsa_ros.core.model import Array
+import numpy as np
+
+from hmsa_ros import motion
+from hmsa_ros.core import law
 from hmsa_ros.core.moves import Level, Move, State
 from hmsa_ros.core.shapers.lagged import (
     at_rest,
@@ -16,6 +18,7 @@ from hmsa_ros.core.shapers.lagged import (
 )
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.shooting import Attempt, on_time, solve, Template
+from hmsa_ros.core.simulation import sampled
 from hmsa_ros.core.status import Code, RefusedError
 
 _RTOL = 1e-12
@@ -70,10 +73,9 @@ def _late(request: Request, holding: float, reason: str) -> Move:
             return Move(Code.MINIMUM_TIME, *found, reason)
         return three_levels(request, Code.MINIMUM_TIME, reason)
     least, most = _bounds(request, holding)
-    work = kernels.work_space()
     for share in _SHARES:
         low, high = holding + share * (least - holding), holding + share * (most - holding)
-        direction = _direction(work, request, low, high)
+        direction = _direction(request, low, high)
         push, brake = (high, low) if direction > 0.0 else (low, high)
         with contextlib.suppress(RefusedError):
             plain = _attempt(replace(request, delivery=replace(
@@ -88,10 +90,9 @@ def _attempt(
         request: Request, holding: float, least: float,
         most: float) -> Attempt:
     """Push and brake with given loads; None if no command comes of it."""
-    work = kernels.work_space()
-    direction = _direction(work, request, least, most)
+    direction = _direction(request, least, most)
     push, brake = (most, least) if direction > 0.0 else (least, most)
-    pushing, braking = _durations(work, request, direction, push, brake)
+    pushing, braking = _durations(request, direction, push, brake)
     if request.delivery.period > 0.0:
         return _on_grid(request, holding, (push, pushing), (brake, braking))
     delivery = request.delivery
@@ -142,39 +143,39 @@ def _bounds(request: Request, holding: float) -> tuple[float, float]:
     return least, most
 
 
-def _direction(
-        work: Array, request: Request, least: float, most: float) -> float:
+def _direction(request: Request, least: float, most: float) -> float:
     """Return where to push: +1 if full braking would stop short of the target, seen upwards."""
     state = request.state
     stop = state.stretch
     if state.rate != 0.0:
         up = state.rate > 0.0
-        status, _, stop, _, _ = kernels.turning_point(
-            work, state.stretch, state.rate, 1.0 if up else -1.0, least if up else most, 1.0,
+        status, _, stop, _, _ = motion.turning_point(
+            state.stretch, state.rate, 1.0 if up else -1.0, least if up else most, 1.0,
             request.material.packed, _RTOL)
-        if status != kernels.DONE:
+        if status != motion.DONE:
             stop = state.stretch
     return 1.0 if request.target > stop else -1.0
 
 
 def _durations(
-        work: Array, request: Request, direction: float, push: float,
+        request: Request, direction: float, push: float,
         brake: float) -> tuple[float, float]:
     """Find how long to push so that braking turns at the target, and how long that brakes."""
     state, material, target = request.state, request.material, request.target
     packed = material.packed
+    begins, loads, slopes = np.array([[0.0], [push], [0.0]])
 
     def follow(start: State, time: float) -> State:
-        _, stretch, rate, _ = kernels.follow_one(
-            work, start.stretch, start.rate, 0.0, push, 0.0, 0.0, 0.0, time, packed, _RTOL)
+        stretch, rate, *_ = sampled(
+            begins, loads, slopes, np.array([float(time)]), start, material, _RTOL)[:, 0].tolist()
         return State(stretch, rate)
 
     def turn(start: State) -> tuple[float, float]:
         if direction * start.rate <= 0.0:
             return 0.0, start.stretch
-        status, time, stretch, _, _ = kernels.turning_point(
-            work, start.stretch, start.rate, direction, brake, 1.0, packed, _RTOL)
-        if status != kernels.DONE:
+        status, time, stretch, _, _ = motion.turning_point(
+            start.stretch, start.rate, direction, brake, 1.0, packed, _RTOL)
+        if status != motion.DONE:
             # Too hard against a limiting stretch to be followed: far beyond the target.
             return 0.0, float(packed[law.UPPER if direction > 0.0 else law.LOWER])
         return time, stretch
@@ -183,9 +184,9 @@ def _durations(
     here = state
     if direction * state.rate < 0.0:
         # Moving away: the push first has to bring it to a stop.
-        status, begin, stretch, _, _ = kernels.turning_point(
-            work, state.stretch, state.rate, -direction, push, 1.0, packed, _RTOL)
-        if status == kernels.DONE:
+        status, begin, stretch, _, _ = motion.turning_point(
+            state.stretch, state.rate, -direction, push, 1.0, packed, _RTOL)
+        if status == motion.DONE:
             here = State(stretch, 0.0)
     stride = 0.02 / (request.frequency + material.zeta)
     low = 0.0

@@ -1,0 +1,172 @@
+// One step of DOP853 (Hairer, Norsett, Wanner, Solving ODEs I, sec. II.5) for any scalar.
+#pragma once
+#include <utility>
+#include "dual.hpp"
+
+namespace hmsa {
+namespace dop853 {
+constexpr double node[12] = {
+    0.0, 0.05260015195876773, 0.0789002279381516, 0.1183503419072274, 0.2816496580927726,
+    0.3333333333333333, 0.25, 0.3076923076923077, 0.6512820512820513, 0.6, 0.8571428571428571, 1.0};
+// Rows of the Runge-Kutta matrix, then the weights.
+constexpr double a[13][12] = {
+    {},
+    {0.05260015195876773},
+    {0.0197250569845379, 0.0591751709536137},
+    {0.02958758547680685, 0.0, 0.08876275643042054},
+    {0.2413651341592667, 0.0, -0.8845494793282861, 0.924834003261792},
+    {0.037037037037037035, 0.0, 0.0, 0.17082860872947386, 0.12546768756682242},
+    {0.037109375, 0.0, 0.0, 0.17025221101954405, 0.06021653898045596, -0.017578125},
+    {0.03709200011850479, 0.0, 0.0, 0.17038392571223998, 0.10726203044637328,
+     -0.015319437748624402, 0.008273789163814023},
+    {0.6241109587160757, 0.0, 0.0, -3.3608926294469414, -0.868219346841726, 27.59209969944671,
+     20.154067550477894, -43.48988418106996},
+    {0.47766253643826434, 0.0, 0.0, -2.4881146199716677, -0.590290826836843, 21.230051448181193,
+     15.279233632882423, -33.28821096898486, -0.020331201708508627},
+    {-0.9371424300859873, 0.0, 0.0, 5.186372428844064, 1.0914373489967295, -8.149787010746927,
+     -18.52006565999696, 22.739487099350505, 2.4936055526796523, -3.0467644718982196},
+    {2.273310147516538, 0.0, 0.0, -10.53449546673725, -2.0008720582248625, -17.9589318631188,
+     27.94888452941996, -2.8589982771350235, -8.87285693353063, 12.360567175794303,
+     0.6433927460157636},
+    {0.054293734116568765, 0.0, 0.0, 0.0, 0.0, 4.450312892752409, 1.8915178993145003,
+     -5.801203960010585, 0.3111643669578199, -0.1521609496625161, 0.20136540080403034,
+     0.04471061572777259}};
+constexpr double e3[12] = {
+    -0.18980075407240762, 0.0, 0.0, 0.0, 0.0, 4.450312892752409, 1.8915178993145003,
+    -5.801203960010585, -0.4226823213237919, -0.1521609496625161, 0.20136540080403034,
+    0.02265179219836082};
+constexpr double e5[12] = {
+    0.01312004499419488, 0.0, 0.0, 0.0, 0.0, -1.2251564463762044, -0.4957589496572502,
+    1.6643771824549864, -0.35032884874997366, 0.3341791187130175, 0.08192320648511571,
+    -0.022355307863886294};
+
+// x += weight k, where the weight is not 0: known when compiled.
+template <int I, int J, class R> HMSA_INLINE void add(R &x, const R &k)
+{
+    if constexpr (J == 0)
+        x = a[I][0] * k;
+    else if constexpr (a[I][J] != 0)
+        x = x + a[I][J] * k;
+}
+}  // namespace dop853
+
+// The numbers in a state: values, then derivatives.
+template <class S> constexpr int size_of = sizeof(S) / sizeof(real<S>);
+
+// f(i, y, k): derivative k of state y at node i of the step. Returns the error in units of rtol.
+template <class S, int W> struct Step {
+    using R = real<S>;
+    S k[12][W];
+    template <int I> HMSA_INLINE void stage(const S *y, const R &h, S *x) const
+    {
+        constexpr int n = size_of<S>;
+        for (int w = 0; w < W; w++) {
+            R *out = reinterpret_cast<R *>(&x[w]);
+            const R *from = reinterpret_cast<const R *>(&y[w]);
+            for (int m = 0; m < n; m++)
+                // What came last is added last: the rest is ready when it comes.
+                if constexpr (I == 1)
+                    out[m] = from[m] + (dop853::a[1][0] * h) * at(0, w, m);
+                else
+                    out[m] = (from[m] + h * row<I>(w, m, std::make_integer_sequence<int, I - 1>()))
+                        + (dop853::a[I][I - 1] * h) * at(I - 1, w, m);
+        }
+    }
+    HMSA_INLINE const R &at(int i, int w, int m) const { return reinterpret_cast<const R *>(&k[i][w])[m]; }
+    template <int I, int... J>
+    HMSA_INLINE R row(int w, int m, std::integer_sequence<int, J...>) const
+    {
+        R x{};
+        (dop853::add<I, J>(x, at(J, w, m)), ...);
+        return x;
+    }
+    template <int I, class F> HMSA_INLINE void one(const F &f, const S *y, const R &h)
+    {
+        S x[W];
+        stage<I>(y, h, x);
+        f(I, x, k[I]);
+    }
+    template <class F, int... I>
+    HMSA_INLINE void all(const F &f, const S *y, const R &h, std::integer_sequence<int, I...>)
+    {
+        (one<I + 1>(f, y, h), ...);
+    }
+    // Where a state is more than two numbers and their derivatives by one, a loop over the stages:
+    // the equation then stands once in what is compiled, and not twelve times.
+    static constexpr bool unrolled = W == 2 && count_of<S> <= 1;
+    template <class F> HMSA_INLINE void move(const F &f, const S *y, const R &h, S *end)
+    {
+        if constexpr (unrolled) {
+            f(0, y, k[0]);
+            all(f, y, h, std::make_integer_sequence<int, 11>());
+            stage<12>(y, h, end);
+        } else {
+            for (int i = 0; i < 12; i++) {
+                sum(i, y, h, end);
+                f(i, end, k[i]);
+            }
+            sum(12, y, h, end);
+        }
+    }
+    void sum(int row, const S *y, double h, S *to) const
+    {
+        constexpr int n = W * size_of<S>;
+        double *out = reinterpret_cast<double *>(to);
+        const double *from = reinterpret_cast<const double *>(y);
+        double total[n] = {};
+        for (int j = 0; j < row && j < 12; j++) {
+            const double weight = dop853::a[row][j];
+            if (weight == 0)
+                continue;
+            const double *add = reinterpret_cast<const double *>(k[j]);
+            for (int m = 0; m < n; m++)
+                total[m] += weight * add[m];
+        }
+        for (int m = 0; m < n; m++)
+            out[m] = from[m] + h * total[m];
+    }
+    // The error of the first two alone, the second of which is small against ``fastest``.
+    template <class F> HMSA_INLINE double scaled(
+        const F &f, const S *y, double h, double rtol, double fastest, S *end)
+    {
+        move(f, y, h, end);
+        double n5 = 0, n3 = 0;
+        for (int w = 0; w < 2; w++) {
+            double d5 = 0, d3 = 0;
+            for (int j = 0; j < 12; j++) {
+                d5 += dop853::e5[j] * value(k[j][w]);
+                d3 += dop853::e3[j] * value(k[j][w]);
+            }
+            const double scale = 1 / (rtol * ((w ? fastest : 1) + abs(value(end[w]))));
+            n5 += d5 * scale * (d5 * scale);
+            n3 += d3 * scale * (d3 * scale);
+        }
+        return h * n5 / sqrt(2 * (n5 + 0.01 * n3) + 1e-300);
+    }
+    template <class F> HMSA_INLINE R operator()(const F &f, const S *y, const R &h, const R &rtol, S *end)
+    {
+        move(f, y, h, end);
+        R n5{}, n3{};
+        for (int w = 0; w < W; w++) {
+            R d5 = dop853::e5[0] * value(k[0][w]), d3 = dop853::e3[0] * value(k[0][w]);
+            for (int j = 5; j < 12; j++) {
+                d5 = d5 + dop853::e5[j] * value(k[j][w]);
+                d3 = d3 + dop853::e3[j] * value(k[j][w]);
+            }
+            const R scale = 1.0 / (rtol * (1.0 + abs(value(end[w]))));
+            d5 = d5 * scale;
+            d3 = d3 * scale;
+            n5 = n5 + d5 * d5;
+            n3 = n3 + d3 * d3;
+        }
+        return h * n5 / sqrt(R(double(W) * (n5 + 0.01 * n3) + 1e-300));
+    }
+};
+// Factor of the next step's length; 0.2 for an error that is no number.
+template <class R> HMSA_INLINE R resized(const R &error)
+{
+    const R x = 0.9 / sqrt(sqrt(sqrt(R(error + 1e-12)))), least = R{} + 0.2, most = R{} + 6.0;
+    const R high = select(x > least, x, least);
+    return select(high < most, high, most);
+}
+}  // namespace hmsa

@@ -1,0 +1,210 @@
+// Motion over time, with Maxwell branches and behind a coil that lags. Branch i holds
+// ratio (psi'(l) - w), where w follows the elastic force, w' = speed (psi'(l) - w). Where the output
+// of the amplifier is linear in time, the field behind it is a line and an exponential.
+#pragma once
+#include "swing.hpp"
+
+namespace hmsa {
+constexpr int most_branches = 3, most_attempts = 200000;
+
+// Columns of a branch: ratio, 1/time, and where it goes on with the state, what it follows.
+enum Column { ratio_at, speed_at, follower_at };
+
+template <int NB> struct Branches {
+    double ratio[NB + 1] = {}, speed[NB + 1] = {};
+    double total = 1, fastest = 0;
+    // Fewer than NB are filled up by ones that hold nothing.
+    void read(const double *from, int columns, int count)
+    {
+        for (int b = 0; b < count && b < NB; b++) {
+            ratio[b] = from[columns * b + ratio_at];
+            speed[b] = from[columns * b + speed_at];
+            total += ratio[b];
+            fastest = max(fastest, speed[b]);
+        }
+    }
+};
+
+// A load: line + slope t + rest exp(-decay t).
+template <class S> struct Drive {
+    S line;
+    double slope;
+    S rest;
+    double decay;
+};
+
+template <class S, class System, int NB> struct Motion {
+    static constexpr int width = 2 + NB;
+    const System &system;
+    const Branches<NB> &branches;
+    S y[width] = {};  // stretch, rate, what the branches follow
+    Step<S, width> step;
+    Motion(const System &a, const Branches<NB> &b) : system(a), branches(b) {}
+
+    // The derivative of a state by time.
+    HMSA_INLINE void change(const S *x, const S &load, S *by) const
+    {
+        by[0] = x[1];
+        by[1] = system.acceleration(x[0], x[1], system.drag, [&](const S &force)
+            __attribute__((always_inline)) {
+                S net = load - force;
+                for (int b = 0; b < NB; b++) {
+                    const S above = force - x[2 + b];
+                    net = net - above * branches.ratio[b];
+                    by[2 + b] = above * branches.speed[b];
+                }
+                return net;
+            });
+    }
+    // Integrates over a duration; h is the step to begin with, 0 for none known, and to go on with.
+    // Motion that meets a limiting stretch too hard to be resolved turns there, in no time and
+    // without loss.
+    HMSA_APART bool advance(const Drive<S> &drive, double duration, double zeta, double rtol, double &h)
+    {
+        const bool fades = drive.decay > 0 && (value(drive.rest) != 0 || count_of<S> > 0);
+        const double stiff = sqrt(branches.total), root = sqrt(sqrt(sqrt(rtol)));
+        if (!(h > 0)) {
+            const double first = 4 * root / (frequency(system, value(y[0])) + 3 * zeta + 1e-9);
+            const double fastest = max(branches.fastest, value(drive.rest) != 0 ? drive.decay : 0);
+            h = 1 / (stiff / first + 0.25 / root * fastest);
+        }
+        S end[width];
+        double done = 0;
+        for (int i = 0; i < most_attempts; i++) {
+            const double left = duration - done;
+            if (!(left > 0))
+                return true;
+            const double span = min(h, left), l = value(y[0]), v = value(y[1]);
+            const double felt = rounding * abs(l) * stiff * frequency(system, l) / (1 + abs(v));
+            if (felt > resolved && v * (l - system.rest) > 0)
+                negate(y[1]);
+            const S line = drive.line + drive.slope * done;
+            const S rest = fades ? S(drive.rest * exp(-drive.decay * done)) : S(0.0 * drive.rest);
+            const double error = step([&](int stage, const S *x, S *by)
+                __attribute__((always_inline)) {
+                    const double t = span * dop853::node[stage];
+                    S load = line + drive.slope * t;
+                    if (fades)
+                        load = load + rest * exp(-drive.decay * t);
+                    change(x, load, by);
+                }, y, span, max(rtol, felt), end);
+            if (!(error <= 1)) {
+                h = span * resized(error);
+                continue;
+            }
+            for (int w = 0; w < width; w++)
+                y[w] = end[w];
+            // A rate on which only damping still acts falls to numbers with which processors take
+            // ten times as long.
+            if (abs(value(y[1])) < 1e-200)
+                settle(y[1]);
+            done = span == left ? duration : done + span;
+            if (span == h || error > 0.5)
+                h = span * resized(error);
+        }
+        return false;
+    }
+    static void negate(double &x) { x = -x; }
+    static void settle(double &x) { x = 0; }
+    template <int N> static void negate(Dual<double, N> &x) { x.v = -x.v; }
+    template <int N> static void settle(Dual<double, N> &x) { x.v = 0; }
+};
+
+// What is left of an exponential after a duration: nothing that a sum would not show.
+inline double faded(double line, double rest, double decay, double duration)
+{
+    rest *= exp(-decay * duration);
+    return abs(rest) > 1e-17 * (1e-3 + abs(line)) ? rest : 0;
+}
+
+// Actuators that are advanced together, each by a duration of its own: rows of stretch, rate and
+// step, of the drive, of the packed material, and of the branches (most_branches, 3).
+struct Plant {
+    int first, last;
+    const bool *wanted;
+    double *state, *drive;
+    const double *material;
+    int stride;
+    double *branches;  // null where nothing creeps
+    const double *durations;
+    double rtol;
+    int64_t *status;
+};
+template <int NB, class System> bool advance_row(const Plant &plant, int i, const System &system)
+{
+    double *state = plant.state + 3 * i, *drive = plant.drive + 4 * i;
+    double *rows = plant.branches ? plant.branches + 3 * most_branches * i : nullptr;
+    Branches<NB> branches;
+    if (NB > 0)
+        branches.read(rows, 3, NB);
+    Motion<double, System, NB> motion{system, branches};
+    motion.y[0] = state[0], motion.y[1] = state[1];
+    for (int b = 0; b < NB; b++)
+        motion.y[2 + b] = rows[3 * b + follower_at];
+    const double duration = plant.durations[i];
+    const double zeta = plant.material[int64_t(plant.stride) * i + zeta_at];
+    double h = state[2];
+    if (!motion.advance({drive[0], drive[1], drive[2], drive[3]}, duration, zeta, plant.rtol, h))
+        return false;
+    state[0] = motion.y[0], state[1] = motion.y[1], state[2] = h;
+    for (int b = 0; b < NB; b++)
+        rows[3 * b + follower_at] = motion.y[2 + b];
+    const double line = drive[0];
+    drive[0] += drive[1] * duration;
+    if (drive[2] != 0)
+        drive[2] = faded(line, drive[2], drive[3], duration);
+    return true;
+}
+
+// Samples at increasing times of the response to an amplifier whose output is loads[m] +
+// slopes[m] (t - switches[m]) from switches[m] on; the motion begins at the first, which is not later
+// than the first time. Rows of out (3 + NB, count) are stretch, rate, field and followers.
+struct Course {
+    int pieces, count;
+    const double *switches, *loads, *slopes, *times;
+    double stretch, rate, field, lag, zeta, rtol;
+    double *branches;  // (NB, 3)
+    int branch_count;
+    double *out;
+};
+template <int NB, class System> bool sample(const System &system, const Course &course)
+{
+    Branches<NB> branches;
+    branches.read(course.branches, 3, course.branch_count);
+    Motion<double, System, NB> motion{system, branches};
+    motion.y[0] = course.stretch, motion.y[1] = course.rate;
+    for (int b = 0; b < course.branch_count; b++)
+        motion.y[2 + b] = course.branches[3 * b + follower_at];
+    const double lag = course.lag, decay = lag > 0 ? 1 / lag : 0;
+    double t = course.switches[0], field = course.field, h = 0;
+    int piece = 0;
+    double line = course.loads[0] - course.slopes[0] * lag;
+    double rest = lag > 0 ? field - line : 0;
+    for (int i = 0; i < course.count;) {
+        const bool ends = piece + 1 < course.pieces && course.switches[piece + 1] <= course.times[i];
+        const double end = ends ? course.switches[piece + 1] : course.times[i], span = end - t;
+        const double slope = course.slopes[piece];
+        if (!motion.advance({line, slope, rest, decay}, span, course.zeta, course.rtol, h))
+            return false;
+        line += slope * span;
+        if (rest != 0)
+            rest *= exp(-decay * span);
+        field = line + rest;
+        t = end;
+        if (ends) {
+            piece++;
+            h = 0;
+            line = course.loads[piece] - course.slopes[piece] * lag;
+            rest = lag > 0 ? field - line : 0;
+            continue;
+        }
+        double *column = course.out + i++;
+        column[0] = motion.y[0];
+        column[course.count] = motion.y[1];
+        column[2 * course.count] = field;
+        for (int b = 0; b < course.branch_count; b++)
+            column[(3 + b) * course.count] = motion.y[2 + b];
+    }
+    return true;
+}
+}  // namespace hmsa

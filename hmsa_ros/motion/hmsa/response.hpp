@@ -1,0 +1,240 @@
+// The response to recorded levels with its derivatives by the parameters, in seconds:
+//     m(l) l'' + m'(l) l'^2/2 + d l' + a psi'(l) + sum_i gamma_i a (psi'(l) - w_i) = k B + f
+//     tau_i w_i' = psi'(l) - w_i        tau_c B' = u - B
+// divided by the density and L^2; u is the piecewise linear level of the amplifier.
+#pragma once
+#include "motion.hpp"
+
+namespace hmsa {
+// Places in theta; after first_branch gamma and tau of each branch in turn. Beyond all places:
+// constant i of the law is the first plus i, the time at which piece m begins the second plus m.
+enum Theta { stiffness_of, damping_of, drive_of, force_of, lag_of, stretch_of, rate_of, first_branch };
+constexpr int constant_of = 500, switch_of = 1000;
+
+// Phase of the fastest motion over which a quintic interpolates to about 1e-8.
+constexpr double smooth_phase = 0.45;
+// Largest phase of a step where there are derivatives: they ring on when the motion is over, and the
+// error that is controlled is that of the motion alone. And in times of the fastest branch: beyond
+// some six the derivatives would grow without an end.
+constexpr double longest_phase = 1, relaxed_share = 4;
+// What no recording needs and a start value far off may ask for.
+constexpr int most_response_steps = 20000, most_steps_a_sample = 20;
+
+struct Recorded {
+    const double *theta, *material;
+    int branches;
+    int wanted_count;
+    const int64_t *wanted;  // places by which to differentiate
+    const double *start;  // derivatives of the initial stretch by these
+    int pieces;
+    const double *begins, *levels, *ramps;
+    double field, field_lag;  // at the first begin, and its derivative by the lag
+    int count;
+    const double *times;
+    double rtol;
+    double *stretch, *rate;  // (count,)
+    double *jacobian, *by_rate;  // (count, wanted_count); the latter may be null
+};
+
+// N of the wanted parameters at a time, from one of them on; the motion is the same to the bit.
+template <class C, class System, int NB> struct Response {
+    using S = C;
+    static constexpr int width = 2 + NB, N = count_of<S>;
+    const Recorded &of;
+    int from;
+    Response(const Recorded &recorded, int first) : of(recorded), from(first) {}
+    System system;
+    S a, damping, drive, force, lag, ratio[NB + 1], per_time[NB + 1];
+    double level, ramp;
+    S excess;  // of the field over the line, where the piece began
+    double piece_begin, fastest;
+    Step<S, width> step;
+
+    static S plain(double x)
+    {
+        S made{};
+        value_of(made) = x;
+        return made;
+    }
+    static double &value_of(double &x) { return x; }
+    template <int M> static double &value_of(Dual<double, M> &x) { return x.v; }
+    template <class F> void each(const F &f) const
+    {
+        for (int j = 0; j < N && from + j < of.wanted_count; j++)
+            f(j, int(of.wanted[from + j]));
+    }
+    S seeded_at(int place) const
+    {
+        S x = plain(of.theta[place]);
+        if constexpr (N > 0)
+            each([&](int j, int wanted) { x.d[j] = wanted == place ? 1 : 0; });
+        return x;
+    }
+    void set_up()
+    {
+        system.read(0, of.material);
+        if constexpr (System::direct)
+            each([&](int j, int wanted) {
+                if (constant_of <= wanted && wanted < switch_of)
+                    system.law.seed(wanted - constant_of, j);
+            });
+        a = seeded_at(stiffness_of), damping = seeded_at(damping_of), drive = seeded_at(drive_of);
+        force = seeded_at(force_of), lag = seeded_at(lag_of);
+        for (int b = 0; b < NB; b++) {
+            ratio[b] = per_time[b] = plain(0);
+            if (b < of.branches) {
+                ratio[b] = seeded_at(first_branch + 2 * b);
+                per_time[b] = inverse(seeded_at(first_branch + 2 * b + 1));
+            }
+        }
+    }
+    S field(double dt) const
+    {
+        S now = plain(level + ramp * dt) - lag * ramp;
+        if (value(lag) > 0)
+            now = now + excess * fading(inverse(lag) * -dt);
+        return now;
+    }
+    static S fading(const S &x)
+    {
+        const double e = exp(value(x));
+        if constexpr (N > 0)
+            return through(x, e, e);
+        else
+            return e;
+    }
+    HMSA_INLINE void change(const S *x, double dt, S *by) const
+    {
+        const S pull = drive * field(dt) + force;
+        by[0] = x[1];
+        by[1] = system.acceleration(x[0], x[1], damping, [&](const S &elastic)
+            __attribute__((always_inline)) {
+                S held = elastic;
+                for (int b = 0; b < NB; b++) {
+                    const S above = elastic - x[2 + b];
+                    held = held + ratio[b] * above;
+                    by[2 + b] = above * per_time[b];
+                }
+                return pull - a * held;
+            });
+    }
+    static S quintic(double x, double h, const S &p0, const S &v0, const S &a0, const S &p1,
+        const S &v1, const S &a1, S &rate)
+    {
+        const S v = v0 * h, b = a0 * (h * h);
+        const S r = p1 - p0 - v - 0.5 * b, s = v1 * h - v - b, u = a1 * (h * h) - b;
+        const S c3 = 10.0 * r - 4.0 * s + 0.5 * u, c4 = 7.0 * s - 15.0 * r - u;
+        const S c5 = 6.0 * r - 3.0 * s + 0.5 * u;
+        rate = (v + x * (b + x * (3.0 * c3 + x * (4.0 * c4 + x * (5.0 * c5))))) * (1 / h);
+        return p0 + x * (v + x * (0.5 * b + x * (c3 + x * (c4 + x * c5))));
+    }
+    void put(int i, const S &l, const S &v) const
+    {
+        of.stretch[i] = value(l), of.rate[i] = value(v);
+        if constexpr (N > 0)
+            each([&](int j, int) {
+                of.jacobian[int64_t(i) * of.wanted_count + from + j] = l.d[j];
+                if (of.by_rate)
+                    of.by_rate[int64_t(i) * of.wanted_count + from + j] = v.d[j];
+            });
+    }
+    bool operator()()
+    {
+        set_up();
+        S y[width], end[width], first[width], final[width];
+        y[0] = plain(of.theta[stretch_of]), y[1] = seeded_at(rate_of);
+        if constexpr (N > 0)
+            each([&](int j, int) { y[0].d[j] = of.start[from + j]; });
+        for (int b = 0; b < NB; b++)
+            y[2 + b] = system.force(y[0]);
+        level = of.levels[0], ramp = of.ramps[0], piece_begin = of.begins[0];
+        excess = plain(of.field - level) + lag * ramp;
+        if constexpr (N > 0)
+            each([&](int j, int wanted) {
+                if (wanted == lag_of)
+                    excess.d[j] += of.field_lag;
+            });
+        // The law in units in which its stiffness is 1.
+        typename System::Bare bare;
+        bare.read(0, of.material);
+        const double stiff = value(a);
+        fastest = sqrt(stiff / bare.mass(bare.rest));
+        double h = 0.2 / fastest, relaxed = infinity(), t = of.begins[0];
+        for (int b = 0; b < of.branches; b++)
+            relaxed = min(relaxed, relaxed_share * of.theta[first_branch + 2 * b + 1]);
+        bool fresh = true;
+        int piece = 0, i = 0;
+        const int64_t most = most_response_steps + int64_t(most_steps_a_sample) * of.count;
+        for (int64_t attempt = 0; attempt < most; attempt++) {
+            if (fresh)
+                change(y, t - piece_begin, first);
+            fresh = false;
+            for (; i < of.count && of.times[i] <= t; i++)  // before the begin it is uniform
+                put(i, y[0] + y[1] * (of.times[i] - t), y[1]);
+            if (i == of.count)
+                return true;
+            const double limit = piece + 1 < of.pieces ? of.begins[piece + 1] : infinity();
+            const double l = value(y[0]);
+            const double per_phase = sqrt(bare.mass(l) / (stiff * bare.elastic(l).d[0]));
+            const double smooth = smooth_phase * per_phase;
+            const double target = min(limit, of.times[i] - t >= smooth ? of.times[i] : t + smooth);
+            if (of.wanted_count > 0)
+                h = min(h, min(longest_phase * per_phase, relaxed));
+            const double span = min(h, target - t), dt = t - piece_begin;
+            const double error = make(y, first, dt, span, end);
+            if (!(error <= 1)) {
+                h = span * resized(error);
+                if (!(h > 1e-12 / fastest))
+                    return false;
+                continue;
+            }
+            const double after = span == target - t ? target : t + span;
+            change(end, after - piece_begin, final);
+            for (; i < of.count && of.times[i] < after; i++) {
+                S rate;
+                const S stretch = quintic((of.times[i] - t) / span, span, y[0], y[1], first[1],
+                    end[0], end[1], final[1], rate);
+                put(i, stretch, rate);
+            }
+            for (int w = 0; w < width; w++)
+                y[w] = end[w], first[w] = final[w];
+            t = after;
+            if (span == h || error > 0.5)
+                h = span * resized(error);
+            for (; piece + 1 < of.pieces && of.begins[piece + 1] <= t; fresh = true)
+                begin(++piece, y);
+        }
+        return false;
+    }
+    void begin(int piece, S *y)
+    {
+        const S before = field(of.begins[piece] - piece_begin);
+        piece_begin = of.begins[piece];
+        const double jump = of.levels[piece] - value(before);
+        level = of.levels[piece], ramp = of.ramps[piece];
+        excess = before - level + lag * ramp;
+        if constexpr (N > 0)
+            if (jump != 0) {
+                // By a lag of 0, or by a later switch: what the step lacks is an impulse.
+                typename System::Bare bare;
+                bare.read(0, of.material);
+                const double impulse = value(drive) * jump / bare.mass(value(y[0]));
+                each([&](int j, int wanted) {
+                    if (wanted == switch_of + piece || (wanted == lag_of && !(value(lag) > 0)))
+                        y[1].d[j] -= impulse;
+                });
+            }
+    }
+    // One step, whose first slope is known; the rate counts in natural frequencies.
+    double make(const S *y, const S *known, double dt, double h, S *end)
+    {
+        return step.scaled([&](int stage, const S *x, S *by) __attribute__((always_inline)) {
+            if (stage == 0)
+                for (int w = 0; w < width; w++)
+                    by[w] = known[w];
+            else
+                change(x, dt + h * dop853::node[stage], by);
+        }, y, h, of.rtol, fastest, end);
+    }
+};
+}  // namespace hmsa

@@ -1,0 +1,251 @@
+// The equation of motion, once, over any scalar (Eq. 11 in energy form):
+//     m(l) l'' + m'(l) l'^2 / 2 + d l' + psi'(l) = beta
+// with stretch l, time in L sqrt(rho/G) and the load beta = Br B/(mu0 G).
+#pragma once
+#include "dop853.hpp"
+#include "law.hpp"
+
+namespace hmsa {
+// Places in a packed material, and the families of laws (hmsa_ros/core/law.py, laws/record.py).
+enum Place { kind_at, zeta_at, c1_at, damping_at, lower_at, upper_at, constants_at };
+enum Family { gent, neo_hookean, polynomial, ogden, table, beam };
+
+// What depends on the stretch alone is differentiated by it, and by all else after; unless the
+// constants of the law have derivatives, too.
+template <class S, class C> using Along = std::conditional_t<
+    (count_of<C> > 0 || count_of<S> == 0), S, Dual<real<S>, 1>>;
+template <class L, bool direct, class S> HMSA_INLINE L inner(const S &l)
+{
+    if constexpr (direct || count_of<S> == 0)
+        return l;
+    else
+        return seeded<L>(value(l));
+}
+template <bool direct, class L, class S> HMSA_INLINE S outer(const L &f, const S &l)
+{
+    if constexpr (direct || count_of<S> == 0)
+        return f;
+    else
+        return chained(f, l);
+}
+
+// A block: inertia m = (l^-3 + c1)/6, and a constant damping. C is the type of its constants.
+template <class C, template <class> class Law> struct Block {
+    static constexpr double rest = 1;
+    static constexpr bool direct = count_of<C> > 0;
+    using Bare = Block<double, Law>;  // without derivatives
+    real<C> c1;
+    C drag;
+    Law<C> law;
+
+    void read(int lane, const double *m)
+    {
+        set(c1, lane, m[c1_at]);
+        set(drag, lane, m[damping_at]);
+        law.read(lane, m + constants_at);
+    }
+    // The acceleration under net(psi'(l)), the load less all that is elastic; also the square of the
+    // natural frequency where it is asked for.
+    template <class S, class D, class F> HMSA_INLINE S acceleration(
+        const S &l, const S &v, const D &damping, const F &net, real<S> *squared = nullptr) const
+    {
+        using L = Along<S, C>;
+        const L x = inner<L, direct>(l), x2 = x * x, x4 = x2 * x2, q = inverse(x + x4 * c1);
+        const L force = law.force(x), per_mass = 6.0 * x4 * q;
+        if constexpr (count_of<S> > 0 && !direct)
+            if (squared)
+                *squared = force.d[0] * per_mass.v;
+        const S i_mass = outer<direct>(per_mass, l);
+        return net(outer<direct>(force, l)) * i_mass
+            - (i_mass * damping - outer<direct>(L(1.5 * q), l) * v) * v;
+    }
+    double energy(double l) const { return law.energy(l); }
+    template <class S> S force(const S &l) const { return law.force(l); }
+    Dual<double, 1> elastic(double l) const { return law.force(Dual<double, 1>{l, {1}}); }
+    double mass(double l) const { return (1 / (l * l * l) + get(c1, 0)) / 6; }
+    double shape(double) const { return 1; }  // the damping is this times drag
+};
+
+// A clamped beam by the deflection of its tip, odd in it, from tables of degree 7
+// (hmsa_ros/core/laws/bending.py): inertia of its own, and a damping that grows with it.
+struct Beam {
+    double drag;
+    const double *c;
+
+    const double *piece(double a) const
+    {
+        const int i = int((1 - __builtin_sqrt(1 - a / c[1])) * c[3]), last = int(c[0]) - 1;
+        return c + 8 + 26 * (i < 0 ? 0 : i > last ? last : i);
+    }
+    template <class S> S force(const S &l) const
+    {
+        const double x = value(l), a = abs(x), sign = x < 0 ? -1 : 1;
+        if (!(a >= 0))
+            return l;
+        const S size = l * sign;
+        if (a > c[2])
+            return beyond(S(size - c[2]), c[1] - c[2], c[4], c[5]) * sign;
+        const double *p = piece(a);
+        return horner<7>(p + 2, S(size - *p)) * sign;
+    }
+    // Inertia, half its slope, and what multiplies the damping at rest.
+    template <class S> void inertia(const S &l, S &mass, S &half, S &shape) const
+    {
+        const double x = value(l), a = abs(x), sign = x < 0 ? -1 : 1;
+        if (!(a <= c[2])) {
+            mass = 0.0 * l + c[6];
+            half = 0.0 * l;
+            shape = 0.0 * l + c[7];
+            return;
+        }
+        const double *p = piece(a);
+        const S u = l * sign - *p;
+        mass = horner<7>(p + 10, u);
+        half = horner_slope<7>(p + 10, u) * (0.5 * sign);
+        shape = horner<7>(p + 18, u);
+    }
+    double energy(double l) const
+    {
+        const double a = abs(l), way = a - c[2], inside = min(a, c[2]);
+        const double *p = piece(inside);
+        const double u = inside - *p;
+        double total = 0;
+        for (int k = 8; k > 0; k--)
+            total = u * (p[1 + k] / k + total);
+        return p[1] + total + (way > 0 ? energy_beyond(way, c[1] - c[2], c[4], c[5]) : 0);
+    }
+};
+
+// An actuator of any law beside Gent, chosen while it runs: a step with it calls, and a step with
+// Gent does not.
+struct Any {
+    static constexpr bool direct = false;
+    using Bare = Any;
+    int kind;
+    double rest, c1, drag;
+    Polynomial<double> polynomial_law;
+    Ogden<double> ogden_law;
+    Table<double> table_law;
+    Beam beam_law;
+
+    void read(int, const double *m)
+    {
+        kind = int(m[kind_at]), c1 = m[c1_at], drag = m[damping_at];
+        rest = kind == beam ? 0 : 1;
+        switch (kind) {
+        case polynomial: return polynomial_law.read(0, m + constants_at);
+        case ogden: return ogden_law.read(0, m + constants_at);
+        case table: return table_law.read(0, m + constants_at);
+        default: beam_law = {drag, m + constants_at};
+        }
+    }
+    template <class L> HMSA_APART L force(const L &l) const
+    {
+        switch (kind) {
+        case polynomial: return polynomial_law.force(l);
+        case ogden: return ogden_law.force(l);
+        case table: return table_law.force(l);
+        default: return beam_law.force(l);
+        }
+    }
+    // 1/m, m'/(2 m), and what multiplies the damping at rest, over m.
+    template <class L> HMSA_APART void inertia(const L &l, L &i_mass, L &falls, L &damps) const
+    {
+        if (kind == beam) {
+            L m, half, shape;
+            beam_law.inertia(l, m, half, shape);
+            i_mass = inverse(m);
+            falls = half * i_mass;
+            damps = shape * i_mass;
+            return;
+        }
+        const L l2 = l * l, l4 = l2 * l2, q = inverse(l + l4 * c1);
+        i_mass = 6.0 * l4 * q;
+        falls = -1.5 * q;
+        damps = i_mass;
+    }
+    template <class S, class D, class F> HMSA_INLINE S acceleration(
+        const S &l, const S &v, const D &damping, const F &net, real<S> *squared = nullptr) const
+    {
+        using L = Along<S, double>;
+        const L x = inner<L, false>(l), pull = force(x);
+        L i_mass, falls, damps;
+        inertia(x, i_mass, falls, damps);
+        if constexpr (count_of<S> > 0)
+            if (squared)
+                *squared = pull.d[0] * i_mass.v;
+        return net(outer<false>(pull, l)) * outer<false>(i_mass, l)
+            - (outer<false>(damps, l) * damping + outer<false>(falls, l) * v) * v;
+    }
+    double energy(double l) const
+    {
+        switch (kind) {
+        case polynomial: return polynomial_law.energy(l);
+        case ogden: return ogden_law.energy(l);
+        case table: return table_law.energy(l);
+        default: return beam_law.energy(l);
+        }
+    }
+    Dual<double, 1> elastic(double l) const { return force(Dual<double, 1>{l, {1}}); }
+    double mass(double l) const
+    {
+        double i_mass, falls, damps;
+        inertia(l, i_mass, falls, damps);
+        return 1 / i_mass;
+    }
+    double shape(double l) const
+    {
+        double i_mass, falls, damps;
+        inertia(l, i_mass, falls, damps);
+        return damps / i_mass;
+    }
+};
+
+// Of small undamped motion about a stretch; where the force falls, the rate at which motion grows.
+template <class System> double frequency(const System &system, double l)
+{
+    return sqrt(abs(system.elastic(l).d[0]) / system.mass(l));
+}
+template <class System> double critical_zeta(const System &system, const double *m, double l)
+{
+    return 4 / m[c1_at] * sqrt(system.mass(l) * system.elastic(l).d[0]) / system.shape(l);
+}
+// Beyond what can be held, the limit on its side. psi' rises between the limits.
+template <class System> double equilibrium(const System &system, const double *m, double beta)
+{
+    double lower = m[lower_at], upper = m[upper_at];
+    const double rest = system.rest;
+    if (beta > 0) {
+        lower = rest;
+        if (upper == infinity())
+            for (upper = 2; system.elastic(upper).v < beta; upper *= 2) {}
+    } else if (beta < 0)
+        upper = rest;
+    else
+        return beta == 0 ? rest : beta;
+    double l = 0.5 * (lower + upper);
+    for (int i = 0; i < 200; i++) {
+        const auto force = system.elastic(l);
+        double off = force.v - beta;
+        if (off != off)  // rounded onto a limit
+            off = beta * infinity();
+        if (off > 0)
+            upper = l;
+        else if (off < 0)
+            lower = l;
+        else
+            return l;
+        // Newton on ln(force/beta), on which a pole at a limit acts about linearly; on the force
+        // itself where it is of the other sign or small.
+        const double ratio = force.v / beta;
+        const double step = ratio > 1 ? log(ratio) * force.v / force.d[0] : off / force.d[0];
+        double next = l - step;
+        if (!(lower < next && next < upper))
+            next = 0.5 * (lower + upper);
+        if (abs(next - l) <= 2e-16 * abs(l))
+            return next;
+        l = next;
+    }
+    return l;
+}
+}  // namespace hmsa

@@ -1,0 +1,254 @@
+// Constant levels that keep an elastomer at rest on its target while its branches relax. Levels are
+// those of the amplifier. Where the field lags behind it, so does the vibration that they leave: its
+// bound holds as well.
+#pragma once
+#include "motion.hpp"
+
+namespace hmsa {
+struct Complex {
+    double re, im;
+};
+inline Complex operator+(Complex a, Complex b) { return {a.re + b.re, a.im + b.im}; }
+inline Complex operator-(Complex a, Complex b) { return {a.re - b.re, a.im - b.im}; }
+inline Complex operator-(Complex a, double b) { return {a.re - b, a.im}; }
+inline Complex operator+(Complex a, double b) { return {a.re + b, a.im}; }
+inline Complex operator*(Complex a, Complex b) { return {a.re * b.re - a.im * b.im, a.re * b.im + a.im * b.re}; }
+inline Complex operator*(Complex a, double b) { return {a.re * b, a.im * b}; }
+inline Complex operator/(Complex a, Complex b)
+{
+    const double size = b.re * b.re + b.im * b.im;
+    return {(a.re * b.re + a.im * b.im) / size, (a.im * b.re - a.re * b.im) / size};
+}
+inline double abs(Complex a) { return sqrt(a.re * a.re + a.im * a.im); }
+inline Complex exp(Complex a)
+{
+    double sine, cosine;
+    sine_cosine(a.im, sine, cosine);
+    const double size = exp(a.re);
+    return {size * cosine, size * sine};
+}
+
+// Columns of a staircase: time, load over that of rest, and, where it begins, deviation of stretch,
+// rate, and field over that of rest.
+enum Row { time_column, excess_column, deviation_column, rate_column, field_column, columns };
+
+struct Tail {
+    // Vibration that a pair of levels leaves, in units of slope of the tail times duration^3/mass.
+    static constexpr double pair_share = 0.05;
+    // Longest level of a pair, in half periods, and the phase beyond which a grid allows none.
+    static constexpr double longest = 0.5, last_phase = 2.6;
+    // Vibration about a single level in units of the drift during it: the drift, what a step of
+    // that height rings to both sides, and some to be sure.
+    static constexpr double single = 3.5;
+    static constexpr double forever = 1e15;  // half periods of a single level at the most
+    // How the vibration grows until there is room for its levels, and how often the way back is
+    // halved.
+    static constexpr double coarser = 3;
+    static constexpr int halvings = 5;
+
+    int count;  // of branches
+    const double *held, *branches;  // (count,) and (count, 2)
+    double lag, period, until;
+    double *out;  // (room, columns)
+    int room;
+    double stiffness, inertia, frequency, half;
+    Complex modes[2];
+    double excess[most_branches];
+
+    double speed(int b) const { return branches[2 * b + speed_at]; }
+    double &at(int row, int column) const { return out[row * columns + column]; }
+
+    template <class System> void set_up(const System &system, double stretch)
+    {
+        stiffness = system.elastic(stretch).d[0];
+        inertia = system.mass(stretch);
+        frequency = hmsa::frequency(system, stretch);
+        // Branches are springs to fast motion, dampers to slow motion.
+        const double own = system.drag * system.shape(stretch);
+        double drag = own;
+        for (int i = 0; i < 3; i++) {
+            double stiff = stiffness;
+            drag = own;
+            for (int b = 0; b < count; b++) {
+                const double phase = frequency / speed(b);
+                const double part = branches[2 * b + ratio_at] * stiffness * phase / (1 + phase * phase);
+                stiff += part * phase;
+                drag += part / frequency;
+            }
+            frequency = sqrt(stiff / inertia);
+        }
+        const double decay = 0.5 * drag / inertia, square = decay * decay - frequency * frequency;
+        Complex root = square < 0 ? Complex{0, sqrt(-square)} : Complex{sqrt(square), 0};
+        if (abs(root) < 1e-6 * frequency)
+            root = {1e-6 * frequency, 0};
+        half = 3.141592653589793 / (decay < frequency ? abs(root) : frequency);
+        modes[0] = root - decay, modes[1] = Complex{-root.re, -root.im} - decay;
+        // So that the field, behind the amplifier, is what they hold.
+        for (int b = 0; b < count; b++)
+            excess[b] = held[b] * (1 - lag * speed(b));
+    }
+    // Of the tail at a time: its value, and the bounds of value and slope.
+    void left(double time, double &sum, double &bound, double &steepest) const
+    {
+        sum = bound = steepest = 0;
+        for (int b = 0; b < count; b++) {
+            const double part = excess[b] * exp(-speed(b) * time);
+            sum += part;
+            bound += abs(part);
+            steepest += speed(b) * abs(part);
+        }
+    }
+    double bound(double time) const
+    {
+        double sum, found, steepest;
+        left(time, sum, found, steepest);
+        return found;
+    }
+    // What a mode, exp(mode t) and ``turned`` after a span, takes up of exp(-speed t).
+    static Complex taken(Complex mode, Complex turned, double speed, double span)
+    {
+        const Complex gap = mode + speed;
+        if (abs(gap) * span > 1e-7)
+            return (turned - exp(-speed * span)) / gap;
+        return turned * span;
+    }
+    Complex passed(const double *of, Complex mode, Complex turned, double time, double span) const
+    {
+        Complex sum{0, 0};
+        for (int b = 0; b < count; b++)
+            sum = sum + taken(mode, turned, speed(b), span) * (of[b] * exp(-speed(b) * time));
+        return sum;
+    }
+    // What a mode takes up of the tail in two spans, in units of a level in one.
+    Complex both(Complex mode, Complex turned, double time, double span) const
+    {
+        const Complex sum = passed(excess, mode, turned, time, span) * turned
+            + passed(excess, mode, turned, time + span, span);
+        return sum * mode / (turned - 1);
+    }
+    // Two levels of the same length between which the oscillator goes from rest to rest: both modes
+    // are still at the end where a turned once + b once = what they have taken up by then.
+    void pair(double time, double span, double &a, double &b) const
+    {
+        const Complex one = exp(modes[0] * span), other = exp(modes[1] * span);
+        const Complex first = both(modes[0], one, time, span);
+        const Complex second = both(modes[1], other, time, span);
+        const Complex level = (first - second) / (one - other);
+        a = level.re, b = (first - level * one).re;
+    }
+    // For how long the tail may go down by a drift: odd multiples of a half period, since rings of
+    // equal steps so far apart cancel.
+    double single_span(double time, double drift) const
+    {
+        const double here = bound(time);
+        double low = 0, high = 1;
+        for (; high < forever; high *= 2) {
+            const double later = bound(time + high * half);
+            if (here - later > drift)
+                break;
+            low = high;
+            if (later < drift)
+                break;
+        }
+        while (high - low > 1) {
+            const double middle = __builtin_floor(0.5 * (low + high));
+            (here - bound(time + middle * half) > drift ? high : low) = middle;
+        }
+        const double whole = max(low, 1.0);
+        const double even = whole - 2 * __builtin_floor(0.5 * whole) == 0;
+        double span = half * (whole - even);
+        if (period > 0)
+            span = max(__builtin_floor(span / period + 0.5), 1.0) * period;
+        return span;
+    }
+    // How many levels a ripple takes, -1 for more than there is room for, and their vibration.
+    int levels(double ripple, bool counting, double &most) const
+    {
+        double time = 0;
+        int found = 0;
+        bool drifting = false;
+        most = ripple;
+        for (;;) {
+            double sum, here, steepest;
+            left(time, sum, here, steepest);
+            if (found + 2 > room)
+                return -1;
+            if (time >= until)
+                return found;
+            if (here <= 0.25 * ripple * stiffness)
+                break;
+            if (single * steepest * half <= ripple * stiffness || frequency * period > last_phase) {
+                const double drift = ripple * stiffness / single;
+                // From rest on target half of it, and about the target then.
+                const double span = single_span(time, drifting ? drift : 0.5 * drift);
+                double later, rest, unused;
+                left(time + span, later, rest, unused);
+                at(found, time_column) = time;
+                at(found, excess_column) = drifting ? 0.5 * (sum + later) : sum;
+                most = max(most, single * (here - rest) / stiffness);
+                time += span;
+                found++;
+                drifting = true;
+                continue;
+            }
+            double span = min(cube_root(ripple * inertia / (pair_share * steepest)), longest * half);
+            if (period > 0)
+                span = max(__builtin_floor(span / period + 1e-9), 1.0) * period;
+            if (!counting) {
+                at(found, time_column) = time, at(found + 1, time_column) = time + span;
+                pair(time, span, at(found, excess_column), at(found + 1, excess_column));
+            }
+            most = max(most, pair_share * steepest * span * span * span / inertia);
+            time += 2 * span;
+            found += 2;
+        }
+        at(found, time_column) = time, at(found, excess_column) = 0;
+        return found + 1;
+    }
+    static double cube_root(double x) { return exp(log(x) / 3); }
+    // Deviation, rate and field where levels begin, from rest on target.
+    void predict(int found) const
+    {
+        const Complex gap = (modes[0] - modes[1]) * inertia;
+        Complex up[2] = {{0, 0}, {0, 0}};
+        double field = 0;
+        for (int b = 0; b < count; b++)
+            field += held[b];
+        for (int i = 0; i < found; i++) {
+            at(i, deviation_column) = ((up[0] - up[1]) / gap).re;
+            at(i, rate_column) = ((modes[0] * up[0] - modes[1] * up[1]) / gap).re;
+            at(i, field_column) = field;
+            if (i + 1 == found)
+                break;
+            const double time = at(i, time_column), level = at(i, excess_column);
+            const double span = at(i + 1, time_column) - time, over = field - level;
+            for (int j = 0; j < 2; j++) {
+                const Complex turned = exp(modes[j] * span);
+                up[j] = up[j] * turned + taken(modes[j], turned, 0, span) * level
+                    - passed(held, modes[j], turned, time, span);
+                if (lag > 0)
+                    up[j] = up[j] + taken(modes[j], turned, 1 / lag, span) * over;
+            }
+            field = level;
+            if (lag > 0)
+                field += over * exp(-span / lag);
+        }
+    }
+    // While the tail is steep, pairs of levels, from rest to rest; later single levels as long as
+    // the ripple, a vibration of the stretch from peak to peak, allows, or one as near above it as
+    // there is room for. Returns how many there are, and a bound of the vibration.
+    int staircase(double ripple, double &most) const
+    {
+        double fine = ripple, rough = ripple;
+        while (levels(rough, true, most) < 0)
+            fine = rough, rough *= coarser;
+        for (int i = 0; rough > fine && i < halvings; i++) {
+            const double middle = sqrt(fine * rough);
+            (levels(middle, true, most) < 0 ? fine : rough) = middle;
+        }
+        const int found = levels(rough, false, most);
+        predict(found);
+        return found;
+    }
+};
+}  // namespace hmsa

@@ -1,0 +1,274 @@
+// The two-step command (Eq. 13): the load whose first turning point is the target, and when.
+#pragma once
+#include "swing.hpp"
+
+namespace hmsa {
+enum Status { two_step, hold, too_damped, indistinguishable, no_two_step, not_converged, out_of_range, bad_input };
+struct Plan {
+    int status;
+    double beta_p, tau_p, beta_1;
+    int passes;
+};
+inline Plan without(int status, double beta_1 = __builtin_nan(""), int passes = 0)
+{
+    return {status, __builtin_nan(""), __builtin_nan(""), beta_1, passes};
+}
+
+struct Move {
+    double start, rate, target;
+};
+struct Wanted {
+    double least, most;  // admissible loads
+    double rtol;
+    double hold;  // deviation below which the actuator counts as being there already
+};
+
+// Sign of the deviation is decided by the linearised motion below this share of the move or of the
+// room to a limit.
+constexpr double linear = 1e-6;
+constexpr int most_passes = 80, newton_passes = 8, most_stuck = 4, most_crossing = 200000;
+constexpr double coarse = 1e-7, farthest = 1e3;
+
+// Newton on d = direction (beta_1 - beta_p) > 0, kept inside a bracket: at d = 0 the motion
+// overshoots the target, at a large d it stops short. The difference is the unknown because it
+// falls below the rounding of beta_p itself near critical damping. The turning point is compared to
+// the target by ln((l - lower)/(upper - l)), on which the load acts about linearly even close to a
+// limiting stretch. The first passes are coarse and only guess for the last ones, which bracket
+// anew. The search ends at the admissible loads, or far from the target's own where they are
+// infinite.
+template <class System> struct Search {
+    System system;
+    double start, rate, target, direction, zeta, lower, upper, beta_1, move, frequency_at_start;
+    double fine, enough, tolerance, least, most, top, guess, low, high, d;
+    int pass, times_stuck;
+    Plan plan;
+
+    double load() const { return beta_1 - direction * d; }
+    // Without damping the energy balance gives d. The linear oscillator says how it shrinks with
+    // damping, by 2 K/(1 + K) with the decay K over half a period; its damping ratio is the damping
+    // force, at the rate that the balance gives half way, against that of the spring.
+    HMSA_APART double first_guess() const
+    {
+        if (target == start)
+            return infinity();
+        const double e0 = system.energy(start) + 0.5 * system.mass(start) * rate * rate;
+        const double beta = (system.energy(target) - e0) / (target - start);
+        const double delta = direction * (beta_1 - beta), half = 0.5 * (start + target);
+        const double kinetic = e0 + beta * (half - start) - system.energy(half);
+        const double fastest = sqrt(max(2 * kinetic / system.mass(half), 0.0));
+        const double xi = 0.5 * system.drag * system.shape(half) * fastest / abs(delta);
+        const double decay = xi < 0.9 ? exp(-3.141592653589793 * xi / sqrt(1 - xi * xi)) : 1e-3;
+        return delta * 2 * decay / (1 + decay);
+    }
+    // Returns whether there is something to search.
+    HMSA_APART bool begin(const System &of, const double *m, const Move &from, double where, const Wanted &wanted)
+    {
+        system = of;
+        start = from.start, rate = from.rate, target = from.target, direction = where;
+        zeta = m[zeta_at], lower = m[lower_at], upper = m[upper_at];
+        const auto elastic = system.elastic(target);
+        beta_1 = elastic.v;
+        frequency_at_start = frequency(system, start);
+        move = abs(target - start) + abs(rate) / frequency(system, target);
+        const double size = 1 + target;  // errors count against the move and the room that is left
+        fine = max(min(wanted.rtol, 1e-10 * move / size), 1e-14);
+        enough = max(0.1 * sqrt(fine), 1e-14 * size / move);
+        tolerance = max(fine, coarse * min(min(size, move), min(target - lower, upper - target)) / size);
+        // A smaller difference of loads is rounding of the elastic force.
+        least = 1e-14 * (abs(beta_1) + abs(target) * elastic.d[0]);
+        most = infinity();
+        if (rate == 0) {
+            most = direction * (beta_1 - system.elastic(start).v);
+            if (!(most > 0)) {
+                plan = without(no_two_step, beta_1);
+                return false;
+            }
+        }
+        top = direction * (beta_1 - (direction > 0 ? wanted.least : wanted.most));
+        if (!(top < infinity()))
+            top = farthest * (1 + abs(beta_1));
+        // From rest beta_p lies between the two holding loads: it is found there, inside or not.
+        top = most < infinity() ? max(top, most) : top;
+        guess = first_guess();
+        if (!(0 < guess && guess < min(most, top)))
+            guess = most < infinity() ? 0.5 * most : 1;
+        low = 0, high = most, d = guess;
+        pass = times_stuck = 0;
+        return true;
+    }
+    bool ended(int status)
+    {
+        plan = without(status, beta_1, pass);
+        return true;
+    }
+    // Takes the turning point of a pass; returns whether the search is over.
+    HMSA_APART bool found(const Event &event)
+    {
+        pass++;
+        times_stuck += event.status == stuck;
+        if (times_stuck == most_stuck)
+            return ended(not_converged);
+        const double end = event.stretch, miss = end - target, beta = load();
+        const bool turn = event.status == turned;
+        double change = infinity();
+        if (turn) {
+            const double excess = log1p(miss / (target - lower)) - log1p(-miss / (upper - target));
+            change = direction * excess
+                / (event.by_load * (1 / (end - lower) + 1 / (upper - end)));
+        }
+        if (event.status != no_turn && direction * miss > 0)
+            low = max(low, d);
+        else
+            high = min(high, d);
+        double next = d + change;
+        if (high == infinity() && pass > newton_passes)
+            // Newton approaches an excess that never ends: stride out to the bound.
+            next = max(next, 4 * d);
+        // Against beta_p, where that is the smaller one: close to a limit.
+        double relative = abs(next - d) / min(d, 1 + abs(beta));
+        if (!(low < next && next < high)) {
+            const bool lost = high < 8 * least, closed = high - low <= 4e-16 * (abs(beta_1) + high);
+            if (tolerance > fine && (lost || closed)) {
+                // Coarse passes have misled the search: begin again.
+                tolerance = fine;
+                low = 0, high = most, d = guess;
+                return pass == most_passes && ended(not_converged);
+            }
+            if (lost)
+                return ended(turn || event.status == no_turn ? indistinguishable : not_converged);
+            if (turn && abs(miss) <= 1e-7 * move && (closed || abs(change) <= 1e-13 * d))
+                next = d;  // as near as rounding allows
+            else if (closed)
+                return ended(not_converged);
+            else if (high == infinity())
+                next = 4 * d;
+            else
+                next = low == 0 ? 0.125 * high : 0.5 * (low + high);
+            relative = abs(next - d) / min(d, 1 + abs(beta));
+        }
+        if (tolerance <= fine && relative <= enough && turn && abs(miss) <= 1e-6 * move) {
+            if (next < least)
+                return ended(indistinguishable);
+            const double moved = direction * (next - d);
+            plan = {two_step, beta - moved, event.time - event.time_by_load * moved, beta_1, pass};
+            return true;
+        }
+        d = next;
+        if (d > top)
+            return ended(no_two_step);
+        if (relative < 0.1 && tolerance > fine) {
+            // What quadratic convergence leaves for the next pass to resolve.
+            tolerance = max(fine, min(tolerance, 1e-2 * relative * relative));
+            if (tolerance < 1e3 * fine) {
+                tolerance = fine;
+                low = 0, high = most;
+            }
+        }
+        return pass == most_passes && ended(not_converged);
+    }
+};
+
+// Whether the response to the target's own load passes the target. Below critical damping it always
+// does. Above, it is followed until it has, or until the linearised motion says: with eigenvalues
+// a < b < 0 and deviation x it stays on its own side unless (v - a x) x < 0.
+template <class System> HMSA_APART bool crosses(const System &system, const double *m, const Move &move, double rtol)
+{
+    const double target = move.target;
+    if (!(m[zeta_at] > 0) || m[zeta_at] < critical_zeta(system, m, target))
+        return true;
+    const double beta = system.elastic(target).v, omega = frequency(system, target);
+    const double half = 0.5 * system.drag * system.shape(target) / system.mass(target);
+    const double fast = -half - sqrt(max(half * half - omega * omega, 0.0));
+    double y[2] = {move.start, move.rate}, end[2];
+    const double side = y[0] - target;
+    const double enough = linear * max(
+        max(abs(side), abs(y[1] / fast)), min(target - m[lower_at], m[upper_at] - target));
+    double h = 4 * sqrt(sqrt(sqrt(rtol))) / (frequency(system, y[0]) + 3 * m[zeta_at] + 1e-9);
+    Step<double, 2> step;
+    for (int i = 0; i < most_crossing; i++) {
+        const double x = y[0] - target;
+        if (x * side < 0 || x == 0)
+            return true;
+        if (abs(x) < enough && abs(y[1]) < enough * abs(fast))
+            return (y[1] - fast * x) * x < 0;
+        const double error = step([&](int, const double *at, double *change) {
+            change[0] = at[1];
+            change[1] = system.acceleration(at[0], at[1], system.drag, under(beta));
+        }, y, h, rtol, end);
+        if (error <= 1)
+            y[0] = end[0], y[1] = end[1];
+        h *= resized(error);
+    }
+    return false;
+}
+
+// Plans moves from any state, one after the other.
+template <class System> struct Planner {
+    Search<System> search;
+    Swing<double, System> swing;
+
+    void begin_pass()
+    {
+        swing.begin(0, search.start, search.rate, search.load(), search.direction, search.move,
+            search.frequency_at_start, search.zeta, search.tolerance);
+    }
+    Plan shoot(const System &system, const double *m, const Move &move, double direction, const Wanted &wanted)
+    {
+        if (!search.begin(system, m, move, direction, wanted))
+            return search.plan;
+        swing.system = system;
+        for (begin_pass();;)
+            if (swing.advance()) {
+                const Event event = swing.decide(0, system);
+                if (event.status == goes_on)
+                    continue;
+                if (search.found(event))
+                    return search.plan;
+                begin_pass();
+            }
+    }
+    // Whether there is something to search; else the plan says why not.
+    HMSA_APART bool begins(const System &system, const double *m, const Move &move, const Wanted &wanted, Plan &plan)
+    {
+        const double lower = m[lower_at], upper = m[upper_at], target = move.target;
+        plan = without(out_of_range);
+        if (!(lower < target && target < upper && lower < move.start && move.start < upper))
+            return false;
+        const double beta_1 = system.elastic(target).v;
+        plan = {hold, beta_1, 0, beta_1, 0};
+        if (abs(move.start - target) <= wanted.hold
+                && abs(move.rate) <= wanted.hold * frequency(system, target))
+            return false;
+        plan = without(too_damped, beta_1);
+        return crosses(system, m, move, max(wanted.rtol, 1e-10));
+    }
+    // The fastest single intermediate load that ends at rest at the target. There are at most two:
+    // one whose turning point is reached on the way up and one on the way down (Eqs. 13 and 14 from
+    // rest have the direct one only).
+    HMSA_APART Plan operator()(const System &system, const double *m, const Move &move, const Wanted &wanted)
+    {
+        Plan plan;
+        if (!begins(system, m, move, wanted, plan))
+            return plan;
+        const double up = move.target > move.start ? 1 : -1;
+        const auto admissible = [&](const Plan &plan) {
+            return plan.status == two_step && wanted.least <= plan.beta_p && plan.beta_p <= wanted.most;
+        };
+        plan = shoot(system, m, move, up, wanted);
+        if (move.rate == 0)
+            return plan;
+        Plan other = shoot(system, m, move, -up, wanted);
+        const int passes = plan.passes + other.passes;
+        if ((admissible(other) && (!admissible(plan) || other.tau_p < plan.tau_p))
+                || (plan.status != two_step && other.status == two_step))
+            plan = other;
+        plan.passes = passes;
+        return plan;
+    }
+};
+inline bool usable(const double *m, const Move &move, double rest)
+{
+    return m[zeta_at] >= 0 && m[c1_at] > 0 && m[lower_at] < rest && rest < m[upper_at]
+        && finite(m[zeta_at] + m[c1_at] + move.start + move.rate + move.target);
+}
+}  // namespace hmsa
