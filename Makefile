@@ -82,7 +82,7 @@ clean: ## remove the environment, builds and caches
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 .PHONY: env
-env: $(VENV)/.kernels ## make the environment
+env: $(VENV)/.motion ## make the environment
 
 .PHONY: tools
 tools: $(VENV)/.tools env ## make the environment, with what tests and documentation need
@@ -95,10 +95,12 @@ $(VENV)/.installed: setup.py setup.cfg pyproject.toml package.xml constraints.tx
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null \
 	|| { echo "hmsa_ros: $(PYTHON) cannot make environments: expected its modules venv and" \
 	"ensurepip; install them (on Debian and Ubuntu: python3-venv)" >&2; exit 1; }
+	@command -v c++ >/dev/null || { echo "hmsa_ros: no C++ compiler (c++): install one; on Debian" \
+	"and Ubuntu: apt install g++" >&2; exit 1; }
 	@echo "Making the environment $(VENV), which takes some minutes the first time"
 	$(PYTHON) -m venv --clear $(VENV)
 	$(INSTALL) -e '.[ros]'
-	@touch $@
+	@touch $@ $(VENV)/.motion
 
 $(VENV)/.tools: $(VENV)/.installed
 	$(INSTALL) -e '.[test,studies,cluster,docs]'
@@ -108,9 +110,9 @@ $(VENV)/.bench: $(VENV)/.installed
 	$(INSTALL) -e '.[bench,studies,cluster]'
 	@touch $@
 
-# Compiled now and cached, so that no command waits for it.
-$(VENV)/.kernels: $(VENV)/.installed $(wildcard hmsa_ros/core/*.py hmsa_ros/identification/kernels.py)
-	$(BIN)/python -m hmsa_ros.warmup
+# The installation compiles the motion, too; this is for when its sources change.
+$(VENV)/.motion: $(wildcard hmsa_ros/motion/*.cpp hmsa_ros/motion/hmsa/*.hpp) | $(VENV)/.installed
+	$(BIN)/python setup.py --quiet build_ext --inplace
 	@touch $@
 
 # An environment whose Python does not start (moved, or its base removed) is made anew too.

@@ -3,8 +3,10 @@
 from glob import glob
 import os
 import re
+import shutil
 
-from setuptools import find_packages, setup
+from setuptools import Extension, find_packages, setup
+from setuptools.command.build_ext import build_ext
 
 PACKAGE = 'hmsa_ros'
 # colcon build --symlink-install runs a link to this file.
@@ -28,7 +30,6 @@ INSTALL_REQUIRES = [
     'matplotlib>=3.6',
     'mcap>=1.6',
     'mcap-ros2-support>=0.5',
-    'numba>=0.60',
     'numpy>=1.26',
     'plotly>=5.15',
     'rich>=13.0',
@@ -82,13 +83,40 @@ EXTRAS_REQUIRE = {
     ],
 }
 
+# The same bits on every x86-64: no instructions beyond the baseline, nothing fused or reordered.
+MOTION = Extension(
+    PACKAGE + '.motion._motion', [PACKAGE + '/motion/module.cpp'],
+    include_dirs=[PACKAGE + '/motion'], depends=sorted(glob(PACKAGE + '/motion/hmsa/*.hpp')),
+    language='c++', extra_compile_args=[
+        '-std=c++17', '-O2', '-ftree-vectorize', '-ffp-contract=off', '-fno-math-errno',
+        '-fno-trapping-math', '-fvisibility=hidden', '-fno-exceptions', '-fno-rtti', '-Wno-psabi',
+        '-g0'])
+
+
+class BuildMotion(build_ext):
+    """Compiles from wherever setup.py runs, and says what is missing where it cannot."""
+
+    def build_extension(self, ext):
+        """Build with absolute paths: colcon links to this file from a folder without sources."""
+        ext.sources = [os.path.join(HERE, x) for x in ext.sources]
+        ext.include_dirs = [os.path.join(HERE, x) for x in ext.include_dirs]
+        command = (getattr(self.compiler, 'compiler_so_cxx', None) or self.compiler.compiler_so)[0]
+        if shutil.which(command) is None or shutil.which('c++') is None:
+            raise SystemExit(
+                'hmsa_ros: no C++ compiler (c++): install one; on Debian and Ubuntu: apt install '
+                'g++')
+        super().build_extension(ext)
+
+
 NODES = ('planner', 'plant', 'driver', 'recorder', 'player', 'controller')
 
 setup(
     name=PACKAGE,
     version=VERSION,
     packages=find_packages(include=[PACKAGE, PACKAGE + '.*']),
-    package_data={PACKAGE: ['fastdds.xml', 'fastdds_localhost.xml']},
+    package_data={PACKAGE: ['fastdds.xml', 'fastdds_localhost.xml', 'motion/*.pyi', 'motion/hmsa/*.hpp']},
+    ext_modules=[MOTION],
+    cmdclass={'build_ext': BuildMotion},
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/' + PACKAGE]),
         ('share/' + PACKAGE, ['package.xml']),
@@ -97,7 +125,7 @@ setup(
            sorted(path for path in glob(folder + '/*') if os.path.isfile(path)))
           for folder in ('config', 'config/rviz', 'config/security')),
     ],
-    zip_safe=True,
+    zip_safe=False,
     python_requires='>=3.10,<3.14',
     install_requires=INSTALL_REQUIRES,
     extras_require=EXTRAS_REQUIRE,
