@@ -114,7 +114,8 @@ setup(
     name=PACKAGE,
     version=VERSION,
     packages=find_packages(include=[PACKAGE, PACKAGE + '.*']),
-    package_data={PACKAGE: ['fastdds.xml', 'fastdds_localhost.xml', 'motion/*.pyi', 'motion/hmsa/*.hpp']},
+    package_data={PACKAGE: [
+        'fastdds.xml', 'fastdds_localhost.xml', 'motion/*.pyi', 'motion/hmsa/*.hpp']},
     ext_modules=[MOTION],
     cmdclass={'build_ext': BuildMotion},
     data_files=[

@@ -81,8 +81,8 @@ def main(arguments: list[str] | None = None) -> int:
     if not console.is_terminal:
         console = Console(width=_WIDTH)
     host = machine()
-    where = (f'{host["processor"]}, {host["cores"]} cores, Python {host["python"]}, Numba '
-             f'{host["numba"]}, SciPy {host["scipy"]}; load average {host["load_average"]:.1f} '
+    where = (f'{host["processor"]}, {host["cores"]} cores, Python {host["python"]}, '
+             f'SciPy {host["scipy"]}; load average {host["load_average"]:.1f} '
              'at the start')
     console.print(where)
     if host['load_average'] > 0.5:

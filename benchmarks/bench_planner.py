@@ -15,23 +15,29 @@ from pathlib import Path
 import statistics
 import subprocess
 import sys
+import sysconfig
 import tempfile
 from time import perf_counter
+import venv
 
-import numba
 import numpy as np
 
 from benchmarks import contenders
 from benchmarks.measure import Contender, loosest, race, Report, Row, stopwatch
 from benchmarks.reference import Actuator, two_step
-from hmsa_ros.core import kernels, two_step_kernel
+from hmsa_ros import motion
 from hmsa_ros.core.creep import Creep
 from hmsa_ros.core.delivery import Delivery
 from hmsa_ros.core.moves import State
 from hmsa_ros.core.parameters import NondimensionalParameters
 from hmsa_ros.core.shapers.request import Request
 from hmsa_ros.core.shapers.two_step import two_step as shaper
-from hmsa_ros.core.two_step import HOLD_TOLERANCE, plan_two_step, plan_two_step_batch
+from hmsa_ros.core.two_step import (
+    available_cores,
+    HOLD_TOLERANCE,
+    plan_two_step,
+    plan_two_step_batch,
+)
 
 MOVES = [(1.0, 1.1), (1.1, 1.2), (1.2, 1.4), (1.0, 0.9), (0.9, 0.8), (0.8, 0.7), (1.0, 0.85),
          (0.85, 0.7), (0.7, 0.85)]
@@ -42,7 +48,7 @@ LIMIT = 1e-10
 #: The cheapest that keeps it.
 POLYNOMIALS = contenders.Collocation(elements=2, degree=7)
 #: Tolerance of the first pass, as in the kernel.
-COARSE = two_step_kernel._COARSE
+COARSE = 1e-7
 NOT_INSTALLED = 'not installed'
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -82,17 +88,14 @@ def _ours(reference: Reference) -> list[Contender]:
         return solve
 
     def bare(rtol: float) -> contenders.Solver:
-        work = kernels.work_space()
-
         def solve(start: float, target: float) -> tuple[float, float]:
-            return two_step_kernel.two_step(
-                work, start, 0.0, target, MATERIAL.packed, -np.inf, np.inf, rtol,
-                HOLD_TOLERANCE)[1:3]
+            return motion.two_step(
+                start, 0.0, target, MATERIAL.packed, -np.inf, np.inf, rtol, HOLD_TOLERANCE)[1:3]
         return solve
 
     return [
         _contender(name, f'rtol {rtol:g}', make(rtol), reference)
-        for make, name in ((public, 'plan_two_step'), (bare, 'its kernel alone'))
+        for make, name in ((public, 'plan_two_step'), (bare, 'its search alone'))
         for rtol in (1e-10, 1e-12)]
 
 
@@ -117,10 +120,9 @@ def _batches(reference: Reference, copies: int) -> list[Contender]:
     start, target = np.tile(np.array(MOVES), (copies, 1)).T
     found = []
     for rtol in (1e-10, 1e-12):
-        for threads in sorted({1, numba.config.NUMBA_NUM_THREADS}):
+        for threads in sorted({1, available_cores()}):
             def work(rtol: float = rtol, threads: int = threads) -> np.ndarray:
-                numba.set_num_threads(threads)
-                return plan_two_step_batch(start, target, rtol=rtol).beta_p
+                return plan_two_step_batch(start, target, rtol=rtol, workers=threads).beta_p
 
             loads = [float(x) for x in work()[:len(MOVES)]]
             found.append(Contender(
@@ -210,7 +212,6 @@ def compare(*, quick: bool = False) -> Report:
                 MOVES)
             rows += race([_external(
                 'GNU Octave, ode45 and fzero', program, reference, 2, LIMIT, start=1e-10)], 1)
-    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
     rows += [Row(name, note=NOT_INSTALLED) for name in missing]
     return Report(
         'planner', 'Two-step plans: nine moves, zeta 0.2, J_lim 5, c1 2', 'time per plan',
@@ -279,35 +280,42 @@ def _children() -> float:
     return times.children_user + times.children_system
 
 
-def _process(code: list[str], cache: str | None = None) -> list[float]:
-    """Return time from start to end and processor time of Python, and the numbers it prints."""
-    environment = dict(os.environ)
-    if cache is not None:
-        environment['NUMBA_CACHE_DIR'] = cache
+def _process(command: list[str]) -> list[float]:
+    """Return time from start to end and processor time of a command, and numbers it prints."""
     before = _children()
     begin = perf_counter()
     done = subprocess.run(
-        [sys.executable, *code], cwd=ROOT, env=environment, check=True, capture_output=True,
-        text=True, timeout=600.0)
+        command, cwd=ROOT, check=True, capture_output=True, text=True, timeout=600.0)
     span = perf_counter() - begin
     printed = [float(x) for x in done.stdout.split() if x.replace('.', '', 1).isdigit()]
     return [span, _children() - before, *printed]
 
 
 def start_up(*, quick: bool = False) -> Report:
-    """Measure the first plan of a new process, with the compiled kernels cached and without."""
-    _process(['-c', _FIRST])
-    runs = [_process(['-c', _FIRST]) for _ in range(1 if quick else 9)]
+    """Measure the first plan of a new process, and of a new installation."""
+    _process([sys.executable, '-c', _FIRST])
+    runs = [_process([sys.executable, '-c', _FIRST]) for _ in range(1 if quick else 9)]
     names = ('new process, first plan, from start to end', 'of that, processor time',
              'of that, importing', 'of that, the first plan')
     rows = [Row(name, '', min(times), statistics.median(times))
             for name, times in zip(names, zip(*runs, strict=True), strict=True)]
     if not quick:
-        for name, code, part in (
-                ('without cache: the first plan', ['-c', _FIRST], 3),
-                ('without cache: all kernels, with the warm-up command',
-                 ['-m', 'hmsa_ros.warmup'], 0)):
-            with tempfile.TemporaryDirectory() as cache:
-                time = _process(code, cache)[part]
-            rows.append(Row(name, '', time, time))
+        rows += _installed()
     return Report('start', 'Start', 'time', 'error', rows)
+
+
+def _installed() -> list[Row]:
+    """Install the package alone into a new environment, and make the first plan there."""
+    with tempfile.TemporaryDirectory() as folder:
+        venv.create(folder, with_pip=True)
+        python = str(Path(folder) / 'bin' / 'python')
+        install = _process([
+            python, '-m', 'pip', 'install', '--no-deps', '--quiet',
+            '--disable-pip-version-check', '.'])
+        # The requirements, which take as long as the network does, are those of this Python.
+        for site in Path(folder).glob('lib/python*/site-packages'):
+            (site / 'requirements.pth').write_text(f'{sysconfig.get_path("purelib")}\n')
+        first = _process([python, '-I', '-c', _FIRST])
+    return [
+        Row('pip install . without requirements, processor time', '', install[1], install[1]),
+        Row('the first plan after it, processor time from start to end', '', first[1], first[1])]

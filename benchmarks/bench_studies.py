@@ -24,13 +24,12 @@ import tempfile
 import threading
 from time import perf_counter, process_time, sleep
 
-import numba
 import numpy as np
 
 from benchmarks import contenders
 from benchmarks.sheet import Sheet
+from hmsa_ros import motion
 from hmsa_ros.core.law import pack
-from hmsa_ros.core.lockstep_kernel import two_step_batch
 from hmsa_ros.core.two_step import HOLD_TOLERANCE, plan_two_step_batch, RTOL
 from hmsa_ros.studies.chunks import Chunks, LEAST_ROWS
 from hmsa_ros.studies.engine import compute
@@ -132,7 +131,7 @@ def rates(*, quick, minutes=math.inf):
                 ('processes', lambda: local_processes(WORKERS), points),
                 ('Dask', lambda: dask('local', WORKERS), min(points, 20_000_000))):
             with start() as (executor, _):
-                # Each worker loads the kernels.
+                # Each worker starts first.
                 compute(grid(8 * LEAST_ROWS), folder / f'{words} first', executor)
                 begin, before = perf_counter(), _spent()
                 compute(grid(rows), folder / words, executor)
@@ -160,10 +159,9 @@ def _together(size):
 
 def _alone(size):
     """Return the plans a second of the kernel on one core."""
-    numba.set_num_threads(1)
     zeta, j_lim = (np.resize(parse_grid(x, x), size) for x in ('0:1.5:1000', '4:9:997'))
     begin = perf_counter()
-    plan_two_step_batch(1.0, 1.1, zeta=zeta, j_lim=j_lim)
+    plan_two_step_batch(1.0, 1.1, zeta=zeta, j_lim=j_lim, workers=1)
     return size / (perf_counter() - begin)
 
 
@@ -175,7 +173,6 @@ def _spent():
 
 def lockstep(*, quick):
     """Compare moves in lock-step with one after the other, here and in C, by processor time."""
-    numba.set_num_threads(1)
     size = 1000
     zeta, j_lim = (np.resize(parse_grid(x, x), size) for x in ('0:1.5:1000', '4:9:997'))
     moves = ''.join(
@@ -183,8 +180,8 @@ def lockstep(*, quick):
     repeats = 1 if quick else 20
     with tempfile.TemporaryDirectory() as name:
         entries = {
-            'package, one move after the other': _kernel(zeta, j_lim, repeats, together=False),
-            'package, 8 moves in lock-step': _kernel(zeta, j_lim, repeats, together=True),
+            'package, 4 moves in lock-step, baseline': _batch(zeta, j_lim, repeats, wide=False),
+            'package, 4 moves in lock-step, AVX2': _batch(zeta, j_lim, repeats, wide=True),
             **{f'C, {words}': _in_c(Path(name), lanes, moves, repeats) for lanes, words in (
                 (1, 'one move after the other'), (4, '4 moves in lock-step'),
                 (8, '8 moves in lock-step'))}}
@@ -204,8 +201,8 @@ def lockstep(*, quick):
         {'times': times, 'apart': apart})
 
 
-def _kernel(zeta, j_lim, repeats, *, together):
-    """Return what times the kernel of batches: seconds of a core for a plan, and beta_p."""
+def _batch(zeta, j_lim, repeats, *, wide):
+    """Return what times a batch: seconds of a core for a plan, and beta_p."""
     rows = np.ones(zeta.size), np.zeros(zeta.size), np.full(zeta.size, 1.1)
     material = pack(zeta, j_lim, np.full(zeta.size, 2.0))
     results = np.empty((3, zeta.size))
@@ -213,8 +210,8 @@ def _kernel(zeta, j_lim, repeats, *, together):
     def run():
         begin = process_time()
         for _ in range(repeats):
-            two_step_batch(
-                *rows, material, -np.inf, np.inf, RTOL, HOLD_TOLERANCE, zeta.size, together,
+            motion.two_step_batch(
+                *rows, material, material.shape[1], -np.inf, np.inf, RTOL, HOLD_TOLERANCE, wide,
                 np.empty(zeta.size, np.int64), *results)
         return (process_time() - begin) / repeats / zeta.size, results[0].copy()
 

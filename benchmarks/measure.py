@@ -172,7 +172,6 @@ def ros_domain() -> int:
 
 def machine() -> dict[str, Any]:
     """Return processor, cores, versions and the load average at this moment."""
-    import numba
     import numpy
     import scipy
 
@@ -186,5 +185,5 @@ def machine() -> dict[str, Any]:
     load = os.getloadavg()[0] if hasattr(os, 'getloadavg') else float('nan')
     return {
         'processor': processor, 'cores': os.cpu_count(), 'load_average': load,
-        'python': platform.python_version(), 'numba': numba.__version__,
+        'python': platform.python_version(),
         'numpy': numpy.__version__, 'scipy': scipy.__version__}

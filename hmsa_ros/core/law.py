@@ -11,8 +11,8 @@ has the deflection of its tip for ``l``, inertia m of its own, and a damping tha
 
 The compiled functions (`hmsa_ros.motion`) take one array ``material``, as `pack` makes it: a
 header (`KIND` to `UPPER`), then the constants of the law from `CONSTANTS` on, as many as it has,
-tables included. Nothing here checks its arguments. Where there is no energy the results are NaN. Between
-`LOWER` and `UPPER` the force rises, so that each stretch can be held.
+tables included. Nothing here checks its arguments. Where there is no energy the results are NaN.
+Between `LOWER` and `UPPER` the force rises, so that each stretch can be held.
 """
 
 from collections.abc import Callable

@@ -72,7 +72,8 @@ def acceleration(
     """Return the second derivative of the stretch in nondimensional time, Eq. 11."""
     columns = np.broadcast_arrays(_array(stretch), _array(rate), _array(load))
     out = np.empty(columns[0].size)
-    law.accelerations(*(np.array(x).ravel() for x in columns), material.packed, out)
+    stretches, rates, loads = (np.array(x).ravel() for x in columns)
+    law.accelerations(stretches, rates, loads, material.packed, out)
     return out.reshape(columns[0].shape)
 
 

@@ -94,12 +94,12 @@ def plan_two_step(
         raise BadInputError(
             'the group has Maxwell branches: expected one without, or plan_sequence for one that '
             'creeps')
-    status, *found = motion.two_step(
+    status, beta_p, tau_p, beta_1, passes = motion.two_step(
         start, rate, target, material.packed, *load_limits, rtol, HOLD_TOLERANCE)
-    return TwoStep(CODES[status], *found)
+    return TwoStep(CODES[status], beta_p, tau_p, beta_1, passes)
 
 
-def threads() -> int:
+def available_cores() -> int:
     """Return how many cores this process may use."""
     if hasattr(os, 'sched_getaffinity'):
         return len(os.sched_getaffinity(0))
@@ -168,7 +168,7 @@ def plan_two_step_batch(
             start, rate, target, materials, materials.shape[1], *load_limits, rtol,
             HOLD_TOLERANCE, True, status[part], *(x[part] for x in results))
 
-    count = max(min(workers or threads(), status.size // _PART), 1)
+    count = max(min(workers or available_cores(), status.size // _PART), 1)
     size = min(-(-status.size // count), each) or 1
     parts = [slice(x, x + size) for x in range(0, status.size, size)]
     if count == 1:

@@ -49,16 +49,16 @@ class Plans:
 
 def by_batch(
         start: Array, target: Array, zeta: Array, j_lim: Array, c1: Array,
-        elastic: Elastic | None = None) -> Plans:
+        elastic: Elastic | None = None, *, workers: int = 0) -> Plans:
     """Return two-step plans from rest on ideal hardware without limits."""
     found = plan_two_step_batch(
-        start, target, zeta=zeta, j_lim=j_lim, c1=c1, elastic=elastic)
+        start, target, zeta=zeta, j_lim=j_lim, c1=c1, elastic=elastic, workers=workers)
     return Plans(_PLACES[found.status], np.array([found.beta_p, found.tau_p, found.beta_1]))
 
 
 def by_settings(
         settings: Sequence[Setting | None], which: NDArray[np.int64], start: Array,
-        target: Array, shapers: NDArray[np.str_]) -> Plans:
+        target: Array, shapers: NDArray[np.str_], *, workers: int = 0) -> Plans:
     """Return plans from rest; each row has the setting at `which`, None if out of range."""
     plans = Plans.none(len(which))
     # Laws by place: comparing tables would take longer than planning.
@@ -73,7 +73,8 @@ def by_settings(
         rows = np.flatnonzero(group == number)
         if len(rows):
             found = _limited(
-                [settings[x] for x in which[rows]], start[rows], target[rows], elastic)
+                [settings[x] for x in which[rows]], start[rows], target[rows], elastic,
+                workers)
             plans.put(rows, found.codes, found.numbers)
     for row in np.flatnonzero(group == -1).tolist():
         setting = settings[which[row]]
@@ -85,13 +86,13 @@ def by_settings(
 
 def _limited(
         settings: Sequence[Setting | None], start: Array, target: Array,
-        elastic: Elastic | None) -> Plans:
+        elastic: Elastic | None, workers: int) -> Plans:
     """Return plans of the batch, without those beyond the limits of the load."""
     given = np.array([
         (x.material.zeta, x.material.j_lim, x.material.c1, x.limits.minimum, x.limits.maximum)
         for x in settings if x is not None]).T
     zeta, j_lim, c1, least, most = given
-    plans = by_batch(start, target, zeta, j_lim, c1, elastic)
+    plans = by_batch(start, target, zeta, j_lim, c1, elastic, workers=workers)
     first, _, last = plans.numbers
     outside = (last < least) | (last > most)
     outside |= (plans.codes == _TWO_STEP) & ((first < least) | (first > most))

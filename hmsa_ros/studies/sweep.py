@@ -12,7 +12,6 @@ import hashlib
 import math
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -192,8 +191,8 @@ class Sweep:
                     else np.ascontiguousarray(values, dtype='<f8').tobytes())
         return made.hexdigest()
 
-    def rows(self, begin: int, end: int) -> Rows:
-        """Plan rows from one number up to another, on the threads that Numba has."""
+    def rows(self, begin: int, end: int, *, workers: int = 0) -> Rows:
+        """Plan rows from one number up to another, on so many threads; 0 for one a core."""
         places = np.unravel_index(np.arange(begin, end), self._shape)
         values = {
             name: column[place]
@@ -201,7 +200,8 @@ class Sweep:
             for name, column in axis.items()}
         inputs: dict[str, Any] = {name: values[name] for name in self._inputs}
         if self._plain:
-            plans = by_batch(*(inputs[name] for name in Nondimensional.columns))
+            plans = by_batch(
+                *(inputs[name] for name in Nondimensional.columns), workers=workers)
             return Rows(inputs, plans.codes, self._results(plans, 1.0, 1.0))
         occurring, which = self._occurring(inputs, places)
         settings = [_setting(self._system.setting, {
@@ -214,7 +214,7 @@ class Sweep:
             plans, *left = carried_out(
                 settings, [_setting(self._system.carried, x) for x in occurring], *moves)
         else:
-            plans = by_settings(settings, *moves)
+            plans = by_settings(settings, *moves, workers=workers)
         units: Array = np.array([
             (1.0, 1.0) if x is None else (x.units.time, x.units.load) for x in settings])[which]
         return Rows(inputs, plans.codes, self._results(plans, units[:, 0], units[:, 1], *left))
@@ -251,12 +251,7 @@ class Sweep:
 
     def table(self, begin: int, end: int) -> Any:
         """Plan rows from one number up to another on one core; return a table of pyarrow."""
-        threads = numba.get_num_threads()
-        numba.set_num_threads(1)
-        try:
-            return self.rows(begin, end).arrow()
-        finally:
-            numba.set_num_threads(threads)
+        return self.rows(begin, end, workers=1).arrow()
 
     def blocks(self, rows: int) -> Iterator[Rows]:
         """Plan the sweep and yield its rows in order, in blocks of so many."""

@@ -152,12 +152,12 @@ def left(
     switches, loads, slopes = np.array(rows).T
     found = np.empty((len(cases), 2))
     out = np.empty((3, 1))
-    for row, x, end, *pieces in zip(
+    for row, x, end, begins, heights, rises in zip(
             found, cases, arrival * faster, switches * faster, loads / stiffer,
             slopes / (stiffer * faster), strict=True):
         if not motion.sample(
-                x.stretch, x.rate, request.field / x.stiffer, *pieces, delivery.lag * x.faster,
-                end, x.packed, _NO_BRANCHES, _RTOL, out):
+                x.stretch, x.rate, request.field / x.stiffer, begins, heights, rises,
+                delivery.lag * x.faster, end, x.packed, _NO_BRANCHES, _RTOL, out):
             row[:] = math.inf
             continue
         away = out[0, 0] - x.rest
