@@ -98,7 +98,7 @@ def test_an_interrupt_that_python_drops_still_ends_a_computation():
         os.kill(os.getpid(), {number})
 class Sender""")
     done = subprocess.run(
-        [sys.executable, '-c', code.format(module='numba', number=int(signal.SIGINT))],
+        [sys.executable, '-c', code.format(module='numpy', number=int(signal.SIGINT))],
         capture_output=True, text=True, check=False, timeout=60)
     assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
 

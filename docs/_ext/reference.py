@@ -40,7 +40,7 @@ PACKAGE = Path(errors.__file__).parent
 IGNORED = frozenset({'ES01', 'EX01', 'SA01', 'GL02', 'GL03', 'PR03', 'PR08', 'RT04', 'RT02'})
 # Modules without anything to call from outside; ros_launch is imported by ROS 2's launch alone.
 NOT_PUBLIC = re.compile(
-    r'\.(__main__|cli|compiling|dop853|kernels|law|\w+_kernel|ros_launch|warmup)\b')
+    r'\.(__main__|cli|_motion|law|ros_launch)\b')
 
 
 def contract_entries(kind: type) -> list[Any]:
