@@ -115,7 +115,9 @@ setup(
     version=VERSION,
     packages=find_packages(include=[PACKAGE, PACKAGE + '.*']),
     package_data={PACKAGE: [
-        'fastdds.xml', 'fastdds_localhost.xml', 'motion/*.pyi', 'motion/hmsa/*.hpp']},
+        'fastdds.xml', 'fastdds_localhost.xml', 'motion/_motion.pyi',
+        *(os.path.relpath(x, os.path.join(HERE, PACKAGE)) for x in sorted(glob(
+            os.path.join(HERE, PACKAGE, 'motion', 'hmsa', '*.hpp'))))]},
     ext_modules=[MOTION],
     cmdclass={'build_ext': BuildMotion},
     data_files=[

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.special import stdtrit
 
 from hmsa_ros.judge import judge, missed, Sensor, Setpoint, Tolerances, worst
+from hmsa_ros.judge.fit import student_quantile
 
 MS = 1_000_000
 OMEGA, DECAY = 540.0, 54.0
@@ -108,3 +110,9 @@ def test_a_sensor_that_rounds_at_rest_is_not_frozen():
     stretch = np.concatenate((np.linspace(1.2, 1.38, 20), stretch))
     assert judge(time, np.round(stretch, 3), setpoint()).arrived
     assert 'frozen' in judge(time, np.minimum(stretch, 1.3), setpoint()).message
+
+
+@pytest.mark.parametrize('freedom', [1.0, 2.0, 3.0, 4.5, 10.0, 300.0])
+def test_the_quantile_of_students_t_is_that_of_scipy(freedom):
+    assert student_quantile(freedom, 0.995) == pytest.approx(
+        stdtrit(freedom, 0.995), rel=0.01)

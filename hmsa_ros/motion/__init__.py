@@ -34,7 +34,7 @@ __all__ = [
     'two_step_batch']
 
 #: Statuses of a turning point: found; into an equilibrium instead; out of steps; against a
-#: limiting stretch too hard to be resolved. An actuator that `follow` moved has the first or third.
+#: limiting stretch too hard to be resolved. Those of `follow` are the first and the third.
 DONE, NO_TURN, STUCK, TOO_CLOSE = range(4)
 #: Columns of a branch: gamma, 1/tau and, where it goes on with the state, what it follows.
 RATIO, SPEED, FOLLOWER = range(3)
