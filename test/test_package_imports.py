@@ -42,7 +42,7 @@ def modules(package: str) -> list[str]:
 
 
 PACKAGES = ('core', 'device', 'runtime', 'bag', 'studies', 'contract', 'runs', 'report',
-            'identification', 'estimation', 'judge')
+            'identification', 'estimation', 'judge', 'motion')
 
 
 def test_physics_runtime_bags_and_studies_import_without_ros():
@@ -60,7 +60,9 @@ def imported(package: str) -> set[str]:
     found = set()
     for path in (ROOT / 'hmsa_ros' / package).rglob('*.py'):
         for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, (ast.Import, ast.ImportFrom)):
+            if isinstance(node, ast.ImportFrom) and node.module == 'hmsa_ros':
+                found |= {x.name for x in node.names}
+            elif isinstance(node, (ast.Import, ast.ImportFrom)):
                 found |= {x.partition('.')[0] for x in re.findall(
                     r'\bhmsa_ros\.([\w.]+)', ast.unparse(node))}
     return {x for x in found if (ROOT / 'hmsa_ros' / x).is_dir()} - {package}
