@@ -124,9 +124,12 @@ def test_a_controller_with_hardware_moves_it_and_says_what_it_measured(start, ro
     send = start.hmsa('send', '1.1:0.3', '1.0:0.3', '--wait', '--timeout', '60')
     assert send.wait() == 0, send.output
     assert 'measured' in send.output
-    names = {x for x, _ in ros.node.get_node_names_and_namespaces()}
-    assert {'planner', 'driver'} <= names
-    assert 'plant' not in names
+
+    def names():
+        return {x for x, _ in ros.node.get_node_names_and_namespaces()}
+
+    ros.spin_until(lambda: {'planner', 'driver'} <= names(), 'both nodes of the controller')
+    assert 'plant' not in names()
     # The level at the start, and two for each move.
     ros.spin_until(lambda: len(applied) >= 5, 'the levels of two moves')
     assert controller.stop() == 0, controller.output

@@ -2,7 +2,7 @@
 The ``hmsa`` command.
 
 Each command is a module of this package with ``add_parser(subparsers)`` and ``run(arguments)``,
-listed in `COMMANDS`. Modules import what is slow (rclpy, Numba, matplotlib) inside ``run``, so
+listed in `COMMANDS`. Modules import what is slow (rclpy, SciPy, matplotlib) inside ``run``, so
 that ``hmsa --help`` answers at once.
 """
 

@@ -52,7 +52,7 @@ def actuator_from(
 def model_from(
         values: Mapping[str, Any], modulus: float | None = None, period: int = 0) -> 'Model':
     """Return what the parameters `PLANNED` plan with, on a grid of a period in ns."""
-    from hmsa_ros.core.timeline import Model, Options  # imports Numba
+    from hmsa_ros.core.timeline import Model, Options  # not all need plans
 
     return Model(planned_from(values, modulus), Options(
         flux_density_min=values['flux_density_min'], flux_density_max=values['flux_density_max'],

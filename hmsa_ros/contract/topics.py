@@ -143,7 +143,8 @@ CLOCK_TOPIC = Topic(
     publishers=(PLANT, PLAYER))
 DIAGNOSTICS = Topic(
     '/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', RELIABLE,
-    'Counters and health, once a second.', publishers=NODES)
+    'Counters and health, once a second; by them, a second planner, plant or driver of a joint is '
+    'noticed.', publishers=NODES, subscribers=(PLANNER, PLANT, DRIVER))
 
 STOP = Service('~/stop', _TRIGGER, {
     PLANNER: 'Drops the rest of the sequence and comes to rest without vibration.',

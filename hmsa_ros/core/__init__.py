@@ -1,5 +1,5 @@
 """
 Physics and planning of the actuator, free of ROS.
 
-Imports the standard library, NumPy, SciPy and Numba only.
+Imports the standard library, NumPy, SciPy and `hmsa_ros.motion` only.
 """

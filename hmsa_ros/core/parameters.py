@@ -97,7 +97,7 @@ class NondimensionalParameters:
     @cached_property
     def packed(self) -> NDArray[np.float64]:
         """The one argument of the compiled law, see `hmsa_ros.core.law`."""
-        from hmsa_ros.core import law  # imports Numba, which not all who have parameters need
+        from hmsa_ros.core import law  # not all who have parameters need it
 
         return law.pack(self.zeta, self.j_lim, self.c1, self.law)
 

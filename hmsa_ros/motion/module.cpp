@@ -195,7 +195,7 @@ __attribute__((target("avx2"), flatten)) void plan_wide(const Rows &rows)
 {
     plan_lanes<four, Gent>(rows);
 }
-__attribute__((flatten)) void plan_narrow(const Rows &rows) { plan_lanes<four, Gent>(rows); }
+__attribute__((flatten)) void plan_narrow(const Rows &rows) { plan_lanes<two, Gent>(rows); }
 // two_step_batch(start, rate, target, materials, stride, least, most, rtol, hold, wide, status,
 // beta_p, tau_p, beta_1)
 PyObject *two_step_batch(PyObject *, PyObject *arguments)

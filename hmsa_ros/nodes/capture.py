@@ -67,7 +67,7 @@ class _Allocator(ctypes.Structure):
 
 
 class Buffer(ctypes.Structure):
-    """rcutils_uint8_array_t."""
+    """The structure rcutils_uint8_array_t."""
 
     _fields_ = [
         ('buffer', ctypes.c_void_p), ('length', ctypes.c_size_t),

@@ -18,7 +18,7 @@ from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
 
 if TYPE_CHECKING:
-    # Numba comes along with the planner, which a recorder has no use for.
+    # It comes along with the planner, which a recorder has no use for.
     from hmsa_ros.runtime.records import StatusChanged
 
 #: What a receipt says while commands of before a cut-off are refused.

@@ -29,7 +29,7 @@ from hmsa_ros.runs.record import Run
 from hmsa_ros.runs.topics import APPLIED, COMMAND, FORCE, JOINT_STATES
 
 if TYPE_CHECKING:
-    # Numba comes along with it, which other commands on bags have no use for.
+    # Other commands on bags have no use for it.
     from hmsa_ros.core.simulation import ActuatorSimulation
 
 # Samples further from the others than this are of another run, or garbage; in ns.

@@ -1,7 +1,7 @@
 """
 The laws of elasticity: one table, and one module for each with its constants and its source.
 
-Nothing here is compiled; the functions that kernels call are in `hmsa_ros.core.laws.kernels`.
+Nothing here is compiled; forces and energies are in `hmsa_ros/motion/hmsa/law.hpp`.
 """
 
 from hmsa_ros.core.laws import arruda_boyce, beam, gent, mooney_rivlin, ogden, table, yeoh

@@ -125,7 +125,7 @@ def centreline(deflected: float, points: int) -> tuple[Array, Array]:
 @cache
 def packed() -> tuple[float, ...]:
     """
-    Return the constants of the kernel `hmsa_ros.core.laws.kernels.beam`.
+    Return the constants of ``Beam`` in ``motion/hmsa/system.hpp``.
 
     Number of pieces; deflections of the fold and of the end of the tables; inverse of the
     share of ``1 - sqrt(1 - u/fold)`` that each piece has; force, stiffness, inertia and

@@ -64,7 +64,7 @@ class Curve:
 
     def packed(self, unit: float) -> tuple[float, ...]:
         """
-        Return the constants of the kernel `hmsa_ros.core.laws.kernels.table`, for a unit in T.
+        Return the constants of ``Table`` in ``motion/hmsa/law.hpp``, for a unit in T.
 
         Number of pieces and depths of the stops; of each piece begin, energy there and factors;
         end, energy, force and stiffness there.

@@ -6,7 +6,7 @@ from typing import Any
 
 from hmsa_ros.errors import BadInputError, excerpt
 
-# Families of laws, as the kernels know them: the first number of a packed material.
+# Families of laws: the first number of a packed material.
 ANY = -1.0  # one of them
 GENT = 0.0  # 1/J_lim
 NEO_HOOKEAN = 1.0  # none
@@ -42,7 +42,7 @@ class Elastic:
     """An elastic energy in units of its shear modulus at small strain."""
 
     law: str  #: name
-    family: float  #: which of the kernels has it
+    family: float  #: one of the families above
     constants: tuple[float, ...]  #: those of the family
     #: Parameters that gave it, those in Pa and in T in units of the block.
     given: tuple[tuple[str, Any], ...]

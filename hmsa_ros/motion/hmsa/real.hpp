@@ -11,6 +11,7 @@
 namespace hmsa {
 template <class R> constexpr int lanes = sizeof(R) / sizeof(double);
 #if defined(__GNUC__) && !defined(HMSA_NO_LANES)
+typedef double two __attribute__((vector_size(16)));
 typedef double four __attribute__((vector_size(32)));
 #endif
 
@@ -22,11 +23,10 @@ template <class R> HMSA_INLINE void set(R &x, int i, double value) { x[i] = valu
 HMSA_INLINE double sqrt(double x) { return __builtin_sqrt(x); }
 #ifdef __SSE2__
 // GCC 12 makes single roots of a loop over lanes.
+HMSA_INLINE two sqrt(two x) { return __builtin_ia32_sqrtpd(x); }
 HMSA_INLINE four sqrt(four x)
 {
-    typedef double two __attribute__((vector_size(16)));
-    const two low = __builtin_ia32_sqrtpd(two{x[0], x[1]});
-    const two high = __builtin_ia32_sqrtpd(two{x[2], x[3]});
+    const two low = sqrt(two{x[0], x[1]}), high = sqrt(two{x[2], x[3]});
     return four{low[0], low[1], high[0], high[1]};
 }
 #else
