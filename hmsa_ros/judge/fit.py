@@ -79,8 +79,9 @@ def fit(time: Array, rest: Array, frequency: float, decay: float) -> Fit | None:
         (_WIDE if periods >= _FAR else _MIDDLE) if dense else _NEAR))
     if dense:
         high = min(high, 0.9 * math.pi / interval)
-    omegas = np.linspace(
-        low, high, max(int((high - low) * span * _TRIED / (2.0 * math.pi)), _REFINED))
+    omegas: Array = np.linspace(
+        low, high, max(int((high - low) * span * _TRIED / (2.0 * math.pi)), _REFINED)
+    ).astype(np.float64)
     decays = _DECAYS * min(max(_FASTER * decay, _LEAST * frequency), _MOST * frequency)
     tried = problem.solve(omegas, decays)
     searched = 2.0 * math.log(max((high - low) * span / (2.0 * math.pi), 1.0))
@@ -198,7 +199,9 @@ def _bounds(problem: _Problem, tried: _Solved, searched: float) -> Fit:
     slack = sure**2 + searched - (tried.squares - least) / max(scale, 1e-300)
     possible = np.flatnonzero(slack >= 0.0)
     if len(possible) > _MOST_POSSIBLE:
-        possible = np.sort(possible[np.argsort(-slack[possible])[:_MOST_POSSIBLE]])
+        # Where samples have no noise many fits are as good as the best, which has to stay.
+        likely = possible[np.argsort(-slack[possible])[:_MOST_POSSIBLE]]
+        possible = np.union1d(likely, [place])
     within = tried.taken(possible)
     # One that was only found by searching is not shown, but it may be.
     reach = np.sqrt(np.maximum(slack[possible], 0.0) * scale)
