@@ -1,7 +1,7 @@
 """
 The equation of motion, compiled when the package is built: C++ templates over any scalar.
 
-``hmsa/*.hpp`` know no Python and allocate nothing; ``module.cpp`` binds them. Everything is
+``hmsa/*.hpp`` do not use Python and allocate nothing; ``module.cpp`` binds them. Everything is
 nondimensional but `respond`, and nothing checks values: whoever calls these functions does.
 """
 

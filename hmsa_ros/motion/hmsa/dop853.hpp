@@ -92,7 +92,7 @@ template <class S, int W> struct Step {
         (one<I + 1>(f, y, h), ...);
     }
     // Where a state is more than two numbers and their derivatives by one, a loop over the stages:
-    // the equation then stands once in what is compiled, and not twelve times.
+    // the equation is then compiled once, and not twelve times.
     static constexpr bool unrolled = W == 2 && count_of<S> <= 1;
     template <class F> HMSA_INLINE void move(const F &f, const S *y, const R &h, S *end)
     {
