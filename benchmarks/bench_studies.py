@@ -180,7 +180,7 @@ def lockstep(*, quick):
     repeats = 1 if quick else 20
     with tempfile.TemporaryDirectory() as name:
         entries = {
-            'package, 4 moves in lock-step, baseline': _batch(zeta, j_lim, repeats, wide=False),
+            'package, 2 moves in lock-step, baseline': _batch(zeta, j_lim, repeats, wide=False),
             'package, 4 moves in lock-step, AVX2': _batch(zeta, j_lim, repeats, wide=True),
             **{f'C, {words}': _in_c(Path(name), lanes, moves, repeats) for lanes, words in (
                 (1, 'one move after the other'), (4, '4 moves in lock-step'),
