@@ -62,7 +62,7 @@ def test_a_sequence_arrives_commanded_a_few_cycles_ahead_and_the_bag_shows_it(
     file = tmp_path / 'own.yaml'
     file.write_text(PARAMETERS.format(mismatch=1.0))
     controller = start.hmsa('controller', '--ros-args', '--params-file', str(file))
-    # It may have to compile its kernels first.
+    # On a busy machine its start takes a while.
     ros.spin_until(lambda: ros.node.count_publishers('planner/plan'), 'the planner', 300.0)
     recorder = start.hmsa(
         'recorder', '--ros-args', '-p', f'storage.uri:={tmp_path / "bag"}',

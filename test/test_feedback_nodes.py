@@ -13,7 +13,7 @@ from benchmarks.bench_feedback import GRAPHS, judge, run
 from hmsa_ros.contract import topics
 
 pytestmark = pytest.mark.ros
-# Where the kernels must be compiled first that takes a while.
+# On a busy machine the start of the nodes takes a while.
 RUN_SECONDS = 300.0
 PLANT = ('--ros-args', '-p', 'mismatch.shear_modulus:=1.2', '-p', 'stretch_noise:=0.001')
 

@@ -101,8 +101,8 @@ for _seconds in (2.0, 25.0):
         f'hosts_outage_{_seconds:g}', f'hosts apart for {_seconds:g} s',
         'planner and plant in network namespaces, link down at 1.35, ARP entries removed; '
         'safe_flux zero',
-        'the field goes to zero and stays there until asked again; the planner tells of the '
-        'outage and of the cut-off; the next move is shaped')(
+        'the field goes to zero and stays there until asked again; the planner reports the '
+        'outage and the cut-off; the next move is shaped')(
             lambda rig, seconds=_seconds: _outage(rig, seconds))
 
 

@@ -28,7 +28,7 @@ def _array(value: ArrayLike) -> Array:
 
 
 def packed(material: Material) -> Array:
-    """Return what the kernels take for a material."""
+    """Return what `hmsa_ros.motion` takes for a material."""
     if isinstance(material, NondimensionalParameters):
         return material.packed
     return law.pack(0.0, material, 1.0)

@@ -38,7 +38,7 @@ class Response:
 
 def _chain(
         values: Mapping[str, float], branches: int) -> tuple[Array, dict[str, dict[int, float]]]:
-    """Return theta of the kernel and, by name, its derivatives by the parameters."""
+    """Return theta of the motion and, by name, its derivatives by the parameters."""
     geometry = geometry_of(values)
     inertia = values['density'] * geometry.half_length ** 2
     a = values['shear_modulus'] / inertia
@@ -98,9 +98,9 @@ def _packed(group: NondimensionalParameters) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What the kernel needs of values, and how its derivatives make those by free parameters."""
+    """What the motion needs of values, and how its derivatives make those by free parameters."""
 
-    theta: Array  # as the kernel names its places
+    theta: Array  # as `hmsa_ros.motion.theta` names its places
     material: Array  # the packed law
     branches: int  # of creep
     # Places in theta, or of constants of the law, by which to differentiate, shape (w,).

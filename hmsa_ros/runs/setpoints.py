@@ -30,7 +30,7 @@ _ROUNDED = 1e-3
 
 @dataclass(frozen=True)
 class Requested:
-    """A setpoint as it was requested, and what became of it."""
+    """A setpoint as it was requested, with its result."""
 
     setpoint: Setpoint
     due: int | None  #: until when it was requested in ns; None if it was to be held on

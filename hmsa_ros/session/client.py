@@ -29,8 +29,8 @@ from hmsa_ros.nodes.visitor import leave, visit
 from hmsa_ros.session import graph
 
 _SLICE_SECONDS = 0.05
-# The first start after an installation compiles the kernels.
-_COMPILE_SECONDS = 300.0
+# How long a planner whose node is there may take to listen, on a busy machine.
+_LISTENS_SECONDS = 300.0
 # To come to rest, perhaps in slow motion; and until a planner that does not answer is gone.
 _STOP_SECONDS = 15.0
 _GONE_SECONDS = 3.0
@@ -121,7 +121,7 @@ class PlannerClient:
             return (self._verdict is not _SILENCE
                     and self._publisher.get_subscription_count() > 0)
 
-        # One whose node is there but does not listen yet is compiling its kernels.
+        # One whose node is there but does not listen yet is still starting.
         self.spin_until(lambda: found() or self._planner_starts(), failure, each)
         state = ServiceCall(self.node.create_client(
             GetState, f'{topics.PLANNER}/get_state'), GetState.Request())
@@ -141,7 +141,7 @@ class PlannerClient:
         self.spin_until(
             settled, 'the planner does not subscribe to '
                                                            'requests', each,
-            max(self._timeout, _COMPILE_SECONDS))
+            max(self._timeout, _LISTENS_SECONDS))
         self.spin_until(found, failure, each)
 
     def _planner_starts(self) -> bool:

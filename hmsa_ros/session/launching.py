@@ -14,7 +14,7 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.session.processes import NodeProcess
 
 _YES_OR_NO = ('true', 'false')
-# Discovery and the first compilation of the kernels take their time; a plant that dies ends all.
+# Discovery and the start of the nodes take their time; a plant that dies ends all.
 _START_SECONDS = 600.0
 # For the recorder to find the topics of a plant that has just become active.
 _RECORDER_NANOSECONDS = 500_000_000

@@ -24,7 +24,7 @@ Start = Callable[[], AbstractContextManager[tuple[Executor, int]]]
 PATIENCE = 15
 #: Chunks that wait at a Dask cluster: they are small there, and it grows by what waits.
 AHEAD = 1000
-# A cluster on this machine shares its cores with the kernels. As Dask sets itself up, it watches
+# A cluster on this machine shares its cores with the plans. As Dask sets itself up, it watches
 # itself a hundred times a second, and its workers give each freed page back.
 _QUIET = {
     'distributed.worker.profile.enabled': False,

@@ -44,6 +44,7 @@ template <class C, class System, int NB> struct Response {
     int from;
     Response(const Recorded &recorded, int first) : of(recorded), from(first) {}
     System system;
+    typename System::Bare bare;  // the same without derivatives
     S a, damping, drive, force, lag, ratio[NB + 1], per_time[NB + 1];
     double level, ramp;
     S excess;  // of the field over the line, where the piece began
@@ -73,6 +74,7 @@ template <class C, class System, int NB> struct Response {
     void set_up()
     {
         system.read(0, of.material);
+        bare.read(0, of.material);
         if constexpr (System::direct)
             each([&](int j, int wanted) {
                 if (constant_of <= wanted && wanted < switch_of)
@@ -154,9 +156,6 @@ template <class C, class System, int NB> struct Response {
                 if (wanted == lag_of)
                     excess.d[j] += of.field_lag;
             });
-        // The law in units in which its stiffness is 1.
-        typename System::Bare bare;
-        bare.read(0, of.material);
         const double stiff = value(a);
         fastest = sqrt(stiff / bare.mass(bare.rest));
         double h = 0.2 / fastest, relaxed = infinity(), t = of.begins[0];
@@ -216,8 +215,6 @@ template <class C, class System, int NB> struct Response {
         if constexpr (N > 0)
             if (jump != 0) {
                 // By a lag of 0, or by a later switch: what the step lacks is an impulse.
-                typename System::Bare bare;
-                bare.read(0, of.material);
                 const double impulse = value(drive) * jump / bare.mass(value(y[0]));
                 each([&](int j, int wanted) {
                     if (wanted == switch_of + piece || (wanted == lag_of && !(value(lag) > 0)))
