@@ -173,7 +173,7 @@ template <int NB, class System> bool sample(const System &system, const Course &
     branches.read(course.branches, 3, course.branch_count);
     Motion<double, System, NB> motion{system, branches};
     motion.y[0] = course.stretch, motion.y[1] = course.rate;
-    for (int b = 0; b < course.branch_count; b++)
+    for (int b = 0; b < NB && b < course.branch_count; b++)
         motion.y[2 + b] = course.branches[3 * b + follower_at];
     const double lag = course.lag, decay = lag > 0 ? 1 / lag : 0;
     double t = course.switches[0], field = course.field, h = 0;
@@ -202,7 +202,7 @@ template <int NB, class System> bool sample(const System &system, const Course &
         column[0] = motion.y[0];
         column[course.count] = motion.y[1];
         column[2 * course.count] = field;
-        for (int b = 0; b < course.branch_count; b++)
+        for (int b = 0; b < NB && b < course.branch_count; b++)
             column[(3 + b) * course.count] = motion.y[2 + b];
     }
     return true;

@@ -43,7 +43,7 @@ template <class System, int NB, int P> struct Shooting {
     double duration[2 * most_levels], begin[2 * most_levels], slope[2 * most_levels];
     double d_duration[2 * most_levels][P], d_begin[2 * most_levels][P];
     double end[M], d_end[M][P];  // stretch, rate, field, followers
-    double miss[P], trial[P][P];
+    double miss[most_unknowns], trial[most_unknowns][P];  // as many rows as unknowns
     double frequency_at_target, stiffness, force;
     double first_times[most_levels], first_loads[most_levels];
 
@@ -114,7 +114,7 @@ template <class System, int NB, int P> struct Shooting {
         Motion<S, System, NB> motion{system, branches};
         motion.y[0] = motion.y[0] + shot.stretch;
         motion.y[1] = motion.y[1] + shot.rate;
-        for (int b = 0; b < shot.branch_count; b++)
+        for (int b = 0; b < NB && b < shot.branch_count; b++)
             motion.y[2 + b] = motion.y[2 + b] + shot.followed[b];
         S field = 0.0 * motion.y[0] + shot.field;
         const double decay = shot.lag > 0 ? 1 / shot.lag : 0;
@@ -172,7 +172,7 @@ template <class System, int NB, int P> struct Shooting {
                 trial[row][c] = shot.d_loads[(shot.levels - 1) * shot.unknowns + c] / stiffness;
             row++;
         }
-        for (int b = 0; b < shot.branch_count; b++)
+        for (int b = 0; b < NB && b < shot.branch_count; b++)
             // What a branch holds the field has to balance, and the amplifier to lead.
             for (int i = 2; i < row; i++) {
                 double share = branches.ratio[b] / stiffness;
@@ -188,7 +188,7 @@ template <class System, int NB, int P> struct Shooting {
         return sqrt(squares);
     }
     // The Newton step, by elimination.
-    void newton(const double jacobian[P][P], double *step) const
+    void newton(const double (*jacobian)[P], double *step) const
     {
         const int n = shot.unknowns;
         double work[P][P + 1];
@@ -253,7 +253,7 @@ template <class System, int NB, int P> struct Shooting {
             move += abs(shot.field - shot.loads[levels - 1]) / stiffness;
         const double farthest_load = farthest_trial * (high + abs(shot.load) + 1);
         const double longest = farthest_trial * shot.times[levels - 1];
-        double x[P] = {}, step[P] = {}, jacobian[P][P] = {};
+        double x[P] = {}, step[P] = {}, jacobian[most_unknowns][P] = {};
         double share = 1, size = infinity(), before = infinity();
         const double fine = max(fine_least, min(fine_most, fine_share * move));
         double rtol = max(fine, min(rough, rough_share * move));
