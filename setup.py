@@ -113,7 +113,7 @@ NODES = ('planner', 'plant', 'driver', 'recorder', 'player', 'controller')
 setup(
     name=PACKAGE,
     version=VERSION,
-    packages=find_packages(include=[PACKAGE, PACKAGE + '.*']),
+    packages=find_packages(include=[PACKAGE, PACKAGE + '.*', 'hmsa_studies', 'hmsa_studies.*']),
     package_data={PACKAGE: [
         'fastdds.xml', 'fastdds_localhost.xml', 'motion/_motion.pyi',
         *(os.path.relpath(x, os.path.join(HERE, PACKAGE)) for x in sorted(glob(

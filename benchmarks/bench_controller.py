@@ -6,8 +6,8 @@ import tempfile
 from benchmarks.faults.rig import Rig
 from benchmarks.measure import ros_domain
 from benchmarks.sheet import Sheet
-from hmsa_ros.contract import topics
-from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.interfaces import topics
+from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes.conversions import to_trajectory
 
 #: Work of a cycle that 99 of 100 are promised to stay below, in us.

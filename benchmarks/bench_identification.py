@@ -10,12 +10,12 @@ from scipy.stats import binom, chi2
 
 from benchmarks.fits import Fitted, with_casadi, with_scipy
 from benchmarks.sheet import Sheet
-from hmsa_ros.core.model import Array, elastic_force
-from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
-from hmsa_ros.core.two_step import plan_two_step
 from hmsa_ros.identification import identify, Recording
 from hmsa_ros.identification.quantities import DEFAULT_FREE, derivative, values_of
 from hmsa_ros.identification.response import respond
+from hmsa_ros.model.equations import Array, elastic_force
+from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
+from hmsa_ros.planning.two_step import plan_two_step
 
 BLOCK = paper_actuator()
 SPAN = 10.0 * BLOCK.time_unit

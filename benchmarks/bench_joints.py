@@ -13,10 +13,10 @@ import numpy as np
 from benchmarks.faults.rig import Child, Rig
 from benchmarks.measure import ros_domain
 from benchmarks.sheet import Sheet
-from hmsa_ros.contract import topics
-from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import HmsaError
-from hmsa_ros.nodes import interface
+from hmsa_ros.interfaces import topics
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.capture import Capture, Taken
 from hmsa_ros.nodes.conversions import stamp_of, to_trajectory
 
@@ -47,10 +47,10 @@ class _Watch:
         self.refusal = ''
         # Stamped as they arrive and not decoded: what this process does later does not count.
         self._capture = Capture(rig.node, self._take)
-        self._capture.add(None, interface.listen(rig.node, replace(
+        self._capture.add(None, endpoints.listen(rig.node, replace(
             topics.JOINT_STATES, name=f'{space}/{topics.JOINT_STATES.name}')))
         self._capture.start()
-        interface.subscribe(rig.node, topics.STATUS, self._judge, f'{space}/{topics.PLANNER}')
+        endpoints.subscribe(rig.node, topics.STATUS, self._judge, f'{space}/{topics.PLANNER}')
 
     def close(self) -> None:
         """End the thread that receives."""
@@ -86,7 +86,7 @@ def _run(
         rig.spin_until(
             lambda: all(x.behind for x in watches), 'samples of all plants', _PATIENCE)
         trajectories = [
-            interface.publisher(
+            endpoints.publisher(
                 rig.node, topics.JOINT_TRAJECTORY, f'/pair_{k}/{topics.PLANNER}')
             for k in range(spaces)]
         rig.spin_until(

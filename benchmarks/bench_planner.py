@@ -26,13 +26,13 @@ from benchmarks import contenders
 from benchmarks.measure import Contender, loosest, race, Report, Row, stopwatch
 from benchmarks.reference import Actuator, two_step
 from hmsa_ros import motion
-from hmsa_ros.core.creep import Creep
-from hmsa_ros.core.delivery import Delivery
-from hmsa_ros.core.moves import State
-from hmsa_ros.core.parameters import NondimensionalParameters
-from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.core.shapers.two_step import two_step as shaper
-from hmsa_ros.core.two_step import (
+from hmsa_ros.model.creep import Creep
+from hmsa_ros.model.delivery import Delivery
+from hmsa_ros.model.moves import State
+from hmsa_ros.model.parameters import NondimensionalParameters
+from hmsa_ros.planning.shapers.request import Request
+from hmsa_ros.planning.shapers.two_step import two_step as shaper
+from hmsa_ros.planning.two_step import (
     available_cores,
     HOLD_TOLERANCE,
     plan_two_step,
@@ -268,8 +268,8 @@ def choices(*, quick: bool = False) -> Report:
 
 _FIRST = (
     'from time import perf_counter; begin = perf_counter()\n'
-    'from hmsa_ros.core.parameters import NondimensionalParameters\n'
-    'from hmsa_ros.core.two_step import plan_two_step\n'
+    'from hmsa_ros.model.parameters import NondimensionalParameters\n'
+    'from hmsa_ros.planning.two_step import plan_two_step\n'
     'imported = perf_counter()\n'
     'plan_two_step(1.0, 1.1, NondimensionalParameters())\n'
     'print(imported - begin, perf_counter() - imported)\n')

@@ -16,8 +16,8 @@ from scipy.integrate import odeint, solve_ivp
 from benchmarks.contenders import acceleration, holding_load
 from benchmarks.measure import Contender, loosest, race, Report, stopwatch
 from benchmarks.reference import Actuator, response
-from hmsa_ros.core.parameters import NondimensionalParameters
-from hmsa_ros.core.simulation import RTOL, simulate
+from hmsa_ros.model.parameters import NondimensionalParameters
+from hmsa_ros.model.simulation import RTOL, simulate
 
 LIMIT = 1e-9
 ACTUATOR = Actuator(zeta=0.2, j_lim=5.0, c1=2.0)

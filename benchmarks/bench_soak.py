@@ -148,7 +148,7 @@ def check_bag(folder: Path, kind: str, killed: str, step: int = _STEP_NS) -> Cyc
     from hmsa_ros.bag.recover import recover
     from hmsa_ros.errors import HmsaError
     from hmsa_ros.nodes.conversions import stamp_of
-    from hmsa_ros.runs.verify import verify
+    from hmsa_ros.recordings.verify import verify
 
     found = Cycle(kind, killed)
     bag = folder
@@ -436,7 +436,7 @@ class Soak:
     def _rubbish(self, *, calm: bool) -> None:
         """Send garbage; in calm cycles only where it cannot reach the plant or what is checked."""
         from benchmarks.faults import garbage
-        from hmsa_ros.contract import topics
+        from hmsa_ros.interfaces import topics
         from hmsa_ros.nodes.message_types import interface_class
 
         inputs = [
@@ -509,7 +509,7 @@ class Soak:
         """Undo what garbage may have set."""
         from std_srvs.srv import SetBool
 
-        from hmsa_ros.contract import topics
+        from hmsa_ros.interfaces import topics
 
         self._publish_inputs()
         rig = self.rig
@@ -610,11 +610,11 @@ def run_in_process(hours: float, seed: int = 2) -> Core:
     from rclpy.serialization import deserialize_message, serialize_message
     from sensor_msgs.msg import MagneticField
 
-    from hmsa_ros.core.parameters import paper_actuator
-    from hmsa_ros.core.planner import Options, Planner
-    from hmsa_ros.core.simulation import ActuatorSimulation
     from hmsa_ros.errors import HmsaError
+    from hmsa_ros.model.parameters import paper_actuator
+    from hmsa_ros.model.simulation import ActuatorSimulation
     from hmsa_ros.nodes.conversions import from_command, to_command
+    from hmsa_ros.planning.planner import Options, Planner
 
     dice = random.Random(seed)
     wild = (math.nan, math.inf, -1.0, 0.0, 1e300, 2.7, 0.2)

@@ -29,12 +29,12 @@ import numpy as np
 from benchmarks import contenders
 from benchmarks.sheet import Sheet
 from hmsa_ros import motion
-from hmsa_ros.core.law import pack
-from hmsa_ros.core.two_step import HOLD_TOLERANCE, plan_two_step_batch, RTOL
-from hmsa_ros.studies.chunks import Chunks, LEAST_ROWS
-from hmsa_ros.studies.engine import compute
-from hmsa_ros.studies.executors import dask, local_processes
-from hmsa_ros.studies.sweep import parse_grid, Sweep
+from hmsa_ros.model.law import pack
+from hmsa_ros.planning.two_step import HOLD_TOLERANCE, plan_two_step_batch, RTOL
+from hmsa_studies.chunks import Chunks, LEAST_ROWS
+from hmsa_studies.engine import compute
+from hmsa_studies.executors import dask, local_processes
+from hmsa_studies.sweep import parse_grid, Sweep
 
 WORKERS = 2
 # Chunks that are done between two kills, at most.

@@ -8,10 +8,10 @@ import numpy as np
 from scipy.constants import mu_0
 from scipy.optimize import least_squares
 
-from hmsa_ros.core.model import Array
 from hmsa_ros.identification import Recording
 from hmsa_ros.identification.quantities import from_coordinate, to_coordinate
 from hmsa_ros.identification.response import respond
+from hmsa_ros.model.equations import Array
 
 # Steps of Runge and Kutta from one sample to the next: errors far below the noise.
 _SUBSTEPS = 4

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from hmsa_ros.bag.reader import BagReader, read_messages
-from hmsa_ros.contract import topics
-from hmsa_ros.core.laws.coordinate import shared_name, STRETCH
 from hmsa_ros.errors import BadInputError, complain, HmsaError
-from hmsa_ros.runs.parameters import actuators, recorded
+from hmsa_ros.interfaces import topics
+from hmsa_ros.model.laws.coordinate import shared_name, STRETCH
+from hmsa_ros.recordings.parameters import actuators, recorded
 
 APPLICATION = 'hmsa_ros'
 JOINT_STATES = topics.JOINT_STATES.name

@@ -15,19 +15,19 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from benchmarks.beam_segments import Chain  # noqa: E402
-from hmsa_ros.contract.actuator import actuator_from  # noqa: E402
-from hmsa_ros.contract.parameters import BLOCK  # noqa: E402
-from hmsa_ros.core.creep import Creep  # noqa: E402
-from hmsa_ros.core.delivery import Delivery, pieces  # noqa: E402
-from hmsa_ros.core.laws import LAWS  # noqa: E402
-from hmsa_ros.core.laws.bending import centreline  # noqa: E402
-from hmsa_ros.core.model import elastic_force, stretch_limits  # noqa: E402
-from hmsa_ros.core.moves import State  # noqa: E402
-from hmsa_ros.core.parameters import NondimensionalParameters  # noqa: E402
-from hmsa_ros.core.sequence import plan_sequence, Setpoint  # noqa: E402
-from hmsa_ros.core.simulation import simulate  # noqa: E402
-from hmsa_ros.core.two_step import plan_two_step  # noqa: E402
-from hmsa_ros.figures import style  # noqa: E402
+from hmsa_ros.interfaces.actuator import actuator_from  # noqa: E402
+from hmsa_ros.interfaces.parameters import BLOCK  # noqa: E402
+from hmsa_ros.model.creep import Creep  # noqa: E402
+from hmsa_ros.model.delivery import Delivery, pieces  # noqa: E402
+from hmsa_ros.model.equations import elastic_force, stretch_limits  # noqa: E402
+from hmsa_ros.model.laws import LAWS  # noqa: E402
+from hmsa_ros.model.laws.bending import centreline  # noqa: E402
+from hmsa_ros.model.moves import State  # noqa: E402
+from hmsa_ros.model.parameters import NondimensionalParameters  # noqa: E402
+from hmsa_ros.model.simulation import simulate  # noqa: E402
+from hmsa_ros.planning.sequence import plan_sequence, Setpoint  # noqa: E402
+from hmsa_ros.planning.two_step import plan_two_step  # noqa: E402
+from hmsa_ros.report import style  # noqa: E402
 
 FOLDER = ROOT / 'docs' / 'images'
 MATERIAL = NondimensionalParameters(zeta=0.2, j_lim=5.0)

@@ -9,11 +9,11 @@ import numpy as np
 from scipy.constants import mu_0
 from scipy.integrate import solve_ivp
 
-from hmsa_ros.core.group import PlannerGroup
-from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
-from hmsa_ros.core.planner import Options, Planner
-from hmsa_ros.runtime.planner import PlannerRuntime
-from hmsa_ros.runtime.records import EstimateChanged, Send, Settings, Target
+from hmsa_ros.control.planner import PlannerRuntime
+from hmsa_ros.control.records import EstimateChanged, Send, Settings, Target
+from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
+from hmsa_ros.planning.group import PlannerGroup
+from hmsa_ros.planning.planner import Options, Planner
 
 MS = 1_000_000
 START = 1000 * MS

@@ -100,11 +100,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def bound(kind: Any, qos: Any = 1000) -> tuple[Any, Any]:
-    """Return message class and profile; types and qualities may be those of the contract."""
-    from hmsa_ros.nodes import interface
+    """Return message class and profile, of rclpy or as `hmsa_ros.interfaces` names them."""
+    from hmsa_ros.nodes import endpoints
     from hmsa_ros.nodes.message_types import interface_class
     return (interface_class(kind) if isinstance(kind, str) else kind,
-            interface.profile(qos) if isinstance(qos, interface.Quality) else qos)
+            endpoints.profile(qos) if isinstance(qos, endpoints.Quality) else qos)
 
 
 def wait_until(

@@ -433,7 +433,7 @@ def declared(node: str) -> dict[str, Any]:
 
 
 def _nodes() -> tuple[str, ...]:
-    from hmsa_ros.contract import topics
+    from hmsa_ros.interfaces import topics
 
     return topics.NODES
 
@@ -473,7 +473,7 @@ def _check_parameter(name: str, nodes: Iterable[str]) -> None:
 
 def _topic_names() -> dict[str, str]:
     """Return each topic as it is named from outside without a namespace, with its type."""
-    from hmsa_ros.contract import topics
+    from hmsa_ros.interfaces import topics
 
     found: dict[str, str] = {}
     for topic in vars(topics).values():
@@ -545,7 +545,7 @@ def _check_hmsa(words: list[str]) -> None:
 def _check_launch(name: str, rest: list[str]) -> None:
     file = ROOT / 'launch' / name
     _require(file.is_file(), f'no launch file {name!r}')
-    from hmsa_ros.session import launching
+    from hmsa_ros.lab import launching
 
     known = {x.name: x for x in getattr(launching, name.partition('.')[0].upper()).arguments}
     for word in rest:
@@ -558,7 +558,7 @@ def _check_launch(name: str, rest: list[str]) -> None:
 
 def _check_message(kind: str, words: list[str]) -> None:
     """Require that a payload fits the type, and the type the topic or service."""
-    from hmsa_ros.contract import topics
+    from hmsa_ros.interfaces import topics
 
     name, type_name = words[:2]
     package, group, cls = type_name.split('/')

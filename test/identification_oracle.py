@@ -9,7 +9,7 @@ from scipy.constants import mu_0
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
+from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 
 BLOCK = paper_actuator()
 

@@ -16,11 +16,11 @@ from std_srvs.srv import Trigger
 from hmsa_ros.bag.definitions import message_definition
 from hmsa_ros.bag.reader import read_messages
 from hmsa_ros.bag.writer import BagWriter, Topic
-from hmsa_ros.core.parameters import paper_actuator
-from hmsa_ros.core.simulation import ActuatorSimulation
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.parameters import paper_actuator
+from hmsa_ros.model.simulation import ActuatorSimulation
 from hmsa_ros.nodes.conversions import to_command
-from hmsa_ros.runs.verify import verify
+from hmsa_ros.recordings.verify import verify
 
 SAME = 1e-9
 BEGIN = 1_000_000_000

@@ -24,23 +24,23 @@ from scipy.integrate import solve_bvp
 
 from benchmarks.beam_segments import Chain
 from hmsa_ros.cli import main
-from hmsa_ros.contract.actuator import actuator_from, parameters_of
-from hmsa_ros.contract.parameters import BLOCK
-from hmsa_ros.core import model
-from hmsa_ros.core.actuators import check_stretch
-from hmsa_ros.core.creep import Creep
-from hmsa_ros.core.laws import bending
-from hmsa_ros.core.planner import Options, Planner
-from hmsa_ros.core.simulation import ActuatorSimulation
-from hmsa_ros.core.status import Code, RefusedError
-from hmsa_ros.core.two_step import plan_two_step
-from hmsa_ros.core.units import MU_0
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.interfaces.actuator import actuator_from, parameters_of
+from hmsa_ros.interfaces.parameters import BLOCK
+from hmsa_ros.model import equations
+from hmsa_ros.model.actuators import check_stretch
+from hmsa_ros.model.creep import Creep
+from hmsa_ros.model.laws import bending
+from hmsa_ros.model.simulation import ActuatorSimulation
+from hmsa_ros.model.status import Code, RefusedError
+from hmsa_ros.model.units import MU_0
+from hmsa_ros.planning.planner import Options, Planner
+from hmsa_ros.planning.two_step import plan_two_step
 
 
 def test_the_first_frequency_is_that_of_euler_and_bernoulli():
     beam = silicone()
-    frequency = model.natural_frequency(0.0, beam.nondimensional) / beam.time_unit
+    frequency = equations.natural_frequency(0.0, beam.nondimensional) / beam.time_unit
     wanted = mode()[4] ** 2 * math.sqrt(BENDING / (DENSITY * AREA * LENGTH ** 4))
     assert frequency == pytest.approx(wanted, rel=1e-10)
 
@@ -48,7 +48,7 @@ def test_the_first_frequency_is_that_of_euler_and_bernoulli():
 @pytest.mark.parametrize('deflection', [0.05, 0.3, -0.55, 0.7, 0.78])
 def test_a_field_holds_the_deflection_that_the_full_elastica_has_within_3_percent(deflection):
     beam = silicone()
-    flux = float(model.elastic_force(deflection, beam.nondimensional)) * beam.flux_density_unit
+    flux = float(equations.elastic_force(deflection, beam.nondimensional)) * beam.flux_density_unit
     force = REMANENCE * flux / MU_0 * AREA * LENGTH ** 2 / BENDING
     s = np.linspace(0.0, 1.0, 30)
     angle = float(bending.angle_of(deflection))
@@ -181,7 +181,8 @@ def test_a_parameter_file_of_a_beam_plans_its_deflection_to_both_sides(tmp_path,
     plan = plan_two_step(0.0, -0.2, beam.nondimensional)
     assert first['time_p'] == pytest.approx(plan.tau_p * beam.time_unit, rel=1e-8)
     assert second['flux_density_1'] == pytest.approx(
-        float(model.elastic_force(0.3, beam.nondimensional)) * beam.flux_density_unit, rel=1e-9)
+        float(equations.elastic_force(0.3, beam.nondimensional)) * beam.flux_density_unit,
+        rel=1e-9)
     assert main(['plan', '-0.2:1', '--params-file', str(file)]) == 0
     assert 'deflection' in capsys.readouterr().out
     # From rest, which is not stretch 1.

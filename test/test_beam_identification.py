@@ -20,7 +20,6 @@ import pytest
 
 from benchmarks.beam_segments import Chain
 from hmsa_ros.cli import main
-from hmsa_ros.core import model
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification import identify, Recording
 from hmsa_ros.identification.excitation import Bounds, Designer, excite
@@ -28,10 +27,11 @@ from hmsa_ros.identification.files import read_belief
 from hmsa_ros.identification.quantities import derivative, values_of
 from hmsa_ros.identification.recording import Course
 from hmsa_ros.identification.response import respond
+from hmsa_ros.model import equations
 
 BEAM = silicone()
 PERIOD = 2.0 * np.pi * BEAM.time_unit / float(
-    model.natural_frequency(0.0, BEAM.nondimensional))
+    equations.natural_frequency(0.0, BEAM.nondimensional))
 TRUE = {'shear_modulus': BEAM.shear_modulus, 'damping_coefficient': DAMPING,
         'remanence': REMANENCE, 'stretch_bias': 0.0}
 #: As one would guess it.
@@ -39,7 +39,7 @@ START = replace(
     BEAM, shear_modulus=2.5 * BEAM.shear_modulus, damping_coefficient=0.4 * DAMPING,
     remanence=0.07)
 LEVELS = np.array([0.0, *(BEAM.flux_density_unit * float(
-    model.elastic_force(x, BEAM.nondimensional)) for x in (0.2, -0.3, 0.4, 0.0))])
+    equations.elastic_force(x, BEAM.nondimensional)) for x in (0.2, -0.3, 0.4, 0.0))])
 LEVEL_TIMES = np.append(0.0, 0.1 + 4.0 * PERIOD * np.arange(4))
 TIMES = np.arange(0.0, LEVEL_TIMES[-1] + 4.0 * PERIOD, 0.01)
 

@@ -21,7 +21,7 @@ import pytest
 from hmsa_ros.cli import build_parser, main, split_ros_args
 from hmsa_ros.cli.completion import commands_of, VALUES
 from hmsa_ros.cli.progress import progress
-from hmsa_ros.core.shapers import SHAPERS
+from hmsa_ros.planning.shapers import SHAPERS
 
 TOLERANCE = 1e-9
 ROOT = Path(__file__).resolve().parent.parent
@@ -129,8 +129,8 @@ def test_send_is_patient_in_simulated_time_that_is_slower_than_the_wall(start, r
 @pytest.mark.slow
 @pytest.mark.ros
 def test_send_trusts_a_driver_that_publishes_samples_alone(start, ros):
-    from hmsa_ros.contract import topics
-    from hmsa_ros.nodes import interface
+    from hmsa_ros.interfaces import topics
+    from hmsa_ros.nodes import endpoints
 
     ros.collect(
         topics.FLUX_DENSITY_COMMAND.type, 'flux_density_command',
@@ -140,7 +140,7 @@ def test_send_trusts_a_driver_that_publishes_samples_alone(start, ros):
     send = start.hmsa('send', '1.1:0.1', '--wait')
     assert send.wait(30.0) == 1, send.output
     assert 'nobody reports levels that take effect' in send.stderr
-    interface.publisher(ros.node, topics.JOINT_STATES)
+    endpoints.publisher(ros.node, topics.JOINT_STATES)
     send = start.hmsa('send', '1.2:0.1', '--wait')
     assert send.wait(30.0) == 0, send.output
     assert 'done: at_rest, predicted, not measured' in send.stdout
@@ -165,7 +165,7 @@ def test_send_fails_where_the_actuator_is_measured_to_miss_the_setpoint(start, r
 @pytest.mark.slow
 @pytest.mark.ros
 def test_send_moves_several_joints_each_to_its_stretch_or_all_to_one(start, ros):
-    from hmsa_ros.contract import topics
+    from hmsa_ros.interfaces import topics
 
     plans = ros.collect(topics.PLAN.type, 'planner/plan', topics.PLAN.qos)
     joints = ['--ros-args', '-p', 'joints:=[left, right]']

@@ -16,10 +16,9 @@ import pytest
 
 from hmsa_ros.cli import main
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.figures import paper_data
-from hmsa_ros.studies import matrix, robustness
-from hmsa_ros.studies.executors import given, here, in_order
-from hmsa_ros.studies.feedback import SCENARIOS, STRATEGIES, trial
+from hmsa_studies import matrix, paper_data, robustness
+from hmsa_studies.executors import given, here, in_order
+from hmsa_studies.feedback import SCENARIOS, STRATEGIES, trial
 
 ROOT = Path(__file__).resolve().parent.parent
 PNG = b'\x89PNG\r\n\x1a\n'

@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from hmsa_ros.core.creep import Creep
-from hmsa_ros.core.delivery import Delivery, IDEAL
-from hmsa_ros.core.moves import Limits, State
-from hmsa_ros.core.parameters import NondimensionalParameters, paper_actuator
-from hmsa_ros.core.planner import Options, Planner
-from hmsa_ros.core.sequence import plan_sequence
-from hmsa_ros.core.setpoint import Setpoint
-from hmsa_ros.core.shapers import get_shaper, SHAPERS
-from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.core.status import RefusedError
-from hmsa_ros.core.two_step import plan_two_step
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.creep import Creep
+from hmsa_ros.model.delivery import Delivery, IDEAL
+from hmsa_ros.model.moves import Limits, State
+from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
+from hmsa_ros.model.status import RefusedError
+from hmsa_ros.planning.planner import Options, Planner
+from hmsa_ros.planning.sequence import plan_sequence
+from hmsa_ros.planning.setpoint import Setpoint
+from hmsa_ros.planning.shapers import get_shaper, SHAPERS
+from hmsa_ros.planning.shapers.request import Request
+from hmsa_ros.planning.two_step import plan_two_step
 
 MS = 1_000_000
 J, ZETA, C1 = 5.0, 0.2, 2.0

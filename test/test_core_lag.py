@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from hmsa_ros.core.delivery import Delivery, ramps
-from hmsa_ros.core.model import elastic_force
-from hmsa_ros.core.moves import Limits, State
-from hmsa_ros.core.parameters import NondimensionalParameters, paper_actuator
-from hmsa_ros.core.planner import Options, Planner
-from hmsa_ros.core.sequence import plan_sequence
-from hmsa_ros.core.setpoint import Setpoint
-from hmsa_ros.core.shapers import get_shaper
-from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.core.simulation import ActuatorSimulation, simulate
-from hmsa_ros.core.status import Code, RefusedError
+from hmsa_ros.model.delivery import Delivery, ramps
+from hmsa_ros.model.equations import elastic_force
+from hmsa_ros.model.moves import Limits, State
+from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
+from hmsa_ros.model.simulation import ActuatorSimulation, simulate
+from hmsa_ros.model.status import Code, RefusedError
+from hmsa_ros.planning.planner import Options, Planner
+from hmsa_ros.planning.sequence import plan_sequence
+from hmsa_ros.planning.setpoint import Setpoint
+from hmsa_ros.planning.shapers import get_shaper
+from hmsa_ros.planning.shapers.request import Request
 
 PAPER = NondimensionalParameters()
 LIMITS = Limits(-2.5, 2.5)

@@ -7,13 +7,18 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from hmsa_ros.core import law
-from hmsa_ros.core.model import elastic_energy, elastic_force, equilibrium_stretch, stretch_limits
-from hmsa_ros.core.parameters import NondimensionalParameters
-from hmsa_ros.core.simulation import simulate
-from hmsa_ros.core.status import Code
-from hmsa_ros.core.two_step import plan_two_step, plan_two_step_batch
+from hmsa_ros.model import law
+from hmsa_ros.model.equations import (
+    elastic_energy,
+    elastic_force,
+    equilibrium_stretch,
+    stretch_limits,
+)
+from hmsa_ros.model.parameters import NondimensionalParameters
+from hmsa_ros.model.simulation import simulate
+from hmsa_ros.model.status import Code
 from hmsa_ros.motion import constant_slope
+from hmsa_ros.planning.two_step import plan_two_step, plan_two_step_batch
 
 NEO_HOOKEAN = NondimensionalParameters(j_lim=math.inf)
 

@@ -11,25 +11,25 @@ import sympy
 
 from hmsa_ros import motion
 from hmsa_ros.cli import main
-from hmsa_ros.contract.actuator import actuator_from, parameters_of
-from hmsa_ros.contract.parameters import BLOCK
-from hmsa_ros.core.actuators import check_stretch, unheld
-from hmsa_ros.core.laws import LAWS
-from hmsa_ros.core.model import (
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification import identify
+from hmsa_ros.identification.files import read_belief
+from hmsa_ros.interfaces.actuator import actuator_from, parameters_of
+from hmsa_ros.interfaces.parameters import BLOCK
+from hmsa_ros.model.actuators import check_stretch, unheld
+from hmsa_ros.model.equations import (
     elastic_energy,
     elastic_force,
     elastic_stiffness,
     equilibrium_stretch,
     stretch_limits,
 )
-from hmsa_ros.core.parameters import paper_actuator
-from hmsa_ros.core.simulation import simulate
-from hmsa_ros.core.status import Code
-from hmsa_ros.core.two_step import plan_two_step, plan_two_step_batch
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification import identify
-from hmsa_ros.identification.files import read_belief
-from hmsa_ros.runs.parameters import read_parameter_file, recorded
+from hmsa_ros.model.laws import LAWS
+from hmsa_ros.model.parameters import paper_actuator
+from hmsa_ros.model.simulation import simulate
+from hmsa_ros.model.status import Code
+from hmsa_ros.planning.two_step import plan_two_step, plan_two_step_batch
+from hmsa_ros.recordings.parameters import read_parameter_file, recorded
 
 L = sympy.Symbol('l', positive=True)
 I1, I2 = L ** 2 + 2 / L, 2 * L + L ** -2

@@ -11,13 +11,13 @@ import pytest
 from scipy.constants import mu_0
 import sympy
 
-from hmsa_ros.core import model
-from hmsa_ros.core.parameters import (
+from hmsa_ros.model import equations
+from hmsa_ros.model.parameters import (
     ActuatorParameters,
     NondimensionalParameters,
     paper_actuator,
 )
-from hmsa_ros.core.simulation import simulate
+from hmsa_ros.model.simulation import simulate
 
 EPS = np.finfo(float).eps
 PAPER = NondimensionalParameters()
@@ -30,7 +30,7 @@ RANDOM_STATES = 200
 
 def inside(j_lim: float, share: np.ndarray) -> np.ndarray:
     """Return stretches at shares of the admissible interval."""
-    lower, upper = model.stretch_limits(j_lim)
+    lower, upper = equations.stretch_limits(j_lim)
     return lower + (upper - lower) * share
 
 
@@ -115,7 +115,7 @@ def test_acceleration_is_what_the_lagrangian_gives(derivation, states):
     material = BLOCK.nondimensional
     expected = derivation['reduced'](
         stretch, rate, load, material.zeta, material.c1, material.j_lim)
-    found = model.acceleration(stretch, rate, load, material)
+    found = equations.acceleration(stretch, rate, load, material)
     assert np.max(closeness(found, expected, stretch, rate, load, material)) < 20 * EPS
 
 
@@ -127,7 +127,7 @@ def test_acceleration_in_si_is_what_the_lagrangian_gives(derivation, states):
         stretch, rate, flux_density, BLOCK.density, BLOCK.half_length, BLOCK.half_thickness,
         BLOCK.shear_modulus, BLOCK.chain_limit, BLOCK.remanence, BLOCK.damping_coefficient,
         mu_0)
-    found = model.acceleration_si(stretch, rate, flux_density, BLOCK)
+    found = equations.acceleration_si(stretch, rate, flux_density, BLOCK)
     unit = BLOCK.time_unit
     close = closeness(
         found * unit ** 2, expected * unit ** 2, stretch, rate * unit, load,
@@ -139,9 +139,9 @@ def test_the_two_scalings_agree_to_rounding(states):
     stretch, rate, load = states
     material = BLOCK.nondimensional
     unit = BLOCK.time_unit
-    found = model.acceleration_si(
+    found = equations.acceleration_si(
         stretch, rate / unit, load * BLOCK.flux_density_unit, BLOCK) * unit ** 2
-    expected = model.acceleration(stretch, rate, load, material)
+    expected = equations.acceleration(stretch, rate, load, material)
     assert np.max(closeness(found, expected, stretch, rate, load, material)) < 50 * EPS
 
 
@@ -152,11 +152,11 @@ def test_the_integration_is_of_the_same_acceleration(states):
     for stretch, rate, load in zip(*(x[:40] for x in states), strict=True):
         _, rates = simulate(
             [0.0], [load], [h, 2 * h, 3 * h, 4 * h], material, stretch=stretch, rate=rate)
-        expected = float(model.acceleration(stretch, rate, load, material))
+        expected = float(equations.acceleration(stretch, rate, load, material))
         slope = (-25.0 / 12.0 * rate + 4.0 * rates[0] - 3.0 * rates[1] + 4.0 / 3.0 * rates[2]
                  - 0.25 * rates[3]) / h
-        room = min(stretch - model.stretch_limits(material.j_lim)[0],
-                   model.stretch_limits(material.j_lim)[1] - stretch)
+        room = min(stretch - equations.stretch_limits(material.j_lim)[0],
+                   equations.stretch_limits(material.j_lim)[1] - stretch)
         assert slope == pytest.approx(expected, rel=1e-6, abs=1e-6 / room ** 2)
 
 
@@ -165,18 +165,18 @@ def test_the_oracle_has_the_same_equation(states):
     for stretch, rate, load in zip(*(x[:20] for x in states), strict=True):
         expected = equation(load, material.zeta, material.j_lim, material.c1)(
             0.0, (stretch, rate))[1]
-        assert model.acceleration(stretch, rate, load, material) == pytest.approx(
+        assert equations.acceleration(stretch, rate, load, material) == pytest.approx(
             expected, rel=1e-11)
 
 
 def test_the_energy_form_is_the_same_equation(states):
     stretch, rate, load = states
     material = BLOCK.nondimensional
-    inertia = model.mass(stretch, material)
+    inertia = equations.mass(stretch, material)
     change = -0.5 * stretch ** -4
-    force = (load - model.elastic_force(stretch, material.j_lim)
-             - model.damping(material) * rate - 0.5 * change * rate ** 2)
-    expected = model.acceleration(stretch, rate, load, material)
+    force = (load - equations.elastic_force(stretch, material.j_lim)
+             - equations.damping(material) * rate - 0.5 * change * rate ** 2)
+    expected = equations.acceleration(stretch, rate, load, material)
     assert np.max(closeness(
         force / inertia, expected, stretch, rate, load, material)) < 50 * EPS
 
@@ -195,13 +195,13 @@ def test_force_and_stiffness_are_derivatives_of_the_energy(j_lim):
 
         for stretch in inside(j_lim, shares):
             exact = mpmath.mpf(float(stretch))
-            lower, upper = model.stretch_limits(j_lim)
+            lower, upper = equations.stretch_limits(j_lim)
             # Rounding of the stretch itself, near a limit, is all that may be left.
             loss = 16 * EPS * (1.0 + stretch / min(stretch - lower, upper - stretch))
             values = (
-                (model.elastic_energy, energy(exact)),
-                (model.elastic_force, mpmath.diff(energy, exact)),
-                (model.elastic_stiffness, mpmath.diff(energy, exact, 2)))
+                (equations.elastic_energy, energy(exact)),
+                (equations.elastic_force, mpmath.diff(energy, exact)),
+                (equations.elastic_stiffness, mpmath.diff(energy, exact, 2)))
             for function, expected in values:
                 tolerance = 3.0 * loss * (1.0 + abs(float(expected)))
                 assert abs(function(stretch, j_lim) - float(expected)) < tolerance
@@ -213,8 +213,8 @@ def test_energy_is_lost_at_the_rate_of_the_damper():
         material = NondimensionalParameters(zeta=zeta)
         times = np.linspace(0.0, 3.0, 1501)
         stretch, speed = simulate([0.0], [load], times, material, stretch=start, rate=rate)
-        energy = model.energy(stretch, speed, load, material)
-        power = model.damping(material) * speed ** 2
+        energy = equations.energy(stretch, speed, load, material)
+        power = equations.damping(material) * speed ** 2
         step = times[1] - times[0]
         # Simpson's rule over pairs of intervals.
         lost = step / 3.0 * np.cumsum(power[:-2:2] + 4.0 * power[1:-1:2] + power[2::2])
@@ -233,7 +233,7 @@ def test_stretch_limits_are_the_roots_on_both_sides(j_lim):
             mpmath.re(x) for x in mpmath.polyroots(
                 [1, 0, -(3 + mpmath.mpf(float(j_lim))), 2], maxsteps=200, extraprec=200))
         lower, upper = (float(x) for x in roots[1:])
-    found = model.stretch_limits(float(j_lim))
+    found = equations.stretch_limits(float(j_lim))
     assert found[0] == pytest.approx(lower, rel=4 * EPS * (1.0 + 1.0 / math.sqrt(j_lim)))
     assert found[1] == pytest.approx(upper, rel=4 * EPS * (1.0 + 1.0 / math.sqrt(j_lim)))
     assert 0.0 < found[0] < 1.0 < found[1]
@@ -241,19 +241,19 @@ def test_stretch_limits_are_the_roots_on_both_sides(j_lim):
 
 @pytest.mark.parametrize(('j_lim', 'printed'), [(1.0, 1.675), (3.0, 2.262), (5.0, 2.694)])
 def test_upper_limits_are_the_papers(j_lim, printed):
-    assert round(model.stretch_limits(j_lim)[1], 3) == printed
+    assert round(equations.stretch_limits(j_lim)[1], 3) == printed
 
 
 @pytest.mark.parametrize('j_lim', [0.01, 1.0, 3.0, 5.0, 1e3, 1e6])
 def test_equilibrium_inverts_the_load_over_the_whole_interval(j_lim):
-    lower, upper = model.stretch_limits(j_lim)
+    lower, upper = equations.stretch_limits(j_lim)
     shares = np.linspace(0.001, 0.999, 401)
     gaps = 10.0 ** np.arange(-12.0, -2.0)
     stretch = np.concatenate([
         inside(j_lim, shares), lower + gaps * lower, upper - gaps * upper])
     stretch = stretch[(stretch > lower) & (stretch < upper)]
-    load = model.elastic_force(stretch, j_lim)
-    found = model.equilibrium_stretch(load, j_lim)
+    load = equations.elastic_force(stretch, j_lim)
+    found = equations.equilibrium_stretch(load, j_lim)
     # The load's own rounding moves the stretch by load/stiffness, at most by an ulp or two.
     assert np.max(np.abs(found - stretch) / stretch) < 8 * EPS
     assert np.all((found > lower) & (found < upper))
@@ -262,7 +262,7 @@ def test_equilibrium_inverts_the_load_over_the_whole_interval(j_lim):
 @pytest.mark.parametrize('j_lim', [0.01, 5.0, 1e6])
 def test_equilibrium_of_tiny_loads_is_linear(j_lim):
     load = np.array([1e-300, 1e-20, 1e-12, 1e-8, -1e-8, -1e-12, -1e-20, -1e-300, 0.0])
-    found = model.equilibrium_stretch(load, j_lim)
+    found = equations.equilibrium_stretch(load, j_lim)
     # psi''(1) = 3.
     assert np.max(np.abs(found - 1.0 - load / 3.0)) <= 1e-15
     assert found[-1] == 1.0
@@ -271,28 +271,28 @@ def test_equilibrium_of_tiny_loads_is_linear(j_lim):
 @pytest.mark.parametrize('load', [1e3, 1e6, 1e9, 1e12, -1e3, -1e6, -1e9, -1e12])
 def test_equilibrium_of_a_huge_load_stays_inside_the_limits(load):
     for j_lim in (0.01, 1.0, 5.0, 1e4):
-        lower, upper = model.stretch_limits(j_lim)
-        found = float(model.equilibrium_stretch(load, j_lim))
+        lower, upper = equations.stretch_limits(j_lim)
+        found = float(equations.equilibrium_stretch(load, j_lim))
         # Far beyond what doubles tell apart it is the limit itself.
         assert lower * (1 - 2 * EPS) <= found <= upper * (1 + 2 * EPS)
 
 
 def test_load_and_stretch_are_monotone():
     stretch = inside(5.0, np.linspace(1e-6, 1.0 - 1e-6, 4001))
-    assert np.all(np.diff(model.elastic_force(stretch, 5.0)) > 0.0)
+    assert np.all(np.diff(equations.elastic_force(stretch, 5.0)) > 0.0)
     load = np.sinh(np.linspace(-12.0, 12.0, 4001))
-    assert np.all(np.diff(model.equilibrium_stretch(load, 5.0)) > 0.0)
+    assert np.all(np.diff(equations.equilibrium_stretch(load, 5.0)) > 0.0)
 
 
 def test_the_field_is_signed_in_contraction():
     stretch = np.array([0.6, 0.9, 1.0, 1.1, 1.4])
-    load = model.elastic_force(stretch, 5.0)
+    load = equations.elastic_force(stretch, 5.0)
     assert np.array_equal(np.sign(load), [-1.0, -1.0, 0.0, 1.0, 1.0])
-    b = model.signed_root(load)
+    b = equations.signed_root(load)
     assert np.array_equal(np.sign(b), np.sign(load))
     assert b * np.abs(b) == pytest.approx(load, rel=4 * EPS)
     # Eq. 11 with b^2 = b |b| is in balance there.
-    assert np.max(np.abs(model.acceleration(stretch, 0.0, b * np.abs(b), PAPER))) < 1e-13
+    assert np.max(np.abs(equations.acceleration(stretch, 0.0, b * np.abs(b), PAPER))) < 1e-13
 
 
 # -- linearised motion --------------------------------------------------------------------------
@@ -317,9 +317,9 @@ def test_linearised_motion_has_the_eigenvalues_of_the_jacobian(j_lim, c1, zeta):
             by_stretch = mpmath.diff(lambda x: motion(x, 0), rho)  # noqa: B023
             by_rate = mpmath.diff(lambda v: motion(rho, v), 0)  # noqa: B023
             discriminant = by_rate ** 2 / 4 + by_stretch
-        frequency = float(model.natural_frequency(stretch, material))
+        frequency = float(equations.natural_frequency(stretch, material))
         assert frequency ** 2 == pytest.approx(float(-by_stretch), rel=1e-12)
-        critical = float(model.critical_zeta(stretch, material))
+        critical = float(equations.critical_zeta(stretch, material))
         assert (zeta < critical) == (discriminant < 0)
         if zeta > 0.0:
             # The discriminant vanishes where zeta is the critical one.
@@ -330,14 +330,14 @@ def test_linearised_motion_has_the_eigenvalues_of_the_jacobian(j_lim, c1, zeta):
 def test_the_papers_critical_damping_follows_from_a_cube():
     for j_lim, expected in ((5.0, 2.1615), (1e9, 2.1425)):
         material = NondimensionalParameters(j_lim=j_lim)
-        assert float(model.critical_zeta(1.1, material)) == pytest.approx(expected, abs=5e-5)
+        assert float(equations.critical_zeta(1.1, material)) == pytest.approx(expected, abs=5e-5)
 
 
 def test_small_oscillations_have_the_natural_frequency():
     material = NondimensionalParameters(zeta=0.0)
     for stretch in (0.7, 1.0, 1.9):
-        frequency = float(model.natural_frequency(stretch, material))
-        load = float(model.elastic_force(stretch, 5.0))
+        frequency = float(equations.natural_frequency(stretch, material))
+        load = float(equations.elastic_force(stretch, 5.0))
         period = 2.0 * math.pi / frequency
         start = stretch * (1.0 + 1e-6)
         end = follow((start, 0.0), [(period, load)], 0.0, 5.0, 2.0)
@@ -351,24 +351,25 @@ def test_small_oscillations_have_the_natural_frequency():
 def test_functions_take_scalars_and_broadcast_arrays():
     stretch = np.linspace(0.8, 1.3, 4)[:, None]
     rate = np.linspace(-1.0, 1.0, 3)
-    table = model.acceleration(stretch, rate, 0.2, PAPER)
+    table = equations.acceleration(stretch, rate, 0.2, PAPER)
     assert table.shape == (4, 3)
     assert table.dtype == np.float64
-    assert table[2, 1] == pytest.approx(float(model.acceleration(
+    assert table[2, 1] == pytest.approx(float(equations.acceleration(
         float(stretch[2, 0]), float(rate[1]), 0.2, PAPER)), rel=1e-14)
-    assert model.energy(stretch, rate, 0.2, PAPER).shape == (4, 3)
-    assert model.equilibrium_stretch([[0.1, -0.1]], 5.0).shape == (1, 2)
-    assert float(model.elastic_force(1, 5)) == 0.0
-    for function in (model.elastic_energy, model.elastic_force, model.elastic_stiffness):
+    assert equations.energy(stretch, rate, 0.2, PAPER).shape == (4, 3)
+    assert equations.equilibrium_stretch([[0.1, -0.1]], 5.0).shape == (1, 2)
+    assert float(equations.elastic_force(1, 5)) == 0.0
+    for function in (
+            equations.elastic_energy, equations.elastic_force, equations.elastic_stiffness):
         assert np.shape(function(1.2, 5.0)) == ()
         assert function(stretch, 5.0).shape == (4, 1)
-    assert np.shape(model.signed_root(-4)) == ()
-    assert float(model.signed_root(-4)) == -2.0
+    assert np.shape(equations.signed_root(-4)) == ()
+    assert float(equations.signed_root(-4)) == -2.0
 
 
 def test_elastic_energy_is_not_a_number_beyond_the_limits():
-    lower, upper = model.stretch_limits(5.0)
-    assert np.all(np.isnan(model.elastic_energy([0.9 * lower, 1.1 * upper], 5.0)))
+    lower, upper = equations.stretch_limits(5.0)
+    assert np.all(np.isnan(equations.elastic_energy([0.9 * lower, 1.1 * upper], 5.0)))
 
 
 @settings(max_examples=100, deadline=None)
@@ -396,5 +397,5 @@ def test_the_default_block_has_the_scale_that_the_notes_give():
     actuator = paper_actuator()
     assert actuator.time_unit == pytest.approx(4.36e-3, abs=5e-6)
     assert actuator.half_thickness == actuator.half_length
-    flux_density = float(model.elastic_force(1.4, 5.0)) * actuator.flux_density_unit
+    flux_density = float(equations.elastic_force(1.4, 5.0)) * actuator.flux_density_unit
     assert flux_density == pytest.approx(0.12, abs=2e-3)

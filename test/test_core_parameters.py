@@ -6,12 +6,12 @@ import math
 import pytest
 from scipy.constants import mu_0
 
-from hmsa_ros.core.parameters import (
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.parameters import (
     ActuatorParameters,
     NondimensionalParameters,
     paper_actuator,
 )
-from hmsa_ros.errors import BadInputError
 
 ACTUATOR = {
     'shear_modulus': 1e4, 'density': 1900.0, 'half_length': 0.01, 'half_thickness': 0.02,

@@ -9,16 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
 
-from hmsa_ros.core.delivery import Delivery
-from hmsa_ros.core.model import critical_zeta, natural_frequency, stretch_limits
-from hmsa_ros.core.moves import Limits, State
-from hmsa_ros.core.parameters import NondimensionalParameters
-from hmsa_ros.core.sequence import plan_sequence
-from hmsa_ros.core.setpoint import Setpoint
-from hmsa_ros.core.status import Code, RefusedError
-from hmsa_ros.core.two_step import plan_two_step
-from hmsa_ros.core.units import Units
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.delivery import Delivery
+from hmsa_ros.model.equations import critical_zeta, natural_frequency, stretch_limits
+from hmsa_ros.model.moves import Limits, State
+from hmsa_ros.model.parameters import NondimensionalParameters
+from hmsa_ros.model.status import Code, RefusedError
+from hmsa_ros.model.units import Units
+from hmsa_ros.planning.sequence import plan_sequence
+from hmsa_ros.planning.setpoint import Setpoint
+from hmsa_ros.planning.two_step import plan_two_step
 
 PAPER = NondimensionalParameters()
 SPAN = 10.0

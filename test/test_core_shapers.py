@@ -11,24 +11,24 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from hmsa_ros.core.delivery import Delivery, pieces
-from hmsa_ros.core.model import (
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.delivery import Delivery, pieces
+from hmsa_ros.model.equations import (
     acceleration,
     critical_zeta,
     elastic_force,
     natural_frequency,
     stretch_limits,
 )
-from hmsa_ros.core.moves import Limits, Move, State
-from hmsa_ros.core.parameters import NondimensionalParameters, paper_actuator
-from hmsa_ros.core.planner import Options, Planner
-from hmsa_ros.core.sequence import plan_sequence
-from hmsa_ros.core.setpoint import Setpoint
-from hmsa_ros.core.shapers import get_shaper, SHAPERS
-from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.core.simulation import ActuatorSimulation, follow
-from hmsa_ros.core.status import Code, RefusedError
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.moves import Limits, Move, State
+from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
+from hmsa_ros.model.simulation import ActuatorSimulation, follow
+from hmsa_ros.model.status import Code, RefusedError
+from hmsa_ros.planning.planner import Options, Planner
+from hmsa_ros.planning.sequence import plan_sequence
+from hmsa_ros.planning.setpoint import Setpoint
+from hmsa_ros.planning.shapers import get_shaper, SHAPERS
+from hmsa_ros.planning.shapers.request import Request
 
 PAPER = NondimensionalParameters()
 WIDE = Limits(-20.0, 20.0)

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp, trapezoid
 
-from hmsa_ros.core.model import damping, elastic_force, energy, equilibrium_stretch, mass
-from hmsa_ros.core.parameters import NondimensionalParameters, paper_actuator
-from hmsa_ros.core.schedule import CommandSchedule
-from hmsa_ros.core.sequence import plan_sequence
-from hmsa_ros.core.setpoint import Setpoint
-from hmsa_ros.core.simulation import ActuatorSimulation, longest_motion, simulate, unshaped
 from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.model.equations import damping, elastic_force, energy, equilibrium_stretch, mass
+from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
+from hmsa_ros.model.schedule import CommandSchedule
+from hmsa_ros.model.simulation import ActuatorSimulation, longest_motion, simulate, unshaped
+from hmsa_ros.planning.sequence import plan_sequence
+from hmsa_ros.planning.setpoint import Setpoint
 
 PAPER = NondimensionalParameters()
 ACTUATOR = paper_actuator()

@@ -20,18 +20,18 @@ import numpy as np
 import pytest
 
 from hmsa_ros import motion
-from hmsa_ros.core.law import gent_limits, pack
-from hmsa_ros.core.model import (
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.equations import (
     critical_zeta,
     elastic_force,
     natural_frequency,
     stretch_limits,
 )
-from hmsa_ros.core.parameters import NondimensionalParameters
-from hmsa_ros.core.simulation import simulate
-from hmsa_ros.core.status import Code
-from hmsa_ros.core.two_step import CODES, plan_two_step, plan_two_step_batch, TwoStep
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.law import gent_limits, pack
+from hmsa_ros.model.parameters import NondimensionalParameters
+from hmsa_ros.model.simulation import simulate
+from hmsa_ros.model.status import Code
+from hmsa_ros.planning.two_step import CODES, plan_two_step, plan_two_step_batch, TwoStep
 
 PAPER = NondimensionalParameters()
 # Agreement with the independent solution, relative.

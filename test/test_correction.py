@@ -10,17 +10,17 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from hmsa_ros.core.timeline import Options as PlannerOptions
 from hmsa_ros.estimation import Estimator, Options, Prior
 from hmsa_ros.estimation.correction import Corrector, Course, expect
-from hmsa_ros.studies.feedback import (
+from hmsa_ros.planning.timeline import Options as PlannerOptions
+from hmsa_studies.feedback import (
     scenario_of,
     SCENARIOS,
     STRATEGIES,
     Strategy,
     trial,
 )
-from hmsa_ros.studies.linear import Linearised
+from hmsa_studies.linear import Linearised
 
 TARGET, BEGIN, MS = 1.4, 50_000_000, 1_000_000
 
@@ -169,11 +169,11 @@ def test_others_that_use_samples_take_the_offset_away_and_leave_more_vibration(n
 
 
 def test_open_loop_in_the_study_leaves_what_the_study_of_shapers_says():
-    from hmsa_ros.core.moves import State
-    from hmsa_ros.core.parameters import NondimensionalParameters
-    from hmsa_ros.core.shapers import get_shaper
-    from hmsa_ros.core.shapers.request import Request
-    from hmsa_ros.studies.residual import Actual, Errors
+    from hmsa_ros.model.moves import State
+    from hmsa_ros.model.parameters import NondimensionalParameters
+    from hmsa_ros.planning.shapers import get_shaper
+    from hmsa_ros.planning.shapers.request import Request
+    from hmsa_studies.residual import Actual, Errors
 
     material = NondimensionalParameters()
     move = get_shaper('two_step')(Request(State(1.0), 1.4, material))

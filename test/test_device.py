@@ -8,9 +8,6 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from hmsa_ros.core.actuators import Setup
-from hmsa_ros.core.parameters import paper_actuator
-from hmsa_ros.core.simulation import ActuatorSimulation
 from hmsa_ros.device.health import enough_samples, judge_commands, too_few_samples
 from hmsa_ros.device.protocol import Kind, Sample
 from hmsa_ros.device.sensor import Sensor, SensorErrors
@@ -18,6 +15,9 @@ from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.device.transport import Transport
 from hmsa_ros.device.watchdog import Fallback, Watchdog
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.actuators import Setup
+from hmsa_ros.model.parameters import paper_actuator
+from hmsa_ros.model.simulation import ActuatorSimulation
 
 ACTUATOR = paper_actuator()
 MS = 1_000_000

@@ -174,7 +174,7 @@ def test_a_block_cannot_be_left_out(language, marker, reason):
 
 @pytest.mark.ros
 def test_topics_and_services_are_those_that_the_nodes_have(start, ros, ros_env):
-    from hmsa_ros.contract import topics
+    from hmsa_ros.interfaces import topics
 
     # By parameter only, or only while it is needed.
     sometimes = {'/clock', '/planner/markers', '/plant/markers'}

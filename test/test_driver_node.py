@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from hmsa_ros.contract import topics
+from hmsa_ros.interfaces import topics
 from hmsa_ros.nodes.conversions import from_time, to_command
 
 TUTORIALS = Path(__file__).resolve().parent.parent / 'docs' / 'tutorials'

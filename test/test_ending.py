@@ -28,7 +28,7 @@ sys.exit(entry.{entry}())
 IN_A_DESTRUCTOR = """
 import os, signal, sys
 from hmsa_ros.entry import main
-from hmsa_ros.session.client import PlannerClient
+from hmsa_ros.lab.client import PlannerClient
 class Trap:
     def __del__(self):
         os.kill(os.getpid(), signal.SIGINT)

@@ -6,12 +6,12 @@ import identification_oracle as oracle
 import numpy as np
 import pytest
 
-from hmsa_ros.core.creep import Creep
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation import Estimator, Options, Prior
 from hmsa_ros.estimation.motion import follow, Levels
 from hmsa_ros.estimation.words import confounded, sentence
 from hmsa_ros.identification.files import read_belief
+from hmsa_ros.model.creep import Creep
 
 # Rest without field, a push, rest near 1.4, and back to rest near 1.1; in s and T.
 TIMES = np.array([0.0, 0.03, 0.036, 0.09])

@@ -10,7 +10,7 @@ from std_srvs.srv import Trigger
 import yaml
 
 from benchmarks.bench_feedback import GRAPHS, judge, run
-from hmsa_ros.contract import topics
+from hmsa_ros.interfaces import topics
 
 pytestmark = pytest.mark.ros
 # On a busy machine the start of the nodes takes a while.

@@ -13,16 +13,16 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 
 from hmsa_ros.cli import main
-from hmsa_ros.core.parameters import NondimensionalParameters
-from hmsa_ros.core.two_step import plan_two_step
-from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.figures import claims, paper_data
-from hmsa_ros.figures.paper import FIGURES, write_figure
+from hmsa_ros.model.parameters import NondimensionalParameters
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.planning.two_step import plan_two_step
+from hmsa_ros.recordings.levels import Level
+from hmsa_ros.recordings.record import Run
 from hmsa_ros.report.evaluation import Evaluation, MoveResult
 from hmsa_ros.report.picture import draw_run
-from hmsa_ros.runs.levels import Level
-from hmsa_ros.runs.record import Run
+from hmsa_studies import claims, paper_data
+from hmsa_studies.paper import FIGURES, write_figure
 
 ROOT = Path(__file__).resolve().parent.parent
 # Coarse, so that drawing takes little time.

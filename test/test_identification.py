@@ -8,7 +8,6 @@ import pytest
 from scipy.signal import lfilter
 
 from benchmarks.bench_identification import levels_of
-from hmsa_ros.core.two_step import plan_two_step
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification import identify, profile, Recording
 from hmsa_ros.identification.quantities import (
@@ -18,6 +17,7 @@ from hmsa_ros.identification.quantities import (
     values_of,
 )
 from hmsa_ros.identification.response import respond
+from hmsa_ros.planning.two_step import plan_two_step
 
 T = BLOCK.time_unit
 SPAN = 10.0 * T

@@ -8,11 +8,11 @@ from core_oracle import follow
 import numpy as np
 import pytest
 
-from hmsa_ros.core.group import PlannerGroup
-from hmsa_ros.core.parameters import paper_actuator
-from hmsa_ros.core.planner import Options, Planner
-from hmsa_ros.runtime.planner import PlannerRuntime
-from hmsa_ros.runtime.records import Note, Send, Settings, Severity, StatusChanged, Trajectory
+from hmsa_ros.control.planner import PlannerRuntime
+from hmsa_ros.control.records import Note, Send, Settings, Severity, StatusChanged, Trajectory
+from hmsa_ros.model.parameters import paper_actuator
+from hmsa_ros.planning.group import PlannerGroup
+from hmsa_ros.planning.planner import Options, Planner
 
 MS = 1_000_000
 START = 1000 * MS
@@ -158,10 +158,10 @@ def _policies(kind, unit, lead, count, monkeypatch):
         with monkeypatch.context() as patch:
             if policy == 'always':
                 patch.setattr(
-                    'hmsa_ros.runtime.following.compared', lambda *_: (math.inf, 0.0))
-                patch.setattr('hmsa_ros.runtime.following.expected', lambda *_: math.inf)
-                patch.setattr('hmsa_ros.runtime.lateness.Lateness.known', True)
-                patch.setattr('hmsa_ros.runtime.lateness.Lateness.expected', 0)
+                    'hmsa_ros.control.following.compared', lambda *_: (math.inf, 0.0))
+                patch.setattr('hmsa_ros.control.following.expected', lambda *_: math.inf)
+                patch.setattr('hmsa_ros.control.lateness.Lateness.known', True)
+                patch.setattr('hmsa_ros.control.lateness.Lateness.expected', 0)
             settings = replace(QUIET, replan_late=policy != 'nothing')
             left[policy] = float(np.mean([
                 sequence(unit, lead, _delays(kind, lead, seed), settings=settings).mean()

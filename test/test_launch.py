@@ -16,8 +16,8 @@ import pytest
 
 from hmsa_ros.bag.reader import BagReader
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.runs.verify import verify
-from hmsa_ros.session.launching import DEMO, failure, REPLAY
+from hmsa_ros.lab.launching import DEMO, failure, REPLAY
+from hmsa_ros.recordings.verify import verify
 
 ROOT = Path(__file__).resolve().parent.parent
 FILES = {'demo': (DEMO, {}), 'replay': (REPLAY, {'bag': 'some_bag'})}

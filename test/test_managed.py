@@ -5,8 +5,8 @@ from lifecycle_msgs.srv import ChangeState, GetState
 import pytest
 from std_msgs.msg import Float64
 
-from hmsa_ros.contract.parameters import ParameterSpec
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.interfaces.parameters import ParameterSpec
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.parameters import declare
 

@@ -9,11 +9,11 @@ import pytest
 from std_msgs.msg import Float64
 from visualization_msgs.msg import Marker, MarkerArray
 
-from hmsa_ros.contract import parameters as contract
-from hmsa_ros.contract import topics
-from hmsa_ros.contract.actuator import actuator_from
-from hmsa_ros.core.parameters import paper_actuator
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.interfaces import parameters as declared
+from hmsa_ros.interfaces import topics
+from hmsa_ros.interfaces.actuator import actuator_from
+from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.nodes.markers import BLOCK, Block, FIELD, LABEL, MAGNETISATION, Scene, State, TARGET
 
 ACTUATOR = paper_actuator()
@@ -220,7 +220,7 @@ def test_rate_zero_shows_nothing(ros, serve):
 
 @pytest.mark.parametrize('deflection', [0.0, 0.4, -0.7])
 def test_a_bent_beam_is_closed_keeps_its_volume_and_ends_where_its_tip_is(deflection):
-    beam = actuator_from({x.name: x.default for x in contract.BLOCK} | {
+    beam = actuator_from({x.name: x.default for x in declared.BLOCK} | {
         'law.name': 'beam', 'law.youngs_modulus': 1e6, 'law.width': 0.005,
         'actuator.half_length': 0.0125, 'actuator.half_thickness': 0.0005})
     markers = Scene((Block.of('actuator', beam),), 'coil').states(0, [State(deflection, 0.001)])

@@ -11,13 +11,15 @@ from scipy.optimize import brentq, linprog, minimize
 import yaml
 
 from hmsa_ros.cli import main
-from hmsa_ros.core.delivery import Delivery, IDEAL
-from hmsa_ros.core.mismatch import Ellipsoid, Errors
-from hmsa_ros.core.model import acceleration, elastic_force
-from hmsa_ros.core.moves import Limits, State
-from hmsa_ros.core.parameters import NondimensionalParameters, paper_actuator
-from hmsa_ros.core.shapers import get_shaper
-from hmsa_ros.core.shapers.minimax import (
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.delivery import Delivery, IDEAL
+from hmsa_ros.model.equations import acceleration, elastic_force
+from hmsa_ros.model.mismatch import Ellipsoid, Errors
+from hmsa_ros.model.moves import Limits, State
+from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
+from hmsa_ros.model.status import Code
+from hmsa_ros.planning.shapers import get_shaper
+from hmsa_ros.planning.shapers.minimax import (
     _cases,
     _command,
     _frame,
@@ -26,10 +28,8 @@ from hmsa_ros.core.shapers.minimax import (
     least_largest,
     left,
 )
-from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.core.status import Code
-from hmsa_ros.core.timeline import Model, Options
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.planning.shapers.request import Request
+from hmsa_ros.planning.timeline import Model, Options
 
 PAPER = NondimensionalParameters()
 WIDE = Limits(-20.0, 20.0)

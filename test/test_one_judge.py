@@ -8,18 +8,18 @@ import random
 import numpy as np
 import pytest
 
-from hmsa_ros.core.actuators import Setup
-from hmsa_ros.core.group import PlannerGroup
-from hmsa_ros.core.parameters import paper_actuator
-from hmsa_ros.core.planner import Options, Planner
+from hmsa_ros.control.planner import PlannerRuntime
+from hmsa_ros.control.records import PlanChanged, Send, Settings, StatusChanged, Trajectory
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.judge import VERDICTS
+from hmsa_ros.model.actuators import Setup
+from hmsa_ros.model.parameters import paper_actuator
+from hmsa_ros.planning.group import PlannerGroup
+from hmsa_ros.planning.planner import Options, Planner
+from hmsa_ros.recordings.levels import Level
+from hmsa_ros.recordings.record import RecordedRequest, Run, Verdict
 from hmsa_ros.report.outcome import findings_of
-from hmsa_ros.runs.levels import Level
-from hmsa_ros.runs.record import RecordedRequest, Run, Verdict
-from hmsa_ros.runtime.planner import PlannerRuntime
-from hmsa_ros.runtime.records import PlanChanged, Send, Settings, StatusChanged, Trajectory
 
 MS = 1_000_000
 START = 1000 * MS

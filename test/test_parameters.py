@@ -15,11 +15,11 @@ from rclpy.node import Node
 from rclpy.parameter import get_parameter_value, Parameter, parameter_value_to_python
 import yaml
 
-from hmsa_ros.contract.actuator import actuator_from
-from hmsa_ros.contract.parameters import ACTUATOR, BLOCK, ParameterSpec
-from hmsa_ros.contract.topics import NODES
-from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.interfaces.actuator import actuator_from
+from hmsa_ros.interfaces.parameters import ACTUATOR, BLOCK, ParameterSpec
+from hmsa_ros.interfaces.topics import NODES
+from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 import hmsa_ros.nodes
 from hmsa_ros.nodes import planning, plant_joint
 from hmsa_ros.nodes.joints import declare_joints

@@ -18,12 +18,12 @@ from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from hmsa_ros.contract import topics
-from hmsa_ros.core.model import natural_frequency
-from hmsa_ros.core.parameters import paper_actuator
-from hmsa_ros.core.planner import Options, Planner
-from hmsa_ros.core.simulation import ActuatorSimulation
-from hmsa_ros.nodes import interface
+from hmsa_ros.control.planner import PlannerRuntime
+from hmsa_ros.interfaces import topics
+from hmsa_ros.model.equations import natural_frequency
+from hmsa_ros.model.parameters import paper_actuator
+from hmsa_ros.model.simulation import ActuatorSimulation
+from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.conversions import (
     from_command,
     from_time,
@@ -34,7 +34,7 @@ from hmsa_ros.nodes.conversions import (
 )
 from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.timekeeping import StepWatch
-from hmsa_ros.runtime.planner import PlannerRuntime
+from hmsa_ros.planning.planner import Options, Planner
 
 pytestmark = pytest.mark.ros
 
@@ -60,10 +60,10 @@ class Driver:
         self.received = 0
         self.hold_back = False
         self.held: list[Any] = []
-        interface.subscribe(
+        endpoints.subscribe(
             ros.node, topics.of_joint(topics.FLUX_DENSITY_COMMAND, joint, joints),
             self.on_command)
-        self.applied = interface.publisher(
+        self.applied = endpoints.publisher(
             ros.node, topics.of_joint(topics.FLUX_DENSITY_APPLIED, joint, joints))
 
     def on_command(self, message: Any) -> None:
@@ -266,7 +266,7 @@ def test_some_joints_only_by_parameter_and_one_by_its_own_setpoint(rig):
 
 def test_first_request_waits_for_the_state_in_force(rig, ros):
     planner = rig()
-    samples = interface.publisher(ros.node, topics.JOINT_STATES)
+    samples = endpoints.publisher(ros.node, topics.JOINT_STATES)
     ros.spin_until(lambda: planner.planner.count_publishers('joint_states'), 'the publisher')
     driver = planner.driver
     driver.plant.set_state(1.15, 3.0, 0.06)
@@ -304,8 +304,8 @@ def test_planner_that_is_killed_is_followed_by_one_that_takes_over(ros, start, m
     arguments = ('planner', '--ros-args', *QUIET)
     clock = ros.node.create_publisher(
         Clock, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
-    samples = interface.publisher(ros.node, topics.JOINT_STATES)
-    setpoints = interface.publisher(ros.node, topics.SETPOINT, topics.PLANNER)
+    samples = endpoints.publisher(ros.node, topics.JOINT_STATES)
+    setpoints = endpoints.publisher(ros.node, topics.SETPOINT, topics.PLANNER)
     statuses = ros.collect(topics.STATUS.type, 'planner/status', topics.STATUS.qos)
     driver = Driver(ros)
     now = START

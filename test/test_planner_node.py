@@ -16,14 +16,14 @@ from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from hmsa_ros.contract import topics
-from hmsa_ros.core.parameters import paper_actuator
-from hmsa_ros.core.planner import Options, PlannedLevel, Planner
-from hmsa_ros.core.shapers.pace import Pace
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.identification.files import errors_from
+from hmsa_ros.interfaces import topics
+from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.nodes.conversions import from_command, from_time, to_time, to_trajectory
 from hmsa_ros.nodes.planner import PlannerNode
+from hmsa_ros.planning.planner import Options, PlannedLevel, Planner
+from hmsa_ros.planning.shapers.pace import Pace
 
 pytestmark = pytest.mark.ros
 

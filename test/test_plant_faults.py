@@ -13,10 +13,10 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool
 
-from hmsa_ros.contract import topics
-from hmsa_ros.core.parameters import paper_actuator
-from hmsa_ros.core.simulation import ActuatorSimulation
-from hmsa_ros.nodes import interface
+from hmsa_ros.interfaces import topics
+from hmsa_ros.model.parameters import paper_actuator
+from hmsa_ros.model.simulation import ActuatorSimulation
+from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.conversions import from_time, to_clock, to_command, to_time
 from hmsa_ros.nodes.guard import Allegiance
 from hmsa_ros.nodes.message_types import interface_class
@@ -247,7 +247,7 @@ def test_a_disturbing_force_acts_from_its_stamp_on(stand):
 def test_another_clock_beside_the_authority_is_told(stand):
     plant = stand('-p', 'real_time_factor:=2.0')
     assert plant.report('time', clock_publishers=1).level == DiagnosticStatus.OK
-    other = interface.publisher(plant.ros.node, topics.CLOCK_TOPIC)
+    other = endpoints.publisher(plant.ros.node, topics.CLOCK_TOPIC)
     other.publish(to_clock(START))
     status = plant.report('time', clock_publishers=2)
     assert status.level == DiagnosticStatus.WARN

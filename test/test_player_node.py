@@ -23,7 +23,7 @@ from hmsa_ros.bag.definitions import message_definition, type_hash
 from hmsa_ros.bag.info import summarize
 from hmsa_ros.bag.qos import Qos
 from hmsa_ros.bag.writer import BagWriter, Topic
-from hmsa_ros.session.launching import REPLAY
+from hmsa_ros.lab.launching import REPLAY
 
 pytestmark = pytest.mark.ros
 FLOAT = 'std_msgs/msg/Float64'

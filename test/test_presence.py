@@ -5,9 +5,9 @@ import pytest
 from sensor_msgs.msg import JointState
 
 from hmsa_ros.cli import main
-from hmsa_ros.contract import topics
-from hmsa_ros.contract.status import Verdict
-from hmsa_ros.nodes import interface
+from hmsa_ros.interfaces import topics
+from hmsa_ros.interfaces.status import Verdict
+from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.plant import PlantNode
 from hmsa_ros.watch.listener import Listener
@@ -24,11 +24,11 @@ class Asking:
     def __init__(self, ros):
         self.verdicts, self.reports = [], {}
         self._ros = ros
-        interface.subscribe(
+        endpoints.subscribe(
             ros.node, topics.STATUS, lambda x: self.verdicts.append(Verdict.read(x)),
             topics.PLANNER)
-        interface.subscribe(ros.node, topics.DIAGNOSTICS, self._on_diagnostics)
-        self._setpoint = interface.publisher(ros.node, topics.SETPOINT, topics.PLANNER)
+        endpoints.subscribe(ros.node, topics.DIAGNOSTICS, self._on_diagnostics)
+        self._setpoint = endpoints.publisher(ros.node, topics.SETPOINT, topics.PLANNER)
         ros.spin_until(self._setpoint.get_subscription_count, 'the planner')
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
@@ -41,7 +41,7 @@ class Asking:
         def got() -> bool:
             if self.verdicts and (self.verdicts[-1].code == 'several_plants') == refused:
                 return True
-            self._setpoint.publish(interface.interface_class(topics.SETPOINT.type)(data=1.1))
+            self._setpoint.publish(endpoints.interface_class(topics.SETPOINT.type)(data=1.1))
             return False
 
         self._ros.spin_until(got, f'refused {refused}')
@@ -51,7 +51,7 @@ class Asking:
 def test_second_plant_of_a_joint_is_refused_until_it_is_gone(ros, serve, start):
     serve(PlannerNode, PlantNode)
     asking = Asking(ros)
-    other = interface.publisher(ros.node, topics.JOINT_STATES)
+    other = endpoints.publisher(ros.node, topics.JOINT_STATES)
     other.publish(JointState(name=['elbow'], position=[1.0]))
     asking.until(refused=False)
     second = start.hmsa('plant')

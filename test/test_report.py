@@ -19,24 +19,18 @@ from rosbags.typesys import get_typestore, Stores
 from hmsa_ros.bag.definitions import message_definition
 from hmsa_ros.bag.writer import BagWriter, Topic
 from hmsa_ros.cli import main
-from hmsa_ros.contract.actuator import parameters_of
-from hmsa_ros.contract.parameters import ACTUATOR_FIELDS
-from hmsa_ros.core.creep import Creep
-from hmsa_ros.core.parameters import NondimensionalParameters, paper_actuator
-from hmsa_ros.core.planner import Options, Planner
-from hmsa_ros.core.residual import residual_vibration
-from hmsa_ros.core.simulation import ActuatorSimulation, simulate
-from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.report import charts
-from hmsa_ros.report.evaluation import evaluate, period_of, plan_points
-from hmsa_ros.report.outcome import level_results
-from hmsa_ros.report.page import page
-from hmsa_ros.report.picture import draw
-from hmsa_ros.report.timing import timing
-from hmsa_ros.runs.bags import read_runs
-from hmsa_ros.runs.levels import in_force, Level, without_repeats
-from hmsa_ros.runs.topics import (
+from hmsa_ros.interfaces.actuator import parameters_of
+from hmsa_ros.interfaces.parameters import ACTUATOR_FIELDS
+from hmsa_ros.model.creep import Creep
+from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
+from hmsa_ros.model.residual import residual_vibration
+from hmsa_ros.model.simulation import ActuatorSimulation, simulate
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.planning.planner import Options, Planner
+from hmsa_ros.recordings.bags import read_runs
+from hmsa_ros.recordings.levels import in_force, Level, without_repeats
+from hmsa_ros.recordings.topics import (
     APPLIED,
     COMMAND,
     JOINT_STATES,
@@ -46,7 +40,13 @@ from hmsa_ros.runs.topics import (
     TRAJECTORY,
     TYPES,
 )
-from hmsa_ros.runs.verify import verify
+from hmsa_ros.recordings.verify import verify
+from hmsa_ros.report import charts
+from hmsa_ros.report.evaluation import evaluate, period_of, plan_points
+from hmsa_ros.report.outcome import level_results
+from hmsa_ros.report.page import page
+from hmsa_ros.report.picture import draw
+from hmsa_ros.report.timing import timing
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 ACTUATOR = paper_actuator()

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from test_report import ACTUATOR, applied, parameters, parts_of, simulated, write
 
-from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.recordings.bags import read_runs
 from hmsa_ros.report import charts
 from hmsa_ros.report.evaluation import evaluate
 from hmsa_ros.report.page import page
 from hmsa_ros.report.timing import timing
-from hmsa_ros.runs.bags import read_runs
 
 pytestmark = pytest.mark.skipif(
     find_browser() is None,

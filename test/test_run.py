@@ -7,8 +7,8 @@ import signal
 from mcap.reader import make_reader
 import pytest
 
-from hmsa_ros.runs.bags import read_runs
-from hmsa_ros.runs.levels import without_repeats
+from hmsa_ros.recordings.bags import read_runs
+from hmsa_ros.recordings.levels import without_repeats
 
 RUN_SECONDS = 300.0
 SETPOINTS = ('1.10:0.1', '1.20:0.1', '1.00:0.1')
@@ -93,7 +93,7 @@ def test_a_block_arrives_and_stays_though_it_creeps(start, tmp_path, feedback):
 
 @pytest.mark.slow
 def test_an_interrupted_experiment_brings_the_running_actuator_to_rest(start, ros, tmp_path):
-    from hmsa_ros.contract import topics
+    from hmsa_ros.interfaces import topics
 
     statuses = ros.collect(topics.STATUS.type, 'planner/status', topics.STATUS.qos)
     nodes = [start.hmsa('plant'), start.hmsa('planner')]

@@ -9,14 +9,7 @@ import numpy as np
 import pytest
 from test_runtime_watch import Loop, MS, START
 
-from hmsa_ros.core.creep import Creep
-from hmsa_ros.core.parameters import paper_actuator
-from hmsa_ros.core.planner import Options
-from hmsa_ros.core.timeline import Model
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.files import read_belief
-from hmsa_ros.identification.known import Known
-from hmsa_ros.runtime.records import (
+from hmsa_ros.control.records import (
     EstimateChanged,
     Send,
     Settings,
@@ -24,7 +17,14 @@ from hmsa_ros.runtime.records import (
     StatusChanged,
     Target,
 )
-from hmsa_ros.studies.feedback import SCENARIOS
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification.files import read_belief
+from hmsa_ros.identification.known import Known
+from hmsa_ros.model.creep import Creep
+from hmsa_ros.model.parameters import paper_actuator
+from hmsa_ros.planning.planner import Options
+from hmsa_ros.planning.timeline import Model
+from hmsa_studies.feedback import SCENARIOS
 
 
 def estimates(loop):

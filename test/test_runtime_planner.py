@@ -5,14 +5,8 @@ import math
 
 import pytest
 
-from hmsa_ros.core.group import PlannerGroup
-from hmsa_ros.core.model import natural_frequency
-from hmsa_ros.core.parameters import paper_actuator
-from hmsa_ros.core.planner import Options, Planner
-from hmsa_ros.core.simulation import ActuatorSimulation
-from hmsa_ros.errors import HmsaError
-from hmsa_ros.runtime.planner import PlannerRuntime
-from hmsa_ros.runtime.records import (
+from hmsa_ros.control.planner import PlannerRuntime
+from hmsa_ros.control.records import (
     Note,
     PlanChanged,
     Send,
@@ -23,6 +17,12 @@ from hmsa_ros.runtime.records import (
     Target,
     Trajectory,
 )
+from hmsa_ros.errors import HmsaError
+from hmsa_ros.model.equations import natural_frequency
+from hmsa_ros.model.parameters import paper_actuator
+from hmsa_ros.model.simulation import ActuatorSimulation
+from hmsa_ros.planning.group import PlannerGroup
+from hmsa_ros.planning.planner import Options, Planner
 
 MS = 1_000_000
 START = 1000 * MS

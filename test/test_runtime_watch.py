@@ -6,14 +6,14 @@ import math
 import numpy as np
 import pytest
 
-from hmsa_ros.core.actuators import Setup
-from hmsa_ros.core.group import PlannerGroup
-from hmsa_ros.core.parameters import paper_actuator
-from hmsa_ros.core.planner import Options, Planner
+from hmsa_ros.control.planner import PlannerRuntime
+from hmsa_ros.control.records import Note, Send, Settings, StatusChanged, Trajectory
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
-from hmsa_ros.runtime.planner import PlannerRuntime
-from hmsa_ros.runtime.records import Note, Send, Settings, StatusChanged, Trajectory
+from hmsa_ros.model.actuators import Setup
+from hmsa_ros.model.parameters import paper_actuator
+from hmsa_ros.planning.group import PlannerGroup
+from hmsa_ros.planning.planner import Options, Planner
 
 MS = 1_000_000
 START = 1000 * MS

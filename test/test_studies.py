@@ -11,20 +11,25 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from hmsa_ros.core.creep import Creep
-from hmsa_ros.core.delivery import Delivery
-from hmsa_ros.core.model import acceleration_si, critical_zeta, elastic_force, natural_frequency
-from hmsa_ros.core.moves import Level, Limits, Move
-from hmsa_ros.core.parameters import ActuatorParameters, NondimensionalParameters, paper_actuator
-from hmsa_ros.core.status import Code
-from hmsa_ros.core.two_step import plan_two_step
 from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.figures.studies import draw_damped, draw_front, draw_robustness, draw_sampled
-from hmsa_ros.studies.__main__ import main, pictures, tables
-from hmsa_ros.studies.axes import MOST_VALUES, parse_grid, read_cases
-from hmsa_ros.studies.damped import damped_study, settling_time
-from hmsa_ros.studies.residual import Actual, arrival_of, Errors
-from hmsa_ros.studies.robustness import (
+from hmsa_ros.model.creep import Creep
+from hmsa_ros.model.delivery import Delivery
+from hmsa_ros.model.equations import (
+    acceleration_si,
+    critical_zeta,
+    elastic_force,
+    natural_frequency,
+)
+from hmsa_ros.model.moves import Level, Limits, Move
+from hmsa_ros.model.parameters import ActuatorParameters, NondimensionalParameters, paper_actuator
+from hmsa_ros.model.status import Code
+from hmsa_ros.planning.two_step import plan_two_step
+from hmsa_studies.__main__ import main, pictures, tables
+from hmsa_studies.axes import MOST_VALUES, parse_grid, read_cases
+from hmsa_studies.damped import damped_study, settling_time
+from hmsa_studies.pictures import draw_damped, draw_front, draw_robustness, draw_sampled
+from hmsa_studies.residual import Actual, arrival_of, Errors
+from hmsa_studies.robustness import (
     Candidate,
     candidates,
     Case,
@@ -33,9 +38,9 @@ from hmsa_ros.studies.robustness import (
     study,
     write_csv,
 )
-from hmsa_ros.studies.sampled import ideal_move, sampled_study
-from hmsa_ros.studies.sweep import Sweep
-from hmsa_ros.studies.tables import open_writer
+from hmsa_studies.sampled import ideal_move, sampled_study
+from hmsa_studies.sweep import Sweep
+from hmsa_studies.tables import open_writer
 
 COLUMNS = Sweep({}).columns
 DOCS = Path(__file__).resolve().parent.parent / 'docs' / 'studies.md'

@@ -14,12 +14,12 @@ pytest.importorskip('pyarrow')
 
 from hmsa_ros.cli import main
 from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.studies import chunks as chunk_module
-from hmsa_ros.studies import executors
-from hmsa_ros.studies.chunks import Chunks, LEAST_ROWS
-from hmsa_ros.studies.engine import compute, parse_shard
-from hmsa_ros.studies.sweep import parse_grid, Sweep
-from hmsa_ros.studies.tables import open_writer
+from hmsa_studies import chunks as chunk_module
+from hmsa_studies import executors
+from hmsa_studies.chunks import Chunks, LEAST_ROWS
+from hmsa_studies.engine import compute, parse_shard
+from hmsa_studies.sweep import parse_grid, Sweep
+from hmsa_studies.tables import open_writer
 
 #: Three chunks, the last one not full; some rows without a plan.
 AXES = {'zeta': '0:2:400', 'target': '1.1,1.2,3.0', 'j_lim': '4:9:80'}
@@ -250,16 +250,15 @@ def test_a_missing_dask_is_said_with_how_to_get_it(run, monkeypatch):
 
 
 def test_chunks_of_other_code_have_other_names(sweep, tmp_path, monkeypatch):
-    package = tmp_path / 'hmsa_ros'
-    for name in ('core', 'studies', 'contract', 'estimation', 'identification', 'motion'):
+    for name in ('hmsa_ros', 'hmsa_studies'):
         shutil.copytree(
-            Path(chunk_module.__file__).parent.parent / name, package / name,
+            Path(chunk_module.__file__).parent.parent / name, tmp_path / name,
             ignore=shutil.ignore_patterns('__pycache__'))
     before = Chunks.of(sweep, tmp_path).digest
-    monkeypatch.setattr(chunk_module, '__file__', str(package / 'studies' / 'chunks.py'))
+    monkeypatch.setattr(chunk_module, '__file__', str(tmp_path / 'hmsa_studies' / 'chunks.py'))
     for change in (False, True):
         if change:
-            with (package / 'motion' / 'hmsa' / 'law.hpp').open('a') as source:
+            with (tmp_path / 'hmsa_ros' / 'motion' / 'hmsa' / 'law.hpp').open('a') as source:
                 source.write('// changed\n')
         chunk_module.code.cache_clear()
         assert (Chunks.of(sweep, tmp_path).digest == before) is not change

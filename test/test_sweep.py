@@ -11,20 +11,20 @@ from scipy.integrate import solve_ivp
 import yaml
 
 from hmsa_ros.cli import main
-from hmsa_ros.contract.parameters import PLANNED
-from hmsa_ros.core.laws import LAWS
-from hmsa_ros.core.model import acceleration_si
-from hmsa_ros.core.moves import State
-from hmsa_ros.core.parameters import ActuatorParameters
-from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.core.shapers.two_step import two_step
-from hmsa_ros.core.two_step import plan_two_step_batch
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.runs.parameters import read_parameter_file, values_of
-from hmsa_ros.studies.axes import Belief, draw, NOTHING, parse_values, Spread
-from hmsa_ros.studies.residual import Actual, Errors
-from hmsa_ros.studies.settings import InSI, Nondimensional
-from hmsa_ros.studies.sweep import Sweep
+from hmsa_ros.interfaces.parameters import PLANNED
+from hmsa_ros.interfaces.settings import InSI, Nondimensional
+from hmsa_ros.model.equations import acceleration_si
+from hmsa_ros.model.laws import LAWS
+from hmsa_ros.model.moves import State
+from hmsa_ros.model.parameters import ActuatorParameters
+from hmsa_ros.planning.shapers.request import Request
+from hmsa_ros.planning.shapers.two_step import two_step
+from hmsa_ros.planning.two_step import plan_two_step_batch
+from hmsa_ros.recordings.parameters import read_parameter_file, values_of
+from hmsa_studies.axes import Belief, draw, NOTHING, parse_values, Spread
+from hmsa_studies.residual import Actual, Errors
+from hmsa_studies.sweep import Sweep
 
 ACTUATOR = {
     'actuator.shear_modulus': 12e3, 'actuator.density': 1800.0, 'actuator.half_length': 0.008,
@@ -185,7 +185,8 @@ def test_chunks_of_samples_shapers_and_laws_merge_to_the_table_of_one_process(ru
 
 
 def test_a_law_of_many_constants_takes_no_room_for_each_row(monkeypatch):
-    from hmsa_ros.core import law, two_step
+    from hmsa_ros.model import law
+    from hmsa_ros.planning import two_step
 
     sizes = []
     pack = law.pack

@@ -21,9 +21,9 @@ from std_msgs.msg import Float64
 import yaml
 
 from hmsa_ros import rerun_view
-from hmsa_ros.contract import topics
-from hmsa_ros.contract.actuator import parameters_of
-from hmsa_ros.core.parameters import paper_actuator
+from hmsa_ros.interfaces import topics
+from hmsa_ros.interfaces.actuator import parameters_of
+from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.nodes.markers import Block, Scene, State
 from hmsa_ros.nodes.message_types import interface_class
 

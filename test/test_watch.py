@@ -20,7 +20,7 @@ import numpy as np
 import pyte
 import pytest
 
-from hmsa_ros.contract.status import Verdict
+from hmsa_ros.interfaces.status import Verdict
 from hmsa_ros.watch.chart import limits, strip
 from hmsa_ros.watch.scene import History, Joint, Report, Scene
 from hmsa_ros.watch.screen import as_json, line, Screen
@@ -263,8 +263,8 @@ def test_each_joint_has_its_own_target_command_and_history(ros, ros_env, wait_un
     from sensor_msgs.msg import JointState, MagneticField
     from std_msgs.msg import Header
 
-    from hmsa_ros.contract import topics
-    from hmsa_ros.nodes import interface
+    from hmsa_ros.interfaces import topics
+    from hmsa_ros.nodes import endpoints
     from hmsa_ros.nodes.conversions import to_time
     from hmsa_ros.watch.listener import Listener
 
@@ -276,7 +276,7 @@ def test_each_joint_has_its_own_target_command_and_history(ros, ros_env, wait_un
     publish = {
         name: ros.node.create_publisher(kind, name, qos).publish for name, kind, qos in (
             ('joint_states', JointState, 100), ('diagnostics', DiagnosticArray, 10),
-            ('planner/status', DiagnosticStatus, interface.profile(topics.LATCHED)),
+            ('planner/status', DiagnosticStatus, endpoints.profile(topics.LATCHED)),
             ('right/flux_density_command', MagneticField, 100))}
     publish['planner/status'](status(
         'planner: request', DiagnosticStatus.OK, 'left, right', state='moving', stretch='',
@@ -322,8 +322,8 @@ def test_garbage_on_its_topics_neither_ends_nor_misleads_it(ros, ros_env, wait_u
     from trajectory_msgs.msg import JointTrajectory
 
     from benchmarks.faults import garbage
-    from hmsa_ros.contract import topics
-    from hmsa_ros.nodes import interface
+    from hmsa_ros.interfaces import topics
+    from hmsa_ros.nodes import endpoints
     from hmsa_ros.nodes.conversions import to_command
     from hmsa_ros.watch.listener import Listener
 
@@ -331,8 +331,8 @@ def test_garbage_on_its_topics_neither_ends_nor_misleads_it(ros, ros_env, wait_u
     senders = [
         (kind, ros.node.create_publisher(kind, name, qos)) for name, kind, qos in (
             ('joint_states', JointState, 1000), ('diagnostics', DiagnosticArray, 1000),
-            ('planner/status', DiagnosticStatus, interface.profile(topics.LATCHED)),
-            ('planner/plan', JointTrajectory, interface.profile(topics.LATCHED)),
+            ('planner/status', DiagnosticStatus, endpoints.profile(topics.LATCHED)),
+            ('planner/plan', JointTrajectory, endpoints.profile(topics.LATCHED)),
             ('flux_density_command', type(to_command(0, 0.0, '')), 1000))]
     screen = Screen(span=10.0, unicode=True)
     with Listener(span=10.0) as listener:

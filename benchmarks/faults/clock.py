@@ -13,9 +13,9 @@ from time import monotonic, sleep
 
 import rclpy
 
-from hmsa_ros.contract import topics
-from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.nodes import interface
+from hmsa_ros.interfaces import topics
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.conversions import to_clock
 
 _PERIOD_SECONDS = 0.001
@@ -31,7 +31,7 @@ def main(arguments: list[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     rclpy.init(args=[])
     node = rclpy.create_node('clock', enable_rosout=False)
-    publisher = interface.publisher(node, topics.CLOCK_TOPIC)
+    publisher = endpoints.publisher(node, topics.CLOCK_TOPIC)
     begin = monotonic()
     try:
         while rclpy.ok():

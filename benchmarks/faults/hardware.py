@@ -11,7 +11,7 @@ from benchmarks.faults.board import Board
 from benchmarks.faults.common import Register
 from benchmarks.faults.rig import Child, Rig
 from benchmarks.faults.table import Seen
-from hmsa_ros.contract import topics
+from hmsa_ros.interfaces import topics
 from hmsa_ros.nodes.conversions import to_command
 
 FAULTS = Register()

@@ -22,7 +22,7 @@ from benchmarks.faults.rig import Rig, settled
 from benchmarks.faults.table import Seen
 from hmsa_ros.bag.reader import BagReader
 from hmsa_ros.bag.recover import recover
-from hmsa_ros.contract import topics
+from hmsa_ros.interfaces import topics
 
 FAULTS = Register()
 _TIMEOUT = 0.5

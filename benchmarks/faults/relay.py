@@ -22,8 +22,8 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import MagneticField
 
-from hmsa_ros.contract import topics
-from hmsa_ros.nodes import interface
+from hmsa_ros.interfaces import topics
+from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.runner import spin
 
 _TICK_SECONDS = 0.0005
@@ -43,8 +43,8 @@ class Relay(Node):
         self._lost: list[Time] = []
         self._waiting: deque[tuple[float, MagneticField]] = deque()
         topic = topics.FLUX_DENSITY_COMMAND
-        self._publisher = interface.publisher(self, replace(topic, name=options.target))
-        interface.subscribe(self, replace(topic, name=options.source), self._on_command)
+        self._publisher = endpoints.publisher(self, replace(topic, name=options.target))
+        endpoints.subscribe(self, replace(topic, name=options.source), self._on_command)
         self.create_timer(
             _TICK_SECONDS, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 

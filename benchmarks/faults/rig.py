@@ -21,10 +21,10 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState, MagneticField
 from std_msgs.msg import Float64
 
-from hmsa_ros.contract import topics
-from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import HmsaError
-from hmsa_ros.nodes import interface
+from hmsa_ros.interfaces import topics
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.conversions import from_time, to_trajectory
 from hmsa_ros.nodes.message_types import interface_class
 
@@ -232,12 +232,12 @@ class Rig:
 
     def _subscribe(
             self, topic: topics.Topic, owner: str, callback: Callable[[Any], None]) -> None:
-        interface.subscribe(
+        endpoints.subscribe(
             self.node, topic, lambda x: None if self.deaf else callback(x), owner)
 
     def publisher(self, topic: topics.Topic, owner: str = '') -> Any:
         """Return a publisher of ours."""
-        return interface.publisher(self.node, topic, owner)
+        return endpoints.publisher(self.node, topic, owner)
 
     def _on_sample(self, message: JointState) -> None:
         self._stamps.append(from_time(message.header.stamp))

@@ -5,8 +5,8 @@ import signal
 from benchmarks.faults.common import await_change, jump, move, pair, Register, share
 from benchmarks.faults.rig import Rig
 from benchmarks.faults.table import Seen
-from hmsa_ros.contract import topics
-from hmsa_ros.nodes import interface
+from hmsa_ros.interfaces import topics
+from hmsa_ros.nodes import endpoints
 
 FAULTS = Register()
 _TARGET = 1.2
@@ -17,7 +17,7 @@ _LEFT = 0.02
 def _failing(rig: Rig, fault: str, word: str, counter: str) -> Seen:
     """Learn with a sensor that works, have it fail at rest, and move again."""
     told: list[tuple[str, dict[str, str]]] = []
-    interface.subscribe(
+    endpoints.subscribe(
         rig.node, topics.ESTIMATE, lambda x: told.extend(
             (y.message, {z.key: z.value for z in y.values}) for y in x.status), topics.PLANNER)
     name = topics.JOINT_STATES.name

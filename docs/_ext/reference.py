@@ -28,11 +28,11 @@ from sphinx.util.docutils import SphinxDirective
 
 from hmsa_ros import errors
 from hmsa_ros.cli import build_parser
-from hmsa_ros.contract import topics
-from hmsa_ros.core.status import Code, EXPLANATIONS
+from hmsa_ros.interfaces import topics
+from hmsa_ros.model.status import Code, EXPLANATIONS
 
 LOGGER = logging.getLogger(__name__)
-PACKAGE = Path(errors.__file__).parent
+PACKAGES = Path(errors.__file__).parent.parent
 # Rules of numpydoc that the style of this project does not share: sections that not every
 # function needs (ES01, EX01, SA01), the empty line before the closing quotes (GL02, GL03),
 # parameters of one type described together (PR03), symbols that begin a description (PR08,
@@ -43,8 +43,8 @@ NOT_PUBLIC = re.compile(
     r'\.(__main__|cli|_motion|law|ros_launch)\b')
 
 
-def contract_entries(kind: type) -> list[Any]:
-    """Return what `hmsa_ros.contract.topics` declares of a kind (Topic, Service), in its order."""
+def declared(kind: type) -> list[Any]:
+    """Return what `interfaces.topics` declares of a kind (Topic, Service), in its order."""
     return [x for x in vars(topics).values() if isinstance(x, kind)]
 
 
@@ -206,10 +206,10 @@ class Topics(Generated):
     def markdown(self, argument: str) -> str:
         """Return a table of all topics (see `Generated.markdown`)."""
         rows = []
-        for topic in contract_entries(topics.Topic):
+        for topic in declared(topics.Topic):
             if not topic.meaning or not (topic.publishers or topic.subscribers):
                 self.missing(
-                    f'topic {topic.name} in hmsa_ros.contract.topics has no meaning, or no '
+                    f'topic {topic.name} in hmsa_ros.interfaces.topics has no meaning, or no '
                     'publishers and subscribers: expected both beside its name')
             rows.append((
                 f'`{topic.name}`',
@@ -224,11 +224,11 @@ class Services(Generated):
 
     def markdown(self, argument: str) -> str:
         """Return a table of all services (see `Generated.markdown`)."""
-        services = contract_entries(topics.Service)
+        services = declared(topics.Service)
         for service in services:
             if not service.meaning:
                 self.missing(
-                    f'service {service.name} in hmsa_ros.contract.topics has no meaning: '
+                    f'service {service.name} in hmsa_ros.interfaces.topics has no meaning: '
                     'expected one for each node that serves it')
         return table(
             ('node', 'name', 'meaning'),
@@ -276,7 +276,7 @@ class Codes(Generated):
         for code in Code:
             if code not in EXPLANATIONS:
                 self.missing(
-                    f'code {code} in hmsa_ros.core.status is not explained: expected an entry '
+                    f'code {code} in hmsa_ros.model.status is not explained: expected an entry '
                     'in EXPLANATIONS')
         return table(
             ('code', 'meaning', 'what to do'),
@@ -303,7 +303,7 @@ class ErrorMessages(Generated):
         """Return a list of the sentences, without repetition (see `Generated.markdown`)."""
         found: dict[str, str] = {}
         for part in argument.split():
-            place = PACKAGE / part
+            place = PACKAGES / part.replace('.', '/')
             for path in sorted(place.rglob('*.py')) if place.is_dir() else [place]:
                 for _, text, _ in messages(path):
                     found.setdefault(' '.join(text.split()), path.name)

@@ -1,9 +1,9 @@
 """
 The ``hmsa`` command.
 
-Each command is a module of this package with ``add_parser(subparsers)`` and ``run(arguments)``,
-listed in `COMMANDS`. Modules import what is slow (rclpy, SciPy, matplotlib) inside ``run``, so
-that ``hmsa --help`` answers at once.
+Each command is a module with ``add_parser(subparsers)`` and ``run(arguments)``, listed in
+`COMMANDS`: of this package or, for studies, of another one. Modules import what is slow (rclpy,
+SciPy, matplotlib) inside ``run``, so that ``hmsa --help`` answers at once.
 """
 
 import argparse
@@ -20,8 +20,11 @@ from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import complain, HmsaError
 
 COMMANDS = (
-    'demo', 'init', 'excite', 'identify', 'plan', 'node', 'send', 'run', 'watch', 'bag', 'report',
-    'export', 'sweep', 'robustness', 'figures', 'completion')
+    *(f'hmsa_ros.cli.{x}' for x in (
+        'demo', 'init', 'excite', 'identify', 'plan', 'node', 'send', 'run', 'watch', 'bag',
+        'report', 'export')),
+    *(f'hmsa_studies.commands.{x}' for x in ('sweep', 'robustness', 'figures')),
+    'hmsa_ros.cli.completion')
 
 
 class _Help(argparse.HelpFormatter):
@@ -59,7 +62,7 @@ def build_parser() -> Parser:
     parser.add_argument('--version', action='version', version=f'hmsa_ros {__version__}')
     subparsers = parser.add_subparsers(metavar='COMMAND', required=True)
     for name in COMMANDS:
-        module = import_module(f'hmsa_ros.cli.{name}')
+        module = import_module(name)
         before = set(subparsers.choices)
         module.add_parser(subparsers)
         for added in subparsers.choices.keys() - before:

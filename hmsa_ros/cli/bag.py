@@ -80,9 +80,9 @@ def _info(arguments: argparse.Namespace) -> int:
 
 def _verify(arguments: argparse.Namespace) -> int:
     """Compare recorded and integrated motion; 1 if they differ or something is missing."""
-    from hmsa_ros.runs.bags import read_runs
-    from hmsa_ros.runs.parameters import read_parameter_file
-    from hmsa_ros.runs.verify import verify_run
+    from hmsa_ros.recordings.bags import read_runs
+    from hmsa_ros.recordings.parameters import read_parameter_file
+    from hmsa_ros.recordings.verify import verify_run
 
     if not 0.0 <= arguments.tolerance < math.inf:
         raise BadInputError(

@@ -13,7 +13,7 @@ from hmsa_ros.ending import ENDING
 from hmsa_ros.files import json_text
 
 if TYPE_CHECKING:
-    from hmsa_ros.session.demo import DemoResult
+    from hmsa_ros.lab.demo import DemoResult
 
 
 def add_parser(subparsers: Any) -> None:
@@ -35,13 +35,13 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the demo."""
     from rich.console import Console
 
-    from hmsa_ros.session.processes import local_environment
+    from hmsa_ros.lab.processes import local_environment
 
     folder = arguments.out or Path('hmsa_demo') / datetime.now().strftime('%Y-%m-%d_%H-%M-%S')
     # Set before anything of ROS is imported: this process joins the nodes' domain.
     os.environ.update(local_environment())
-    from hmsa_ros.session.demo import run_demo
-    from hmsa_ros.session.experiment import prepare
+    from hmsa_ros.lab.demo import run_demo
+    from hmsa_ros.lab.experiment import prepare
 
     prepare(folder)
     ENDING.note()

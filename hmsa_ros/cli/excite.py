@@ -9,8 +9,8 @@ from hmsa_ros.cli.options import add_options, JSON
 from hmsa_ros.files import json_text, write_text
 
 if TYPE_CHECKING:
-    from hmsa_ros.core.parameters import ActuatorParameters
     from hmsa_ros.identification.excitation import Excitation, Program
+    from hmsa_ros.model.parameters import ActuatorParameters
 
 
 def add_parser(subparsers: Any) -> None:

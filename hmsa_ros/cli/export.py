@@ -29,8 +29,8 @@ def add_parser(subparsers: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Read and write; raise `BadInputError` if the bag has several runs."""
-    from hmsa_ros.runs.bags import read_runs
-    from hmsa_ros.runs.tables import levels_of, samples_of, write_table
+    from hmsa_ros.recordings.bags import read_runs
+    from hmsa_ros.recordings.tables import levels_of, samples_of, write_table
 
     out: Path = arguments.out
     with progress() as update:

@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
         write_text(arguments.out, file_text(found, belief, str(arguments.recording), now))
         written.append(arguments.out)
     if arguments.report is not None:
-        from hmsa_ros.identification.page import page
+        from hmsa_ros.report.identified import page
 
         write_text(arguments.report, page(found))
         written.append(arguments.report)

@@ -19,13 +19,13 @@ from hmsa_ros.cli.quantities import (
     QUANTITIES,
     Quantity,
 )
-from hmsa_ros.contract.parameters import LAW_NAME, PUBLISH_RATE
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text, write_text
+from hmsa_ros.interfaces.parameters import LAW_NAME, PUBLISH_RATE
 
 if TYPE_CHECKING:
-    from hmsa_ros.core.parameters import ActuatorParameters
-    from hmsa_ros.core.scales import Coil, Scales
+    from hmsa_ros.model.parameters import ActuatorParameters
+    from hmsa_ros.planning.scales import Coil, Scales
 
 _JOINT = 'actuator'
 # In place of which the damping coefficient may be given.
@@ -110,7 +110,7 @@ def run(arguments: argparse.Namespace) -> int:
         if not _known(key, given):
             given[key] = default_of(quantity, given)
 
-    from hmsa_ros.core.scales import Coil, scales
+    from hmsa_ros.planning.scales import Coil, scales
 
     actuator = _beam(given) if arguments.beam else _block(given)
     coil = Coil(given['flux_min'], given['flux_max'], given['slew_limit'])
@@ -220,9 +220,9 @@ def _answer(question: str) -> str:
 
 def _beam(given: Mapping[str, float]) -> 'ActuatorParameters':
     """Return the beam."""
-    from hmsa_ros.contract.actuator import actuator_from
-    from hmsa_ros.contract.parameters import BLOCK
-    from hmsa_ros.core.model import critical_zeta
+    from hmsa_ros.interfaces.actuator import actuator_from
+    from hmsa_ros.interfaces.parameters import BLOCK
+    from hmsa_ros.model.equations import critical_zeta
 
     beam = actuator_from({x.name: x.default for x in BLOCK} | {
         LAW_NAME.name: 'beam', 'actuator.damping_coefficient': 0.0} | {
@@ -237,8 +237,8 @@ def _beam(given: Mapping[str, float]) -> 'ActuatorParameters':
 
 def _block(given: Mapping[str, float]) -> 'ActuatorParameters':
     """Return the block."""
-    from hmsa_ros.core.creep import Creep
-    from hmsa_ros.core.parameters import ActuatorParameters
+    from hmsa_ros.model.creep import Creep
+    from hmsa_ros.model.parameters import ActuatorParameters
 
     damping = given.get(DAMPING.key)
     if damping is None:
@@ -371,7 +371,7 @@ def _sampling(actuator: 'ActuatorParameters') -> list[str]:
 
 def _parameters(actuator: 'ActuatorParameters', coil: 'Coil') -> dict[str, Any]:
     """Return the nodes' parameters by name."""
-    from hmsa_ros.contract.actuator import parameters_of
+    from hmsa_ros.interfaces.actuator import parameters_of
 
     values = parameters_of(actuator)
     if not actuator.rest:

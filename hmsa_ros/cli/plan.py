@@ -8,15 +8,15 @@ from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.options import add_options, MATERIAL
 from hmsa_ros.cli.setpoints import setpoint
-from hmsa_ros.core.setpoint import impossible
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text
+from hmsa_ros.planning.setpoint import impossible
 
 if TYPE_CHECKING:
-    from hmsa_ros.core.mismatch import Uncertainty
-    from hmsa_ros.core.moves import State
-    from hmsa_ros.core.sequence import Segment
-    from hmsa_ros.studies.settings import Setting
+    from hmsa_ros.interfaces.settings import Setting
+    from hmsa_ros.model.mismatch import Uncertainty
+    from hmsa_ros.model.moves import State
+    from hmsa_ros.planning.sequence import Segment
 
 
 def add_parser(subparsers: Any) -> None:
@@ -58,9 +58,9 @@ def add_parser(subparsers: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Plan and print, in seconds and tesla for the actuator of a parameter file."""
-    from hmsa_ros.core.sequence import plan_sequence
-    from hmsa_ros.core.setpoint import Setpoint
-    from hmsa_ros.core.shapers.pace import Pace
+    from hmsa_ros.planning.sequence import plan_sequence
+    from hmsa_ros.planning.setpoint import Setpoint
+    from hmsa_ros.planning.shapers.pace import Pace
 
     model = nominal(arguments)
     group, time, load = model.material, model.units.time, model.units.load
@@ -92,9 +92,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 def nominal(arguments: argparse.Namespace) -> 'Setting':
     """Return what options or a file plan with; raise `BadInputError` if both say something."""
-    from hmsa_ros.core.parameters import NondimensionalParameters
-    from hmsa_ros.runs.model import model_of
-    from hmsa_ros.studies.settings import Setting
+    from hmsa_ros.interfaces.settings import Setting
+    from hmsa_ros.model.parameters import NondimensionalParameters
+    from hmsa_ros.recordings.model import model_of
 
     given = {name: value for name in ('zeta', 'j_lim', 'c1')
              if (value := getattr(arguments, name)) is not None}
@@ -119,14 +119,14 @@ def _possible(setpoints: Sequence[tuple[float, float]], rest: float) -> list[tup
 
 def _start(arguments: argparse.Namespace, rest: float) -> 'State':
     """Return the state at the start, unless given at rest without a field."""
-    from hmsa_ros.core.moves import State
+    from hmsa_ros.model.moves import State
 
     return State(rest if arguments.start is None else arguments.start)
 
 
 def _errors(arguments: argparse.Namespace) -> 'Uncertainty':
     """Return the errors for which minimax plans."""
-    from hmsa_ros.core.shapers.request import as_errors, ERRORS
+    from hmsa_ros.planning.shapers.request import as_errors, ERRORS
 
     if arguments.errors is not None:
         try:
@@ -158,7 +158,7 @@ def _si_row(segment: 'Segment', time: float, load: float) -> dict[str, Any]:
 
 def _row(segment: 'Segment') -> dict[str, float | str | None]:
     """Return a segment as the JSON output shows it; null where there is no such number."""
-    from hmsa_ros.core.model import signed_root
+    from hmsa_ros.model.equations import signed_root
 
     levels, tail = segment.move.levels, segment.move.tail
     shaped = len(levels) > max(len(tail), 1)

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import math
 import re
 
-from hmsa_ros.contract.parameters import (
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.interfaces.parameters import (
     ACTUATOR,
     ACTUATOR_FIELDS,
     FLUX_DENSITY_MAX,
@@ -18,7 +19,6 @@ from hmsa_ros.contract.parameters import (
     SLEW_LIMIT,
     ZETA,
 )
-from hmsa_ros.errors import BadInputError
 
 _UNITS: dict[str, dict[str, float]] = {
     'm': {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'µm': 1e-6},

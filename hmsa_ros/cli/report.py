@@ -10,7 +10,7 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text, write_text
 
 if TYPE_CHECKING:
-    from hmsa_ros.runs.record import Run
+    from hmsa_ros.recordings.record import Run
 
 
 def add_parser(subparsers: Any) -> None:
@@ -47,12 +47,12 @@ def run(arguments: argparse.Namespace) -> int:
     targets = [x for x in (out, arguments.png, arguments.pdf) if x is not None]
     _check_targets(targets, bags)
 
+    from hmsa_ros.recordings.bags import read_runs
+    from hmsa_ros.recordings.parameters import read_parameter_file
     from hmsa_ros.report.charts import Part, RUN_COLOURS
     from hmsa_ros.report.evaluation import evaluate
     from hmsa_ros.report.page import page
     from hmsa_ros.report.timing import timing
-    from hmsa_ros.runs.bags import read_runs
-    from hmsa_ros.runs.parameters import read_parameter_file
 
     joints = [x for x in arguments.joint.split(',') if x]
     parameters = None if arguments.params is None else read_parameter_file(arguments.params)

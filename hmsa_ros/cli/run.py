@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from hmsa_ros.judge import Finding, Tolerances
+    from hmsa_ros.lab.experiment import Conducted, Experiment
     from hmsa_ros.report.outcome import LevelResult
-    from hmsa_ros.session.experiment import Conducted, Experiment
 
 NOT_MEASURED = 'predicted, not measured'
 # Rows of the table of levels.
@@ -68,11 +68,11 @@ def run(arguments: argparse.Namespace) -> int:
     tolerances = _tolerances(arguments)
     folder = arguments.out or Path('hmsa_run') / datetime.now().strftime('%Y-%m-%d_%H-%M-%S')
     if arguments.simulate:
-        from hmsa_ros.session.processes import local_environment
+        from hmsa_ros.lab.processes import local_environment
         # Set before anything of ROS is imported: this process joins the nodes' domain.
         os.environ.update(local_environment())
     experiment = _experiment(arguments, folder)
-    from hmsa_ros.session.experiment import conduct, prepare
+    from hmsa_ros.lab.experiment import conduct, prepare
 
     prepare(folder)
     ENDING.note()
@@ -119,9 +119,9 @@ def _tolerances(arguments: argparse.Namespace) -> 'Tolerances | None':
 
 
 def _experiment(arguments: argparse.Namespace, folder: Path) -> 'Experiment':
-    from hmsa_ros.runs.parameters import read_parameter_file
-    from hmsa_ros.session.experiment import Experiment
-    from hmsa_ros.session.simulated import simulated_nodes
+    from hmsa_ros.lab.experiment import Experiment
+    from hmsa_ros.lab.simulated import simulated_nodes
+    from hmsa_ros.recordings.parameters import read_parameter_file
 
     expected = {} if arguments.params_file is None else dict(read_parameter_file(
         arguments.params_file))
@@ -139,8 +139,8 @@ def _measure(
         experiment: 'Experiment',
         tolerances: 'Tolerances | None') -> 'tuple[list[Finding], list[LevelResult]]':
     """Read the bag and judge the setpoints or measure the levels of each joint."""
+    from hmsa_ros.recordings.bags import read_runs
     from hmsa_ros.report.outcome import findings_of, level_results
-    from hmsa_ros.runs.bags import read_runs
 
     runs = read_runs(
         experiment.bag, joints=experiment.joints if len(experiment.joints) > 1 else ())
@@ -151,11 +151,11 @@ def _measure(
 
 def _report(bag: Path, path: Path) -> Path:
     from hmsa_ros.files import write_text
+    from hmsa_ros.recordings.bags import read_runs
     from hmsa_ros.report.charts import Part
     from hmsa_ros.report.evaluation import evaluate
     from hmsa_ros.report.page import page
     from hmsa_ros.report.timing import timing
-    from hmsa_ros.runs.bags import read_runs
 
     write_text(path, page([Part(x, evaluate(x), timing(x)) for x in read_runs(bag)]))
     return path

@@ -4,8 +4,8 @@ import argparse
 import math
 from pathlib import Path
 
-from hmsa_ros.core.setpoint import Setpoint
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.planning.setpoint import Setpoint
 
 
 def add_sequence(parser: argparse.ArgumentParser) -> None:

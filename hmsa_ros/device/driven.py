@@ -8,11 +8,11 @@ import math
 
 import numpy as np
 
-from hmsa_ros.core.schedule import CommandSchedule
 from hmsa_ros.device.hardware import Calls, Hardware, HardwareError, Instrument
 from hmsa_ros.device.protocol import Change, Kind, Notice, Sample, StateLostError
 from hmsa_ros.device.watchdog import Device, Fallback
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.schedule import CommandSchedule
 
 # Of the levels that took effect last, which tell at what level an older sample was taken.
 _REMEMBERED = 64

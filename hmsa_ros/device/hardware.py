@@ -11,10 +11,10 @@ import sys
 from time import monotonic
 from typing import Any, cast, NamedTuple, Protocol
 
-from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.device.protocol import StateLostError
 from hmsa_ros.ending import Deadline, encoded
 from hmsa_ros.errors import BadInputError, excerpt, HmsaError
+from hmsa_ros.model.units import NANOSECONDS
 
 # What cannot be when a level took effect, in ns from now.
 _ABSURD = 10 * NANOSECONDS

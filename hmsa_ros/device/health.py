@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 import math
 
-from hmsa_ros.core.model import natural_frequency
-from hmsa_ros.core.parameters import ActuatorParameters
+from hmsa_ros.model.equations import natural_frequency
+from hmsa_ros.model.parameters import ActuatorParameters
 
 _OK, _WARN, _ERROR = 0, 1, 2
 # Below, peaks of a vibration lie between samples.

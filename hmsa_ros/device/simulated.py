@@ -3,14 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from hmsa_ros.core.actuators import Actuators, Setup
-from hmsa_ros.core.model import Array
-from hmsa_ros.core.simulation import too_large
-from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
 from hmsa_ros.device.sensor import Sensor, SensorErrors
 from hmsa_ros.device.transport import Transport
 from hmsa_ros.device.watchdog import Device, Fallback
+from hmsa_ros.model.actuators import Actuators, Setup
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.simulation import too_large
+from hmsa_ros.model.units import NANOSECONDS
 
 # A gap of the clock that is not simulated through but skipped.
 _LARGEST_GAP_NS = 5 * NANOSECONDS

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 import math
 
-from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.units import NANOSECONDS
 
 #: What to do: keep the last level, go to zero at once, or ramp to zero.
 SAFE_FLUX = ('hold', 'zero', 'ramp')

@@ -12,11 +12,11 @@ from threading import Condition, Event, Thread
 from time import monotonic
 from typing import NamedTuple, TypeVar
 
-from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.device.driven import HardwareDevice
 from hmsa_ros.device.hardware import told
 from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
 from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.model.units import NANOSECONDS
 
 T = TypeVar('T')
 

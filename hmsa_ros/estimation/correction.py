@@ -15,16 +15,16 @@ import math
 
 import numpy as np
 
-from hmsa_ros.core.moves import Move, State
-from hmsa_ros.core.shapers import get_shaper
-from hmsa_ros.core.shapers.request import Request
-from hmsa_ros.core.shapers.through import through
-from hmsa_ros.core.status import RefusedError
-from hmsa_ros.core.timeline import Model, Options
-from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation.estimator import Estimate
 from hmsa_ros.estimation.motion import follow, followed, Levels, rest
+from hmsa_ros.model.moves import Move, State
+from hmsa_ros.model.status import RefusedError
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.planning.shapers import get_shaper
+from hmsa_ros.planning.shapers.request import Request
+from hmsa_ros.planning.shapers.through import through
+from hmsa_ros.planning.timeline import Model, Options
 
 #: A move that is expected to leave more than this share of its step is given more time.
 TOLERANCE = 5e-3

@@ -9,11 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from hmsa_ros.core.model import Array
-from hmsa_ros.core.parameters import ActuatorParameters
-from hmsa_ros.core.timeline import Model
-from hmsa_ros.core.timeline import Options as PlannerOptions
-from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.estimation.motion import behind, follow, Levels, rest
 from hmsa_ros.estimation.prior import Prior
@@ -22,6 +17,11 @@ from hmsa_ros.estimation.screening import Screening
 from hmsa_ros.estimation.window import coordinates, Solution, Window
 from hmsa_ros.identification.fit import robust_scale
 from hmsa_ros.identification.quantities import actuator_of, derivative, QUANTITIES
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.parameters import ActuatorParameters
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.planning.timeline import Model
+from hmsa_ros.planning.timeline import Options as PlannerOptions
 
 # Until the scatter is seen.
 _FIRST_NOISE, _LEAST_NOISE = 1e-3, 2e-6

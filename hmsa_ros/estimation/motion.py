@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from hmsa_ros.core.delivery import late
-from hmsa_ros.core.law import elastic_force, evaluate, FORCE, natural_frequency
-from hmsa_ros.core.model import Array
 from hmsa_ros.identification.recording import pieces
 from hmsa_ros.identification.response import sensed, set_rest, Setup
+from hmsa_ros.model.delivery import late
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.law import elastic_force, evaluate, FORCE, natural_frequency
 from hmsa_ros.motion import respond
 from hmsa_ros.motion import theta as places
 

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from hmsa_ros.core.creep import Creep
-from hmsa_ros.core.laws.coordinate import Coordinate, coordinate_of
-from hmsa_ros.core.model import Array
-from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.known import Known
 from hmsa_ros.identification.quantities import check_free, derivative, values_of
 from hmsa_ros.identification.response import complete
+from hmsa_ros.model.creep import Creep
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.laws.coordinate import Coordinate, coordinate_of
+from hmsa_ros.model.parameters import ActuatorParameters
 
 #: Standard deviations where no identification gives any: of the logarithm for parameters that
 #: are sought by it, of the value in SI otherwise. That of the damping and of the chain limit is a

@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from hmsa_ros.core.model import Array
 from hmsa_ros.estimation.window import Solution
 from hmsa_ros.identification.fit import robust_scale
+from hmsa_ros.model.equations import Array
 
 # Samples that show how much they scatter at rest, and how well they fit.
 _FEWEST, _MOVING = 10, 20

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from hmsa_ros.core.laws.coordinate import Coordinate
-from hmsa_ros.core.model import Array
 from hmsa_ros.estimation.motion import follow, Levels
 from hmsa_ros.estimation.window import Solution, Window
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.laws.coordinate import Coordinate
 
 # So many rejected samples in a row are no outliers: sensor or actuator is not where it was.
 _LOST = 6

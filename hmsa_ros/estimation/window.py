@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from hmsa_ros.core.model import Array
 from hmsa_ros.estimation.motion import follow, Levels, Motion
 from hmsa_ros.identification.fit import loss, weights_of
 from hmsa_ros.identification.quantities import from_coordinate, QUANTITIES, to_coordinate
 from hmsa_ros.identification.response import clip, complete
+from hmsa_ros.model.equations import Array
 
 # Steps of Gauss and Newton at most, halvings of each, and the step, in deviations, that ends them.
 _PASSES, _HALVINGS, _SMALL = 6, 4, 0.03

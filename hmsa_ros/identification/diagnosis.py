@@ -6,8 +6,6 @@ import math
 
 import numpy as np
 
-from hmsa_ros.core import model
-from hmsa_ros.core.model import Array
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.fit import Fit
 from hmsa_ros.identification.noise import autocorrelation, inflation, Whiteness, whiteness
@@ -21,6 +19,8 @@ from hmsa_ros.identification.quantities import (
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.response import complete, respond
 from hmsa_ros.identification.result import Signature
+from hmsa_ros.model import equations
+from hmsa_ros.model.equations import Array
 
 # Deviation, in the coordinates, from which on a number is none: of positive values a quarter.
 _RELATIVE = 0.25
@@ -242,7 +242,7 @@ def _second_mode(fit: Fit) -> list[Signature]:
     chance = len(power) * math.exp(-len(power) * float(power[place]) / float(np.sum(power)))
     frequency = (place + 3) / (float(np.mean(np.diff(time))) * len(time))
     group = group_of(fit.values)
-    own = float(model.natural_frequency(group.rest, group)) / complete(
+    own = float(equations.natural_frequency(group.rest, group)) / complete(
         fit.values, fit.free)['time_unit'] / (2.0 * math.pi)
     apart = not 0.5 < frequency / own < 2.0
     return [Signature(

@@ -14,14 +14,6 @@ import math
 
 import numpy as np
 
-from hmsa_ros.core import model
-from hmsa_ros.core.delivery import Delivery
-from hmsa_ros.core.model import Array
-from hmsa_ros.core.moves import Limits, State
-from hmsa_ros.core.parameters import ActuatorParameters
-from hmsa_ros.core.sequence import plan_sequence
-from hmsa_ros.core.setpoint import Setpoint
-from hmsa_ros.core.status import RefusedError
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.quantities import (
     check_free,
@@ -31,6 +23,14 @@ from hmsa_ros.identification.quantities import (
 )
 from hmsa_ros.identification.recording import Course
 from hmsa_ros.identification.response import respond, Response
+from hmsa_ros.model import equations
+from hmsa_ros.model.delivery import Delivery
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.moves import Limits, State
+from hmsa_ros.model.parameters import ActuatorParameters
+from hmsa_ros.model.status import RefusedError
+from hmsa_ros.planning.sequence import plan_sequence
+from hmsa_ros.planning.setpoint import Setpoint
 
 _PATTERN = 5  # levels in the pattern that is repeated
 # Tries to find the largest pattern inside the limits, what they aim at, and what is large enough.
@@ -141,7 +141,7 @@ class Designer:
         self._values = values_of(actuator)
         self._group = actuator.nondimensional
         self.period = 2.0 * math.pi * actuator.time_unit / float(
-            model.natural_frequency(self._group.rest, self._group))
+            equations.natural_frequency(self._group.rest, self._group))
         if not (rate > 0.0 and math.isfinite(rate) and noise > 0.0):
             raise BadInputError(
                 f'rate is {rate:g} Hz and noise {noise:g}: expected finite numbers above 0')
@@ -160,7 +160,7 @@ class Designer:
         self._times: Array = np.arange(count) / rate
         self._dense: Array = np.linspace(
             0.0, duration, max(int(40.0 * duration / self.period), 200), dtype=np.float64)
-        lower, upper = model.stretch_limits(self._group)
+        lower, upper = equations.stretch_limits(self._group)
         if math.isinf(upper):
             upper = 10.0
         unit = actuator.flux_density_unit
@@ -174,7 +174,7 @@ class Designer:
         self._unit = unit
 
     def _holding(self, stretch: float) -> float:
-        return float(model.elastic_force(stretch, self._group)
+        return float(equations.elastic_force(stretch, self._group)
                      ) * self._actuator.flux_density_unit
 
     def _respond(
@@ -379,7 +379,7 @@ def excite(
     bounds = bounds or Bounds()
     if duration is None:
         duration = 180.0 * 2.0 * math.pi * actuator.time_unit / float(
-            model.natural_frequency(actuator.rest, actuator.nondimensional))
+            equations.natural_frequency(actuator.rest, actuator.nondimensional))
     designer = Designer(actuator, bounds, duration, rate=rate, noise=noise, free=free)
     best = designer.search()
     nothing = Program(

@@ -15,17 +15,17 @@ from typing import Any
 
 import numpy as np
 
-from hmsa_ros.contract.actuator import actuator_from, parameters_of
-from hmsa_ros.contract.parameters import BLOCK
-from hmsa_ros.contract.topics import PLANNER, PLANT
-from hmsa_ros.core.mismatch import Ellipsoid, Uncertainty
-from hmsa_ros.core.parameters import ActuatorParameters
-from hmsa_ros.core.shapers.request import as_errors, LARGEST_ERROR
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.known import Known, PREFIX
 from hmsa_ros.identification.quantities import actuator_of, QUANTITIES
 from hmsa_ros.identification.result import Identification
-from hmsa_ros.runs.parameters import Entries, entries_of, number_of, values_of
+from hmsa_ros.interfaces.actuator import actuator_from, parameters_of
+from hmsa_ros.interfaces.parameters import BLOCK
+from hmsa_ros.interfaces.topics import PLANNER, PLANT
+from hmsa_ros.model.mismatch import Ellipsoid, Uncertainty
+from hmsa_ros.model.parameters import ActuatorParameters
+from hmsa_ros.planning.shapers.request import as_errors, LARGEST_ERROR
+from hmsa_ros.recordings.parameters import Entries, entries_of, number_of, values_of
 
 # What coil and sensor have, by the name in parameter files.
 _OTHERS = {
@@ -35,7 +35,7 @@ _LISTS = {
     'viscoelastic_ratio': 'viscoelastic.ratio', 'viscoelastic_time': 'viscoelastic.time'}
 # Half of a 95 % interval, or half an axis of the ellipsoid of so many, in standard deviations.
 _HALF_95 = (0.0, 1.96, 2.448, 2.795, 3.080)
-# What changes how a block moves, in the order of `hmsa_ros.core.mismatch.Errors`.
+# What changes how a block moves, in the order of `hmsa_ros.model.mismatch.Errors`.
 _MISMATCH = ('shear_modulus', 'damping_coefficient', 'chain_limit', 'remanence')
 _RANKS = {'': 1, PLANT: 2, PLANNER: 3}
 

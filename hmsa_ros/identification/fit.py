@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from hmsa_ros.core.model import Array
 from hmsa_ros.identification.quantities import from_coordinate, to_coordinate
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.response import clip, respond, Response
+from hmsa_ros.model.equations import Array
 
 _FULL, _NONE = 3.0, 6.0
 _MAX_PASSES = 60

@@ -7,8 +7,6 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hmsa_ros.core.model import Array
-from hmsa_ros.core.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification import diagnosis
 from hmsa_ros.identification.fit import Fit, fit, LEAST_SCALE, loss, moved, robust_scale
@@ -28,6 +26,8 @@ from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.response import complete, respond
 from hmsa_ros.identification.result import Estimate, Identification, Verdict
 from hmsa_ros.identification.start import scan, segments, starts
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 
 # Of these, each does what an offset of the stamps does.
 _DELAYS = {'sensor_latency', 'coil_time_constant'}

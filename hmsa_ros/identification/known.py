@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from hmsa_ros.core.model import Array
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.quantities import check_free
+from hmsa_ros.model.equations import Array
 
 #: Where parameter files have it.
 PREFIX = 'identification.'

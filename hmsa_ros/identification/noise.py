@@ -12,8 +12,8 @@ import math
 
 import numpy as np
 
-from hmsa_ros.core.model import Array
 from hmsa_ros.identification.fit import LEAST_SCALE, loss, robust_scale, weights_of
+from hmsa_ros.model.equations import Array
 
 # Below this probability residuals are not white.
 _WHITE = 1e-3

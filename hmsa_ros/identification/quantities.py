@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import math
 from typing import Any
 
-from hmsa_ros.core.creep import Creep
-from hmsa_ros.core.laws.record import Elastic
-from hmsa_ros.core.parameters import ActuatorParameters, Geometry, NondimensionalParameters
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.creep import Creep
+from hmsa_ros.model.laws.record import Elastic
+from hmsa_ros.model.parameters import ActuatorParameters, Geometry, NondimensionalParameters
 
 
 @dataclass(frozen=True)

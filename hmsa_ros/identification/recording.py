@@ -6,11 +6,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from hmsa_ros.core.delivery import ramps
-from hmsa_ros.core.laws.coordinate import Coordinate, STRETCH
-from hmsa_ros.core.model import Array
-from hmsa_ros.core.moves import Level
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.delivery import ramps
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.laws.coordinate import Coordinate, STRETCH
+from hmsa_ros.model.moves import Level
 
 #: Fewer samples than this hold no motion and five parameters.
 FEWEST = 12

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmsa_ros import motion
-from hmsa_ros.core.creep import Creep
-from hmsa_ros.core.law import elastic_force, elastic_stiffness, equilibrium_stretch, KIND
-from hmsa_ros.core.laws.record import GENT
-from hmsa_ros.core.model import Array
-from hmsa_ros.core.parameters import NondimensionalParameters
-from hmsa_ros.core.units import MU_0
 from hmsa_ros.identification.quantities import derivative, geometry_of, group_of, QUANTITIES
 from hmsa_ros.identification.recording import Course, pieces, Recording
+from hmsa_ros.model.creep import Creep
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.law import elastic_force, elastic_stiffness, equilibrium_stretch, KIND
+from hmsa_ros.model.laws.record import GENT
+from hmsa_ros.model.parameters import NondimensionalParameters
+from hmsa_ros.model.units import MU_0
 from hmsa_ros.motion import theta as places
 
 #: Relative tolerance of the integration: far below the noise of any sensor.

@@ -4,11 +4,11 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
-from hmsa_ros.core.model import Array
-from hmsa_ros.core.parameters import ActuatorParameters
 from hmsa_ros.identification.noise import Whiteness
 from hmsa_ros.identification.quantities import actuator_of, modulus_of
 from hmsa_ros.identification.recording import Recording
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.parameters import ActuatorParameters
 
 Verdict = Literal['identified', 'not_identifiable', 'model_rejected']
 #: Correlation from which two parameters count as confounded.

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from hmsa_ros.core.parameters import ActuatorParameters
-from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.recording import Recording
-from hmsa_ros.runs.bags import read_runs
-from hmsa_ros.runs.levels import in_force, without_repeats
+from hmsa_ros.model.parameters import ActuatorParameters
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.recordings.bags import read_runs
+from hmsa_ros.recordings.levels import in_force, without_repeats
 
 
 def read_bag(

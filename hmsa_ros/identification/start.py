@@ -13,12 +13,12 @@ import math
 
 import numpy as np
 
-from hmsa_ros.core import model
-from hmsa_ros.core.model import Array
-from hmsa_ros.core.units import MU_0
 from hmsa_ros.identification.quantities import damping_unit, group_of
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.response import respond
+from hmsa_ros.model import equations
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.units import MU_0
 
 _FEWEST = 6  # samples on a level that may ring
 _MOST_SAMPLES = 150  # of a level that are looked at
@@ -79,12 +79,12 @@ def static(
         group = group_of(values, j_lim=limit)
         # Motion may go further than what can be held, but not where there is no force.
         ends = group.rest + 1.002 * (np.array([low, high]) - group.rest)
-        if not np.all(np.isfinite(model.elastic_force(ends, group))):
+        if not np.all(np.isfinite(equations.elastic_force(ends, group))):
             continue
-        force = np.asarray(model.elastic_force(stretch, group))
+        force = np.asarray(equations.elastic_force(stretch, group))
         slope = float(fields @ force) / float(fields @ fields)
         if slope > 0.0:
-            held = np.asarray(model.equilibrium_stretch(slope * fields, group))
+            held = np.asarray(equations.equilibrium_stretch(slope * fields, group))
             miss = float(np.sum((held - stretch) ** 2))
             if miss < 0.98 * best[0]:
                 best = miss, slope, limit
@@ -148,17 +148,17 @@ def starts(
         given['stretch_gain'] = 1.0
     found = static(recording, given, free)
     material = group_of(given, zeta=0.2, j_lim=found.chain_limit)
-    lower, upper = model.stretch_limits(material)
+    lower, upper = equations.stretch_limits(material)
     candidates: list[dict[str, float]] = []
     for frequency, decay, mean in ringing(recording, found.rests):
         if not lower < mean < upper:
             continue
         natural = math.hypot(frequency, decay)
-        unit = float(model.natural_frequency(mean, material)) / natural
+        unit = float(equations.natural_frequency(mean, material)) / natural
         candidate = _candidate(given, free, unit, found)
         if 'damping_coefficient' in free:
             candidate['damping_coefficient'] = decay / natural * damping_unit(candidate) * float(
-                model.critical_zeta(mean, material))
+                equations.critical_zeta(mean, material))
         if all(abs(math.log(x['time_unit'] / candidate['time_unit'])) > 0.02
                for x in candidates):
             candidates.append(candidate)
@@ -186,7 +186,7 @@ def scan(
     timed = {'shear_modulus', 'density', 'time_unit'}.intersection(free)
     factors = np.geomspace(1.0 / _SCAN_RANGE, _SCAN_RANGE, _SCAN_POINTS) if timed else (1.0,)
     group = group_of(values)
-    critical = float(model.critical_zeta(group.rest, group))
+    critical = float(equations.critical_zeta(group.rest, group))
     for factor in factors:
         unit = max(float(factor) * values['time_unit'], shortest)
         candidate = _candidate(values, free, unit, found)

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmsa_ros.columns import read_table, Table
-from hmsa_ros.core.laws.coordinate import Coordinate, STRETCH
-from hmsa_ros.core.model import Array
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.recording import Recording
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.laws.coordinate import Coordinate, STRETCH
 
 # Of what is left out: more than this is not a few bad rows.
 _MOST_LEFT_OUT = 0.2

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hmsa_ros.core.model import Array
+from hmsa_ros.model.equations import Array
 
 #: Fewer samples, or fewer periods of the vibration, say nothing about it.
 FEWEST, SHORTEST = 8, 1.4

@@ -12,9 +12,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from hmsa_ros.core.model import Array
-from hmsa_ros.core.status import Code
-from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.judge.fit import FEWEST, Figure, Fit, fit
 from hmsa_ros.judge.records import (
     Finding,
@@ -25,6 +22,9 @@ from hmsa_ros.judge.records import (
     unobserved,
     VERDICTS,
 )
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.status import Code
+from hmsa_ros.model.units import NANOSECONDS
 
 Stamps = NDArray[np.int64]
 

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 import math
 
-from hmsa_ros.core.status import Code
+from hmsa_ros.model.status import Code
 
 #: Verdicts on a setpoint, the better ones first.
 VERDICTS = (

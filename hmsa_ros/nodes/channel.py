@@ -6,12 +6,12 @@ from rclpy.node import Node
 from sensor_msgs.msg import MagneticField, TimeReference
 from std_msgs.msg import Float64
 
-from hmsa_ros.contract import topics
+from hmsa_ros.control.planner import PlannerRuntime
+from hmsa_ros.control.records import Send, Target
+from hmsa_ros.control.seldom import Seldom
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.nodes import conversions, interface
-from hmsa_ros.runtime.planner import PlannerRuntime
-from hmsa_ros.runtime.records import Send, Target
-from hmsa_ros.runtime.seldom import Seldom
+from hmsa_ros.interfaces import topics
+from hmsa_ros.nodes import conversions, endpoints
 
 
 class JointChannel:
@@ -23,14 +23,14 @@ class JointChannel:
         """Create publisher and subscriptions; who is linked gives news of commands itself."""
         self._node, self._joint, self._runtime, self._serve = node, joint, runtime, serve
         self._tell_ignored = Seldom()
-        self._command = interface.publisher(
+        self._command = endpoints.publisher(
             node, topics.of_joint(topics.FLUX_DENSITY_COMMAND, joint, joints))
-        interface.subscribe(
+        endpoints.subscribe(
             node, topics.of_joint(topics.SETPOINT, joint, joints), self._on_setpoint)
         self._applied = self._received = ''
         if not linked:
             self._applied, self._received = (
-                interface.subscribe(
+                endpoints.subscribe(
                     node, topics.of_joint(topic, joint, joints), take).topic_name
                 for topic, take in (
                     (topics.FLUX_DENSITY_APPLIED, self._on_applied),

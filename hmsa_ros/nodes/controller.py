@@ -13,17 +13,17 @@ import gc
 
 from rclpy.node import Node
 
-from hmsa_ros.contract import topics
+from hmsa_ros.control.cycles import Cycles
+from hmsa_ros.control.records import Output, Send
+from hmsa_ros.control.takeover import Seen
 from hmsa_ros.device.protocol import Change, Sample
-from hmsa_ros.nodes import conversions, interface
+from hmsa_ros.interfaces import topics
+from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.device_node import DeviceNode, TICK_SECONDS
 from hmsa_ros.nodes.driver import DriverNode, HARDWARE, SHORT
 from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.plant import PlantNode
 from hmsa_ros.nodes.runner import run
-from hmsa_ros.runtime.cycles import Cycles
-from hmsa_ros.runtime.records import Output, Send
-from hmsa_ros.runtime.takeover import Seen
 
 # Time in ns that must be left of a period to publish one more message, and how many wait at most.
 _ENOUGH, _CROWDED = 400_000, 50
@@ -137,7 +137,7 @@ class Linked(DeviceNode):
         self.cycles = Cycles(round(TICK_SECONDS * 1e9))
         super().__init__()  # type: ignore[call-arg]  # that of the node it is linked to
         planner.plant = self
-        self._of_loop = interface.publisher(self, topics.DIAGNOSTICS)
+        self._of_loop = endpoints.publisher(self, topics.DIAGNOSTICS)
         self.keep(
             self.every(TICK_SECONDS, self._cycle), self.every(1.0, self._report_loop),
             self._of_loop)

@@ -1,4 +1,4 @@
-"""Conversion between messages and the records of `hmsa_ros.core`."""
+"""Conversion between messages and the records of `hmsa_ros.planning`."""
 
 from collections.abc import Iterable, Mapping, Sequence
 import json
@@ -13,13 +13,13 @@ from sensor_msgs.msg import MagneticField, TimeReference
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from hmsa_ros.core.schedule import obeyed
-from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.schedule import obeyed
+from hmsa_ros.model.units import NANOSECONDS
 
 if TYPE_CHECKING:
     # It comes along with the planner, which a recorder has no use for.
-    from hmsa_ros.runtime.records import StatusChanged
+    from hmsa_ros.control.records import StatusChanged
 
 #: What a receipt says while commands of before a cut-off are refused.
 CUT_OFF = 'cut_off'

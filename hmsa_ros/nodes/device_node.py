@@ -8,20 +8,20 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import MagneticField
 
-from hmsa_ros.contract import topics
-from hmsa_ros.contract.parameters import ParameterSpec
+from hmsa_ros.control.seldom import Seldom
 from hmsa_ros.device.health import judge_commands
 from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
 from hmsa_ros.device.watchdog import Fallback, SAFE_FLUX
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.nodes import conversions, interface
+from hmsa_ros.interfaces import topics
+from hmsa_ros.interfaces.parameters import ParameterSpec
+from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.guard import COMMAND_SOURCES, CommandInput
 from hmsa_ros.nodes.joints import JointParameters
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.outlet import Outlet
 from hmsa_ros.nodes.presence import Presence
 from hmsa_ros.nodes.samples import SamplePublisher
-from hmsa_ros.runtime.seldom import Seldom
 
 #: What a joint does when nobody commands it; each may have values of its own.
 FALLBACK = (
@@ -77,7 +77,7 @@ class DeviceJoint:
         self._tell_refused, self._tell_late = Seldom(), Seldom()
         self.received = self.refused = self.late = self.latest = self.failed = 0
         self._applied, self._received = (
-            Outlet(interface.publisher(node, topics.of_joint(x, self.name, names)))
+            Outlet(endpoints.publisher(node, topics.of_joint(x, self.name, names)))
             for x in (topics.FLUX_DENSITY_APPLIED, topics.FLUX_DENSITY_RECEIVED))
         # Stamp of the newest command, when it came if that was not told yet, both in ns; and when
         # something was told by a clock that is never set.

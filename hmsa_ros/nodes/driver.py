@@ -9,15 +9,15 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import ParameterDescriptor
 
-from hmsa_ros.contract import topics
-from hmsa_ros.contract.parameters import JOINT, ParameterSpec, PUBLISH_RATE
-from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
 from hmsa_ros.device.hardware import Calls, load
 from hmsa_ros.device.health import judge_hardware, listed
 from hmsa_ros.device.worker import HardwareWorker
 from hmsa_ros.ending import Deadline, ENDING
 from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.interfaces import topics
+from hmsa_ros.interfaces.parameters import JOINT, ParameterSpec, PUBLISH_RATE
+from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import conversions
 from hmsa_ros.nodes.device_node import (
     COMMAND_SOURCE,

@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterable
 from rclpy.node import Node
 from sensor_msgs.msg import MagneticField
 
-from hmsa_ros.contract import topics
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.nodes import interface
+from hmsa_ros.interfaces import topics
+from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.capture import decode, RawSubscription
 
 #: Obey every publisher, or only the one that was seen first, until it is gone.
@@ -70,8 +70,8 @@ class CommandInput:
         if source == 'first':
             self._allegiance = Allegiance()
         if source == 'first' or companion:
-            self._raw = interface.listen(node, topic)
-        self._subscription = None if self._raw is not None else interface.subscribe(
+            self._raw = endpoints.listen(node, topic)
+        self._subscription = None if self._raw is not None else endpoints.subscribe(
             node, topic, take)
 
     @property

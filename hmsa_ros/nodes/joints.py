@@ -14,8 +14,8 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from hmsa_ros.contract.parameters import JOINT, ParameterSpec
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.interfaces.parameters import JOINT, ParameterSpec
 from hmsa_ros.nodes.parameters import declare, declare_one, from_files
 
 JOINTS = ParameterSpec(

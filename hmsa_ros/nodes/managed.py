@@ -25,10 +25,10 @@ from rclpy.parameter_service import ParameterService
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock
 
-from hmsa_ros.contract import topics
-from hmsa_ros.contract.parameters import ParameterSpec
 from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.nodes import interface
+from hmsa_ros.interfaces import topics
+from hmsa_ros.interfaces.parameters import ParameterSpec
+from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.conversions import to_diagnostics
 from hmsa_ros.nodes.message_types import interface_class
 from hmsa_ros.nodes.outlet import Outlet
@@ -122,7 +122,7 @@ class ManagedNode(LifecycleNode):
     def diagnose(
             self, report: Callable[[], Iterable[DiagnosticStatus]]) -> Callable[[], None]:
         """Publish statuses once a second; return what publishes them at once."""
-        publisher = Outlet(interface.publisher(self, topics.DIAGNOSTICS))
+        publisher = Outlet(endpoints.publisher(self, topics.DIAGNOSTICS))
 
         def publish() -> None:
             statuses = [*report()]

@@ -5,10 +5,10 @@ from typing import Any
 
 from rclpy.node import Node
 
-from hmsa_ros.contract import topics
-from hmsa_ros.contract.actuator import actuator_from
-from hmsa_ros.contract.parameters import ParameterSpec
-from hmsa_ros.nodes import interface
+from hmsa_ros.interfaces import topics
+from hmsa_ros.interfaces.actuator import actuator_from
+from hmsa_ros.interfaces.parameters import ParameterSpec
+from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.joints import JointParameters
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.markers import Block, Scene, State
@@ -45,7 +45,7 @@ class StateMarkers:
     def __init__(
             self, node: ManagedNode, values: JointParameters, pace: float,
             states: Callable[[], tuple[int, Sequence[State]]]) -> None:
-        self._publisher = interface.publisher(node, topics.MARKERS)
+        self._publisher = endpoints.publisher(node, topics.MARKERS)
         self._states = states
         rate: float = values[MARKER_RATE.name]
         lifetime = 0.0
@@ -65,7 +65,7 @@ class TargetMarkers:
     """Publishes where the joints are to go, whenever that changes."""
 
     def __init__(self, node: Node, values: JointParameters) -> None:
-        self._publisher = interface.publisher(node, topics.MARKERS)
+        self._publisher = endpoints.publisher(node, topics.MARKERS)
         self._scene = scene_from(values)
         self._shown: Any = None
 

@@ -25,10 +25,10 @@ import numpy as np
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from hmsa_ros.core.laws.bending import centreline, tangent
-from hmsa_ros.core.parameters import ActuatorParameters
-from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.laws.bending import centreline, tangent
+from hmsa_ros.model.parameters import ActuatorParameters
+from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes.conversions import to_duration, to_time
 
 #: Identifiers of a joint's markers, the same in every message.

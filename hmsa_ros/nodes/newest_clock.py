@@ -5,9 +5,9 @@ from time import time_ns
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
-from hmsa_ros.contract import topics
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.nodes import interface
+from hmsa_ros.interfaces import topics
+from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.capture import decode, RawSubscription
 
 
@@ -37,7 +37,7 @@ class NewestClock:
 
     def _subscribe(self) -> None:
         if self._subscription is None:
-            self._subscription = interface.listen(self._node, topics.CLOCK_TOPIC)
+            self._subscription = endpoints.listen(self._node, topics.CLOCK_TOPIC)
 
     def read(self) -> int:
         """Return the node's time in ns, by the newest message if it is simulated."""

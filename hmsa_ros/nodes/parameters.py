@@ -17,10 +17,10 @@ from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from hmsa_ros.contract import topics
-from hmsa_ros.contract.actuator import completed
-from hmsa_ros.contract.parameters import FIXED, LAW, ParameterSpec, present_name
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.interfaces import topics
+from hmsa_ros.interfaces.actuator import completed
+from hmsa_ros.interfaces.parameters import FIXED, LAW, ParameterSpec, present_name
 
 # What hmsa identify once wrote beside the rest.
 _ONCE = {'identification.verdict', 'identification.noise_std'}

@@ -14,12 +14,25 @@ from rclpy.parameter import Parameter
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 
-from hmsa_ros.contract import topics
-from hmsa_ros.contract.actuator import actuator_from
-from hmsa_ros.core.actuators import unheld
-from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.control.planner import PlannerRuntime
+from hmsa_ros.control.records import (
+    EstimateChanged,
+    Note,
+    Output,
+    PlanChanged,
+    Send,
+    Severity,
+    StatusChanged,
+    Stop,
+    Trajectory,
+)
+from hmsa_ros.control.takeover import Seen
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.nodes import conversions, interface
+from hmsa_ros.interfaces import topics
+from hmsa_ros.interfaces.actuator import actuator_from
+from hmsa_ros.model.actuators import unheld
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.capture import decode, RawSubscription
 from hmsa_ros.nodes.channel import JointChannel
 from hmsa_ros.nodes.joints import declare_joints
@@ -32,19 +45,6 @@ from hmsa_ros.nodes.presence import Presence
 from hmsa_ros.nodes.runner import run
 from hmsa_ros.nodes.timekeeping import StepWatch
 from hmsa_ros.nodes.trajectories import read_trajectory
-from hmsa_ros.runtime.planner import PlannerRuntime
-from hmsa_ros.runtime.records import (
-    EstimateChanged,
-    Note,
-    Output,
-    PlanChanged,
-    Send,
-    Severity,
-    StatusChanged,
-    Stop,
-    Trajectory,
-)
-from hmsa_ros.runtime.takeover import Seen
 
 PARAMETERS = SPECS
 
@@ -61,7 +61,7 @@ _LINGER_NS = 2 * NANOSECONDS
 
 
 class PlannerNode(ManagedNode):
-    """Connects `hmsa_ros.runtime.planner.PlannerRuntime` to topics, services and the clock."""
+    """Connects `hmsa_ros.control.planner.PlannerRuntime` to topics, services and the clock."""
 
     #: Whether the device is in the same process: whoever links them serves the runtime.
     linked = False
@@ -101,15 +101,15 @@ class PlannerNode(ManagedNode):
         self._channels = {x: JointChannel(
             self, x, names, self._runtime, self._serve, linked=self.linked) for x in names}
         if not self.linked:
-            self._newest = interface.listen(self, _NEWEST)
+            self._newest = endpoints.listen(self, _NEWEST)
         self._plan, self._status, self._estimate = (
-            interface.publisher(self, x) for x in (topics.PLAN, topics.STATUS, topics.ESTIMATE))
+            endpoints.publisher(self, x) for x in (topics.PLAN, topics.STATUS, topics.ESTIMATE))
         self._targets = TargetMarkers(self, self._settings)
         self._publish: dict[type, Callable[..., None]] = {
             Send: self._publish_command, PlanChanged: self._publish_plan,
             StatusChanged: self._publish_status, EstimateChanged: self._publish_estimate,
             Note: self._log}
-        interface.subscribe(self, topics.JOINT_TRAJECTORY, self._on_trajectory, raw=True)
+        endpoints.subscribe(self, topics.JOINT_TRAJECTORY, self._on_trajectory, raw=True)
         self.offer(topics.STOP, self._on_stop)
         self.offer(topics.RESET_ESTIMATE, lambda: (True, self._runtime.feedback.reset()))
         self.offer(topics.SAVE_ESTIMATE, lambda: (
@@ -252,7 +252,7 @@ class PlannerNode(ManagedNode):
         if wanted:
             self._listen_until = monotonic_ns() + _LINGER_NS
         if wanted and self._samples is None:
-            self._samples = interface.subscribe(self, _SAMPLES, self._on_sample, raw=True)
+            self._samples = endpoints.subscribe(self, _SAMPLES, self._on_sample, raw=True)
         elif self._samples is not None and monotonic_ns() > self._listen_until:
             self.destroy_subscription(self._samples)
             self._samples = None

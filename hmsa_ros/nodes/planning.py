@@ -1,12 +1,18 @@
-"""Parameters of the planner node, and what they mean for `hmsa_ros.core`."""
+"""Parameters of the planner node, and what they mean for `hmsa_ros.planning`."""
 
 from collections.abc import Mapping
 from dataclasses import replace
 import math
 from typing import Any
 
-from hmsa_ros.contract.actuator import planned_from
-from hmsa_ros.contract.parameters import (
+from hmsa_ros.control.feedback import MODES
+from hmsa_ros.control.records import AFTER_CUT_OFF, Settings
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification.files import errors_from
+from hmsa_ros.identification.known import Known
+from hmsa_ros.identification.quantities import check_free
+from hmsa_ros.interfaces.actuator import planned_from
+from hmsa_ros.interfaces.parameters import (
     BLOCK,
     COIL_TIME_CONSTANT,
     CREEP_TOLERANCE,
@@ -20,24 +26,18 @@ from hmsa_ros.contract.parameters import (
     SLEW_LIMIT,
     VISCOELASTIC,
 )
-from hmsa_ros.core.group import PlannerGroup
-from hmsa_ros.core.planner import Options, Planner
-from hmsa_ros.core.sequence import SHORT_SPELL
-from hmsa_ros.core.shapers import SHAPERS
-from hmsa_ros.core.shapers.pace import LEAST_PERIODS, MOST_PERIODS, Pace
-from hmsa_ros.core.shapers.request import ERRORS, LARGEST_ERROR
-from hmsa_ros.core.timeline import Model
-from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.identification.files import errors_from
-from hmsa_ros.identification.known import Known
-from hmsa_ros.identification.quantities import check_free
 from hmsa_ros.judge import Tolerances
+from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes.joints import JointParameters, JOINTS
 from hmsa_ros.nodes.managed import AUTOSTART
 from hmsa_ros.nodes.marker_publisher import MARKER_SCALE
-from hmsa_ros.runtime.feedback import MODES
-from hmsa_ros.runtime.records import AFTER_CUT_OFF, Settings
+from hmsa_ros.planning.group import PlannerGroup
+from hmsa_ros.planning.planner import Options, Planner
+from hmsa_ros.planning.sequence import SHORT_SPELL
+from hmsa_ros.planning.shapers import SHAPERS
+from hmsa_ros.planning.shapers.pace import LEAST_PERIODS, MOST_PERIODS, Pace
+from hmsa_ros.planning.shapers.request import ERRORS, LARGEST_ERROR
+from hmsa_ros.planning.timeline import Model
 
 _OPTIONS = Options()
 _SETTINGS = Settings()

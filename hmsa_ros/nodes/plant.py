@@ -9,15 +9,15 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.parameter import Parameter
 
-from hmsa_ros.contract import topics
-from hmsa_ros.contract.parameters import JOINT, ParameterSpec, PUBLISH_RATE
-from hmsa_ros.core.actuators import unheld
-from hmsa_ros.core.pacer import Pacer
-from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.device.health import too_few_samples
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.nodes import conversions, interface
+from hmsa_ros.interfaces import topics
+from hmsa_ros.interfaces.parameters import JOINT, ParameterSpec, PUBLISH_RATE
+from hmsa_ros.model.actuators import unheld
+from hmsa_ros.model.pacer import Pacer
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.device_node import COMMAND_SOURCE, DeviceNode, PUBLISH_SCALARS
 from hmsa_ros.nodes.joints import declare_joints, JointParameters, JOINTS
 from hmsa_ros.nodes.managed import AUTOSTART
@@ -108,7 +108,7 @@ class PlantNode(DeviceNode):
         self._clocks_warned = False
 
         self._clock_publisher = (
-            interface.publisher(self, topics.CLOCK_TOPIC) if self._authority else None)
+            endpoints.publisher(self, topics.CLOCK_TOPIC) if self._authority else None)
         self._open(PlantJoint)
         StateMarkers(self, values, factor, self._states)
         self.offer(topics.RESET, self._on_reset)

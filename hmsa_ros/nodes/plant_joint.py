@@ -6,9 +6,13 @@ from typing import Any
 
 from geometry_msgs.msg import WrenchStamped
 
-from hmsa_ros.contract import topics
-from hmsa_ros.contract.actuator import actuator_from, creep_from
-from hmsa_ros.contract.parameters import (
+from hmsa_ros.control.seldom import Seldom
+from hmsa_ros.device.sensor import SensorErrors
+from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.interfaces import topics
+from hmsa_ros.interfaces.actuator import actuator_from, creep_from
+from hmsa_ros.interfaces.parameters import (
     BLOCK,
     COIL_TIME_CONSTANT,
     INITIAL_STRETCH,
@@ -17,13 +21,9 @@ from hmsa_ros.contract.parameters import (
     SLEW_LIMIT,
     VISCOELASTIC,
 )
-from hmsa_ros.core.actuators import check_stretch, Setup
-from hmsa_ros.device.sensor import SensorErrors
-from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
-from hmsa_ros.errors import BadInputError
-from hmsa_ros.nodes import conversions, interface
+from hmsa_ros.model.actuators import check_stretch, Setup
+from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.device_node import DeviceJoint, DeviceNode, FALLBACK, fallback_from
-from hmsa_ros.runtime.seldom import Seldom
 
 #: Parameters that each joint may have values of its own for.
 OWN = (
@@ -63,7 +63,7 @@ class PlantJoint(DeviceJoint):
     def __init__(self, node: DeviceNode, number: int) -> None:
         super().__init__(node, number)
         self._tell_force = Seldom()
-        interface.subscribe(node, topics.of_joint(
+        endpoints.subscribe(node, topics.of_joint(
             topics.DISTURBANCE_FORCE, self.name, node.values.names), self._on_force)
 
     def _on_force(self, message: WrenchStamped) -> None:

@@ -28,10 +28,10 @@ from hmsa_ros.bag.limits import CHUNK_SIZE
 from hmsa_ros.bag.reader import BagReader
 from hmsa_ros.bag.sender import CLOCK_WHILE_WAITING_SECONDS, ClockOut, Excerpt, Sender
 from hmsa_ros.bag.transport import Transport
-from hmsa_ros.contract import topics
-from hmsa_ros.contract.parameters import ParameterSpec
 from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.nodes import interface
+from hmsa_ros.interfaces import topics
+from hmsa_ros.interfaces.parameters import ParameterSpec
+from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.audience import Audience
 from hmsa_ros.nodes.conversions import to_clock, to_status
 from hmsa_ros.nodes.managed import ManagedNode
@@ -243,7 +243,7 @@ class Player(ManagedNode):
                 f'{self._reader.path} reaches to {latest * 1e-9:.0f} s: expected less than '
                 f'{_LATEST_CLOCK // 10**9} s for /clock')
         # First of all, so that nodes that wait for it can get ready.
-        self._clock_publisher = interface.publisher(self, topics.CLOCK_TOPIC)
+        self._clock_publisher = endpoints.publisher(self, topics.CLOCK_TOPIC)
         self._send_clock(self._excerpt.start)
         return ClockOut(self._send_clock, frequency, on_publish)
 

@@ -17,10 +17,10 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-from hmsa_ros.contract import topics
-from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.nodes import interface
+from hmsa_ros.interfaces import topics
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.capture import decode, RawSubscription, Taken
 
 #: How long a process that was heard counts as running, in s.
@@ -55,7 +55,7 @@ class Presence:
 
     def __init__(self, node: Node, *, samples: bool = True) -> None:
         self._node, self._of_samples = node, samples
-        self._diagnostics = interface.listen(node, topics.DIAGNOSTICS)
+        self._diagnostics = endpoints.listen(node, topics.DIAGNOSTICS)
         self._samples: RawSubscription | None = None
         # When processes, and publishers of samples of a joint, were last heard, in system time.
         self._heard: dict[bytes, int] = {}
@@ -68,7 +68,7 @@ class Presence:
         if not self._of_samples:
             return
         if self._samples is None and len(self._publishers(states)) > 1:
-            self._samples = interface.listen(self._node, _SAMPLES)
+            self._samples = endpoints.listen(self._node, _SAMPLES)
         elif self._samples is not None:
             self._note(taken := self._samples.take())
             # The newest of each publisher: reading all would take long.

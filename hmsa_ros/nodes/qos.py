@@ -6,8 +6,8 @@ from rclpy.duration import Duration
 from rclpy.qos import LivelinessPolicy, QoSProfile
 
 from hmsa_ros.bag.qos import Qos
-from hmsa_ros.contract.topics import Quality
-from hmsa_ros.nodes import interface
+from hmsa_ros.interfaces.topics import Quality
+from hmsa_ros.nodes import endpoints
 
 # Depth of a republished topic whose recorded depth is unknown, as it is where publishers are
 # discovered over DDS.
@@ -31,7 +31,7 @@ def subscription(offered: Iterable[Qos], depth: int) -> QoSProfile:
     profiles = list(offered)
     reliable = all(profile.reliability == 'reliable' for profile in profiles)
     latched = all(profile.durability == 'transient_local' for profile in profiles)
-    return interface.profile(Quality(depth, reliable, latched))
+    return endpoints.profile(Quality(depth, reliable, latched))
 
 
 def publisher(recorded: Sequence[Qos]) -> QoSProfile:
@@ -43,7 +43,7 @@ def publisher(recorded: Sequence[Qos]) -> QoSProfile:
     reliable = not recorded or any(
         profile.reliability in ('reliable', 'system_default') for profile in recorded)
     depth = min(MAX_DEPTH, max((profile.depth for profile in recorded), default=0))
-    profile = interface.profile(Quality(
+    profile = endpoints.profile(Quality(
         depth or (min(MAX_DEPTH, len(recorded)) if latched else PUBLISHER_DEPTH),
         reliable, latched))
     alike = set(recorded)

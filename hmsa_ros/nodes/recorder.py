@@ -29,10 +29,10 @@ from hmsa_ros.bag.output import PRESETS
 from hmsa_ros.bag.reception import figures, judge, RecordedTopic
 from hmsa_ros.bag.recording import Limits, lost_by_topic, Recording, Status
 from hmsa_ros.bag.writer import BagWriter, parse_custom_data
-from hmsa_ros.contract import topics
-from hmsa_ros.contract.parameters import ParameterSpec
 from hmsa_ros.errors import BadInputError, BagError
-from hmsa_ros.nodes import interface
+from hmsa_ros.interfaces import topics
+from hmsa_ros.interfaces.parameters import ParameterSpec
+from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.capture import Capture, decode, SimulatedTime, Taken
 from hmsa_ros.nodes.conversions import from_time, to_status
 from hmsa_ros.nodes.managed import ManagedNode
@@ -155,7 +155,7 @@ class Recorder(ManagedNode):
     def _start(self) -> None:
         """Create what the node offers and start receiving."""
         if self._sim_time is not None:
-            self._capture.add(self._sim_time, interface.listen(self, replace(
+            self._capture.add(self._sim_time, endpoints.listen(self, replace(
                 topics.CLOCK_TOPIC, qos=topics.Quality(1000, reliable=False))))
         self._capture.start()
         self.offer(topics.PAUSE, lambda: self._set_paused(True))
@@ -218,7 +218,7 @@ class Recorder(ManagedNode):
         """Store the setpoints that are sent on a topic."""
         if name not in self._setpoint_topics:
             self._setpoint_topics.add(name)
-            interface.subscribe(
+            endpoints.subscribe(
                 self, replace(topic, name=name), lambda message: self._setpoints.add(
                     name, self.now(), message))
 

@@ -8,10 +8,10 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 
-from hmsa_ros.contract import topics
-from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.device.protocol import Sample
-from hmsa_ros.nodes import interface
+from hmsa_ros.interfaces import topics
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.outlet import Outlet
 
 _STAMP = Struct('<iI')
@@ -31,9 +31,9 @@ class SamplePublisher:
     """
 
     def __init__(self, node: Node, names: Sequence[str], *, scalars: bool) -> None:
-        self._states = Outlet(interface.publisher(node, topics.JOINT_STATES))
+        self._states = Outlet(endpoints.publisher(node, topics.JOINT_STATES))
         self._scalars = [
-            tuple(Outlet(interface.publisher(node, topics.of_joint(x, name, names)))
+            tuple(Outlet(endpoints.publisher(node, topics.of_joint(x, name, names)))
                   for x in (topics.STRETCH, topics.STRETCH_RATE))
             for name in names] if scalars else []
         count = len(names)

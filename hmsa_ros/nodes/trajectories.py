@@ -11,10 +11,10 @@ from copy import copy
 from dataclasses import dataclass
 import struct
 
-from hmsa_ros.core.status import Code, RefusedError
-from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.control.records import Trajectory
 from hmsa_ros.errors import BadInputError, excerpt
-from hmsa_ros.runtime.records import Trajectory
+from hmsa_ros.model.status import Code, RefusedError
+from hmsa_ros.model.units import NANOSECONDS
 
 # What a message begins with: the representation, and options of two bytes.
 _PREAMBLE = 4

@@ -2,7 +2,7 @@
 The figures of a report, as plain data for Plotly.
 
 Curves are thinned out to what a screen can show, peaks kept. Colours are those of
-`hmsa_ros.figures.style`; the page replaces them by lighter ones in dark mode.
+`hmsa_ros.report.style`; the page replaces them by lighter ones in dark mode.
 """
 
 from collections.abc import Sequence
@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from hmsa_ros.core.model import Array
-from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.recordings.record import Run
 from hmsa_ros.report.evaluation import Evaluation, MoveResult, verdicts
 from hmsa_ros.report.timing import Timing
-from hmsa_ros.runs.record import Run
 
 # Okabe and Ito's palette, told apart with every kind of colour vision.
 BLUE, ORANGE, GREEN, PURPLE = '#0072B2', '#E69F00', '#009E73', '#CC79A7'

@@ -10,28 +10,28 @@ import math
 
 import numpy as np
 
-from hmsa_ros.contract.topics import PLANNER
-from hmsa_ros.core.delivery import late, pieces
-from hmsa_ros.core.model import (
+from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.interfaces.topics import PLANNER
+from hmsa_ros.judge import Finding
+from hmsa_ros.model.delivery import late, pieces
+from hmsa_ros.model.equations import (
     Array,
     elastic_force,
     natural_frequency,
     signed_root,
     stretch_limits,
 )
-from hmsa_ros.core.moves import Level as PlannedLoad
-from hmsa_ros.core.moves import State
-from hmsa_ros.core.parameters import ActuatorParameters
-from hmsa_ros.core.residual import residual_vibration
-from hmsa_ros.core.simulation import RTOL, sampled, simulate
-from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.judge import Finding
+from hmsa_ros.model.moves import Level as PlannedLoad
+from hmsa_ros.model.moves import State
+from hmsa_ros.model.parameters import ActuatorParameters
+from hmsa_ros.model.residual import residual_vibration
+from hmsa_ros.model.simulation import RTOL, sampled, simulate
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.recordings.levels import in_force, Level, without_repeats
+from hmsa_ros.recordings.parameters import creep_of
+from hmsa_ros.recordings.record import Run
+from hmsa_ros.recordings.setpoints import Requested, SAME, setpoints_of, start_of
 from hmsa_ros.report.outcome import findings_of
-from hmsa_ros.runs.levels import in_force, Level, without_repeats
-from hmsa_ros.runs.parameters import creep_of
-from hmsa_ros.runs.record import Run
-from hmsa_ros.runs.setpoints import Requested, SAME, setpoints_of, start_of
 
 # Plain steps are simulated with this many points a period of the actuator at least, up to so many.
 _POINTS_A_PERIOD, _MOST_POINTS = 100, 2_000_000

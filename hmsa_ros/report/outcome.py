@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 
-from hmsa_ros.core.model import equilibrium_stretch
-from hmsa_ros.core.units import NANOSECONDS
+from hmsa_ros.control.holds import Hold
 from hmsa_ros.judge import Finding, Sensor, Tolerances, unobserved
-from hmsa_ros.runs.parameters import number_of, of_joint
-from hmsa_ros.runs.record import Run
-from hmsa_ros.runs.setpoints import Requested, setpoints_of
-from hmsa_ros.runtime.holds import Hold
+from hmsa_ros.model.equations import equilibrium_stretch
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.recordings.parameters import number_of, of_joint
+from hmsa_ros.recordings.record import Run
+from hmsa_ros.recordings.setpoints import Requested, setpoints_of
 
 _LEFT_OUT = 'no time was left for it'
 _SENSOR = Sensor()

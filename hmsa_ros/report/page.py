@@ -15,18 +15,18 @@ import numpy as np
 
 from hmsa_ros import __version__
 from hmsa_ros.bag.info import BagSummary
-from hmsa_ros.contract.actuator import parameters_of
-from hmsa_ros.contract.parameters import ACTUATOR, ACTUATOR_FIELDS, LAW
-from hmsa_ros.core.model import critical_zeta, stretch_limits
-from hmsa_ros.core.parameters import ActuatorParameters
-from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import HmsaError
+from hmsa_ros.interfaces.actuator import parameters_of
+from hmsa_ros.interfaces.parameters import ACTUATOR, ACTUATOR_FIELDS, LAW
+from hmsa_ros.model.equations import critical_zeta, stretch_limits
+from hmsa_ros.model.parameters import ActuatorParameters
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.recordings.record import Run
+from hmsa_ros.recordings.topics import APPLIED
 from hmsa_ros.report import charts
 from hmsa_ros.report.assets import SCRIPT, STYLE
 from hmsa_ros.report.charts import Figure, NOT_MOVED, Part, percent, TimeUnit
 from hmsa_ros.report.evaluation import FEW_SAMPLES, period_of, plan_points
-from hmsa_ros.runs.record import Run
-from hmsa_ros.runs.topics import APPLIED
 
 _POLICY = (
     "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "

@@ -6,7 +6,8 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
-from hmsa_ros.figures import style
+from hmsa_ros.recordings.record import Run
+from hmsa_ros.report import style
 from hmsa_ros.report.charts import (
     AFTER,
     BEFORE,
@@ -22,7 +23,6 @@ from hmsa_ros.report.charts import (
     worst,
 )
 from hmsa_ros.report.evaluation import Evaluation, verdicts
-from hmsa_ros.runs.record import Run
 
 # Panels of arrivals in a row.
 _PANELS = 3

@@ -5,10 +5,10 @@ import math
 
 import numpy as np
 
-from hmsa_ros.core.model import Array
-from hmsa_ros.core.units import NANOSECONDS
-from hmsa_ros.runs.levels import lateness_of, Level, without_repeats
-from hmsa_ros.runs.record import Run, Times
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.recordings.levels import lateness_of, Level, without_repeats
+from hmsa_ros.recordings.record import Run, Times
 
 # A change of level that took effect within so many s of its stamp was in time.
 _PUNCTUAL = 1e-6

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hmsa_ros.core.model import Array
+from hmsa_ros.model.equations import Array
 
 # Bits of a Braille cell, by row from above and column.
 _BITS = ((0x01, 0x08), (0x02, 0x10), (0x04, 0x20), (0x40, 0x80))

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 from sensor_msgs.msg import JointState
 
-from hmsa_ros.contract import topics
-from hmsa_ros.contract.status import texts, Verdict, whole
-from hmsa_ros.core.laws.coordinate import COORDINATES
-from hmsa_ros.core.schedule import CommandSchedule
-from hmsa_ros.core.units import NANOSECONDS
 from hmsa_ros.errors import BadInputError, printable
-from hmsa_ros.nodes import interface
+from hmsa_ros.interfaces import topics
+from hmsa_ros.interfaces.status import texts, Verdict, whole
+from hmsa_ros.model.laws.coordinate import COORDINATES
+from hmsa_ros.model.schedule import CommandSchedule
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.capture import decode, RawSubscription, Taken
 from hmsa_ros.nodes.conversions import from_time
 from hmsa_ros.nodes.message_types import interface_class
@@ -120,7 +120,7 @@ class Listener:
     def _subscribe(self, topic: topics.Topic, qos: topics.Quality | None = None) -> _Source:
         source = _Source(
             self._node.resolve_topic_name(topics.from_outside(topic.name, topics.PLANNER)),
-            interface_class(topic.type), interface.listen(
+            interface_class(topic.type), endpoints.listen(
                 self._node, replace(topic, qos=qos or topic.qos), topics.PLANNER))
         self._sources.append(source)
         return source

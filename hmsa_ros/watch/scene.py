@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from hmsa_ros.contract.status import Verdict
-from hmsa_ros.core.laws.coordinate import POSITION
-from hmsa_ros.core.model import Array
+from hmsa_ros.interfaces.status import Verdict
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.laws.coordinate import POSITION
 
 #: What diagnostics and verdicts call their levels.
 LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')

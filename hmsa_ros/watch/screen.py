@@ -8,8 +8,8 @@ import numpy as np
 from rich.cells import cell_len
 from rich.text import Text
 
-from hmsa_ros.core.laws.coordinate import shared_name
-from hmsa_ros.core.status import Code
+from hmsa_ros.model.laws.coordinate import shared_name
+from hmsa_ros.model.status import Code
 from hmsa_ros.watch.chart import dots, limits, strip
 from hmsa_ros.watch.scene import Joint, LEVELS, Report, Scene
 

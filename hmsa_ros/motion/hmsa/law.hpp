@@ -1,6 +1,6 @@
 // Hyperelastic laws in units of the shear modulus at small strain. A law is its force over any
 // scalar, and its energy; derivatives come from Dual. It reads its constants from those of a packed
-// material (hmsa_ros/core/law.py). Where there is no energy, the force is not a number.
+// material (hmsa_ros/model/law.py). Where there is no energy, the force is not a number.
 #pragma once
 #include "dual.hpp"
 

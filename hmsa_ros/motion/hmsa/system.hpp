@@ -6,7 +6,7 @@
 #include "law.hpp"
 
 namespace hmsa {
-// Places in a packed material, and the families of laws (hmsa_ros/core/law.py, laws/record.py).
+// Places in a packed material, and the families of laws (hmsa_ros/model/law.py, laws/record.py).
 enum Place { kind_at, zeta_at, c1_at, damping_at, lower_at, upper_at, constants_at };
 enum Family { gent, neo_hookean, polynomial, ogden, table, beam };
 
@@ -67,7 +67,7 @@ template <class C, template <class> class Law> struct Block {
 };
 
 // A clamped beam by the deflection of its tip, odd in it, from tables of degree 7
-// (hmsa_ros/core/laws/bending.py): inertia of its own, and a damping that grows with it.
+// (hmsa_ros/model/laws/bending.py): inertia of its own, and a damping that grows with it.
 struct Beam {
     double drag;
     const double *c;

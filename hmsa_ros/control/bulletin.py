@@ -1,0 +1,130 @@
+"""What a runtime tells: verdicts, progress and previews, in the order in which they happen."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+from hmsa_ros.control.following import Following
+from hmsa_ros.control.records import (
+    Note,
+    Output,
+    PlanChanged,
+    Severity,
+    StatusChanged,
+    Verdict,
+)
+from hmsa_ros.control.slices import Clock
+from hmsa_ros.control.watching import Watch
+from hmsa_ros.judge import Finding, VERDICTS
+from hmsa_ros.model.status import Code
+from hmsa_ros.planning.group import PlannerGroup, Progress
+from hmsa_ros.planning.timeline import PlannedSegment
+
+# Changes of level in one preview.
+_PREVIEW = 500
+#: How often it is looked whether somebody listens, in ns.
+LOOK = 200_000_000
+
+
+class Bulletin:
+    """Verdicts, progress, previews and notes that wait to be passed on."""
+
+    def __init__(
+            self, group: PlannerGroup, following: Following, watch: Watch, clock: Clock,
+            steady: Clock, unheard: Callable[[], str]) -> None:
+        self._group, self._following, self._watch = group, following, watch
+        self._clock, self._steady, self._look = clock, steady, unheard
+        self._look_again = 0
+        self.unheard = ''  # why nobody carries out commands; empty where somebody does
+        self.verdict = Verdict(Severity.OK, 'none', 'no request yet')
+        self.outputs: list[Output] = []
+        self.preview_again: int | None = None  # time in ns of the next part of a long plan
+        self._told: tuple[Progress, Mapping[str, Progress], bool] | None = None
+        # What progress follows from, and until when it stays as it is.
+        self._segments: list[tuple[PlannedSegment, ...]] = []
+        self._until: int | None = None
+        self.tell()
+
+    def give(self, verdict: Verdict, *, log: bool = False) -> None:
+        """Give a verdict; what went wrong is not taken back by a correction."""
+        if verdict.code != 'corrected' or not self._warned:
+            self.verdict = verdict
+        if log:
+            self.note(verdict.message)
+        self.tell()
+
+    @property
+    def _warned(self) -> bool:
+        """Whether the verdict warns of something else than what was measured."""
+        return self.verdict.severity > Severity.OK and self.verdict.code not in VERDICTS
+
+    def note(self, message: str) -> None:
+        """Have a sentence logged."""
+        self.outputs.append(Note(Severity.WARN, message))
+
+    def tell(self) -> None:
+        """Tell verdict and progress."""
+        self._told = self._state()
+        progress, each, watching = self._told
+        self.outputs.append(StatusChanged(
+            self.verdict, progress, each, self._group.number, self._following.lateness.count,
+            self._following.replanned, self._watch.findings, self._watch.worst, watching,
+            self.unheard, self._watch.measuring,
+            {name: x.model.units.coordinate for name, x in self._group.planners.items()}))
+
+    def tell_progress(self, now: int) -> None:
+        """Tell progress, if there is any by a time in ns."""
+        if not self._unchanged(now) and self._state() != self._told:
+            self.tell()
+
+    def _unchanged(self, now: int) -> bool:
+        """Return whether all plans are as they were and nothing in them has begun or ended."""
+        planners = self._group.planners.values()
+        return (self._until is None or now < self._until) and all(
+            x.plan.segments is known for x, known in zip(planners, self._segments, strict=True))
+
+    def _state(self) -> tuple[Progress, Mapping[str, Progress], bool]:
+        now = self._clock()
+        self._watch.follow(now)
+        self._segments = [x.plan.segments for x in self._group.planners.values()]
+        self._until = self._group.next_change(now)
+        return *self._group.progress(now), self._watch.open
+
+    @property
+    def next_change(self) -> int | None:
+        """Time in ns at which progress changes next; None for never."""
+        return self._until
+
+    def show(self) -> None:
+        """Show what is planned; of a long plan the beginning, and the rest in time."""
+        stamps, samples = self._group.preview(self._clock(), _PREVIEW)
+        self.preview_again = stamps[_PREVIEW // 2] if len(stamps) == _PREVIEW else None
+        self.outputs.append(PlanChanged(tuple(stamps), samples))
+
+    def found(self, findings: Sequence[Finding]) -> None:
+        """Tell what was measured; the verdict is the worst of the request."""
+        worst = self._watch.worst
+        if worst is None or self.verdict.severity is Severity.ERROR or not worst.failed and (
+                self._warned or not self._watch.finished):
+            self.tell()
+            return
+        fine = worst.arrived or worst.verdict is Code.UNOBSERVED and not self._watch.measuring
+        self.give(
+            Verdict(
+                Severity.OK if fine else Severity.WARN, str(worst.verdict), worst.message,
+                self.verdict.request), log=worst.failed and worst in findings)
+
+    def corrected(self, names: Iterable[str]) -> None:
+        """Take in that the plans of joints have been corrected."""
+        for name in names:
+            self._watch.corrected(name)
+
+    def look_for_listeners(self) -> None:
+        """Warn where nobody carries out what is sent, and say when somebody does."""
+        now = self._steady()
+        if now < self._look_again:
+            return
+        self._look_again = now + LOOK
+        before, self.unheard = self.unheard, self._look()
+        if self.unheard == before:
+            return
+        self.note(self.unheard or 'commands are carried out now')
+        self.tell()

@@ -1,0 +1,58 @@
+"""Whether a planner can take a request: active, for its joints, not for too many setpoints."""
+
+from collections.abc import Sequence
+
+from hmsa_ros.control.records import Request, Settings, Target, Trajectory
+from hmsa_ros.errors import excerpt
+from hmsa_ros.model.status import Code, RefusedError
+
+
+def check_ready(now: int, *, active: bool, crowded: str) -> None:
+    """Raise `RefusedError` if no request can be taken at all, at a time in ns."""
+    if crowded:
+        raise RefusedError(Code.SEVERAL_PLANTS, crowded)
+    if not active:
+        raise RefusedError(
+            Code.INACTIVE, 'the planner is inactive: expected it active (ros2 lifecycle set NODE '
+            'activate)')
+    if now == 0:
+        raise RefusedError(
+            Code.NO_TIME,
+            'simulated time has not started: expected messages on /clock (start the simulator, or '
+            'set use_sim_time to false)')
+
+
+def check_joints(request: Request, joints: Sequence[str], settings: Settings) -> None:
+    """
+    Check whom a request is for.
+
+    Raises `RefusedError` if a joint is another one, there twice or missing, or there are too many
+    setpoints.
+    """
+    if isinstance(request, Target) and request.joint not in joints:
+        raise RefusedError(
+            Code.UNKNOWN_JOINT, f'joint {request.joint!r}: expected one of {", ".join(joints)}')
+    if not isinstance(request, Trajectory):
+        return
+    names = request.joints
+    if len(joints) == 1 and names != tuple(joints):
+        raise _unknown(f'is {excerpt(list(names))}: expected {list(joints)}')
+    if twice := sorted({x for x in names if names.count(x) > 1}):
+        raise _unknown(f'has {excerpt(twice[0])} twice: expected each joint once')
+    if unknown := [x for x in names if x not in joints]:
+        raise _unknown(f'has {excerpt(unknown[0])}: expected names among {", ".join(joints)}')
+    missing = [x for x in joints if x not in names]
+    if not names or missing and not settings.allow_partial_joints:
+        raise _unknown(
+            f'lacks {missing[0]!r}: expected all of {", ".join(joints)} (set '
+            'allow_partial_joints to let a message name only some of them)')
+    count = request.count * len(names)
+    if count > settings.max_points:
+        raise RefusedError(
+            Code.TOO_LONG,
+            f'the trajectory has {count} setpoints: expected at most {settings.max_points}, the '
+            'parameter max_points; send it in parts, each stamped with its start')
+
+
+def _unknown(reason: str) -> RefusedError:
+    return RefusedError(Code.UNKNOWN_JOINT, f'joint_names {reason}')

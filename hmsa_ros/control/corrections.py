@@ -1,0 +1,160 @@
+"""Plans that are corrected from what feedback has seen."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+import math
+
+from hmsa_ros.control.feedback import Feedback
+from hmsa_ros.control.records import Severity, Verdict
+from hmsa_ros.control.slices import Clock, in_time, Work
+from hmsa_ros.control.trimming import trimmed
+from hmsa_ros.estimation import Estimate
+from hmsa_ros.estimation.correction import Course, expect, lengthening, worthwhile
+from hmsa_ros.model.status import Code, RefusedError
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.planning.drafting import Steps
+from hmsa_ros.planning.group import PlannerGroup
+from hmsa_ros.planning.planner import Planner
+from hmsa_ros.planning.timeline import Draft, Model, Plan
+
+# A correction gains at least this share of the step, less while a move has time for corrections:
+# what rests is not to be moved for little.
+_GAIN, _LITTLE = 5e-4, 5e-5
+# Units of time before its end from which on a move is not corrected any more.
+_SHORTEST = 0.3
+# A step that is smaller counts as this one.
+_LEAST_STEP = 0.1
+
+
+class Corrections:
+    """Corrects plans where that is expected to leave less."""
+
+    def __init__(self, group: PlannerGroup, feedback: Feedback, clock: Clock) -> None:
+        self._group, self._feedback, self._clock = group, feedback, clock
+        # Times in ns at which moves that take longer are at rest.
+        self._arrivals: dict[str, int] = {}
+
+    def cautious(self, drafts: Mapping[str, Draft]) -> Mapping[str, Draft]:
+        """
+        Give first moves more time to be corrected in, where they are expected to leave much.
+
+        Their levels stay: the early effect of these shows what the actuator is.
+        """
+        self._arrivals = {x: y for x, y in self._arrivals.items() if x not in drafts}
+        if math.isinf(self._feedback.tolerance):
+            return drafts
+        return {name: self._slowly(name, draft) for name, draft in drafts.items()}
+
+    def _slowly(self, name: str, draft: Draft) -> Draft:
+        segment, *rest = draft.segments
+        estimate = self._feedback.foreseen(name, draft.begin)
+        if estimate is None or segment.arrival is None or segment.code is Code.LEVELS:
+            return draft
+        longer = lengthening(
+            estimate, _drafted(draft),
+            max(abs(segment.stretch - draft.levels[0].stretch), _LEAST_STEP),
+            self._group.planners[name].options.slew_limit, self._feedback.tolerance)
+        if longer == 1.0:
+            return draft
+        arrival = segment.begin + round(longer * (segment.arrival - segment.begin))
+        if rest:
+            arrival = max(min(arrival, rest[0].begin), segment.arrival)
+        self._arrivals[name] = arrival
+        return replace(draft, segments=(replace(segment, arrival=arrival), *rest))
+
+    def due(self, now: int) -> Iterator[Work]:
+        """Yield what may be worth correcting by a time in ns; the results are for `take`."""
+        for name, planner in self._feedback.news():
+            if not planner.plan.segments or planner.as_sent(planner.soonest(now)):
+                continue
+            estimate = self._feedback.state(name, planner.soonest(now))
+            if estimate is None:
+                continue
+            level = trimmed(planner, estimate, self._feedback.trim)
+            if level is not None:
+                steps = partial(self._trim, name, level)
+            elif self._worthwhile(estimate, planner, self._arrival(name, now)):
+                steps = partial(self._correct, name)
+            else:
+                continue
+            yield Work(frozenset([name]), in_time(
+                steps, self._group, frozenset([name]), self._clock), corrects=True)
+
+    def _trim(self, name: str, level: float, now: int) -> Steps[Mapping[str, Draft]]:
+        """Hold by another level in T."""
+        return {name: (yield from self._group.planners[name].draft_trim(now, level))}
+
+    def _arrival(self, name: str, now: int) -> int:
+        """Return the time in ns of rest of a move that has time for corrections; 0 without one."""
+        planner, arrival = self._group.planners[name], self._arrivals.get(name, 0)
+        left = arrival - planner.soonest(now)
+        return arrival if left >= _SHORTEST * planner.model.units.time * NANOSECONDS else 0
+
+    def _worthwhile(self, estimate: Estimate, planner: Planner, arrival: int) -> bool:
+        """Return whether a plan is expected to leave more than it must."""
+        course, gain = _course(planner.plan, estimate.time, _LITTLE if arrival else _GAIN)
+        return expect(estimate, course, planner.options.slew_limit) > gain
+
+    def _correct(self, name: str, now: int) -> Steps[Mapping[str, Draft]]:
+        """Plan the rest anew, if that is expected to leave less."""
+        planner, arrival = self._group.planners[name], self._arrival(name, now)
+        try:
+            draft = yield from planner.draft_resumption(now, arrival or None)
+        except RefusedError:
+            if not arrival:
+                raise
+            return {}
+        estimate = None if draft is None else self._feedback.state(name, draft.begin)
+        if draft is None or estimate is None or draft.missed:
+            # A correction leaves no setpoint out.
+            return {}
+        if max(abs(x.flux_density) for x in draft.levels) > self._feedback.possible(name):
+            # An amplifier that is saturated follows no larger level.
+            return {}
+        slew = planner.options.slew_limit
+        course, gain = _course(planner.plan, draft.begin, _LITTLE if arrival else _GAIN)
+        segment = draft.segments[0]
+        before = expect(estimate, course, slew, segment.arrival or 0)
+        after = expect(estimate, _drafted(draft), slew)
+        return {name: draft} if worthwhile(before, after, estimate.noise, gain) else {}
+
+    def take(self, drafts: Mapping[str, Draft], now: int, request: str) -> Verdict | None:
+        """Take a correction worked out for a time in ns; None where nothing changes."""
+        for name, draft in drafts.items():
+            words = self._feedback.words(name, self._clock())
+            self._group.planners[name].take(draft, now)
+            self._feedback.corrections += 1
+            return Verdict(
+                Severity.OK, 'corrected', f'corrected from samples: {words}', request)
+        return None
+
+
+def _drafted(draft: Draft) -> Course:
+    """Return the course of the first setpoint of a draft."""
+    segment, *rest = draft.segments
+    return Course(
+        tuple((x.stamp, x.flux_density) for x in draft.levels
+              if not rest or x.stamp < rest[0].begin),
+        segment.arrival or draft.begin, segment.stretch,
+        _relaxed(draft.levels[0].model, segment.stretch) if rest else math.nan)
+
+
+def _relaxed(model: Model, stretch: float) -> float:
+    """Return the level in T where a tail leads that the next setpoint cuts; NaN without creep."""
+    return model.holding(stretch) * model.units.load if model.material.creep else math.nan
+
+
+def _course(plan: Plan, begin: int, gain: float) -> tuple[Course, float]:
+    """Return what is planned from a time in ns to its setpoint's end, and what counts then."""
+    levels, place = plan.levels, max(plan.under_way(begin), 0)
+    segment = plan.segments[place]
+    end = plan.segments[place + 1].begin if place + 1 < len(plan.segments) else None
+    first = plan.place(begin)
+    kept = [x for x in levels[first:] if end is None or x.stamp < end or x is levels[first]]
+    start = plan.segments[place - 1].stretch if place else levels[0].stretch
+    return Course(
+        tuple((x.stamp, x.flux_density) for x in kept),
+        segment.arrival or kept[-1].stamp, segment.stretch,
+        math.nan if end is None else _relaxed(kept[-1].model, segment.stretch)), max(
+            gain * abs(segment.stretch - start), gain * _LEAST_STEP, segment.vibration)

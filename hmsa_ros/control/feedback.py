@@ -1,0 +1,302 @@
+"""Feedback: what samples say of the actuators, and models that are learnt from them."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+import math
+
+import numpy as np
+
+from hmsa_ros.control.field import Field
+from hmsa_ros.control.learnt import alike, differs, learnt_model, save
+from hmsa_ros.control.records import EstimateChanged, Output, Settings, Severity
+from hmsa_ros.control.slices import Clock
+from hmsa_ros.control.tracked import Joint
+from hmsa_ros.control.trust import Trust
+from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.estimation import Estimate, Estimator, Options, Prior
+from hmsa_ros.estimation.motion import followed
+from hmsa_ros.estimation.words import differences
+from hmsa_ros.identification.known import Known
+from hmsa_ros.judge import Sensor
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.planning.group import PlannerGroup
+from hmsa_ros.planning.planner import Planner
+from hmsa_ros.planning.timeline import Model
+
+#: What the parameter `feedback` can be.
+MODES = ('off', 'observe', 'adapt')
+# How often samples are taken into account while a joint moves and while it rests, and how often
+# the estimate is told, in ns.
+_UPDATE, _RESTING, _TELL = 20_000_000, 200_000_000, 200_000_000
+# Samples of a natural period that are looked at, and how many fewer at rest.
+_DENSE, _SPARSE = 40, 10
+# Periods after the last change of level from which on a joint rests.
+_QUIET = 12.0
+# What the judge calls figures of a sensor, and the share of what was not known of one before
+# below which it has been found.
+_SENSOR = {'stretch_bias': 'bias', 'stretch_gain': 'gain', 'sensor_latency': 'latency'}
+_FOUND = 0.3
+# States further ahead than so many units of time are those of rest.
+_AHEAD = 100.0
+
+
+class Feedback:
+    """Estimates from samples, reports what is wrong, and learns what to plan with."""
+
+    def __init__(
+            self, group: PlannerGroup, settings: Settings, outputs: list[Output],
+            clock: Clock) -> None:
+        self._group, self._outputs, self._clock = group, outputs, clock
+        self._settings = settings
+        self._joints: dict[str, Joint] = {}
+        self._nominal: dict[str, Model] = {}
+        self.corrections = 0  # plans that were corrected
+        self.restart()
+
+    @property
+    def mode(self) -> str:
+        """One of `MODES`."""
+        return self._settings.feedback
+
+    @property
+    def on(self) -> bool:
+        """Whether samples count."""
+        return self.mode != 'off'
+
+    def restart(self) -> None:
+        """Forget what was learnt: plan with what is given, from what is predicted."""
+        for name, planner in self._group.planners.items():
+            if name in self._nominal:
+                planner.take_model(self._nominal[name])
+            self._nominal[name] = planner.model
+            planner.believed = partial(self._believed, name)
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin with nothing seen."""
+        self._joints = {}
+        if self.on:
+            self._joints = {
+                name: Joint(
+                    Estimator(self._prior(name, model), Options(
+                        slew_limit=model.options.slew_limit,
+                        learn=not self._settings.feedback_frozen)),
+                    Trust(self._clock(), at_once=self._settings.feedback_cautious), Field(),
+                    model.actuator.rest)
+                for name, model in self._nominal.items()}
+
+    def change(self, settings: Settings, models: Mapping[str, Model]) -> Mapping[str, Model]:
+        """
+        Take other settings and models as given; return the models to plan with.
+
+        What was learnt stays in them, as long as block and coil are given as before.
+        """
+        same = settings.feedback_parameters == self._settings.feedback_parameters and (
+            (settings.feedback == 'off') is not self.on) and all(
+                model.actuator == self._nominal[name].actuator
+                and model.options.coil_time_constant
+                == self._nominal[name].options.coil_time_constant
+                for name, model in models.items())
+        self._settings = settings
+        self._nominal.update(models)
+        if not same:
+            self._begin()
+            return models
+        for joint in self._joints.values():
+            joint.estimator.learning = not settings.feedback_frozen
+        if self.mode != 'adapt':
+            return models
+        return {name: self._learnt(name, model) for name, model in models.items()}
+
+    def _prior(self, name: str, model: Model) -> Prior:
+        return Prior.nominal(model.actuator, self._settings.feedback_parameters, others={
+            'coil_time_constant': model.options.coil_time_constant}).informed(
+                self._settings.known.get(name, Known()))
+
+    def _learnt(self, name: str, model: Model) -> Model:
+        """Return a model with what is known better by now, or was when samples fitted last."""
+        joint = self._joints[name]
+        if joint.acts and joint.latest is not None:
+            return learnt_model(
+                model, joint.latest, self._group.planners[name].plan.levels[-1].stretch)
+        confirmed = joint.trust.confirmed
+        return model if confirmed is None else Model(confirmed.actuator, replace(
+            model.options, coil_time_constant=confirmed.options.coil_time_constant))
+
+    def latest(self, name: str) -> Estimate | None:
+        """Return what is believed of a joint, where a whole move has shown that samples fit."""
+        joint = self._joints.get(name)
+        return joint.latest if joint is not None and joint.acts else None
+
+    def reset(self) -> str:
+        """Forget what was learnt and say so; refused where nothing is learnt at all."""
+        self._check_on()
+        self.restart()
+        return 'what was learnt is forgotten: plans use the parameters as given'
+
+    def save(self, *, by_joint: bool) -> str:
+        """Write what was learnt to the file of the settings and say so; refused without any."""
+        self._check_on()
+        return save(
+            self._settings.feedback_file,
+            {name: joint.latest for name, joint in self._joints.items()}, by_joint=by_joint)
+
+    def _check_on(self) -> None:
+        if not self.on:
+            raise BadInputError(
+                'feedback is off and nothing is learnt: expected observe or adapt')
+
+    def looks_at(self, stamp: int) -> bool:
+        """Return whether a sample with a stamp in ns is of use."""
+        return any(
+            not joint.newest <= stamp < joint.newest + self._cell(name, joint)
+            for name, joint in self._joints.items())
+
+    def _cell(self, name: str, joint: Joint) -> int:
+        """Return how far apart in ns samples are to be."""
+        cell = round(self._nominal[name].units.time * NANOSECONDS) * 2 // _DENSE
+        return cell * _SPARSE if joint.latest and self._quiet(name, joint) else cell
+
+    def _quiet(self, name: str, joint: Joint) -> bool:
+        planner = self._group.planners[name]
+        last = planner.plan.levels[-1].stamp
+        span = round(2.0 * _QUIET * self._nominal[name].units.time * NANOSECONDS)
+        return joint.newest > last + span
+
+    def add(
+            self, name: str, stamp: int, stretch: float, flux_density: float = math.nan) -> None:
+        """Take in stretch and field in T measured at a stamp in ns; samples come in any order."""
+        joint = self._joints.get(name)
+        if joint is None:
+            return
+        now = self._clock()
+        lost = joint.field.measured(self._group.planners[name].plan, stamp, flux_density)
+        if lost and joint.trust.why != lost and joint.trust.doubt(lost, now, at_once=True):
+            joint.estimator.restart()
+            joint.latest, joint.news = None, True
+        joint.add(stamp, math.nan if lost else stretch, now)
+
+    def applied(self, name: str, stamp: int, flux_density: float) -> None:
+        """Take in that a level in T has taken effect at a stamp in ns, before the plan does."""
+        joint = self._joints.get(name)
+        if joint is not None:
+            joint.field.applied(self._group.planners[name].plan, stamp, flux_density)
+
+    def possible(self, name: str) -> float:
+        """Return the largest level in T that a joint's coil is known to follow."""
+        joint = self._joints.get(name)
+        return math.inf if joint is None else joint.field.largest
+
+    @property
+    def wake(self) -> int | None:
+        """Time in ns at which to look at samples next; None for never."""
+        return min((x.next_update for x in self._joints.values() if x.fresh), default=None)
+
+    def update(self, now: int) -> None:
+        """Take samples into account that have come by a time in ns, and tell what they say."""
+        for name, joint in self._joints.items():
+            if not joint.fresh or now < joint.next_update:
+                continue
+            joint.next_update = now + (_RESTING if self._quiet(name, joint) else _UPDATE)
+            joint.update(self._group.planners[name].plan, now)
+            if now >= joint.next_tell:
+                joint.next_tell = now + _TELL
+                self._tell(name, joint, now)
+
+    def _tell(self, name: str, joint: Joint, now: int) -> None:
+        found = joint.latest
+        bad = joint.trust.why or found is not None and self.mode == 'observe' and differences(
+            found, joint.estimator.prior.values)
+        self._outputs.append(EstimateChanged(
+            now, name, Severity.WARN if bad else Severity.OK, self.words(name, now),
+            {'mode': self.mode, **joint.figures(),
+             'used_by_plans': self.mode == 'adapt' and joint.acts,
+             'corrections': self.corrections}))
+
+    def words(self, name: str, now: int) -> str:
+        """Say in a sentence without its stop what is wrong with a joint at a time in ns."""
+        return self._joints[name].words(
+            self._group.planners[name].plan, now, adapting=self.mode == 'adapt')
+
+    def _believed(
+            self, name: str, time: int) -> tuple[float, float, tuple[float, ...]] | None:
+        """Return what `hmsa_ros.planning.planner.Planner` is to believe of a time in ns."""
+        try:
+            found = self.state(name, time)
+        except HmsaError:
+            return None
+        return None if found is None else (
+            found.stretch, found.rate, followed(found.values, found.stretch))
+
+    def state(self, name: str, time: int) -> Estimate | None:
+        """Return what plans may begin from at a time in ns; None where predictions count."""
+        joint = self._joints.get(name)
+        if joint is None or self.mode != 'adapt' or joint.latest is None or not joint.acts:
+            return None
+        latest = joint.latest
+        if time - latest.time > _AHEAD * latest.values['time_unit'] * NANOSECONDS:
+            return None
+        return self._predicted(name, joint, time)
+
+    def follows(self, name: str) -> bool:
+        """Return whether plans for a joint begin from what is estimated."""
+        return self.state(name, self._clock()) is not None
+
+    def _predicted(self, name: str, joint: Joint, time: int) -> Estimate | None:
+        """Return what is believed of a time in ns under the plan in force by now."""
+        joint.take_levels(self._group.planners[name].plan, time)
+        return joint.estimator.predict(time)
+
+    def foreseen(self, name: str, time: int) -> Estimate | None:
+        """Return what moves may be corrected from at a time in ns, before samples come too."""
+        joint = self._joints.get(name)
+        if joint is None or joint.latest is not None:
+            return self.state(name, time)
+        return self._predicted(name, joint, time)
+
+    def sensor(self, name: str) -> Sensor:
+        """Return what was found of the sensor of a joint; one as given where nothing was."""
+        found = self.latest(name)
+        if found is None:
+            return Sensor()
+        prior = np.diag(self._joints[name].estimator.prior.covariance)
+        known = [x for i, x in enumerate(found.free) if x in _SENSOR and (
+            found.covariance[i, i] < _FOUND**2 * prior[i])]
+        figures = {_SENSOR[x]: found.values[x] for x in known} | {
+            f'{_SENSOR[x]}_std': found.deviations[x] for x in known}
+        together = 0.0
+        if 'stretch_bias' in known and 'stretch_gain' in known:
+            pair = [found.free.index(x) for x in ('stretch_bias', 'stretch_gain')]
+            (one, both), (_, two) = found.covariance[np.ix_(pair, pair)]
+            together = float(both / math.sqrt(one * two))
+        return Sensor(**figures, together=together)
+
+    @property
+    def trim(self) -> float:
+        """How far in T holding levels may be changed; 0 for not at all."""
+        return self._settings.feedback_trim if self.mode == 'adapt' else 0.0
+
+    @property
+    def tolerance(self) -> float:
+        """Share of its step that a move may be expected to leave without taking longer."""
+        cautious = self.mode == 'adapt' and self._settings.feedback_cautious
+        return self._settings.feedback_tolerance if cautious else math.inf
+
+    def news(self) -> Iterator[tuple[str, Planner]]:
+        """Plan with what is known best by now, and yield joints with new estimates to act upon."""
+        if self.mode != 'adapt':
+            return
+        for name, joint in self._joints.items():
+            if not joint.news:
+                continue
+            joint.news = False
+            planner = self._group.planners[name]
+            if joint.acts and joint.latest is not None:
+                if differs(planner.model, joint.latest):
+                    planner.take_model(self._learnt(name, planner.model))
+                yield name, planner
+            else:
+                model = self._learnt(name, self._nominal[name])
+                if not alike(model, planner.model):
+                    planner.take_model(model)

@@ -1,0 +1,286 @@
+"""Late, lost and foreign commands, and the new plans that they call for."""
+
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import replace
+import math
+
+from hmsa_ros.control.lateness import Lateness
+from hmsa_ros.control.records import Note, Settings, Severity, Verdict
+from hmsa_ros.control.seldom import Seldom
+from hmsa_ros.control.slices import Clock, in_time, Work
+from hmsa_ros.control.weighing import aims, compared, expected, step_of
+from hmsa_ros.errors import HmsaError
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.planning.drafting import Steps
+from hmsa_ros.planning.group import PlannerGroup, Resumption
+from hmsa_ros.planning.timeline import Draft, Options
+
+# Residual vibration from peak to peak, as a share of the step, from which on deviations count, and
+# how much less a new plan is to leave than one that goes on as it is.
+_SHARE, _GAIN, _CLEARLY = 5e-3, 5e-3, 0.6
+# Share of a period by which commands may be sent late that are not left out.
+_PART = 0.25
+# How long samples may stay away, in ns, before nothing follows from their times.
+_SILENT = 10 * NANOSECONDS
+# Least time in ns between two looks at a plan that is left as it is.
+_PAUSE = 20_000_000
+
+
+class Following:
+    """Holds what takes effect against the plans."""
+
+    def __init__(self, group: PlannerGroup) -> None:
+        self._group = group
+        self.lateness = Lateness()
+        # Stamp in ns and level in T of the newest change that took effect.
+        self.newest: dict[str, tuple[int, float]] = {}
+        self.astray: set[str] = set()  # joints whose plan reality has left
+        self.verdicts: list[Verdict] = []  # to be given
+        self.replanned = 0  # plans made anew
+        # By joint, vibration that is not planned for, and from when on to look at it again, in ns.
+        self._strayed: dict[str, float] = {}
+        self._again: dict[str, int] = {}
+        # What amplifiers that saturate do, and their limits as they are given.
+        self._saturated: dict[str, tuple[str, Options]] = {}
+        # Joints that may have left their plan, and the stamp of what was not heard of.
+        self._suspected: dict[str, int] = {}
+        # Time in ns of the newest report, the same at the last look, and when that was new. By
+        # joint, how old the newest change was when it was heard of, in ns.
+        self._newest_seen = 0
+        self._looked = 0, 0
+        self._ages: dict[str, int] = {}
+        self._found: dict[str, Resumption] = {}
+        #: Returns how the clocks of plant or driver and planner differ; empty where they do not.
+        self.clocks: Callable[[], str] = str
+        self._tell_late, self._tell_foreign, self.tell_replanned = Seldom(), Seldom(), Seldom()
+
+    def restart(self) -> None:
+        """Forget what belongs to plans that are dropped."""
+        self.newest.clear()
+        self._suspected.clear()
+        self._ages.clear()
+        self._newest_seen = 0
+        self.dropped(list(self._group.planners))
+
+    def dropped(self, joints: Iterable[str]) -> None:
+        """Forget what belongs to plans of joints that others take the place of."""
+        for name in joints:
+            self.astray.discard(name)
+            self._strayed.pop(name, None)
+            self._again.pop(name, None)
+
+    def asked(self, joints: Iterable[str]) -> None:
+        """Try again what an amplifier can do, since somebody asks for something."""
+        for name in joints:
+            if name in self._saturated:
+                _, options = self._saturated.pop(name)
+                self._limit(name, options.flux_density_min, options.flux_density_max)
+
+    def _limit(self, name: str, least: float, most: float) -> None:
+        planner = self._group.planners[name]
+        planner.take_model(replace(planner.model, options=replace(
+            planner.options, flux_density_min=least, flux_density_max=most)))
+
+    # -- commands and their effects -------------------------------------------------------------
+
+    def sent(self, joint: str, stamp: int, now: int) -> list[Note]:
+        """Take in that a command was handed out."""
+        self.lateness.sent(joint, stamp, now)
+        if stamp >= now:
+            return []
+        self.lateness.missed(now - stamp)
+        return self._late()
+
+    def applied(
+            self, joint: str, stamp: int, flux_density: float, settings: Settings,
+            now: int) -> list[Note]:
+        """Hold a change of level that has taken effect against the plan; times in ns."""
+        self.newest[joint] = stamp, flux_density
+        self._ages[joint] = max(now - stamp, 0)
+        tolerance, planner = settings.lateness_tolerance, self._group.planners[joint]
+        found = self._group.applied(joint, stamp, flux_density, tolerance)
+        if found is None:
+            return []
+        step = step_of(planner.plan, planner.plan.under_way(stamp))
+        cost = 2.0 * found.effect / step
+        if not found.foreign:
+            self.lateness.note(
+                found.late, joint, stamp - found.late, tolerance,
+                2.0 * planner.vibration(1, found.change) / step)
+            for other in self._group.planners.values():
+                other.delay = self.lateness.expected
+        self._strayed[joint] = self._strayed.get(joint, 0.0) + cost
+        again = self._again.get(joint)
+        if settings.replan_late and not planner.as_sent(stamp - max(found.late, 0) - 1) and (
+                self._strayed[joint] > _SHARE
+                or again is not None and (stamp >= again or not planner.awaiting)):
+            self.astray.add(joint)
+        if found.asked is not None:
+            return self._saturates(joint, found.asked, flux_density)
+        if found.foreign and self._tell_foreign():
+            return [Note(Severity.WARN, (
+                f'joint {joint}: {flux_density:g} T took effect but was not commanded'))]
+        return self._late() if found.late > tolerance else []
+
+    def _saturates(self, joint: str, asked: float, reached: float) -> list[Note]:
+        """Plan with what an amplifier gives until somebody asks for something."""
+        options = self._group.planners[joint].options
+        name = 'flux_density_max' if asked > 0.0 else 'flux_density_min'
+        words = (
+            f'amplifier of joint {joint} saturated: {reached:.4g} T took effect where {asked:.4g} '
+            'T was commanded; nothing beyond that is commanded until the next request; set '
+            f'{name} to what the amplifier gives')
+        given = self._saturated.get(joint, (words, options))[1]
+        self._saturated[joint] = words, given
+        self._limit(
+            joint, max(options.flux_density_min, reached if asked < 0.0 else -math.inf),
+            min(options.flux_density_max, reached if asked > 0.0 else math.inf))
+        self.verdicts.append(Verdict(Severity.WARN, 'saturated', words, figures={
+            'commanded': asked, 'reached': reached}))
+        return [Note(Severity.WARN, words)]
+
+    def drop_missed(
+            self, now: int, tolerance: int, but: Collection[str] = ()) -> list[Note]:
+        """Take out of the plans what is too late to be sent, as after a jump of the clock."""
+        notes = []
+        for name, planner in self._group.planners.items():
+            stamp = planner.next_stamp
+            if name in but or stamp is None or stamp >= now - tolerance or (
+                    planner.as_sent(stamp)):
+                continue
+            model = planner.model
+            late = max(tolerance, model.ns(_PART * 2.0 * math.pi / model.frequency(
+                planner.last_sent.stretch)))
+            if stamp >= now - late or not self._group.may_resume(name):
+                continue
+            for _ in range(planner.drop_missed(now, tolerance)):
+                self.lateness.missed(now - stamp)
+            notes += self._late()
+            self._leaves(name)
+        return notes
+
+    def _leaves(self, name: str) -> None:
+        """Note that a joint has left its plan, whatever is expected of commands."""
+        self._strayed[name] = math.inf
+        self.astray.add(name)
+
+    def seen(self, stamp: int) -> None:
+        """Take in that plant or driver has reported something of a time in ns."""
+        self._newest_seen = max(self._newest_seen, stamp)
+
+    def look_for_unheard(self, now: int) -> None:
+        """Find plans that reality has left without a word; news may be as late as commands."""
+        before, self._suspected = self._suspected, {}
+        for name, planner in self._group.planners.items():
+            if name not in self.newest:
+                # Nobody reports what took effect.
+                continue
+            stamp = planner.unheard(self._reported(name, now) - planner.options.lead_time)
+            if stamp is None:
+                continue
+            if before.get(name) != stamp:
+                # It may wait to be read.
+                self._suspected[name] = stamp
+                continue
+            planner.drop_unheard(stamp)
+            self._leaves(name)
+
+    def _reported(self, name: str, now: int) -> int:
+        """Return up to which time in ns a joint's reports have come."""
+        # A plant that is busy reports later, and simulated time may be slower.
+        if self._newest_seen != self._looked[0]:
+            self._looked = self._newest_seen, now
+        sampled = self._newest_seen and now - self._looked[1] < _SILENT
+        return min(now, self._newest_seen) if sampled else now - self._ages.get(name, 0)
+
+    def _late(self) -> list[Note]:
+        return [Note(Severity.WARN, self.advice)] if self._tell_late() else []
+
+    @property
+    def advice(self) -> str:
+        """What happens to commands, and what helps; all joints have the same lead time."""
+        planner = next(iter(self._group.planners.values()))
+        return f'{self.lateness.words()}; ' + (
+            self.clocks() or self.lateness.advice(planner.options.lead_time))
+
+    # -- plans made anew -----------------------------------------------------------------------
+
+    def to_resume(self) -> list[str]:
+        """Return joints whose plan is perhaps to be made anew."""
+        vain = [x for x in self.astray if not self._group.may_resume(x)]
+        if vain:
+            self.dropped(vain)
+            self._tell_kept()
+        return sorted(self.astray)
+
+    def resumption(self, name: str, clock: Clock) -> Work:
+        """Return the work of planning a joint's rest anew, where that leaves less."""
+        def make(now: int) -> Steps[Mapping[str, Draft]]:
+            planner = self._group.planners[name]
+            self._found.pop(name, None)
+            plan, (start, levels) = planner.plan, planner.unknown(now)
+            if plan.segments and expected(
+                    start, levels, aims(plan, now), self.lateness) <= _SHARE:
+                return {}
+            if (levels and not self.lateness.known
+                    and math.isfinite(self._strayed.get(name, 0.0))):
+                # Perhaps all are so late.
+                self._found[name] = Resumption(None)
+                return {}
+            yield
+            found = yield from self._group.draft_resumption(name, now)
+            if found.draft is None:
+                return {}
+            before, after = compared(plan, start, levels, found.draft, now, self.lateness)
+            if after > min(_CLEARLY * before, before - _GAIN):
+                found = Resumption(None, left=before)
+            self._found[name] = found
+            return {} if found.draft is None else {name: found.draft}
+        joints = frozenset([name])
+        return Work(joints, in_time(make, self._group, joints, clock))
+
+    def resume(
+            self, work: Work, drafts: Mapping[str, Draft], now: int,
+            request: str) -> Verdict | None:
+        """Take a plan made anew for a time in ns; None if nothing was left to do."""
+        name, = work.joints
+        found = self._found.pop(name, None)
+        planner = self._group.planners[name]
+        self.dropped([name])
+        if found is None:
+            return None
+        if found.draft is None:
+            if not self.lateness.known:
+                self._again[name] = 0
+            elif planner.awaiting:
+                self._again[name] = now + max(_PAUSE, planner.model.ns(1.0))
+            if not planner.awaiting:
+                self._tell_kept()
+            return None
+        self._group.resume(name, found, now)
+        why = self._saturated[name][0] if name in self._saturated else ''
+        if found.refusal:
+            return Verdict(
+                Severity.ERROR, 'saturated' if why else 'stopped', f'{why}; ' * bool(why) +
+                f'joint {name} comes to rest, since its sequence cannot be resumed: '
+                f'{found.refusal}', request)
+        self.replanned += 1
+        missed = drafts[name].missed
+        return Verdict(
+            Severity.WARN, 'saturated' if why else 'replanned',
+            (why or 'commands did not take effect as planned') + ': the rest is replanned' + (
+                f', without {missed} setpoints whose time has passed' if missed else ''), request)
+
+    def abandon(self, work: Work, error: HmsaError, request: str) -> Verdict:
+        """Leave a plan as it is that cannot even be stopped."""
+        name, = work.joints
+        self.dropped([name])
+        return Verdict(
+            Severity.ERROR, 'not_converged', f'joint {name} cannot be replanned: {error}',
+            request)
+
+    def _tell_kept(self) -> None:
+        """Give the verdict where a new plan does not help."""
+        self.verdicts.append(Verdict(
+            Severity.WARN, 'late', f'{self.advice}; a new plan would not leave less',
+            figures={'largest_lateness': self.lateness.largest / NANOSECONDS}))

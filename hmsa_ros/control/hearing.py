@@ -1,0 +1,146 @@
+"""Whether plant or driver hear the planner, what their clocks say, and coils that were cut off."""
+
+import math
+
+from hmsa_ros.control.following import Following
+from hmsa_ros.control.receipts import Offset, Receipts
+from hmsa_ros.control.records import Settings, Severity, Verdict
+from hmsa_ros.control.slices import Clock
+from hmsa_ros.control.takeover import Takeover
+from hmsa_ros.model.status import Code, RefusedError
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.planning.group import PlannerGroup
+
+# How often a cut-off is acknowledged, in ns.
+_AGAIN = 100_000_000
+# Share of half a natural period, and of lead_time, from which on an offset of clocks is warned of.
+_SHARE = 0.1
+
+
+class Hearing:
+    """
+    Follows what devices say of themselves, and draws conclusions for the plans.
+
+    ``cut`` are the joints whose device refuses commands of before a cut-off, and ``until`` how
+    long to wait for it to obey, in ns by the steady clock.
+    """
+
+    def __init__(
+            self, group: PlannerGroup, following: Following, takeover: Takeover, clock: Clock,
+            steady: Clock) -> None:
+        self._group, self._following, self._takeover = group, following, takeover
+        self._clock, self._steady = clock, steady
+        self.receipts = Receipts(steady)
+        self.cut: set[str] = set()
+        self.until: int | None = None
+        self._acknowledged: dict[str, int] = {}
+        self._warned = False
+        following.clocks = self._clocks
+        takeover.lag = self.receipts.lag
+
+    # -- silence -------------------------------------------------------------------------------
+
+    @property
+    def deaf(self) -> bool:
+        """Whether no device is heard that was heard before."""
+        return bool(self.receipts.silent) and self.receipts.silent >= self._group.planners.keys()
+
+    def look(self) -> None:
+        """Doubt where joints are whose device has fallen silent, or is heard again."""
+        for names in self.receipts.look():
+            for name in names:
+                self._takeover.doubt(name)
+
+    # -- cut-offs ------------------------------------------------------------------------------
+
+    def cut_off(self, joint: str, settings: Settings, *, in_force: bool) -> Verdict | None:
+        """Take in whether the coil of a joint was cut off; return the verdict on its plan."""
+        if not in_force:
+            self.cut.discard(joint)
+            return None
+        if joint in self.cut or joint not in self._group.planners:
+            return None
+        self.cut.add(joint)
+        if not self._takeover.engaged:
+            return None
+        self._takeover.doubt(joint)
+        if settings.after_cut_off == 'resume':
+            self._following.astray.add(joint)
+            return None
+        self._following.astray.discard(joint)
+        self._group.planners[joint].abandon(self._clock())
+        return Verdict(
+            Severity.ERROR, str(Code.CUT_OFF),
+            f'the coil of joint {joint} was cut off by the plant or driver: the rest of the '
+            'sequence is dropped, and the next request starts from where the actuator is then')
+
+    def may_acknowledge(self, joint: str) -> bool:
+        """Return whether to tell a device that its cut-off is known: seldom, if it is off."""
+        steady = self._steady()
+        level = self._following.newest.get(joint)
+        if level is None or level[1] != 0.0 or (
+                steady - self._acknowledged.get(joint, -_AGAIN) < _AGAIN):
+            return False
+        self._acknowledged[joint] = steady
+        return True
+
+    def holds(self, settings: Settings) -> bool:
+        """Return whether to plan later, once it is known if a coil was cut off and is obeyed."""
+        names = self._following.astray
+        if not self.cut and all(
+                level[1] != 0.0 or self.receipts.since(name, level[0])
+                for name, level in self._following.newest.items() if name in names):
+            self.until = None
+            return False
+        if self.until is None:
+            self.until = self._steady() + settings.takeover_timeout
+        return self._steady() <= self.until
+
+    # -- clocks --------------------------------------------------------------------------------
+
+    @property
+    def offset(self) -> Offset | None:
+        """How far the clock of a device is ahead; None where that is not measured."""
+        return self.receipts.worst(self._group.planners)
+
+    def check_clocks(self) -> None:
+        """
+        Look at the clocks before a move.
+
+        Raises
+        ------
+        RefusedError
+            If they are so far apart that every command would come too late.
+
+        """
+        offset = self.offset
+        if offset is not None and offset.ahead - offset.error > max(
+                x.options.lead_time for x in self._group.planners.values()):
+            raise RefusedError(
+                Code.CLOCKS_DIFFER,
+                f'every command would come too late, since {offset.words}')
+
+    def limit(self) -> float:
+        """Return from which offset of clocks on to warn, in ns: it shifts and spoils moves."""
+        limits = [math.inf]
+        for planner in self._group.planners.values():
+            model, plan = planner.model, planner.plan
+            stretch = plan.segments[-1].stretch if plan.segments else plan.levels[-1].stretch
+            limits.append(
+                math.pi / model.frequency(stretch) * model.units.time * NANOSECONDS)
+            limits += [planner.options.lead_time] if planner.options.lead_time else []
+        return _SHARE * min(limits)
+
+    def clocks_changed(self, limit: float) -> str:
+        """Return what to log of the clocks: once when they begin to differ."""
+        offset = self.offset
+        warned, self._warned = self._warned, offset is not None and offset.beyond(limit)
+        return offset.words if self._warned and not warned and offset is not None else ''
+
+    def _clocks(self) -> str:
+        """Return how the clocks differ, where that alone makes commands late."""
+        offset = self.offset
+        if offset is None or offset.ahead - offset.error <= 0.5 * next(
+                iter(self._group.planners.values())).options.lead_time:
+            return ''
+        return offset.words

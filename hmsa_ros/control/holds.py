@@ -1,0 +1,188 @@
+"""Samples of one setpoint, and when there are enough of them to judge it."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from hmsa_ros.judge import (
+    ENOUGH,
+    Finding,
+    judge,
+    look_length,
+    missed,
+    rests_from,
+    Sensor,
+    Setpoint,
+    Tolerances,
+    unobserved,
+)
+from hmsa_ros.model.status import Code
+from hmsa_ros.model.units import NANOSECONDS
+
+# Time in ns in which samples that are rare are waited for after an arrival.
+_RARE = NANOSECONDS // 4
+# Samples of the move that are kept: they show whether the sensor moves at all.
+_MOVING = 32
+# How long samples may stay away, by the steady clock, before it is judged without them.
+_PATIENCE = NANOSECONDS // 2
+# How far in ns ahead of the clock a stamp may be: news of the time may be late.
+_AHEAD = NANOSECONDS // 20
+
+
+class Hold:
+    """
+    Gathers the samples of a setpoint that count, and judges it when they are there.
+
+    ``found`` is the newest finding; once ``over``, no more samples are waited for.
+    """
+
+    def __init__(self, setpoint: Setpoint, *, last: bool) -> None:
+        self.setpoint = setpoint
+        self.found: Finding | None = None
+        self.over = False
+        self._last = last
+        self._samples: dict[int, float] = {}
+        self._moving: set[int] = set()  # parts of the move of which there is one
+        # Newest sample by its stamp; newest of all that were looked at, and when that was.
+        self._newest = self._seen = self._heard = 0
+        # Largest that a stamp was ahead of the clock.
+        self._ahead = 0
+        # Arrival as it was requested, and by the newest plan.
+        self._asked = rests_from(setpoint)
+        self._begin_at(self._asked)
+
+    def _begin_at(self, begin: int) -> None:
+        setpoint = self.setpoint
+        self._begin, self._length = begin, look_length(setpoint)
+        # The last one is held on, so that there is always time for a look.
+        least = begin + max(2 * self._length, _RARE) if self._last else begin
+        self._closes = least if setpoint.end is None else max(setpoint.end, least)
+        if self._last and setpoint.end is not None and setpoint.moved is None:
+            self.setpoint = replace(setpoint, end=self._closes)
+        self.due = min(begin + self._length, self._closes)
+        self._few: bool | None = None
+
+    def move(self, arrival: int, *, corrected: bool) -> None:
+        """Take in that another plan arrives at a time in ns, perhaps one corrected on the way."""
+        if arrival == self._begin:
+            return
+        end = self.setpoint.end
+        if corrected and self._last:
+            # What is held on is corrected as long as it is.
+            end = None
+        self.setpoint = replace(
+            self.setpoint, end=end, moved=None if arrival == self.setpoint.arrival else arrival)
+        if not self._last and end is not None and arrival >= end:
+            self.miss('a plan that was made anew reaches it only after its time')
+            return
+        self.over = False
+        self._begin_at(arrival)
+
+    def miss(self, reason: str) -> None:
+        """Take in that the setpoint is not carried out."""
+        if not self.over:
+            self.found, self.over = missed(self.setpoint, reason), True
+
+    # -- samples -------------------------------------------------------------------------------
+
+    def lacks(self, stamp: int, steady: int) -> bool:
+        """Return whether a sample of a time is of use; old ones show that newer ones may come."""
+        if self.over:
+            return False
+        if self._seen < stamp <= self._closes:
+            self._seen, self._heard = stamp, steady
+        return stamp >= self.due > self._newest or (
+            stamp not in self._samples and self._counts(stamp))
+
+    def add(self, stamp: int, stretch: float, now: int) -> None:
+        """Take a sample that arrives at a time in ns; none that is from the future."""
+        if stamp > now + _AHEAD:
+            self._ahead = max(self._ahead, stamp - now)
+            return
+        self._newest = max(self._newest, stamp)
+        if self._counts(stamp):
+            self._samples.setdefault(stamp, stretch)
+            if stamp < self._asked:
+                self._moving.add(self._cell(stamp))
+
+    def _counts(self, stamp: int) -> bool:
+        """Return whether a sample of a time is in one of the looks."""
+        begins, asked = self.setpoint.begins, self._asked
+        if stamp < min(asked, self._begin):
+            return stamp >= begins and self._cell(stamp) not in self._moving
+        if stamp > self._closes:
+            return False
+        return stamp >= self._closes - 2 * self._length or any(
+            self._looks_at(stamp - x) for x in {asked, self._begin} if x <= stamp)
+
+    def _cell(self, stamp: int) -> int:
+        """Return which part of the move a time is in."""
+        begins = self.setpoint.begins
+        return (stamp - begins) // max((self._asked - begins) // _MOVING, 1)
+
+    def _looks_at(self, after: int) -> bool:
+        """Return whether a time in ns after an arrival is in one of the looks."""
+        if after <= 2 * self._length:
+            return True
+        if self._few is None:
+            self._few = self._first() < ENOUGH
+        looks = after // self._length
+        return self._few or looks == 1 << (looks.bit_length() - 1)
+
+    def _first(self) -> int:
+        """Return how many samples of the first look there are."""
+        end = self._begin + self._length
+        return sum(self._begin <= x <= end for x in self._samples)
+
+    # -- judging -------------------------------------------------------------------------------
+
+    def judge(
+            self, now: int, steady: int, tolerances: Tolerances, sensor: Sensor, *,
+            observable: bool) -> Finding | None:
+        """Judge if that is due at a time in ns; None if not, or if that changes nothing."""
+        if self.over or not self._ready(now, steady, observable=observable):
+            return None
+        self.over = self.due >= self._closes
+        found = self._judged(tolerances, sensor)
+        after = self.due - self._begin
+        self.due = min(self._begin + max(2 * after, self._length), self._closes)
+        before, self.found = self.found, self._better_known(found)
+        same = before is not None and before.verdict is self.found.verdict
+        return None if same and not self.over else self.found
+
+    def wake(self, now: int) -> int:
+        """Return when to judge next, a time in ns; 0 for now."""
+        return self._begin if now < self._begin else self.due if now < self.due else 0
+
+    def _ready(self, now: int, steady: int, *, observable: bool) -> bool:
+        if now >= self._begin and not observable and not self._samples:
+            self.due = self._closes
+            return True
+        if now < self.due:
+            return False
+        rare = min(self._begin + _RARE, self._closes)
+        if self._newest >= self.due and (
+                self._newest >= rare or self._first() >= ENOUGH):
+            return True
+        self._heard = self._heard or steady
+        if steady - self._heard <= _PATIENCE or now < self._closes:
+            return False
+        self.due = self._closes
+        return True
+
+    def _judged(self, tolerances: Tolerances, sensor: Sensor) -> Finding:
+        if not self._samples:
+            return unobserved(
+                self.setpoint, self._ahead and (
+                    f'samples are stamped up to {self._ahead / NANOSECONDS:.3g} s ahead of the '
+                    'clock') or '')
+        stamps = np.fromiter(self._samples, dtype=np.int64, count=len(self._samples))
+        values = np.fromiter(self._samples.values(), dtype=np.float64, count=len(stamps))
+        return judge(stamps, values, self.setpoint, tolerances, sensor=sensor)
+
+    def _better_known(self, found: Finding) -> Finding:
+        """Return a finding, or the one before where the samples are too few for another."""
+        before, open_ = self.found, (Code.UNOBSERVED, Code.UNDECIDED)
+        if before is not None and found.verdict in open_ and before.verdict not in open_:
+            return before
+        return found

@@ -1,0 +1,159 @@
+"""How late commands take effect, and what helps: delays of transport and of the driver differ."""
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmsa_ros.model.units import NANOSECONDS
+
+# Commands that are compared, and the least number that says something.
+_RECENT = 16
+_ENOUGH = 3
+# Commands that are taken to be in time before more is known.
+_TRUSTED = 6
+# Commands of a joint whose time of sending is remembered.
+_REMEMBERED = 64
+# A driver's delay is called constant where sending earlier or later explains it less than this.
+_CONSTANT = 0.5
+# Vibration, as a share of the step, that is not worth a word.
+_NOTHING = 1e-3
+# Shares of the last commands that were less late than what all of the next may be.
+_SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)
+
+
+class Lateness:
+    """
+    Counts late commands, finds what they have in common, and expects the same of those to come.
+
+    A command that arrives late is the later the later it was sent. One that a driver applies late
+    is as late as any other, however far ahead of its stamp it was sent.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.largest = 0  # how late the latest was, in ns
+        self.earliest = 0  # how long before its stamp a command took effect, in ns
+        self._missed = False
+        self._sent: dict[str, dict[int, int]] = {}
+        # How late, in ns, and the vibration that each ns leaves, as a share of the step.
+        self._recent: deque[tuple[int, float]] = deque(maxlen=_RECENT)
+        # Of those that were late: by how much, and how long ahead of their stamps they were sent.
+        self._late: deque[tuple[int, int]] = deque(maxlen=_RECENT)
+
+    def sent(self, joint: str, stamp: int, now: int) -> None:
+        """Remember when a command was sent; times in ns."""
+        sent = self._sent.setdefault(joint, {})
+        sent.pop(stamp, None)
+        sent[stamp] = now
+        if len(sent) > _REMEMBERED:
+            del sent[next(iter(sent))]
+
+    def note(
+            self, late: int, joint: str, stamp: int, tolerance: int = 0,
+            cost: float = 0.0) -> None:
+        """
+        Take in that a command of a joint took effect so many ns after its stamp.
+
+        The cost is the vibration that each ns of that leaves, as a share of the step.
+        """
+        self._recent.append((late, cost))
+        if late > tolerance:
+            self.count += 1
+            self.largest = max(self.largest, late)
+            sent = self._sent.get(joint, {}).get(stamp)
+            if sent is not None:
+                self._late.append((late, stamp - sent))
+        elif late < -tolerance:
+            self.earliest = max(self.earliest, -late)
+
+    def missed(self, late: int) -> None:
+        """Count a command that is sent so many ns late, or not at all for that."""
+        self.count += 1
+        self.largest = max(self.largest, late)
+        self._missed = True
+
+    # -- what is expected ----------------------------------------------------------------------
+
+    def _known(self) -> list[int]:
+        late = [x for x, _ in self._recent]
+        if self.known and 2 * min(late) > max(late):
+            return sorted(late)
+        # Until more is known, what is late is an exception.
+        return sorted(late + [0] * (_TRUSTED - len(late)))
+
+    @property
+    def known(self) -> bool:
+        """Whether there is news of enough commands to expect something."""
+        return len(self._recent) >= _ENOUGH
+
+    @property
+    def expected(self) -> int:
+        """How late, in ns, the next commands are expected to be."""
+        known = self._known()
+        return known[(len(known) - 1) // 2]
+
+    def scenarios(self, count: int, most: int) -> NDArray[np.int64]:
+        """Return how late commands to come may be, in ns; shape (at most `most`, count)."""
+        known = np.array(self._known(), dtype=np.int64)
+        if most == 1 or known[0] == known[-1]:
+            return np.full((1, count), self.expected)
+        alike = [known[int(x * len(known))] for x in _SHARES]
+        chance = np.random.default_rng(0).choice(known, (most, count))
+        chance[:len(alike)] = np.array(alike[:most])[:, None]
+        return chance
+
+    # -- words ---------------------------------------------------------------------------------
+
+    @property
+    def cost(self) -> float:
+        """Vibration that the last commands left, not being alike late, as a share of the step."""
+        alike = self.expected
+        return min(max((abs(late - alike) * x for late, x in self._recent), default=0.0), 1.0)
+
+    @property
+    def harms(self) -> bool:
+        """Whether late commands leave vibration; those do not that are all alike."""
+        return self._missed or self.count > 0 and self.cost >= _NOTHING
+
+    def _by_driver(self) -> bool | None:
+        """Return whether the driver delays the last commands; None if that cannot be told."""
+        if self._late and self._late[-1][1] < 0:
+            # They were sent too late.
+            return False
+        if len(self._late) < _ENOUGH:
+            return None
+        late = [x for x, _ in self._late]
+        under_way = [x + ahead for x, ahead in self._late]
+        spread, explained = max(late) - min(late), max(under_way) - min(under_way)
+        if spread < _CONSTANT * explained:
+            return True
+        return False if explained < _CONSTANT * spread else None
+
+    def words(self) -> str:
+        """Return what happens to commands, as the first half of a sentence."""
+        if self.largest:
+            said = f'commands take effect up to {self.largest / 1e6:.3g} ms late'
+        elif self.earliest:
+            said = f'commands take effect up to {self.earliest / 1e6:.3g} ms early'
+        else:
+            return 'commands are lost, or overridden by somebody else'
+        if self.cost < _NOTHING:
+            return f'{said}, all alike, which leaves no vibration'
+        return f'{said}: some {100.0 * self.cost:.2g} % of the step of residual vibration'
+
+    def advice(self, lead_time: int) -> str:
+        """Return what helps, the rest of a sentence; commands are sent `lead_time` ns ahead."""
+        if not self.largest:
+            return 'let the driver apply commands at their stamps' if self.earliest else (
+                'see who else publishes commands, or what drops them')
+        by_driver = self._by_driver()
+        if by_driver:
+            return (
+                'the driver applies them so long after their stamps however early they are sent, '
+                'so a larger lead_time does not help: ' + (
+                    'nothing needs to be done, but it may write that much earlier'
+                    if self.cost < _NOTHING else 'have it write at more even times'))
+        needed = (lead_time + self.largest) / NANOSECONDS
+        return f'raise lead_time to more than {needed:.3g} s' + (
+            ', unless the driver itself is that slow' if by_driver is None else '')

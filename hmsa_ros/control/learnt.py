@@ -1,0 +1,103 @@
+"""What was learnt of an actuator: as a model to plan with, and as a parameter file."""
+
+from collections.abc import Mapping
+from datetime import datetime
+import math
+from pathlib import Path
+
+import numpy as np
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.estimation import Estimate
+from hmsa_ros.files import write_text
+from hmsa_ros.identification.files import known_lines, yaml_text
+from hmsa_ros.identification.known import Known
+from hmsa_ros.identification.quantities import derivative, QUANTITIES, values_of
+from hmsa_ros.interfaces.actuator import parameters_of
+from hmsa_ros.model.simulation import check_stretch
+from hmsa_ros.planning.timeline import Model
+
+# A model is another one from this share of a parameter, and this many of its deviations, on.
+_NEWS, _SURE = 1e-3, 0.5
+# Parameters of planner and plant besides those of the block.
+_OTHERS = ('coil_time_constant', 'stretch_bias', 'stretch_gain')
+
+
+def learnt_model(model: Model, estimate: Estimate, held: float) -> Model:
+    """Return a model with an estimate's parameters; as it is if that cannot hold a stretch."""
+    try:
+        found = estimate.model(model.options)
+        check_stretch(held, found.material, 'stretch')
+    except BadInputError:
+        return model
+    return found
+
+
+def differs(model: Model, estimate: Estimate) -> bool:
+    """Return whether an estimate is known to be of another actuator than a model."""
+    for key in estimate.free:
+        value = estimate.values[key]
+        before = model.options.coil_time_constant if key == 'coil_time_constant' else getattr(
+            model.actuator, key, value)
+        if abs(value - before) > max(_NEWS * abs(value), _SURE * estimate.deviations[key]):
+            return True
+    return False
+
+
+def alike(model: Model, other: Model) -> bool:
+    """Return whether two models are of the same actuator but for what is no news."""
+    one, two = (
+        values_of(x.actuator, {'coil_time_constant': x.options.coil_time_constant})
+        for x in (model, other))
+    return all(
+        math.isclose(one[x], two[x], rel_tol=_NEWS) if isinstance(one[x], float)
+        else one[x] == two[x] for x in one)
+
+
+def known_of(estimate: Estimate) -> Known:
+    """Return how well an estimate knows parameters."""
+    count = len(estimate.free)
+    values = tuple(estimate.values[x] for x in estimate.free)
+    scale = np.array([derivative(x, y) for x, y in zip(estimate.free, values, strict=True)])
+    return Known(
+        estimate.free, values,
+        np.outer(scale, scale) * estimate.covariance[:count, :count])
+
+
+def file_text(estimates: Mapping[str, Estimate], now: datetime) -> str:
+    """Return a parameter file with what was learnt by joint; '' names all joints."""
+    lines = [
+        f'# What feedback learnt of an actuator until {now.isoformat(" ", "seconds")}.',
+        '# Planner and plant take it after their own parameter file.',
+        '/**:', '  ros__parameters:']
+    for joint, estimate in estimates.items():
+        prefix = f'{joint}.' if joint else ''
+        given = parameters_of(estimate.actuator) | {
+            x: estimate.values[x] for x in _OTHERS if x in estimate.free}
+        for key, value in given.items():
+            name = key.rpartition('.')[2]
+            note = f'  # standard deviation {estimate.deviations[name]:.3g} ' \
+                f'{QUANTITIES[name].unit}'.rstrip() if name in estimate.free else ''
+            lines.append(f'    {prefix}{key}: {yaml_text(value)}{note}')
+        lines += known_lines(known_of(estimate), prefix)
+    return '\n'.join(lines) + '\n'
+
+
+def save(file: str, estimates: Mapping[str, Estimate | None], *, by_joint: bool) -> str:
+    """
+    Write what was learnt by joint, and say so.
+
+    Raises `BadInputError` if nothing was learnt yet, or it cannot be written.
+    """
+    if not file:
+        raise BadInputError('parameter feedback_file is empty: expected the file to write to')
+    found: dict[str, Estimate] = {}
+    for name, estimate in estimates.items():
+        if estimate is None or not estimate.trusted:
+            why = 'no samples yet' if estimate is None else estimate.trouble
+            raise BadInputError(
+                f'what was learnt of joint {name} is not saved: {why}; expected samples on '
+                'joint_states that fit')
+        found[name if by_joint else ''] = estimate
+    write_text(Path(file), file_text(found, datetime.now()))
+    return f'saved what was learnt to {file}'

@@ -1,0 +1,405 @@
+"""
+A planner at work: requests and what really happened in, commands and verdicts out.
+
+Knows no ROS. Whoever drives it calls `PlannerRuntime.tick` with the time of its clock often
+enough, at the latest when `PlannerRuntime.wake` says so, and passes on what that returns: a node
+to topics, a loop that has the coil at hand to the coil.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+import math
+from time import monotonic_ns
+
+from hmsa_ros.control.bulletin import Bulletin, LOOK
+from hmsa_ros.control.checks import check_joints, check_ready
+from hmsa_ros.control.corrections import Corrections
+from hmsa_ros.control.feedback import Feedback
+from hmsa_ros.control.following import Following
+from hmsa_ros.control.hearing import Hearing
+from hmsa_ros.control.planning import Planning, SLICE
+from hmsa_ros.control.records import (
+    Output,
+    Request,
+    Settings,
+    Severity,
+    Stop,
+    Trajectory,
+    Verdict,
+)
+from hmsa_ros.control.sending import Sending
+from hmsa_ros.control.slices import Clock, work_on
+from hmsa_ros.control.takeover import Seen, Takeover
+from hmsa_ros.control.watching import Watch
+from hmsa_ros.model.status import RefusedError
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.planning.group import PlannerGroup
+from hmsa_ros.planning.timeline import Model
+
+# Clock jumps nearer to each other than this make one verdict.
+_STORM = NANOSECONDS
+_WAITING = Verdict(
+    Severity.OK, 'waiting', 'accepted: starts as soon as the current state is known')
+
+
+class PlannerRuntime:
+    """
+    Plans requests in slices, sends commands in time and follows their effects.
+
+    Two clocks return ns: `clock` the time of the stamps and of `tick`, `steady` the one that
+    timeouts and the length of a slice are measured by. `observable` returns whether somebody may
+    give samples, and `unheard` why nobody carries out commands (empty where somebody does): the
+    first request waits for both. `glance` returns the newest samples by joint, if there are new
+    ones: later requests are held against them.
+    """
+
+    def __init__(
+            self, group: PlannerGroup, settings: Settings, *, clock: Clock,
+            steady: Clock = monotonic_ns,
+            observable: Callable[[], bool] = lambda: True,
+            unheard: Callable[[], str] = str,
+            glance: Callable[[], Iterable[tuple[str, Seen]]] = tuple) -> None:
+        self.group = group
+        self.settings = settings
+        self.active = False
+        #: That several plants carry out the commands, which is refused; empty otherwise.
+        self.crowded = ''
+        #: Returns whether one clock tells the times of all nodes, as simulated time does.
+        self.one_clock: Callable[[], bool] = bool
+        self.following = Following(group)
+        self.clock_jumps = 0
+        self._clock, self._steady, self._observable = clock, steady, observable
+        self._glance = glance
+        self._takeover = Takeover(group, clock, steady, observable, unheard)
+        self._watch = Watch(group, steady, clock)
+        self.hearing = Hearing(group, self.following, self._takeover, clock, steady)
+        self._bulletin = Bulletin(
+            group, self.following, self._watch, clock, steady,
+            lambda: unheard() or self.hearing.receipts.words)
+        self.sending = Sending(
+            group, self.following, self.hearing.receipts, self._bulletin.outputs)
+        self.feedback = Feedback(group, settings, self._bulletin.outputs, clock)
+        self._watch.sensor = self.feedback.sensor
+        self.planning = Planning(
+            group, self.following, Corrections(group, self.feedback, clock), self._bulletin,
+            clock, steady, lambda: self.sending.send(clock()))
+        self._last_jump: int | None = None
+        self._set_back = 0
+
+    # -- in ------------------------------------------------------------------------------------
+
+    def request(self, request: Request) -> Verdict:
+        """
+        Take a request, and work it out at once as far as a slice goes.
+
+        One that replaces everything from now on is planned before those that wait, and they are
+        dropped if it can be carried out. The verdict is ``waiting`` if it is not this request's
+        yet.
+        """
+        try:
+            check_ready(self._clock(), active=self.active, crowded=self.crowded)
+            check_joints(request, tuple(self.group.planners), self.settings)
+            if not isinstance(request, Stop):
+                self.hearing.check_clocks()
+        except RefusedError as error:
+            return self.planning.refuse(error, request)
+        self._begin_anew()
+        self._check(request)
+        if not isinstance(request, Stop):
+            self.following.asked(
+                request.joints if isinstance(request, Trajectory) else [request.joint])
+        work = self.planning.add(request, engaged=self._takeover.engaged)
+        self._engage(begin=True)
+        sure = self._work_on()
+        while sure and work in self.planning and not isinstance(request, Trajectory):
+            # Short work, which whoever asks wants to be done.
+            sure = self._work_on()
+        if self._set_back:
+            # While it was planned, for times that are not to come.
+            return self.request(request)
+        return _WAITING if work in self.planning else self._bulletin.verdict
+
+    def _check(self, request: Request) -> None:
+        """Have joints looked at that are to move now; to stop nothing is waited for."""
+        self.hearing.until = None
+        if isinstance(request, Stop) or not self._takeover.engaged:
+            return
+        names = request.joints if isinstance(request, Trajectory) else (request.joint,)
+        later = isinstance(request, Trajectory) and request.stamp is not None
+        now = self._clock()
+        self._look_at_samples()
+        self._takeover.check(
+            x for x in names if not (later and self.group.planners[x].moves(now)))
+
+    def _look_at_samples(self) -> None:
+        for joint, seen in self._glance():
+            self._takeover.observe(joint, seen)
+
+    def received(
+            self, joint: str, time: int, command: int, *, cut_off: bool) -> None:
+        """
+        Take in a receipt: by its time in ns a device has received a command of a stamp.
+
+        A device that was cut off refuses commands of before.
+        """
+        self.following.seen(time)
+        self.hearing.receipts.received(
+            joint, time, command, self._clock(), comparable=not self.one_clock())
+        self.cut_off(joint, in_force=cut_off)
+
+    def cut_off(self, joint: str, *, in_force: bool) -> None:
+        """Take in whether a joint's device was cut off and refuses commands of before."""
+        verdict = self.hearing.cut_off(joint, self.settings, in_force=in_force)
+        if verdict is not None:
+            self._bulletin.show()
+            self._bulletin.give(replace(verdict, request=self._bulletin.verdict.request), log=True)
+        if in_force and self.active and self.hearing.may_acknowledge(joint):
+            self.sending.acknowledge(joint, self._clock())
+
+    def applied(self, joint: str, stamp: int, flux_density: float) -> None:
+        """Take in that a joint's level in T has really been in force from a stamp in ns on."""
+        if not math.isfinite(flux_density):
+            # Nobody knows what is in force.
+            return
+        self.feedback.applied(joint, stamp, flux_density)
+        if self._takeover.engaged:
+            self._bulletin.outputs += self.following.applied(
+                joint, stamp, flux_density, self.settings, self._clock())
+        else:
+            self.following.newest[joint] = stamp, flux_density
+
+    def observed(
+            self, joint: str, stamp: int, stretch: float, rate: float,
+            flux_density: float) -> None:
+        """Take in a sample: stamp in ns, stretch, rate in 1/s and flux density in T."""
+        if self._takeover.waiting or not self._takeover.engaged:
+            self._takeover.observe(joint, Seen(
+                stamp, stretch, rate, flux_density,
+                None if self.one_clock() else self._clock() - stamp))
+        self._watch.add(joint, stamp, stretch)
+        if self.feedback.looks_at(stamp):
+            self.feedback.add(joint, stamp, stretch, flux_density)
+
+    def clock_set_back(self, back: int) -> None:
+        """
+        Take in that the clock was set back by some ns: the state in force is read again.
+
+        The clock may find this out when it is read in the middle of planning, so the plans are
+        dropped when that is done.
+        """
+        self.clock_jumps += 1
+        self._set_back = max(self._set_back, back)
+
+    def _begin_anew(self) -> None:
+        """Drop the plans if the clock was set back, and report it."""
+        back, self._set_back = self._set_back, 0
+        if not back:
+            return
+        self.group.restart()
+        self.following.restart()
+        self.planning.clear()
+        self._watch.restart()
+        self.feedback.restart()
+        self.hearing.receipts.clock_set_back()
+        self._takeover.drop()
+        self._takeover.engaged = False
+        last, self._last_jump = self._last_jump, self._steady()
+        if last is not None and self._last_jump - last < _STORM:
+            return
+        self._bulletin.give(Verdict(
+            Severity.WARN, 'clock_jumped',
+            f'the clock jumped back by {back / NANOSECONDS:.3f} s: the plan is dropped, and the '
+            'actuator is assumed where it began, at initial_stretch, unless joint_states shows '
+            'otherwise'),
+            log=True)
+
+    def deactivate(self) -> None:
+        """Come to rest, for which all commands are sent now, and take no more requests."""
+        self._begin_anew()
+        self.active = False
+        # What is seen before the joints have come to rest is not where they are later.
+        self._takeover.drop()
+        self.planning.clear()
+        now = self._clock()
+        if self._takeover.engaged and now:
+            work = work_on(Stop(), self.group, self._clock)
+            while not self.planning.advance(work):
+                pass
+            self.planning.clear()
+            self.sending.send(now, everything=True)
+            self._watch.restart()
+            self._bulletin.give(Verdict(Severity.OK, 'stopped', 'deactivated: coming to rest'))
+        self._takeover.engaged = False
+
+    def change(
+            self, settings: Settings, models: Mapping[str, Model], *,
+            simultaneous: bool) -> None:
+        """Take other settings now, and other models by joint from the next request on."""
+        if settings.heartbeat_period != self.settings.heartbeat_period:
+            self.sending.next_beat = self._clock() + settings.heartbeat_period
+        self.settings = settings
+        for name, model in self.feedback.change(settings, models).items():
+            self.group.planners[name].take_model(model)
+        self.group.simultaneous = simultaneous
+
+    # -- out -----------------------------------------------------------------------------------
+
+    @property
+    def wants_samples(self) -> bool:
+        """Whether samples are waited for now, or will be of use soon."""
+        return self._takeover.waiting or self.active and (
+            self._watch.open or self.feedback.on)
+
+    def looks_at(self, stamp: int) -> bool:
+        """Return whether a sample with a stamp in ns is of use; most are not."""
+        self.following.seen(stamp)
+        return (self._takeover.waiting or self._watch.wants(stamp)
+                or self.feedback.looks_at(stamp))
+
+    @property
+    def wake(self) -> int | None:
+        """Time in ns at which there is something to do next; None for never, 0 for now."""
+        if (self._set_back or self.planning or self._takeover.waiting
+                or self._bulletin.outputs):
+            return 0
+        if not self._takeover.engaged:
+            return None
+        now = self._clock()
+        times = [
+            None if self.hearing.deaf else self.group.next_command(),
+            self._bulletin.next_change, self._bulletin.preview_again, self._watch.wake(now),
+            self.feedback.wake]
+        if self.settings.heartbeat_period:
+            times.append(self.sending.next_beat)
+        if self.following.astray or self.following.verdicts:
+            times.append(0)
+        if self.hearing.receipts:
+            times.append(now + LOOK)
+        return min((x for x in times if x is not None), default=None)
+
+    def send(self, now: int) -> list[Output]:
+        """Return the commands that are due at a time in ns: of `tick`, what cannot wait."""
+        self._begin_anew()
+        self._send(now)
+        return self._taken()
+
+    def tick(self, now: int) -> list[Output]:
+        """Do what is due at a time in ns, for some ms at most; return what to pass on."""
+        self._begin_anew()
+        self._engage()
+        if self._send(now):
+            self.feedback.update(now)
+        self._work_on()
+        if self._bulletin.preview_again is not None and now >= self._bulletin.preview_again:
+            self._bulletin.show()
+        self._bulletin.tell_progress(now)
+        if self.active and (self._watch.open or self._bulletin.unheard or self.hearing.receipts
+                            or self._bulletin.next_change is not None):
+            self._bulletin.look_for_listeners()
+            self._judge(now)
+        self._begin_anew()
+        return self._taken()
+
+    def _send(self, now: int) -> bool:
+        """Send what is due, if commands are sent at all."""
+        if not (self._takeover.engaged and self.active):
+            return False
+        self.hearing.look()
+        if self.settings.replan_late:
+            self._bulletin.outputs += self.following.drop_missed(
+                now, self.settings.lateness_tolerance, self.hearing.receipts.silent)
+        if self.following.astray:
+            # Before more of a plan is sent that does not hold.
+            self._work_on()
+        self.sending.send(now)
+        self.sending.beat(now, self.settings, self.hearing.cut)
+        return True
+
+    def _taken(self) -> list[Output]:
+        outputs = self._bulletin.outputs.copy()
+        self._bulletin.outputs.clear()
+        return outputs
+
+    def _engage(self, *, begin: bool = False) -> None:
+        """Go on from where the joints are, as soon as that is known."""
+        engaged = self._takeover.engaged
+        if begin:
+            self._takeover.begin(self.settings)
+        if self._takeover.waiting:
+            self._look_at_samples()
+        try:
+            notes = self._takeover.go_on(self.settings, self.following.newest)
+        except RefusedError as error:
+            self._takeover.drop()
+            self.planning.refuse_all(error)
+            return
+        for note in notes:
+            self._bulletin.note(note)
+        if self._takeover.engaged and not engaged:
+            self.sending.next_beat = self._clock() + self.settings.heartbeat_period
+
+    def _work_on(self) -> bool:
+        """Plan what waits, if it is known where the joints are; return whether it is."""
+        if not self._takeover.engaged or not self._sure():
+            return False
+        self.planning.work_on()
+        return True
+
+    def _sure(self) -> bool:
+        """Return whether joints are where they are predicted, or seen, as far as that matters."""
+        requests = self.planning.requests
+        if not requests and not self.following.astray:
+            return True
+        if any(not isinstance(x, Stop) for x in requests) or not requests:
+            if self.hearing.holds(self.settings):
+                return False
+            self._look_at_samples()
+            try:
+                notes = self._takeover.look(
+                    self.settings, self.following.newest, self.feedback.follows,
+                    keep=not requests)
+            except RefusedError as error:
+                self.planning.refuse_all(error)
+                return not requests
+            if notes is None:
+                return False
+            for note in notes:
+                self._bulletin.note(note)
+        return True
+
+    def _judge(self, now: int) -> None:
+        """Judge arrivals by what was measured."""
+        if not self._watch.open:
+            return
+        found, end = [], self._steady() + SLICE
+        observable = self._observable()
+        while self._steady() < end:
+            finding = self._watch.judge(now, self.settings.tolerances, observable=observable)
+            if finding is None:
+                break
+            found.append(finding)
+        if found or not self._watch.open:
+            self._bulletin.found(found)
+
+    def report(self) -> tuple[Severity, str, dict[str, object]]:
+        """Return how commands fare: severity, a sentence and counters."""
+        late, severity, message = self.following.lateness, Severity.OK, 'commands sent in time'
+        offset, limit = self.hearing.offset, self.hearing.limit()
+        if late.count:
+            severity = Severity.WARN if late.harms or self.following.clocks() else Severity.OK
+            message = f'{late.count} commands late: {self.following.advice}'
+        elif offset is not None and offset.beyond(limit):
+            severity, message = Severity.WARN, offset.words
+        if self.hearing.receipts.words:
+            severity, message = Severity.ERROR, self.hearing.receipts.words
+        note = self.hearing.clocks_changed(limit)
+        if note:
+            self._bulletin.note(note)
+        values: dict[str, object] = {} if offset is None else {
+            'clock_offset_ms': f'{offset.ahead / 1e6:.3f}',
+            'clock_offset_error_ms': f'{offset.error / 1e6:.3f}'}
+        return severity, message, {
+            'sent': self.sending.sent, 'late': late.count, 'replanned': self.following.replanned,
+            'heartbeats': self.sending.heartbeats,
+            'largest_lateness_ms': f'{late.largest / 1e6:.3f}',
+            'refused': self.planning.refused, 'clock_jumps': self.clock_jumps, **values}

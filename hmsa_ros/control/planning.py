@@ -1,0 +1,184 @@
+"""Requests that wait to be planned, and what comes of planning them."""
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+from hmsa_ros.control.bulletin import Bulletin
+from hmsa_ros.control.corrections import Corrections
+from hmsa_ros.control.following import Following
+from hmsa_ros.control.records import Note, Request, Severity, Stop, Verdict
+from hmsa_ros.control.slices import Clock, Work, work_on
+from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.model.status import Code, RefusedError
+from hmsa_ros.planning.group import PlannerGroup
+from hmsa_ros.planning.timeline import Draft
+
+#: How long planning goes on before commands and requests are served again, in ns.
+SLICE = 4_000_000
+# Levels and setpoints of replaced plans that are freed at a time.
+_FREED = 2_000
+
+
+class Planning:
+    """Plans what waits in slices, and answers."""
+
+    def __init__(
+            self, group: PlannerGroup, following: Following, corrections: Corrections,
+            bulletin: Bulletin, clock: Clock, steady: Clock, send: Callable[[], None]) -> None:
+        self._group, self._following, self._bulletin = group, following, bulletin
+        self._corrections = corrections
+        self._clock, self._steady, self._send = clock, steady, send
+        self._queue: deque[Work] = deque()
+        # What plans that were replaced consist of: to free it all at once takes tens of ms.
+        self._leftovers: list[object] = []
+        self.refused = 0
+
+    def __bool__(self) -> bool:
+        return bool(self._queue or self._leftovers)
+
+    @property
+    def requests(self) -> list[Request]:
+        """What was asked for and is not answered yet."""
+        return [x.request for x in self._queue if x.request is not None]
+
+    def refuse_all(self, error: HmsaError) -> None:
+        """Answer all that waits by the same refusal."""
+        for work in list(self._queue):
+            if work.request is not None:
+                self._queue.remove(work)
+                self.refuse(error, work.request)
+
+    def __contains__(self, work: Work) -> bool:
+        return work in self._queue
+
+    def clear(self) -> None:
+        """Drop what waits."""
+        self._queue.clear()
+        self._leftovers.clear()
+
+    def add(self, request: Request, *, engaged: bool) -> Work:
+        """Take a checked request; one that replaces all that waits comes first once engaged."""
+        work = work_on(request, self._group, self._clock)
+        if engaged and work.replaces(self._queue):
+            self._queue.appendleft(work)
+        else:
+            self._queue.append(work)
+        return work
+
+    def _supersede(self, work: Work) -> None:
+        """Drop what came before and would be replaced as soon as it is planned."""
+        for old in list(self._queue):
+            if old.number < work.number and old.joints <= work.joints and not work.postponed:
+                self._queue.remove(old)
+                if old.request is not None:
+                    self._bulletin.give(Verdict(
+                        Severity.WARN, 'superseded', 'another request came before this one was '
+                        'planned', old.request.name))
+
+    def work_on(self) -> None:
+        """Plan what waits, for the length of a slice."""
+        for name in self._following.to_resume():
+            if not any(x.request is None and name in x.joints for x in self._queue):
+                self._queue.appendleft(self._following.resumption(name, self._clock))
+        if not self._queue:
+            self._queue += self._corrections.due(self._clock())
+        del self._leftovers[-_FREED:]
+        end = self._steady() + SLICE
+        while self._queue and self._steady() < end:
+            work = self._queue[0]
+            if self.advance(work) and work in self._queue:
+                self._queue.remove(work)
+        while self._following.verdicts:
+            self._bulletin.give(replace(
+                self._following.verdicts.pop(0), request=self._bulletin.verdict.request))
+
+    def advance(self, work: Work) -> bool:
+        """Go on with one piece of work; say whether it is done."""
+        planners = [self._group.planners[x] for x in work.joints]
+        plans = [x.plan for x in planners]
+        try:
+            next(work.steps)
+        except StopIteration as end:
+            drafts, now = end.value
+            if work.corrects:
+                self._correct(drafts, now)
+            elif work.request is None:
+                self._resume(work, drafts, now)
+            else:
+                self._supersede(work)
+                self._answer(work.request, drafts, now)
+        except HmsaError as error:
+            if work.corrects:
+                self._bulletin.note(f'plan not corrected: {error}')
+            elif work.request is None:
+                self._bulletin.give(
+                    self._following.abandon(work, error, self._bulletin.verdict.request),
+                    log=True)
+            else:
+                self.refuse(error, work.request)
+        else:
+            return False
+        for planner, plan in zip(planners, plans, strict=True):
+            if planner.plan is not plan:
+                self._leftovers += plan.levels
+                self._leftovers += plan.segments
+        return True
+
+    def _answer(self, request: Request, drafts: Mapping[str, Draft], now: int) -> None:
+        """Begin to carry out a request."""
+        self._following.dropped(drafts)
+        if not isinstance(request, Stop):
+            drafts = self._corrections.cautious(drafts)
+        changed = self._group.take(drafts, now)
+        # First, since reporting takes time.
+        self._send()
+        warnings = [x.warning for x in drafts.values() if x.warning is not None]
+        if changed:
+            self._bulletin.show()
+        self._bulletin.look_for_listeners()
+        if warnings:
+            self._bulletin.give(Verdict(
+                Severity.WARN, str(warnings[0].code), warnings[0].reason, request.name), log=True)
+        elif changed:
+            self._bulletin.give(Verdict(
+                Severity.OK, 'accepted', _accepted(drafts), request.name))
+        else:
+            self._bulletin.give(Verdict(
+                Severity.OK, 'unchanged', 'already on the way there: the plan is unchanged',
+                request.name))
+
+    def refuse(self, error: HmsaError, request: Request) -> Verdict:
+        """Answer a request that cannot be read or carried out."""
+        code = Code.BAD_INPUT if isinstance(error, BadInputError) else Code.NOT_CONVERGED
+        if isinstance(error, RefusedError):
+            code = error.code
+        self.refused += 1
+        self._bulletin.give(Verdict(Severity.ERROR, str(code), str(error), request.name))
+        self._bulletin.outputs.append(Note(Severity.ERROR, f'request refused ({code}): {error}'))
+        return self._bulletin.verdict
+
+    def _resume(self, work: Work, drafts: Mapping[str, Draft], now: int) -> None:
+        """Go on with a plan that was made anew."""
+        verdict = self._following.resume(work, drafts, now, self._bulletin.verdict.request)
+        self._send()
+        if verdict is not None:
+            self._bulletin.show()
+            self._bulletin.give(verdict, log=self._following.tell_replanned())
+
+    def _correct(self, drafts: Mapping[str, Draft], now: int) -> None:
+        """Go on with a plan that was corrected from samples."""
+        verdict = self._corrections.take(drafts, now, self._bulletin.verdict.request)
+        self._send()
+        if verdict is not None:
+            self._bulletin.corrected(drafts)
+            self._bulletin.show()
+            self._bulletin.give(verdict)
+
+
+def _accepted(drafts: Mapping[str, Draft]) -> str:
+    """Return in words that drafts are taken, and what following creep leaves."""
+    left = max((x.vibration for draft in drafts.values() for x in draft.segments), default=0.0)
+    if left == 0.0:
+        return 'accepted'
+    return f'accepted; levels that follow creep leave a vibration of up to {left:.1e}'

@@ -1,0 +1,112 @@
+"""Requests that are planned in slices, so that commands and requests are served in between."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from itertools import count
+
+from hmsa_ros.control.records import Request, Target, Trajectory
+from hmsa_ros.planning.drafting import Steps
+from hmsa_ros.planning.group import PlannerGroup
+from hmsa_ros.planning.timeline import Draft
+
+#: Tells the time of the stamps in ns.
+Clock = Callable[[], int]
+# Points of a trajectory that are read between two pauses.
+_READ = 100
+# How much longer than estimated or measured planning may take the next time.
+_MARGIN = 3
+
+
+@dataclass(eq=False)
+class Work:
+    """A request, or a plan to be made anew, that is being worked out."""
+
+    joints: frozenset[str]  # whose plans it changes
+    # Pause after each bounded piece; return drafts by joint and the time in ns they are for.
+    steps: Steps[tuple[Mapping[str, Draft], int]]
+    request: Request | None = None  # None for a plan that is made anew
+    number: int = field(default_factory=count().__next__)  # grows from one to the next
+    corrects: bool = False  # from samples
+
+    @property
+    def postponed(self) -> bool:
+        """Whether a running plan goes on until a stamp before this one begins."""
+        return isinstance(self.request, Trajectory) and self.request.stamp is not None
+
+    def replaces(self, others: Iterable['Work']) -> bool:
+        """Return whether it makes no difference to its plans that others are planned later."""
+        return not self.postponed and all(
+            x.joints <= self.joints or x.joints.isdisjoint(self.joints) for x in others)
+
+
+def work_on(request: Request, group: PlannerGroup, clock: Clock) -> Work:
+    """Return the work that a request of joints of a group makes."""
+    if isinstance(request, Trajectory):
+        return Work(
+            frozenset(request.joints), _trajectory(request, group, clock), request)
+    if isinstance(request, Target):
+        joints = frozenset([request.joint])
+        steps = in_time(
+            lambda now: group.draft_setpoint(request.joint, request.stretch, now),
+            group, joints, clock)
+        return Work(joints, steps, request)
+    joints = frozenset(group.planners)
+    return Work(joints, in_time(group.draft_stop, group, joints, clock), request)
+
+
+def _trajectory(
+        request: Trajectory, group: PlannerGroup,
+        clock: Clock) -> Steps[tuple[Mapping[str, Draft], int]]:
+    """Read the points, then plan."""
+    points: dict[str, list[tuple[float, int]]] = {name: [] for name in request.joints}
+    for number, (stretches, time) in enumerate(request.points):
+        for name, stretch in zip(request.joints, stretches, strict=True):
+            points[name].append((stretch, time))
+        if number % _READ == _READ - 1:
+            yield
+    return (yield from in_time(
+        lambda now: group.draft_request(points, request.stamp, now, raw=request.raw), group,
+        frozenset(request.joints), clock, request.count * len(request.joints)))
+
+
+def in_time(
+        make: Callable[[int], Steps[Mapping[str, Draft]]], group: PlannerGroup,
+        joints: frozenset[str], clock: Clock,
+        size: int = 1) -> Steps[tuple[Mapping[str, Draft], int]]:
+    """
+    Return drafts, and the time in ns they are for, which has not come yet when they are ready.
+
+    If what is going to happen to the joints changes meanwhile, it begins anew. The size is about
+    how many pauses it makes.
+    """
+    planners = [group.planners[x] for x in sorted(joints)]
+    lead = planners[0].options.lead_time
+    later = 0
+    while True:
+        began = clock()
+        revisions = [x.revision for x in planners]
+        steps = make(began + later)
+        drafts: Mapping[str, Draft] | None = None
+        for done in count(1):
+            try:
+                next(steps)
+            except StopIteration as end:
+                drafts = end.value
+                break
+            spent = clock() - began
+            if 2 * spent > lead + 2 * later and spent * size > (lead + later) * done:
+                # It will not be ready in time.
+                later = max(_MARGIN * spent * size // done, 2 * later)
+                break
+            if revisions != [x.revision for x in planners]:
+                break
+            yield
+        if drafts is None or revisions != [x.revision for x in planners]:
+            yield
+            continue
+        if not drafts:
+            return drafts, began + later
+        spent = clock() - began
+        if min(x.begin for x in drafts.values()) >= began + spent:
+            return drafts, began + later
+        later = max(_MARGIN * spent, later)

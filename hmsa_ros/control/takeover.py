@@ -1,0 +1,273 @@
+"""The state in force, as samples show it before the first command and before later ones."""
+
+from collections.abc import Callable, Iterable, Mapping
+import math
+from typing import NamedTuple
+
+from hmsa_ros.control.records import Settings
+from hmsa_ros.control.slices import Clock
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.status import Code, RefusedError
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.planning.group import PlannerGroup
+from hmsa_ros.planning.planner import Planner
+
+# How long ago, in ns by the steady clock, a sample may have come to show where a joint is.
+_RECENT = 2 * NANOSECONDS
+# Samples that are older, in ns, are not the newest there are.
+_OLDEST = 60 * NANOSECONDS
+# Times that are further apart, in ns, are of clocks that began at different times.
+_ANOTHER_CLOCK = 100_000_000 * NANOSECONDS
+# How far a sample may be off the prediction: a stretch, a share of the way from rest without a
+# field, and a share of the step while the joint moves and after it. A wrong model is off by less.
+_LEAST, _WAY, _MOVING, _ARRIVED = 0.03, 0.5, 0.6, 0.25
+# Units of time after an arrival until which a joint counts as moving.
+_QUIET = 20.0
+
+
+class Seen(NamedTuple):
+    """A sample of a joint."""
+
+    stamp: int  # in ns
+    stretch: float
+    rate: float  # in 1/s
+    flux_density: float  # in T
+    lag: int | None = None  # how old it was when it came, in ns; None where one clock tells both
+    came: int = 0  # when it came, in ns by the steady clock
+
+
+class Takeover:
+    """
+    Waits for samples of where the joints are before the first request, and goes on from there.
+
+    `clock` returns the time of the stamps in ns, `steady` one that timeouts are measured by,
+    `observable` whether somebody may give samples, and `unheard` why nobody carries out commands.
+    """
+
+    def __init__(
+            self, group: PlannerGroup, clock: Clock, steady: Clock,
+            observable: Callable[[], bool], unheard: Callable[[], str]) -> None:
+        self._group, self._clock, self._steady = group, clock, steady
+        self._observable, self._unheard = observable, unheard
+        #: Returns how old in ns what a device says of itself is when it comes; None if unknown.
+        self.lag: Callable[[str], int | None] = lambda joint: None
+        self._until: int | None = None
+        # Whether it is known where the joints are, or they are taken to rest.
+        self.engaged = False
+        # The newest sample of each joint.
+        self._samples: dict[str, Seen] = {}
+        # Joints to look at before they are planned for, and those that are not where predicted.
+        self._unsure: set[str] = set()
+        self._doubted: set[str] = set()
+        self._look_until: int | None = None
+
+    @property
+    def waiting(self) -> bool:
+        """Whether samples are waited for."""
+        return self._until is not None or self._look_until is not None
+
+    def begin(self, settings: Settings) -> None:
+        """Wait for samples, if there is somebody to give them or nobody is found yet at all."""
+        if self.engaged or self._until is not None:
+            return
+        if settings.takeover_timeout and (self._observable() or self._unheard()):
+            self._until = self._steady() + settings.takeover_timeout
+        else:
+            self.engaged = True
+
+    def observe(self, joint: str, seen: Seen) -> None:
+        """Take in a sample; one of another joint, with a gap or out of order does not count."""
+        if joint not in self._group.planners or not math.isfinite(
+                seen.stretch + seen.rate + seen.flux_density):
+            return
+        last, steady = self._samples.get(joint), self._steady()
+        if last is None or seen.stamp >= last.stamp or steady - last.came > _RECENT:
+            self._samples[joint] = seen._replace(came=steady)
+
+    def drop(self) -> None:
+        """Wait for nothing, and forget the samples."""
+        self._until = self._look_until = None
+        self._samples.clear()
+        self._unsure.clear()
+        self._doubted.clear()
+
+    def go_on(
+            self, settings: Settings, newest: Mapping[str, tuple[int, float]]) -> list[str]:
+        """
+        Go on from the samples there are, once there is nothing more to wait for.
+
+        The newest change of each joint has its stamp in ns and its level in T. Returned is in a
+        sentence each why samples do not count. Samples of another clock are a `RefusedError`.
+        """
+        if self._until is None:
+            return []
+        now = self._clock()
+        samples = {
+            name: x for name, x in self._samples.items()
+            if abs(now - x.stamp) <= settings.takeover_max_age}
+        over = self._steady() > self._until
+        for name, seen in self._samples.items():
+            if name in samples:
+                self._check_ahead(name, seen)
+            elif (over and seen.came >= self._until - settings.takeover_timeout
+                  or abs(now - seen.stamp) > _ANOTHER_CLOCK):
+                self._check_age(name, seen, settings)
+                # Old indeed, and still the newest there is.
+                samples[name] = seen
+        if not over and (len(samples) < len(self._group.planners) or self._unheard()):
+            return []
+        self._until, self.engaged = None, True
+        observable = self._observable()
+        notes = []
+        for name in self._group.planners:
+            if name in samples:
+                notes += self._take(name, samples[name], newest)
+            elif observable:
+                notes.append(
+                    f'no sample of joint {name} on joint_states: it is assumed at rest where '
+                    'it began (initial_stretch)')
+        return notes
+
+    def _take(
+            self, name: str, seen: Seen, newest: Mapping[str, tuple[int, float]], *,
+            keep: bool = False) -> list[str]:
+        """Have a joint go on from a sample, with its setpoints if they are kept."""
+        level = newest.get(name)
+        try:
+            self._group.planners[name].take_over(
+                seen.stamp, seen.stretch, seen.rate, seen.flux_density,
+                level[1] if level is not None and level[0] <= seen.stamp else None, keep=keep)
+        except BadInputError as error:
+            return [f'sample of joint {name} ignored: {error}']
+        return []
+
+    # -- clocks --------------------------------------------------------------------------------
+
+    def _check_age(self, name: str, seen: Seen, settings: Settings) -> None:
+        """Refuse a sample that is older or newer than it can be by our clock."""
+        if seen.lag is None and abs(self._clock() - seen.stamp) <= _ANOTHER_CLOCK:
+            return
+        lag = self._clock() - seen.stamp if seen.lag is None else seen.lag
+        known, most = self.lag(name), settings.takeover_max_age
+        agrees = known is not None and abs(known) <= most
+        if abs(lag) <= most or 0 < lag <= _OLDEST and agrees:
+            # In time, or the clocks agree and it is the sample that is late.
+            return
+        raise RefusedError(
+            Code.CLOCKS_DIFFER,
+            f'samples of joint {name} come {abs(lag) / NANOSECONDS:.3f} s '
+            f'{"after" if lag > 0 else "before"} their stamps, by the clock of the planner: '
+            f'expected at most {settings.takeover_max_age / NANOSECONDS:g} s (takeover_max_age). '
+            + ('One side has simulated time, or time since a start: set use_sim_time alike'
+               if abs(lag) > _ANOTHER_CLOCK else
+               'The clocks differ, or samples are that late: set the clocks of planner, plant and '
+               'sensor by one source, or see what delays samples'))
+
+    def _check_ahead(self, name: str, seen: Seen) -> None:
+        """Refuse to command a device whose clock is so far ahead that all commands are late."""
+        lead = self._group.planners[name].options.lead_time
+        if seen.lag is None or -seen.lag <= lead:
+            return
+        raise RefusedError(
+            Code.CLOCKS_DIFFER,
+            f'samples of joint {name} are stamped {-seen.lag / NANOSECONDS:.3f} s ahead of the '
+            'clock of the planner, more than lead_time, and every command would come too late: '
+            'set the clocks of planner, plant and sensor by one source')
+
+    # -- before later requests -----------------------------------------------------------------
+
+    def check(self, joints: Iterable[str]) -> None:
+        """Hold joints against their samples before they are planned for again."""
+        self._unsure |= {*joints} & self._group.planners.keys()
+
+    def doubt(self, joint: str) -> None:
+        """Plan for a joint from a sample next: it may not be where it is predicted."""
+        self._doubted.add(joint)
+        self._unsure.add(joint)
+
+    def look(
+            self, settings: Settings, newest: Mapping[str, tuple[int, float]],
+            followed: Callable[[str], bool], *, keep: bool) -> list[str] | None:
+        """
+        Return in sentences what samples show of joints that are checked; None to wait for some.
+
+        A joint that feedback has ``followed`` is left to it. One that is not where it is predicted
+        goes on from its sample, with the setpoints ahead if they are kept. Where samples came and
+        do not any more, or are of another clock, it is a `RefusedError`.
+        """
+        notes: list[str] = []
+        for name in sorted(self._unsure):
+            if name not in self._doubted and followed(name):
+                continue
+            seen = self._samples.get(name)
+            if seen is None or not self._observable():
+                # Nobody shows where it is: as predicted.
+                continue
+            if self._steady() - seen.came > _RECENT or (
+                    name in self._doubted and not self._is_new(seen, settings)):
+                if not settings.takeover_timeout:
+                    continue
+                if not self._is_over(name, seen, settings):
+                    return None
+            notes += self._compare(name, seen, settings, newest, keep=keep)
+        self._settle()
+        return notes
+
+    def _is_new(self, seen: Seen, settings: Settings) -> bool:
+        return self._look_until is not None and (
+            seen.came > self._look_until - settings.takeover_timeout)
+
+    def _is_over(self, name: str, seen: Seen, settings: Settings) -> bool:
+        """Wait for another sample; say when that has been vain, or refuse to go on without."""
+        steady = self._steady()
+        if self._look_until is None:
+            self._look_until = steady + settings.takeover_timeout
+        if steady <= self._look_until:
+            return False
+        silence = steady - seen.came
+        self._settle(keep=name)
+        if silence <= _RECENT:
+            return True
+        raise RefusedError(
+            Code.UNSEEN,
+            f'no sample of joint {name} for {silence / NANOSECONDS:.1f} s, though there were '
+            'some and joint_states has a publisher: expected one before the actuator is moved; '
+            'mend the sensor, or end what publishes')
+
+    def _settle(self, keep: str = '') -> None:
+        """Wait for nothing more, and doubt nothing but a joint of which nothing is known."""
+        self._look_until = None
+        self._unsure.clear()
+        self._doubted &= {keep}
+
+    def _compare(
+            self, name: str, seen: Seen, settings: Settings,
+            newest: Mapping[str, tuple[int, float]], *, keep: bool) -> list[str]:
+        """Go on from a sample where the prediction of its time cannot be."""
+        self._check_age(name, seen, settings)
+        self._check_ahead(name, seen)
+        planner = self._group.planners[name]
+        predicted = planner.state(seen.stamp).stretch
+        contradicts = abs(seen.stretch - predicted) > _tolerance(planner, seen.stamp, predicted)
+        if not contradicts and name not in self._doubted:
+            return []
+        notes = self._take(name, seen, newest, keep=keep)
+        if contradicts and not notes:
+            notes.append(
+                f'joint {name} is at {seen.stretch:.4g} on joint_states, where {predicted:.4g} '
+                'was predicted: what comes next is planned from the sample')
+        return notes
+
+
+def _tolerance(planner: Planner, time: int, predicted: float) -> float:
+    """Return how far a stretch may be off what is predicted of a time in ns."""
+    plan, rest = planner.plan, planner.model.actuator.rest
+    found = planner.segment(time)
+    if found is None:
+        return max(_LEAST, _WAY * abs(predicted - rest))
+    place, segment = found
+    before = plan.segments[place - 1].stretch if place else plan.levels[0].stretch
+    quiet = round(_QUIET * planner.model.units.time * NANOSECONDS)
+    arrived = segment.arrival is not None and time > segment.arrival + quiet
+    step = abs(segment.stretch - before)
+    return max(_LEAST, _WAY * abs(predicted - rest), (_ARRIVED if arrived else _MOVING) * step)

@@ -1,0 +1,262 @@
+"""The setpoints of a request as they were requested, and what samples show of each."""
+
+from bisect import bisect_left, insort
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+from hmsa_ros.control.holds import Hold
+from hmsa_ros.control.slices import Clock
+from hmsa_ros.judge import Finding, missed, Sensor, Setpoint, Tolerances, worst
+from hmsa_ros.model.equations import stretch_limits
+from hmsa_ros.model.law import critical_zeta
+from hmsa_ros.planning.group import PlannerGroup
+from hmsa_ros.planning.timeline import Plan, PlannedSegment
+
+# How long ago a sample may have come for samples to be expected, by the steady clock.
+_RECENT = 10_000_000_000
+_LEFT_OUT = 'commands came late, and there was no time left for it'
+_STOPPED = 'the joint came to rest instead'
+
+
+@dataclass
+class _Joint:
+    """The setpoints of a joint as they were requested, and what was found of them."""
+
+    asked: Plan  # as it was accepted
+    plan: Plan  # as it is now
+    request: int  # its number in the group
+    following: int = 0  # number, from 0, of the next setpoint to watch
+    left_out: list[int] = field(default_factory=list)  # numbers that new plans left out
+    holds: list[Hold] = field(default_factory=list)  # the last one stays when it is over
+    news: list[Finding] = field(default_factory=list)  # of setpoints that need no samples
+    corrected: bool = False  # whether the plan that is to come corrects the one in force
+    newest: Finding | None = None
+    closed: Finding | None = None  # the worst of the setpoints that are over
+
+    @property
+    def count(self) -> int:
+        """How many setpoints were requested."""
+        return len(self.asked.segments) - self.asked.kept
+
+    @property
+    def open(self) -> bool:
+        """Whether setpoints that have begun are still to be judged."""
+        return bool(self.news) or any(not x.over for x in self.holds)
+
+    @property
+    def worst(self) -> Finding | None:
+        return worst(x for x in (self.closed, *(y.found for y in self.holds)) if x is not None)
+
+    def close(self, found: Finding | None) -> None:
+        """Take in what was found of a setpoint that is over."""
+        self.closed = worst(x for x in (self.closed, found) if x is not None)
+
+    def segment(self, number: int) -> PlannedSegment | None:
+        """Return a setpoint as it is planned now; None for one that was left out."""
+        place = bisect_left(self.left_out, number)
+        if self.left_out[place:place + 1] == [number]:
+            return None
+        # All plans reach to the last setpoint.
+        back = self.count - number - (len(self.left_out) - place)
+        return self.plan.segments[-back] if back <= len(self.plan.segments) else None
+
+    def leave_out(self, plan: Plan, now: int) -> list[int]:
+        """Go over to a plan that was made anew, and return the numbers that it leaves out."""
+        before, after = self.plan.segments, plan.segments
+        # What is over stays as it is.
+        place = max(self.plan.under_way(now), 0)
+        while place < min(len(before), len(after)) and before[place] is after[place]:
+            place += 1
+        self.plan = plan
+        number = place - (len(before) - self.count + len(self.left_out))
+        for left in self.left_out:
+            number += left <= number
+        gone: list[int] = []
+        while len(gone) < len(before) - len(after) and number < self.count:
+            if number >= 0 and number not in self.left_out:
+                gone.append(number)
+                insort(self.left_out, number)
+            number += 1
+        return gone
+
+
+class Watch:
+    """Looks at samples of each setpoint as it was requested, and judges them."""
+
+    def __init__(self, group: PlannerGroup, steady: Clock, clock: Clock) -> None:
+        self._group, self._steady, self._clock = group, steady, clock
+        #: Returns what is known of the sensor of a joint.
+        self.sensor: Callable[[str], Sensor] = lambda name: Sensor()
+        self._joints: dict[str, _Joint] = {}
+        # Reading a clock for each sample of each joint would take longer than all else.
+        self._now = 0
+        self._heard: int | None = None
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget everything; what is planned by now is not judged."""
+        self._joints = {}
+        for name, planner in self._group.planners.items():
+            plan = planner.plan
+            self._joints[name] = _Joint(
+                replace(plan, kept=len(plan.segments)), plan, self._group.number)
+
+    def _asked(self) -> list[_Joint]:
+        """Return the joints of the newest request."""
+        newest = max(x.request for x in self._joints.values())
+        return [x for x in self._joints.values() if x.request == newest]
+
+    @property
+    def open(self) -> bool:
+        """Whether setpoints that hold have not been judged yet."""
+        return any(x.open for x in self._joints.values())
+
+    @property
+    def finished(self) -> bool:
+        """Whether all setpoints have been judged."""
+        return not self.open and all(x.following >= x.count for x in self._asked())
+
+    @property
+    def measuring(self) -> bool:
+        """Whether samples have come lately."""
+        return self._heard is not None and self._steady() - self._heard < _RECENT
+
+    @property
+    def findings(self) -> dict[str, Finding]:
+        """Return the newest finding of each joint, where there is one."""
+        return {
+            name: x.newest for name, x in self._joints.items() if x.newest is not None}
+
+    @property
+    def worst(self) -> Finding | None:
+        """Return the worst that was found of the newest request."""
+        return worst(x.worst for x in self._asked() if x.worst is not None)
+
+    def wake(self, now: int) -> int | None:
+        """Return when to judge next, a time in ns; None for never, 0 for now."""
+        times = [0 for x in self._joints.values() if x.news]
+        times += [
+            y.wake(now)
+            for x in self._joints.values() for y in x.holds if not y.over]
+        return min(times, default=None)
+
+    # -- setpoints -----------------------------------------------------------------------------
+
+    def corrected(self, name: str) -> None:
+        """Take in that the plan of a joint has been corrected, and not made anew in need."""
+        self._joints[name].corrected = True
+
+    def follow(self, now: int) -> None:
+        """Watch the setpoints that have begun by a time in ns, as they were requested."""
+        for name, planner in self._group.planners.items():
+            joint, plan = self._joints[name], planner.plan
+            if plan.number != joint.plan.number:
+                joint = self._begin(name, joint, plan)
+            elif plan.segments is not joint.plan.segments:
+                self._change(name, joint, plan, now)
+            segments, kept = joint.asked.segments, joint.asked.kept
+            while joint.following < joint.count and (
+                    segments[kept + joint.following].since <= now):
+                self._open(name, joint)
+
+    def _begin(self, name: str, joint: _Joint, plan: Plan) -> _Joint:
+        """Take in a request, or that a joint came to rest in place of the rest of one."""
+        if self._group.number != joint.request:
+            self._joints[name] = begun = _Joint(plan, plan, self._group.number)
+            return begun
+        joint.plan = plan
+        for hold in joint.holds:
+            hold.miss(_STOPPED)
+        joint.news += [
+            missed(self._setpoint(name, joint, x), _STOPPED)
+            for x in range(joint.following, joint.count) if x not in joint.left_out]
+        joint.following = joint.count
+        return joint
+
+    def _change(self, name: str, joint: _Joint, plan: Plan, now: int) -> None:
+        """Go over to a plan that was made anew; what it leaves out is missed."""
+        begun = {x.setpoint.number: x for x in joint.holds}
+        for number in joint.leave_out(plan, now):
+            if number + 1 in begun:
+                begun[number + 1].miss(_LEFT_OUT)
+            elif number >= joint.following:
+                joint.news.append(missed(self._setpoint(name, joint, number), _LEFT_OUT))
+        for hold in joint.holds:
+            _keep_up(hold, joint)
+        joint.corrected = False
+
+    def _open(self, name: str, joint: _Joint) -> None:
+        """Watch the next setpoint."""
+        number, joint.following = joint.following, joint.following + 1
+        if number in joint.left_out:
+            return
+        for hold in joint.holds:
+            if hold.over:
+                joint.close(hold.found)
+        joint.holds = [x for x in joint.holds if not x.over]
+        hold = Hold(self._setpoint(name, joint, number), last=number + 1 == joint.count)
+        _keep_up(hold, joint)
+        joint.holds.append(hold)
+
+    def _setpoint(self, name: str, joint: _Joint, number: int) -> Setpoint:
+        """Return a setpoint as it was requested."""
+        asked, place = joint.asked, joint.asked.kept + number
+        segment = asked.segments[place]
+        level = asked.level(segment.begin if segment.arrival is None else segment.arrival)
+        model = level.model
+        omega = model.frequency(segment.stretch) / model.units.time
+        ratio = model.material.zeta / critical_zeta(segment.stretch, model.material.packed)
+        return Setpoint(
+            segment.stretch, asked.segments[place - 1].stretch if number
+            else asked.level(segment.begin).stretch,
+            segment.since, segment.arrival, segment.until if number + 1 == joint.count
+            else asked.segments[place + 1].since, omega, ratio * omega,
+            name if len(self._joints) > 1 else '', number + 1, joint.count,
+            possible=stretch_limits(model.material))
+
+    # -- samples -------------------------------------------------------------------------------
+
+    def wants(self, stamp: int) -> bool:
+        """Return whether a sample of a time in ns is of use for one of the joints."""
+        steady, wanted = self._steady(), False
+        self._heard = steady
+        for joint in self._joints.values():
+            for hold in joint.holds:
+                wanted |= hold.lacks(stamp, steady)
+        return wanted
+
+    def add(self, name: str, stamp: int, stretch: float) -> None:
+        """Take in a stretch measured at a stamp in ns; samples may come in any order."""
+        if name not in self._joints:
+            return
+        if stamp > self._now:
+            self._now = self._clock()
+        for hold in self._joints[name].holds:
+            hold.add(stamp, stretch, self._now)
+
+    def judge(self, now: int, tolerances: Tolerances, *, observable: bool) -> Finding | None:
+        """Judge one setpoint, if one can be judged by a time in ns and changes what is known."""
+        self._now = now
+        for name, joint in self._joints.items():
+            if joint.news:
+                joint.newest = joint.news.pop(0)
+                joint.close(joint.newest)
+                return joint.newest
+            for hold in joint.holds:
+                found = hold.judge(
+                    now, self._steady(), tolerances, self.sensor(name), observable=observable)
+                if found is not None:
+                    joint.newest = found
+                    return found
+        return None
+
+
+def _keep_up(hold: Hold, joint: _Joint) -> None:
+    """Have a setpoint judged from when it is reached by the plan in force."""
+    segment = joint.segment(hold.setpoint.number - 1)
+    if segment is None:
+        hold.miss(_LEFT_OUT)
+    elif segment.arrival is not None:
+        hold.move(segment.arrival, corrected=joint.corrected)
+    elif hold.setpoint.arrival is not None:
+        hold.miss('its time ended before the move to it')

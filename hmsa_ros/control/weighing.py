@@ -1,0 +1,144 @@
+"""
+What plans are expected to leave, where commands take effect late.
+
+Late commands leave vibration, and so does a new plan whose commands are late again. Both are
+simulated with commands to come as late as those before, in several ways that this may happen.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmsa_ros.control.lateness import Lateness
+from hmsa_ros.errors import HmsaError
+from hmsa_ros.model.delivery import pieces
+from hmsa_ros.model.moves import Level
+from hmsa_ros.model.simulation import simulate
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.planning.timeline import Draft, Plan, PlannedLevel
+
+#: A step that is smaller counts as this one.
+LEAST_STEP = 0.1
+# Setpoints that are looked at, how far ahead the next one may begin, units of time that may be
+# simulated, and ways in which commands may be late.
+_SETPOINTS, _NEAR, _LONGEST, _WAYS = 2, 50.0, 2000.0, 16
+
+
+@dataclass(frozen=True)
+class Aim:
+    """A setpoint that is to be arrived at; times in ns."""
+
+    stretch: float
+    step: float  #: of stretch, at least `LEAST_STEP`
+    arrival: int
+    end: int | None  #: when the next setpoint begins; None for never
+
+
+def step_of(plan: Plan, place: int) -> float:
+    """Return the step of a setpoint of a plan by its place; small ones count as larger."""
+    if place < 0:
+        return LEAST_STEP
+    begin = plan.segments[place - 1].stretch if place else plan.levels[0].stretch
+    return max(abs(plan.segments[place].stretch - begin), LEAST_STEP)
+
+
+def aims(plan: Plan, now: int) -> list[Aim]:
+    """Return the setpoint of a plan that is under way at a time in ns, and the next ones."""
+    found: list[Aim] = []
+    unit = plan.levels[-1].model.units.time * NANOSECONDS
+    first = max(plan.under_way(now), 0)
+    for place in range(first, min(first + _SETPOINTS, len(plan.segments))):
+        segment = plan.segments[place]
+        end = plan.segments[place + 1].since if place + 1 < len(plan.segments) else None
+        arrival = segment.arrival
+        if arrival is None:
+            arrival = end if end is not None else plan.levels[-1].stamp
+        if found and segment.since - max(found[-1].arrival, now) > _NEAR * unit:
+            break
+        found.append(Aim(segment.stretch, step_of(plan, place), arrival, end))
+    return found
+
+
+def expected(
+        start: PlannedLevel, levels: Sequence[PlannedLevel], wanted: Sequence[Aim],
+        lateness: Lateness) -> float:
+    """
+    Return how far from rest at its aims an actuator is expected to be, in sum over them.
+
+    That is the vibration from peak to peak, and twice the distance, as a share of the step. It
+    starts in the state of a level, and the others follow.
+    """
+    levels = [x for x in levels if wanted[-1].end is None or x.stamp <= wanted[-1].end]
+    last = max(wanted[-1].arrival, levels[-1].stamp if levels else 0, start.stamp)
+    span = start.model.time(last - start.stamp) + 1.0
+    most = int(min(max(_LONGEST / span, 1.0), _WAYS))
+    stamps = np.array([x.due for x in levels], dtype=np.int64)
+    ways = [_left(start, levels, stamps + late, wanted)
+            for late in lateness.scenarios(len(levels), most)]
+    return sum(ways) / len(ways)
+
+
+def _left(
+        start: PlannedLevel, levels: Sequence[PlannedLevel], stamps: NDArray[np.int64],
+        wanted: Sequence[Aim]) -> float:
+    """Return what is left where levels take effect at times in ns."""
+    model, begin = start.model, start.stamp
+    times = np.maximum.accumulate(np.maximum(stamps, begin)).tolist()
+    looks = list(_looks(levels, times, wanted, begin))
+    end = max(looks)
+    course = [Level(0.0, start.flux_density / model.units.load), *(
+        Level(model.time(x - begin), level.flux_density / model.units.load)
+        for x, level in zip(times, levels, strict=True) if x < end)]
+    # Of commands that come at once the last one counts.
+    course = [one for one, other in pairwise([*course, Level(math.inf, 0.0)])
+              if one.time < other.time]
+    state = start.at(begin)
+    try:
+        switches, loads, slopes, _ = pieces(
+            course, state.ramps_from, model.time(end - begin), model.delivery.slew)
+        stretch, rate = simulate(
+            switches, loads, [model.time(x - begin) for x in looks], model.material,
+            stretch=state.stretch, rate=state.rate, slopes=slopes, lag=model.delivery.lag,
+            field=state.load, followed=state.followed)
+    except HmsaError:
+        return math.inf
+    return sum(
+        2.0 * math.hypot(x - aim.stretch, v / model.frequency(aim.stretch)) / aim.step
+        for x, v, aim in zip(stretch.tolist(), rate.tolist(), wanted, strict=True))
+
+
+def _looks(
+        levels: Sequence[PlannedLevel], times: Sequence[int], wanted: Sequence[Aim],
+        begin: int) -> Iterator[int]:
+    """Yield times in ns at which to look: the last level is in force, and the next is not."""
+    look = begin
+    for aim in wanted:
+        own = sum(aim.end is None or x.stamp < aim.end for x in levels)
+        look = max(look, aim.arrival, times[own - 1] if own else begin)
+        if aim.end is not None:
+            look = min(look, times[own] if own < len(times) else max(aim.end, begin))
+        yield look
+
+
+def compared(
+        plan: Plan, start: PlannedLevel, levels: Sequence[PlannedLevel], draft: Draft,
+        now: int, lateness: Lateness) -> tuple[float, float]:
+    """Return what a plan leaves from a start on, by `expected`, and what a draft in its place."""
+    first = max(plan.under_way(now), 0)
+    kept = first if draft.resumed is None else draft.resumed + draft.missed
+    wanted = []
+    for place, aim in enumerate(aims(plan, now), first):
+        # As late as the later of the two arrives.
+        own = draft.segments[place - kept] if 0 <= place - kept < len(draft.segments) else None
+        arrival = aim.arrival if own is None or own.arrival is None else own.arrival
+        wanted.append(replace(aim, arrival=max(aim.arrival, arrival)))
+    anew = [*(x for x in levels if x.stamp < draft.begin), *draft.levels]
+    # What a draft leaves out, beyond what is looked at, is missed by a step each.
+    out = max(len(plan.segments) - first - len(wanted), 0) if draft.resumed is None else 0
+    return (
+        expected(start, levels, wanted, lateness),
+        expected(start, anew, wanted, lateness) + 2.0 * out)

@@ -1,0 +1,253 @@
+"""
+Parameters that nodes, files and reports share: name, default, unit, range and description.
+
+`ParameterSpec` is one entry. What only one node has is declared with that node.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+from typing import Any
+
+from hmsa_ros.errors import BadInputError, excerpt
+from hmsa_ros.model.laws import LAWS
+
+#: Words that YAML reads as false or true where nobody quotes them.
+WORDS = {False: ('off', 'no'), True: ('on', 'yes')}
+
+Value = bool | int | float | str | list[str] | list[float]
+
+
+@dataclass(frozen=True)
+class ParameterSpec:
+    """
+    One parameter: name in snake case, default, and what it may be.
+
+    The default's type is the parameter's; ``items`` is what a list holds. The description is a
+    sentence without the unit, which is empty for a dimensionless value. Numbers, those of a list
+    too, may have a closed range and strings choices; a ``read_only`` one is fixed at the start.
+    """
+
+    name: str
+    default: Value
+    description: str
+    unit: str = ''
+    minimum: float | None = None
+    maximum: float | None = None
+    choices: tuple[str, ...] = ()
+    read_only: bool = True
+    items: type = str
+
+    def taken(self, value: Any) -> Any:
+        """
+        Return a value of ROS or a file, checked, as the nodes use it; one item is a list of one.
+
+        An unquoted word that YAML reads as a truth value is the choice of that name.
+
+        Raises
+        ------
+        BadInputError
+            If it is of another type, outside the range or not one of the choices.
+
+        """
+        if isinstance(self.default, list):
+            value = self._as_list(value)
+            for item in value:
+                self.check(item)
+            return value
+        if isinstance(value, bool):
+            value = next((x for x in self.choices if x in WORDS[value]), value)
+        if isinstance(self.default, str) and not isinstance(value, str):
+            raise BadInputError(
+                f'parameter {self.name} is {excerpt(value)}: expected a text')
+        self.check(value)
+        return value
+
+    def _as_list(self, value: Any) -> list[Any]:
+        if value is None:
+            return []
+        several = not isinstance(value, str) and (
+            isinstance(value, Sequence) or hasattr(value, 'typecode'))
+        values = list(value) if several else [value]
+        kinds = (int, float) if self.items is float else (str,)
+        if not all(isinstance(x, kinds) and not isinstance(x, bool) for x in values):
+            of = 'numbers' if self.items is float else 'strings'
+            raise BadInputError(
+                f'parameter {self.name} is {excerpt(value)}: expected a list of {of}')
+        return [self.items(x) for x in values]
+
+    def check(self, value: Any) -> None:
+        """
+        Refuse a value outside the range or the choices.
+
+        Raises
+        ------
+        BadInputError
+            If it is not finite, outside the range or not one of the choices.
+
+        """
+        if isinstance(value, float) and not (math.isfinite(value) or value == self.maximum):
+            raise BadInputError(
+                f'parameter {self.name} is {value}: expected a finite number')
+        if self.choices and value not in self.choices:
+            raise BadInputError(
+                f'parameter {self.name} is {excerpt(value)}: expected one of '
+                + ', '.join(self.choices))
+        if isinstance(value, (int, float)) and not (
+                (self.minimum is None or value >= self.minimum)
+                and (self.maximum is None or value <= self.maximum)):
+            raise BadInputError(
+                f'parameter {self.name} is {value:g}: expected {self.range_text()}')
+
+    def range_text(self) -> str:
+        """Return the range in words, for example ``'at least 0 s'``."""
+        unit = f' {self.unit}' if self.unit else ''
+        if self.minimum is None and self.maximum is None:
+            return 'any value'
+        if self.maximum is None:
+            return f'at least {self.minimum:g}{unit}'
+        if self.minimum is None:
+            return f'at most {self.maximum:g}{unit}'
+        return f'{self.minimum:g} to {self.maximum:g}{unit}'
+
+
+#: zeta of the example block, which nobody can look up for a block of their own.
+ZETA = 0.2
+
+#: The block that planner and plant have in common; the defaults are the example block's.
+ACTUATOR = (
+    ParameterSpec(
+        'actuator.shear_modulus', 1e4, 'Shear modulus G.', 'Pa',
+        1e-3, 1e12),
+    ParameterSpec(
+        'actuator.density', 1900.0, 'Density rho.', 'kg/m^3', 1e-3, 1e6),
+    ParameterSpec(
+        'actuator.half_length', 0.01,
+        'Half length L of the block, across the field.', 'm', 1e-9, 1e3),
+    ParameterSpec(
+        'actuator.half_thickness', 0.01,
+        'Half thickness H of the block, along the field.', 'm', 1e-9, 1e3),
+    ParameterSpec(
+        'actuator.remanence', 0.1, 'Residual flux density Br.', 'T', 1e-9, 1e3),
+    ParameterSpec(
+        'actuator.chain_limit', 5.0,
+        'Chain extensibility limit J_lim of the Gent model; .inf gives neo-Hookean.', '',
+        1e-3, math.inf),
+    ParameterSpec(
+        'actuator.damping_coefficient', 8.0 * ZETA * 0.01 * 0.01 * math.sqrt(1900.0 * 1e4),
+        'Damping coefficient c; zeta = c/(8 L H sqrt(rho G)).', 'N s/m', 0.0, 1e12),
+)
+
+
+
+def _of_laws() -> tuple[ParameterSpec, ...]:
+    """Return the constants of all laws; a name that two laws have is one parameter."""
+    texts: dict[str, list[str]] = {}
+    found: dict[str, ParameterSpec] = {}
+    for law in LAWS.values():
+        for x in law.constants:
+            texts.setdefault(x.name, []).append(f'{law.name}: {x.symbol}')
+            number = x.kind is not str
+            found[x.name] = ParameterSpec(
+                x.name, 0.0 if x.kind is float else x.kind(),
+                f'Constant of law {"; ".join(texts[x.name])}.', x.unit,
+                x.minimum if number else None, x.maximum if number else None,
+                items=float if x.kind is list else str)
+    return tuple(found.values())
+
+
+LAW_NAME = ParameterSpec(
+    'law.name', next(iter(LAWS)),
+    'Elastic law of the block. All but gent and neo_hookean have constants law.*, from which '
+    'the shear modulus follows.', choices=tuple(LAWS))
+
+#: The elastic law of the block and its constants.
+LAW = (LAW_NAME, *_of_laws())
+
+# Names of earlier versions. ROS tools cannot show a value and a group of values of one name.
+_FORMER = {'law': LAW_NAME.name}
+
+
+def present_name(name: str) -> str:
+    """Return the name of a parameter, perhaps of one joint, that older files may have another."""
+    joint, dot, rest = name.rpartition('.')
+    return f'{joint}{dot}{_FORMER.get(rest, rest)}'
+
+
+#: Constants of laws that are read once, when a node starts.
+FIXED = frozenset(x.name for law in LAWS.values() for x in law.constants if x.fixed)
+
+#: All that describes a block.
+BLOCK = (*ACTUATOR, *LAW)
+
+JOINT = ParameterSpec(
+    'joint', 'actuator', 'Name of the joint in trajectories and joint states.')
+
+INITIAL_STRETCH = ParameterSpec(
+    'initial_stretch', 1.0,
+    'Stretch at rest before the first command; the deflection of a beam, 0 unless given.', '',
+    -1.0, 1e3)
+
+SLEW_LIMIT = ParameterSpec(
+    'slew_limit', 0.0,
+    'Rate at which the amplifier ramps to a commanded level; 0 for steps.', 'T/s', 0.0, 1e12)
+
+FLUX_DENSITY_MIN = ParameterSpec(
+    'flux_density_min', -0.5, "Lower limit of the coil's flux density.", 'T',
+    -1e3, 1e3)
+
+FLUX_DENSITY_MAX = ParameterSpec(
+    'flux_density_max', 0.5, "Upper limit of the coil's flux density.", 'T',
+    -1e3, 1e3)
+
+COIL_TIME_CONSTANT = ParameterSpec(
+    'coil_time_constant', 0.0, 'Time constant of the first-order coil lag; 0 for none.', 's',
+    0.0, 1e3)
+
+#: What a plan depends on.
+PLANNED = (*BLOCK, FLUX_DENSITY_MIN, FLUX_DENSITY_MAX, SLEW_LIMIT, COIL_TIME_CONSTANT)
+
+#: Maxwell branches beside the elastic law.
+VISCOELASTIC = (
+    ParameterSpec(
+        'viscoelastic.ratio', [],
+        'Creep: stiffness of up to three Maxwell branches in units of that of the elastic law, '
+        'which is what the elastomer holds in the end; empty for none.', '', 0.0, 1e3,
+        items=float),
+    ParameterSpec(
+        'viscoelastic.time', [], 'Creep: relaxation time of each Maxwell branch.', 's',
+        1e-9, 1e9, items=float),
+)
+
+#: How well parameters are known, as ``hmsa identify --out`` and ``~/save_estimate`` write it.
+KNOWN = (
+    ParameterSpec(
+        'identification.names', [],
+        'Parameters that were identified: what feedback knows of them before the first sample.'),
+    ParameterSpec(
+        'identification.values', [],
+        'Their values in SI; those that are parameters of the planner as well have them there.',
+        items=float),
+    ParameterSpec(
+        'identification.covariance', [],
+        'Covariance of these values, row after row, in SI.', items=float),
+)
+
+CREEP_TOLERANCE = ParameterSpec(
+    'creep_tolerance', 1e-4,
+    'Vibration that the levels which follow creep at rest may leave, peak to peak, as a share of '
+    'the move; the smaller, the more levels, up to 300 a move.', '', 1e-6, 1.0)
+
+PUBLISH_RATE = ParameterSpec(
+    'publish_rate', 1000.0, "Sample rate, in the plant's own time.", 'Hz', 1e-3, 1e6)
+
+#: Factors on the actuator's parameters, by which a plant differs from what the planner knows.
+MISMATCH = tuple(
+    ParameterSpec(
+        f'mismatch.{spec.name.partition(".")[2]}', 1.0,
+        f"Factor on {spec.name}: the simulated actuator then differs from the planner's model.",
+        '', 1e-3, 1e3)
+    for spec in ACTUATOR)
+
+#: Fields of `hmsa_ros.model.parameters.ActuatorParameters`, as the parameters name them.
+ACTUATOR_FIELDS = tuple(spec.name.partition('.')[2] for spec in ACTUATOR)

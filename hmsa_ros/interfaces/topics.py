@@ -1,0 +1,191 @@
+"""
+Names, types, quality of service and meaning of every topic and service, without ROS.
+
+All names are relative or private, so that namespaces and remapping work; only ``/clock`` and
+``/diagnostics`` are absolute, as ROS has them. `hmsa_ros.nodes.endpoints` takes this page to
+rclpy; the reference in the documentation is made from it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How many messages are kept, if lost ones are sent again, if late subscribers get them."""
+
+    depth: int
+    reliable: bool = True
+    latched: bool = False
+
+
+RELIABLE = Quality(10)
+# A plan may be sent as one burst of commands; none of them may be overwritten unread.
+COMMAND = Quality(1000)
+# Samples at 1 kHz and more: deep enough for a reader that pauses for some seconds.
+SAMPLES = Quality(5000)
+LATCHED = Quality(1, latched=True)
+# News that is of no use any more when it is late.
+NEWEST = Quality(1, reliable=False)
+# The changes of level that took effect last, for late subscribers.
+CHANGES = Quality(100, latched=True)
+CLOCK = Quality(1, reliable=False)
+
+
+@dataclass(frozen=True)
+class Topic:
+    """
+    A topic by its relative or private name, and the nodes of this package that send and take it.
+
+    The type is one like ``'sensor_msgs/msg/JointState'``; publishers and subscribers share the
+    quality of service.
+    """
+
+    name: str
+    type: str
+    qos: Quality
+    meaning: str = ''
+    publishers: tuple[str, ...] = ()
+    subscribers: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Service:
+    """A service by its private name and type, and what a call does by the node that serves it."""
+
+    name: str
+    type: str
+    meaning: Mapping[str, str] = field(default_factory=dict)
+
+
+PLANNER = 'planner'
+PLANT = 'plant'
+DRIVER = 'driver'
+RECORDER = 'recorder'
+PLAYER = 'player'
+NODES = (PLANNER, PLANT, DRIVER, RECORDER, PLAYER)
+
+_FIELD = 'sensor_msgs/msg/MagneticField'
+_FLOAT = 'std_msgs/msg/Float64'
+_TRAJECTORY = 'trajectory_msgs/msg/JointTrajectory'
+_TRIGGER = 'std_srvs/srv/Trigger'
+
+JOINT_TRAJECTORY = Topic(
+    '~/joint_trajectory', _TRAJECTORY, RELIABLE,
+    'A sequence of setpoints. Each point says: be at rest at `positions` by `time_from_start`, '
+    "having left the previous point at that point's `time_from_start`. Stamp 0 starts now; a "
+    'future stamp keeps the running plan until then; a sequence that began in the past is '
+    'joined in the middle. Points without `positions` and with `effort` are raw levels: the flux '
+    'density in tesla from `time_from_start` on; the planner checks them, and ends at rest.',
+    subscribers=(PLANNER, RECORDER))
+SETPOINT = Topic(
+    '~/setpoint', _FLOAT, RELIABLE,
+    'One stretch to go to now, held until the next request.',
+    subscribers=(PLANNER, RECORDER))
+PLAN = Topic(
+    '~/plan', _TRAJECTORY, LATCHED,
+    'The plan: a point at each change of level, with the predicted stretch and rate, and the '
+    'flux density from then on.', publishers=(PLANNER,))
+STATUS = Topic(
+    '~/status', 'diagnostic_msgs/msg/DiagnosticStatus', LATCHED,
+    'The verdict on the last request, with a code and a sentence, what was measured at the last '
+    'setpoint, and the progress of its sequence.', publishers=(PLANNER,))
+ESTIMATE = Topic(
+    '~/estimate', 'diagnostic_msgs/msg/DiagnosticArray', RELIABLE,
+    'With the parameter `feedback`: a status of each joint with what samples say of it in a '
+    'sentence, the parameters believed with their standard deviations (`NAME.std`) and the given '
+    'values (`NAME.nominal`), whether plans use them, and how many samples were rejected.',
+    publishers=(PLANNER,))
+FLUX_DENSITY_COMMAND = Topic(
+    'flux_density_command', _FIELD, COMMAND,
+    'The shaped command: from its stamp on, which may be in the future, z is the flux density '
+    'in tesla; x and y are 0. A message supersedes all earlier ones with the same or a later '
+    'stamp.',
+    publishers=(PLANNER,), subscribers=(PLANT, DRIVER))
+FLUX_DENSITY_APPLIED = Topic(
+    'flux_density_applied', _FIELD, CHANGES,
+    'The applied level: one message per change of level, stamped with the time at which it took '
+    'effect; z is the level from then on, in tesla: the one really set, and NaN where it is not '
+    'known.',
+    publishers=(PLANT, DRIVER), subscribers=(PLANNER,))
+FLUX_DENSITY_RECEIVED = Topic(
+    'flux_density_received', 'sensor_msgs/msg/TimeReference', NEWEST,
+    'A receipt for a command, and a sign of life five times a second: `header.stamp` is when the '
+    'newest command came, or the present time, by the clock of the sender; `time_ref` is the '
+    'stamp of that command (0 before the first), `source` the joint. `frame_id` is `cut_off` '
+    'while commands of before a cut-off of the coil are refused. The planner sees from it that '
+    'its commands arrive, and how far the two clocks are apart. Optional for a driver of your '
+    'own.',
+    publishers=(PLANT, DRIVER), subscribers=(PLANNER,))
+DISTURBANCE_FORCE = Topic(
+    'disturbance_force', 'geometry_msgs/msg/WrenchStamped', RELIABLE,
+    'An unplanned force on the simulated actuator: from its stamp on (0: immediately) until the '
+    'next message, force.z pulls along the field, in newtons; all other components are 0.',
+    subscribers=(PLANT,))
+JOINT_STATES = Topic(
+    'joint_states', 'sensor_msgs/msg/JointState', SAMPLES,
+    'Samples of the actuator: position is stretch, velocity stretch rate in 1/s, effort the '
+    'applied flux density in tesla.', publishers=(PLANT, DRIVER), subscribers=(PLANNER,))
+STRETCH = Topic(
+    'stretch', _FLOAT, SAMPLES, 'The stretch alone, for plotting and echo.',
+    publishers=(PLANT, DRIVER))
+STRETCH_RATE = Topic(
+    'stretch_rate', _FLOAT, SAMPLES, 'The stretch rate alone, in 1/s.',
+    publishers=(PLANT, DRIVER))
+MARKERS = Topic(
+    '~/markers', 'visualization_msgs/msg/MarkerArray', LATCHED,
+    'Markers for a 3-D view. The plant publishes each deformed block, with arrows for its '
+    'magnetisation and the field, at marker_rate while there is a subscriber; the planner '
+    'publishes each block at its target whenever that changes.', publishers=(PLANT, PLANNER))
+CLOCK_TOPIC = Topic(
+    '/clock', 'rosgraph_msgs/msg/Clock', CLOCK,
+    'Simulated time, published by the plant or the player if a parameter enables it.',
+    publishers=(PLANT, PLAYER))
+DIAGNOSTICS = Topic(
+    '/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', RELIABLE,
+    'Counters and health, once a second; by them, a second planner, plant or driver of a joint is '
+    'noticed.', publishers=NODES, subscribers=(PLANNER, PLANT, DRIVER))
+
+STOP = Service('~/stop', _TRIGGER, {
+    PLANNER: 'Drops the rest of the sequence and comes to rest without vibration.',
+    PLAYER: 'Ends playback.'})
+RESET_ESTIMATE = Service('~/reset_estimate', _TRIGGER, {
+    PLANNER: 'Forgets what feedback has learnt: plans and estimates begin again with the '
+             'parameters as given.'})
+SAVE_ESTIMATE = Service('~/save_estimate', _TRIGGER, {
+    PLANNER: 'Writes what feedback has learnt to the file named by `feedback_file`, with its '
+             'covariance, as a parameter file.'})
+RESET = Service('~/reset', _TRIGGER, {
+    PLANT: 'Returns the actuators to their initial states, or to reset_stretch and reset_rate; '
+           'time continues.'})
+STEP = Service('~/step', _TRIGGER, {
+    PLANT: 'Advances a paused plant by step_count samples (default 1).'})
+SET_PAUSED = Service('~/set_paused', 'std_srvs/srv/SetBool', {
+    PLANT: 'Pauses or resumes simulated time.'})
+PAUSE = Service('~/pause', _TRIGGER, {
+    RECORDER: 'Pauses recording; messages that arrive meanwhile are not recorded.',
+    PLAYER: 'Pauses playback.'})
+RESUME = Service('~/resume', _TRIGGER, {
+    RECORDER: 'Resumes recording.', PLAYER: 'Resumes playback.'})
+TOGGLE_PAUSED = Service('~/toggle_paused', _TRIGGER, {PLAYER: 'Pauses or resumes playback.'})
+IS_PAUSED = Service('~/is_paused', _TRIGGER, {
+    RECORDER: '`success` says whether it is paused.',
+    PLAYER: '`success` says whether it is paused.'})
+PLAY_NEXT = Service('~/play_next', _TRIGGER, {PLAYER: 'Sends the next message while paused.'})
+SNAPSHOT = Service('~/snapshot', _TRIGGER, {
+    RECORDER: 'Writes the messages that a recorder in snapshot mode holds in memory.'})
+SPLIT_BAGFILE = Service('~/split_bagfile', _TRIGGER, {
+    RECORDER: 'Closes the current file and continues in a new one.'})
+
+
+def of_joint(topic: Topic, joint: str, joints: Sequence[str]) -> Topic:
+    """Return the topic of a joint, which is in its name if there are several joints."""
+    if len(joints) == 1:
+        return topic
+    start = '~/' if topic.name.startswith('~/') else ''
+    return replace(topic, name=f'{start}{joint}/{topic.name.removeprefix(start)}')
+
+
+def from_outside(name: str, node: str) -> str:
+    """Return ``'~/stop'`` as ``'planner/stop'``; other names, and without a node, unchanged."""
+    return f'{node}/{name[2:]}' if node and name.startswith('~/') else name

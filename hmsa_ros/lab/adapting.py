@@ -1,0 +1,124 @@
+"""
+The demonstration's second act: an actuator that is not as planned, open loop and adapting.
+
+Planner and simulated plant run in one loop, as in ``hmsa controller`` but without ROS and in
+simulated time. The block is ten times as long as that of the first act, so that a camera sees its
+first move.
+"""
+
+from dataclasses import asdict, dataclass, replace
+import math
+from pathlib import Path
+
+import numpy as np
+
+from hmsa_ros.control.planner import PlannerRuntime
+from hmsa_ros.control.records import Send, Settings, Target
+from hmsa_ros.device.sensor import SensorErrors
+from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
+from hmsa_ros.model.actuators import Setup
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
+from hmsa_ros.planning.group import PlannerGroup
+from hmsa_ros.planning.planner import Options, Planner
+
+#: Factor on the shear modulus that the planner does not know.
+FACTOR = 1.2
+_TARGETS, _HOLD = (1.4, 1.1), 0.8
+_MS, _JOINT = 1_000_000, 'actuator'
+# A camera of 200 Hz, 10 ms late, with noise and bias of stretch; and how far ahead commands go.
+_PERIOD, _DELAY, _LEAD = 5 * _MS, 10 * _MS, 2 * _MS
+_ERRORS = SensorErrors(stretch_noise=1e-3, stretch_bias=1e-3)
+_LIMIT = 0.5
+
+
+@dataclass(frozen=True)
+class AdaptingResult:
+    """One move: vibration after its arrival, and rest beside the target, as shares of the step."""
+
+    feedback: str
+    stretch: float
+    arrival: float
+    vibration: float
+    offset: float
+
+
+@dataclass(frozen=True, eq=False)
+class SecondAct:
+    """Results of both modes, and the picture."""
+
+    results: tuple[AdaptingResult, ...]
+    picture: Path
+
+    def as_json(self) -> dict[str, object]:
+        """Return it for JSON."""
+        return {'shear_modulus_factor': FACTOR, 'picture': str(self.picture),
+                'moves': [asdict(x) for x in self.results]}
+
+
+def _carry_out(
+        block: ActuatorParameters, feedback: str) -> tuple[Array, list[AdaptingResult]]:
+    """Make the moves; return time in s with true stretch, and what is left of each."""
+    now = 0
+    true = replace(block, shear_modulus=FACTOR * block.shear_modulus)
+    device = SimulatedDevice(
+        [SimulatedJoint(Setup(true), errors=_ERRORS)], period=_PERIOD, measurement_delay=_DELAY)
+    planner = Planner(block, Options(
+        flux_density_min=-_LIMIT, flux_density_max=_LIMIT, lead_time=_LEAD))
+    runtime = PlannerRuntime(
+        PlannerGroup({_JOINT: planner}),
+        Settings(takeover_timeout=0, feedback=feedback, feedback_cautious=True),
+        clock=lambda: now, steady=lambda: now)
+    runtime.active = True
+    seen, results, before = [], [], 1.0
+    for target in _TARGETS:
+        begin = now = now + _MS
+        runtime.request(Target(_JOINT, target))
+        while now < begin + _HOLD * 1e9:
+            for output in runtime.tick(now):
+                if isinstance(output, Send):
+                    device.receive(0, output.stamp, output.flux_density)
+            now += _MS
+            device.advance(now)
+            for change in device.changes():
+                runtime.applied(_JOINT, change.stamp, change.level)
+            for sample in device.samples():
+                runtime.observed(
+                    _JOINT, sample.time, float(sample.stretch[0]), math.nan, math.nan)
+            seen.append((now * 1e-9, float(device.stretch[0])))
+            if now - begin == _LEAD + _MS:
+                # As planned before anything is corrected.
+                arrival = (planner.plan.segments[-1].arrival or now) * 1e-9
+        track: Array = np.array(seen, dtype=np.float64)
+        after = track[track[:, 0] >= arrival, 1]
+        step, before = target - before, target
+        results.append(AdaptingResult(
+            feedback, target, arrival - begin * 1e-9, float(np.ptp(after)) / abs(step),
+            (float(after[-1]) - target) / step))
+    return track, results
+
+
+def second_act(picture: Path) -> SecondAct:
+    """Run it with feedback off and adapt, and draw both."""
+    from hmsa_ros.report import style
+
+    block = paper_actuator()
+    block = replace(
+        block, half_length=10.0 * block.half_length, half_thickness=10.0 * block.half_thickness,
+        damping_coefficient=100.0 * block.damping_coefficient)
+    results: list[AdaptingResult] = []
+    with style.picture(picture, 2.8) as figure:
+        axes = figure.add_subplot()
+        for feedback, label, kind in (
+                ('off', 'open loop', style.UNSHAPED), ('adapt', 'adapting', style.SHAPED)):
+            track, found = _carry_out(block, feedback)
+            results += found
+            axes.plot(1e3 * track[:, 0], track[:, 1], label=label, **kind)
+        for i, target in enumerate(_TARGETS):
+            axes.plot([1e3 * i * _HOLD, 1e3 * (i + 1) * _HOLD], [target, target],
+                      label=None if i else 'target', **style.TARGET)
+        axes.set_title(
+            f'shear modulus {100.0 * FACTOR - 100.0:+.0f} %, unknown to the planner', fontsize=9)
+        style.finish(axes, 'time $t$ [ms]', r'stretch $\lambda$ [1]')
+        axes.legend(loc='upper right')
+    return SecondAct(tuple(results), picture)

@@ -1,0 +1,104 @@
+"""
+The paper's sequence on real ROS 2 processes, recorded and evaluated.
+
+Planner, plant and recorder run as processes of their own and talk over DDS on this host. The
+plant is the authority on time and runs in slow motion: the whole sequence lasts 0.13 s for the
+silicone block of `paper_actuator`.
+"""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from hmsa_ros.errors import HmsaError
+from hmsa_ros.judge import Tolerances
+from hmsa_ros.lab.adapting import second_act, SecondAct
+from hmsa_ros.lab.experiment import conduct, Experiment
+from hmsa_ros.lab.processes import NodeProcess
+from hmsa_ros.model.parameters import paper_actuator
+from hmsa_ros.recordings.bags import read_runs
+from hmsa_ros.recordings.levels import without_repeats
+from hmsa_ros.report.evaluation import evaluate, MoveResult
+from hmsa_ros.report.outcome import findings_of
+
+#: The paper's first expansion sequence, (stretch, span) in nondimensional time (Figs. 4, 5).
+SEQUENCE = ((1.10, 10.0), (1.20, 10.0), (1.40, 10.0))
+REAL_TIME_FACTOR = 0.0125
+PUBLISH_RATE = 20_000.0
+LEAD_TIME = 0.01
+#: Largest residual vibration, as a share of the step, of a setpoint that counts as held.
+LARGEST_RESIDUAL = 1e-6
+# Time stands still until all are ready.
+_NODES = (
+    NodeProcess('plant', {
+        'publish_clock': True, 'start_paused': True, 'real_time_factor': REAL_TIME_FACTOR,
+        'publish_rate': PUBLISH_RATE}),
+    NodeProcess('planner', {'use_sim_time': True, 'lead_time': LEAD_TIME}))
+
+
+@dataclass(frozen=True)
+class SetpointResult(MoveResult):
+    """The result of one setpoint from the bag, with what was found of it within a tolerance."""
+
+    finding: dict[str, object] = field(default_factory=dict)
+
+    @property
+    def reached(self) -> bool:
+        """Whether it arrived, and was held within `LARGEST_RESIDUAL`."""
+        return self.finding['verdict'] == 'arrived' and max(
+            self.error, self.residual) <= LARGEST_RESIDUAL
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """What the demo found: setpoints, exit statuses by process, files, and the second act."""
+
+    setpoints: tuple[SetpointResult, ...]
+    exits: dict[str, int]
+    bag: Path
+    picture: Path
+    adapting: SecondAct
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether every setpoint was reached and held and every process ended cleanly."""
+        return all(x.reached for x in self.setpoints) and not any(self.exits.values())
+
+    def as_json(self) -> dict[str, object]:
+        """Return the result for JSON."""
+        return {
+            'succeeded': self.succeeded, 'setpoints': [asdict(x) for x in self.setpoints],
+            'exits': self.exits, 'bag': str(self.bag), 'picture': str(self.picture),
+            'adapting': self.adapting.as_json()}
+
+
+def run_demo(
+        folder: Path, environment: dict[str, str],
+        progress: Callable[[str, float], None]) -> DemoResult:
+    """Run the paper's sequence in a prepared folder and read the result back from the bag."""
+    experiment = Experiment(folder, [
+        ((stretch,), span * paper_actuator().time_unit) for stretch, span in SEQUENCE], _NODES)
+    exits = conduct(experiment, environment, progress).exits
+    progress('evaluating the bag', 1.0)
+    results = _evaluate(experiment.bag, folder / 'run.png')
+    progress('a plant that is not as planned', 1.0)
+    return DemoResult(
+        results, exits, experiment.bag, folder / 'run.png', second_act(folder / 'adapting.png'))
+
+
+def _evaluate(bag: Path, picture: Path) -> tuple[SetpointResult, ...]:
+    """Read the run back from the bag, measure it and draw it."""
+    from hmsa_ros.report.picture import draw_run
+
+    run, = read_runs(bag)
+    levels = without_repeats(run.commands)[0]
+    if len(levels) != 2 * len(SEQUENCE):
+        raise HmsaError(
+            f'the bag holds {len(levels)} commands: expected {2 * len(SEQUENCE)}')
+    evaluation = evaluate(run)
+    found = findings_of(run, Tolerances(LARGEST_RESIDUAL, LARGEST_RESIDUAL, 0.0))
+    results = tuple(
+        SetpointResult(**asdict(x), finding=found[x.place].to_dict())
+        for x in evaluation.results)
+    draw_run(picture, run, evaluation)
+    return results

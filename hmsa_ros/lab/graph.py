@@ -1,0 +1,43 @@
+"""Who takes the commands of a planner, by the graph of ROS."""
+
+from collections.abc import Iterable, Sequence
+
+from rclpy.node import Node
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+from hmsa_ros.interfaces import topics
+
+
+def unheard(node: Node, namespace: str, joints: Sequence[str]) -> list[str]:
+    """Return a planner's topics of commands that nobody but recorders subscribes to."""
+    leave_out = recorders(node)
+    return [x for x in _commands(node, namespace, joints)
+            if leave_out.issuperset(subscribers(node, x))]
+
+
+def subscribers(node: Node, topic: str) -> list[str]:
+    """Return the full names of the nodes that subscribe to a topic, by its full name."""
+    return _names(node.get_subscriptions_info_by_topic(topic))
+
+
+def recorders(node: Node) -> set[str]:
+    """Return the full names of recorders; rosbag2's, too, offer to split the bag."""
+    return {
+        service.rpartition('/')[0] for service, _ in node.get_service_names_and_types()
+        if service.endswith('/split_bagfile')}
+
+
+def _commands(node: Node, namespace: str, joints: Sequence[str]) -> list[str]:
+    """Return the topics on which the planner commands joints, whatever they are called."""
+    planner = f'/{namespace.strip("/")}/{topics.PLANNER}'.replace('//', '/')
+    named = [
+        topic for topic, types in node.get_topic_names_and_types()
+        if topics.FLUX_DENSITY_COMMAND.type in types
+        and planner in _names(node.get_publishers_info_by_topic(topic))]
+    return [x for x in named if x.split('/')[-2] in joints] or named or [
+        node.resolve_topic_name(
+            topics.of_joint(topics.FLUX_DENSITY_COMMAND, x, joints).name) for x in joints]
+
+
+def _names(ends: Iterable[TopicEndpointInfo]) -> list[str]:
+    return [f'{x.node_namespace.rstrip("/")}/{x.node_name}' for x in ends]

@@ -1,0 +1,114 @@
+"""
+How commands reach the coil: at any time or on a grid, in steps or in ramps.
+
+A command names a level. Ideal hardware takes it up at once; sampled hardware takes commands at
+multiples of a period only; an amplifier with a slew limit ramps to the level; the field of a coil
+follows its amplifier with a lag of first order.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.moves import Level
+
+# Time constants after which nothing is left of a lag.
+_SETTLED = 40.0
+
+
+@dataclass(frozen=True)
+class Delivery:
+    """Nondimensional properties of the hardware that carries the command."""
+
+    period: float = 0.0  #: commands take effect at multiples of this; 0 for any time
+    slew: float = math.inf  #: largest change of the load per unit of time; infinite for steps
+    resolution: float = 0.0  #: times of commands are rounded to multiples of this; 0 for none
+    lag: float = 0.0  #: time constant of the field behind the amplifier
+    #: Vibration that levels which follow creep may leave, as a share of the move.
+    ripple: float = 1e-6
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        if not 0.0 <= self.period < math.inf:
+            raise BadInputError(
+                f'command period is {self.period:g}: expected a finite number of at least 0')
+        if not self.slew > 0.0:
+            raise BadInputError(f'slew limit is {self.slew:g}: expected a number above 0')
+        if not 0.0 <= self.lag < math.inf:
+            raise BadInputError(
+                f'coil time constant is {self.lag:g}: expected a finite number of at least 0')
+        if not 0.0 < self.ripple <= 1.0:
+            raise BadInputError(f'creep tolerance is {self.ripple:g}: expected above 0 to 1')
+
+    @property
+    def ideal(self) -> bool:
+        """Whether levels apply at any time and at once."""
+        return self.period == 0.0 and math.isinf(self.slew) and self.lag == 0.0
+
+    def settling(self, change: float) -> float:
+        """Return after what time (ramp and lag) nothing is left of a signed change of the load."""
+        return self.ramp(change) + _SETTLED * self.lag
+
+    def rounded(self, time: float) -> float:
+        """Return a time, which may be infinite, as the nearest multiple of the resolution."""
+        if self.resolution == 0.0 or math.isinf(time):
+            return time
+        return round(time / self.resolution) * self.resolution
+
+    def ramp(self, change: float) -> float:
+        """Return how long a signed change of the load takes; 0 without a slew limit."""
+        return 0.0 if math.isinf(self.slew) else abs(change) / self.slew
+
+
+IDEAL = Delivery()
+
+#: Time of a switch, load from then on, and its change per unit of time.
+Piece = tuple[float, float, float]
+
+
+def pieces(
+        levels: Sequence[Level], load: float, end: float,
+        slew: float) -> tuple[Array, Array, Array, float]:
+    """
+    Return switches, loads and slopes (m,) of the load that levels make, and the last load.
+
+    From ``switches[i]`` on the load is ``loads[i] + slopes[i] (t - switches[i])``. Levels are by
+    time, the first at the start, and ``load`` is in force before; ``end`` is not before the last.
+    """
+    rows, load = ramps(levels, load, end, slew)
+    switches, loads, slopes = np.array(rows).T
+    return switches, loads, slopes, load
+
+
+def late(pieces: Sequence[Piece], end: float, field: float, lag: float) -> float:
+    """Return the load that a lagging field has reached at a time after the amplifier's pieces."""
+    for i, (begin, load, slope) in enumerate(pieces):
+        span = (pieces[i + 1][0] if i + 1 < len(pieces) else end) - begin
+        line = load - slope * lag
+        field = line + slope * span + (field - line) * math.exp(-span / lag)
+    return field
+
+
+def ramps(
+        levels: Sequence[Level], load: float, end: float,
+        slew: float) -> tuple[list[Piece], float]:
+    """Return `pieces` without arrays: switch, load and slope of each; and the last load."""
+    rows: list[Piece] = []
+    for number, level in enumerate(levels):
+        until = levels[number + 1].time if number + 1 < len(levels) else end
+        begin = level.time
+        if not math.isinf(slew) and level.load != load:
+            sign = math.copysign(1.0, level.load - load)
+            reached = begin + abs(level.load - load) / slew
+            rows.append((begin, load, sign * slew))
+            if reached > until:
+                load += sign * slew * (until - begin)
+                continue
+            begin = reached
+        load = level.load
+        rows.append((begin, load, 0.0))
+    return rows, load

@@ -1,0 +1,159 @@
+"""
+One mode of a clamped-free beam that bends as far as it likes, as functions of its tip.
+
+The tangent at the share ``s`` of the length turns by ``theta(s) = q f(s)``, where ``f`` is the
+slope of the first mode of a beam, scaled so that ``q`` is the angle of the tip. The coordinate
+is ``u = integral of sin(theta)``, the deflection of the tip across the beam over its length:
+along it a uniform field across does work as a constant force at the tip does. In the units of
+`hmsa_ros.model.laws.beam` elastic force, inertia and damping are then functions of ``u`` alone,
+the same for every beam.
+"""
+
+from functools import cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+#: Root of cos x cosh x = -1: the first frequency is its square times sqrt(EI/(rho A L^4)).
+ROOT = 1.8751040687119611
+#: Largest angle of the tip that is planned for.
+LARGEST_ANGLE = np.radians(80.0)
+# The tables go on to here, where a stop begins that no beam has.
+_TABLE_ANGLE = np.radians(95.0)
+# Points of the quadrature along the beam, and pieces of the tables with their degree.
+_POINTS, _PIECES, _DEGREE = 48, 96, 7
+_NEWTON = 60
+
+
+@cache
+def _rule() -> tuple[Array, Array, Array, Array]:
+    """Return nodes and weights along the beam, what integrates up to each node, and f there."""
+    legendre = np.polynomial.legendre
+    x, weights = legendre.leggauss(_POINTS)
+    powers = legendre.legvander(x, _POINTS - 1)
+    integrals = np.stack(
+        [legendre.legval(x, legendre.legint(row, lbnd=-1)) for row in np.eye(_POINTS)], axis=1)
+    nodes = 0.5 + 0.5 * x
+    up_to: Array = 0.5 * integrals @ np.linalg.inv(powers)
+    return nodes, 0.5 * weights, up_to, slope(nodes)
+
+
+def slope(share: ArrayLike) -> Array:
+    """Return the slope of the first mode at shares of the length, 1 at the tip."""
+    ratio = (np.sin(ROOT) - np.sinh(ROOT)) / (np.cos(ROOT) + np.cosh(ROOT))
+
+    def unscaled(x: Array) -> Array:
+        found: Array = np.sinh(x) + np.sin(x) + ratio * (np.cosh(x) - np.cos(x))
+        return found
+
+    made: Array = unscaled(ROOT * np.asarray(share, dtype=np.float64)) / unscaled(np.array(ROOT))
+    return made
+
+
+def deflection(angle: ArrayLike) -> Array:
+    """Return the deflection over length at angles of the tip in rad."""
+    _, weights, _, f = _rule()
+    made: Array = np.sin(np.multiply.outer(np.asarray(angle, dtype=np.float64), f)) @ weights
+    return made
+
+
+def _gain(angle: ArrayLike) -> Array:
+    """Return the derivative of `deflection`."""
+    _, weights, _, f = _rule()
+    made: Array = np.cos(np.multiply.outer(np.asarray(angle, dtype=np.float64), f)) @ (
+        f * weights)
+    return made
+
+
+@cache
+def fold() -> float:
+    """Return the angle at which the tip deflects the most: beyond it a field pulls it back."""
+    angle = 1.8
+    for _ in range(_NEWTON):
+        _, weights, _, f = _rule()
+        angle += float(_gain(angle)) / float(np.sin(angle * f) @ (f * f * weights))
+    return angle
+
+
+def angle_of(deflections: ArrayLike) -> Array:
+    """Return the angle of the tip in rad at deflections, each within that of `fold`."""
+    wanted = np.asarray(deflections, dtype=np.float64)
+    most = float(deflection(fold()))
+    # What is left of the deflection is about a square of what is left of the angle.
+    angle = np.sign(wanted) * fold() * (
+        1.0 - np.sqrt(np.maximum(1.0 - np.abs(wanted) / most, 0.0)))
+    for _ in range(_NEWTON):
+        step = (deflection(angle) - wanted) / np.maximum(_gain(angle), 1e-9)
+        angle = np.clip(angle - step, -fold(), fold())
+        if np.max(np.abs(step), initial=0.0) < 1e-9:
+            break
+    made: Array = angle
+    return made
+
+
+def inertia_of_angle(angle: ArrayLike) -> Array:
+    """Return the integral of the squared velocities at a unit rate of the angle, for length 1."""
+    _, weights, up_to, f = _rule()
+    turned = np.multiply.outer(np.asarray(angle, dtype=np.float64), f)
+    along = (np.sin(turned) * f) @ up_to.T
+    across = (np.cos(turned) * f) @ up_to.T
+    made: Array = (along ** 2 + across ** 2) @ weights
+    return made
+
+
+def tangent(deflected: float, share: ArrayLike) -> Array:
+    """Return the angle in rad by which a bent beam is turned at shares of its length."""
+    turned: Array = float(angle_of(deflected)) * slope(share)
+    return turned
+
+
+def centreline(deflected: float, points: int) -> tuple[Array, Array]:
+    """Return places along and across the beam from clamp to tip, over its length."""
+    # At the points, and halfway between them.
+    turned = tangent(deflected, np.linspace(0.0, 1.0, 2 * points - 1))
+    ends, middle = turned[::2], turned[1::2]
+    # Simpson's rule, from each point to the next.
+    sums = [
+        np.append(0.0, np.cumsum(
+            (of(ends[1:]) + 4.0 * of(middle) + of(ends[:-1])) / (6.0 * (points - 1))))
+        for of in (np.cos, np.sin)]
+    return sums[0], sums[1]
+
+
+@cache
+def packed() -> tuple[float, ...]:
+    """
+    Return the constants of ``Beam`` in ``motion/hmsa/system.hpp``.
+
+    Number of pieces; deflections of the fold and of the end of the tables; inverse of the
+    share of ``1 - sqrt(1 - u/fold)`` that each piece has; force, stiffness, inertia and
+    damping at the end. Then of each piece: deflection and energy where it begins, and the
+    factors of the powers of what is beyond for force, inertia and damping.
+    """
+    most = float(deflection(fold()))
+    end = float(deflection(_TABLE_ANGLE))
+    share = (1.0 - np.sqrt(1.0 - end / most)) / _PIECES
+    breaks = most * (1.0 - (1.0 - share * np.arange(_PIECES + 1)) ** 2)
+    breaks[-1] = end
+    widths = np.diff(breaks)
+    nodes = 0.5 - 0.5 * np.cos(np.pi * (np.arange(_DEGREE + 1) + 0.5) / (_DEGREE + 1))
+    angle = angle_of(breaks[:-1, None] + widths[:, None] * nodes)
+    per, rest = _gain(angle), float(_gain(0.0))
+    values = np.stack([
+        3.0 * rest ** 2 * angle / per, 4.0 * inertia_of_angle(angle) / per ** 2,
+        (rest / per) ** 2])
+    powers = nodes[:, None] ** np.arange(_DEGREE + 1)
+    factors = np.linalg.solve(powers, values[..., None])[..., 0]
+    pieces = factors / widths[:, None] ** np.arange(_DEGREE + 1)
+    # Nothing holds a straight beam.
+    pieces[0, 0, 0] = 0.0
+    at_end = widths[-1] ** np.arange(_DEGREE + 1)
+    last = pieces[:, -1] @ at_end
+    stiffness = float(pieces[0, -1, 1:] @ (np.arange(1, _DEGREE + 1) * at_end[:-1]))
+    energy = 1.5 * (rest * angle_of(breaks[:-1])) ** 2
+    rows = np.column_stack([breaks[:-1], energy, *pieces])
+    return (
+        float(_PIECES), most, end, float(1.0 / share), float(last[0]), stiffness, float(last[1]),
+        float(last[2]), *rows.ravel().tolist())

@@ -1,0 +1,96 @@
+"""By how much an actuator differs from its model, or may differ."""
+
+from dataclasses import dataclass, replace
+from itertools import product
+import math
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.delivery import Delivery
+from hmsa_ros.model.parameters import NondimensionalParameters
+
+
+@dataclass(frozen=True)
+class Errors:
+    """
+    By how much the actuator differs from the model: actual value = model's (1 + error).
+
+    Errors are above -1; that of the damping coefficient may be -1, for none.
+    """
+
+    #: Of G, which scales the loads, the time unit and, for a given coefficient c, zeta.
+    shear_modulus: float = 0.0
+    zeta: float = 0.0  #: of the damping coefficient c
+    j_lim: float = 0.0
+    remanence: float = 0.0  #: of Br, which scales the loads
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for name, value, least in (
+                ('shear_modulus', self.shear_modulus, False), ('zeta', self.zeta, True),
+                ('j_lim', self.j_lim, False), ('remanence', self.remanence, False)):
+            if not (-1.0 < value < math.inf or (least and value == -1.0)):
+                raise BadInputError(
+                    f'error of {name} is {value:g}: expected a finite number '
+                    f'{"of at least" if least else "above"} -1')
+
+    @property
+    def stiffer(self) -> float:
+        """Return the actuator's unit of load in that of the model."""
+        return (1.0 + self.shear_modulus) / (1.0 + self.remanence)
+
+    @property
+    def faster(self) -> float:
+        """Return the model's unit of time in that of the actuator."""
+        return math.sqrt(1.0 + self.shear_modulus)
+
+    def delivery(self, planned: Delivery) -> Delivery:
+        """Return how ramps and lag of the model are in the actuator's units."""
+        return Delivery(
+            slew=planned.slew / self.faster / self.stiffer, lag=planned.lag * self.faster)
+
+    def actual(self, material: NondimensionalParameters) -> NondimensionalParameters:
+        """Return the model's group for the actuator: zeta = c/8 sqrt(1/(L^2 H^2 rho G))."""
+        return replace(
+            material,
+            zeta=material.zeta * (1.0 + self.zeta) / self.faster,
+            j_lim=material.j_lim * (1.0 + self.j_lim),
+            creep=replace(
+                material.creep, times=tuple(x * self.faster for x in material.creep.times)))
+
+
+#: Errors of G, damping coefficient, J_lim and remanence.
+Offs = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Ellipsoid:
+    """Where errors may be together, around none."""
+
+    axes: tuple[Offs, ...]  #: half axes, one to four
+
+    def __post_init__(self) -> None:
+        """Check the axes."""
+        if not (1 <= len(self.axes) <= 4 and all(math.isfinite(x) for y in self.axes for x in y)):
+            raise BadInputError(
+                f'an ellipsoid of errors has the half axes {self.axes}: expected one to four, of '
+                'finite shares')
+
+    def offs(self, largest: float) -> list[Offs]:
+        """Return the ends of the axes, the middles of the first, and points in between."""
+        count = len(self.axes)
+        ends = [tuple(sign * float(i == j) for j in range(count))
+                for i in range(count) for sign in (-1.0, 1.0)]
+        between = [tuple(x / math.sqrt(count) for x in signs)
+                   for signs in product((-1.0, 1.0), repeat=count)]
+        middles = [tuple(0.5 * x for x in end) for end in ends[:2]]
+        found = []
+        for shares in (*middles, *ends, *between):
+            sums = [math.fsum(share * axis[i] for share, axis in zip(
+                shares, self.axes, strict=True)) for i in range(4)]
+            a, b, c, d = (min(max(x, -largest), largest) for x in sums)
+            found.append((a, b, c, d))
+        return found
+
+
+#: Largest errors of G, damping coefficient and J_lim by themselves, or of all together.
+Uncertainty = tuple[float, float, float] | Ellipsoid

@@ -1,0 +1,272 @@
+"""
+Response of the actuator to a command: sampled, or followed step by step as the plant does.
+
+Commands take effect exactly at their times, inside the integration: each piece between two
+changes of level is integrated on its own.
+"""
+
+from collections.abc import Sequence
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hmsa_ros import motion
+from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.model import law
+from hmsa_ros.model.actuators import Actuators, check_stretch, RTOL, Setup
+from hmsa_ros.model.creep import Creep
+from hmsa_ros.model.delivery import Delivery, Piece, ramps
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.moves import Level, State
+from hmsa_ros.model.parameters import ActuatorParameters, NondimensionalParameters
+from hmsa_ros.model.schedule import CommandSchedule
+
+__all__ = [
+    'ActuatorSimulation', 'check_stretch', 'follow', 'longest_motion', 'RTOL', 'simulate',
+    'too_large', 'unshaped']
+
+# Time constants after which nothing is left of a motion, and periods after which nobody knows
+# its phase.
+_SETTLED = 40.0
+_MOST_PERIODS = 2000.0
+_STUCK = 'the integration ran out of steps: the load is too large to follow'
+
+
+def simulate(
+        switches: ArrayLike, loads: ArrayLike, times: ArrayLike,
+        material: NondimensionalParameters, *, stretch: float | None = None, rate: float = 0.0,
+        slopes: ArrayLike | None = None, rtol: float = RTOL, lag: float = 0.0,
+        field: float = math.nan, followed: Sequence[float] = ()) -> tuple[Array, Array]:
+    """
+    Sample the response to a piecewise constant or linear load.
+
+    Parameters
+    ----------
+    switches : array_like, shape (m,)
+        Times at which a level begins, increasing; the motion starts at the first.
+    loads : array_like, shape (m,)
+        Load beta from each switch on.
+    times : array_like, shape (n,)
+        Times to sample at, not decreasing, none before the first switch.
+    material : NondimensionalParameters
+        zeta, J_lim and c1.
+    stretch, rate : float
+        State at the first switch; default at rest without a field.
+    slopes : array_like, shape (m,), optional
+        Change of the load per unit of time from each switch on; default none.
+    rtol : float
+        Relative tolerance.
+    lag : float
+        Time constant with which the field follows these loads; 0 for at once.
+    field : float
+        Load in force at the first switch, for a lag; default the first of ``loads``.
+    followed : sequence of float
+        What the Maxwell branches have followed at the first switch; default relaxed.
+
+    Returns
+    -------
+    stretch, rate : ndarray, shape (n,)
+        Samples.
+
+    Raises
+    ------
+    BadInputError
+        If shapes, order or range of the arguments are wrong.
+    HmsaError
+        If the integration does not get through.
+
+    """
+    switches, loads, times = _vector(switches), _vector(loads), _vector(times)
+    slope = np.zeros_like(loads) if slopes is None else _vector(slopes)
+    if not (switches.ndim == 1 and switches.size and switches.shape == loads.shape
+            == slope.shape and times.ndim == 1):
+        raise BadInputError(
+            f'switches {switches.shape}, loads {loads.shape}, slopes {slope.shape}, times '
+            f'{times.shape}: expected one-dimensional arrays, the first three of one length')
+    if not all(np.all(np.isfinite(a)) for a in (switches, loads, slope, times)):
+        raise BadInputError('switches, loads, slopes and times must be finite numbers')
+    if np.any(np.diff(switches) < 0.0) or np.any(np.diff(times) < 0.0) or (
+            times.size and times[0] < switches[0]):
+        raise BadInputError(
+            'switches and times must not decrease, and no time may lie before the first switch')
+    stretch = material.rest if stretch is None else stretch
+    check_stretch(stretch, material)
+    rows = sampled(
+        switches, loads, slope, times, State(stretch, rate, field, followed=tuple(followed)),
+        material, rtol, lag)
+    return rows[motion.STRETCH], rows[motion.RATE]
+
+
+def follow(
+        levels: Sequence[Level], state: State, end: float, material: NondimensionalParameters,
+        delivery: Delivery) -> State:
+    """Return the state that levels lead to at a time after the last of them, without checks."""
+    pieces, last = ramps(levels, state.ramps_from, end, delivery.slew)
+    if material.creep or delivery.lag > 0.0:
+        return _follow_slowly(pieces, last, state, end, material, delivery)
+    switches, loads, slopes = np.array(pieces).T.copy()
+    stretch, rate, *_ = sampled(
+        switches, loads, slopes, np.array([float(end)]), state, material, RTOL)[:, 0].tolist()
+    return State(stretch, rate, last)
+
+
+def followed_by(state: State, material: NondimensionalParameters) -> tuple[float, ...]:
+    """Return what each branch that holds anything has followed in a state."""
+    count = len(material.branches)
+    if len(state.followed) == count:
+        return state.followed
+    return (float(law.elastic_force(state.stretch, material.packed)),) * count
+
+
+def sampled(
+        switches: Array, loads: Array, slopes: Array, times: Array, state: State,
+        material: NondimensionalParameters, rtol: float, lag: float = 0.0) -> Array:
+    """Return stretch, rate, field and what branches follow, (3 + n, m), or raise `HmsaError`."""
+    branches = np.column_stack([material.branches, followed_by(state, material)])
+    out = np.empty((motion.FOLLOWED + len(branches), times.size))
+    if not motion.sample(
+            state.stretch, state.rate, loads[0] if math.isnan(state.load) else state.load,
+            switches, loads, slopes, lag, times, material.packed, branches, rtol, out):
+        raise HmsaError(_STUCK)
+    return out
+
+
+def _follow_slowly(
+        pieces: Sequence[Piece], last: float, state: State, end: float,
+        material: NondimensionalParameters, delivery: Delivery) -> State:
+    """Integrate until vibration has ended; from then on branches relax alone."""
+    switches, loads, slopes = np.array(pieces).T.copy()
+    rings, amplifier = end, last if delivery.lag > 0.0 else None
+    if material.creep:
+        rings = min(end, max(pieces[-1][0], 0.0) + longest_motion(last, material)
+                    + delivery.settling(0.0))
+    stretch, rate, field, *followed = sampled(
+        switches, loads, slopes, np.array([float(rings)]), state, material, RTOL,
+        delivery.lag)[:, 0].tolist()
+    if rings == end:
+        return State(
+            stretch, rate, last if amplifier is None else field, amplifier, tuple(followed))
+    # Without inertia the elastic force is linear in what the branches follow, which follows it.
+    ratios, speeds = material.branches.T
+    share = ratios / (1.0 + np.sum(ratios))
+    values, vectors = np.linalg.eig(speeds[:, None] * (share - np.eye(len(share))))
+    left = np.linalg.solve(vectors, np.array(followed) - last)
+    relaxed = last + np.real(vectors @ (left * np.exp(values * (end - rings))))
+    force = last + float(share @ (relaxed - last))
+    return State(
+        float(law.equilibrium_stretch(force, material.packed)), 0.0, last, amplifier,
+        tuple(relaxed.tolist()))
+
+
+def _vector(values: ArrayLike) -> Array:
+    """Return a contiguous copy."""
+    return np.array(values, dtype=np.float64, ndmin=1, order='C')
+
+
+def longest_motion(load: float, material: NondimensionalParameters) -> float:
+    """Return the time after which motion under a load beta has settled, or a bound for it."""
+    stretch = law.equilibrium_stretch(load, material.packed)
+    frequency = law.natural_frequency(stretch, material.packed)
+    longest = _MOST_PERIODS * 2.0 * math.pi / frequency
+    decay = law.damping(stretch, material.packed) / (2.0 * law.mass(stretch, material.packed))
+    if decay == 0.0:
+        return longest
+    if decay < frequency:
+        return min(longest, _SETTLED / decay)
+    # The slower of two decays.
+    return _SETTLED * 2.0 * decay / frequency ** 2
+
+
+class ActuatorSimulation:
+    """`Actuators` with one actuator, seen as numbers; the parameters are those of `Setup`."""
+
+    def __init__(
+            self, actuator: ActuatorParameters, *, time: int = 0, stretch: float | None = None,
+            slew_limit: float = math.inf, coil_time_constant: float = 0.0,
+            creep: Creep | None = None) -> None:
+        """Start at rest."""
+        self.actuator = actuator
+        self._all = Actuators(
+            [Setup(actuator, actuator.rest if stretch is None else stretch, slew_limit,
+                   coil_time_constant, creep or Creep())], time=time)
+
+    @property
+    def time(self) -> int:
+        """Time in ns that the state belongs to; setting it skips what lies between."""
+        return self._all.time
+
+    @time.setter
+    def time(self, time: int) -> None:
+        self._all.time = time
+
+    @property
+    def stretch(self) -> float:
+        """Stretch."""
+        return float(self._all.stretch[0])
+
+    @property
+    def rate(self) -> float:
+        """Stretch rate in 1/s."""
+        return float(self._all.rate[0])
+
+    @property
+    def flux_density(self) -> float:
+        """Flux density in force, in T."""
+        return float(self._all.flux_density[0])
+
+    @property
+    def schedule(self) -> CommandSchedule:
+        """Commands in force and ahead, in T."""
+        return self._all.schedules[0]
+
+    def reset(self) -> None:
+        """Return to the initial state, at rest, with no command ahead; time goes on."""
+        self._all.reset(0)
+
+    def set_state(
+            self, stretch: float, rate: float, flux_density: float,
+            level: float | None = None) -> None:
+        """Go on from another state, as `Actuators.set_state`."""
+        self._all.set_state(0, stretch, rate, flux_density, level)
+
+    def command(self, stamp: int, flux_density: float) -> int:
+        """Take a command in T, as `Actuators.command`; return how late it is in ns."""
+        return self._all.command(0, stamp, flux_density)
+
+    def force(self, stamp: int, force: float) -> None:
+        """Take a disturbing force in N, as `Actuators.force`."""
+        self._all.force(0, stamp, force)
+
+    def equilibrium(self) -> float:
+        """Return the stretch that the flux density in force would hold."""
+        return self._all.equilibrium(0)
+
+    def advance(self, time: int) -> None:
+        """Integrate to a time in ns; a load too large to follow is an `HmsaError`."""
+        failed = self._all.advance(time)
+        self._all.changes.clear()
+        if failed:
+            self._all.time = failed[0][1]
+            raise HmsaError(too_large(self.time, self.flux_density))
+
+
+def too_large(time: int, flux_density: float) -> str:
+    """Return the sentence for a load that cannot be followed, at a time in ns and in T."""
+    return (f'the integration stopped at {time} ns under {flux_density:g} T: the load is too '
+            'large to follow')
+
+
+def unshaped(
+        targets: Sequence[float], begins: Sequence[float], times: ArrayLike,
+        material: NondimensionalParameters, *, start: float | None = None) -> tuple[Array, Array]:
+    """
+    Sample stretch and rate (n,) under plain steps to targets, the paper's unshaped input.
+
+    Each step begins at its time with the load that holds its target. The start is at rest, by
+    default without a field. A stretch or times out of range are a `BadInputError`.
+    """
+    for target in targets:
+        check_stretch(target, material, 'target')
+    loads = [law.elastic_force(float(x), material.packed) for x in targets]
+    return simulate(begins, loads, times, material, stretch=start)

@@ -1,0 +1,51 @@
+"""Topics and services (`hmsa_ros.interfaces.topics`) on a node of rclpy."""
+
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.client import Client
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+
+from hmsa_ros.interfaces.topics import from_outside, Quality, Service, Topic
+from hmsa_ros.nodes.capture import RawSubscription
+from hmsa_ros.nodes.message_types import interface_class
+
+
+def profile(quality: Quality) -> QoSProfile:
+    """Return a quality of service as rclpy has it."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST, depth=quality.depth,
+        reliability=ReliabilityPolicy.RELIABLE if quality.reliable
+        else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if quality.latched
+        else DurabilityPolicy.VOLATILE)
+
+
+def publisher(node: Node, topic: Topic, owner: str = '') -> Publisher:
+    """Return a node's publisher of a topic, or of another node's private topic."""
+    return node.create_publisher(
+        interface_class(topic.type), from_outside(topic.name, owner), profile(topic.qos))
+
+
+def subscribe(
+        node: Node, topic: Topic, take: Callable[..., Any], owner: str = '', *,
+        raw: bool = False) -> Subscription:
+    """Have ``take`` called with each message, serialized if raw, of a topic (see `publisher`)."""
+    return node.create_subscription(
+        interface_class(topic.type), from_outside(topic.name, owner), take, profile(topic.qos),
+        raw=raw)
+
+
+def listen(node: Node, topic: Topic, owner: str = '') -> RawSubscription:
+    """Return a subscription to a topic (see `publisher`) whose messages are asked for."""
+    return RawSubscription(
+        node, interface_class(topic.type), from_outside(topic.name, owner), profile(topic.qos))
+
+
+def client(node: Node, service: Service, owner: str) -> Client:
+    """Return a node's client of another node's service."""
+    return node.create_client(
+        interface_class(service.type), from_outside(service.name, owner))

@@ -1,0 +1,5 @@
+"""
+Plans without residual vibration: the two-step command, shapers, sequences and their timeline.
+
+Like the model, it is dimensionless unless a name says otherwise, and free of ROS.
+"""

@@ -1,0 +1,332 @@
+"""
+Requests worked out as drafts, step by step, without changing the plan in force.
+
+Each function is a generator that pauses after a bounded amount of work and returns the draft:
+whoever plans a long sequence can do other things in between. `finish` does it at once.
+"""
+
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+import math
+from typing import TypeVar
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.moves import Level, Move, State
+from hmsa_ros.model.status import Code, RefusedError
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.planning.history import agree
+from hmsa_ros.planning.sequence import Segment, segments
+from hmsa_ros.planning.setpoint import impossible, Setpoint
+from hmsa_ros.planning.shapers.request import Shaper
+from hmsa_ros.planning.shapers.through import through
+from hmsa_ros.planning.stopping import brake, holdable
+from hmsa_ros.planning.timeline import Draft, Model, Plan, PlannedLevel, PlannedSegment
+
+T = TypeVar('T')
+#: Work that pauses now and then.
+Steps = Generator[None, None, T]
+
+# How hard to brake where the hardest does not lead to a plan, from the nearest stop on.
+_BRAKE_SHARES = (0.5, 0.1, 0.02, 0.0)
+# How many natural periods later to try again where a plan cannot be made anew at once.
+_PATIENCE = (0.0, 0.15, 0.3, 0.45, 0.6)
+# How far off its stretch a field at rest may be, as a share of the load.
+_SETTLED = 1e-6
+# Codes of plans that do not do what was requested.
+_WARNINGS = (Code.TOO_DAMPED, Code.INDISTINGUISHABLE, Code.SPELL_TOO_SHORT)
+# Setpoints that are checked between two pauses, which takes some 0.1 ms.
+_CHECKED = 200
+
+
+def finish(steps: Steps[T]) -> T:
+    """Do work without a pause and return its result."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            result: T = end.value
+            return result
+
+
+@dataclass(frozen=True)
+class Outset:
+    """What a draft is worked out from: a state predicted at a time in ns."""
+
+    plan: Plan
+    model: Model
+    begin: int  #: the soonest time
+    state: State
+    #: Place of the first level of the plan whose prediction holds no more.
+    stale: int | None = None
+
+    def on_grid(self, time: int) -> int:
+        """Return the next multiple of the command period."""
+        return on_grid(time, self.model)
+
+
+def on_grid(time: int, model: Model) -> int:
+    """Return the next time in ns that a command may be stamped with."""
+    period = model.options.period
+    return time if period == 0 else -(-time // period) * period
+
+
+def check_points(points: Sequence[tuple[float, int]], rest: float) -> Steps[None]:
+    """Refuse points (stretch, end in ns from the start) that are no sequence: `RefusedError`."""
+    if not points:
+        raise RefusedError(
+            Code.BAD_INPUT, 'the trajectory has no points: expected at least one')
+    previous = -1
+    for number, (stretch, time) in enumerate(points):
+        check_target(stretch, rest)
+        if time <= previous:
+            raise RefusedError(
+                Code.NOT_INCREASING,
+                f'time_from_start of point {number} is {time / NANOSECONDS:g} s'
+                + (f' after {previous / NANOSECONDS:g} s: expected strictly increasing '
+                   'times' if number else ': expected at least 0 s'))
+        previous = time
+        if number % _CHECKED == _CHECKED - 1:
+            yield
+
+
+def check_target(stretch: float, rest: float) -> None:
+    """Refuse with `RefusedError` what no actuator with a rest there has as a stretch."""
+    if reason := impossible(stretch, rest):
+        raise RefusedError(Code.BAD_INPUT, reason)
+
+
+def draft_sequence(
+        outset: Outset, points: Sequence[tuple[float, int]], base: int,
+        now: int) -> Steps[Draft | None]:
+    """
+    Plan checked points (stretch, end in ns) from a start in ns; None if they change nothing.
+
+    What cannot be carried out is a `RefusedError`.
+    """
+    begin = outset.begin
+    if points[0][1] == 0 and len(points) > 1 and base == begin:
+        # A first point at time 0 that repeats where the actuator is asks for nothing.
+        here = outset.state.stretch
+        if abs(points[0][0] - here) > 1e-6:
+            raise RefusedError(
+                Code.SPELL_TOO_SHORT,
+                f'the first point asks for {outset.model.units.coordinate} {points[0][0]:g} at '
+                f'time_from_start 0, the actuator is at {here:.6g}: expected enough time for the '
+                'move')
+    if base + points[-1][1] <= begin:
+        raise _over(points, base, now, outset.model.units.coordinate)
+    setpoints = []
+    left = begin
+    for number, (stretch, time) in enumerate(points):
+        if base + time > begin:
+            end = outset.on_grid(base + time)
+            if end == left:
+                raise RefusedError(
+                    Code.SPELL_TOO_SHORT,
+                    f'{outset.model.units.coordinate} {stretch:g} begins and ends within one '
+                    f'command period of {outset.model.options.period / NANOSECONDS:g} s: expected '
+                    'a longer span')
+            setpoints.append(Setpoint(stretch, outset.model.time(end - left)))
+            left = end
+        if number % _CHECKED == _CHECKED - 1:
+            yield
+    return (yield from draft_setpoints(outset, setpoints))
+
+
+def draft_setpoints(outset: Outset, setpoints: Sequence[Setpoint]) -> Steps[Draft | None]:
+    """Plan setpoints; None where the plan is on the way to the only one, with nothing between."""
+    planned = outset.plan.segments
+    if len(setpoints) == 1 and planned and planned[-1].stretch == setpoints[0].stretch \
+            and planned[-1].since <= outset.begin:
+        return None
+    return (yield from draft_moves(outset, setpoints))
+
+
+def draft_stop(outset: Outset) -> Steps[Draft]:
+    """Plan how to come to rest as near as the flux density limits allow."""
+    # The load that brakes hardest is held until the first turning point, then the load that
+    # holds that stretch: a two-step command whose target is chosen by its beta_p. Where one
+    # brake does not do, on a grid, through ramps or at a limit, it is a move to a stretch near by.
+    model, state = outset.model, outset.state
+    found = brake(model, state)
+    # A coil that must not step brakes as the shaper smooth does, on from where it would turn.
+    smooth = model.options.shaper == 'smooth'
+    if (not smooth and holdable(model, found.stretch) == found.stretch
+            and not model.material.creep
+            and (model.delivery.ideal or found.duration == 0.0 and _settled(model, state))):
+        move = Move(Code.HOLD, tuple(
+            [Level(0.0, found.load)] * (found.duration > 0.0)
+            + [Level(found.duration, model.holding(found.stretch))]),
+            found.duration, 'stopped')
+        end = State(found.stretch, 0.0, move.levels[-1].load)
+        levels, placed = _placed(model, outset.begin, Segment(
+            Setpoint(found.stretch, math.inf), 0.0, state, end, move, end.load))
+        return Draft(outset.begin, tuple(levels), (placed,))
+    ways = [(0.0, 'smooth')] * smooth + [(x, 'two_step') for x in _BRAKE_SHARES]
+    for share, shaper in ways:
+        stretch = holdable(model, brake(model, state, share).stretch)
+        try:
+            return (yield from draft_moves(outset, [Setpoint(stretch, math.inf)], shaper))
+        except BadInputError:
+            yield
+    # Nothing stops it at once: let it settle.
+    return (yield from draft_moves(
+        outset, [Setpoint(holdable(model, state.stretch), math.inf)], 'step'))
+
+
+def _settled(model: Model, state: State) -> bool:
+    """Return whether the field of a coil that lags holds the stretch already."""
+    return model.delivery.lag == 0.0 or math.isclose(
+        state.load, model.holding(state.stretch), rel_tol=_SETTLED, abs_tol=_SETTLED)
+
+
+def later_outsets(outset: Outset) -> Iterator[int]:
+    """Yield times in ns to begin at where there is no way from the motion at the first."""
+    model = outset.model
+    period = 2.0 * math.pi / model.frequency(outset.state.stretch)
+    for share in _PATIENCE:
+        yield outset.on_grid(outset.begin + model.ns(share * period))
+
+
+def draft_resumption(outset: Outset, arrival: int | None = None) -> Steps[Draft | None]:
+    """
+    Plan what is left of the running plan anew, until it is on its way again; None if nothing is.
+
+    Rest at the setpoint under way is at ``arrival`` in ns, or as soon as its shaper can. What
+    cannot be carried out from there is a `RefusedError`.
+    """
+    # Setpoints end when they did; one that there is no time left for is left out. From where the
+    # new plan meets the running one it goes on as that.
+    planned = outset.plan.segments
+    first = max(outset.plan.under_way(outset.begin), 0)
+    refusal: RefusedError | None = None
+    for index in range(first, len(planned)):
+        # Left out setpoints make room for the next one, which is gone to at once.
+        try:
+            draft = yield from _rejoining(outset, index, arrival)
+        except RefusedError as error:
+            refusal = refusal or error
+            if error.code is not Code.SPELL_TOO_SHORT or arrival is not None:
+                break
+            yield
+            continue
+        anew = replace(
+            draft.segments[0], since=min(planned[index].since, draft.segments[0].since))
+        return replace(
+            draft, segments=(anew, *draft.segments[1:]), resumed=first, missed=index - first)
+    if refusal is not None:
+        raise refusal
+    return None
+
+
+def _rejoining(outset: Outset, index: int, arrival: int | None) -> Steps[Draft]:
+    """Plan the setpoints from a place on, until the running plan is met."""
+    first = None if arrival is None else partial(
+        through, duration=outset.model.time(arrival - outset.begin))
+    planned = outset.plan.segments
+    levels: list[PlannedLevel] = []
+    placed: list[PlannedSegment] = []
+    for segment in _planned(
+            outset.model, outset.state, _left(outset, index), first=first):
+        more, one = _placed(outset.model, outset.begin, segment)
+        levels += more
+        placed.append(one)
+        following = index + len(placed)
+        place = _meeting(outset, segment.end, following) if following < len(planned) else None
+        if place is not None:
+            levels += outset.plan.levels[place:]
+            placed += planned[following:]
+            break
+        yield
+    return Draft(outset.begin, tuple(levels), tuple(placed))
+
+
+def _left(outset: Outset, index: int) -> Iterator[Setpoint]:
+    """Yield the setpoints of the running plan from a place on, with the time left for them."""
+    planned = outset.plan.segments
+    left = outset.begin
+    for place in range(index, len(planned) - 1):
+        end = planned[place + 1].since
+        yield Setpoint(planned[place].stretch, outset.model.time(end - left))
+        left = end
+    yield Setpoint(planned[-1].stretch, math.inf)
+
+
+def _meeting(outset: Outset, state: State, following: int) -> int | None:
+    """Return from which level on the running plan continues a state at a setpoint's begin."""
+    planned = outset.plan.segments[following]
+    place = outset.plan.place(planned.begin)
+    level = outset.plan.levels[place]
+    if (level.stamp != planned.begin or level.model is not outset.model
+            or outset.stale is not None and place < outset.stale):
+        return None
+    here = PlannedLevel.of(level.stamp, level.flux_density, state, level.model)
+    return place if agree(here, level) else None
+
+
+def draft_moves(
+        outset: Outset, setpoints: Iterable[Setpoint], shaper: str = '') -> Steps[Draft]:
+    """Plan setpoints and place them on the timeline; the shaper is that of the options."""
+    levels: list[PlannedLevel] = []
+    placed: list[PlannedSegment] = []
+    warning: PlannedSegment | None = None
+    for segment in _planned(outset.model, outset.state, setpoints, shaper):
+        more, one = _placed(outset.model, outset.begin, segment)
+        levels += more
+        placed.append(one)
+        if warning is None and one.code in _WARNINGS:
+            warning = one
+        yield
+    return Draft(outset.begin, tuple(levels), tuple(placed), warning=warning)
+
+
+def _planned(
+        model: Model, state: State, setpoints: Iterable[Setpoint], shaper: str = '',
+        first: Shaper | None = None) -> Iterator[Segment]:
+    options = model.options
+    return segments(
+        setpoints, model.material, start=state, shaper=shaper or options.shaper, first=first,
+        limits=model.limits, delivery=model.delivery, order=options.order, units=model.units,
+        short_spell=options.short_spell, errors=options.errors, pace=model.pace)
+
+
+def _placed(
+        model: Model, begin: int, segment: Segment) -> tuple[list[PlannedLevel], PlannedSegment]:
+    """Place a planned move on the timeline, in SI units."""
+    start = begin + model.ns(segment.begin)
+    state = segment.start
+    if math.isnan(state.load):
+        raise ValueError('a segment on the timeline knows the load it starts from')
+    levels = []
+    time = 0.0
+    known = len(segment.move.levels) - len(segment.move.tail)
+    for number, level in enumerate(segment.move.levels):
+        if number >= known:
+            state = segment.move.tail[number - known]
+        elif number:
+            state = model.follow(state, segment.move.levels[number - 1].load, level.time - time)
+        time = level.time
+        levels.append(PlannedLevel.of(
+            start + model.ns(time), level.load * model.units.load, state, model))
+    duration = segment.move.duration
+    return levels, PlannedSegment(
+        segment.setpoint.stretch, start,
+        None if math.isinf(duration) else start + model.ns(duration),
+        segment.move.code, segment.move.reason, start, segment.move.vibration,
+        None if math.isinf(segment.setpoint.span) else start + model.ns(segment.setpoint.span))
+
+
+def _over(
+        points: Sequence[tuple[float, int]], base: int, now: int, coordinate: str) -> RefusedError:
+    """Return the refusal of a sequence that is over."""
+    stretch, last = points[-1]
+    if last == 0:
+        return RefusedError(
+            Code.SPELL_TOO_SHORT,
+            f'{coordinate} {stretch:g} is due at time_from_start 0: expected time for the move')
+    return RefusedError(
+        Code.IN_THE_PAST,
+        f'the sequence stamped {base / NANOSECONDS:.3f} s ends at '
+        f'{(base + last) / NANOSECONDS:.3f} s, now is {now / NANOSECONDS:.3f} s: expected an '
+        'end more than lead_time ahead; do sender and planner use the same clock (use_sim_time)?')

@@ -1,0 +1,243 @@
+"""
+Planners of several joints that take a request together or not at all.
+
+One joint is a group of one, planned as by its planner alone.
+"""
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+import math
+
+from hmsa_ros.model.status import RefusedError
+from hmsa_ros.planning.drafting import Steps
+from hmsa_ros.planning.history import Deviation
+from hmsa_ros.planning.planner import Planner
+from hmsa_ros.planning.timeline import Draft, Plan, PlannedSegment
+
+# How often running a plan is made anew, with no command in time in between.
+_ATTEMPTS = 3
+# What a joint counts as resting within, relative to its load and its natural frequency.
+_AT_REST = 1e-6
+# The first of these that some joint is in is that of all.
+_STATES = ('moving', 'waiting', 'holding', 'settling', 'at_rest', 'idle')
+# Setpoints whose arrivals are compared between two pauses.
+_COMPARED = 100
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a joint, or all of them, have come in their sequence."""
+
+    state: str = 'idle'  #: idle, or another of `_STATES`
+    setpoint: int = 0  #: under way, from 1
+    setpoints: int = 0
+    stretch: str = ''  #: target; empty for none, or for several joints
+
+
+@dataclass(frozen=True)
+class Resumption:
+    """How a joint goes on after a deviation: a draft (None if done), or why it comes to rest."""
+
+    draft: Draft | None
+    refusal: str = ''
+    left: float = 0.0  #: vibration that the plan leaves that stays, as a share of the step
+
+
+class PlannerGroup:
+    """
+    Several planners, each with a block, limits and a timeline of its own.
+
+    Lead time and command period must be the same for all. Where they are to be ``simultaneous``,
+    which may change from request to request, joints that would arrive sooner begin later, so that
+    all arrive together. ``number`` counts accepted requests from 1.
+    """
+
+    def __init__(
+            self, planners: Mapping[str, Planner], *, simultaneous: bool = False) -> None:
+        """Take the planners as they are."""
+        self.planners = dict(planners)
+        self.simultaneous = simultaneous
+        self.number = 0
+        self._attempts = dict.fromkeys(self.planners, 0)
+
+    # -- requests ------------------------------------------------------------------------------
+
+    def draft_request(
+            self, points: Mapping[str, Sequence[tuple[float, int]]], stamp: int | None,
+            now: int, *, raw: bool = False) -> Steps[dict[str, Draft]]:
+        """Work out a sequence, or levels if raw, without joints that change nothing."""
+        if raw:
+            return (yield from self._each(
+                points, lambda name: self.planners[name].draft_levels(
+                    points[name], stamp, now)))
+        drafts = yield from self._each(
+            points, lambda name: self.planners[name].draft_request(points[name], stamp, now))
+        if self.simultaneous:
+            return (yield from self._together(drafts))
+        return drafts
+
+    def draft_setpoint(self, name: str, stretch: float, now: int) -> Steps[dict[str, Draft]]:
+        """Work out a single stretch for one joint; `draft_request` says more."""
+        return (yield from self._each(
+            [name], lambda name: self.planners[name].draft_setpoint(stretch, now)))
+
+    def draft_stop(self, now: int) -> Steps[dict[str, Draft]]:
+        """Work out how all joints come to rest; `draft_request` says more."""
+        return (yield from self._each(
+            self.planners, lambda name: self.planners[name].draft_stop(now)))
+
+    def take(self, drafts: Mapping[str, Draft], now: int) -> bool:
+        """Take drafts of one request, made at the same time (ns); return if anything changes."""
+        for name, draft in drafts.items():
+            self.planners[name].take(draft, now)
+            self._attempts[name] = 0
+        self.number += bool(drafts)
+        return bool(drafts)
+
+    def draft_resumption(self, name: str, now: int) -> Steps[Resumption]:
+        """Work out how what is left of a joint's plan goes on, or how the joint stops."""
+        planner = self.planners[name]
+        try:
+            return Resumption((yield from planner.draft_resumption(now)))
+        except RefusedError as error:
+            return Resumption((yield from planner.draft_stop(now)), str(error))
+
+    def resume(self, name: str, found: Resumption, now: int) -> None:
+        """Take a joint's plan that has been made anew."""
+        self._attempts[name] += 1
+        self.planners[name].take(found.draft, now)
+
+    def may_resume(self, name: str) -> bool:
+        """Return whether a joint may replan; not where several new plans came too late."""
+        return self._attempts[name] < _ATTEMPTS
+
+    def applied(
+            self, name: str, stamp: int, flux_density: float,
+            tolerance: int) -> Deviation | None:
+        """Take in a joint's change of level as `RunningPlan.applied` does."""
+        found = self.planners[name].applied(stamp, flux_density, tolerance)
+        if found is not None and not found.beyond(tolerance):
+            self._attempts[name] = 0
+        return found
+
+    def _each(
+            self, names: Iterable[str],
+            draft: Callable[[str], Steps[Draft | None]]) -> Steps[dict[str, Draft]]:
+        drafts = {}
+        for name in names:
+            try:
+                made = yield from draft(name)
+            except RefusedError as error:
+                if len(self.planners) == 1:
+                    raise
+                raise RefusedError(error.code, f'joint {name}: {error}') from error
+            if made is not None:
+                drafts[name] = made
+        return drafts
+
+    def _together(self, drafts: dict[str, Draft]) -> Steps[dict[str, Draft]]:
+        """Have moves begin later that would arrive before the slowest to the same setpoint."""
+        delays: dict[str, list[int]] = {name: [] for name in drafts}
+        for number, row in enumerate(zip(*(x.segments for x in drafts.values()), strict=True)):
+            latest = max((x.arrival for x in row if x.arrival is not None), default=None)
+            for (name, draft), segment in zip(drafts.items(), row, strict=True):
+                delays[name].append(
+                    latest - segment.arrival
+                    if latest is not None and segment.arrival is not None
+                    and _rests(draft, segment) else 0)
+            if number % _COMPARED == _COMPARED - 1:
+                yield
+        return {name: draft.delayed(delays[name]) for name, draft in drafts.items()}
+
+    # -- what comes of them --------------------------------------------------------------------
+
+    def restart(self) -> None:
+        """Drop all plans, after the clock has jumped back."""
+        for planner in self.planners.values():
+            planner.restart()
+
+    def next_command(self) -> int | None:
+        """Return the time in ns at which a command is to be handed out; None for none."""
+        times = ((x.next_stamp, x.options.lead_time) for x in self.planners.values())
+        return min((stamp - lead for stamp, lead in times if stamp is not None), default=None)
+
+    def next_change(self, now: int) -> int | None:
+        """Return the time in ns after now at which progress changes; None for never."""
+        return min((
+            x for planner in self.planners.values() for x in _changes(planner.plan, now)
+        ), default=None)
+
+    def progress(self, now: int) -> tuple[Progress, dict[str, Progress]]:
+        """Return the progress of all joints, as of the one with most to do, and of each."""
+        each = {name: _progress(x.plan, now) for name, x in self.planners.items()}
+        if len(each) == 1:
+            return next(iter(each.values())), each
+        busy = [x for x in each.values() if x.state != 'idle']
+        if not busy:
+            return Progress(), each
+        last = max(busy, key=lambda x: x.setpoints - x.setpoint)
+        return Progress(
+            min((x.state for x in busy), key=_STATES.index), last.setpoint,
+            last.setpoints), each
+
+    def preview(
+            self, begin: int,
+            limit: int) -> tuple[list[int], dict[str, list[tuple[float, float, float]]]]:
+        """Return stamps in ns and, by joint, stretch, rate (1/s) and flux density (T) at each."""
+        # From the level in force at begin on, at most limit changes of level of any joint.
+        stamps = sorted({
+            level.stamp for planner in self.planners.values()
+            for level in planner.plan.ahead(begin, limit)})[:limit]
+        return stamps, {
+            name: _samples(planner.plan, stamps) for name, planner in self.planners.items()}
+
+
+def _rests(draft: Draft, segment: PlannedSegment) -> bool:
+    """Whether a joint can as well begin a move later, since it rests until then."""
+    level = draft.levels[bisect_left(draft.levels, segment.begin, key=lambda x: x.stamp)]
+    model = level.model
+    # What creeps has relaxed further by then.
+    return not model.material.creep and (
+        abs(level.rate) * model.units.time <= _AT_REST
+        and math.isclose(
+            level.in_force / model.units.load, model.holding(level.stretch), rel_tol=_AT_REST,
+            abs_tol=_AT_REST))
+
+
+def _samples(plan: Plan, stamps: Sequence[int]) -> list[tuple[float, float, float]]:
+    """Return stretch, rate in 1/s and flux density in T of a plan at increasing times in ns."""
+    samples: list[tuple[float, float, float]] = []
+    for place, group in groupby(stamps, key=plan.place):
+        level = plan.levels[place]
+        times = [max(x, level.stamp) for x in group]
+        samples += [(*x, level.flux_density) for x in level.sample(times)]
+    return samples
+
+
+def _changes(plan: Plan, now: int) -> Iterable[int]:
+    """Return the next times after now at which the progress of a plan changes."""
+    place = bisect_right(plan.segments, now, key=lambda x: x.since)
+    for segment in plan.segments[place:place + 1]:
+        yield segment.since
+    for segment in plan.segments[max(place - 1, 0):place + 1]:
+        if segment.arrival is not None and segment.arrival > now:
+            yield segment.arrival
+
+
+def _progress(plan: Plan, now: int) -> Progress:
+    """Return how far a plan has come."""
+    count = len(plan.segments) - plan.kept
+    place = plan.under_way(now)
+    if place < plan.kept:
+        return Progress('waiting' if count else 'idle', 0, count)
+    segment = plan.segments[place]
+    last = place == len(plan.segments) - 1
+    if segment.arrival is None:
+        state = 'settling' if last else 'moving'
+    elif now < segment.arrival:
+        state = 'moving'
+    else:
+        state = 'at_rest' if last else 'holding'
+    return Progress(state, place - plan.kept + 1, count, f'{segment.stretch:.12g}')

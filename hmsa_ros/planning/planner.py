@@ -1,0 +1,195 @@
+"""
+The planner over time: requests in, a timeline of stamped flux densities out.
+
+Times are integer nanoseconds of whatever clock the caller keeps. A request is worked out as a
+draft (`hmsa_ros.planning.drafting`), which changes nothing, and then taken: several planners can
+so take all of a request or none of it (`hmsa_ros.planning.group`).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+import math
+
+from hmsa_ros.model.equations import equilibrium_stretch
+from hmsa_ros.model.parameters import ActuatorParameters
+from hmsa_ros.model.simulation import check_stretch
+from hmsa_ros.model.status import Code, RefusedError
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.planning.drafting import (
+    check_points,
+    check_target,
+    draft_moves,
+    draft_resumption,
+    draft_sequence,
+    draft_setpoints,
+    draft_stop,
+    finish,
+    later_outsets,
+    on_grid,
+    Outset,
+    Steps,
+)
+from hmsa_ros.planning.raw import check_levels, draft_levels
+from hmsa_ros.planning.running import RunningPlan
+from hmsa_ros.planning.setpoint import Setpoint
+from hmsa_ros.planning.timeline import (
+    Draft,
+    Model,
+    Options,
+    Plan,
+    PlannedLevel,
+    PlannedSegment,
+)
+
+__all__ = ['Options', 'Plan', 'PlannedLevel', 'PlannedSegment', 'Planner']
+
+
+class Planner(RunningPlan):
+    """Keeps one timeline and replaces its future on request."""
+
+    def __init__(
+            self, actuator: ActuatorParameters, options: Options, *,
+            stretch: float | None = None) -> None:
+        """Start at rest."""
+        super().__init__(
+            Model(actuator, options), actuator.rest if stretch is None else stretch)
+        #: Returns stretch, rate in 1/s and what branches follow, as samples show them of a time in
+        #: ns; None for what is predicted.
+        self.believed: Callable[
+            [int], tuple[float, float, tuple[float, ...]] | None] = lambda time: None
+
+    @property
+    def options(self) -> Options:
+        """How the next request is planned."""
+        return self.model.options
+
+    def set_options(
+            self, options: Options, actuator: ActuatorParameters | None = None) -> None:
+        """Plan the next requests with other options or for another block, once checked."""
+        self.take_model(self.checked_model(options, actuator or self.model.actuator))
+
+    def checked_model(self, options: Options, actuator: ActuatorParameters) -> Model:
+        """Return a model after checking that the block can be where it is held."""
+        if (options, actuator) == (self.model.options, self.model.actuator):
+            return self.model
+        model = Model(actuator, options)
+        segments = self.plan.segments
+        check_stretch(
+            segments[-1].stretch if segments else self.plan.levels[-1].stretch,
+            model.material, 'the stretch that is held')
+        return model
+
+    def take_model(self, model: Model) -> None:
+        """Plan the next requests under a model; the running plan stays."""
+        if model is not self.model:
+            self.model = model
+            self.revision += 1
+
+    # -- requests ------------------------------------------------------------------------------
+
+    def request(
+            self, points: Sequence[tuple[float, int]], stamp: int | None, now: int) -> Plan:
+        """Take a setpoint sequence; `draft_request` says more."""
+        return self.take(finish(self.draft_request(points, stamp, now)), now)
+
+    def setpoint(self, stretch: float, now: int) -> Plan:
+        """Go to one stretch as soon as possible and hold it."""
+        return self.take(finish(self.draft_setpoint(stretch, now)), now)
+
+    def stop(self, now: int) -> Plan:
+        """Drop what is ahead and come to rest as near as the flux density limits allow."""
+        return self.take(finish(self.draft_stop(now)), now)
+
+    def draft_request(
+            self, points: Sequence[tuple[float, int]], stamp: int | None,
+            now: int) -> Steps[Draft | None]:
+        """
+        Work out a sequence of points: stretch, and end in ns from the start, strictly increasing.
+
+        ``stamp`` is the start in ns, or None for now. A future one keeps the running plan until
+        then, a past one joins the sequence in the middle. The draft is None where the request
+        changes nothing; what cannot be carried out is a `RefusedError`.
+        """
+        yield from check_points(points, self.model.material.rest)
+        soonest = self.soonest(now)
+        base = soonest if stamp is None else stamp
+        outset = self._outset(on_grid(max(base, soonest), self.model))
+        return (yield from draft_sequence(outset, points, base, now))
+
+    def draft_levels(
+            self, points: Sequence[tuple[float, int]], stamp: int | None,
+            now: int) -> Steps[Draft]:
+        """
+        Work out levels in T, in force from times in ns on that count from a stamp, or from now.
+
+        What cannot be carried out is a `RefusedError`.
+        """
+        check_levels(points, self.model)
+        soonest = self.soonest(now)
+        begin = on_grid((soonest if stamp is None else stamp) + points[0][1], self.model)
+        if begin < soonest:
+            raise RefusedError(
+                Code.IN_THE_PAST, f'the first level applies {(now - begin) / NANOSECONDS:.3f} s '
+                'ago: expected levels more than lead_time ahead')
+        return (yield from draft_levels(self._outset(begin), points))
+
+    def draft_setpoint(self, stretch: float, now: int) -> Steps[Draft | None]:
+        """Work out a move to one stretch; None where it changes nothing."""
+        check_target(stretch, self.model.material.rest)
+        outset = self._outset(self.soonest(now))
+        return (yield from draft_setpoints(outset, [Setpoint(stretch, math.inf)]))
+
+    def draft_stop(self, now: int) -> Steps[Draft]:
+        """Work out how to come to rest."""
+        return (yield from draft_stop(self._outset(self.soonest(now))))
+
+    def draft_resumption(self, now: int, arrival: int | None = None) -> Steps[Draft | None]:
+        """Plan what is left anew from where the actuator is, to arrive in time if one is given."""
+        # None if nothing is left. From the first time that a command can reach, or, where there is
+        # no way from the motion it meets, a part of a period later.
+        begin = self.soonest(now)
+        if self.plan.segments:
+            begin = max(begin, self.plan.segments[0].since)
+        outset = self._outset(begin)
+        if arrival is not None:
+            return (yield from draft_resumption(outset, arrival))
+        for later in later_outsets(outset):
+            try:
+                return (yield from draft_resumption(self._outset(later)))
+            except RefusedError:
+                # From another phase of the motion it may be possible.
+                yield
+        return (yield from draft_resumption(outset))
+
+    def draft_trim(self, now: int, flux_density: float) -> Steps[Draft]:
+        """Work out how to hold the setpoint under way by another level in T, from rest."""
+        model, begin = self.model, self.soonest(now)
+        state, place = self.state(begin), self.plan.under_way(begin)
+        # Beside the target, by what the model does not know of: it goes by its own stretches.
+        held, wanted = (float(equilibrium_stretch(x / model.units.load, model.material)) for x in (
+            self.plan.level(begin).flux_density, flux_density))
+        draft = yield from draft_moves(
+            Outset(self.plan, model, begin, replace(state, stretch=held, rate=0.0)),
+            [Setpoint(wanted, math.inf)])
+        segment = self.plan.segments[place]
+        anew = replace(draft.segments[0], stretch=segment.stretch, since=segment.since)
+        return replace(draft, segments=(anew,), resumed=place)
+
+    def _outset(self, begin: int) -> Outset:
+        state = self._delayed(begin)
+        believed = self.believed(begin + self.delay)
+        if believed is not None:
+            state = replace(
+                state, stretch=believed[0], rate=believed[1] * self.model.units.time,
+                followed=believed[2] or state.followed)
+        return Outset(self.plan, self.model, begin, state, self._history.stale)
+
+    def as_sent(self, time: int) -> bool:
+        """Whether levels are in force at a time in ns that are to be as somebody sent them."""
+        found = self.segment(time)
+        return found is not None and found[1].code is Code.LEVELS and (
+            found[1].arrival is None or time < found[1].arrival)
+
+    def soonest(self, now: int) -> int:
+        """Return the first time that a command can still reach in time."""
+        return on_grid(now + self.model.options.lead_time, self.model)

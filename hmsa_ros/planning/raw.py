@@ -1,0 +1,140 @@
+"""
+Levels that are commanded as they are, such as those that `hmsa excite` designs.
+
+Nothing shapes them, but all else holds as for other requests: the limits of the coil, the ramps
+of its amplifier, the limits of the block, and rest at the end.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+import math
+
+from hmsa_ros.model.equations import equilibrium_stretch, stretch_limits
+from hmsa_ros.model.moves import State
+from hmsa_ros.model.status import Code, RefusedError
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.planning.drafting import draft_moves, Outset, Steps
+from hmsa_ros.planning.setpoint import Setpoint
+from hmsa_ros.planning.timeline import Draft, Model, PlannedLevel, PlannedSegment
+
+# Share of the way to the limits of the law that a motion may go.
+_MARGIN = 0.98
+# Periods after a change of level in which the motion is largest, and samples of each.
+_PERIODS, _SAMPLES = 2.0, 40
+# Motion about the rest of the last level that counts as rest, stretch.
+_REST = 5e-4
+
+
+def check_levels(points: Sequence[tuple[float, int]], model: Model) -> None:
+    """
+    Check flux densities in T and the times in ns from the start from which they apply.
+
+    Where there are none, times do not increase or the coil has no such level: `RefusedError`.
+    """
+    least, most = model.options.flux_density_min, model.options.flux_density_max
+    if not points:
+        raise RefusedError(
+            Code.BAD_INPUT, 'the trajectory has no points: expected at least one')
+    previous = -1
+    for number, (level, time) in enumerate(points):
+        if not math.isfinite(level):
+            raise RefusedError(
+                Code.BAD_INPUT, f'level {number} is {level:g} T: expected a finite number')
+        if not least <= level <= most:
+            raise RefusedError(
+                Code.FLUX_LIMIT,
+                f'level {number} is {level:g} T: expected {least:g} to {most:g} T, the limits of '
+                'the coil (flux_density_min, flux_density_max)')
+        if time <= previous:
+            raise RefusedError(
+                Code.NOT_INCREASING,
+                f'time_from_start of level {number} is {time / NANOSECONDS:g} s after '
+                f'{previous / NANOSECONDS:g} s: expected strictly increasing times of at least 0')
+        previous = time
+
+
+def draft_levels(outset: Outset, points: Sequence[tuple[float, int]]) -> Steps[Draft]:
+    """
+    Plan checked levels (T, ns); their one setpoint is the stretch that the last one holds.
+
+    Where the motion has not ended with the last of them, a shaped move to that stretch takes its
+    place. A motion beyond the limits of the block, or without a way to rest, is a `RefusedError`.
+    """
+    model, state = outset.model, outset.state
+    levels: list[PlannedLevel] = []
+    for number, (flux_density, time) in enumerate(points):
+        stamp = outset.on_grid(outset.begin + time - points[0][1])
+        if levels:
+            before = levels[-1]
+            if stamp <= before.stamp:
+                raise RefusedError(
+                    Code.NOT_INCREASING,
+                    f'levels {number - 1} and {number} apply within one command period of '
+                    f'{model.options.period / NANOSECONDS:g} s: expected levels farther apart')
+            _check_motion(number - 1, before, state, stamp)
+            state = model.follow(
+                state, before.flux_density / model.units.load, model.time(stamp - before.stamp))
+        levels.append(PlannedLevel.of(stamp, flux_density, state, model))
+        yield
+    last = levels[-1]
+    _check_motion(len(points) - 1, last, state, None)
+    rest = float(equilibrium_stretch(last.flux_density / model.units.load, model.material))
+    settled = model.ns(_settling(last, state))
+    period = _period(model, rest)
+    times = [last.stamp + settled + round(i * period / _SAMPLES)
+             for i in range(round(_PERIODS * _SAMPLES))]
+    moves = max(abs(x - rest) for x, _ in last.sample(times))
+    arrival: int | None = last.stamp + settled
+    if moves > _REST:
+        try:
+            end = yield from draft_moves(
+                replace(outset, begin=last.stamp, state=state), [Setpoint(rest, math.inf)],
+                'two_step')
+        except RefusedError as error:
+            raise RefusedError(
+                error.code, f'the last level leaves a motion of {moves:.2g} about {rest:.6g}, and '
+                f'no move ends it: {error}; expected levels that end at rest, as hmsa excite '
+                'writes them') from error
+        levels[-1:] = end.levels
+        arrival = end.segments[0].arrival
+    return Draft(outset.begin, tuple(levels), (PlannedSegment(
+        rest, outset.begin, arrival, Code.LEVELS, '', outset.begin),))
+
+
+def _settling(level: PlannedLevel, state: State) -> float:
+    """Return the nondimensional time that the field takes to get to a level."""
+    model = level.model
+    return model.delivery.settling(level.flux_density / model.units.load - state.ramps_from)
+
+
+def _period(model: Model, stretch: float) -> float:
+    """Return the shorter period, in ns, of vibration about a stretch and about rest."""
+    return min(
+        2.0 * math.pi / model.frequency(x) * model.units.time * NANOSECONDS
+        for x in (model.material.rest, stretch))
+
+
+def _check_motion(number: int, level: PlannedLevel, state: State, end: int | None) -> None:
+    """Refuse a level under which the block would come too near to the limits of its law."""
+    model = level.model
+    lower, upper = stretch_limits(model.material)
+    home = model.material.rest
+    least, most = (home + _MARGIN * (x - home) for x in (lower, upper))
+    rest = float(equilibrium_stretch(level.flux_density / model.units.load, model.material))
+    if least < rest < most:
+        step = _period(model, rest) / _SAMPLES
+        last = level.stamp + model.ns(_settling(level, state)) + round(
+            _PERIODS * _SAMPLES * step)
+        last = last if end is None else min(end, last)
+        times = [level.stamp + round(i * step) for i in range(
+            int((last - level.stamp) / step) + 1)]
+        stretches = [x for x, _ in level.sample(times)]
+    else:
+        stretches = [rest]
+    for stretch in (min(stretches), max(stretches)):
+        if not least < stretch < most:
+            raise RefusedError(
+                Code.OUT_OF_RANGE,
+                f'level {number} of {level.flux_density:g} T takes the '
+                f'{model.units.coordinate} to {stretch:.4g}: expected {least:.4g} to {most:.4g}, '
+                'as the law of the actuator allows; lower the levels, or correct its parameters')

@@ -1,0 +1,261 @@
+"""
+The plan that runs: its levels are handed out, and what took effect is taken into it.
+
+Times are integer nanoseconds of whatever clock the caller keeps.
+"""
+
+from bisect import bisect_left, bisect_right
+from dataclasses import replace
+import math
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.equations import elastic_stiffness, equilibrium_stretch
+from hmsa_ros.model.moves import State
+from hmsa_ros.model.simulation import check_stretch
+from hmsa_ros.planning.drafting import on_grid
+from hmsa_ros.planning.history import Deviation, History
+from hmsa_ros.planning.timeline import ALWAYS, Draft, Model, Plan, PlannedLevel, PlannedSegment
+
+# Stretch rates of a sample below this share of the natural frequency are rest, where the model
+# would have it move: the model is off then, and not the actuator in motion.
+_SAMPLED_AT_REST = 1e-4
+# How far the model may be off a sample at rest to be believed nevertheless.
+_AGREES = 1e-3
+# Amplitude of stretch up to which drafts hold that were begun before news came.
+_LITTLE = 1e-4
+# Levels that are kept for news of when they took effect.
+_REMEMBERED = 32
+
+
+class RunningPlan:
+    """
+    One timeline, of which the past is what really took effect.
+
+    ``revision`` grows whenever what is going to happen changes: drafts made before are no good.
+    """
+
+    def __init__(self, model: Model, stretch: float) -> None:
+        """Start at rest."""
+        check_stretch(stretch, model.material, 'initial stretch')
+        self.model = model
+        #: How late, in ns, levels to come are expected to take effect, all of them.
+        self.delay = 0
+        self._strayed = 0.0
+        self._initial = stretch
+        self.plan = Plan(0, (), ())
+        self._history = History(())
+        self.revision = 0
+        self.restart()
+
+    def restart(self) -> None:
+        """Drop all plans: at rest where it was before the first request, as the clock begins."""
+        flux_density = self.model.holding(self._initial) * self.model.units.load
+        self._begin_with(PlannedLevel(
+            ALWAYS, flux_density, self._initial, 0.0, flux_density, self.model))
+
+    def _begin_with(self, level: PlannedLevel, *, keep: bool = False) -> None:
+        """Begin anew from a level; if its setpoints are kept, so is what was not sent yet."""
+        old, ahead = self.plan, self._history.levels[self._history.sent:] if keep else ()
+        self._history = History((level, *ahead), stale=1 if ahead else None)
+        self.plan = Plan(
+            old.number, self._history.levels, old.segments if keep else (),
+            old.kept if keep else 0)
+        self.revision += 1
+
+    def take_over(
+            self, stamp: int, stretch: float, rate: float, in_force: float,
+            flux_density: float | None = None, *, keep: bool = False) -> None:
+        """
+        Drop plans and go on from a state measured at a stamp in ns, with the rate in 1/s.
+
+        ``in_force`` is the field in T, ``flux_density`` the level that a slew limit still ramps
+        to. A state that the block cannot have is a `BadInputError`. The setpoints ahead may be
+        kept, to be planned anew.
+        """
+        model = self.model
+        check_stretch(stretch, model.material, 'stretch in force')
+        level = in_force if flux_density is None else flux_density
+        if not math.isfinite(rate + in_force + level):
+            raise BadInputError(
+                f'state in force is rate {rate:g} 1/s, flux density {in_force:g} T: expected '
+                'finite numbers')
+        begin = PlannedLevel(stamp, level, stretch, rate, in_force, model)
+        held = equilibrium_stretch(level / model.units.load, model.material)
+        at_rest = abs(rate) * model.units.time <= _SAMPLED_AT_REST * self.model.frequency(stretch)
+        if at_rest and level == in_force and abs(float(held) - stretch) > _AGREES:
+            begin = replace(begin, stamp=ALWAYS, rate=0.0)
+        self._begin_with(begin, keep=keep)
+
+    def abandon(self, now: int) -> None:
+        """Drop what is ahead at a time in ns, sent or not, and the setpoints: nobody obeys."""
+        self._remember(self._history.predicted(self.plan.place(now) + 1))
+        place = self.plan.place(now)
+        self._history = History(
+            self._history.levels[:place + 1], place + 1, min(self._history.known, place))
+        self.plan = Plan(self.plan.number, self._history.levels, ())
+        self.revision += 1
+
+    def take(self, draft: Draft | None, now: int) -> Plan:
+        """Replace everything from a draft of the present revision on; return the plan in force."""
+        if draft is None:
+            return self.plan
+        old, history, begin = self.plan, self._history, draft.begin
+        kept = bisect_left(old.levels, begin, key=lambda x: x.stamp)
+        begun = bisect_right(old.levels, now, key=lambda x: x.stamp)
+        # What is over and handed out is forgotten, but for the level in force, and for those
+        # that there may still be news of.
+        over = max(min(history.sent, kept, begun) - 1, 0)
+        first = max(min(over, history.known), over - _REMEMBERED)
+        stale = history.stale
+        self._history = History(
+            old.levels[first:kept] + draft.levels, min(history.sent, kept) - first,
+            max(min(history.known, kept - 1) - first, 0),
+            stale - first if stale is not None and stale < kept else None)
+        levels = self._history.levels
+        if draft.resumed is None:
+            segments = _running(old, begin, now)
+            self.plan = Plan(
+                old.number + 1, levels, segments + draft.segments, len(segments))
+        else:
+            before = old.segments[:draft.resumed]
+            self.plan = Plan(
+                old.number, levels, before + draft.segments, min(old.kept, len(before)))
+        self.revision += 1
+        return self.plan
+
+    def due(self, now: int) -> tuple[PlannedLevel, ...]:
+        """Hand out the commands to send now, each once: those stamped up to lead_time ahead."""
+        history, latest = self._history, now + self.model.options.lead_time
+        if not self.pending or history.levels[history.sent].stamp > latest:
+            return ()
+        end = bisect_right(history.levels, latest, history.sent, key=lambda x: x.stamp)
+        self._remember(history.handed_out(end))
+        return self._history.levels[history.sent:end]
+
+    def moves(self, now: int) -> bool:
+        """Return whether setpoints are under way at a time in ns."""
+        segments = self.plan.segments
+        return bool(segments) and (segments[-1].arrival is None or now < segments[-1].arrival)
+
+    @property
+    def pending(self) -> bool:
+        """Whether commands remain to be handed out."""
+        return self._history.sent < len(self._history.levels)
+
+    @property
+    def next_stamp(self) -> int | None:
+        """Stamp in ns of the next command to be handed out; None if there is none."""
+        return self._history.levels[self._history.sent].stamp if self.pending else None
+
+    @property
+    def last_sent(self) -> PlannedLevel:
+        """Level that was handed out last, or the one in force before the first."""
+        return self._history.levels[self._history.sent - 1]
+
+    def beat_stamp(self, now: int) -> int:
+        """Return the time in ns to stamp the level handed out last with when it is repeated."""
+        return on_grid(
+            max(now + self.model.options.lead_time, self.last_sent.stamp), self.model)
+
+    def drop_missed(self, now: int, tolerance: int) -> int:
+        """Drop levels never sent and late by more than a tolerance (ns); return how many."""
+        history = self._history
+        end = bisect_left(
+            history.levels, now - tolerance, history.sent, key=lambda x: x.stamp)
+        if end > history.sent:
+            self._remember(history.without(history.sent, end))
+            self.revision += 1
+        return end - history.sent
+
+    def unheard(self, now: int) -> int | None:
+        """Return the stamp in ns of the last level that never took effect; None for none."""
+        history = self._history
+        count = history.unheard(now)
+        return history.levels[history.known + count].stamp if count else None
+
+    def drop_unheard(self, stamp: int) -> None:
+        """Take out of the plan what `unheard` has found."""
+        first = self._history.known + 1
+        self._remember(self._history.without(first, first + self._history.unheard(stamp)))
+        self.revision += 1
+
+    def applied(self, stamp: int, flux_density: float, tolerance: int) -> Deviation | None:
+        """Take in a change of level as `History.with_news` does; None if it is no news."""
+        history, deviation = self._history.with_news(stamp, flux_density, tolerance)
+        self._remember(history)
+        if deviation is not None:
+            deviation = replace(deviation, effect=self._effect(deviation, tolerance))
+            self._strayed += deviation.effect
+            if self._strayed > _LITTLE:
+                self._strayed = 0.0
+                self.revision += 1
+        return deviation
+
+    def _effect(self, deviation: Deviation, tolerance: int) -> float:
+        """Return how far off the plan news leave the actuator, as a stretch."""
+        punctual = replace(deviation, late=deviation.late - self.delay)
+        if not punctual.beyond(tolerance):
+            return 0.0
+        return math.inf if replace(punctual, late=0).beyond(0) else self.vibration(
+            punctual.late, deviation.change)
+
+    def vibration(self, late: int, change: float) -> float:
+        """Return the amplitude of stretch that a change in T leaves which is so many ns late."""
+        # It has had as much less momentum: omega times the delay, of the change of its rest.
+        level = self._history.levels[self._history.known]
+        model = level.model
+        stretch = equilibrium_stretch(level.flux_density / model.units.load, model.material)
+        stiffness = elastic_stiffness(stretch, model.material)
+        return float(
+            abs(model.time(late) * change / model.units.load / stiffness)
+            * model.frequency(float(stretch)))
+
+    @property
+    def awaiting(self) -> bool:
+        """Whether there is no news yet of levels that have been handed out."""
+        return self._history.sent > self._history.known + 1
+
+    def unknown(self, now: int) -> tuple[PlannedLevel, tuple[PlannedLevel, ...]]:
+        """Return what is in force at a time in ns, as far as there is news, and what follows."""
+        history = self._history
+        known, rest = history.levels[history.known], history.levels[history.known + 1:]
+        time = min(now, rest[0].stamp) if self.awaiting else now
+        if time > known.stamp:
+            known = PlannedLevel.of(time, known.flux_density, known.at(time), known.model)
+        return known, rest
+
+    def _remember(self, history: History) -> None:
+        if history.levels is not self._history.levels:
+            self.plan = replace(self.plan, levels=history.levels)
+        self._history = history
+
+    def state(self, time: int) -> State:
+        """Predict the nondimensional state at a time in ns, in the units of the next request."""
+        self._remember(self._history.predicted(self.plan.place(time) + 1))
+        level = self.plan.level(time)
+        return self.model.taken_from(level.at(time), level.model)
+
+    def _delayed(self, time: int) -> State:
+        """Predict the state `delay` after a time in ns, with levels to come as late as that."""
+        state, rest = self.unknown(ALWAYS)
+        late = [x for x in rest[:_REMEMBERED + 1] if x.stamp <= time]
+        if not self.delay or len(late) > _REMEMBERED:
+            return self.state(time)
+        for level in late:
+            state = replace(
+                level, stamp=max(level.due + self.delay, state.stamp)).after(state)
+        return self.model.taken_from(state.at(time + self.delay), state.model)
+
+    def segment(self, now: int) -> tuple[int, PlannedSegment] | None:
+        """Return place and record of the setpoint under way, None before the first begins."""
+        index = self.plan.under_way(now)
+        return None if index < 0 else (index, self.plan.segments[index])
+
+
+def _running(plan: Plan, begin: int, now: int) -> tuple[PlannedSegment, ...]:
+    """Return the setpoints of a plan from the one under way to those a draft replaces."""
+    end = bisect_left(plan.segments, begin, key=lambda x: x.since)
+    running = plan.segments[max(min(plan.under_way(now), end - 1), 0):end]
+    if running and running[-1].arrival is not None and running[-1].arrival > begin:
+        running = (*running[:-1], replace(running[-1], arrival=None))
+    return running

@@ -1,0 +1,129 @@
+"""What follows from an actuator's parameters: times, damping, flux densities and reach."""
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.equations import (
+    critical_zeta,
+    elastic_force,
+    equilibrium_stretch,
+    natural_frequency,
+    stretch_limits,
+)
+from hmsa_ros.model.law import boundary
+from hmsa_ros.model.parameters import ActuatorParameters
+from hmsa_ros.model.status import Code
+from hmsa_ros.planning.two_step import CODES, plan_two_step, plan_two_step_batch
+
+#: Stretches whose flux density is given, where the coil reaches them, and deflections of a beam.
+STRETCHES = (0.6, 0.8, 0.9, 1.05, 1.1, 1.2, 1.4, 2.0)
+DEFLECTIONS = (0.05, 0.1, 0.2, 0.4, 0.6, 0.7, 0.78)
+#: Move from rest whose duration is given, where the coil allows it.
+USUAL_MOVE = 0.1
+# Points of the first look for the reach on either side.
+_LOOK = 400
+
+
+@dataclass(frozen=True)
+class Coil:
+    """What the coil and its amplifier can do."""
+
+    flux_density_min: float  #: in T
+    flux_density_max: float  #: in T
+    slew_limit: float = 0.0  #: ramps in T/s; 0 for steps
+
+    def __post_init__(self) -> None:
+        """Check the range."""
+        if not -math.inf < self.flux_density_min < self.flux_density_max < math.inf:
+            raise BadInputError(
+                f'flux densities from {self.flux_density_min:g} to {self.flux_density_max:g} T: '
+                'expected the least below the largest')
+        if not 0.0 <= self.slew_limit < math.inf:
+            raise BadInputError(
+                f'slew limit is {self.slew_limit:g} T/s: expected 0 for steps, or more')
+
+
+@dataclass(frozen=True)
+class Scales:
+    """What follows from an actuator's parameters and its coil."""
+
+    time_unit: float  #: L sqrt(rho/G) in s
+    frequency: float  #: undamped, about rest without field, in Hz
+    c1: float  #: shape 2 H^2/L^2
+    zeta: float
+    critical_zeta: float  #: above which small motion about rest does not oscillate
+    damping: float  #: zeta as a coefficient in N s/m
+    critical_damping: float
+    flux_density_unit: float  #: of the load 1, mu0 G/Br in T
+    #: Stretches within reach of the coil, and the T that hold them.
+    flux_densities: tuple[tuple[float, float], ...]
+    stretch_limits: tuple[float, float]  #: at which the chains are fully extended
+    held: tuple[float, float]  #: lowest and highest stretch that the coil can hold
+    #: The same that a two-step command reaches from rest; rest itself on a side without one.
+    reached: tuple[float, float]
+    target: float  #: of a usual move from rest; NaN for none
+    duration: float  #: of the two-step command for it, in s
+
+
+def scales(actuator: ActuatorParameters, coil: Coil) -> Scales:
+    """Work out what follows from parameters and coil; ramps are left out of account."""
+    material = actuator.nondimensional
+    home = material.rest
+    unit = actuator.flux_density_unit
+    loads = coil.flux_density_min / unit, coil.flux_density_max / unit
+    lower, upper = stretch_limits(material)
+    held = tuple(float(equilibrium_stretch(x, material)) for x in loads)
+
+    def duration(target: float) -> float:
+        plan = plan_two_step(home, target, material, load_limits=loads)
+        within = loads[0] <= min(plan.beta_p, plan.beta_1) and max(
+            plan.beta_p, plan.beta_1) <= loads[1]
+        return plan.tau_p if plan.code is Code.TWO_STEP and within else math.nan
+
+    def reach(end: float) -> float:
+        # Fractions of the way out, so that the stretches near rest are looked at closely.
+        targets = home + (end - home) * np.linspace(0.0, 1.0, _LOOK + 1)[1:] ** 2
+        plans = plan_two_step_batch(
+            home, targets, zeta=material.zeta, j_lim=material.j_lim, c1=material.c1,
+            load_limits=loads, elastic=material.law)
+        both = np.stack([plans.beta_p, plans.beta_1])
+        good = np.array([CODES[x] is Code.TWO_STEP for x in plans.status.tolist()]) & np.all(
+            (both >= loads[0]) & (both <= loads[1]), axis=0)
+        found = np.flatnonzero(good)
+        if not len(found):
+            return home
+        last = int(found[-1])
+        beyond = targets[last + 1] if last + 1 < len(targets) else end
+        return boundary(
+            lambda x: math.isfinite(duration(x)), float(targets[last]), float(beyond))
+
+    reached = tuple(reach(x) if abs(x - home) > 1e-12 else home for x in held)
+    # Else half of the way, or all of it, on the side that reaches further.
+    end = max(reached, key=lambda x: abs(math.log(x)) if home else abs(x))
+    target = next((x for x in (home + USUAL_MOVE, 0.5 * (home + end), end)
+                   if x != home and math.isfinite(duration(x))), math.nan)
+    tau = duration(target) if math.isfinite(target) else math.nan
+    critical = float(critical_zeta(home, material))
+    return Scales(
+        time_unit=actuator.time_unit,
+        frequency=float(natural_frequency(home, material)) / (2.0 * math.pi) / actuator.time_unit,
+        c1=material.c1, zeta=material.zeta, critical_zeta=critical,
+        damping=actuator.damping_coefficient,
+        critical_damping=critical * actuator.damping_unit, flux_density_unit=unit,
+        flux_densities=tuple(
+            (x, float(elastic_force(x, material)) * unit)
+            for x in _shown(held[0], held[1], home)),
+        stretch_limits=(lower, upper), held=(held[0], held[1]),
+        reached=(reached[0], reached[1]), target=target,
+        duration=tau * actuator.time_unit)
+
+
+def _shown(least: float, largest: float, home: float) -> tuple[float, ...]:
+    """Return the usual stretches that a coil holds, or else half and all of its reach."""
+    usual = tuple(x for x in (STRETCHES if home else DEFLECTIONS) if least <= x <= largest)
+    return usual or tuple(
+        home + share * (end - home) for end, share in (
+            (least, 1.0), (least, 0.5), (largest, 0.5), (largest, 1.0)) if end != home)

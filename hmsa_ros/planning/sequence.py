@@ -1,0 +1,227 @@
+"""Plans for a sequence of setpoints (Eq. 14), each from where the last one really ends."""
+
+from bisect import bisect_right
+from collections.abc import Generator, Iterable, Sequence
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.delivery import Delivery, IDEAL, Piece, ramps
+from hmsa_ros.model.equations import elastic_force, natural_frequency
+from hmsa_ros.model.laws.record import ENDLESS
+from hmsa_ros.model.mismatch import Uncertainty
+from hmsa_ros.model.moves import Level, Limits, Move, State
+from hmsa_ros.model.parameters import NondimensionalParameters
+from hmsa_ros.model.simulation import check_stretch, follow, longest_motion, simulate
+from hmsa_ros.model.status import Code, RefusedError
+from hmsa_ros.model.units import Units
+from hmsa_ros.planning.setpoint import Setpoint
+from hmsa_ros.planning.shapers import creeping, get_shaper
+from hmsa_ros.planning.shapers.pace import PACE, Pace
+from hmsa_ros.planning.shapers.request import ERRORS, Request, Shaper
+
+#: What to do with a setpoint that ends before the move to it does.
+SHORT_SPELL = ('refuse', 'continue')
+# Samples of a motion, and their tolerance, where it must keep inside the limits of its law.
+_LOOK, _LOOK_RTOL = 300, 1e-7
+
+
+@dataclass(frozen=True)
+class Segment:
+    """One setpoint of a plan."""
+
+    setpoint: Setpoint
+    begin: float  #: when the move begins, from the start of the sequence
+    start: State  #: predicted at begin
+    end: State  #: predicted at the end of the span, or after the last change of level
+    move: Move  #: its times count from begin
+    holding: float  #: load that holds the stretch once nothing creeps
+
+
+def plan_sequence(
+        setpoints: Sequence[Setpoint], material: NondimensionalParameters, *,
+        start: State | None = None, shaper: str = 'two_step', limits: Limits | None = None,
+        delivery: Delivery = IDEAL, order: int = 2, units: Units | None = None,
+        short_spell: str = 'refuse',
+        errors: Uncertainty = ERRORS,
+        pace: Pace = PACE) -> tuple[Segment, ...]:
+    """
+    Plan a sequence of setpoints.
+
+    Parameters
+    ----------
+    setpoints : sequence of Setpoint
+        At least one.
+    material : NondimensionalParameters
+        zeta, J_lim and c1.
+    start : State, optional
+        Default: stretch 1 at rest (Eq. 12).
+    shaper : str
+        Name of a shaper.
+    limits : Limits, optional
+        Admissible loads; default none.
+    delivery : Delivery
+        How commands reach the coil; default at any time and at once. With a period, spans
+        must be multiples of it. The next move starts from what the rounded command leads to.
+    order : int
+        Of the robust shaper, at least 1.
+    units : Units, optional
+        For the messages; default nondimensional.
+    short_spell : {'refuse', 'continue'}
+        For a span that ends before the move: refuse, or plan the next move from the state that
+        is really reached; the last move is then finished after its span.
+    errors : tuple of float or Ellipsoid
+        Of G, damping coefficient and J_lim, as shares, for which minimax plans.
+    pace : Pace
+        How fast the shaper smooth moves; the rate per unit of nondimensional time.
+
+    Returns
+    -------
+    tuple of Segment
+        One a setpoint.
+
+    Raises
+    ------
+    RefusedError
+        If a setpoint cannot be had; its reason names which.
+    BadInputError
+        If an argument is out of range.
+
+    """
+    if not setpoints:
+        raise RefusedError(Code.BAD_INPUT, 'no setpoint given: expected at least one')
+    return tuple(segments(
+        setpoints, material, start=start, shaper=shaper, limits=limits, delivery=delivery,
+        order=order, units=units, short_spell=short_spell, errors=errors, pace=pace))
+
+
+def segments(
+        setpoints: Iterable[Setpoint], material: NondimensionalParameters, *,
+        start: State | None = None, shaper: str = 'two_step', limits: Limits | None = None,
+        delivery: Delivery = IDEAL, order: int = 2, units: Units | None = None,
+        short_spell: str = 'refuse',
+        errors: Uncertainty = ERRORS, pace: Pace = PACE,
+        first: Shaper | None = None) -> Generator[Segment, None, None]:
+    """
+    Plan as `plan_sequence` does, setpoint by setpoint; the first may have a shaper of its own.
+
+    Raises `RefusedError` where a setpoint cannot be had, `BadInputError` for another argument.
+    """
+    if short_spell not in SHORT_SPELL:
+        raise BadInputError(
+            f'short_spell is {short_spell!r}: expected one of {", ".join(SHORT_SPELL)}')
+    shape = first or get_shaper(shaper)
+    creeping.check(material, shaper)
+    limits = limits or Limits()
+    units = units or Units()
+    state = start or State(material.rest)
+    check_stretch(state.stretch, material, 'start stretch')
+    begin = 0.0
+    upcoming = iter(setpoints)
+    setpoint = next(upcoming, None)
+    while setpoint is not None:
+        following = next(upcoming, None)
+        request = Request(
+            state, setpoint.stretch, material, limits, delivery, order, units, errors,
+            pace)
+        move = creeping.held(
+            request, _rounded(shape(request), delivery),
+            math.inf if following is None else setpoint.span)
+        # Both are rounded: a span that the move fills exactly is long enough.
+        if setpoint.span * (1.0 + 1e-12) < move.duration < math.inf:
+            if short_spell == 'refuse':
+                raise RefusedError(
+                    Code.SPELL_TOO_SHORT,
+                    f'the move from {units.coordinate} {state.stretch:.6g} to '
+                    f'{setpoint.stretch:g} takes {units.time_text(move.duration)}, its span is '
+                    f'{units.time_text(setpoint.span)}: expected a span at least as long as the '
+                    'move')
+            move = _cut(move, setpoint, units, last=following is None)
+        end = _follow(state, move, setpoint, material, delivery)
+        if following is not None and move.tail:
+            move = move.until(setpoint.span)
+        yield Segment(
+            setpoint, begin, state, end, move,
+            float(elastic_force(setpoint.stretch, material)))
+        begin += setpoint.span
+        state = end
+        setpoint = following
+        shape = get_shaper(shaper)
+
+
+def _cut(move: Move, setpoint: Setpoint, units: Units, *, last: bool) -> Move:
+    """Return a move that its setpoint leaves no time for; the last one is finished."""
+    return replace(
+        move if last else move.until(setpoint.span), code=Code.SPELL_TOO_SHORT,
+        duration=move.duration if last else math.inf,
+        reason=f'the span {units.time_text(setpoint.span)} ends before '
+        f'{units.coordinate} {setpoint.stretch:g} is reached, which takes '
+        f'{units.time_text(move.duration)}')
+
+
+def _rounded(move: Move, delivery: Delivery) -> Move:
+    """Return a move with its times as commands can carry them."""
+    return Move(
+        move.code, tuple(Level(delivery.rounded(x.time), x.load) for x in move.levels),
+        delivery.rounded(move.duration), move.reason)
+
+
+def _follow(
+        state: State, move: Move, setpoint: Setpoint, material: NondimensionalParameters,
+        delivery: Delivery) -> State:
+    """Return the state at the end of the span, or where the last ramp ends."""
+    end = move.levels[-1].time if math.isinf(move.duration) else move.duration
+    if math.isfinite(setpoint.span):
+        end = max(end, setpoint.span)
+    if math.isnan(state.load):
+        state = replace(state, load=float(elastic_force(state.stretch, material)))
+    if move.tail:
+        return _follow_tail(state, move, end, setpoint.stretch, material, delivery)
+    parts, last = ramps(move.levels, state.ramps_from, end, delivery.slew)
+    settled = longest_motion(last, material) + delivery.settling(0.0)
+    if not material.creep:
+        end = min(end, max(parts[-1][0], 0.0) + settled)
+    _check_known(state, parts, end, setpoint.stretch, material, delivery.lag)
+    return follow(move.levels, state, end, material, delivery)
+
+
+def _follow_tail(
+        state: State, move: Move, end: float, target: float, material: NondimensionalParameters,
+        delivery: Delivery) -> State:
+    """Return the state at a time after the arrival, where what branches do is known."""
+    if move.duration > 0.0:
+        parts, _ = ramps(
+            move.until(move.duration).levels, state.ramps_from, move.duration, delivery.slew)
+        _check_known(state, parts, move.duration, target, material, delivery.lag)
+    place = bisect_right(move.levels, end, key=lambda x: x.time) - 1
+    level = move.levels[place]
+    return follow(
+        (replace(level, time=0.0),), move.tail[place - len(move.levels)], end - level.time,
+        material, delivery)
+
+
+def _check_known(
+        state: State, parts: Sequence[Piece], end: float, target: float,
+        material: NondimensionalParameters, lag: float) -> None:
+    """Refuse a move that swings to where nothing is known of the elastic force."""
+    elastic = material.law
+    if elastic is None or elastic.limits == ENDLESS:
+        return
+    # The first swing about the last level is the widest.
+    swing = 2.0 * math.pi / float(natural_frequency(target, material))
+    times = np.linspace(parts[0][0], min(end, max(parts[-1][0], 0.0) + swing), _LOOK)
+    switches, loads, slopes = np.array(parts).T
+    stretch, _ = simulate(
+        switches, loads, times, material, rtol=_LOOK_RTOL, stretch=state.stretch,
+        rate=state.rate, slopes=slopes, lag=lag, field=state.load, followed=state.followed)
+    for widest, beyond in ((np.min(stretch), -1.0), (np.max(stretch), 1.0)):
+        limit = elastic.limits[beyond > 0.0]
+        if beyond * (widest - limit) > 0.0:
+            raise RefusedError(
+                Code.OUT_OF_RANGE,
+                f'the move from {material.coordinate.name} {state.stretch:.6g} to {target:g} '
+                f'swings to {widest:.4f}: expected a motion between the limits '
+                f'{elastic.limits[0]:.4f} and {elastic.limits[1]:.4f} of law {elastic.law}, '
+                'beyond which nothing is known')

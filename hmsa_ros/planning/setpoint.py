@@ -1,0 +1,32 @@
+"""What is asked of an actuator: a stretch, and how long it lasts."""
+
+from dataclasses import dataclass
+import math
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.laws.coordinate import DEFLECTION, STRETCH
+
+
+def impossible(stretch: float, rest: float) -> str:
+    """Return why no actuator with a rest there has a stretch; empty if one may have it."""
+    if math.isfinite(stretch) and (stretch > 0.0 or rest == 0.0):
+        return ''
+    more = ' greater than 0' if rest else ''
+    name = (STRETCH if rest else DEFLECTION).name
+    return f'{name} is {stretch:g}: expected a finite number{more}'
+
+
+@dataclass(frozen=True)
+class Setpoint:
+    """A stretch and how long it lasts, the paper's (lambda_d, span)."""
+
+    stretch: float  #: target; the deflection of a beam
+    #: Time from leaving the setpoint before to leaving this one, above 0; infinite to stay.
+    span: float
+
+    def __post_init__(self) -> None:
+        """Check both numbers."""
+        if not math.isfinite(self.stretch):
+            raise BadInputError(f'stretch is {self.stretch:g}: expected a finite number')
+        if not self.span > 0.0:
+            raise BadInputError(f'span is {self.span:g}: expected a number greater than 0')

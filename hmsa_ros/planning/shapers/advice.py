@@ -1,0 +1,91 @@
+"""What to change where no command is found: limits with whose other values there is one."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import wraps
+from itertools import combinations
+import math
+
+from hmsa_ros.model.moves import Limits, Move
+from hmsa_ros.model.status import Code, RefusedError
+from hmsa_ros.planning.shapers.request import Request, Shaper
+
+# Codes of refusals that a limit may be to blame for.
+_SEARCHED = (Code.FLUX_LIMIT, Code.SLEW_LIMIT, Code.NO_TWO_STEP, Code.NOT_CONVERGED)
+# By the limit that is to blame, those first that are most often wrong rather than given.
+_CODES = {'flux': Code.FLUX_LIMIT, 'slew': Code.SLEW_LIMIT, 'period': Code.NO_TWO_STEP,
+          'lag': Code.NO_TWO_STEP}
+# How much wider or faster limits are tried.
+_FACTORS = (1.5, 3.0, 10.0, 30.0, math.inf)
+
+
+def advised(shaper: Shaper, factors: Sequence[float] = _FACTORS) -> Shaper:
+    """Return a shaper whose refusals name what limits, eased so much, it finds a command with."""
+    @wraps(shaper)
+    def shape(request: Request) -> Move:
+        try:
+            return shaper(request)
+        except RefusedError as error:
+            ways = _ways(shaper, request) if error.code in _SEARCHED else []
+            what, _, advice = str(error).partition(': expected ')
+            if not ways or (advice and ways == [('flux',)] and error.code is Code.FLUX_LIMIT):
+                raise
+            raise RefusedError(
+                _CODES[ways[0][0]],
+                f'{what}: expected ' + ', or '.join(
+                    _advice(shaper, request, x, factors) for x in ways)) from error
+    return shape
+
+
+def _ways(shaper: Shaper, request: Request) -> list[tuple[str, ...]]:
+    """Return the smallest sets of limits without any of which there is a command."""
+    delivery, limits = request.delivery, request.limits
+    there = [name for name, limited in (
+        ('flux', limits != Limits()), ('slew', delivery.slew < math.inf),
+        ('period', delivery.period > 0.0), ('lag', delivery.lag > 0.0)) if limited]
+    for count in range(1, len(there) + 1):
+        ways = [x for x in combinations(there, count)
+                if _succeeds(shaper, eased(request, x, math.inf))]
+        if ways:
+            return ways
+    return []
+
+
+def _advice(
+        shaper: Shaper, request: Request, names: Sequence[str], factors: Sequence[float]) -> str:
+    """Return in words with which values of some limits there is a command."""
+    factor = next(x for x in factors if x == math.inf or _succeeds(
+        shaper, eased(request, names, x)))
+    there, units = eased(request, names, factor), request.units
+    limits, delivery = there.limits, there.delivery
+    words = {
+        'flux': 'flux density limits of ' + ' to '.join(
+            map(units.load_text, (limits.minimum, limits.maximum))),
+        'slew': f'a slew limit of {units.slew_text(delivery.slew)}',
+        'period': f'a command period of {units.time_text(delivery.period)}',
+        'lag': f'a coil time constant of {units.time_text(delivery.lag)}'}
+    if factor == math.inf:
+        words |= {'flux': 'no flux density limits', 'slew': 'no slew limit'}
+    return ' and '.join(words[x] for x in names)
+
+
+def eased(request: Request, names: Sequence[str], factor: float) -> Request:
+    """Return a request with limits (flux, slew, period, lag) some times as wide, or without."""
+    delivery, limits = request.delivery, request.limits
+    if 'flux' in names:
+        width = limits.maximum - limits.minimum
+        more = (factor - 1.0) * (width if width < math.inf else max(
+            abs(x) for x in (limits.minimum, limits.maximum) if math.isfinite(x)))
+        limits = Limits(limits.minimum - more, limits.maximum + more)
+    return replace(request, limits=limits, delivery=replace(
+        delivery, slew=delivery.slew * (factor if 'slew' in names else 1.0),
+        period=delivery.period / (factor if 'period' in names else 1.0),
+        lag=delivery.lag / (factor if 'lag' in names else 1.0)))
+
+
+def _succeeds(shaper: Shaper, request: Request) -> bool:
+    try:
+        shaper(request)
+    except RefusedError:
+        return False
+    return True

@@ -1,0 +1,40 @@
+"""The fastest command within the load limits that is found."""
+
+from dataclasses import replace
+import math
+
+from hmsa_ros.model.moves import Move
+from hmsa_ros.model.status import Code, RefusedError
+from hmsa_ros.planning.shapers.creeping import check
+from hmsa_ros.planning.shapers.push_brake import push_brake
+from hmsa_ros.planning.shapers.request import Request
+from hmsa_ros.planning.shapers.two_step import two_step
+
+
+def minimum_time(request: Request) -> Move:
+    """
+    Push with the load limit on one side, brake with the other, then hold.
+
+    On a grid, through ramps and with a field that lags, the two-step command can be sooner at
+    rest, or the only one within the limits: it is used then, and the move's reason says so. Where
+    neither is found: `RefusedError`.
+    """
+    check(request.material, 'minimum_time')
+    found: list[Move] = []
+    refusals: list[RefusedError] = []
+    for shaper in (push_brake, two_step):
+        try:
+            found.append(shaper(request))
+        except RefusedError as error:
+            refusals.append(error)
+    if not found:
+        raise refusals[0]
+    fastest = min(found, key=lambda x: x.duration)
+    if fastest.code is Code.TWO_STEP:
+        return replace(fastest, reason=(
+            'no full push and full brake within the limits are found that are sooner at rest at '
+            f'{request.target:g} than the two-step command, which is used'))
+    if refusals and math.isinf(fastest.duration):
+        return replace(
+            fastest, reason=f'{refusals[0]}: the plain step approaches without overshoot')
+    return fastest

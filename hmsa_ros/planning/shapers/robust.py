@@ -1,0 +1,82 @@
+"""
+Chained two-step commands, the nonlinear counterpart of ZVD and its higher orders.
+
+Two two-step commands without a hold between them, through the stretch that beta_p itself would
+hold, leave no vibration either, and forgive errors of the model as a ZVD shaper does: the
+vibration that the first one leaves in error meets the second half a period later. A chain of
+order n goes through the stretches that the levels of order n - 1 would hold, which on a linear
+oscillator gives the levels of n convolved ZV shapers.
+"""
+
+from dataclasses import replace
+import math
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.model import law
+from hmsa_ros.model.delivery import IDEAL
+from hmsa_ros.model.moves import Level, Move, State
+from hmsa_ros.model.status import Code
+from hmsa_ros.planning.shapers.creeping import arrival
+from hmsa_ros.planning.shapers.request import Request
+from hmsa_ros.planning.shapers.two_step import two_step
+
+
+def robust(request: Request) -> Move:
+    """
+    Command a move through ``request.order`` chained two-step commands.
+
+    It has ``order + 1`` levels on ideal hardware, and takes about ``order`` times as long as the
+    two-step command, which is that of order 1. Where there is no chain, it is what `two_step`
+    answers. An order below 1 is a `BadInputError`.
+    """
+    if request.order < 1:
+        raise BadInputError(f'order is {request.order}: expected at least 1')
+    move = two_step(request)
+    if request.order == 1 or move.code is not Code.TWO_STEP:
+        return move
+    # Waypoints belong to the actuator, not to the hardware: they come from the ideal command.
+    ideal = replace(request, delivery=IDEAL, material=request.material.elastic)
+    chain = two_step(ideal)
+    for _ in range(request.order - 1):
+        waypoints = [
+            float(law.equilibrium_stretch(x.load, request.material.packed))
+            for x in chain.levels[:-1]]
+        chain = _chain(ideal, [*waypoints, request.target])
+        if chain.code is not Code.ROBUST:
+            return _single(move, request, chain)
+    if request.material.creep or not request.delivery.ideal:
+        chain = _chain(request, [*waypoints, request.target])
+    return chain if chain.code is Code.ROBUST else _single(move, request, chain)
+
+
+def _single(move: Move, request: Request, chain: Move) -> Move:
+    return replace(move, reason=(
+        f'no chain of order {request.order} leads to {request.named_target} ({chain.code}): '
+        'a single two-step command is used'))
+
+
+def _chain(request: Request, waypoints: list[float]) -> Move:
+    """Return the two-step commands through waypoints, without a hold at any of them."""
+    levels: list[Level] = []
+    begin = 0.0
+    state = request.state
+    for waypoint in waypoints:
+        move = two_step(replace(request, state=state, target=waypoint))
+        if move.code is not Code.TWO_STEP:
+            return move
+        last = move.levels[-1]
+        if levels and begin > levels[-1].time and request.delivery.period > 0.0:
+            # At rest at the end of a ramp: the next command waits for the grid.
+            begin = math.ceil(begin / request.delivery.period - 1e-9) * request.delivery.period
+        levels += [Level(begin + x.time, x.load) for x in move.levels]
+        begin += move.duration
+        if begin == levels[-1].time:
+            # No ramp to finish: the next command takes over at once.
+            levels.pop()
+        if request.material.creep:
+            state = arrival(replace(request, state=state, target=waypoint), move)
+        else:
+            state = State(waypoint, 0.0, last.load)
+    if begin > levels[-1].time and levels[-1].load == last.load:
+        return Move(Code.ROBUST, tuple(levels), begin)
+    return Move(Code.ROBUST, (*levels, Level(begin, last.load)), begin)

@@ -1,0 +1,133 @@
+"""
+Commands with free numbers, solved for rest at the target.
+
+The two-step command on ideal hardware has a search of its own, `hmsa_ros.motion.two_step`.
+Everything else, a command on a grid, through ramps, or with two intermediate levels of given
+height, has two unknowns as well, and they meet the same two conditions: stretch at the target,
+rate zero, at the instant at which the last level is in force. Where the field lags it has to
+arrive there too, for which a third number is free. Newton solves them with the derivatives that
+come out of the integration.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hmsa_ros import motion
+from hmsa_ros.model.delivery import Delivery
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.moves import Level
+from hmsa_ros.model.simulation import followed_by
+
+if TYPE_CHECKING:
+    from hmsa_ros.planning.shapers.request import Request
+
+# Room for the last ramp before the grid goes on, in what a guess of it takes.
+_MORE = 1.25
+
+#: A command and the time at which it is at rest; None if there is none.
+Attempt = tuple[tuple[Level, ...], float] | None
+
+
+@dataclass(frozen=True)
+class Template:
+    """Levels with their derivatives by the unknowns, two or, for a field that lags, three."""
+
+    times: Array  #: (n,), the first is 0
+    loads: Array  #: (n,), the last holds the target
+    d_times: Array  #: (n, 2) or (n, 3)
+    d_loads: Array  #: (n, 2) or (n, 3)
+
+    @classmethod
+    def of(cls, levels: Sequence[Level], unknowns: Sequence[tuple[str, int]]) -> 'Template':
+        """Return the template of a guess, with unknowns ``('load', i)`` and ``('time', i)``."""
+        return cls(
+            np.array([x.time for x in levels]), np.array([x.load for x in levels]),
+            *_derivatives(len(levels), tuple(unknowns)))
+
+
+@lru_cache(maxsize=256)
+def _derivatives(count: int, unknowns: tuple[tuple[str, int], ...]) -> tuple[Array, Array]:
+    """Return the derivatives of times and loads, which nobody may change."""
+    d_times, d_loads = np.zeros((2, count, len(unknowns)))
+    for column, (kind, index) in enumerate(unknowns):
+        if kind == 'load':
+            d_loads[index, column] = 1.0
+        else:
+            d_times[index:, column] = 1.0
+    return d_times, d_loads
+
+
+def solve(
+        template: Template, request: 'Request', delivery: Delivery | None = None, *,
+        wait: float = 0.0) -> Attempt:
+    """
+    Solve a template for rest at the target; the delivery is that of the request unless given.
+
+    Where branches creep and the amplifier ramps, rest is when the last ramp ends, or at least
+    ``wait`` after the last level begins, and on a grid whole periods.
+    """
+    delivery = delivery or request.delivery
+    times, loads = template.times.copy(), template.loads.copy()
+    d_times, d_loads = template.d_times, template.d_loads
+    state, material = request.state, request.material
+    if material.creep and delivery.slew < math.inf:
+        # What the amplifier ramps to at last is where the tail begins.
+        d_times, d_loads = (np.pad(x, ((0, 0), (0, 1))) for x in (d_times, d_loads))
+        d_loads[-1, -1] = 1.0
+        if delivery.period > 0.0:
+            ramp = _MORE * delivery.ramp(loads[-1] - loads[-2] if len(loads) > 1 else 0.0)
+            wait = max(math.ceil(ramp / delivery.period), 1) * delivery.period
+        if wait > 0.0:
+            times, loads = np.append(times, times[-1] + wait), np.append(loads, loads[-1])
+            d_times, d_loads = (np.concatenate([x, x[-1:]]) for x in (d_times, d_loads))
+    solved, duration = motion.solve(
+        times, loads, np.ascontiguousarray(d_times), np.ascontiguousarray(d_loads), state.stretch,
+        state.rate, request.field, request.load, request.target, delivery.slew, delivery.lag,
+        material.packed, material.branches, np.array(followed_by(state, material)))
+    if not solved:
+        return None
+    levels = tuple(Level(t, x) for t, x in zip(times.tolist(), loads.tolist(), strict=True))
+    return levels, duration
+
+
+def first_kept(guesses: Iterable[Template], request: 'Request') -> Attempt:
+    """Return the first solution of some guesses that keeps the load limits, if there is one."""
+    for guess in guesses:
+        found = solve(guess, request)
+        if found is not None and request.keeps(found[0]):
+            return found
+    return None
+
+
+def approach(
+        ideal: tuple[Level, ...],
+        closer: Callable[[tuple[Level, ...], float, float], Attempt], shortest: float) -> Attempt:
+    """Follow levels from ideal to real hardware, in strides down to a share of the way."""
+    # closer(levels, share, aim) solves for the hardware at aim of the way, from levels that are
+    # right at share of it.
+    found: Attempt = None
+    levels, share, stride = ideal, 0.0, 1.0
+    while share < 1.0:
+        aim = min(1.0, share + stride)
+        attempt = closer(levels, share, aim)
+        if attempt is not None:
+            found, levels, share = attempt, attempt[0], aim
+        elif stride > shortest:
+            stride *= 0.5
+        else:
+            return None
+    return found
+
+
+def on_time(found: Attempt, heights: int, request: 'Request') -> Attempt:
+    """Solve once more for the first heights, at times that commands can carry if they can."""
+    if found is None or request.delivery.resolution == 0.0:
+        return found
+    rounded = [Level(request.delivery.rounded(x.time), x.load) for x in found[0]]
+    free = [('load', i) for i in range(heights)]
+    return solve(Template.of(rounded, free), request) or found

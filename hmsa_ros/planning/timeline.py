@@ -1,0 +1,274 @@
+"""
+Records of a plan over time, and the prediction along them.
+
+Times are integer nanoseconds, levels flux densities in tesla: what happens on the wire. Each level
+knows the model under which it was planned, so that a plan that began under other parameters is
+still predicted under those.
+"""
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+import math
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.model import law
+from hmsa_ros.model.delivery import Delivery, IDEAL, pieces
+from hmsa_ros.model.mismatch import Uncertainty
+from hmsa_ros.model.moves import Level, Limits, State
+from hmsa_ros.model.parameters import ActuatorParameters, NondimensionalParameters
+from hmsa_ros.model.simulation import follow, longest_motion, simulate
+from hmsa_ros.model.status import Code
+from hmsa_ros.model.units import NANOSECONDS, Units
+from hmsa_ros.planning.sequence import SHORT_SPELL
+from hmsa_ros.planning.shapers import creeping, get_shaper
+from hmsa_ros.planning.shapers.pace import PACE, Pace
+from hmsa_ros.planning.shapers.request import as_errors, ERRORS
+
+
+def scaled(value: float | None, unit: float) -> float | None:
+    """Return a value in another unit, if there is one."""
+    return None if value is None else value * unit
+
+
+#: Stamp of a level that has been in force at rest for ever.
+ALWAYS = -2**62
+
+
+@dataclass(frozen=True)
+class Options:
+    """How requests are planned."""
+
+    shaper: str = 'two_step'  #: a name in `hmsa_ros.planning.shapers.SHAPERS`
+    short_spell: str = 'refuse'  #: for a span that ends before the move: refuse or continue
+    flux_density_min: float = -math.inf  #: in T
+    flux_density_max: float = math.inf  #: in T
+    lead_time: int = 50_000_000  #: in ns, how far ahead of its stamp a command is sent
+    period: int = 0  #: in ns, of which stamps are multiples; 0 for any time
+    slew_limit: float = math.inf  #: in T/s; infinite for steps
+    order: int = 2  #: of the shapers robust and minimax
+    coil_time_constant: float = 0.0  #: in s, of a lag of first order; 0 for at once
+    #: Vibration that levels which follow creep may leave, as a share of the move.
+    creep_tolerance: float = IDEAL.ripple
+    #: Of G, damping coefficient and J_lim, as shares, for which minimax plans.
+    errors: Uncertainty = ERRORS
+    pace: Pace = PACE  #: of the shaper smooth; the rate in 1/s
+
+
+@dataclass(frozen=True)
+class Model:
+    """Everything that a prediction depends on: the block and how commands reach it."""
+
+    actuator: ActuatorParameters
+    options: Options
+    material: NondimensionalParameters = field(init=False)
+    units: Units = field(init=False)  #: sizes of the nondimensional units of time (s) and load (T)
+    limits: Limits = field(init=False)
+    delivery: Delivery = field(init=False)  #: nondimensional, as limits and pace are
+    pace: Pace = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Work out the nondimensional side."""
+        actuator, options = self.actuator, self.options
+        get_shaper(options.shaper)
+        as_errors(options.errors)
+        if options.short_spell not in SHORT_SPELL:
+            raise BadInputError(
+                f'short_spell is {options.short_spell!r}: expected one of '
+                + ', '.join(SHORT_SPELL))
+        if options.lead_time < 0:
+            raise BadInputError(
+                f'lead_time is {options.lead_time / NANOSECONDS:g} s: expected at least 0 s')
+        time, load = actuator.time_unit, actuator.flux_density_unit
+        worked_out = {
+            'material': actuator.nondimensional,
+            'units': Units(time, load, ' s', ' T', actuator.coordinate.name),
+            'limits': Limits(options.flux_density_min / load, options.flux_density_max / load),
+            'delivery': Delivery(
+                options.period / NANOSECONDS / time, options.slew_limit / load * time,
+                1.0 / NANOSECONDS / time, options.coil_time_constant / time,
+                options.creep_tolerance),
+            'pace': replace(options.pace, rate=options.pace.rate * time),
+        }
+        for name, value in worked_out.items():
+            object.__setattr__(self, name, value)
+        creeping.check(self.material, options.shaper)
+
+    def ns(self, time: float) -> int:
+        """Return a nondimensional time in ns."""
+        return round(time * self.units.time * NANOSECONDS)
+
+    def time(self, ns: int) -> float:
+        """Return a time in ns without a dimension."""
+        return ns / NANOSECONDS / self.units.time
+
+    def holding(self, stretch: float) -> float:
+        """Return the load that holds a stretch."""
+        return float(law.elastic_force(stretch, self.material.packed))
+
+    def frequency(self, stretch: float) -> float:
+        """Return the nondimensional natural frequency about a stretch."""
+        return float(law.natural_frequency(stretch, self.material.packed))
+
+    def follow(self, state: State, load: float, duration: float) -> State:
+        """Predict the state after a load has been commanded for a nondimensional time."""
+        return follow((Level(0.0, load),), state, duration, self.material, self.delivery)
+
+    def taken_from(self, state: State, other: 'Model') -> State:
+        """Return a state of another model in the units of this one."""
+        if other is self:
+            return state
+        return State(
+            state.stretch, state.rate / other.units.time * self.units.time,
+            state.load * other.units.load / self.units.load,
+            scaled(scaled(state.amplifier, other.units.load), 1.0 / self.units.load),
+            creeping.carried(state, other.material, self.material))
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedLevel:
+    """A change of level, and what is predicted at its stamp."""
+
+    stamp: int  #: in ns, from which it applies
+    flux_density: float  #: in T
+    stretch: float
+    rate: float  #: in 1/s
+    in_force: float  #: in T, from which a slew limit ramps to the level
+    model: Model = field(repr=False)  #: of the motion from the stamp on
+    amplifier: float | None = None  #: its output in T; None where the field does not lag behind it
+    #: By Maxwell branches, in units of G; empty where they have relaxed.
+    followed: tuple[float, ...] = ()
+    #: Stamp in ns with which it was sent, where what was sent before it has come later.
+    sent_for: int | None = None
+
+    @property
+    def due(self) -> int:
+        """Stamp in ns with which it is sent."""
+        return self.stamp if self.sent_for is None else self.sent_for
+
+    def at(self, time: int) -> State:
+        """Predict the nondimensional state at a time in ns; before the stamp, as at the stamp."""
+        model = self.model
+        if self.stamp == ALWAYS:
+            return State(self.stretch, 0.0, self.in_force / model.units.load)
+        return model.follow(
+            self._begin(), self.flux_density / model.units.load,
+            min(max(model.time(time - self.stamp), 0.0), self._longest()))
+
+    def _begin(self) -> State:
+        """Return the state at the stamp in the units of the model."""
+        units = self.model.units
+        return State(
+            self.stretch, self.rate * units.time, self.in_force / units.load,
+            scaled(self.amplifier, 1.0 / units.load), self.followed)
+
+    def _longest(self) -> float:
+        """Return for how long the motion is worth following."""
+        model = self.model
+        if model.material.creep:
+            return math.inf
+        end = self.flux_density / model.units.load
+        return model.delivery.settling(end - self._begin().ramps_from) \
+            + longest_motion(end, model.material)
+
+    def sample(self, times: Sequence[int]) -> list[tuple[float, float]]:
+        """Predict stretch and rate (1/s) at times in ns, not decreasing, from the stamp on."""
+        if self.stamp == ALWAYS or all(x == self.stamp for x in times):
+            return [(self.stretch, self.rate)] * len(times)
+        model = self.model
+        if model.material.creep:
+            return [(x.stretch, x.rate / model.units.time) for x in map(self.at, times)]
+        end = self.flux_density / model.units.load
+        longest = self._longest()
+        after = [min(model.time(x - self.stamp), longest) for x in times]
+        switches, loads, slopes, _ = pieces(
+            (Level(0.0, end),), self._begin().ramps_from, after[-1], model.delivery.slew)
+        stretch, rate = simulate(
+            switches, loads, after, model.material, stretch=self.stretch,
+            rate=self.rate * model.units.time, slopes=slopes, lag=model.delivery.lag,
+            field=self.in_force / model.units.load)
+        return list(zip(stretch.tolist(), (rate / model.units.time).tolist(), strict=True))
+
+    @classmethod
+    def of(cls, stamp: int, flux_density: float, state: State, model: Model) -> 'PlannedLevel':
+        """Return a level in T from a stamp in ns on, where the actuator is in a model's state."""
+        units = model.units
+        return cls(
+            stamp, flux_density, state.stretch, state.rate / units.time, state.load * units.load,
+            model, scaled(state.amplifier, units.load), state.followed)
+
+    def after(self, level: 'PlannedLevel') -> 'PlannedLevel':
+        """Return this level with what is predicted at its stamp if another one precedes it."""
+        found = self.of(self.stamp, self.flux_density, level.at(self.stamp), level.model)
+        return replace(found, model=self.model, sent_for=self.sent_for)
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedSegment:
+    """One setpoint on the timeline, times in ns."""
+
+    stretch: float  #: target
+    begin: int  #: of the move
+    arrival: int | None  #: of rest at the target; None where it is only approached
+    code: Code
+    reason: str  #: why it is not the requested command; empty if it is
+    since: int  #: from which the setpoint holds; the move may begin later
+    #: Bound of what levels that follow creep leave of it in stretch, peak to peak.
+    vibration: float = 0.0
+    until: int | None = None  #: end as requested; None for one that is held on
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is going to happen, from the level in force on."""
+
+    number: int  #: counts accepted requests from 1; 0 before the first
+    levels: tuple[PlannedLevel, ...]  #: by stamp; the first ones may lie in the past
+    segments: tuple[PlannedSegment, ...]  #: by time
+    kept: int = 0  #: how many segments, the first ones, belong to earlier requests
+
+    def ahead(self, now: int, limit: int | None = None) -> tuple[PlannedLevel, ...]:
+        """Return levels from the one in force on; none that is in force for ever."""
+        first = self.place(now)
+        first += self.levels[first].stamp < 0
+        return self.levels[first:None if limit is None else first + limit]
+
+    def level(self, time: int) -> PlannedLevel:
+        """Return the level in force at a time, the first one before that."""
+        return self.levels[self.place(time)]
+
+    def place(self, time: int) -> int:
+        """Return the place of the level in force at a time, that of the first before it."""
+        return max(bisect_right(self.levels, time, key=lambda x: x.stamp) - 1, 0)
+
+    def under_way(self, time: int) -> int:
+        """Return the place of the setpoint that holds at a time, -1 before the first."""
+        return bisect_right(self.segments, time, key=lambda x: x.since) - 1
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A plan that has been worked out and not been taken yet."""
+
+    begin: int  #: in ns, from which it replaces what was planned
+    levels: tuple[PlannedLevel, ...]
+    segments: tuple[PlannedSegment, ...]
+    #: Place of the first setpoint of the running plan that it plans anew; None for a new request.
+    resumed: int | None = None
+    missed: int = 0  #: setpoints left out, since their time is over
+    #: The first that is only roughly reached, by another command than requested.
+    warning: PlannedSegment | None = None
+
+    def delayed(self, delays: Sequence[int]) -> 'Draft':
+        """Return the draft with the move of each segment delayed by so many ns."""
+        begins = [x.begin for x in self.segments]
+        levels = tuple(
+            replace(x, stamp=x.stamp + delays[bisect_right(begins, x.stamp) - 1])
+            for x in self.levels)
+        segments = tuple(
+            x if not delay else replace(
+                x, begin=x.begin + delay,
+                arrival=None if x.arrival is None else x.arrival + delay)
+            for x, delay in zip(self.segments, delays, strict=True))
+        return replace(self, levels=levels, segments=segments)
+

@@ -1,0 +1,180 @@
+"""
+The two-step command of Eqs. 13 and 14, for one move from any state.
+
+A constant load beta_p brings the actuator to its turning point exactly at the target; there
+the load that holds the target, beta_1, takes over and nothing is left to oscillate.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+import math
+import os
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hmsa_ros import motion
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.model import law
+from hmsa_ros.model.laws.record import CONSTANTS, Elastic
+from hmsa_ros.model.parameters import NondimensionalParameters
+from hmsa_ros.model.status import Code
+
+#: Relative tolerance of the integration and of beta_p.
+RTOL = 1e-12
+#: Deviation from the target below which the actuator counts as being there already.
+HOLD_TOLERANCE = 1e-9
+
+#: By the statuses of `hmsa_ros.motion.two_step`.
+CODES = dict(enumerate((
+    Code.TWO_STEP, Code.HOLD, Code.TOO_DAMPED, Code.INDISTINGUISHABLE, Code.NO_TWO_STEP,
+    Code.NOT_CONVERGED, Code.OUT_OF_RANGE, Code.BAD_INPUT)))
+
+# Numbers of packed materials that a batch keeps at a time; a table has some 330 a row.
+_MOST_NUMBERS = 1 << 20
+# Rows that are worth a thread of their own.
+_PART = 256
+
+
+class TwoStep(NamedTuple):
+    """Result of `plan_two_step`; loads and times are NaN where there are none."""
+
+    #: ``TWO_STEP`` or ``HOLD`` where the plan leaves no vibration, else why there is none.
+    code: Code
+    beta_p: float  #: intermediate load
+    tau_p: float  #: time at which the target is reached at rest
+    beta_1: float  #: load that holds the target; NaN outside the limits
+    passes: int  #: integrations that the solution took
+
+
+def plan_two_step(
+        start: float, target: float, material: NondimensionalParameters, *,
+        rate: float = 0.0, load_limits: tuple[float, float] = (-math.inf, math.inf),
+        rtol: float = RTOL) -> TwoStep:
+    """
+    Find the intermediate load and its duration for one move (Eq. 13).
+
+    Parameters
+    ----------
+    start : float
+        Stretch at the start, inside the limiting stretches.
+    target : float
+        Stretch to come to rest at, inside the limiting stretches.
+    material : NondimensionalParameters
+        zeta, J_lim and c1.
+    rate : float
+        Stretch rate at the start, per unit of nondimensional time.
+    load_limits : tuple of float
+        Admissible loads. Where two plans exist, the fastest inside them is taken; where none
+        lies inside, the plan with the direct approach is returned and the caller sees from
+        ``beta_p`` what it would need.
+    rtol : float
+        Relative tolerance, 1e-14 to 1e-4.
+
+    Returns
+    -------
+    TwoStep
+        With `Code.TOO_DAMPED` where the response to beta_1 does not cross the target, so that
+        no two-step command exists, and `Code.INDISTINGUISHABLE` where beta_p equals beta_1 to
+        rounding.
+
+    Raises
+    ------
+    BadInputError
+        If an argument is not a finite number or ``rtol`` is out of range.
+
+    """
+    if not math.isfinite(start + target + rate):
+        raise BadInputError(
+            f'start {start!r}, target {target!r}, rate {rate!r}: expected finite numbers')
+    if not 1e-14 <= rtol <= 1e-4:
+        raise BadInputError(f'rtol is {rtol!r}: expected 1e-14 to 1e-4')
+    if material.creep:
+        raise BadInputError(
+            'the group has Maxwell branches: expected one without, or plan_sequence for one that '
+            'creeps')
+    status, beta_p, tau_p, beta_1, passes = motion.two_step(
+        start, rate, target, material.packed, *load_limits, rtol, HOLD_TOLERANCE)
+    return TwoStep(CODES[status], beta_p, tau_p, beta_1, passes)
+
+
+def available_cores() -> int:
+    """Return how many cores this process may use."""
+    if hasattr(os, 'sched_getaffinity'):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@dataclass(frozen=True)
+class TwoStepBatch:
+    """Result of `plan_two_step_batch`: arrays of the broadcast shape, as in `TwoStep`."""
+
+    status: NDArray[np.int64]  #: keys of `CODES`
+    beta_p: NDArray[np.float64]
+    tau_p: NDArray[np.float64]
+    beta_1: NDArray[np.float64]
+
+
+def plan_two_step_batch(
+        start: ArrayLike, target: ArrayLike, *, zeta: ArrayLike = 0.2,
+        j_lim: ArrayLike = 5.0, c1: ArrayLike = 2.0, rate: ArrayLike = 0.0,
+        load_limits: tuple[float, float] = (-math.inf, math.inf),
+        rtol: float = RTOL, elastic: Elastic | None = None, workers: int = 0) -> TwoStepBatch:
+    """
+    Plan many moves at once, over all cores.
+
+    Parameters
+    ----------
+    start, target, zeta, j_lim, c1, rate : array_like
+        As for `plan_two_step`, broadcast against each other.
+    load_limits : tuple of float
+        Admissible loads.
+    rtol : float
+        Relative tolerance, 1e-14 to 1e-4.
+    elastic : Elastic, optional
+        The law of all rows, in place of ``j_lim``.
+    workers : int
+        Threads; 0 for one a core.
+
+    Returns
+    -------
+    TwoStepBatch
+        A row that cannot be planned carries its status and NaN; it never spoils the others.
+
+    Raises
+    ------
+    BadInputError
+        If the shapes do not broadcast or ``rtol`` is out of range.
+
+    """
+    if not 1e-14 <= rtol <= 1e-4:
+        raise BadInputError(f'rtol is {rtol!r}: expected 1e-14 to 1e-4')
+    try:
+        arrays = np.broadcast_arrays(*(
+            np.asarray(a, dtype=np.float64) for a in (start, rate, target, zeta, j_lim, c1)))
+    except ValueError as error:
+        raise BadInputError(f'the arrays do not broadcast against each other: {error}') from error
+    shape = arrays[0].shape
+    columns = [np.array(a).ravel() for a in arrays]
+    status = np.empty(columns[0].size, dtype=np.int64)
+    results = [np.empty(status.size) for _ in range(3)]
+    each = _MOST_NUMBERS // (CONSTANTS + (1 if elastic is None else len(elastic.constants)))
+
+    def plan(part: slice) -> None:
+        start, rate, target, zeta, j_lim, c1 = (x[part] for x in columns)
+        materials = np.ascontiguousarray(law.pack(zeta, j_lim, c1, elastic))
+        motion.two_step_batch(
+            start, rate, target, materials, materials.shape[1], *load_limits, rtol,
+            HOLD_TOLERANCE, True, status[part], *(x[part] for x in results))
+
+    count = max(min(workers or available_cores(), status.size // _PART), 1)
+    size = min(-(-status.size // count), each) or 1
+    parts = [slice(x, x + size) for x in range(0, status.size, size)]
+    if count == 1:
+        for part in parts:
+            plan(part)
+    else:
+        with ThreadPoolExecutor(count) as pool:
+            list(pool.map(plan, parts))
+    return TwoStepBatch(status.reshape(shape), *(a.reshape(shape) for a in results))

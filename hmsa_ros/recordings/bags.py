@@ -1,0 +1,332 @@
+"""
+Runs, read from a bag.
+
+Topics are found by the end of their name and their type, so that any namespace will do; the
+bag may come from this package's recorder, from rosbag2, from a simulated plant or from a coil.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+import math
+from pathlib import Path
+from typing import Any
+
+from hmsa_ros.bag import limits
+from hmsa_ros.bag.info import BagSummary, summarize
+from hmsa_ros.bag.reader import BagReader, Message
+from hmsa_ros.errors import BadInputError, BagError
+from hmsa_ros.interfaces.status import whole
+from hmsa_ros.model.schedule import obeyed
+from hmsa_ros.recordings.levels import Level
+from hmsa_ros.recordings.parameters import actuators, named_joint, recorded
+from hmsa_ros.recordings.record import RecordedRequest, Run, Verdict
+from hmsa_ros.recordings.samples import nanoseconds_of, SampleReader
+from hmsa_ros.recordings.topics import (
+    APPLIED,
+    COMMAND,
+    FORCE,
+    JOINT_STATES,
+    PLAN,
+    SETPOINT,
+    topics_by_joint,
+    TRAJECTORY,
+    TYPES,
+)
+
+# Between two calls of the progress.
+_PROGRESS_MESSAGES = 20_000
+_MOST_NOTES = 20
+_LEVELS = ('ok', 'warning', 'error')
+
+
+def read_runs(
+        path: str | Path, *, parameters: Mapping[str, object] | None = None,
+        joints: Sequence[str] = (), max_chunk_size: int = limits.CHUNK_SIZE,
+        progress: Callable[[str, float], None] = lambda what, share: None) -> list[Run]:
+    """
+    Read a bag: one run for each actuator with joint states.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder of a bag, or an ``.mcap`` file.
+    parameters : mapping of str to object, optional
+        What the block and its coil really are, as `read_parameter_file` returns it; default
+        what the bag contains.
+    joints : sequence of str
+        Names of the actuators in the joint states; default all that have commands of their own,
+        or the one that the nodes name.
+    max_chunk_size : int
+        As for `BagReader`.
+    progress : callable
+        Called with what is going on and the share that is done.
+
+    Returns
+    -------
+    list of Run
+        At least one, in order of namespace and joint.
+
+    Raises
+    ------
+    BadInputError
+        If there is no bag, or it has no samples of an actuator.
+
+    """
+    path = Path(path)
+    reader = BagReader(path, max_chunk_size=max_chunk_size)
+    spaces = topics_by_joint(reader)
+    collected = _collect(reader, spaces, progress)
+    summary = summarize(path, max_chunk_size=max_chunk_size)
+    label = path.resolve().stem if path.is_file() else path.resolve().name
+    runs, reasons = [], []
+    for space, by_joint in sorted(spaces.items()):
+        name = label if len(spaces) == 1 else f'{label} {space or "/"}'
+        for joint, topics in sorted(by_joint.items()):
+            if joint and joints and joint not in joints:
+                reasons.append(BadInputError(
+                    f'{path} has no joint {" or ".join(joints)}: expected one of '
+                    f'{", ".join(sorted(by_joint))}'))
+                continue
+            for wanted in ([joint] if joint else joints or ['']):
+                several = len(by_joint) > 1 or len(joints) > 1
+                try:
+                    runs.append(collected[space].finish(
+                        f'{name} {wanted}' if several else name, reader, summary, topics,
+                        parameters or {}, joint, wanted))
+                except BadInputError as error:
+                    reasons.append(error)
+    if not runs:
+        # What was left out may be the reason.
+        notes = [x for each in collected.values() for x in each.notes]
+        raise BadInputError('; '.join([str(reasons[0]), *notes[:1]]))
+    return runs
+
+
+def _collect(
+        reader: BagReader, spaces: Mapping[str, Mapping[str, Mapping[str, str]]],
+        progress: Callable[[str, float], None]) -> 'dict[str, _Collected]':
+    """Read all messages of some topics, by namespace."""
+    # A namespace's own topics, and in it those of each joint.
+    found = {topic: (space, role, joint) for space, by_joint in spaces.items()
+             for joint, topics in by_joint.items() for role, topic in topics.items()}
+    decoders: dict[str, Callable[[bytes], Any]] = {}
+    for topic in found:
+        try:
+            decoders[topic] = reader.decoder(topic)
+        except BagError as error:
+            raise BadInputError(f'{reader.path} cannot be evaluated: {error}') from error
+    collected = {
+        space: _Collected(SampleReader(decoders[next(iter(by_joint.values()))[JOINT_STATES]]))
+        for space, by_joint in spaces.items()}
+    begin, end = reader.start_time or 0, reader.end_time or 0
+    for i, message in enumerate(reader.messages(list(found))):
+        if i % _PROGRESS_MESSAGES == 0:
+            progress(
+                f'reading {reader.path.name}', (message.log_time - begin) / max(end - begin, 1))
+        space, role, joint = found[message.topic]
+        collected[space].take(role, joint, message, decoders[message.topic])
+    return collected
+
+
+@dataclass(frozen=True)
+class _Point:
+    """A point of a trajectory: time from its start in ns, and values by joint."""
+
+    time: int
+    positions: tuple[float, ...]
+    velocities: tuple[float, ...]
+    effort: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _Trajectory:
+    """A request or a plan as it was received, with its stamp in ns."""
+
+    sent: int
+    joints: tuple[str, ...]
+    stamp: int
+    points: tuple[_Point, ...]
+
+    @classmethod
+    def of(cls, sent: int, message: Any) -> '_Trajectory':
+        """Take it from a message."""
+        return cls(sent, tuple(message.joint_names), nanoseconds_of(message.header.stamp), tuple(
+            _Point(nanoseconds_of(x.time_from_start), *(
+                tuple(map(float, y)) for y in (x.positions, x.velocities, x.effort)))
+            for x in message.points))
+
+
+@dataclass(frozen=True)
+class _Status:
+    """What the planner said, as it was received."""
+
+    sent: int
+    level: int
+    message: str
+    values: dict[str, str]
+
+    @classmethod
+    def of(cls, sent: int, message: Any) -> '_Status':
+        """Take it from a message."""
+        level = message.level[0] if isinstance(message.level, bytes) else int(message.level)
+        return cls(sent, level, message.message, {x.key: x.value for x in message.values})
+
+
+@dataclass
+class _Collected:
+    """What has been read of the actuators of one namespace so far."""
+
+    samples: SampleReader
+    commands: dict[str, list[Level]] = field(default_factory=dict)
+    applied: dict[str, list[Level]] = field(default_factory=dict)
+    forces: dict[str, list[tuple[int, int, float]]] = field(default_factory=dict)
+    refused: dict[str, int] = field(default_factory=dict)
+    # Of all joints, as they were received.
+    plans: list[_Trajectory] = field(default_factory=list)
+    trajectories: list[_Trajectory] = field(default_factory=list)
+    setpoints: dict[str, list[RecordedRequest]] = field(default_factory=dict)
+    statuses: list[_Status] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    left_out: int = 0
+
+    def take(
+            self, role: str, joint: str, message: Message,
+            decode: Callable[[bytes], Any]) -> None:
+        """Take in a message, or count and note it if it is not what its topic is for."""
+        try:
+            if role == JOINT_STATES:
+                self.samples.take(message.log_time, message.data)
+            else:
+                self._take(role, joint, message.log_time, decode(message.data))
+        except (AttributeError, TypeError, ValueError, OverflowError) as error:
+            # The bag brings the definition along, and may call anything by that name.
+            self._leave_out(
+                f'a message of topic {message.topic} is not as {TYPES[role]} is defined in ROS '
+                f'2: {error}')
+        except BagError as error:
+            self._leave_out(str(error))
+
+    def _leave_out(self, reason: str) -> None:
+        self.left_out += 1
+        if len(self.notes) < _MOST_NOTES:
+            self.notes.append(f'{reason}: left out')
+
+    def _take(self, role: str, joint: str, sent: int, content: Any) -> None:
+        if role in (COMMAND, APPLIED):
+            vector = content.magnetic_field
+            kept = self.commands if role == COMMAND else self.applied
+            if obeyed(vector.x, vector.y, vector.z):
+                stamp = nanoseconds_of(content.header.stamp)
+                kept.setdefault(joint, []).append(Level(
+                    stamp or (sent if role == COMMAND else 0), float(vector.z), sent))
+            else:
+                self.refused[joint] = self.refused.get(joint, 0) + 1
+        elif role == FORCE:
+            self.forces.setdefault(joint, []).append((
+                sent, nanoseconds_of(content.header.stamp) or sent,
+                float(content.wrench.force.z)))
+        elif role == PLAN:
+            self.plans.append(_Trajectory.of(sent, content))
+        elif role == TRAJECTORY:
+            self.trajectories.append(_Trajectory.of(sent, content))
+        elif role == SETPOINT:
+            self.setpoints.setdefault(joint, []).append(
+                RecordedRequest(sent, 0, ((float(content.data), None),)))
+        else:
+            self.statuses.append(_Status.of(sent, content))
+
+    def _plans(self, joint: str) -> Iterable[tuple[Level, ...]]:
+        """Return the plans of a joint, or of the one that they are of."""
+        for plan in self.plans:
+            place = _place(plan.joints, joint)
+            if place is None:
+                continue
+            levels = [
+                Level(plan.stamp + x.time, x.effort[place], plan.sent, x.positions[place],
+                      x.velocities[place])
+                for x in plan.points
+                if min(len(x.positions), len(x.velocities), len(x.effort)) > place]
+            # Of several joints there is a point wherever one of them changes.
+            yield tuple(
+                x for i, x in enumerate(levels) if i == 0 or len(plan.joints) == 1
+                or x.flux_density != levels[i - 1].flux_density)
+
+    def _requests(self, joint: str, key: str) -> list[RecordedRequest]:
+        """Return what was asked of a joint, by time."""
+        requests = list(self.setpoints.get(key, ()))
+        for asked in self.trajectories:
+            place = _place(asked.joints, joint)
+            if place is not None:
+                requests.append(RecordedRequest(asked.sent, asked.stamp, tuple(
+                    (x.positions[place], x.time) for x in asked.points
+                    if len(x.positions) == max(len(asked.joints), 1))))
+        return sorted(requests, key=lambda x: x.sent)
+
+    def _verdicts(self, joint: str, joints: Sequence[str]) -> Iterable[Verdict]:
+        """Return what the planner said, with the target of a joint."""
+        for status in self.statuses:
+            # Of several joints each has its own.
+            target = status.values.get(f'{joint}.stretch') if joint in joints and len(joints) > 1 \
+                else status.values.get('stretch')
+            yield Verdict(
+                status.sent, _LEVELS[min(status.level, 2)], status.values.get('code', ''),
+                status.message, _number(target), whole(status.values.get('plan')))
+
+    def finish(
+            self, label: str, reader: BagReader, summary: BagSummary, topics: Mapping[str, str],
+            given: Mapping[str, object], key: str, joint: str) -> Run:
+        """Return the run of one joint, whose topics have its name in them or not."""
+        states = topics[JOINT_STATES]
+        parameters = recorded(reader.custom_data, states[:-len(JOINT_STATES)])
+        planned = [x for plan in self.plans for x in plan.joints]
+        beside = topics.get(COMMAND, '').split('/')[-2:-1]
+        named = joint or next(
+            (x for x in (*planned, named_joint(parameters), *beside) if x in self.samples.names),
+            '')
+        samples = self.samples.columns(f'{reader.path}: {states}', named, required=bool(joint))
+        plant, planner, known, more = actuators(parameters, given, named)
+        refused = self.refused.get(key, 0)
+        notes = [*self.notes, *summary.problems]
+        if COMMAND not in topics:
+            notes.append(
+                f'The recording has no {COMMAND}: setpoints, plain steps and lateness are '
+                'unknown.')
+        elif not self.commands.get(key):
+            notes.append(
+                f'{topics[COMMAND]} holds no command: there is no setpoint to evaluate.')
+        if refused:
+            notes.append(
+                f'{refused} commands are not finite or not along z: left out, as the plant '
+                'does.')
+        return Run(
+            label, named, reader.path, samples.time, samples.logged, samples.stretch, samples.rate,
+            samples.flux_density, tuple(self.commands.get(key, ())),
+            _begun(self.applied.get(key, ()), int(samples.time[0])),
+            tuple(self.forces.get(key, ())), tuple(self._plans(joint)),
+            tuple(self._requests(joint, key)),
+            tuple(self._verdicts(joint, list(dict.fromkeys(planned)))), {**parameters, **given},
+            plant, planner, known, self.left_out + refused + samples.left_out,
+            (*notes, *samples.notes, *more), topics, summary)
+
+
+def _begun(levels: Sequence[Level], first: int) -> tuple[Level, ...]:
+    """Return what took effect, where time 0 is before a recording whose first sample is given."""
+    known = any(0 < x.stamp <= first for x in levels)
+    return tuple(
+        x if x.stamp else replace(x, stamp=min(x.sent, first)) for x in levels
+        if x.stamp or not known)
+
+
+def _number(text: str | None) -> float:
+    """Return a number from a status; NaN for what is none."""
+    try:
+        return float(text or 'nan')
+    except ValueError:
+        return math.nan
+
+
+def _place(names: Sequence[str], joint: str) -> int | None:
+    """Return a joint's place among some names: the first if it does not matter."""
+    if joint in names:
+        return list(names).index(joint)
+    return 0 if not joint or len(names) <= 1 else None

@@ -1,0 +1,79 @@
+"""Levels of the field: commanded, superseded, repeated, and applied."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.schedule import CommandSchedule, Superseding
+from hmsa_ros.model.units import NANOSECONDS
+
+# Stamps of what took effect may be rounded, in ns.
+_ROUNDED_STAMP = 1000
+
+
+@dataclass(frozen=True)
+class Level:
+    """A command, or a change of level in a plan."""
+
+    stamp: int  # time in ns from which it applies
+    flux_density: float  # in T
+    sent: int  # time in ns at which it was recorded
+    stretch: float = math.nan  # predicted at the stamp; NaN for a command
+    rate: float = math.nan  # likewise, in 1/s
+
+
+def in_force(messages: Iterable[Sequence[Level]]) -> tuple[Level, ...]:
+    """Return the levels left when each message has superseded all at or after its first stamp."""
+    levels: Superseding[Level] = Superseding()
+    for message in messages:
+        for level in sorted(message, key=lambda x: x.stamp):
+            levels.put(level.stamp, level)
+    return tuple(levels)
+
+
+def without_repeats(commands: Sequence[Level]) -> tuple[tuple[Level, ...], int]:
+    """Return the commands that change something, and the number of those that change nothing."""
+    schedule = CommandSchedule(math.nan)
+    kept = tuple(x for x in commands if schedule.insert(x.stamp, x.flux_density))
+    return kept, len(commands) - len(kept)
+
+
+def lateness_of(
+        commands: Sequence[Level], applied: Sequence[Level], last: int) -> tuple[Array, int]:
+    """
+    Return how long after its stamp each command took effect, and how many never did.
+
+    The lateness is in s, one for each command as `without_repeats` returns them: NaN for one that
+    never took effect, empty if nobody reported what took effect. The number is of the changes of
+    level that were due before ``last`` (ns), not superseded, and never took effect.
+    """
+    if not applied:
+        return np.empty(0), 0
+    result = np.full(len(commands), np.nan)
+    unapplied = 0
+    # What was replaced before its time never took effect.
+    standing = in_force((x,) for x in commands)
+    places = {x: i for i, x in enumerate(commands)}
+    # What was in force when the first command was due; applied levels may be older than that.
+    begin = standing[0].stamp if standing else 0
+    before: Level | None = max(
+        (x for x in applied if x.stamp <= begin), key=lambda x: x.stamp,
+        default=min(applied, key=lambda x: x.stamp))
+    for i, command in enumerate(standing):
+        until = next(
+            (x.stamp for x in standing[i + 1:] if _same_level(x, command)), math.inf)
+        when = [x.stamp for x in applied if _same_level(x, command)
+                and command.stamp - _ROUNDED_STAMP <= x.stamp < until - _ROUNDED_STAMP]
+        if when:
+            result[places[command]] = (min(when) - command.stamp) / NANOSECONDS
+        elif command.stamp < last and not (before and _same_level(before, command)):
+            unapplied += 1
+        before = command
+    return result, unapplied
+
+
+def _same_level(one: Level, other: Level) -> bool:
+    return math.isclose(one.flux_density, other.flux_density, rel_tol=1e-9, abs_tol=1e-12)

@@ -1,0 +1,243 @@
+"""Parameters of a run: as a recorder stored them, or from a parameter file of the nodes."""
+
+from collections.abc import Iterable, Mapping
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from hmsa_ros.bag.experiment import parameters_of
+from hmsa_ros.errors import BadInputError, excerpt
+from hmsa_ros.files import read_at_most
+from hmsa_ros.interfaces.actuator import actuator_from, creep_from
+from hmsa_ros.interfaces.parameters import (
+    ACTUATOR,
+    BLOCK,
+    JOINT,
+    LAW,
+    ParameterSpec,
+    present_name,
+    VISCOELASTIC,
+)
+from hmsa_ros.interfaces.topics import PLANNER, PLANT
+from hmsa_ros.model.creep import Creep
+from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
+
+# Parameter files have some dozens of entries.
+_LARGEST_FILE = 1 << 20
+_DEEPEST = 32
+
+#: Node, dotted name and value of each parameter in a file; no node if all are meant.
+Entries = list[tuple[str, str, object]]
+
+
+def number_of(value: object) -> float | None:
+    """Return a number as a float; None for anything else, NaN or a number too large."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return None if math.isnan(number) else number
+
+
+def of_joint(parameters: Mapping[str, object], joint: str, name: str) -> object:
+    """Return what is set for one joint, or else for all; None for what is not set."""
+    node, _, parameter = name.partition('.')
+    own = parameters.get(f'{node}.{joint}.{parameter}')
+    return parameters.get(name) if own is None else own
+
+
+def recorded(custom_data: Mapping[str, str], space: str) -> dict[str, object]:
+    """Return the parameters of planner and plant in a namespace by ``'node.name'``."""
+    parameters: dict[str, object] = {}
+    for node in (PLANNER, PLANT):
+        for name, text in parameters_of(custom_data, node, space).items():
+            try:
+                parameters[f'{node}.{present_name(name)}'] = json.loads(text)
+            except (ValueError, RecursionError):
+                parameters[f'{node}.{present_name(name)}'] = text
+    return parameters
+
+
+def named_joint(parameters: Mapping[str, object]) -> str:
+    """Return the joint that the nodes of a single one name; empty if they do not."""
+    for node in (PLANT, PLANNER):
+        several = parameters.get(f'{node}.joints')
+        if isinstance(several, list) and several:
+            return str(several[0]) if len(several) == 1 else ''
+        if name := parameters.get(f'{node}.{JOINT.name}'):
+            return str(name)
+    return ''
+
+
+def actuators(
+        parameters: Mapping[str, object], given: Mapping[str, object], joint: str
+) -> tuple[ActuatorParameters, ActuatorParameters, bool, list[str]]:
+    """
+    Return the block of the plant and of the planner, whether they are known, and notes.
+
+    Raises `BadInputError` if the parameters given are of an actuator whose position is another
+    quantity.
+    """
+    # What is given in a parameter file is what the block really is. The example block is taken
+    # where nothing is known.
+    found: dict[str, ActuatorParameters] = {}
+    notes = []
+    for node in (PLANT, PLANNER):
+        values = {x: number_of(of_joint(parameters, joint, f'{node}.{x}')) for x in _NAMES}
+        if all(values[x.name] is not None for x in ACTUATOR):
+            try:
+                found[node] = actuator_from(
+                    {k: v for k, v in values.items() if v is not None}
+                    | _own(parameters, joint, node, LAW))
+            except BadInputError as error:
+                notes.append(f'The parameters of the {node} in the bag cannot be used: {error}.')
+    if given:
+        own = actuator_from(values_of({}, PLANT, ACTUATOR) | _own(given, joint, PLANT, BLOCK))
+        for node, other in found.items():
+            if other.coordinate != own.coordinate:
+                raise BadInputError(
+                    f'the actuator of the parameter file has {own.coordinate.plural}, that of the '
+                    f'{node} in the bag {other.coordinate.plural}: expected the file of the '
+                    'recorded actuator; leave out --params-file to use the parameters in the bag')
+        found[PLANT] = own
+    if not found:
+        notes.append(
+            "The recording does not contain the actuator's parameters: those of the example "
+            'block are used, so what is simulated here (plain steps, prediction, equilibria, b '
+            'and tau) may not match your actuator; name a parameter file with --params-file.')
+    plant = found.get(PLANT) or found.get(PLANNER) or paper_actuator()
+    planner = found.get(PLANNER) or plant
+    if plant != planner:
+        notes.append(
+            'The planner and the plant had different parameters of the actuator: see the table '
+            'of parameters.')
+    try:
+        if creep := creep_of({**parameters, **given}, joint):
+            known = creep == creep_of(parameters, joint, PLANNER)
+            notes.append(
+                'The elastomer of the plant creeps (viscoelastic.*)'
+                + ('.' if known else ', which the planner does not know.'))
+    except BadInputError as error:
+        notes.append(f'What the plant says of creep cannot be used: {error}.')
+    return plant, planner, bool(found), notes
+
+
+def creep_of(parameters: Mapping[str, object], joint: str, node: str = PLANT) -> Creep:
+    """Return the Maxwell branches of the plant of a run, or those that its planner knows."""
+    return creep_from(_own(parameters, joint, node, VISCOELASTIC))
+
+
+def _own(
+        parameters: Mapping[str, object], joint: str, node: str, specs: Iterable[ParameterSpec]
+) -> dict[str, Any]:
+    """Return what is set of some parameters, for a joint or for all."""
+    found = {x.name: of_joint(parameters, joint, f'{node}.{x.name}') for x in specs}
+    return values_of(
+        {f'{node}.{name}': value for name, value in found.items()}, node,
+        [x for x in specs if found[x.name] is not None])
+
+
+_NAMES = tuple(
+    name for x in ACTUATOR for name in (x.name, f'mismatch.{x.name.partition(".")[2]}'))
+
+
+def read_parameter_file(
+        path: str | Path, entries: Entries | None = None) -> dict[str, object]:
+    """
+    Read a YAML parameter file, or take its entries; return values by ``'node.name'``.
+
+    Raises `BadInputError` if the file cannot be read or sets no parameter of the actuator.
+    """
+    entries = entries_of(Path(path)) if entries is None else entries
+    found: dict[str, object] = {}
+    for node in (PLANNER, PLANT):
+        # What is meant for all nodes comes first, so that a node's own goes before it.
+        for own in (False, True):
+            found |= {f'{node}.{name}': value for key, name, value in entries
+                      if key == (node if own else '')}
+    if not any(name.partition('.')[2].endswith(x.name) for name in found for x in BLOCK):
+        raise BadInputError(
+            f'{path} sets no parameter of the actuator: expected some of '
+            + ', '.join(x.name for x in ACTUATOR))
+    return found
+
+
+def values_of(
+        parameters: Mapping[str, object], node: str, specs: Iterable[ParameterSpec]
+) -> dict[str, Any]:
+    """
+    Return a node's values by name: what is set as ``'node.name'``, else the default.
+
+    Raises `BadInputError` if a value is of another type or out of range.
+    """
+    values = {}
+    for spec in specs:
+        value = parameters.get(f'{node}.{spec.name}', spec.default)
+        if isinstance(spec.default, (str, list)):
+            values[spec.name] = spec.taken(value)
+            continue
+        number = number_of(value)
+        if number is None:
+            raise BadInputError(
+                f'parameter {spec.name} is {excerpt(value)}: expected a number, '
+                f'{spec.range_text()}')
+        spec.check(number)
+        values[spec.name] = number
+    return values
+
+
+def entries_of(path: Path) -> Entries:
+    """Return the parameters in a file, or raise `BadInputError` if it cannot be read."""
+    try:
+        content = read_at_most(path, _LARGEST_FILE, 'a parameter file of at most that')
+        document = _load(content.decode('utf-8'))
+    except (OSError, ValueError, RecursionError) as error:
+        if isinstance(error, BadInputError):
+            raise
+        reason = getattr(error, 'strerror', None) or ' '.join(str(error).split())
+        raise BadInputError(
+            f'{path} cannot be read ({reason}): expected a parameter file (YAML)') from error
+    if not isinstance(document, dict):
+        raise BadInputError(
+            f'{path} has no ros__parameters: expected a parameter file as hmsa init writes it')
+    flat: dict[str, object] = {}
+    _flatten(document, '', flat, 0, path)
+    entries = []
+    for name, value in flat.items():
+        whole, _, parameter = name.rpartition('ros__parameters.')
+        node = whole.rstrip('.').rpartition('/')[2]
+        entries.append((
+            '' if node in ('*', '**') else node, present_name(parameter), value))
+    return entries
+
+
+def _load(text: str) -> Any:
+    """Read YAML without aliases, which ROS does not take either and which can grow endlessly."""
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):
+                raise ValueError('it has an alias (*), which ROS does not take either')
+            return super().compose_node(parent, index)
+
+    try:
+        return yaml.load(text, Loader)
+    except yaml.YAMLError as error:
+        raise ValueError(str(error)) from error
+
+
+def _flatten(
+        value: object, name: str, found: dict[str, object], depth: int, path: Path) -> None:
+    """Collect the values of nested mappings by dotted name."""
+    if depth > _DEEPEST:
+        raise BadInputError(
+            f'{path} is nested more than {_DEEPEST} deep: expected a parameter file (YAML)')
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            _flatten(inner, f'{name}.{key}' if name else str(key), found, depth + 1, path)
+    else:
+        found[name] = value

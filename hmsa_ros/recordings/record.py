@@ -1,0 +1,105 @@
+"""The record of a run: what was measured, commanded, planned and known of one actuator."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmsa_ros.bag.info import BagSummary
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
+from hmsa_ros.recordings.levels import in_force, Level
+from hmsa_ros.recordings.parameters import number_of, of_joint
+
+Times = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class RecordedRequest:
+    """A request to the planner."""
+
+    sent: int  # time in ns at which it was recorded
+    stamp: int  # start of the sequence in ns; 0 for at once
+    # Stretch, and time in ns from the start until which it lasts; None for a setpoint that is held
+    # until the next.
+    points: tuple[tuple[float, int | None], ...]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the planner said of a request."""
+
+    sent: int  # time in ns at which it was recorded
+    level: str  # ``'ok'``, ``'warning'`` or ``'error'``
+    code: str
+    message: str
+    stretch: float  # target of the setpoint under way; NaN if there is none
+    plan: int = 0  # number of the request that is carried out, from 1; 0 where not told
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What is known of one actuator in one run; tuples are in the order recorded."""
+
+    label: str  # name for people
+    joint: str  # name in the joint states; empty if it is not known
+    path: Path  # the bag or table
+    time: Times  # shape (n,), n of at least 1: stamps in ns, increasing
+    logged: Times  # shape (n,): when the samples were recorded, in ns
+    stretch: Array  # shape (n,)
+    rate: Array  # shape (n,): in 1/s, from the stretch if it was not recorded
+    flux_density: Array  # shape (n,): in T, NaN if it was not recorded
+    commands: tuple[Level, ...] = ()
+    applied: tuple[Level, ...] = ()  # changes of the field that took effect, as reported
+    forces: tuple[tuple[int, int, float], ...] = ()  # recorded at, stamp (ns), newton
+    plans: tuple[tuple[Level, ...], ...] = ()
+    requests: tuple[RecordedRequest, ...] = ()
+    verdicts: tuple[Verdict, ...] = ()  # each once
+    # Of the nodes, by ``'node.name'``
+    parameters: Mapping[str, object] = field(default_factory=dict)
+    plant: ActuatorParameters = field(default_factory=paper_actuator)  # as it was
+    # As the planner took it to be
+    planner: ActuatorParameters = field(default_factory=paper_actuator)
+    parameters_known: bool = False  # else it is the example block
+    left_out: int = 0  # messages or rows that could not be used
+    notes: tuple[str, ...] = ()  # what a reader should know, one sentence each
+    # Of each role (`hmsa_ros.recordings.topics`)
+    topics: Mapping[str, str] = field(default_factory=dict)
+    summary: BagSummary | None = None  # None for a table
+
+    def __post_init__(self) -> None:
+        """Check the arrays."""
+        shapes = {x.shape for x in (
+            self.time, self.logged, self.stretch, self.rate, self.flux_density)}
+        if len(shapes) != 1 or not len(self.time) or np.any(np.diff(self.time) <= 0):
+            raise BadInputError(
+                f'the samples of {self.label} have shapes {sorted(shapes)}: expected one shape, '
+                'at least one sample, and increasing times')
+
+    def number(self, name: str) -> float:
+        """Return a number like ``'planner.slew_limit'``; 0 if unknown, negative or not finite."""
+        value = number_of(of_joint(self.parameters, self.joint, name))
+        return value if value is not None and 0.0 <= value < math.inf else 0.0
+
+    @property
+    def levels(self) -> tuple[Level, ...]:
+        """
+        Changes of the field in force, by stamp.
+
+        What the plant reported as applied; else the commands that were not superseded; else
+        changes of the measured flux density, known to one sample.
+        """
+        if self.applied:
+            return tuple(sorted(self.applied, key=lambda x: x.stamp))
+        if self.commands:
+            return in_force((x,) for x in self.commands)
+        known = np.flatnonzero(np.isfinite(self.flux_density))
+        values = self.flux_density[known]
+        places = known[np.append(True, values[1:] != values[:-1])] if len(known) else known
+        return tuple(
+            Level(int(self.time[i]), float(self.flux_density[i]), int(self.logged[i]))
+            for i in places)

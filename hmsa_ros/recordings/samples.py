@@ -1,0 +1,248 @@
+"""Joint states as columns: read quickly, picked by joint, put in order."""
+
+from array import array
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import chain
+import struct
+from typing import Any
+
+import numpy as np
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.interfaces.parameters import JOINT
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.recordings.record import Times
+
+# Samples may overtake one another on their way; further back goes only a clock, in ns.
+_CLOCK_JUMP = 100_000_000
+# A sample whose stamp is this far from the others' is of another sender, or garbage; in ns.
+_FAR = 30 * 86_400 * NANOSECONDS
+# What lies beyond is no motion of a block, and nothing could be drawn beside it; the rate in 1/s.
+_LARGEST_STRETCH, _LARGEST_RATE = 1e6, 1e12
+_LITTLE_ENDIAN = b'\x00\x01'
+
+
+def nanoseconds_of(stamp: Any) -> int:
+    """Return a stamp or a duration in ns."""
+    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+
+
+# Names, and how many positions, velocities and efforts.
+_Shape = tuple[tuple[str, ...], int, int, int]
+
+
+class _Columns:
+    """Samples of one shape: log time and stamp, and the numbers, row after row."""
+
+    def __init__(self) -> None:
+        self.times = array('q')
+        self.numbers = array('d')
+
+
+class SampleReader:
+    """
+    Reads joint states, quickly where they all have one layout.
+
+    Decoding field by field takes longer than everything else together. Joint states of one
+    sender differ in their numbers only, so that the places of these are worked out once for
+    each length and the rest is compared.
+    """
+
+    def __init__(self, decode: Callable[[bytes], Any]) -> None:
+        self._decode = decode
+        self._layouts: dict[int, _Layout | None] = {}
+        self._columns: defaultdict[_Shape, _Columns] = defaultdict(_Columns)
+
+    def take(self, logged: int, data: bytes) -> None:
+        """Take in a sample."""
+        length = len(data)
+        if length not in self._layouts:
+            self._layouts[length] = _Layout.find(data, self._decode)
+        layout = self._layouts[length]
+        if layout is not None and layout.fits(data):
+            sec, nanosec = layout.stamp.unpack_from(data, 4)
+            self._put(logged, sec * NANOSECONDS + nanosec, layout.names, [
+                x.unpack_from(data, offset) for x, offset in layout.numbers])
+            return
+        message = self._decode(data)
+        self._put(logged, nanoseconds_of(message.header.stamp), tuple(message.name), [
+            tuple(x) for x in (message.position, message.velocity, message.effort)])
+
+    def _put(
+            self, logged: int, stamp: int, names: tuple[str, ...],
+            numbers: list[tuple[float, ...]]) -> None:
+        position, velocity, effort = map(len, numbers)
+        columns = self._columns[names, position, velocity, effort]
+        # Both are made first: what cannot be kept leaves no half of it behind.
+        times, row = array('q', (logged, stamp)), array('d', chain.from_iterable(numbers))
+        columns.times.extend(times)
+        columns.numbers.extend(row)
+
+    @property
+    def names(self) -> set[str]:
+        """Joints that the samples name."""
+        return {x for shape in self._columns for x in shape[0]}
+
+    def columns(self, where: str, joint: str, *, required: bool) -> 'Samples':
+        """
+        Return a joint's samples in order; another joint will do unless ``required``.
+
+        Raises `BadInputError` if there is no such joint, or none of its samples can be used.
+        """
+        if not self._columns:
+            raise BadInputError(f'{where} holds no message: expected samples of the actuator')
+        joint = self._joint(where, joint, required)
+        parts = []
+        total = 0
+        for (names, *widths), columns in self._columns.items():
+            place = names.index(joint) if joint in names else 0
+            times = np.array(columns.times).reshape(-1, 2)
+            total += len(times)
+            if names and joint not in names or place >= widths[0]:
+                continue
+            numbers = np.array(columns.numbers).reshape(len(times), -1)
+            picked = [
+                numbers[:, sum(widths[:i]) + place] if place < width
+                else np.full(len(times), np.nan) for i, width in enumerate(widths)]
+            parts.append((times[:, 0], times[:, 1], *picked))
+        if not parts:
+            raise BadInputError(
+                f'{where} holds no position of joint {joint!r}: expected the stretch, '
+                'or the deflection of a beam')
+        logged, stamps, stretch, rate, flux_density = (
+            np.concatenate(x) for x in zip(*parts, strict=True))
+        order = np.argsort(logged, kind='stable')
+        return tidy(
+            where, *(x[order] for x in (stamps, logged, stretch, rate, flux_density)),
+            left_out=total - len(stamps))
+
+    def _joint(self, where: str, joint: str, required: bool) -> str:
+        names = self.names
+        if joint in names or not names:
+            return joint
+        if required:
+            raise BadInputError(
+                f'{where} has no joint {joint!r}: expected one of {", ".join(sorted(names))}')
+        if JOINT.default in names:
+            return str(JOINT.default)
+        if len(names) == 1:
+            return names.pop()
+        raise BadInputError(
+            f'{where} has the joints {", ".join(sorted(names))}: expected one; name it with '
+            '--joint')
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where the numbers of a joint state lie, and the bytes between them."""
+
+    stamp: struct.Struct
+    numbers: tuple[tuple[struct.Struct, int], ...]
+    constant: tuple[tuple[int, int, bytes], ...]
+    names: tuple[str, ...]
+
+    def fits(self, data: bytes) -> bool:
+        """Return whether a payload of the same length has this layout."""
+        return all(data[i:j] == x for i, j, x in self.constant)
+
+    @classmethod
+    def find(cls, data: bytes, decode: Callable[[bytes], Any]) -> '_Layout | None':
+        """Return the layout of a payload, None if it is not the usual one."""
+        if data[:2] != _LITTLE_ENDIAN:
+            return None
+        message = decode(data)
+        place = 12
+
+        def count() -> int:
+            nonlocal place
+            place += -place % 4
+            number: int = struct.unpack_from('<I', data, place)[0]
+            place += 4
+            return number
+
+        numbers, constant, begin = [], [(0, 4, data[:4])], 12
+        try:
+            place += count()
+            for _ in range(count()):
+                length = count()
+                place += length
+            for values in (message.position, message.velocity, message.effort):
+                number = count()
+                # Doubles are aligned to 8 from the end of the encapsulation on.
+                start = place + (4 - place) % 8 if number else place
+                constant.append((begin, place, data[begin:place]))
+                numbers.append((struct.Struct(f'<{number}d'), start))
+                place = begin = start + 8 * number
+                if list(numbers[-1][0].unpack_from(data, start)) != list(values):
+                    return None
+        except struct.error:
+            return None
+        return cls(struct.Struct('<iI'), tuple(numbers), tuple(constant), tuple(message.name))
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Samples of one actuator, all of shape (n,)."""
+
+    time: Times  # stamps in ns, increasing
+    logged: Times  # when they were recorded, in ns
+    stretch: Array  # finite
+    rate: Array  # in 1/s
+    flux_density: Array  # in T, or NaN
+    left_out: int  # how many could not be used
+    notes: tuple[str, ...]  # what a reader should know
+
+
+def tidy(
+        where: str, stamps: Times, logged: Times, stretch: Array, rate: Array,
+        flux_density: Array, *, left_out: int = 0) -> Samples:
+    """
+    Leave out what cannot be a motion, sort by stamp and complete the rate.
+
+    Arrays of shape (n,) are in the order recorded, stamps in ns, with NaN for what was not;
+    ``left_out`` says how many were left out before, ``where`` names what is read in messages.
+    Raises `BadInputError` if no stretch is a finite number.
+    """
+    notes = []
+    if not stamps.any():
+        stamps = logged.copy()
+        notes.append(
+            'The samples carry no stamps: the times at which they were recorded are taken.')
+    near = np.abs(stamps - np.sort(stamps)[len(stamps) // 2]) < _FAR
+    if not np.all(near):
+        notes.append(
+            f'{np.count_nonzero(~near)} samples are stamped more than 30 days away from the '
+            'others: left out.')
+        left_out += int(np.count_nonzero(~near))
+    good = np.abs(stretch) < _LARGEST_STRETCH
+    if not np.all(good[near]):
+        notes.append(
+            f'{np.count_nonzero(near & ~good)} samples are not finite numbers, or beyond '
+            f'{_LARGEST_STRETCH:g}: left out.')
+        left_out += int(np.count_nonzero(near & ~good))
+    if not np.any(near & good):
+        raise BadInputError(
+            f'{where} holds no finite position: expected the stretch as a number')
+    stamps, logged, stretch, rate, flux_density = (
+        x[near & good] for x in (stamps, logged, stretch, rate, flux_density))
+    if np.any(np.diff(stamps) < -_CLOCK_JUMP):
+        notes.append(
+            'The stamps of the samples jump back: the samples are sorted by stamp. Was the '
+            'clock reset in the run?')
+    order = np.argsort(stamps, kind='stable')
+    # Of samples with one stamp the first counts, so that time increases.
+    order = order[np.append(True, np.diff(stamps[order]) > 0)]
+    stamps, logged, stretch, rate, flux_density = (
+        x[order] for x in (stamps, logged, stretch, rate, flux_density))
+    missing = ~(np.abs(rate) < _LARGEST_RATE)
+    if np.any(missing):
+        which = 'Stretch rates' if np.all(missing) \
+            else f'{np.count_nonzero(missing)} stretch rates'
+        notes.append(f'{which} were not recorded: they are differences of the stretch.')
+        slope = np.gradient(stretch, (stamps - stamps[0]) / NANOSECONDS) \
+            if len(stamps) > 1 else np.zeros_like(stretch)
+        rate = np.where(missing, slope, rate)
+    return Samples(stamps, logged, stretch, rate, flux_density, left_out, tuple(notes))

@@ -1,0 +1,288 @@
+"""
+The setpoints of a run as they were requested, through all plans that were made anew.
+
+Requests say what was wanted and by when, statuses which of them were taken, and plans when each
+setpoint is reached. Where there is no plan, levels show it; where there is no request, a level
+that lasts for a period of the actuator holds a setpoint.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+
+from hmsa_ros.judge import Setpoint
+from hmsa_ros.model.equations import Array, equilibrium_stretch, natural_frequency, stretch_limits
+from hmsa_ros.model.law import critical_zeta
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.recordings.levels import in_force, Level, without_repeats
+from hmsa_ros.recordings.record import RecordedRequest, Run
+
+#: Stretches that differ by less are one setpoint.
+SAME = 1e-6
+# Rest, to the precision of a planner, and of levels that follow creep: shares of the step, and of
+# the step in the time of a radian.
+_AT_REST = ((0.0, 1e-3), (2e-3, 1e-2))
+# What holds a setpoint is known to the resolution of the hardware, as a share of its distance.
+_ROUNDED = 1e-3
+
+
+@dataclass(frozen=True)
+class Requested:
+    """A setpoint as it was requested, with its result."""
+
+    setpoint: Setpoint
+    due: int | None  #: until when it was requested in ns; None if it was to be held on
+    last: bool = False  #: whether it is held after the end of the sequence
+    #: When plans were made anew, by the recorder, and their arrivals, in ns; None: left out.
+    moves: tuple[tuple[int, int | None], ...] = ()
+    corrected: bool = False  #: whether feedback made them anew, and not need
+    left_out: bool = False  #: whether the levels leave it out
+    until: int | None = None  #: when the next request took its place in ns, if one did
+
+    @property
+    def missed(self) -> bool:
+        """Whether it was left out in the end."""
+        return self.left_out or bool(self.moves) and self.moves[-1][1] is None
+
+    @property
+    def arrival(self) -> int | None:
+        """Planned rest at the target in ns; None where it is only approached."""
+        return self.moves[-1][1] if self.moves else self.setpoint.arrival
+
+
+@dataclass(frozen=True)
+class _Act:
+    """A request that was taken, or a stop (None); when it was, and when it begins, in ns."""
+
+    request: RecordedRequest | None
+    sent: int
+    begin: int
+
+
+def setpoints_of(run: Run) -> list[Requested]:
+    """Return the setpoints that were requested in a run, else those that its levels hold."""
+    levels = in_force((x,) for x in without_repeats(run.commands)[0])
+    acts = list(_acts(run, levels))
+    found: list[Requested] = []
+    previous = start_of(run, acts[0].begin if acts else int(run.time[0]))
+    for i, act in enumerate(acts):
+        after = acts[i + 1] if i + 1 < len(acts) else None
+        mine = [] if act.request is None else list(
+            _of(run, act, act.request, after, levels, previous))
+        # A setpoint that another request replaced before it was reached was not missed.
+        found += mine if after is None else [
+            replace(x, until=after.begin) for x in mine
+            if (x.setpoint.begins if x.arrival is None else x.arrival) < after.begin]
+        if mine:
+            previous = mine[-1].setpoint.target
+    return found if any(x.points for x in run.requests) else _held(run, levels)
+
+
+# -- requests -----------------------------------------------------------------------------------
+
+def _acts(run: Run, levels: Sequence[Level]) -> Iterator[_Act]:
+    """Yield what changed the plan, by time."""
+    # Others are refused.
+    requests = [x for x in run.requests if all(math.isfinite(y) for y, _ in x.points)]
+    number = max((x.plan for x in run.verdicts if requests and x.sent < requests[0].sent),
+                 default=0)
+    for i, request in enumerate(requests):
+        until = requests[i + 1].sent if i + 1 < len(requests) else math.inf
+        answers = [x for x in run.verdicts if request.sent <= x.sent < until]
+        taken = sorted({x.plan for x in answers if x.plan > number})
+        if any(x.plan for x in answers):
+            accepted = bool(taken)
+        else:
+            accepted = not answers or any(x.level != 'error' for x in answers)
+        if accepted:
+            yield _Act(request, request.sent, _begin(run, request, levels))
+        for later in taken[1:]:
+            # Nobody asked for it here: the joint was to stop.
+            sent = min(x.sent for x in answers if x.plan == later)
+            yield _Act(None, sent, _new(run, _plan_at(run, sent)) or sent)
+        number = taken[-1] if taken else number
+
+
+def _begin(run: Run, request: RecordedRequest, levels: Sequence[Level]) -> int:
+    """Return from when on a request is carried out."""
+    place = next((i for i, x in enumerate(run.plans) if x and x[0].sent >= request.sent), None)
+    begin = None if place is None else _new(run, place)
+    if begin is None:
+        begin = next((x.stamp for x in levels if x.sent >= request.sent), None)
+    if begin is None:
+        begin = request.stamp or request.sent + round(
+            run.number('planner.lead_time') * NANOSECONDS)
+    return begin
+
+
+def _plan_at(run: Run, sent: int) -> int | None:
+    """Return the place of the newest plan at a time of the recorder."""
+    return max((i for i, x in enumerate(run.plans) if x and x[0].sent <= sent), default=None)
+
+
+def _new(run: Run, place: int | None) -> int | None:
+    """Return the first stamp of a plan that the one before does not have."""
+    if place is None:
+        return None
+    plan, before = run.plans[place], run.plans[place - 1] if place else ()
+    if not before and len(plan) > 1 and plan[0].stamp < plan[0].sent and (
+            abs(float(balance(run, plan[:1])[0]) - plan[0].stretch) <= _ROUNDED):
+        # It was in force, and holds what was there.
+        plan = plan[1:]
+    fresh = _fresh(plan, before)
+    return None if fresh == math.inf else int(fresh)
+
+
+def _fresh(plan: Sequence[Level], before: Sequence[Level]) -> float:
+    """Return from when on a plan is not as the one before; infinite if it goes on as that."""
+    if not plan:
+        return math.inf
+    # The first level was in force, perhaps from another time on than planned.
+    begun = bool(before) and plan[0].stamp < plan[0].sent
+    new = {(x.stamp, x.flux_density) for x in plan[begun:]}
+    old = {(x.stamp, x.flux_density) for x in before if plan[0].stamp < x.stamp}
+    return min((stamp for stamp, level in new ^ old if (stamp, level) in new
+                or stamp <= plan[-1].stamp), default=math.inf)
+
+
+def start_of(run: Run, stamp: int) -> float:
+    """Return the stretch before a time: planned if that is known, else measured."""
+    planned = next((x.stretch for x in in_force(run.plans) if x.stamp == stamp), None)
+    if planned is not None:
+        return planned
+    return float(run.stretch[max(int(np.searchsorted(run.time, stamp, side='right')) - 1, 0)])
+
+
+# -- setpoints ----------------------------------------------------------------------------------
+
+def _of(
+        run: Run, act: _Act, request: RecordedRequest, after: _Act | None,
+        levels: Sequence[Level], start: float) -> Iterator[Requested]:
+    """Yield the setpoints of a request."""
+    base = request.stamp or act.begin
+    points = [(x, None if y is None else base + y) for x, y in request.points]
+    points = [(x, y) for x, y in points if y is None or y > act.begin]
+    until = math.inf if after is None else after.sent
+    plans = [x for x in run.plans if x and act.sent <= x[0].sent < until]
+    codes = [x.code for x in run.verdicts if act.sent <= x.sent < until]
+    earliest = begin = act.begin
+    start = next((x.stretch for plan in plans for x in plan if x.stamp == begin), start)
+    for number, (target, end) in enumerate(points, 1):
+        last = number == len(points)
+        setpoint = _described(run, target, start, begin, end)
+        setpoint = replace(setpoint, number=number, count=len(points))
+        here = replace(setpoint, end=None) if last else setpoint
+        if plans:
+            moves = list(_arrivals(run, plans, here, earliest, last=last))
+            arrival, left_out = moves.pop(0)[1] if moves else None, False
+        else:
+            arrival, moves = _by_levels(run, levels, here), []
+            left_out = setpoint.step > SAME and not _within(levels, here)
+        yield Requested(
+            replace(setpoint, arrival=arrival), end, last, tuple(moves),
+            'corrected' in codes and 'replanned' not in codes, left_out)
+        earliest, begin, start = begin, end or begin, target
+
+
+def _described(
+        run: Run, target: float, start: float, begins: int, end: int | None) -> Setpoint:
+    """Return a setpoint with what the model of the planner says of it."""
+    material, unit = run.planner.nondimensional, run.planner.time_unit
+    low, high = stretch_limits(material)
+    inside = min(max(target, low + SAME), high - SAME)
+    omega = float(natural_frequency(inside, material)) / unit
+    decay = material.zeta / critical_zeta(inside, material.packed) * omega
+    return Setpoint(target, start, begins, None, end, omega, decay, possible=(low, high))
+
+
+def _within(levels: Sequence[Level], setpoint: Setpoint) -> list[Level]:
+    """Return the changes of level while a setpoint is to be reached and held."""
+    end = math.inf if setpoint.end is None else setpoint.end
+    return [x for x in levels if setpoint.begins <= x.stamp < end]
+
+
+def _arrivals(
+        run: Run, plans: Sequence[Sequence[Level]], setpoint: Setpoint, earliest: int, *,
+        last: bool) -> Iterator[tuple[int, int | None]]:
+    """Yield when plans were shown that change a setpoint, and when each arrives at it."""
+    before: Sequence[Level] = ()
+    arrival = None
+    for plan in plans:
+        fresh = _fresh(plan, before)
+        goes_on = before and fresh > before[-1].stamp and not last
+        before = plan
+        if setpoint.end is not None and fresh >= setpoint.end or arrival and goes_on:
+            continue
+        new = [x for x in plan if x.stamp >= fresh]
+        found = _rest(run, new, setpoint)
+        if found is None and arrival is not None:
+            # One that is left out makes room for the next.
+            found = _rest(run, new, replace(setpoint, begins=earliest))
+        if found is not None or arrival is not None:
+            yield plan[0].sent, found
+        arrival = found if found is not None else arrival
+
+
+def _rest(run: Run, plan: Sequence[Level], setpoint: Setpoint) -> int | None:
+    """Return when a plan rests at a setpoint; None if it does not."""
+    for share, slow in _AT_REST:
+        for level in _within(plan, setpoint):
+            if abs(level.stretch - setpoint.target) <= SAME + share * setpoint.step and (
+                    abs(level.rate) <= slow * setpoint.frequency * setpoint.step):
+                return level.stamp + _ramp(run, plan, level)
+    # Some shapers leave a vibration.
+    return _by_levels(run, plan, setpoint)
+
+
+def _ramp(run: Run, levels: Sequence[Level], level: Level) -> int:
+    """Return for how long in ns the amplifier goes on to a level."""
+    slew = run.number('plant.slew_limit') or run.number('planner.slew_limit')
+    before = max((x for x in levels if x.stamp < level.stamp), key=lambda x: x.stamp, default=None)
+    if not slew or before is None:
+        return 0
+    # A bag may contain any slew limit.
+    return round(min(abs(level.flux_density - before.flux_density) / slew, 1e6) * NANOSECONDS)
+
+
+def _by_levels(run: Run, levels: Sequence[Level], setpoint: Setpoint) -> int | None:
+    """Return when the level came that holds a setpoint; None where one step leads to it."""
+    inside = _within(levels, setpoint)
+    if setpoint.step <= SAME:
+        return setpoint.begins
+    near = _ROUNDED * max(setpoint.step, abs(setpoint.target - run.planner.rest))
+    held = None
+    for level, stretch in zip(inside[:0:-1], balance(run, inside)[:0:-1].tolist(), strict=True):
+        if abs(stretch - setpoint.target) > near:
+            break
+        held = level
+    return None if held is None else held.stamp + _ramp(run, levels, held)
+
+
+def balance(run: Run, levels: Sequence[Level]) -> Array:
+    """Return the stretches that levels hold by the planner's parameters."""
+    return equilibrium_stretch(
+        [x.flux_density / run.planner.flux_density_unit for x in levels],
+        run.planner.nondimensional)
+
+
+def _held(run: Run, levels: Sequence[Level]) -> list[Requested]:
+    """Return setpoints where nobody requested one: what is held for a period."""
+    held = balance(run, levels)
+    found: list[Requested] = []
+    begin, start = 0, start_of(run, levels[0].stamp if levels else 0)
+    for i, (level, target) in enumerate(zip(levels, held.tolist(), strict=True)):
+        until = levels[i + 1].stamp if i + 1 < len(levels) else int(run.time[-1])
+        setpoint = _described(run, target, start, levels[begin].stamp, until)
+        if not (until - level.stamp) / NANOSECONDS * setpoint.frequency >= 2.0 * math.pi:
+            continue
+        if setpoint.step > SAME:
+            found.append(Requested(replace(
+                setpoint, arrival=None if i == begin else level.stamp
+                + _ramp(run, levels, level)), until))
+            start = target
+        begin = i + 1
+    return [replace(
+        x, last=i == len(found), setpoint=replace(x.setpoint, number=i, count=len(found)))
+        for i, x in enumerate(found, 1)]

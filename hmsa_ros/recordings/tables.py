@@ -1,0 +1,75 @@
+"""A run as tables: its samples, and the levels that drove it."""
+
+from collections.abc import Mapping
+import csv
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.files import replacing, require_arrow
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.recordings.record import Run
+
+SUFFIXES = ('.csv', '.parquet')
+
+
+def samples_of(run: Run) -> dict[str, Array]:
+    """
+    Return the samples of a run by the name of their column.
+
+    ``time`` in s from the first sample, ``stretch``, ``stretch_rate`` in 1/s and ``flux_density``
+    in T: measured, else the level in force, else NaN.
+    """
+    field = run.flux_density
+    levels = run.levels
+    if levels and not np.isfinite(field).any():
+        place = np.searchsorted([x.stamp for x in levels], run.time, side='right') - 1
+        values = np.array([x.flux_density for x in levels])
+        field = np.where(place >= 0, values[np.maximum(place, 0)], np.nan)
+    return {'time': _seconds(run, run.time), 'stretch': run.stretch, 'stretch_rate': run.rate,
+            'flux_density': field}
+
+
+def levels_of(run: Run) -> dict[str, Array]:
+    """
+    Return the levels that drove a run by the name of their column.
+
+    ``time`` in s from the first sample and ``flux_density`` in T, in force from then on: applied,
+    else commanded, else as measured.
+    """
+    stamps = np.array([x.stamp for x in run.levels], dtype=np.int64)
+    return {'time': _seconds(run, stamps),
+            'flux_density': np.array([x.flux_density for x in run.levels])}
+
+
+def _seconds(run: Run, stamps: NDArray[np.int64]) -> Array:
+    return np.asarray((stamps - run.time[0]) / NANOSECONDS, dtype=np.float64)
+
+
+def write_table(path: Path, columns: Mapping[str, Array]) -> None:
+    """
+    Write columns as CSV or Parquet, by the ending of the name, in full double precision.
+
+    NaN is left empty in CSV. Raises `BadInputError` if the name ends otherwise, pyarrow is
+    missing, or the file cannot be written.
+    """
+    kind = path.suffix.lower()
+    if kind not in SUFFIXES:
+        raise BadInputError(
+            f'the format of {path} is unknown: expected a name that ends in '
+            + ' or '.join(SUFFIXES))
+    if kind == '.parquet':
+        arrow, parquet = require_arrow()
+        with replacing(path) as beside:
+            parquet.write_table(arrow.table(dict(columns)), beside)
+        return
+    with replacing(path) as beside, beside.open('w', newline='', encoding='utf-8') as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(
+            ['' if math.isnan(value) else repr(value) for value in row]
+            for row in zip(*(x.tolist() for x in columns.values()), strict=True))

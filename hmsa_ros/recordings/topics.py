@@ -1,0 +1,79 @@
+"""Which topics of a bag belong to which actuator: by the end of their names and their types."""
+
+from collections.abc import Mapping, Sequence
+import re
+
+from hmsa_ros.bag.reader import BagReader
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.interfaces import topics as declared
+
+#: Message type by role: the end of a topic's name.
+TYPES = {
+    declared.from_outside(x.name, declared.PLANNER): x.type for x in (
+        declared.JOINT_STATES, declared.FLUX_DENSITY_COMMAND, declared.FLUX_DENSITY_APPLIED,
+        declared.DISTURBANCE_FORCE, declared.PLAN, declared.JOINT_TRAJECTORY, declared.SETPOINT,
+        declared.STATUS)}
+JOINT_STATES, COMMAND, APPLIED, FORCE, PLAN, TRAJECTORY, SETPOINT, STATUS = TYPES
+# Roles whose topics are one for each joint where there are several.
+_OF_A_JOINT = (COMMAND, APPLIED, FORCE, SETPOINT)
+
+
+def topics_by_joint(reader: BagReader) -> dict[str, dict[str, dict[str, str]]]:
+    """
+    Return topics by namespace, joint (empty for the only one) and role.
+
+    Raises `BadInputError` if there are no joint states, or commands in other namespaces only.
+    """
+    names: dict[str, list[tuple[str, str]]] = {role: [] for role in TYPES}
+    for topic in reader.topics.values():
+        for role, kind in TYPES.items():
+            node, _, last = role.rpartition('/')
+            if topic.type != kind:
+                continue
+            if f'/{topic.name}'.endswith(f'/{role}'):
+                names[role].append((topic.name[:-len(role)].rstrip('/'), topic.name))
+            elif role == SETPOINT and re.search(rf'/{node}/[^/]+/{last}$', f'/{topic.name}'):
+                # .../planner/JOINT/setpoint goes with .../JOINT/flux_density_command.
+                space, _, joint = topic.name[:-len(last) - 1].rpartition('/')
+                names[role].append((f'{space[:-len(node)]}{joint}', topic.name))
+    if not names[JOINT_STATES]:
+        has = ', '.join(sorted(reader.topics)) or 'none: the bag is empty'
+        raise BadInputError(
+            f'{reader.path} has no topic .../{JOINT_STATES} ({TYPES[JOINT_STATES]}): expected a '
+            f'bag of a run; its topics are {has}')
+    spaces: dict[str, dict[str, dict[str, str]]] = {}
+    for space, name in names[JOINT_STATES]:
+        own = _topics_in(names, space, name)
+        if COMMAND in own or not names[COMMAND]:
+            spaces[space] = {'': own}
+            continue
+        by_joint = {
+            where[len(space) + 1:]: where for where, _ in names[COMMAND]
+            if where.startswith(f'{space}/') and '/' not in where[len(space) + 1:]}
+        if by_joint:
+            spaces[space] = {joint: {
+                **own, **{role: topic for role in _OF_A_JOINT
+                          for at, topic in names[role] if at == where}}
+                for joint, where in by_joint.items()}
+    if not spaces:
+        raise BadInputError(
+            f'{reader.path} has joint states and commands in different namespaces: expected '
+            f'{COMMAND} beside one of '
+            + ', '.join(name for _, name in names[JOINT_STATES]))
+    return spaces
+
+
+def _topics_in(
+        names: Mapping[str, Sequence[tuple[str, str]]], space: str, states: str
+) -> dict[str, str]:
+    """Return the topics of a namespace, by role."""
+    topics = {JOINT_STATES: states}
+    for role in TYPES:
+        same = [x for where, x in names[role] if where == space]
+        if same:
+            topics[role] = same[0]
+        elif len(names[role]) == 1 and len(names[JOINT_STATES]) == 1 and (
+                role not in _OF_A_JOINT or len(names[COMMAND]) == 1):
+            # Planner and plant in namespaces of their own, remapped to each other.
+            topics[role] = names[role][0][1]
+    return topics

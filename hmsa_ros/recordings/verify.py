@@ -1,0 +1,230 @@
+"""
+Checking a run against the model: what drove the actuator, integrated once more.
+
+The state is that of the first sample; from there on every sample of the stretch must come out
+again. Where the plant reported which levels took effect and when, these are integrated, so that
+late, refused and repeated commands and its watchdog are accounted for; recorded disturbing
+forces are applied too, and the Maxwell branches of an elastomer that creeps are integrated.
+Measurement noise is not: it is the difference that is left.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import heapq
+import itertools
+import math
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.creep import Creep
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.recordings.bags import read_runs
+from hmsa_ros.recordings.levels import in_force, lateness_of, Level, without_repeats
+from hmsa_ros.recordings.parameters import creep_of, number_of, of_joint
+from hmsa_ros.recordings.record import Run
+from hmsa_ros.recordings.topics import APPLIED, COMMAND, FORCE, JOINT_STATES
+
+if TYPE_CHECKING:
+    # Other commands on bags have no use for it.
+    from hmsa_ros.model.simulation import ActuatorSimulation
+
+# Samples further from the others than this are of another run, or garbage; in ns.
+_LARGEST_LEAP = 3600 * NANOSECONDS
+_COMMAND, _FORCE, _SAMPLE = range(3)
+# Distance from rest, in stretch, from which on branches that creep hold something.
+_AT_REST = 1e-6
+
+
+@dataclass(frozen=True)
+class Verification:
+    """Recorded against integrated motion."""
+
+    states: str  # the topics compared
+    commands: str
+    sample_count: int  # messages compared and applied
+    command_count: int
+    # Commands that came after their stamp, so that the moment of their effect is not known; none
+    # where the plant reported it.
+    late_count: int
+    largest_difference: float  # of the stretch, or of a beam's deflection; dimensionless
+    where: float  # time of it after the first sample, in s
+    note: str = ''  # losses, noise, what was left out
+    left_out: int = 0  # messages that are not what their topic is for
+    unapplied_count: int = 0  # changes of level that never took effect, as reported
+
+
+def verify(path: str | os.PathLike[str]) -> list[Verification]:
+    """Compare each actuator of a bag with its recorded stretch: `read_runs`, then `verify_run`."""
+    return [verify_run(run) for run in read_runs(Path(path))]
+
+
+def verify_run(run: Run) -> Verification:
+    """
+    Integrate what drove one actuator and compare with its samples.
+
+    Raises `BadInputError` if there is nothing to integrate, the actuator is not known, or there
+    are several runs, `HmsaError` if the integration does not get through.
+    """
+    if run.summary is not None and len(run.summary.files) > 1 and (
+            jumps := run.summary.custom_data.get('time_jumps', '0')) != '0':
+        raise BadInputError(
+            f'in {run.path} time jumped back {jumps} times: expected one run; name one of its '
+            f'files, for example {run.path / run.summary.files[0][0]}')
+    if COMMAND not in run.topics and not run.levels:
+        raise BadInputError(
+            f'{run.path} holds no {COMMAND} and no field: expected a run with what drove the '
+            'actuator; its topics are ' + (', '.join(run.topics.values()) or 'none'))
+    if not run.parameters_known:
+        raise BadInputError(
+            f'{run.path} does not contain the parameters of the plant: name a parameter file '
+            'with --params-file')
+    replay = _Replay(run)
+    replay.run()
+    unapplied = _unapplied(run)
+    left_out = run.left_out + replay.left_out
+    return Verification(
+        run.topics.get(JOINT_STATES, str(run.path)), run.topics.get(COMMAND, ''), replay.samples,
+        len(run.commands) - replay.refused, replay.late, replay.largest,
+        replay.where / NANOSECONDS,
+        '; '.join([*replay.notes, *_notes(run, left_out, unapplied)]),
+        left_out, unapplied)
+
+
+class _Replay:
+    """An actuator that is driven anew by what was recorded of it."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._window = _one_run(run)
+        self.samples = self.late = self.refused = 0
+        self.left_out = len(run.time) - (self._window.stop - self._window.start)
+        self.largest, self.where = 0.0, 0
+        self.notes: list[str] = []
+
+    def run(self) -> None:
+        """Integrate from the first sample to the last."""
+        run, first = self._run, self._window.start
+        creep = creep_of(run.parameters, run.joint)
+        simulation = _start(run, first, creep)
+        if creep and not _rests(simulation):
+            self.notes.append(
+                'the first sample is not one of rest: what the branches of viscoelastic.* hold by '
+                'then is not known and taken as nothing, expected differences that fade')
+        samples = zip(
+            np.maximum.accumulate(run.logged[self._window]).tolist(), itertools.repeat(_SAMPLE),
+            run.time[self._window].tolist(), run.stretch[self._window].tolist(), strict=False)
+        forces = ((sent, _FORCE, stamp, newton) for sent, stamp, newton in run.forces)
+        for _, kind, stamp, value in heapq.merge(
+                samples, self._commands(first), forces, key=lambda x: x[:2]):
+            if kind == _SAMPLE:
+                simulation.advance(stamp)
+                difference = abs(simulation.stretch - value)
+                if difference > self.largest or math.isnan(difference):
+                    self.largest, self.where = difference, stamp - int(run.time[first])
+                self.samples += 1
+                continue
+            try:
+                if kind == _FORCE:
+                    simulation.force(stamp, value)
+                elif simulation.command(stamp, value) > 0 and not run.applied:
+                    self.late += 1
+            except BadInputError:
+                self.left_out += 1
+                self.refused += kind == _COMMAND
+
+    def _commands(self, first: int) -> Iterator[tuple[int, int, int, float]]:
+        """Return what took effect, which is known from the begin; or what was commanded."""
+        run = self._run
+        begin = int(run.time[first])
+        if run.applied or not run.commands:
+            for level in run.levels:
+                if level.stamp > begin:
+                    yield int(run.logged[first]) - 1, _COMMAND, level.stamp, level.flux_density
+            return
+        for level in run.commands:
+            if level.sent > run.logged[first] or level.stamp > begin:
+                yield level.sent, _COMMAND, level.stamp, level.flux_density
+
+
+def _one_run(run: Run) -> slice:
+    """Return the samples without a leap of time between them; the most, if there are several."""
+    ends = [0, *(np.flatnonzero(np.diff(run.time) > _LARGEST_LEAP) + 1).tolist(), len(run.time)]
+    return max((slice(*x) for x in zip(ends, ends[1:], strict=False)),
+               key=lambda x: x.stop - x.start)
+
+
+def _start(run: Run, first: int, creep: Creep) -> 'ActuatorSimulation':
+    """Return the simulation of the recorded actuator as it is at its first sample."""
+    from hmsa_ros.model.equations import elastic_force
+    from hmsa_ros.model.simulation import ActuatorSimulation
+
+    stamp = int(run.time[first])
+    simulation = ActuatorSimulation(
+        run.plant, time=stamp, slew_limit=run.number('plant.slew_limit') or math.inf,
+        coil_time_constant=run.number('plant.coil_time_constant'),
+        creep=creep)
+    # What had taken effect by then is in force; a slow coil may still be on its way there.
+    past = [x.flux_density for x in sorted(run.applied, key=lambda x: x.stamp)
+            if x.stamp <= stamp]
+    field = float(run.flux_density[first])
+    if math.isnan(field):
+        before = [x.flux_density for x in run.levels if x.stamp <= stamp]
+        # Else what holds the actuator there: it may have been held so before the recording began.
+        field = before[-1] if before else run.plant.flux_density_unit * float(
+            elastic_force(float(run.stretch[first]), run.plant.nondimensional))
+    try:
+        simulation.set_state(
+            float(run.stretch[first]), float(run.rate[first]), field, past[-1] if past else None)
+    except BadInputError as error:
+        raise BadInputError(
+            f'the first sample of {run.path} is not of the actuator that the parameters describe: '
+            f'{error}; name the parameter file of the recorded one with --params-file') from error
+    return simulation
+
+
+def _rests(simulation: 'ActuatorSimulation') -> bool:
+    """Whether an actuator is where its field would hold it, and stays."""
+    return abs(simulation.equilibrium() - simulation.stretch) < _AT_REST and (
+        abs(simulation.rate) * simulation.actuator.time_unit < _AT_REST)
+
+
+def _unapplied(run: Run) -> int:
+    """Return how many changes of level were due and took no effect, as the plant reported."""
+    if APPLIED not in run.topics:
+        return 0
+    commands, last = without_repeats(run.commands)[0], int(run.time[-1])
+    # What is in force as the recording begins may be sent again without a change.
+    known = run.applied
+    if math.isfinite(field := float(run.flux_density[0])):
+        known = Level(int(run.time[0]), field, int(run.logged[0])), *known
+    if not known:
+        return sum(x.stamp < last for x in in_force((x,) for x in commands))
+    return lateness_of(commands, known, last)[1]
+
+
+def _notes(run: Run, left_out: int, unapplied: int) -> Iterator[str]:
+    """Return what makes the recorded samples differ from the motion, or is lost."""
+    counts = {} if run.summary is None else {x.name: x.lost for x in run.summary.topics}
+    lost = [f'{count} of {name}' for role in (COMMAND, APPLIED, FORCE)
+            if (name := run.topics.get(role)) and (count := counts.get(name))]
+    if lost:
+        yield (f'the recorder lost messages, {" and ".join(lost)}: expected differences from '
+               'there on')
+    noise = [
+        f'{name} {value:g}' for name, none in (
+            ('stretch_noise', 0.0), ('rate_noise', 0.0), ('stretch_bias', 0.0),
+            ('stretch_gain', 1.0))
+        if (value := number_of(of_joint(run.parameters, run.joint, f'plant.{name}')))
+        not in (None, none)]
+    if noise:
+        yield (f'the samples are measured with {" and ".join(noise)}: expected differences of '
+               'that size, from the first sample on')
+    if unapplied:
+        yield (f'{unapplied} commands never took effect, as {run.topics[APPLIED]} shows: '
+               'nobody applied them')
+    if left_out:
+        yield f'left out: {left_out} of the messages, since they are not what their topic is for'

@@ -1,0 +1,179 @@
+"""An identification as one HTML page: data, fit, residuals, intervals, what is confounded."""
+
+from html import escape
+import math
+from typing import Any
+
+import numpy as np
+
+from hmsa_ros import __version__
+from hmsa_ros.identification.recording import Course
+from hmsa_ros.identification.response import respond
+from hmsa_ros.identification.result import Identification
+from hmsa_ros.model.equations import Array
+from hmsa_ros.report import charts
+from hmsa_ros.report.charts import decimate, Figure, numbers
+from hmsa_ros.report.page import Cell, cell, document, placed, table, text
+
+_LAGS = 60
+# Points of the fitted curve, in time units, and how many at most.
+_FINE, _MOST_FINE = 0.05, 20_000
+_HEADINGS = {
+    'identified': 'identified', 'not_identifiable': 'not identifiable',
+    'model_rejected': 'model rejected'}
+
+
+def page(found: Identification) -> str:
+    """Return the HTML page of an identification."""
+    figures = [_motion(found), _residuals(found), _correlation(found)]
+    label = found.recording.label
+    tiles = [
+        (_HEADINGS[found.verdict], 'verdict'), (f'{found.noise_std:.3g}', 'noise of a sample'),
+        (str(found.samples), 'samples'), (f'{found.residual_rms:.3g}', 'residual, rms'),
+        (f'{float(found.whiteness.autocorrelation[1]):.2f}', 'autocorrelation at one sample')]
+    notes = ''.join(f'<li>{escape(x)}</li>' for x in (found.reason, *found.warnings))
+    body = [
+        f'<h1>{escape(label)}: identification</h1>',
+        '<div class="tiles">' + ''.join(
+            f'<div><b>{escape(x)}</b><span>{escape(y)}</span></div>' for x, y in tiles)
+        + '</div>', f'<ul class="notes">{notes}</ul>',
+        '<section id="parameters"><h2>Parameters</h2>' + _parameters(found) + '</section>',
+        '<section id="motion-section"><h2>Data and fit</h2>' + text(
+            f'Above, the level of the field; below, the {found.recording.coordinate.name}: '
+            'measured, and as the fitted actuator moves.') + placed(figures[0]) + '</section>',
+        '<section id="residual-section"><h2>Residuals</h2>' + text(
+            'Measured less fitted. Nothing but noise should be left: no swing, no trend, no '
+            'bursts at the changes of level.') + placed(figures[1]) + text(
+            'Autocorrelation of the residuals; 95 % of the bars of white noise lie between the '
+            'lines.') + placed(figures[2]) + _marks(found) + '</section>',
+        '<section id="pairs"><h2>What is confounded</h2>' + _pairs(found) + '</section>',
+        f'<footer class="soft"><p>Written by hmsa_ros {__version__}.</p></footer>']
+    return document(f'{label} – identification', body, figures)
+
+
+def _unit(found: Identification) -> tuple[float, str]:
+    span = float(found.recording.time[-1] - found.recording.time[0])
+    return (1e-3, 'ms') if span < 2.0 else (1.0, 's')
+
+
+def _curve(name: str, x: Array, y: Array, **style: Any) -> dict[str, Any]:
+    return {'type': 'scatter', 'mode': 'lines', 'name': name, 'x': numbers(x), 'y': numbers(y),
+            **style}
+
+
+def _axis(title: str, **more: Any) -> dict[str, Any]:
+    return {'title': {'text': title}, 'exponentformat': 'power', **more}
+
+
+def _motion(found: Identification) -> Figure:
+    """Return level, measured and fitted motion over time."""
+    size, unit = _unit(found)
+    recording = found.recording
+    time = recording.time / size
+    end = max(float(recording.time[-1]), float(recording.level_times[-1]))
+    levels = np.append(recording.levels, recording.levels[-1]) * 1e3
+    level_times = np.append(recording.level_times, end) / size
+    few = len(time) <= charts.BUCKETS
+    data = [
+        _curve('measured', *decimate(time, recording.stretch), mode='markers' if few else 'lines',
+               marker={'size': 3 if len(time) > 200 else 6, 'color': charts.BLUE},
+               line={'color': charts.BLUE, 'width': 1.0}),
+        _curve('fitted', *_fitted(found, size),
+               line={'color': charts.VERMILION, 'width': 1.6}),
+        _curve('level', level_times, levels, yaxis='y2',
+               line={'color': charts.BLACK, 'width': 1.6, 'shape': 'hv'})]
+    what = recording.coordinate
+    return Figure('motion', f'Level, measured and fitted {what.name} over time', 520, data, {
+        'xaxis': _axis(f'time [{unit}]', anchor='y', range=numbers([time[0], time[-1]])),
+        'yaxis': _axis(f'{what.name} {what.symbol} [1]', domain=[0.0, 0.66]),
+        'yaxis2': _axis('flux density B [mT]', domain=[0.74, 1.0], anchor='x')})
+
+
+def _fitted(found: Identification, size: float) -> tuple[Array, Array]:
+    """Return times and stretch of the fit, between few samples too."""
+    recording = found.recording
+    unit = found.values['time_unit']
+    dense = np.union1d(recording.time, np.arange(
+        recording.time[0], recording.time[-1], _FINE * unit, dtype=np.float64)) if (
+            recording.time[-1] - recording.time[0] < _MOST_FINE * _FINE * unit) else recording.time
+    course = Course(dense, recording.level_times, recording.levels, recording.slew_limit,
+                    at_rest=recording.at_rest)
+    response = None if recording.earlier else respond(course, found.values, ())
+    if response is None:
+        return decimate(recording.time / size, found.fitted)
+    return decimate(dense / size, response.stretch)
+
+
+def _residuals(found: Identification) -> Figure:
+    """Return the residuals over time, outliers apart."""
+    size, unit = _unit(found)
+    time = found.recording.time / size
+    out = found.weights == 0.0
+    data = [_curve(
+        'residual', *decimate(time[~out], found.residual[~out]), mode='markers',
+        marker={'size': 3 if len(time) > 200 else 6, 'color': charts.BLUE})]
+    if np.any(out):
+        data.append(_curve(
+            'outlier', time[out], found.residual[out], mode='markers',
+            marker={'size': 6, 'symbol': 'x', 'color': charts.VERMILION}))
+    return Figure('residuals', 'Residuals over time', 300, data, {
+        'xaxis': _axis(f'time [{unit}]', range=numbers([time[0], time[-1]])),
+        'yaxis': _axis('measured less fitted [1]')})
+
+
+def _correlation(found: Identification) -> Figure:
+    """Return the autocorrelation of the residuals."""
+    rho = found.whiteness.autocorrelation[1:_LAGS + 1]
+    lags = np.arange(1, len(rho) + 1)
+    limit = 1.96 / math.sqrt(found.samples)
+    data = [{
+        'type': 'bar', 'name': 'autocorrelation', 'x': numbers(lags), 'y': numbers(rho),
+        'marker': {'color': charts.BLUE}}]
+    ends = np.array([0.5, len(rho) + 0.5])
+    data += [_curve(
+        'white noise, 95 %', ends, np.full(2, x), showlegend=x > 0.0,
+        line={'color': charts.GREY, 'width': 1.2, 'dash': '5px,3px'}) for x in (limit, -limit)]
+    return Figure('correlation', 'Autocorrelation of the residuals over the lag', 260, data, {
+        'xaxis': _axis('lag [samples]'), 'yaxis': _axis('autocorrelation [1]')})
+
+
+def _parameters(found: Identification) -> str:
+    rows: list[list[Cell | str]] = []
+    for key in found.parameters:
+        name, x = found.shown(key)
+        if x.free:
+            lost = math.isnan(x.value)
+            rows.append([
+                name, x.unit or '1', *(cell(y) for y in (x.value, x.std, x.low, x.high)),
+                'not identifiable' if lost else cell(100.0 * x.std / abs(x.value), '.3g')
+                if abs(x.value) > x.std else ''])
+        else:
+            rows.append([name, x.unit or '1', cell(x.value), '', '', '', 'known'])
+    return table(
+        'parameter-table', 'Low and high bound the 95 % interval.',
+        ['parameter', 'unit', 'value', 'deviation', 'low', 'high', 'deviation [%]'], rows)
+
+
+def _marks(found: Identification) -> str:
+    rows: list[list[Cell | str]] = [
+        [x.name, cell(100.0 * x.share, '.3g'), cell(x.deviations, '.3g'),
+         'yes' if x.found else 'no'] for x in found.signatures]
+    return table(
+        'signature-table', 'What the residuals were searched for: the share of them that it '
+        'explains, and its size in standard deviations.',
+        ['searched for', 'share [%]', 'deviations', 'found'], rows) if rows else ''
+
+
+def _pairs(found: Identification) -> str:
+    if len(found.names) < 2:
+        return text('There is one free parameter.')
+    matrix = found.correlation
+    names = [found.shown(x)[0] for x in found.names]
+    rows: list[list[Cell | str]] = [
+        [name, *(cell(float(x), '.3f') for x in matrix[i])]
+        for i, name in enumerate(names)]
+    words = '; '.join(f'{one} and {other} ({x:.3f})' for one, other, x in found.confounded())
+    return text(
+        f'The data hardly distinguish {words}.' if words else
+        'No pair has a correlation of 0.95 or more.') + table(
+            'correlation-table', 'Correlation of the estimates.', ['', *names], rows)

@@ -1,0 +1,160 @@
+"""
+``python -m hmsa_studies``: the pictures and tables of the documentation.
+
+Pictures are written to a folder; tables are printed in Markdown.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+import sys
+
+import numpy as np
+
+from hmsa_ros.cli import Parser
+from hmsa_ros.errors import BadInputError, complain, HmsaError
+from hmsa_ros.model.moves import State
+from hmsa_ros.model.parameters import NondimensionalParameters
+from hmsa_ros.planning.shapers import SHAPERS
+from hmsa_ros.planning.shapers.pace import Pace
+from hmsa_ros.planning.shapers.request import Request
+from hmsa_studies.damped import damped_study, DampedStudy, LIMITS
+from hmsa_studies.pictures import draw_damped, draw_front, draw_robustness, draw_sampled
+from hmsa_studies.residual import Actual, Errors
+from hmsa_studies.robustness import Candidate, candidates, Case, PARAMETERS, percent, study
+from hmsa_studies.sampled import sampled_study
+from hmsa_studies.sweep import parse_grid, Sweep
+from hmsa_studies.sweep_pictures import draw_sweep
+
+MOVES = ((1.0, 1.1), (1.0, 1.4), (1.0, 0.7))
+MATERIAL = NondimensionalParameters()
+#: Command periods in the table, as shares of tau_p; none divides it.
+PERIODS = (0.03, 0.07, 0.13, 0.23, 0.33, 0.45)
+#: Natural periods that smooth moves take in the table.
+PACES = (0.5, 1.0, 1.5, 2.0, 3.0)
+ZETAS = (2.2, 3.0, 4.0, 5.0, 6.0)
+
+Table = list[tuple[str, ...]]
+
+
+def robustness_table(start: float, target: float) -> Table:
+    """Return header and rows comparing all shapers for one move at rest, errors up to 10 %."""
+    case = Case(start, target, MATERIAL)
+    rows: Table = [(
+        'shaper', 'arrival', 'nominal', *(f'{name} ±10 %' for name in PARAMETERS),
+        'all ±10 %')]
+    for candidate in candidates():
+        result = study(case, candidate)
+        rows.append((
+            candidate.label,
+            f'{result.arrival:.3f}' if candidate.shaper != 'step' else 'never',
+            percent(result.nominal),
+            *(percent(worst.residual) for worst in result.alone.values()),
+            percent(result.worst.residual)))
+    return rows
+
+
+def single_error_table() -> Table:
+    """Return header and rows of residuals at single errors of G and zeta."""
+    cases = [(name, error) for name in ('G', 'zeta') for error in (-0.1, -0.05, 0.05, 0.1)]
+    rows: Table = [('shaper, move', *(f'{name} {100 * x:+g} %' for name, x in cases))]
+    for candidate in (Candidate('two_step'), Candidate('robust')):
+        for start, target in MOVES:
+            move = SHAPERS[candidate.shaper](Request(
+                State(start), target, MATERIAL, order=candidate.order))
+            rows.append((f'{candidate.name}, {start:g} to {target:g}', *(
+                percent(Actual.off(MATERIAL, Errors(**{PARAMETERS[name]: error})).residual(
+                    move, start, target, move.duration))
+                for name, error in cases)))
+    return rows
+
+
+def smooth_table() -> Table:
+    """Return header and rows of what smooth moves of several durations leave."""
+    rows: Table = [('smooth, at least', *(f'{x:g} periods' for x in PACES))]
+    for start, target in MOVES:
+        moves = [SHAPERS['smooth'](Request(State(start), target, MATERIAL, pace=Pace(x)))
+                 for x in PACES]
+        name = f'{start:g} to {target:g}'
+        rows.append((f'arrival, {name}', *(f'{x.duration:.3f}' for x in moves)))
+        rows.append((f'G ±10 %, {name}', *(percent(max(
+            Actual.off(MATERIAL, Errors(error)).residual(x, start, target, x.duration)
+            for error in (-0.1, 0.1))) for x in moves)))
+    return rows
+
+
+def sampled_table() -> Table:
+    """Return header and rows of residuals on sampled hardware."""
+    rows: Table = [('command, move', *(f'T = {x:g} tau_p' for x in PERIODS))]
+    for start, target in MOVES:
+        found = sampled_study(start, target, MATERIAL, np.array(PERIODS))
+        move = f'{start:g} to {target:g}'
+        rows.append((f'solved on the grid, {move}', *map(percent, found.solved.tolist())))
+        rows.append((f'rounded, at worst, {move}', *map(percent, found.bound.tolist())))
+    return rows
+
+
+def damped_table(found: DampedStudy) -> Table:
+    """Return header and rows of times above critical damping, at the study's values of zeta."""
+    rows: Table = [('time to', *(f'zeta = {x:g}' for x in found.zetas))]
+    rows.append(('plain step: within 1 %', *(f'{x:.2f}' for x in found.step)))
+    for (least, most), settled, arrival in zip(
+            LIMITS, found.settled, found.arrival, strict=True):
+        name = f'minimum time, {least:g} to {most:g} beta_1'
+        rows.append((f'{name}: within 1 %', *(f'{x:.2f}' for x in settled)))
+        rows.append((f'{name}: rest', *(f'{x:.2f}' for x in arrival)))
+    return rows
+
+
+def tables() -> list[Table]:
+    """Return all tables of the documentation in their order there."""
+    return [
+        *(robustness_table(*move) for move in MOVES), single_error_table(), smooth_table(),
+        sampled_table(), damped_table(damped_study(1.0, 1.1, np.array(ZETAS)))]
+
+
+def pictures(folder: Path) -> list[Path]:
+    """Draw all pictures of the documentation into a folder; return their paths."""
+    case = Case(1.0, 1.4, MATERIAL)
+    written = [
+        folder / f'{x}.png' for x in ('robustness', 'sampled', 'damped', 'front', 'map')]
+    results = [study(case, x) for x in (*candidates(), Candidate('robust', 4))]
+    draw_robustness(written[0], case, results[:-1])
+    draw_front(written[3], [(case, results)])
+    draw_sampled(written[1], sampled_study(
+        1.0, 1.4, MATERIAL, np.geomspace(0.041, 0.99, 700)))
+    draw_damped(written[2], damped_study(1.0, 1.1, np.linspace(2.2, 6.0, 77)))
+    sweep = Sweep({
+        'zeta': parse_grid('0:3:240', 'zeta'), 'j_lim': parse_grid('log:0.1:100:160', 'j_lim')})
+    rows = sweep.rows(0, sweep.size).results
+    draw_sweep([written[4]], sweep.view(), {x: rows[x] for x in sweep.shown}, sweep.fixed)
+    return written
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Draw the pictures and print the tables; return the exit status."""
+    parser = Parser(
+        prog='python -m hmsa_studies',
+        description='Draw the pictures of docs/studies.md and print its tables.')
+    parser.add_argument(
+        '--out', type=Path, default=Path('docs', 'images'), metavar='DIR',
+        help='folder that exists, for the pictures (default docs/images)')
+    arguments = parser.parse_args(argv)
+    try:
+        if not arguments.out.is_dir():
+            raise BadInputError(
+                f'{arguments.out} is no folder: expected one that exists (--out)')
+        for table in tables():
+            for number, row in enumerate(table):
+                print(f'| {" | ".join(row)} |')
+                if number == 0:
+                    print(f'| --- |{" ---: |" * (len(row) - 1)}')
+            print()
+        for path in pictures(arguments.out):
+            print(path)
+    except HmsaError as error:
+        return complain(error)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

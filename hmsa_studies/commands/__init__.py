@@ -1,0 +1,1 @@
+"""The commands of ``hmsa`` for studies, and for the figures of the paper."""

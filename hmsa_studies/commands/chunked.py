@@ -1,0 +1,115 @@
+"""What commands share that compute a study in chunks: options, executor, progress and end."""
+
+import argparse
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+import sys
+from typing import TYPE_CHECKING
+
+from hmsa_ros.cli.options import Row
+from hmsa_ros.errors import BadInputError
+
+if TYPE_CHECKING:
+    from hmsa_studies.chunks import Chunks, Study
+    from hmsa_studies.engine import Outcome
+    from hmsa_studies.executors import Start
+
+
+def options(workers: str) -> tuple[Row, ...]:
+    """Return the options of the engine."""
+    return (
+        ('--workers', 'N', int, workers),
+        ('--shard', 'I/N', str,
+         'compute part I of N only, as a job of an array does; I from 0 to N-1 or from 1 to N'),
+        ('--dask', 'ADDRESS', str,
+         'compute on a Dask cluster: its address, its scheduler file (.json), or "local"; all '
+         'workers must see the folder of --out'),
+        ('--resume', 'keep the chunks of an earlier run that are there and whole'))
+
+
+def asked(arguments: argparse.Namespace) -> list[str]:
+    """Return the options of chunks that are given; raise `BadInputError` if they do not fit."""
+    if arguments.workers is not None and arguments.workers < 1:
+        raise BadInputError(f'--workers is {arguments.workers}: expected at least 1')
+    if arguments.dask is not None and arguments.workers is not None and arguments.dask != 'local':
+        raise BadInputError('--workers and --dask ADDRESS: expected one of them')
+    return [f'--{x}' for x in ('shard', 'dask', 'resume') if getattr(arguments, x)]
+
+
+def engine(arguments: argparse.Namespace, workers: int) -> 'tuple[Start, int]':
+    """Return what computes, unless said on so many cores, and on how many as far as is known."""
+    from hmsa_studies.executors import cores, dask, local
+
+    if arguments.dask is not None:
+        return (partial(dask, arguments.dask, arguments.workers),
+                arguments.workers or (cores() if arguments.dask == 'local' else 1))
+    return local(arguments.workers or workers), arguments.workers or workers
+
+
+def shard_of(arguments: argparse.Namespace) -> tuple[int, int]:
+    """Return which part is computed, from 0, of how many."""
+    from hmsa_studies.engine import parse_shard
+
+    return (0, 1) if arguments.shard is None else parse_shard(arguments.shard)
+
+
+def compute_chunks(
+        study: 'Study', folder: Path, arguments: argparse.Namespace, start: 'Start', words: str,
+        finish: 'Callable[[Chunks, Outcome], int]') -> int:
+    """Compute what is asked for of a study, and `finish` it if all chunks are there."""
+    from hmsa_ros.files import require_arrow
+    from hmsa_studies.chunks import Chunks
+    from hmsa_studies.engine import compute
+
+    require_arrow()
+    shard = shard_of(arguments)
+    chunks = Chunks.of(study, folder)
+    try:
+        with progress(words, -(-study.size // shard[1])) as advance:
+            outcome = compute(
+                study, folder, start, shard=shard, resume=arguments.resume, say=say,
+                advance=advance)
+        if len(chunks.found()) == chunks.count:
+            return finish(chunks, outcome)
+    except KeyboardInterrupt:
+        say(f'{len(chunks.found()):,} of {chunks.count:,} chunks are in {folder}: go on with '
+            '--resume')
+        raise
+    say(f'{outcome.computed:,} chunks computed, {outcome.kept:,} kept; {len(chunks.found()):,} '
+        f'of {chunks.count:,} are there, and the table is written when all are')
+    print(folder)
+    return 0
+
+
+def say(sentence: str) -> None:
+    """Print a sentence on standard error."""
+    print(sentence, file=sys.stderr)
+
+
+@contextmanager
+def progress(words: str, total: int) -> Iterator[Callable[[int], None]]:
+    """Show rows done, rate and time left, on a terminal only."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        Task,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+    from rich.text import Text
+
+    class Rate(TextColumn):
+        def render(self, task: Task) -> Text:
+            return Text(f'{task.speed:,.{0 if task.speed > 10.0 else 1}f}/s' if task.speed else '')
+
+    console = Console(stderr=True)
+    with Progress(
+            TextColumn(words), BarColumn(), MofNCompleteColumn(), Rate(''),
+            TimeRemainingColumn(), console=console, transient=True,
+            disable=not console.is_terminal) as shown:
+        task = shown.add_task('', total=total)
+        yield lambda rows: shown.advance(task, rows)

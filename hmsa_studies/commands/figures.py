@@ -1,0 +1,38 @@
+"""``hmsa figures``: the paper's figures from this package's own computation."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from hmsa_ros.cli.progress import progress
+from hmsa_ros.files import make_folder
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command."""
+    parser = subparsers.add_parser(
+        'figures', help="compute and draw the paper's Figures 2 to 10",
+        description="Compute the paper's Figures 2 to 10 and write each as PNG and CSV "
+                    '(figure_02.png, figure_02.csv, ...). Existing files are replaced.',
+        epilog='example: hmsa figures --out figures')
+    parser.add_argument(
+        '--out', type=Path, default=Path('figures'), metavar='DIR',
+        help='output folder, created if missing (default figures)')
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write the figures and print what was written."""
+    folder: Path = arguments.out
+    # Before the slow imports: a bad folder is reported immediately.
+    make_folder(folder)
+
+    from hmsa_studies.paper import FIGURES, write_figure
+
+    written: list[Path] = []
+    with progress() as update:
+        for i, (number, figure) in enumerate(FIGURES.items()):
+            update(f'Figure {number}', i / len(FIGURES))
+            written += write_figure(figure, folder)
+    for path in written:
+        print(path)
+    return 0

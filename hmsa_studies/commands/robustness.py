@@ -1,0 +1,315 @@
+"""``hmsa robustness``: what each shaper leaves of a move when the model is in error."""
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import asdict
+from itertools import product
+import math
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+from hmsa_ros.cli.options import add_options, MATERIAL
+from hmsa_ros.cli.plan import nominal
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.files import json_text, make_folder
+from hmsa_studies.commands import chunked
+
+if TYPE_CHECKING:
+    from hmsa_studies.executors import Start
+    from hmsa_studies.matrix import Row
+    from hmsa_studies.robustness import Case, Result
+
+_MOVES = ((1.0, 1.1), (1.0, 1.4), (1.0, 0.7))
+# Of a beam, which rests at 0.
+_BENDS = ((0.0, 0.1), (0.0, 0.4))
+
+
+def _move(text: str) -> tuple[float, float]:
+    start, _, target = text.partition(':')
+    try:
+        return float(start), float(target)
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f'{text!r}: expected START:TARGET, two stretches such as 1.0:1.4') from None
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command."""
+    parser = subparsers.add_parser(
+        'robustness', help='compare the shapers under model error',
+        description='Plan moves with each shaper and the nominal parameters, simulate them with '
+                    'errors in shear modulus G, damping coefficient zeta and J_lim, and compare '
+                    'the residuals: peak-to-peak stretch after arrival as a share of the step, '
+                    'without the steady offset. Minimax plans for these errors. Prints a table '
+                    'and writes robustness.csv, a picture of each move, and front.png, the worst '
+                    'residual over the duration; pictures as PDF too; existing files are '
+                    'replaced.',
+        epilog='example: hmsa robustness --move 1.0:1.4 1.2:0.8 --errors 0.05 --order 2 3 4')
+    add_options(
+        parser,
+        ('--move', 'START:TARGET', _move,
+         'moves from one stretch at rest to another (default 1.0:1.1 1.0:1.4 1.0:0.7; of a beam '
+         '0:0.1 0:0.4)', {'nargs': '+'}),
+        ('--shapers', 'NAME,...', str,
+         'shapers, separated by commas (default all, or all that know of the creep of the '
+         'parameter file)'),
+        ('--errors', 'E', float,
+         'largest error in the table and the box, as a share (default 0.1); the curves go to '
+         'twice that', {'default': 0.1}),
+        ('--order', 'N', int, 'orders of robust and minimax (default 2 3)', {'nargs': '+'}),
+        *((option, metavar, float, text if option == '--c1' else f'nominal {text}')
+          for option, metavar, text in MATERIAL),
+        ('--out', 'DIR', Path,
+         'output folder, created if missing (default robustness; with --feedback feedback)'),
+        ('--feedback',
+         'compare open loop with corrections from samples instead: vibration and offset after '
+         'moves with G up to 20 %% off, noise, delay and an unknown bias of the sensor; takes '
+         'minutes; of the other options --params-file, --seeds, --out, --json and those below; '
+         'writes files only with --out or --shard, --dask and --resume'),
+        ('--params-file', 'YAML', Path,
+         'actuator and coil in place of --zeta, --j-lim and --c1, of any law; with --feedback '
+         'seen by a camera (default: blocks and sensors of a list)'),
+        ('--seeds', 'N', int, 'runs with different noise for --feedback (default 10)',
+         {'default': 10}),
+        *chunked.options('processes (default 1)'),
+        ('--json', 'print JSON in full precision'))
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Study, print and write."""
+    in_chunks = bool(chunked.asked(arguments))
+    start, _ = chunked.engine(arguments, 1)
+    return (_feedback if arguments.feedback else _shapers)(arguments, start, in_chunks)
+
+
+def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> int:
+    """Compare the shapers."""
+    from hmsa_ros.planning.shapers import creeping
+    from hmsa_studies.executors import in_order
+    from hmsa_studies.robustness import (
+        candidates,
+        Case,
+        comparison,
+        LARGEST,
+        ORDERS,
+        result_of,
+        study,
+    )
+
+    model = nominal(arguments)
+    shapers = creeping.SHAPERS if model.material.creep else None
+    if arguments.shapers is not None:
+        shapers = tuple(name.strip() for name in arguments.shapers.split(','))
+    compared = candidates(shapers, arguments.order or ORDERS)
+    cases = [
+        Case(begin, target, model.material, model.limits, model.delivery, arguments.errors,
+             max(arguments.errors, min(2.0 * arguments.errors, LARGEST)))
+        for begin, target in dict.fromkeys(
+            arguments.move or (_MOVES if model.material.rest else _BENDS))]
+    tasks = list(product(cases, compared))
+    folder: Path = arguments.out or Path('robustness')
+
+    def finish(results: 'list[Result]', *files: Path) -> int:
+        count = len(compared)
+        studies = [(x, results[i * count:(i + 1) * count]) for i, x in enumerate(cases)]
+        return _show(studies, [*files, *_write(folder, studies)], as_json=arguments.json)
+
+    if in_chunks:
+        table = folder / 'table.parquet'
+        return chunked.compute_chunks(
+            comparison(tasks), folder, arguments, start, 'studying',
+            lambda chunks, _: finish([
+                result_of(*task, row)
+                for task, row in zip(tasks, chunks.merge_rows(table), strict=True)], table))
+    make_folder(folder)
+    with chunked.progress('studying', len(tasks)) as advance:
+        found = []
+        for result in in_order(start, study, tasks):
+            found.append(result)
+            advance(1)
+    return finish(found)
+
+
+def _show(
+        studies: 'list[tuple[Case, list[Result]]]', files: list[Path], *, as_json: bool) -> int:
+    """Print the results and the names of the files."""
+    if as_json:
+        print(json_text({
+            'moves': [_record(case, results) for case, results in studies],
+            'files': [str(path) for path in files]}))
+        return 0
+    for case, results in studies:
+        _print_table(case, results)
+    print(*files, sep='\n')
+    return 0
+
+
+def _write(folder: Path, studies: 'list[tuple[Case, list[Result]]]') -> list[Path]:
+    """Write the numbers and the pictures."""
+    from hmsa_studies.pictures import draw_front, draw_robustness
+    from hmsa_studies.robustness import write_csv
+
+    files = [folder / 'robustness.csv']
+    write_csv(files[0], studies)
+    kinds = ('png', 'pdf')
+    for case, results in studies:
+        paths = [
+            folder / f'robustness_{case.start:g}_to_{case.target:g}.{kind}' for kind in kinds]
+        draw_robustness(paths, case, results)
+        files += paths
+    fronts = [folder / f'front.{kind}' for kind in kinds]
+    draw_front(fronts, studies)
+    return files + fronts
+
+
+def _record(case: 'Case', results: 'list[Result]') -> dict[str, Any]:
+    """Return a case as the JSON output shows it; null where there is no such number."""
+    from hmsa_studies.robustness import ORDERED, PARAMETERS
+
+    errors = case.errors().tolist()
+    records = []
+    for result in results:
+        record: dict[str, Any] = {
+            'shaper': result.candidate.shaper,
+            'order': result.candidate.order if result.candidate.shaper in ORDERED else None,
+            'label': result.candidate.label,
+            'status': str(result.code),
+            'reason': result.reason,
+        }
+        if result.move is not None:
+            record |= {
+                'levels': [[x.time, x.load] for x in result.move.levels],
+                'arrival': result.arrival,
+                'arrives': math.isfinite(result.move.duration),
+                'residual': result.nominal,
+                'worst': {
+                    **{name: {
+                        'residual': worst.residual,
+                        'error': getattr(worst.errors, PARAMETERS[name])}
+                        for name, worst in result.alone.items()},
+                    'box': {
+                        'residual': result.worst.residual,
+                        'errors': {
+                            name: getattr(result.worst.errors, attribute)
+                            for name, attribute in PARAMETERS.items()}},
+                },
+                'curves': {
+                    name: {'errors': errors, 'residuals': curve.tolist()}
+                    for name, curve in result.curves.items()},
+            }
+        records.append(record)
+    return {
+        'start': case.start, 'target': case.target, 'zeta': case.material.zeta,
+        'j_lim': case.material.j_lim, 'c1': case.material.c1, 'box': case.box,
+        'shapers': records}
+
+
+def _print_table(case: 'Case', results: 'list[Result]') -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+
+    from hmsa_studies.robustness import percent
+
+    error = f'{100.0 * case.box:g}'
+    table = Table(
+        box=SIMPLE_HEAD,
+        title=f'{case.material.coordinate.name} {case.start:g} to {case.target:g}, '
+              f'{case.nominal}',
+        caption=f'residual: peak-to-peak {case.material.coordinate.name} after arrival in % of '
+                f'the step, without the steady offset; worst within {error} % of error, in the '
+                'last column of all at once; arrival in '
+                + ('L sqrt(rho/G)' if case.material.law is None else 'units of time'))
+    table.add_column('shaper', no_wrap=True)
+    for name in ('arrival', 'nominal', *case.parameters, 'all'):
+        table.add_column(name, justify='right', no_wrap=True)
+    for result in results:
+        if result.move is None:
+            table.add_row(result.candidate.name, *'---', *'-' * len(case.parameters))
+            continue
+        arrival = f'{result.arrival:.3f}'
+        table.add_row(
+            result.candidate.name,
+            arrival if math.isfinite(result.move.duration) else f'({arrival})',
+            percent(result.nominal), *(percent(x.residual) for x in result.alone.values()),
+            percent(result.worst.residual))
+    console = Console()
+    console.print(table)
+    notes = [f'{x.candidate.name}: {x.reason}' for x in results if x.reason]
+    linear = [x.candidate.name for x in results if x.candidate.linear]
+    if linear:
+        notes.append(f'{", ".join(linear)}: linear, designed at the target')
+    if any(x.move is not None and math.isinf(x.move.duration) for x in results):
+        notes.append('an arrival in brackets is not one: where the motion is only approached, '
+                     'the residual counts from when the two-step command arrives, or from half '
+                     'a natural period on where there is none')
+    if any(math.isnan(x.worst.residual) for x in results if x.move is not None):
+        notes.append('a question mark marks a motion too close to a limiting stretch to '
+                     'integrate')
+    for note in notes:
+        console.print(f'note: {note}', highlight=False, soft_wrap=True)
+
+
+def _feedback(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> int:
+    """Compare open loop with corrections."""
+    from hmsa_ros.identification.files import read_belief
+    from hmsa_studies.executors import in_order
+    from hmsa_studies.feedback import scenario_of, trial
+    from hmsa_studies.matrix import left_of, Matrix
+
+    if arguments.seeds < 1:
+        raise BadInputError(f'--seeds is {arguments.seeds}: expected at least 1')
+    matrix = Matrix(arguments.seeds)
+    if arguments.params_file is not None:
+        belief = read_belief(arguments.params_file)
+        for key, name in (
+                ('coil_time_constant', 'coil_time_constant'),
+                ('viscoelastic_ratio', 'viscoelastic.ratio')):
+            if belief.others.get(key):
+                raise BadInputError(
+                    f'{arguments.params_file} gives {name} {belief.others[key]:g}: expected 0 '
+                    'with --feedback, which compares actuators without coil lag and creep; leave '
+                    'it out of the file')
+        matrix = Matrix(arguments.seeds, [scenario_of(belief.actuator)])
+    if not in_chunks and arguments.out is None:
+        return _show_matrix(
+            matrix.seeds, matrix.rows(in_order(start, trial, matrix.tasks)),
+            as_json=arguments.json)
+    folder = arguments.out or Path('feedback')
+    table = folder / 'table.parquet'
+    return chunked.compute_chunks(
+        matrix.study, folder, arguments, start, 'moving', lambda chunks, _: _show_matrix(
+            matrix.seeds, matrix.rows(map(left_of, chunks.merge_rows(table))),
+            as_json=arguments.json, table=table))
+
+
+def _show_matrix(
+        seeds: int, rows: 'Iterator[Row]', *, as_json: bool, table: Path | None = None) -> int:
+    """Print rows as they are worked out."""
+    if as_json:
+        found = {'seeds': seeds, 'rows': [asdict(x) for x in rows]}
+        print(json_text(found if table is None else {**found, 'files': [str(table)]}))
+        return 0
+    print('peak-to-peak vibration (offset) in % of the step, root mean square: after the first '
+          'move\n(0.4 from rest), a cycle and two cycles later, after the next move (to 0.1); what'
+          ' would be left\nif nothing was corrected from then on. LQR and MPC: as seen in the '
+          'cycle that follows, the\nloop closed. Learning: after each of four trials of the first '
+          'move. Worst: vibration after\nthe first move. No worse: no vibration above 1.2 times '
+          'that of the chain, or, where the model\nis exact, above half of what noise alone '
+          'shows.')
+    before = ''
+    for row in rows:
+        if row.scenario != before:
+            print(f'\n{row.scenario}\n{"G off":>6} {"strategy":<9} {"after the move":>16} '
+                  f'{"a cycle later":>16} {"two cycles":>16} {"next move":>16} {"worst":>7} '
+                  'no worse')
+            before = row.scenario
+        cells = ' '.join(
+            f'{100.0 * x.vibration:>7.3f} ({100.0 * x.offset:6.3f})' for x in row.left)
+        verdict = {None: '', True: 'yes', False: 'no'}[row.no_worse]
+        line = (f'{100.0 * row.error:>4g} % {row.strategy:<9} {cells} '
+                f'{100.0 * row.worst[0]:>7.3f} {verdict}')
+        print(line.rstrip(), flush=True)
+    if table is not None:
+        print(table)
+    return 0

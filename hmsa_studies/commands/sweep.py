@@ -1,0 +1,330 @@
+"""``hmsa sweep``: plans over grids, tables and samples of parameters."""
+
+import argparse
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+import shutil
+from typing import Any, TYPE_CHECKING
+
+from hmsa_ros.cli.options import add_options, MATERIAL
+from hmsa_ros.errors import BadInputError
+from hmsa_studies.commands import chunked
+
+if TYPE_CHECKING:
+    from hmsa_ros.model.equations import Array
+    from hmsa_studies.chunks import Chunks
+    from hmsa_studies.engine import Outcome
+    from hmsa_studies.sweep import Sweep
+    from hmsa_studies.views import View
+
+#: What takes less time on a core, in s, is planned at once, without chunks.
+_SMALL = 3.4
+#: From so many points on, what a sweep takes is said before.
+_LARGE = 1_000_000
+# Option of a column, and what it is.
+_AXES = (
+    ('--start', 'initial stretch, at rest (default 1; of a beam 0)'),
+    ('--target', 'stretch to come to rest at (default 1.1)'),
+    *((option, text) for option, _, text in MATERIAL),
+)
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command."""
+    parser = subparsers.add_parser(
+        'sweep', help='plan over grids, tables and samples of parameters',
+        description='Plan a move for all combinations of the values given, nondimensional as '
+                    'in the paper, or in SI units with --params-file. GRID is a value, '
+                    'FIRST:LAST:POINTS or log:FIRST:LAST:POINTS, or several of these separated '
+                    'by commas; or sobol:LOW:HIGH or normal:MEAN:STD, of which samples are '
+                    'drawn. A case that cannot be planned gives the reason in its status; the '
+                    'others are still planned. The table is the same, to the byte, however many '
+                    'workers or shards compute it.',
+        epilog='example: hmsa sweep --zeta 0:2:1000 --j-lim log:0.1:100:50 --out sweep.csv')
+    add_options(
+        parser,
+        *((option, 'GRID', str, text) for option, text in _AXES),
+        ('--vary', 'NAME=GRID', str,
+         'another column: load_min, load_max, period, slew, lag or a constant of the law '
+         '(law.c10, ...); with --params-file a parameter, such as actuator.shear_modulus, '
+         'flux_density_max, slew_limit, coil_time_constant or command_period. The actuator may '
+         'differ from what is planned with, in error.shear_modulus, error.zeta, error.j_lim and '
+         'error.remanence (shares); with --params-file in actual.shear_modulus, '
+         'actual.remanence, actual.coil_time_constant and so on (SI)',
+         {'action': 'append', 'default': []}),
+        ('--residual',
+         'carry out each plan too: columns residual (vibration after arrival, peak to peak) and '
+         'offset at rest, as shares of the step; so do columns of the actuator. With '
+         '--identified the samples are actuators, and plans are made with the file'),
+        ('--law', 'NAME,...', str, 'elastic laws to compare, separated by commas'),
+        ('--shaper', 'NAME,...', str,
+         'shapers to compare, separated by commas (default two_step)'),
+        ('--params-file', 'YAML', Path,
+         'parameter file (YAML) of planner and plant: plans in seconds and tesla, within the '
+         'limits of its coil'),
+        ('--identified',
+         'draw samples of what hmsa identify wrote to --params-file, normal with its covariance'),
+        ('--samples', 'N', int, 'how many samples are drawn (default 1024)'),
+        ('--seed', 'S', int, 'of the samples (default 0)', {'default': 0}),
+        ('--cases', 'FILE.csv', Path,
+         'CSV with a header of columns; each row is combined with the samples, and with the '
+         'grids of the other columns'),
+        ('--out', 'FILE|DIR', Path,
+         'file to write, ending in .csv or .parquet; an existing file is replaced. Or a folder, '
+         'which keeps the chunks and gets table.parquet once all are there (default: CSV on '
+         'standard output)'),
+        ('--picture', 'FILE', Path,
+         'draw the results too, each name ending in .png or .pdf: curves over one column of '
+         'numbers, a map with contours over two, bands of quantiles of samples; hatched where '
+         'there is no plan. A folder of --out gets table.png and table.pdf',
+         {'nargs': '+', 'default': []}),
+        ('--show', 'COLUMN,...', str,
+         'columns to draw (default: duration and first level, or residual and offset)'),
+        *chunked.options(
+            'processes; 1 computes in this one (default: one a core for large sweeps)'))
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Plan and write."""
+    sweep = _sweep(arguments)
+    in_chunks = _in_chunks(sweep, arguments)
+    picture = _Picture(sweep, arguments)
+    return _plan_in_chunks(sweep, arguments, picture) if in_chunks \
+        else _plan_at_once(sweep, arguments.out, picture)
+
+
+class _Picture:
+    """What is drawn of a sweep, and where."""
+
+    def __init__(self, sweep: 'Sweep', arguments: argparse.Namespace) -> None:
+        """Find out what, before anything is computed."""
+        import numpy as np
+
+        self._sweep = sweep
+        self._view: View | None = None
+        self._columns: dict[str, Array] = {}
+        self._added = 0
+        self._paths: list[Path] = arguments.picture
+        names = list(sweep.shown) if arguments.show is None else _names(arguments.show)
+        wrong = [x for x in names if x not in sweep.results]
+        if wrong:
+            raise BadInputError(
+                f'--show has {wrong[0]!r}: expected some of {", ".join(sweep.results)}')
+        for path in self._paths:
+            if path.suffix.lower() not in {'.png', '.pdf'}:
+                raise BadInputError(
+                    f'the format of {path} is unknown: expected a name that ends in .png or .pdf')
+        out: Path | None = arguments.out
+        asked = bool(self._paths)
+        self._default = arguments.show is None
+        if out is not None and _is_folder(out) and not asked:
+            self._paths = [out / 'table.png', out / 'table.pdf']
+        if not self._paths:
+            return
+        try:
+            self._view = sweep.view()
+        except BadInputError as error:
+            if asked:
+                raise
+            chunked.say(str(error))
+            return
+        self._columns = {name: np.full(sweep.size, np.nan) for name in names}
+
+    def add(self, table: Any) -> None:
+        """Take the next rows, by column."""
+        begin = self._added
+        for name, column in self._columns.items():
+            self._added = begin + len(table[name])
+            column[begin:self._added] = table[name]
+
+    def draw(self, *, changed: bool = True) -> list[Path]:
+        """Draw all rows unless they are drawn already; return the files."""
+        if self._view is None:
+            return []
+        if not changed and self._default and all(x.exists() for x in self._paths):
+            return self._paths
+        from hmsa_studies.sweep_pictures import draw_sweep
+
+        draw_sweep(self._paths, self._view, self._columns, self._sweep.fixed)
+        return self._paths
+
+
+def _sweep(arguments: argparse.Namespace) -> 'Sweep':
+    """Return what the arguments ask for."""
+    from hmsa_ros.interfaces.settings import ACTUAL, BLOCK_OF, InSI, Nondimensional, System
+    from hmsa_studies.axes import draw, NOTHING, parse_values, read_cases, Spread
+    from hmsa_studies.sweep import Sweep
+
+    system: System = Nondimensional()
+    belief = NOTHING
+    if arguments.params_file is not None:
+        from hmsa_ros.identification.files import errors_of, read_belief
+        from hmsa_ros.interfaces.parameters import PLANNED, VISCOELASTIC
+        from hmsa_ros.interfaces.topics import PLANNER
+        from hmsa_ros.planning.shapers.request import ERRORS
+        from hmsa_ros.recordings.parameters import entries_of, read_parameter_file, values_of
+
+        path = arguments.params_file
+        entries = entries_of(path)
+        known = read_belief(path, entries)
+        system = InSI.of(
+            values_of(read_parameter_file(path, entries), PLANNER, (*PLANNED, *VISCOELASTIC)),
+            errors_of(known, ERRORS))
+        if arguments.identified:
+            from hmsa_studies.identified import belief_of
+
+            belief = belief_of(known, path)
+            if arguments.residual:
+                belief = replace(belief, names=tuple(
+                    f'{ACTUAL}{x.removeprefix(BLOCK_OF)}' for x in belief.names))
+    elif arguments.identified:
+        raise BadInputError(
+            '--identified without --params-file: expected the file that hmsa identify --out wrote')
+    columns = [option.removeprefix('--').replace('-', '_') for option, _ in _AXES]
+    texts = {x: y for x in columns if (y := getattr(arguments, x)) is not None}
+    if arguments.residual and f'{ACTUAL}shear_modulus' in belief.names:
+        # Under any law, plans are made with the modulus about which the samples are.
+        texts[f'{BLOCK_OF}shear_modulus'] = repr(
+            float(belief.mean[belief.names.index(f'{ACTUAL}shear_modulus')]))
+    for text in arguments.vary:
+        name, sign, grid = text.partition('=')
+        if not sign or name in texts:
+            raise BadInputError(f'--vary {text!r}: expected NAME=GRID, each name once')
+        texts[name] = grid
+    values = {name: parse_values(text, name) for name, text in texts.items()}
+    spreads = {name: x for name, x in values.items() if isinstance(x, Spread)}
+    samples = None
+    if spreads or belief.names:
+        samples = draw(
+            spreads, belief, 1024 if arguments.samples is None else arguments.samples,
+            arguments.seed)
+    elif arguments.samples is not None:
+        raise BadInputError(
+            '--samples without anything to draw: expected a column sobol:LOW:HIGH or '
+            'normal:MEAN:STD, or --identified')
+    return Sweep(
+        {name: x for name, x in values.items() if not isinstance(x, Spread)},
+        None if arguments.cases is None else read_cases(
+            arguments.cases, {**system.ranges, **system.actual}),
+        samples=samples, laws=_names(arguments.law), shapers=_names(arguments.shaper),
+        system=system, residual=arguments.residual)
+
+
+def _names(text: str | None) -> list[str]:
+    return [] if text is None else [x.strip() for x in text.split(',')]
+
+
+def _in_chunks(sweep: 'Sweep', arguments: argparse.Namespace) -> bool:
+    """Return whether chunks are kept; refuse options that do not fit."""
+    asked = [*(['--workers'] if arguments.workers is not None else []), *chunked.asked(arguments)]
+    out: Path | None = arguments.out
+    if out is None:
+        if asked:
+            raise BadInputError(
+                f'{asked[0]} without --out: expected --out with a file or a folder')
+        return False
+    if _is_folder(out) or asked:
+        return True
+    # What could not be written in the end is refused at the beginning, without a chunk.
+    return sweep.size > _SMALL * sweep.rate and out.suffix.lower() in {'.csv', '.parquet'} and \
+        not out.is_dir() and out.parent.is_dir() and (
+            out.suffix.lower() == '.parquet' or _has_arrow())
+
+
+def _is_folder(out: Path) -> bool:
+    return not out.suffix or (out.is_dir() and out.suffix.lower() not in {'.csv', '.parquet'})
+
+
+def _has_arrow() -> bool:
+    from importlib.util import find_spec
+
+    return find_spec('pyarrow') is not None
+
+
+def _plan_at_once(sweep: 'Sweep', out: Path | None, picture: _Picture) -> int:
+    from hmsa_studies.chunks import Chunks
+    from hmsa_studies.tables import open_writer
+
+    counts: Counter[str] = Counter()
+    with open_writer(out, sweep.columns) as write, \
+            chunked.progress('planning', sweep.size) as advance:
+        for block in sweep.blocks(Chunks.of(sweep, Path()).rows):
+            write(block)
+            picture.add(block.results)
+            counts.update(block.status.tolist())
+            advance(block.status.size)
+    _report(sweep.size, counts)
+    pictures = picture.draw()
+    if out is not None:
+        print(out, *pictures, sep='\n')
+    return 0
+
+
+def _plan_in_chunks(
+        sweep: 'Sweep', arguments: argparse.Namespace, picture: _Picture) -> int:
+    from hmsa_ros.files import require_arrow
+    from hmsa_studies.executors import cores
+
+    require_arrow()
+    table, folder = _places(arguments.out)
+    small = sweep.size <= _SMALL * sweep.rate
+    start, known = chunked.engine(arguments, 1 if small else cores())
+    _estimate(sweep, folder, known, chunked.shard_of(arguments))
+
+    def finish(chunks: 'Chunks', outcome: 'Outcome') -> int:
+        _report(sweep.size, chunks.merge(table, picture.add))
+        pictures = picture.draw(changed=outcome.computed > 0)
+        if table.parent.resolve() != chunks.folder and arguments.shard is None:
+            shutil.rmtree(folder, ignore_errors=True)
+        print(table, *pictures, sep='\n')
+        return 0
+
+    return chunked.compute_chunks(sweep, folder, arguments, start, 'planning', finish)
+
+
+def _places(out: Path) -> tuple[Path, Path]:
+    """Return where the table goes and where the chunks."""
+    if _is_folder(out):
+        return out / 'table.parquet', out
+    if out.suffix.lower() not in {'.csv', '.parquet'}:
+        raise BadInputError(
+            f'the format of {out} is unknown: expected a name that ends in .csv or .parquet, or a '
+            'folder')
+    if out.is_dir():
+        raise BadInputError(f'{out} is a folder: expected the name of a file')
+    if not out.parent.is_dir():
+        raise BadInputError(f'cannot write {out}: No such file or directory; expected a folder')
+    return out, out.with_name(f'{out.name}.chunks')
+
+
+def _estimate(sweep: 'Sweep', folder: Path, cores: int, shard: tuple[int, int]) -> None:
+    """Say what a large sweep takes, and refuse one that the disk has no room for."""
+    from hmsa_studies.chunks import Chunks
+    from hmsa_studies.sweep import ROW_BYTES
+
+    chunks = Chunks.of(sweep, folder)
+    if sweep.size < _LARGE:
+        return
+    size = sweep.size * ROW_BYTES
+    seconds = sweep.size / shard[1] / (sweep.rate * cores)
+    time = f'{seconds / 3600:,.1f} h' if seconds > 3600 else f'{seconds / 60:.1f} min'
+    chunked.say(f'{sweep.size:,} plans in {chunks.count:,} chunks of {chunks.rows:,}: about '
+         f'{size / 1e9:.3g} GB, the table as much again'
+         f'{f"; part {shard[0] + 1} of {shard[1]}" if shard[1] > 1 else ""}; about {time} on '
+         f'{cores} core{"s" if cores > 1 else ""}')
+    place = chunks.folder
+    while not place.exists():
+        place = place.parent
+    free = shutil.disk_usage(place).free
+    if free < size / shard[1]:
+        raise BadInputError(
+            f'{place} has {free / 1e9:.3g} GB of free space: expected some '
+            f'{size / shard[1] / 1e9:.3g} GB for the chunks; take fewer points or another disk')
+
+
+def _report(size: int, counts: Mapping[str, int]) -> None:
+    words = ', '.join(
+        f'{count:,} {status}' for status, count in Counter(counts).most_common())
+    chunked.say(f'{size:,} plans: {words}')

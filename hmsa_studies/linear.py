@@ -1,0 +1,259 @@
+"""
+Linear controllers of a block, as they are usually built: at each target, for small motion.
+
+The block is linearised about the target and sampled exactly, levels that are still on their way
+included. A stationary Kalman filter gives stretch and rate. The sensor is set to zero on the block
+at rest before the first move.
+"""
+
+from abc import ABC, abstractmethod
+from collections import deque
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from scipy.linalg import solve_discrete_are
+from scipy.optimize import lsq_linear
+
+from hmsa_ros.errors import HmsaError
+from hmsa_ros.estimation.motion import follow, Levels
+from hmsa_ros.identification.quantities import values_of
+from hmsa_ros.identification.response import complete
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.parameters import ActuatorParameters
+from hmsa_ros.model.units import NANOSECONDS
+
+# Load by which the block is asked how a level moves it.
+_SMALL = 1e-4
+# How far ahead the predictive controller looks, in units of time.
+_HORIZON = 6.0
+
+
+@dataclass(frozen=True)
+class Weights:
+    """How eager a controller is; the error weighs 1."""
+
+    rate: float  #: by units of time
+    effort: float  #: of the level
+    integral: float = 0.0  #: of the sum of errors over a unit of time, of a regulator alone
+    wander: float = 0.1  #: of a load that acts besides the level, in a unit of time
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """A block about a stretch at which it rests, sampled: x(k + 1) = a x(k) + b u(k)."""
+
+    #: on stretch from the target, rate by units of time, and the levels still on their way, the
+    #: newest first, shape (n, n)
+    a: Array
+    b: Array  #: of a level, as a load above the one that holds the target, shape (n,)
+
+    @classmethod
+    def at(
+            cls, block: ActuatorParameters, target: float, holding: float, period: int,
+            delay: int) -> 'Linearised':
+        """Linearise about a target that a level in T holds; delay of levels and period in ns."""
+        whole, late = divmod(delay, period)
+        by, left = _motion(block, target, holding, period)
+        _, before = _motion(block, target, holding, late)
+        rest, after = _motion(block, target, holding, period - late)
+        n = whole + 3
+        a, b = np.zeros((n, n)), np.zeros(n)
+        a[:2, :2] = by
+        a[:2, n - 1] = rest @ before
+        if whole:
+            a[:2, n - 2] += after
+            b[2] = 1.0
+        else:
+            b[:2], b[2] = after, 1.0
+        a[3:, 2:n - 1] = np.eye(n - 3)
+        return cls(a, b)
+
+    def observer(self, noise: float, wander: float) -> Array:
+        """Return the stationary Kalman gain on stretch, rate and a level that acts besides."""
+        n = len(self.b)
+        a = np.eye(3)
+        a[:2, :2] = self.a[:2, :2]
+        a[:2, 2] = self.a[:2, 2:].sum(axis=1) + (self.b[:2] if n == 3 else 0.0)
+        c = np.array([1.0, 0.0, 0.0])
+        spread = np.diag([1e-12, 1e-12, wander ** 2])
+        p: Array = np.asarray(solve_discrete_are(
+            a.T, c[:, None], spread, np.array([[noise ** 2]])), dtype=np.float64)
+        gain: Array = p @ c / (float(c @ p @ c) + noise ** 2)
+        return gain
+
+
+def _motion(
+        block: ActuatorParameters, target: float, holding: float, time: int
+) -> tuple[Array, Array]:
+    """Return the derivatives of stretch and rate after a time in ns by those before, and load."""
+    unit, load = block.time_unit, block.flux_density_unit
+    values = complete(values_of(block), ())
+    ends = []
+    scale = np.array([1.0, unit])
+    for level in (holding - _SMALL * load, holding + _SMALL * load):
+        motion = follow(
+            values, (), (target, 0.0), Levels(np.zeros(1), np.array([level])), 0.0,
+            np.array([time / NANOSECONDS]))
+        if motion is None:
+            raise HmsaError(
+                f'the motion about {block.coordinate.name} {target:g} cannot be followed: '
+                'expected a target away from the limits of the law')
+        ends.append((motion, scale * [motion.stretch[0], motion.rate[0]]))
+    (one, low), (other, high) = ends
+    by = 0.5 * sum(
+        np.array([x.by[0], x.rate_by[0]]) for x in (one, other)) * scale[:, None] / scale
+    return by, (high - low) / (2.0 * _SMALL)
+
+
+class Controller(ABC):
+    """
+    Commands a level after each sample.
+
+    Parameters
+    ----------
+    block : ActuatorParameters
+        Nominal.
+    largest : float
+        Load that levels keep to, either way.
+    period, delay : int
+        Of the samples, and from a sample to the level that depends on it, in ns.
+    noise : float
+        Standard deviation of a sample.
+    weights : Weights
+        How eager it is.
+
+    """
+
+    def __init__(
+            self, block: ActuatorParameters, largest: float, period: int, delay: int,
+            noise: float, weights: Weights) -> None:
+        """Begin at rest without a field."""
+        self._weights = weights
+        self._block, self._largest, self._noise = block, largest, noise
+        self._period, self._delay = period, delay
+        self._before: list[float] = []
+        self._zero = 0.0
+        self._target, self._holding = block.rest, 0.0
+        self._model: Linearised | None = None
+        self._x = np.zeros(3)
+        self._sent: deque[float] = deque()
+
+    @abstractmethod
+    def _design(self, model: Linearised) -> None:
+        """Make the law for a target."""
+
+    @abstractmethod
+    def _law(self, z: Array, error: float, low: float, high: float) -> float:
+        """Return the level above the holding one, as a load, within bounds."""
+
+    def move(self, target: float, holding: float) -> float:
+        """Go to a target and the level in T that holds it; return the level until a sample."""
+        unit = self._block.flux_density_unit
+        if self._model is None:
+            self._zero = float(np.mean(self._before)) - self._block.rest
+        model = self._model = Linearised.at(
+            self._block, target, holding, self._period, self._delay)
+        if not self._sent:
+            self._sent = deque([0.0] * (len(model.b) - 2))
+        self._gain = model.observer(
+            self._noise,
+            self._weights.wander * self._period / NANOSECONDS / self._block.time_unit)
+        self._x[0] += self._target - target
+        self._target, self._holding = target, holding / unit
+        self._design(model)
+        return self._sent[0] * unit
+
+    def seen(self, stretch: float) -> float | None:
+        """Take in a sample in order; return a level in T, or None before the first move."""
+        if self._model is None:
+            self._before.append(stretch)
+            return None
+        error = stretch - self._zero - self._target
+        sent = np.array(self._sent) - self._holding
+        self._x = self._x + self._gain * (error - self._x[0])
+        load = self._law(
+            np.concatenate([self._x[:2], sent]), error,
+            -self._largest - self._holding, self._largest - self._holding)
+        # On to the next sample.
+        beside = float(self._x[2])
+        z = np.concatenate([self._x[:2], sent + beside])
+        self._x[:2] = (self._model.a @ z + self._model.b * (load + beside))[:2]
+        self._sent.appendleft(load + self._holding)
+        self._sent.pop()
+        return self._sent[0] * self._block.flux_density_unit
+
+
+class Quadratic(Controller):
+    """A linear quadratic regulator with the sum of errors, kept while levels are clipped."""
+
+    _sum = 0.0
+    _gains: Array = np.ones(1)
+
+    def _design(self, model: Linearised) -> None:
+        n = len(model.b)
+        share = self._period / NANOSECONDS / self._block.time_unit
+        a = np.zeros((n + 1, n + 1))
+        a[:n, :n], a[n, 0], a[n, n] = model.a, share, 1.0
+        b = np.append(model.b, 0.0)[:, None]
+        before, weights = self._gains, self._weights
+        self._gains = _regulator(a, b, np.diag(
+            [1.0, weights.rate, *[0.0] * (n - 2), weights.integral]), weights.effort)[0]
+        # The level that it comes to stays.
+        self._sum *= before[-1] / self._gains[-1]
+        self._share = share
+
+    def _law(self, z: Array, error: float, low: float, high: float) -> float:
+        wanted = -float(self._gains @ np.append(z, self._sum))
+        load = min(max(wanted, low), high)
+        if load == wanted:
+            self._sum += error * self._share
+        return load
+
+
+class Predictive(Controller):
+    """
+    A linear model predictive controller without offset: it estimates a level that acts besides.
+
+    G. Pannocchia and J. B. Rawlings, AIChE Journal 49 (2003) 426.
+    """
+
+    def _design(self, model: Linearised) -> None:
+        n = len(model.b)
+        steps = max(round(_HORIZON * self._block.time_unit * NANOSECONDS / self._period), 2)
+        effort = self._weights.effort
+        weight = np.diag([1.0, self._weights.rate, *[0.0] * (n - 2)])
+        final = _regulator(model.a, model.b[:, None], weight, effort)[1]
+        values, vectors = np.linalg.eigh(final)
+        root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+        free = np.eye(n)
+        forced: Array = np.zeros((n, steps))
+        rows, by = [], []
+        for i in range(steps):
+            forced = model.a @ forced
+            forced[:, i] += model.b
+            free = model.a @ free
+            last = root if i == steps - 1 else np.sqrt(weight[:2])
+            rows.append(last @ forced)
+            by.append(last @ free)
+        rows.append(math.sqrt(effort) * np.eye(steps))
+        by.append(np.zeros((steps, n)))
+        self._rows, self._by = np.vstack(rows), np.vstack(by)
+        self._inverse = np.linalg.pinv(self._rows)
+
+    def _law(self, z: Array, error: float, low: float, high: float) -> float:
+        beside = float(self._x[2])
+        right = -self._by @ np.concatenate([z[:2], z[2:] + beside])
+        found = self._inverse @ right
+        if np.any(found < low + beside) or np.any(found > high + beside):
+            found = lsq_linear(
+                self._rows, right, (low + beside, high + beside), method='bvls').x
+        return min(max(float(found[0]) - beside, low), high)
+
+
+def _regulator(a: Array, b: Array, weight: Array, effort: float) -> tuple[Array, Array]:
+    """Return the gains of the quadratic regulator and what a state costs."""
+    cost: Array = np.asarray(
+        solve_discrete_are(a, b, weight, np.array([[effort]])), dtype=np.float64)
+    gains = (b.T @ cost @ a) / (effort + float((b.T @ cost @ b)[0, 0]))
+    return gains[0], cost

@@ -1,0 +1,129 @@
+"""All strategies of feedback in all scenarios, and which leave no more than open loop."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice, product
+from typing import Any
+
+import numpy as np
+from scipy.special import ndtr
+
+from hmsa_studies.feedback import (
+    CHAINED,
+    CYCLE,
+    CYCLES,
+    Left,
+    Scenario,
+    SCENARIOS,
+    STRATEGIES,
+    Strategy,
+    TARGETS,
+    trial,
+)
+from hmsa_studies.tasks import Tasks
+
+#: Errors of the shear modulus that make a row together.
+ERRORS = ((0.0,), (-0.1, 0.1), (-0.2, 0.2))
+# How much more than the chain leaves is no worse.
+_WORSE = 1.2
+#: Arguments of `trial`.
+Task = tuple[Scenario, Strategy, float, int]
+# Numbers of `Left`.
+_LEFT = ('vibration', 'offset', 'motion')
+
+
+@dataclass(frozen=True)
+class Row:
+    """A strategy in a scenario, with errors of one size."""
+
+    scenario: str
+    strategy: str
+    error: float  #: of G, as a share
+    #: Root mean square over both signs and all seeds: after the first move, a cycle later, two
+    #: cycles later, and after the next move; of learning, after each of four trials.
+    left: 'tuple[Left, ...]'
+    worst: tuple[float, ...]  #: largest vibration of all
+    no_worse: bool | None = None  #: whether no run leaves more than `allowed`; None for open loop
+
+
+def rms(trials: Iterable[Sequence[Left]]) -> list[Left]:
+    """Return the root mean square of trials, for each time that was looked at."""
+    rows = np.array([[(x.vibration, x.offset, x.motion) for x in row] for row in trials])
+    return [Left(*x) for x in np.sqrt(np.mean(np.square(rows), axis=0)).tolist()]
+
+
+@dataclass(frozen=True)
+class Matrix:
+    """All strategies in all scenarios."""
+
+    seeds: int  #: of the noise, for each error, on which open loop does not depend
+    scenarios: Sequence[Scenario] = SCENARIOS
+    strategies: Sequence[Strategy] = STRATEGIES
+
+    def _trials(self) -> Iterator[tuple[Scenario, tuple[float, ...], Strategy, list[Task]]]:
+        """Yield scenario, errors and strategy of each row, and its trials."""
+        for scenario, errors, strategy in product(self.scenarios, ERRORS, self.strategies):
+            yield scenario, errors, strategy, [
+                (scenario, strategy, error, seed) for error in errors
+                for seed in range(1 if strategy.kind == 'open' else self.seeds)]
+
+    @property
+    def tasks(self) -> list[Task]:
+        """Return the arguments of all trials."""
+        return [task for *_, tasks in self._trials() for task in tasks]
+
+    @property
+    def study(self) -> Tasks:
+        """Return the trials as a study, whose rows `left_of` reads."""
+        return Tasks(_row, self.tasks, {
+            'scenario': 'string', 'strategy': 'string', 'error': 'double', 'seed': 'int64',
+            **dict.fromkeys(_LEFT, 'doubles')}, (4, 100))
+
+    def rows(self, left: Iterator[list[Left]]) -> Iterator[Row]:
+        """Yield what trials have left, given in the order of the tasks, row after row."""
+        limits: dict[tuple[str, tuple[float, ...]], list[list[float]]] = {}
+        for scenario, errors, strategy, tasks in self._trials():
+            key = scenario.name, errors
+            if key not in limits:
+                limits[key] = [allowed(scenario, x) for x in errors]
+            runs = list(islice(left, len(tasks)))
+            each = len(runs) // len(errors)
+            yield Row(
+                scenario.name, strategy.name, max(errors), tuple(rms(runs)),
+                tuple(max(x.vibration for x in column) for column in zip(*runs, strict=True)),
+                None if strategy.kind == 'open' else all(
+                    x.vibration <= limit[0 if strategy.kind == 'learning' else i]
+                    for place, limit in enumerate(limits[key])
+                    for run in runs[place * each:(place + 1) * each]
+                    for i, x in enumerate(run)))
+
+
+def _row(scenario: Scenario, strategy: Strategy, error: float, seed: int) -> dict[str, Any]:
+    left = trial(scenario, strategy, error, seed)
+    return {
+        'scenario': scenario.name, 'strategy': strategy.name, 'error': error, 'seed': seed,
+        **{name: [getattr(x, name) for x in left] for name in _LEFT}}
+
+
+def left_of(row: Mapping[str, Any]) -> list[Left]:
+    """Return what `trial` did, out of the row of a table."""
+    return [Left(*x) for x in zip(*(row[name] for name in _LEFT), strict=True)]
+
+
+def allowed(scenario: Scenario, error: float) -> list[float]:
+    """Return the vibration, at each time, up to which a strategy is no worse than open loop."""
+    # A fifth more than what the chain of order 2 leaves, or, where nothing is wrong with the
+    # model, half of what noise alone shows from peak to peak in the samples of a cycle.
+    if error or scenario.truth or scenario.coil_time_constant:
+        return [_WORSE * x.vibration for x in trial(scenario, CHAINED, error, 0)]
+    count = CYCLE * scenario.block.time_unit / scenario.period
+    steps = [float(x) for x in np.diff([0.0, *TARGETS])]
+    shown = scenario.noise * _range(count)
+    return [0.5 * shown / abs(x) for x in (*[steps[0]] * CYCLES, *steps[1:])]
+
+
+def _range(count: float) -> float:
+    """Return the mean distance between the largest and the least of so many normal numbers."""
+    x = np.linspace(-8.0, 8.0, 4001)
+    below = ndtr(x)
+    return float(np.sum(1.0 - below ** count - (1.0 - below) ** count) * (x[1] - x[0]))

@@ -1,0 +1,116 @@
+"""What is left of a move on an actuator that is not the one it was planned for."""
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from hmsa_ros.interfaces.settings import Setting
+from hmsa_ros.model.delivery import Delivery, IDEAL, ramps
+from hmsa_ros.model.equations import (
+    Array,
+    critical_zeta,
+    elastic_force,
+    equilibrium_stretch,
+    Floats,
+    natural_frequency,
+)
+from hmsa_ros.model.mismatch import Errors
+from hmsa_ros.model.moves import Level, Move
+from hmsa_ros.model.parameters import NondimensionalParameters
+from hmsa_ros.model.residual import residual_vibration
+from hmsa_ros.model.simulation import simulate
+from hmsa_ros.model.status import Code
+from hmsa_ros.planning.two_step import plan_two_step
+
+__all__ = ['Actual', 'arrival_of', 'Errors']
+
+# Peak-to-peak of a decaying motion is final after one period, or once it has died out.
+_PERIODS = 2.0
+_DECADES = 12.0
+# 150 samples a period miss 2e-4 of an extremum.
+_SAMPLES = 301
+_EXACT = Errors()
+
+
+def arrival_of(
+        move: Move, start: float, target: float, material: NondimensionalParameters) -> float:
+    """Return from when (in the model's time) what still moves counts as residual vibration."""
+    # The end of the command. A plain step, which never arrives, counts from when the two-step
+    # command would; where there is none, from half a natural period on.
+    if math.isfinite(move.duration):
+        return move.duration
+    if not material.creep:
+        plan = plan_two_step(start, target, material)
+        if plan.code is Code.TWO_STEP:
+            return plan.tau_p
+    return math.pi / float(natural_frequency(target, material))
+
+
+def ringing(stretch: float, material: NondimensionalParameters) -> tuple[float, float]:
+    """Return the period (infinite if there is none) and the decay of small motion about rest."""
+    frequency = float(natural_frequency(stretch, material))
+    ratio = material.zeta / float(critical_zeta(stretch, material))
+    if ratio < 1.0:
+        return 2.0 * math.pi / (frequency * math.sqrt(1.0 - ratio * ratio)), frequency * ratio
+    return math.inf, frequency * (ratio - math.sqrt(ratio * ratio - 1.0))
+
+
+@dataclass(frozen=True)
+class Actual:
+    """An actuator that carries out moves planned with, and in the units of, another model."""
+
+    model: NondimensionalParameters
+    material: NondimensionalParameters  #: of the actuator, in its own units
+    time: float = 1.0  #: the actuator's units in those of the model
+    load: float = 1.0
+    delivery: Delivery = IDEAL  #: in the actuator's units; commands are those of the move
+
+    @classmethod
+    def off(
+            cls, model: NondimensionalParameters, errors: Errors = _EXACT,
+            delivery: Delivery = IDEAL) -> 'Actual':
+        """Return the actuator of a model in error, under a coil that is as the model has it."""
+        return cls(
+            model, errors.actual(model), 1.0 / errors.faster, errors.stiffer,
+            errors.delivery(delivery))
+
+    @classmethod
+    def of(cls, model: Setting, actual: Setting) -> 'Actual':
+        """Return an actuator with parameters of its own."""
+        return cls(
+            model.material, actual.material, actual.units.time / model.units.time,
+            actual.units.load / model.units.load, actual.delivery)
+
+    def response(self, move: Move, start: float, times: Floats) -> Array:
+        """Sample the stretch from rest where the model's load for the start really holds it."""
+        held = float(elastic_force(start, self.model)) / self.load
+        end = float(times[-1]) / self.time
+        levels = [Level(x.time / self.time, x.load / self.load) for x in move.levels]
+        rows, _ = ramps(
+            [x for x in levels if x.time <= end] or levels[:1], held, end, self.delivery.slew)
+        switches, loads, slopes = np.array(rows).T
+        stretch, _ = simulate(
+            switches, loads, times / self.time, self.material, slopes=slopes,
+            stretch=float(equilibrium_stretch(held, self.material)), lag=self.delivery.lag,
+            field=held)
+        return stretch
+
+    def rest(self, move: Move) -> float:
+        """Return the stretch at which the last level of a move really holds the actuator."""
+        return float(equilibrium_stretch(move.levels[-1].load / self.load, self.material))
+
+    def residual(self, move: Move, start: float, target: float, arrival: float) -> float:
+        """Return the peak-to-peak stretch after arrival as a share of the commanded step."""
+        # A steady offset, from a load that holds another stretch than the model says, is no
+        # vibration and does not count.
+        period, decay = ringing(self.rest(move), self.material)
+        horizon = min(_PERIODS * period, _DECADES / decay if decay > 0.0 else math.inf)
+        times = arrival + np.linspace(0.0, horizon * self.time, _SAMPLES)
+        return residual_vibration(
+            times, self.response(move, start, times), arrival=arrival, end=float(times[-1]),
+            step=target - start)
+
+    def offset(self, move: Move, start: float, target: float) -> float:
+        """Return how far beyond the target a move comes to rest, as a share of the step."""
+        return (self.rest(move) - target) / (target - start)

@@ -1,0 +1,308 @@
+"""
+Robustness: what each shaper leaves of a move when the model is in error.
+
+Each shaper plans with the nominal parameters; the plan is carried out by an actuator whose
+shear modulus G, damping coefficient and J_lim are others, each alone and all together
+anywhere in a box.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+import csv
+from dataclasses import dataclass, field
+from itertools import product
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.files import replacing
+from hmsa_ros.model.delivery import Delivery, IDEAL
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.moves import Level, Limits, Move, State
+from hmsa_ros.model.parameters import NondimensionalParameters
+from hmsa_ros.model.simulation import check_stretch
+from hmsa_ros.model.status import Code, RefusedError
+from hmsa_ros.planning.shapers import get_shaper, SHAPERS
+from hmsa_ros.planning.shapers.creeping import held
+from hmsa_ros.planning.shapers.request import Request
+from hmsa_studies.residual import Actual, arrival_of, Errors
+from hmsa_studies.tasks import Tasks
+
+#: Parameters in error: name for a person, name in `Errors`.
+PARAMETERS = {'G': 'shear_modulus', 'zeta': 'zeta', 'J_lim': 'j_lim'}
+#: Orders that are compared of the shapers that have one.
+ORDERS = (2, 3)
+ORDERED = ('robust', 'minimax')
+#: A chain is of no use long before this order.
+MOST_ORDER = 100
+#: Values a parameter takes in the curves, besides the edges of the box.
+_POINTS = 41
+# Values a parameter takes in the box, edges and centre included.
+_BOX_POINTS = 9
+#: Largest error that is studied.
+LARGEST = 0.9
+
+_NAMES = {
+    'two_step': 'two-step', 'minimum_time': 'minimum time', 'step': 'plain step', 'zv': 'ZV',
+    'zvd': 'ZVD', 'ei': 'EI'}
+_LINEAR = ('zv', 'zvd', 'ei')
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A shaper to be compared."""
+
+    shaper: str
+    order: int = 2  #: of those in ORDERED
+
+    def __post_init__(self) -> None:
+        """Check both."""
+        get_shaper(self.shaper)
+        if not 1 <= self.order <= MOST_ORDER:
+            raise BadInputError(
+                f'order of the shaper {self.shaper} is {self.order}: expected 1 to {MOST_ORDER}')
+
+    @property
+    def name(self) -> str:
+        """Name for a person."""
+        if self.shaper in ORDERED:
+            return f'{self.shaper}, order {self.order}'
+        return _NAMES.get(self.shaper, self.shaper)
+
+    @property
+    def linear(self) -> bool:
+        """Whether it is a shaper of linear theory, a reference for comparison."""
+        return self.shaper in _LINEAR
+
+    @property
+    def label(self) -> str:
+        """Name that says what a reference is designed for."""
+        return f'{self.name} (linear, designed at the target)' if self.linear else self.name
+
+
+@dataclass(frozen=True)
+class Case:
+    """A move between stretches at rest, its model, and errors of it; in the model's units."""
+
+    start: float
+    target: float
+    material: NondimensionalParameters = field(default_factory=NondimensionalParameters)
+    limits: Limits = field(default_factory=Limits)
+    delivery: Delivery = IDEAL
+    box: float = 0.1  #: half the width of the box of errors, above 0
+    span: float = 0.2  #: largest error in the curves, at least that of the box
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        check_stretch(self.start, self.material, 'start stretch')
+        check_stretch(self.target, self.material, 'target stretch')
+        if abs(self.target - self.start) < 1e-6:
+            raise BadInputError(
+                f'the move from {self.material.coordinate.name} {self.start:g} to '
+                f'{self.target:g} is none: expected two {self.material.coordinate.plural} that '
+                'differ')
+        if not 0.0 < self.box <= self.span <= LARGEST:
+            raise BadInputError(
+                f'errors of up to {self.box:g} in the box and {self.span:g} in the curves: '
+                f'expected numbers above 0 to {LARGEST:g}, the first not the larger one')
+
+    @property
+    def parameters(self) -> dict[str, str]:
+        """Which of `PARAMETERS` the law of the model has."""
+        limited = self.material.law is None and math.isfinite(self.material.j_lim)
+        return {x: y for x, y in PARAMETERS.items() if y != 'j_lim' or limited}
+
+    @property
+    def nominal(self) -> str:
+        """The model in a line."""
+        material = self.material
+        whose = f'J_lim {material.j_lim:g}' if material.law is None else f'law {material.law.law}'
+        return f'nominal zeta {material.zeta:g}, {whose}, c1 {material.c1:g}'
+
+    def actual(self, errors: Errors) -> Actual:
+        """Return the actuator with errors."""
+        return Actual.off(self.material, errors, self.delivery)
+
+    def errors(self) -> Array:
+        """Return the errors of one parameter in the curves, with 0 and both edges of the box."""
+        grid = np.linspace(-self.span, self.span, _POINTS)
+        grid[_POINTS // 2] = 0.0
+        edges = np.array([-self.box, self.box])
+        apart = np.abs(grid[:, np.newaxis] - edges).min(axis=1) > 1e-9
+        return np.sort(np.concatenate([grid[apart], edges]))
+
+
+@dataclass(frozen=True)
+class Worst:
+    """The largest residual among errors, and where."""
+
+    residual: float  #: as a share of the step; NaN if a motion could not be followed
+    errors: Errors
+
+
+@dataclass(frozen=True)
+class Result:
+    """One shaper in one case."""
+
+    candidate: Candidate
+    code: Code  #: another one than the shaper's own where it fell back or refused
+    reason: str  #: why it did
+    move: Move | None  #: None if refused; what follows is empty then, and the numbers NaN
+    arrival: float  #: time from which the residual counts, nominal
+    nominal: float  #: residual without errors
+    curves: dict[str, Array]  #: by parameter: residual at `Case.errors` of it alone
+    alone: dict[str, Worst]  #: by parameter: the worst of it alone, up to the box's edges
+    worst: Worst  #: in the box of all three
+
+
+def candidates(
+        shapers: Sequence[str] | None = None,
+        orders: Sequence[int] = ORDERS) -> tuple[Candidate, ...]:
+    """Return the shapers to compare, each once, those in `ORDERED` with each order."""
+    found = [
+        Candidate(name, order)
+        for name in (SHAPERS if shapers is None else shapers)
+        for order in (orders if name in ORDERED else (2,))]
+    return tuple(dict.fromkeys(found))
+
+
+def study(case: Case, candidate: Candidate) -> Result:
+    """Plan a move with the nominal parameters and carry it out with others."""
+    try:
+        request = Request(
+            State(case.start), case.target, case.material, case.limits, case.delivery,
+            candidate.order, errors=(case.box, case.box, case.box))
+        move = held(request, get_shaper(candidate.shaper)(request), math.inf)
+    except RefusedError as error:
+        return _refused(candidate, error.code, str(error))
+    arrival = arrival_of(move, case.start, case.target, case.material)
+
+    def left(errors: Errors) -> float:
+        try:
+            return case.actual(errors).residual(move, case.start, case.target, arrival)
+        except BadInputError:
+            raise
+        except HmsaError:
+            # Too close to a limiting stretch to follow.
+            return math.nan
+
+    curves = {
+        name: np.array([left(Errors(**{attribute: x})) for x in case.errors().tolist()])
+        for name, attribute in case.parameters.items()}
+    steps = np.linspace(-case.box, case.box, _BOX_POINTS).tolist()
+    box = [Errors(*errors) for errors in product(
+        *(steps if x in curves else [0.0] for x in PARAMETERS))]
+    return Result(
+        candidate, move.code, move.reason, move, arrival, left(Errors()), curves,
+        _alone(case, curves), _worst(np.array([left(errors) for errors in box]), box))
+
+
+def _refused(candidate: Candidate, code: Code, reason: str) -> Result:
+    return Result(
+        candidate, code, reason, None, math.nan, math.nan, {}, {}, Worst(math.nan, Errors()))
+
+
+def _alone(case: Case, curves: Mapping[str, Array]) -> dict[str, Worst]:
+    """Return the worst of each curve within the box."""
+    grid = case.errors()
+    inside = np.abs(grid) <= case.box
+    return {
+        name: _worst(curve[inside], [
+            Errors(**{PARAMETERS[name]: x}) for x in grid[inside].tolist()])
+        for name, curve in curves.items()}
+
+
+def _worst(residuals: Array, errors: Sequence[Errors]) -> Worst:
+    # argmax takes NaN for the largest, which it is here: nothing bounds it.
+    index = int(np.argmax(residuals))
+    return Worst(float(residuals[index]), errors[index])
+
+
+def percent(share: float) -> str:
+    """Word a residual in percent, without the sign; NaN where a motion could not be followed."""
+    if math.isnan(share):
+        return '?'
+    if share < 1e-8:
+        return '<1e-6'
+    value = 100.0 * share
+    if value < 1e-3:
+        return f'{value:.0e}'
+    return f'{value:.{1 if value >= 1.0 else 2 if value >= 0.1 else 3}f}'
+
+
+# What was varied is a parameter, or 'box' for the worst in the box; residual and offset, how far
+# beyond the target the actuator comes to rest, are shares of the step.
+_COLUMNS = (
+    'start', 'target', 'zeta', 'j_lim', 'c1', 'shaper', 'order', 'status', 'varied',
+    'error_G', 'error_zeta', 'error_J_lim', 'residual', 'offset')
+
+
+def write_csv(path: Path, studies: Sequence[tuple[Case, Sequence[Result]]]) -> None:
+    """Write all residuals, one a row, in full double precision; an old file is replaced."""
+    with replacing(path) as beside, beside.open('w', newline='', encoding='utf-8') as file:
+        writer = csv.writer(file, lineterminator='\n')
+        writer.writerow(_COLUMNS)
+        for case, results in studies:
+            for result in results:
+                writer.writerows(_rows(case, result))
+
+
+def _rows(case: Case, result: Result) -> Iterator[tuple[str | float, ...]]:
+    order: int | str = result.candidate.order if result.candidate.shaper in ORDERED else ''
+    fixed = (
+        case.start, case.target, case.material.zeta, case.material.j_lim, case.material.c1,
+        result.candidate.shaper, order, str(result.code))
+    if result.move is None:
+        yield *fixed, '', math.nan, math.nan, math.nan, math.nan, math.nan
+        return
+    points = [
+        (name, Errors(**{PARAMETERS[name]: error}), value)
+        for name, curve in result.curves.items()
+        for error, value in zip(case.errors().tolist(), curve.tolist(), strict=True)]
+    points.append(('box', result.worst.errors, result.worst.residual))
+    for name, errors, value in points:
+        offset = case.actual(errors).offset(result.move, case.start, case.target)
+        yield (*fixed, name, errors.shear_modulus, errors.zeta, errors.j_lim, value, offset)
+
+
+def comparison(tasks: Sequence[tuple[Case, Candidate]]) -> Tasks:
+    """Return a study of shapers in cases, whose rows `result_of` reads."""
+    return Tasks(_row, tasks, {
+        **dict.fromkeys(('start', 'target', 'zeta', 'j_lim', 'c1', 'box', 'span'), 'double'),
+        'shaper': 'string', 'order': 'int64', 'status': 'string', 'reason': 'string',
+        'times': 'doubles', 'levels': 'doubles',
+        **dict.fromkeys(('duration', 'arrival', 'nominal'), 'double'),
+        **{f'residual_{x}': 'doubles' for x in PARAMETERS},
+        **{f'error_{x}': 'double' for x in PARAMETERS}, 'residual': 'double'}, (1, 100))
+
+
+def _row(case: Case, candidate: Candidate) -> dict[str, Any]:
+    found = study(case, candidate)
+    levels = () if found.move is None else found.move.levels
+    return {
+        'start': case.start, 'target': case.target, 'zeta': case.material.zeta,
+        'j_lim': case.material.j_lim, 'c1': case.material.c1, 'box': case.box,
+        'span': case.span, 'shaper': candidate.shaper, 'order': candidate.order,
+        'status': str(found.code), 'reason': found.reason,
+        'times': [x.time for x in levels], 'levels': [x.load for x in levels],
+        'duration': math.nan if found.move is None else found.move.duration,
+        'arrival': found.arrival, 'nominal': found.nominal,
+        **{f'residual_{x}': found.curves[x].tolist() if x in found.curves else []
+           for x in PARAMETERS},
+        **{f'error_{x}': getattr(found.worst.errors, y) for x, y in PARAMETERS.items()},
+        'residual': found.worst.residual}
+
+
+def result_of(case: Case, candidate: Candidate, row: Mapping[str, Any]) -> Result:
+    """Return what `study` did, out of the row of a table."""
+    code, reason = Code(row['status']), row['reason']
+    if not row['times']:
+        return _refused(candidate, code, reason)
+    levels = tuple(map(Level, row['times'], row['levels']))
+    curves = {x: np.array(row[f'residual_{x}'], dtype=np.float64) for x in case.parameters}
+    return Result(
+        candidate, code, reason, Move(code, levels, row['duration'], reason), row['arrival'],
+        row['nominal'], curves, _alone(case, curves), Worst(
+            row['residual'], Errors(*(row[f'error_{x}'] for x in PARAMETERS))))

@@ -1,0 +1,290 @@
+"""
+Sweeps: plans over grids, tables of cases and samples of parameters.
+
+A sweep is a product of axes. It is planned in blocks, so that its size is bounded by the disk
+and not by the memory, and a row that cannot be planned says why in its status.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+import hashlib
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.files import require_arrow
+from hmsa_ros.interfaces.parameters import LAW_NAME, present_name
+from hmsa_ros.interfaces.settings import FINITE, Nondimensional, Range, Setting, System
+from hmsa_ros.model.equations import Array, signed_root
+from hmsa_ros.model.laws import LAWS
+from hmsa_ros.planning.shapers import get_shaper
+from hmsa_studies.axes import parse_grid
+from hmsa_studies.chunks import LEAST_ROWS, MOST_ROWS
+from hmsa_studies.plans import by_batch, by_settings, carried_out, Plans, STATUS
+from hmsa_studies.views import Axis, View
+
+__all__ = ['parse_grid', 'ROW_BYTES', 'Rows', 'Sweep']
+
+#: Roughly: bytes of a row as Parquet.
+ROW_BYTES = 50
+# Roughly: rows a second and core of an idle machine, and rows of a chunk, least and most: by the
+# batch alone, by the batch after a block was made of each row, and one by one.
+_RATES = (400_000.0, 15_000.0, 3_000.0)
+_CHUNKS = ((LEAST_ROWS, MOST_ROWS), (5_000, 50_000), (500, 5_000))
+_LAW, _SHAPER = 'law', 'shaper'
+#: What a plan leaves when it is carried out.
+_LEFT = ('residual', 'offset')
+_STATUS = np.array([str(x) for x in STATUS])
+
+Column = Array | NDArray[np.str_]
+Places = tuple[NDArray[np.int64], ...]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows of a sweep, planned: columns of shape (n,) by name, in order."""
+
+    inputs: dict[str, Column]
+    codes: NDArray[np.int64]  #: places in `hmsa_studies.plans.STATUS`
+    results: dict[str, Array]  #: NaN where there is no such number
+
+    @property
+    def status(self) -> NDArray[np.str_]:
+        """Return the code of each row."""
+        return _STATUS[self.codes]
+
+    def to_pydict(self) -> dict[str, list[Any]]:
+        """Return the columns as lists, as a table of pyarrow does."""
+        columns = {**self.inputs, 'status': self.status, **self.results}
+        return {name: x.tolist() for name, x in columns.items()}
+
+    def arrow(self) -> Any:
+        """Return the columns as a table of pyarrow."""
+        arrow, _ = require_arrow()
+        status = arrow.DictionaryArray.from_arrays(self.codes, _STATUS.tolist())
+        return arrow.table(
+            {**self.inputs, 'status': status.cast(arrow.string()), **self.results})
+
+
+class Sweep:
+    """
+    All combinations of the cases of a table, samples, and the values of other columns.
+
+    Parameters
+    ----------
+    grids : mapping of str to array_like, shape (n,)
+        Values by column; a column of the system that is named nowhere has its default.
+    cases, samples : mapping of str to array_like, shape (m,), optional
+        Columns of tables, taken row by row. Their values may be out of range: the plan of such a
+        row says so.
+    laws, shapers : sequence of str
+        Names that are compared; they have columns if given.
+    system : System, optional
+        Units of the columns; default nondimensional.
+    residual : bool
+        Carry the plans out, and return what they leave; so do columns of the actuator.
+
+    Attributes
+    ----------
+    size : int
+        Number of rows. The cases vary slowest, then the samples, then the columns in order.
+    columns, results : tuple of str
+        Names of all columns of the table, and of those that are computed numbers.
+    rate : float
+        Roughly: rows a second and core.
+    chunk_rows : tuple of int
+        Rows of a chunk, least and most.
+
+    Raises
+    ------
+    BadInputError
+        If a column is unknown, empty, out of range or named twice, or those of a table differ in
+        length.
+
+    """
+
+    def __init__(
+            self, grids: Mapping[str, ArrayLike],
+            cases: Mapping[str, ArrayLike] | None = None, *,
+            samples: Mapping[str, ArrayLike] | None = None, laws: Sequence[str] = (),
+            shapers: Sequence[str] = (), system: System | None = None,
+            residual: bool = False) -> None:
+        self._system = system or Nondimensional()
+        ranges: dict[str, Range] = {**self._system.ranges, **self._system.actual}
+        defaults = self._system.columns
+        self._axes: list[dict[str, Column]] = [
+            _table(words, table) for words, table in (('cases', cases), ('samples', samples))
+            if table]
+        self._sampled = len(self._axes) - 1 if samples else None
+        seen = [name for axis in self._axes for name in axis] + list(grids)
+        for name in seen:
+            if name not in ranges:
+                raise BadInputError(
+                    f'column {name!r} is unknown: expected some of {", ".join(ranges)}')
+            if seen.count(name) > 1:
+                raise BadInputError(
+                    f'{name} is a column of the cases or samples and has other values: expected '
+                    'one of them')
+        self._axes += [
+            {x: _checked(x, grids[x], ranges[x]) if x in grids else np.array([defaults[x]])}
+            for x in ranges if x in grids or (x in defaults and x not in seen)]
+        for law in laws:
+            if law not in LAWS:
+                raise BadInputError(
+                    f'law {law!r} is unknown: expected one of {", ".join(LAWS)}')
+            if not any(x.startswith('law.') for x in seen):
+                # Constants that no row can have are not left to the rows.
+                self._system.setting({**defaults, LAW_NAME.name: law})
+        for shaper in shapers:
+            get_shaper(shaper)
+        self._axes += [
+            {name: np.array(words)} for name, words in ((_LAW, laws), (_SHAPER, shapers)) if words]
+        self._shape = [next(iter(axis.values())).size for axis in self._axes]
+        self.size = math.prod(self._shape)
+        if self.size == 0:
+            raise BadInputError('a column of the sweep is empty: expected at least one value')
+        given = {name for axis in self._axes for name in axis}
+        self._inputs = [x for x in (*ranges, _LAW, _SHAPER) if x in given]
+        self._carried = residual or bool(given & set(self._system.actual))
+        self.results = tuple(self._results(Plans.none(0), 1.0, 1.0))
+        self.columns = (*self._inputs, 'status', *self.results)
+        one_by_one = bool(set(shapers) - {'two_step'} or given & self._system.delivery
+                          or self._carried or not self._system.ideal)
+        self._plain = not one_by_one and given <= {*Nondimensional.columns, _SHAPER} \
+            and isinstance(self._system, Nondimensional)
+        kind = 0 if self._plain else 1 + one_by_one
+        self.rate, self.chunk_rows = _RATES[kind], _CHUNKS[kind]
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """Return the columns that are drawn unless others are named."""
+        if self._carried:
+            return _LEFT
+        return ('tau_p', 'beta_p') if self._system.roots else ('time_p', 'flux_density_p')
+
+    def view(self) -> View:
+        """Return how the sweep is drawn; raise `BadInputError` where there is no picture of it."""
+        return View.of([
+            Axis.of(axis, samples=i == self._sampled) for i, axis in enumerate(self._axes)
+            if self._shape[i] > 1])
+
+    @property
+    def fixed(self) -> dict[str, float]:
+        """Return the columns of numbers that are the same in all rows."""
+        return {
+            name: float(column[0]) for axis, size in zip(self._axes, self._shape, strict=True)
+            for name, column in axis.items() if size == 1 and column.dtype.kind == 'f'}
+
+    @cached_property
+    def digest(self) -> str:
+        """Return a hash of all inputs."""
+        made = hashlib.sha256(f'{self._system!r} {self.columns}'.encode())
+        for axis in self._axes:
+            for name, values in axis.items():
+                made.update(f'{name} {values.size} {len(axis)} '.encode())
+                made.update(
+                    '\n'.join(values.tolist()).encode() if values.dtype.kind == 'U'
+                    else np.ascontiguousarray(values, dtype='<f8').tobytes())
+        return made.hexdigest()
+
+    def rows(self, begin: int, end: int, *, workers: int = 0) -> Rows:
+        """Plan rows from one number up to another, on so many threads; 0 for one a core."""
+        places = np.unravel_index(np.arange(begin, end), self._shape)
+        values = {
+            name: column[place]
+            for axis, place in zip(self._axes, places, strict=True)
+            for name, column in axis.items()}
+        inputs: dict[str, Any] = {name: values[name] for name in self._inputs}
+        if self._plain:
+            plans = by_batch(
+                *(inputs[name] for name in Nondimensional.columns), workers=workers)
+            return Rows(inputs, plans.codes, self._results(plans, 1.0, 1.0))
+        occurring, which = self._occurring(inputs, places)
+        settings = [_setting(self._system.setting, {
+            x: y for x, y in values.items() if x not in self._system.actual})
+            for values in occurring]
+        moves = which, inputs['start'], inputs['target'], inputs.get(
+            _SHAPER, np.full(end - begin, 'two_step'))
+        left: Sequence[Array] = ()
+        if self._carried:
+            plans, *left = carried_out(
+                settings, [_setting(self._system.carried, x) for x in occurring], *moves)
+        else:
+            plans = by_settings(settings, *moves, workers=workers)
+        units: Array = np.array([
+            (1.0, 1.0) if x is None else (x.units.time, x.units.load) for x in settings])[which]
+        return Rows(inputs, plans.codes, self._results(plans, units[:, 0], units[:, 1], *left))
+
+    def _occurring(
+            self, inputs: Mapping[str, Column],
+            places: Places) -> tuple[list[dict[str, Any]], NDArray[np.int64]]:
+        """Return all values of the columns that make a block, and which are where."""
+        names = [x for x in self._inputs if x not in ('start', 'target', _SHAPER)]
+        number = np.zeros(len(inputs['start']), np.int64)
+        for axis, place, size in zip(self._axes, places, self._shape, strict=True):
+            if set(axis) & set(names):
+                # Within a block only differences count, and the product of all may be too large.
+                _, number = np.unique(number * size + place, return_inverse=True)
+        _, first, which = np.unique(number, return_index=True, return_inverse=True)
+        columns = [inputs[name][first].tolist() for name in names]
+        names = [present_name(x) for x in names]
+        return [dict(zip(names, values, strict=True))
+                for values in (zip(*columns, strict=True) if names else [()])], which
+
+    def _results(
+            self, plans: Plans, time: Array | float, load: Array | float,
+            *left: Array) -> dict[str, Array]:
+        """Return the columns of numbers, for units of time and load."""
+        first, duration, last = plans.numbers
+        more = dict(zip(_LEFT, left or (duration,) * 2, strict=True)) if self._carried else {}
+        if self._system.roots:
+            return {
+                'beta_p': first, 'b_p': signed_root(first), 'tau_p': duration,
+                'beta_1': last, 'b_1': signed_root(last), **more}
+        return {
+            'flux_density_p': first * load, 'time_p': duration * time,
+            'flux_density_1': last * load, **more}
+
+    def table(self, begin: int, end: int) -> Any:
+        """Plan rows from one number up to another on one core; return a table of pyarrow."""
+        return self.rows(begin, end, workers=1).arrow()
+
+    def blocks(self, rows: int) -> Iterator[Rows]:
+        """Plan the sweep and yield its rows in order, in blocks of so many."""
+        for begin in range(0, self.size, rows):
+            yield self.rows(begin, min(begin + rows, self.size))
+
+
+def _setting(
+        make: Callable[[Mapping[str, Any]], Setting], values: Mapping[str, Any]) -> Setting | None:
+    """Return a setting, None where values are out of range."""
+    try:
+        return make(values)
+    except BadInputError:
+        return None
+
+
+def _table(words: str, table: Mapping[str, ArrayLike]) -> dict[str, Column]:
+    """Return the columns of a table, which must have one length."""
+    found: dict[str, Column] = {
+        name: np.asarray(x, dtype=np.float64) for name, x in table.items()}
+    if len({x.size for x in found.values()}) > 1:
+        raise BadInputError(f'the columns of the {words} differ in length: expected one length')
+    return found
+
+
+def _checked(name: str, values: ArrayLike, limits: tuple[float, float]) -> Array:
+    """Return the values of a column unless no plan can have them."""
+    found = np.asarray(values, dtype=np.float64)
+    wrong = ~((found >= limits[0]) & (found <= limits[1]))
+    if np.any(wrong):
+        least = 'greater than 0' if 0.0 < limits[0] < 1e-300 else f'of at least {limits[0]:g}'
+        most = f' and at most {limits[1]:g}' if limits[1] < FINITE else ''
+        raise BadInputError(
+            f'{name} takes the value {float(found[wrong][0]):g}: expected finite numbers '
+            f'{least}{most}')
+    return found
