@@ -18,6 +18,7 @@ import yaml
 import hmsa_ros
 
 ROOT = Path(__file__).resolve().parent.parent
+SOURCES = [x for y in ('hmsa_ros', 'hmsa_studies') for x in (ROOT / y).rglob('*.py')]
 PYTHONS = ('3.10', '3.11', '3.12', '3.13')
 # Where the key of a requirement is not python3- and its name in lower case.
 # mcap, lz4 and zstandard come along with mcap-ros2-support.
@@ -87,13 +88,13 @@ def keys(requirements: list[str]) -> set[str]:
 def imported() -> set[str]:
     """Return the top-level modules that the package imports, the standard library's not."""
     modules = set()
-    for path in (ROOT / 'hmsa_ros').rglob('*.py'):
+    for path in SOURCES:
         for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
             if isinstance(node, ast.Import):
                 modules |= {alias.name.partition('.')[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module:
                 modules.add(node.module.partition('.')[0])
-    return modules - set(sys.stdlib_module_names) - {'hmsa_ros'}
+    return modules - set(sys.stdlib_module_names) - {'hmsa_ros', 'hmsa_studies'}
 
 
 def test_package_xml_and_setup_py_describe_the_same_package(setup, manifest):
@@ -151,8 +152,7 @@ def test_rclpy_and_messages_come_only_with_the_extra_for_machines_without_ros(se
 
 
 def test_every_module_of_the_package_is_installed(setup):
-    found = {'.'.join(path.parent.relative_to(ROOT).parts)
-             for path in (ROOT / 'hmsa_ros').rglob('*.py')}
+    found = {'.'.join(path.parent.relative_to(ROOT).parts) for path in SOURCES}
     assert set(setup['packages']) == found
 
 

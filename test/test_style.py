@@ -8,7 +8,7 @@ import re
 import sys
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGE = sorted((ROOT / 'hmsa_ros').rglob('*.py'))
+PACKAGE = sorted(x for y in ('hmsa_ros', 'hmsa_studies') for x in (ROOT / y).rglob('*.py'))
 TESTS = sorted((ROOT / 'test').glob('test_*.py'))
 SHORTEST_SENTENCE = 3
 # A section of its own, or a sentence that names the class.
