@@ -1,15 +1,18 @@
-"""Who commands an actuator in the study of feedback: open loop, corrections, linear control."""
+"""Who commands an actuator in the study of feedback: the controller itself, or linear control."""
 
-from dataclasses import replace
-import math
+from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from hmsa_ros.estimation import Estimate, Estimator, Options, Prior
-from hmsa_ros.estimation.correction import caution, Corrector, Course
+from hmsa_ros.control.loop import Loop
+from hmsa_ros.control.records import Settings, Target
+from hmsa_ros.device.sensor import SensorErrors
+from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
+from hmsa_ros.estimation.correction import caution
+from hmsa_ros.model.actuators import Setup
+from hmsa_ros.model.simulation import ActuatorSimulation
 from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.planning.timeline import Options as PlannerOptions
+from hmsa_ros.planning.group import PlannerGroup
+from hmsa_ros.planning.planner import Options, Planner
 from hmsa_studies.linear import Controller, Predictive, Quadratic
 
 if TYPE_CHECKING:
@@ -17,73 +20,100 @@ if TYPE_CHECKING:
 
 #: Largest load, and time in ns from a sample's arrival to the first level that depends on it.
 LARGEST, REACTION = 2.0, 300_000
+# Bias of the sensor.
+_BIAS = 1e-3
 # A move that is expected to leave more than this share of the step takes longer.
 _TOLERANCE = 3e-5
+_JOINT = 'actuator'
 _LINEAR: dict[str, type[Controller]] = {'lqr': Quadratic, 'mpc': Predictive}
 
 
-class Commander:
-    """Commands one actuator; this one plans with the nominal parameters and learns nothing."""
+class Commander(ABC):
+    """Commands one actuator of a scenario, whose G is off by a share."""
 
-    #: Whether a level follows each sample; else a course is carried out until another one.
+    #: Whether a level follows each sample; else levels are planned ahead.
     steadily = False
 
-    def __init__(self, scenario: 'Scenario', strategy: 'Strategy') -> None:
-        block = scenario.block
-        unit = block.flux_density_unit
-        self._strategy = strategy
-        self._prior = Prior.nominal(block, scenario.free)
-        self._corrector = Corrector(PlannerOptions(
-            flux_density_min=-LARGEST * unit, flux_density_max=LARGEST * unit))
+    def __init__(
+            self, scenario: 'Scenario', strategy: 'Strategy', error: float, seed: int) -> None:
+        self.scenario = scenario
+        self.target = scenario.block.rest
+        self.device = SimulatedDevice(
+            [SimulatedJoint(
+                Setup(scenario.actuator(error), scenario.block.rest,
+                      coil_time_constant=scenario.coil_time_constant),
+                errors=SensorErrors(scenario.noise, stretch_bias=_BIAS))],
+            period=round(scenario.period * NANOSECONDS),
+            measurement_delay=round(scenario.delay * NANOSECONDS), seed=seed)
+        self.planner = planner_of(scenario, strategy, REACTION)
 
-    def _first(
-            self, estimate: Estimate, target: float, course: Course,
-            tolerance: float = math.inf) -> Course:
-        return self._corrector.first(
-            estimate, target, course.holding, shaper=self._strategy.shaper,
-            order=self._strategy.order, tolerance=tolerance)
+    @property
+    @abstractmethod
+    def now(self) -> int:
+        """Time in ns."""
 
-    def move(self, time: int, target: float, course: Course) -> Course:
-        """Return the course to a target from a time in ns on, and from another course."""
-        nominal = Estimate(
-            time, course.target, 0.0, self._prior.values, self._prior.free, {},
-            np.zeros((0, 0)), 0.0, True, '')
-        return self._first(nominal, target, course)
+    @property
+    @abstractmethod
+    def levels(self) -> list[tuple[int, float]]:
+        """Levels in T by stamps in ns that are in force or planned, by time."""
 
-    def seen(self, stamp: int, stretch: float, begin: int, course: Course) -> Course | None:
-        """Take in a sample; return a better course that differs from a time in ns on, if any."""
-        return None
+    @abstractmethod
+    def move(self, target: float) -> int:
+        """Go to a stretch; return when it is to rest there, in ns."""
+
+    @abstractmethod
+    def run(self, until: int) -> None:
+        """Go on until a time in ns."""
+
+    def copy(self) -> ActuatorSimulation:
+        """Return the actuator as it is, with the levels that are planned by now."""
+        setup, now, device = self.device.setups[0], self.now, self.device
+        plant = ActuatorSimulation(
+            setup.actuator, time=now, coil_time_constant=setup.coil_time_constant)
+        plant.set_state(
+            float(device.stretch[0]), float(device.rate[0]), float(device.flux_density[0]),
+            device.level(0))
+        for stamp, level in self.levels:
+            if stamp > now:
+                plant.command(stamp, level)
+        return plant
 
 
-class _Adapting(Commander):
-    """Corrects moves and plans them with what it has learnt."""
+def planner_of(scenario: 'Scenario', strategy: 'Strategy', lead: int = 0) -> Planner:
+    """Return a planner with the nominal parameters, whose commands are sent ns ahead."""
+    block = scenario.block
+    unit = block.flux_density_unit
+    return Planner(block, Options(
+        strategy.shaper, flux_density_min=-LARGEST * unit, flux_density_max=LARGEST * unit,
+        lead_time=lead, order=strategy.order))
 
-    def __init__(self, scenario: 'Scenario', strategy: 'Strategy') -> None:
-        super().__init__(scenario, strategy)
-        self._estimator = Estimator(self._prior, Options(noise=scenario.noise))
-        self._estimator.level(0, 0.0)
-        self._moving = False
 
-    def move(self, time: int, target: float, course: Course) -> Course:
-        estimate = self._estimator.update(time)
-        self._moving = True
-        if estimate is None:
-            return super().move(time, target, course)
-        return self._taken(self._first(estimate, target, course, _TOLERANCE), time)
+class _Running(Commander):
+    """The controller as it is shipped, in open loop or with feedback."""
 
-    def seen(self, stamp: int, stretch: float, begin: int, course: Course) -> Course | None:
-        self._estimator.sample(stamp, stretch)
-        estimate = self._estimator.update(begin)
-        if estimate is None or not self._moving:
-            return None
-        found = self._corrector.correct(estimate, course)
-        return None if found is None else self._taken(found, begin)
+    def __init__(
+            self, scenario: 'Scenario', strategy: 'Strategy', error: float, seed: int) -> None:
+        super().__init__(scenario, strategy, error, seed)
+        self._loop = Loop(PlannerGroup({_JOINT: self.planner}), Settings(
+            takeover_timeout=0, feedback='adapt' if strategy.kind == 'adapt' else 'off',
+            feedback_parameters=scenario.free, feedback_cautious=True,
+            feedback_tolerance=_TOLERANCE), self.device)
 
-    def _taken(self, course: Course, begin: int) -> Course:
-        for stamp, level in course.levels:
-            if stamp >= begin:
-                self._estimator.level(stamp, level)
-        return course
+    @property
+    def now(self) -> int:
+        return self._loop.now
+
+    @property
+    def levels(self) -> list[tuple[int, float]]:
+        return [(x.stamp, x.flux_density) for x in self.planner.plan.levels]
+
+    def move(self, target: float) -> int:
+        self.target = target
+        self._loop.runtime.request(Target(_JOINT, target))
+        return self.planner.plan.segments[-1].arrival or self.now
+
+    def run(self, until: int) -> None:
+        self._loop.run(until)
 
 
 class _Steady(Commander):
@@ -91,29 +121,49 @@ class _Steady(Commander):
 
     steadily = True
 
-    def __init__(self, scenario: 'Scenario', strategy: 'Strategy') -> None:
-        super().__init__(scenario, strategy)
-        self._noise = scenario.noise
+    def __init__(
+            self, scenario: 'Scenario', strategy: 'Strategy', error: float, seed: int) -> None:
+        super().__init__(scenario, strategy, error, seed)
         self._controller = _LINEAR[strategy.kind](
-            scenario.block, LARGEST, round(scenario.period * NANOSECONDS),
+            scenario.block, LARGEST, self.device.period,
             round(scenario.delay * NANOSECONDS) + REACTION, scenario.noise,
             scenario.weights[strategy.kind])
+        self._now = 0
+        self._levels = [(0, 0.0)]
 
-    def move(self, time: int, target: float, course: Course) -> Course:
-        planned = super().move(time, target, course)
+    @property
+    def now(self) -> int:
+        return self._now
+
+    @property
+    def levels(self) -> list[tuple[int, float]]:
+        return self._levels
+
+    def move(self, target: float) -> int:
+        plan = self.planner.setpoint(target, self._now)
+        begin, arrival = plan.segments[-1].begin, plan.segments[-1].arrival or self._now
         longer = caution(
-            len(self._prior.free), self._noise / max(abs(target - course.target), 1e-9))
-        arrival = time + round(longer * (planned.arrival - time))
-        level = self._controller.move(target, planned.holding)
-        return Course(((time, level),), arrival, target)
+            len(self.scenario.free), self.scenario.noise / abs(target - self.target))
+        self.target = target
+        self._command(self._now, self._controller.move(target, plan.levels[-1].flux_density))
+        return self._now + round(longer * (arrival - begin))
 
-    def seen(self, stamp: int, stretch: float, begin: int, course: Course) -> Course | None:
-        level = self._controller.seen(stretch)
-        return None if level is None else replace(
-            course, levels=(course.levels[-1], (begin, level)))
+    def run(self, until: int) -> None:
+        while self._now < until:
+            self._now = min(until, self.device.next_sample)
+            self.device.advance(self._now)
+            for sample in self.device.samples():
+                level = self._controller.seen(float(sample.stretch[0]))
+                if level is not None:
+                    self._command(self._now + REACTION, level)
+
+    def _command(self, stamp: int, level: float) -> None:
+        self.device.receive(0, stamp, level)
+        self._levels = [*self._levels[-1:], (stamp, level)]
 
 
-def commander(scenario: 'Scenario', strategy: 'Strategy') -> Commander:
-    """Return who carries out a strategy; ``learning`` is repeated trials in open loop."""
-    kinds = {'adapt': _Adapting, 'lqr': _Steady, 'mpc': _Steady}
-    return kinds.get(strategy.kind, Commander)(scenario, strategy)
+def commander(
+        scenario: 'Scenario', strategy: 'Strategy', error: float, seed: int) -> Commander:
+    """Return who carries out a strategy."""
+    kind = _Steady if strategy.kind in _LINEAR else _Running
+    return kind(scenario, strategy, error, seed)

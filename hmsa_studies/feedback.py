@@ -2,22 +2,20 @@
 What feedback leaves of moves when the model is in error, beside open loop.
 
 The actuator is simulated with its true parameters, and measured with noise, late, by a sensor with
-an unknown bias. Whoever commands it has the nominal ones.
+an unknown bias. Whoever commands it has the nominal ones. Open loop and feedback are the
+controller that nodes run, driven in simulated time.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from heapq import heappop, heappush
-from itertools import count
 
 import numpy as np
 
-from hmsa_ros.estimation.correction import Course
 from hmsa_ros.estimation.prior import TRACKED
 from hmsa_ros.model.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.model.simulation import ActuatorSimulation
 from hmsa_ros.model.units import NANOSECONDS
-from hmsa_studies.commanders import commander, LARGEST, REACTION
+from hmsa_studies.commanders import Commander, commander, LARGEST, planner_of
 from hmsa_studies.learning import carried_out, Learner
 from hmsa_studies.linear import Weights
 
@@ -25,7 +23,6 @@ from hmsa_studies.linear import Weights
 TARGETS = (0.4, 0.1)
 # Between two samples of a camera, in units of time.
 _INTERVAL = 0.114
-_BIAS = 1e-3
 # Samples before the first move, and points of a motion that is looked at.
 _BEFORE, _LOOK, _WATCHED = 50, 120, 40
 # A cycle, and after what time nothing moves, in nominal units of time.
@@ -144,97 +141,25 @@ def settle(plant: ActuatorSimulation, end: int, target: float, before: float) ->
         (plant.stretch - target) / (target - before))
 
 
-class _Trial:
-    """One run of a strategy on one actuator."""
-
-    def __init__(
-            self, scenario: Scenario, strategy: Strategy, error: float, seed: int,
-            targets: Sequence[float]) -> None:
-        self._scenario, self._targets = scenario, targets
-        self._true = scenario.actuator(error)
-        self._commander = commander(scenario, strategy)
-        self._plant = self._new_plant(0)
-        self._random = np.random.default_rng(seed)
-        self._stretch = scenario.block.rest
-        self._course = Course(((0, 0.0),), 0, self._stretch)
-        self._events: list[tuple[int, int, str, float]] = []
-        self._number = count()
-
-    def _new_plant(self, time: int) -> ActuatorSimulation:
-        return ActuatorSimulation(
-            self._true, time=time, coil_time_constant=self._scenario.coil_time_constant)
-
-    def _at(self, time: int, what: str, value: float = 0.0) -> None:
-        heappush(self._events, (time, next(self._number), what, value))
-
-    def run(self) -> list[Left]:
-        """Return what is left after the first move, after each cycle, and after the next ones."""
-        period = round(self._scenario.period * NANOSECONDS)
-        left: list[Left] = []
-        seen: list[list[float]] = []
-        cycle = round(CYCLE * self._scenario.block.time_unit * NANOSECONDS)
-        self._at(period, 'sample')
-        self._at(_BEFORE * period, 'move', self._targets[0])
-        moves = 0
-        while self._events:
-            time, _, what, value = heappop(self._events)
-            self._plant.advance(time)
-            if what == 'sample':
-                noise = self._scenario.noise * float(self._random.standard_normal())
-                self._at(time + round(self._scenario.delay * NANOSECONDS), 'seen',
-                         self._plant.stretch + _BIAS + noise)
-                self._at(time + period, 'sample')
-            elif what == 'seen':
-                self._seen(time, value)
-            elif what == 'move':
-                self._stretch = self._course.target
-                self._take(self._commander.move(time, value, self._course), time)
-                for i in range(CYCLES if moves == 0 else 1):
-                    self._at(self._course.arrival + i * cycle, 'look')
-                moves += 1
-                if moves < len(self._targets):
-                    self._at(self._course.arrival + CYCLES * cycle, 'move',
-                             self._targets[moves])
-                else:
-                    self._at(self._course.arrival + cycle, 'end')
-            elif what == 'look':
-                left.append(self._left(time))
-                seen.append([])
-                for i in range(_WATCHED):
-                    self._at(time + cycle * i // _WATCHED, 'watch')
-            elif what == 'watch':
-                seen[-1].append(
-                    (self._plant.stretch - self._course.target)
-                    / (self._course.target - self._stretch))
-            else:
-                break
-        return [x.watched(y, steadily=self._commander.steadily)
-                for x, y in zip(left, seen, strict=True)]
-
-    def _seen(self, time: int, value: float) -> None:
-        stamp = time - round(self._scenario.delay * NANOSECONDS)
-        begin = time + REACTION
-        found = self._commander.seen(stamp, value, begin, self._course)
-        if found is not None:
-            self._take(found, begin)
-
-    def _take(self, course: Course, begin: int) -> None:
-        self._course = course
-        for stamp, level in course.levels:
-            if stamp >= begin:
-                self._plant.command(stamp, level)
-
-    def _left(self, time: int) -> Left:
-        """Carry out what is planned on a copy of the plant."""
-        plant, course = self._new_plant(time), self._course
-        before = [x for x in course.levels if x[0] <= time]
-        plant.set_state(
-            self._plant.stretch, self._plant.rate, self._plant.flux_density,
-            (before or course.levels)[-1 if before else 0][1])
-        for stamp, level in course.levels:
-            if stamp > time:
-                plant.command(stamp, level)
-        return settle(plant, max(time, course.arrival), course.target, self._stretch)
+def _moves(commanding: Commander, targets: Sequence[float]) -> Iterator[Left]:
+    """Yield what is left after the first move, after each cycle, and after the next ones."""
+    scenario = commanding.scenario
+    cycle = round(CYCLE * scenario.block.time_unit * NANOSECONDS)
+    commanding.run(_BEFORE * round(scenario.period * NANOSECONDS))
+    for number, target in enumerate(targets):
+        before = commanding.target
+        arrival = commanding.move(target)
+        for i in range(CYCLES if number == 0 else 1):
+            look = arrival + i * cycle
+            commanding.run(look)
+            left = settle(
+                commanding.copy(), max(look, commanding.levels[-1][0]), target, before)
+            seen = []
+            for k in range(_WATCHED):
+                commanding.run(look + cycle * k // _WATCHED)
+                seen.append((float(commanding.device.stretch[0]) - target) / (target - before))
+            yield left.watched(seen, steadily=commanding.steadily)
+        commanding.run(arrival + (CYCLES if number == 0 else 1) * cycle)
 
 
 def trial(
@@ -266,7 +191,7 @@ def trial(
     targets = targets or scenario.targets
     if strategy.kind == 'learning':
         return list(_learned(scenario, strategy, error, seed, targets[0]))
-    return _Trial(scenario, strategy, error, seed, targets).run()
+    return list(_moves(commander(scenario, strategy, error, seed), targets))
 
 
 def _learned(
@@ -274,10 +199,10 @@ def _learned(
         target: float) -> Iterator[Left]:
     """Yield what trials of the first move leave, each from rest with a sensor set to zero."""
     random, block = np.random.default_rng(seed), scenario.block
-    course = commander(scenario, strategy).move(
-        0, target, Course(((0, 0.0),), 0, block.rest))
+    plan = planner_of(scenario, strategy).setpoint(target, 0)
     learner = Learner(
-        block, course.levels, LARGEST * block.flux_density_unit,
+        block, tuple((x.stamp, x.flux_density) for x in plan.levels[-2:]),
+        LARGEST * block.flux_density_unit,
         round(scenario.period * NANOSECONDS))
     for _ in range(_TRIALS):
         levels = learner.levels(learner.unknowns)

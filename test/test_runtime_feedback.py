@@ -188,12 +188,13 @@ def test_a_holding_level_is_trimmed_against_a_constant_force_slowly_and_within_i
     holding = loop.runtime.group.planners['a'].model.holding(1.1) * paper_actuator(
         ).flux_density_unit
     seen = truth[truth[:, 0] > begin + 2500 * MS, 1]
-    assert np.ptp(seen) < 1e-5
+    # G is learnt on meanwhile, and with it what the level is held against.
+    assert np.ptp(seen) < 1e-4
     if not bound:
         assert found == []
         assert seen[-1] - 1.1 == pytest.approx(4e-3, abs=1e-3)
         return
-    assert 0 < len(found) <= 8
+    assert 0 < len(found) <= 10
     assert max(abs(x[1] - holding) for x in found[1::2]) < bound * 1.01
     if bound > 1e-2:
         assert abs(seen[-1] - 1.1) < 3e-4
@@ -202,7 +203,7 @@ def test_a_holding_level_is_trimmed_against_a_constant_force_slowly_and_within_i
             truth[:, 0] < found[1][0] + 30 * MS), 1]
         assert np.ptp(after) < 2e-4
     else:
-        assert len(found) == 8
+        assert len(found) >= 8
         assert 2e-3 < seen[-1] - 1.1 < 3.5e-3
 
 

@@ -26,9 +26,11 @@ from hmsa_ros.planning.timeline import Model
 
 #: What the parameter `feedback` can be.
 MODES = ('off', 'observe', 'adapt')
-# How often samples are taken into account while a joint moves and while it rests, and how often
-# the estimate is told, in ns.
-_UPDATE, _RESTING, _TELL = 20_000_000, 200_000_000, 200_000_000
+# How often samples are taken into account while a joint moves, at least and in units of its time,
+# and while it rests, and how often the estimate is told, in ns.
+_UPDATE, _OFTEN, _RESTING, _TELL = 20_000_000, 0.25, 200_000_000, 200_000_000
+# How many times as long as the last look took the next one is later, at least.
+_IDLE = 4
 # Samples of a natural period that are looked at, and how many fewer at rest.
 _DENSE, _SPARSE = 40, 10
 # Periods after the last change of level from which on a joint rests.
@@ -198,8 +200,12 @@ class Feedback:
         for name, joint in self._joints.items():
             if not joint.fresh or now < joint.next_update:
                 continue
-            joint.next_update = now + (_RESTING if self._quiet(name, joint) else _UPDATE)
+            begun = self._clock()
             joint.update(self._group.planners[name].plan, now)
+            joint.next_update = now + (
+                _RESTING if self._quiet(name, joint) else max(
+                    min(_UPDATE, round(_OFTEN * joint.unit * NANOSECONDS)),
+                    _IDLE * (self._clock() - begun)))
             if now >= joint.next_tell:
                 joint.next_tell = now + _TELL
                 self._tell(name, joint, now)

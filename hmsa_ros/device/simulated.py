@@ -75,6 +75,16 @@ class SimulatedDevice(Device):
         return [x.actuator.coordinate.name for x in self._actuators.setups]
 
     @property
+    def rate(self) -> Array:
+        """True stretch rate of each joint in 1/s."""
+        return self._actuators.rate
+
+    @property
+    def setups(self) -> tuple[Setup, ...]:
+        """What each joint consists of."""
+        return self._actuators.setups
+
+    @property
     def flux_density(self) -> Array:
         """Flux density on each joint in T."""
         return self._actuators.flux_density

@@ -2,8 +2,7 @@
 State and parameters of an actuator that is being moved, estimated from samples as they come.
 
 `Estimator` takes levels and samples, and gives the most probable state and parameters with their
-covariance. `hmsa_ros.estimation.correction` says what a plan is expected to leave under them, and
-plans what is left of a move anew. Nothing here needs ROS.
+covariance. Nothing here needs ROS.
 """
 
 from hmsa_ros.estimation.estimator import Estimate, Estimator, Options

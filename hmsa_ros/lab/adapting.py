@@ -7,13 +7,12 @@ first move.
 """
 
 from dataclasses import asdict, dataclass, replace
-import math
 from pathlib import Path
 
 import numpy as np
 
-from hmsa_ros.control.planner import PlannerRuntime
-from hmsa_ros.control.records import Send, Settings, Target
+from hmsa_ros.control.loop import Loop
+from hmsa_ros.control.records import Settings, Target
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
 from hmsa_ros.model.actuators import Setup
@@ -59,36 +58,24 @@ class SecondAct:
 def _carry_out(
         block: ActuatorParameters, feedback: str) -> tuple[Array, list[AdaptingResult]]:
     """Make the moves; return time in s with true stretch, and what is left of each."""
-    now = 0
     true = replace(block, shear_modulus=FACTOR * block.shear_modulus)
-    device = SimulatedDevice(
-        [SimulatedJoint(Setup(true), errors=_ERRORS)], period=_PERIOD, measurement_delay=_DELAY)
     planner = Planner(block, Options(
         flux_density_min=-_LIMIT, flux_density_max=_LIMIT, lead_time=_LEAD))
-    runtime = PlannerRuntime(
+    device = SimulatedDevice(
+        [SimulatedJoint(Setup(true), errors=_ERRORS)], period=_PERIOD, measurement_delay=_DELAY)
+    loop = Loop(
         PlannerGroup({_JOINT: planner}),
-        Settings(takeover_timeout=0, feedback=feedback, feedback_cautious=True),
-        clock=lambda: now, steady=lambda: now)
-    runtime.active = True
+        Settings(takeover_timeout=0, feedback=feedback, feedback_cautious=True), device)
+    loop.run(_MS)
     seen, results, before = [], [], 1.0
     for target in _TARGETS:
-        begin = now = now + _MS
-        runtime.request(Target(_JOINT, target))
-        while now < begin + _HOLD * 1e9:
-            for output in runtime.tick(now):
-                if isinstance(output, Send):
-                    device.receive(0, output.stamp, output.flux_density)
-            now += _MS
-            device.advance(now)
-            for change in device.changes():
-                runtime.applied(_JOINT, change.stamp, change.level)
-            for sample in device.samples():
-                runtime.observed(
-                    _JOINT, sample.time, float(sample.stretch[0]), math.nan, math.nan)
-            seen.append((now * 1e-9, float(device.stretch[0])))
-            if now - begin == _LEAD + _MS:
-                # As planned before anything is corrected.
-                arrival = (planner.plan.segments[-1].arrival or now) * 1e-9
+        begin = loop.now
+        loop.runtime.request(Target(_JOINT, target))
+        # As planned before anything is corrected.
+        arrival = (planner.plan.segments[-1].arrival or begin) * 1e-9
+        while loop.now < begin + _HOLD * 1e9:
+            loop.run(loop.now + _MS)
+            seen.append((loop.now * 1e-9, float(device.stretch[0])))
         track: Array = np.array(seen, dtype=np.float64)
         after = track[track[:, 0] >= arrival, 1]
         step, before = target - before, target
