@@ -76,10 +76,14 @@ class Loop:
         """Go on until a time in ns."""
         while self.now < until:
             self.serve()
-            wake = self.runtime.wake
+            wakes = [self.runtime.wake, self.runtime.group.next_command()]
+            if wakes[0] is not None and wakes[0] <= self.now:
+                # There is more to do, which may have to wait.
+                self.serve()
+                wakes = [self.now + _PATIENCE, self.runtime.group.next_command()]
             self.now = min(
                 until, max(self.device.next_sample, self.now + 1),
-                until if wake is None else wake if wake > self.now else self.now + _PATIENCE)
+                *(x for x in wakes if x is not None and x > self.now))
             self._follow()
 
     def serve(self) -> None:
