@@ -374,15 +374,22 @@ class RosSide:
         return publisher
 
     def call(self, service_type: type[Any] | str, name: str, request: Any = None) -> Any:
-        """Call a service and return its response."""
+        """Call a service once its nodes know of the client, and return its response."""
         from hmsa_ros.nodes.service_call import ServiceCall
         service_type, _ = bound(service_type)
-        client = self.node.create_client(service_type, name)
-        self.spin_until(client.service_is_ready, f'service {name}')
+        full = self.node.resolve_service_name(name)
+        before = {x: x.count_clients(full) for x in Served.views()}
         call = ServiceCall(
-            client, service_type.Request() if request is None else request, timeout=10.0)
+            self.node, service_type, name,
+            service_type.Request() if request is None else request, timeout=10.0)
+        self.spin_until(
+            lambda: call.ready and all(x.count_clients(full) > n for x, n in before.items()),
+            f'service {name}')
         response = self.spin_until(call.answer, f'the answer of {name}')
-        self.node.destroy_client(client)
+        call.close()
+        self.spin_until(
+            lambda: all(x.count_clients(full) <= n for x, n in before.items()),
+            f'the end of the client of {name}')
         return response
 
     def set_parameters(self, node: str, values: Sequence[Any]) -> Any:
@@ -468,6 +475,11 @@ class Served:
     def publishers(cls) -> list[Any]:
         """Return the publishers of all nodes that run."""
         return [x for served in cls.running for node in served.nodes for x in node.publishers]
+
+    @classmethod
+    def views(cls) -> list[Any]:
+        """Return a node of each context that runs: what it knows, all know there."""
+        return [served.nodes[0] for served in cls.running]
 
     def now(self) -> int:
         """Return the time in ns on the clock of the first node."""

@@ -123,8 +123,8 @@ class PlannerClient:
 
         # One whose node is there but does not listen yet is still starting.
         self.spin_until(lambda: found() or self._planner_starts(), failure, each)
-        state = ServiceCall(self.node.create_client(
-            GetState, f'{topics.PLANNER}/get_state'), GetState.Request())
+        state = ServiceCall(
+            self.node, GetState, f'{topics.PLANNER}/get_state', GetState.Request())
 
         def settled() -> bool:
             if found() or not self._planner_starts():
@@ -139,9 +139,9 @@ class PlannerClient:
             return False
 
         self.spin_until(
-            settled, 'the planner does not subscribe to '
-                                                           'requests', each,
+            settled, 'the planner does not subscribe to requests', each,
             max(self._timeout, _LISTENS_SECONDS))
+        state.close()
         self.spin_until(found, failure, each)
 
     def _planner_starts(self) -> bool:
@@ -319,8 +319,7 @@ class PlannerClient:
 
     def stop(self) -> bool:
         """Have the planner come to rest, signals or not; return whether it says that it rests."""
-        stop = ServiceCall(
-            endpoints.client(self.node, topics.STOP, topics.PLANNER), Trigger.Request())
+        stop = endpoints.call(self.node, topics.STOP, topics.PLANNER, Trigger.Request())
         begin = monotonic()
         answer = None
         while monotonic() - begin < _STOP_SECONDS:

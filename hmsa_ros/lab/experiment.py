@@ -27,7 +27,6 @@ from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.conversions import from_time
 from hmsa_ros.nodes.remote_parameters import RemoteParameters
-from hmsa_ros.nodes.service_call import ServiceCall
 
 Setpoints = Sequence[tuple[Sequence[float], float]]
 Tell = Callable[[str, float], None]
@@ -240,7 +239,6 @@ class _Watch:
         node = client.node
         endpoints.subscribe(node, topics.DIAGNOSTICS, self._on_diagnostics)
         endpoints.subscribe(node, topics.CLOCK_TOPIC, self._on_clock)
-        self._set_paused = endpoints.client(node, topics.SET_PAUSED, topics.PLANT)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -376,7 +374,8 @@ class _Watch:
 
     def unpause(self) -> None:
         """Let simulated time run."""
-        call = ServiceCall(self._set_paused, SetBool.Request(data=False))
+        call = endpoints.call(
+            self.client.node, topics.SET_PAUSED, topics.PLANT, SetBool.Request(data=False))
         for condition, failure in (
                 (lambda: call.ready, 'the plant offers no service to unpause it'),
                 (lambda: call.answer() is not None, 'the plant did not answer'),

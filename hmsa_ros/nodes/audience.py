@@ -38,14 +38,14 @@ class Audience:
         self._senders = senders
         self._topics = topics
         self._states = {
-            x: ServiceCall(node.create_client(GetState, f'{x}/get_state'), GetState.Request())
+            x: ServiceCall(node, GetState, f'{x}/get_state', GetState.Request())
             for x in (*nodes, *filter(None, [recorder]))}
         self._active: set[str] = set()
         self._nodes = nodes
         self._recorder = recorder
         self._selects: Selection | None = None
         self._selection = ServiceCall(
-            node.create_client(GetParameters, f'{recorder}/get_parameters'),
+            node, GetParameters, f'{recorder}/get_parameters',
             GetParameters.Request(names=Selection.parameters)) if recorder else None
 
     def missing(self) -> list[str]:

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -12,6 +11,7 @@ from rclpy.subscription import Subscription
 from hmsa_ros.interfaces.topics import from_outside, Quality, Service, Topic
 from hmsa_ros.nodes.capture import RawSubscription
 from hmsa_ros.nodes.message_types import interface_class
+from hmsa_ros.nodes.service_call import ServiceCall
 
 
 def profile(quality: Quality) -> QoSProfile:
@@ -45,7 +45,7 @@ def listen(node: Node, topic: Topic, owner: str = '') -> RawSubscription:
         node, interface_class(topic.type), from_outside(topic.name, owner), profile(topic.qos))
 
 
-def client(node: Node, service: Service, owner: str) -> Client:
-    """Return a node's client of another node's service."""
-    return node.create_client(
-        interface_class(service.type), from_outside(service.name, owner))
+def call(node: Node, service: Service, owner: str, request: Any) -> ServiceCall:
+    """Return a node's call of another node's service."""
+    return ServiceCall(
+        node, interface_class(service.type), from_outside(service.name, owner), request)

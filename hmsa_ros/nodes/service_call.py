@@ -3,45 +3,68 @@
 from time import monotonic
 from typing import Any
 
+from rclpy.node import Node
+
 
 class ServiceCall:
     """
     One request to a service, sent again while no answer comes.
 
     A server answers a client that it has just discovered before the way back is known to all: the
-    answer is lost then, and its client would wait for ever. So a request must do no harm when it
-    is carried out twice. An answer counts as lost after ``timeout`` in s; meanwhile the client's
-    node must be served.
+    answer is lost then, and its client would wait for ever; some ways back stay lost. So it is
+    sent again by a client of its own each time, and a request must do no harm when it is carried
+    out twice. An answer counts as lost after ``timeout`` in s; meanwhile the node must be served.
     """
 
-    def __init__(self, client: Any, request: Any, timeout: float = 2.0) -> None:
-        self._client = client
+    def __init__(
+            self, node: Node, service_type: type[Any], name: str, request: Any,
+            timeout: float = 2.0) -> None:
+        self._node = node
+        self._service = service_type, name
         self._request = request
         self._timeout = timeout
-        self._futures: list[Any] = []
+        self._client: Any = None
+        self._future: Any = None
         self._sent = 0.0
+        # Clients whose answer counts as lost, and their requests: it may only be late.
+        self._earlier: list[tuple[Any, Any]] = []
 
     @property
     def ready(self) -> bool:
         """Whether there is a server."""
+        if self._client is None:
+            self._client = self._node.create_client(*self._service)
         return bool(self._client.service_is_ready())
 
     def answer(self) -> Any:
         """Return the response, or None as long as there is none; send what is due."""
-        for future in self._futures:
-            if future.done() and (response := future.result()) is not None:
-                self._drop()
+        for client, future in [*self._earlier, (self._client, self._future)]:
+            if future is not None and future.done() and (response := future.result()) is not None:
+                self._earlier = [x for x in self._earlier if x[0] is not client]
+                if client is not self._client:
+                    self._earlier.append((self._client, self._future))
+                self._client, self._future = client, None
+                self._destroy_earlier()
                 return response
         if not self.ready:
             # Whoever was asked is gone: the next server is asked from the beginning.
-            self._drop()
-        elif not self._futures or monotonic() - self._sent > self._timeout:
-            self._futures.append(self._client.call_async(self._request))
+            self._future = None
+        elif self._future is None:
+            self._future = self._client.call_async(self._request)
             self._sent = monotonic()
+        elif monotonic() - self._sent > self._timeout:
+            self._earlier.append((self._client, self._future))
+            self._client = self._future = None
         return None
 
-    def _drop(self) -> None:
-        """Forget what was sent; `answer` begins anew."""
-        for future in self._futures:
-            self._client.remove_pending_request(future)
-        self._futures.clear()
+    def close(self) -> None:
+        """Destroy what the call holds; it cannot be used any more."""
+        self._earlier.append((self._client, self._future))
+        self._client = self._future = None
+        self._destroy_earlier()
+
+    def _destroy_earlier(self) -> None:
+        for client, _ in self._earlier:
+            if client is not None:
+                self._node.destroy_client(client)
+        self._earlier.clear()
