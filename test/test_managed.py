@@ -9,6 +9,7 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.interfaces.parameters import ParameterSpec
 from hmsa_ros.nodes.managed import ManagedNode
 from hmsa_ros.nodes.parameters import declare
+from hmsa_ros.nodes.service_call import ServiceCall
 
 pytestmark = pytest.mark.ros
 
@@ -104,3 +105,24 @@ def test_a_refused_transition_can_be_tried_again(ros, serve):
     assert not change(ros, Transition.TRANSITION_ACTIVATE)
     assert state(ros) == State.PRIMARY_STATE_INACTIVE
     assert not node.active
+
+
+def test_a_lost_answer_is_asked_for_again_by_a_client_of_its_own(ros, serve):
+    service = serve(Example).nodes[0]._service_get_state
+    answer = service.send_response
+    asked = []
+
+    def lose(response, header):
+        asked.append(header)
+        if len(asked) > 2:
+            answer(response, header)
+
+    service.send_response = lose
+    call = ServiceCall(ros.node, GetState, 'example/get_state', GetState.Request(), timeout=0.05)
+    assert ros.spin_until(call.answer).current_state.id == State.PRIMARY_STATE_ACTIVE
+    assert len([*ros.node.clients]) == 1 < len(asked)
+    # Asked anew, by the client that was answered.
+    assert call.answer() is None
+    assert ros.spin_until(call.answer).current_state.id == State.PRIMARY_STATE_ACTIVE
+    call.close()
+    assert not [*ros.node.clients]
