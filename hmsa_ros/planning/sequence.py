@@ -113,7 +113,6 @@ def segments(
         raise BadInputError(
             f'short_spell is {short_spell!r}: expected one of {", ".join(SHORT_SPELL)}')
     shape = first or get_shaper(shaper)
-    creeping.check(material, shaper)
     limits = limits or Limits()
     units = units or Units()
     state = start or State(material.rest)

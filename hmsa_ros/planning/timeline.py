@@ -92,7 +92,6 @@ class Model:
         }
         for name, value in worked_out.items():
             object.__setattr__(self, name, value)
-        creeping.check(self.material, options.shaper)
 
     def ns(self, time: float) -> int:
         """Return a nondimensional time in ns."""

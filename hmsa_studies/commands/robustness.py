@@ -51,8 +51,7 @@ def add_parser(subparsers: Any) -> None:
          'moves from one stretch at rest to another (default 1.0:1.1 1.0:1.4 1.0:0.7; of a beam '
          '0:0.1 0:0.4)', {'nargs': '+'}),
         ('--shapers', 'NAME,...', str,
-         'shapers, separated by commas (default all, or all that know of the creep of the '
-         'parameter file)'),
+         'shapers, separated by commas (default all)'),
         ('--errors', 'E', float,
          'largest error in the table and the box, as a share (default 0.1); the curves go to '
          'twice that', {'default': 0.1}),
@@ -84,7 +83,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> int:
     """Compare the shapers."""
-    from hmsa_ros.planning.shapers import creeping
     from hmsa_studies.executors import in_order
     from hmsa_studies.robustness import (
         candidates,
@@ -97,7 +95,7 @@ def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> 
     )
 
     model = nominal(arguments)
-    shapers = creeping.SHAPERS if model.material.creep else None
+    shapers = None
     if arguments.shapers is not None:
         shapers = tuple(name.strip() for name in arguments.shapers.split(','))
     compared = candidates(shapers, arguments.order or ORDERS)

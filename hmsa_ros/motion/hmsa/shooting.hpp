@@ -4,7 +4,7 @@
 #include "motion.hpp"
 
 namespace hmsa {
-constexpr int most_levels = 96, most_unknowns = 4;  // stretch, rate, field, and load
+constexpr int most_levels = 304, most_unknowns = 4;  // stretch, rate, field, and load
 
 struct Shot {
     int levels, unknowns;

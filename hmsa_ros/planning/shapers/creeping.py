@@ -13,36 +13,27 @@ import math
 import numpy as np
 
 from hmsa_ros import motion
-from hmsa_ros.errors import BadInputError
 from hmsa_ros.model import law
 from hmsa_ros.model.creep import Creep
-from hmsa_ros.model.delivery import IDEAL
+from hmsa_ros.model.delivery import Delivery, IDEAL, ramps
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.moves import Level, Move, State
 from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.model.simulation import follow, followed_by
+from hmsa_ros.model.simulation import follow, followed_by, RTOL, sampled
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.planning.shapers.lagged import free_heights
 from hmsa_ros.planning.shapers.request import Request
 from hmsa_ros.planning.shooting import approach, Attempt, solve, Template
 
-#: Shapers that know of creep.
-SHAPERS = ('two_step', 'robust', 'smooth', 'step')
 # The least move that counts, and how much more a staircase may leave than is worked out.
 _LEAST_MOVE, _SURE = 1e-3, 1.25
 # Levels of a staircase at the most.
 _MOST = 300
 _SHORTEST_STRIDE = 0.03
+# Codes of moves that leave vibration, even if the model is exact.
+_RINGING = (Code.LINEAR, Code.MINIMAX)
 # Time for which a target is held at the least.
 _SHORTEST = 1e-9
-
-
-def check(material: NondimensionalParameters, shaper: str) -> None:
-    """Refuse with `BadInputError` another shaper than `SHAPERS` for what creeps."""
-    if material.creep and shaper not in SHAPERS:
-        raise BadInputError(
-            f'shaper {shaper} does not know of viscoelastic.ratio: expected one of '
-            + ', '.join(SHAPERS))
 
 
 def carried(
@@ -62,8 +53,11 @@ def _product(one: Sequence[float], other: Sequence[float]) -> float:
     return sum(x * y for x, y in zip(one, other, strict=True))
 
 
-def two_levels(request: Request, plain: Move) -> Attempt:
-    """Solve for level and duration with branches, given those without them."""
+def with_branches(
+        request: Request, plain: Sequence[Level], free: Sequence[tuple[str, int]],
+        delivery: Delivery | None = None) -> Attempt:
+    """Solve for the free numbers of levels with branches, given those without them."""
+    # A free first level pushes as much harder as the branches are stiff; times shrink with it.
     material, state = request.material, request.state
     branches = material.branches.tolist()
     frequency = request.frequency
@@ -71,6 +65,8 @@ def two_levels(request: Request, plain: Move) -> Attempt:
     felt = [1.0 / (1.0 + (speed / frequency) ** 2) for _, speed in branches]
     force = float(law.elastic_force(state.stretch, material.packed))
     held = [force - x for x in followed_by(state, material)]
+    loads = {i for kind, i in free if kind == 'load'}
+    times = {i for kind, i in free if kind == 'time'}
 
     def grown(share: float) -> list[float]:
         return [(1.0 + ratio) ** share - 1.0 for ratio, _ in branches]
@@ -78,15 +74,23 @@ def two_levels(request: Request, plain: Move) -> Attempt:
     def stiffer(levels: tuple[Level, ...], share: float, aim: float) -> Attempt:
         before, after = grown(share), grown(aim)
         stiffness = (1.0 + _product(felt, after)) / (1.0 + _product(felt, before))
-        load = force + _product(after, held) + stiffness * (
-            levels[0].load - force - _product(before, held))
-        guess = (Level(0.0, load),
-                 Level(levels[1].time / math.sqrt(stiffness), levels[1].load))
+        # Ramps and grid stay as they are.
+        faster = math.sqrt(stiffness) if times else 1.0
+        guess = [Level(
+            x.time / faster, x.load if i not in loads else
+            force + _product(after, held) + stiffness * (x.load - force - _product(before, held)))
+            for i, x in enumerate(levels)]
         there = request if aim == 1.0 else replace(request, material=replace(
             material, creep=Creep(tuple(after), tuple(1.0 / x for _, x in branches))))
-        return solve(Template.of(guess, [('load', 0), ('time', 1)]), there, IDEAL)
+        found = solve(Template.of(guess, free), there, delivery)
+        return found and (found[0][:len(plain)], found[1]) if aim < 1.0 else found
 
-    return approach(plain.levels, stiffer, _SHORTEST_STRIDE)
+    return approach(tuple(plain), stiffer, _SHORTEST_STRIDE)
+
+
+def two_levels(request: Request, plain: Move) -> Attempt:
+    """Solve for level and duration with branches, given those without them."""
+    return with_branches(request, plain.levels, [('load', 0), ('time', 1)], IDEAL)
 
 
 def free_levels(request: Request) -> Move:
@@ -144,6 +148,10 @@ def held(request: Request, found: Move, span: float) -> Move:
         begins = np.rint(begins / delivery.resolution) * delivery.resolution
     tail = tuple(map(Level, begins.tolist(), loads.tolist()))
     request.check(tail)
+    if found.code in _RINGING:
+        moved = replace(found, levels=levels + tail, tail=_passed(
+            request, levels + tail, begins))
+        return replace(moved, vibration=_SURE * (vibration + more))
     followed = holding - (holding - np.array(end.followed)) * np.exp(
         -np.outer(times - late, speeds))
     field, amplifiers = before, [None] * count
@@ -155,6 +163,24 @@ def held(request: Request, found: Move, span: float) -> Move:
         field.tolist(), amplifiers, map(tuple, followed.tolist()))
     return replace(
         found, levels=levels + tail, tail=tuple(states), vibration=_SURE * (vibration + more))
+
+
+def _passed(
+        request: Request, levels: Sequence[Level], times: Array) -> tuple[State, ...]:
+    """Return the states at times at which levels begin, where the block is not at rest."""
+    delivery = request.delivery
+    rows, _ = ramps(levels, request.load, float(times[-1]), delivery.slew)
+    switches, loads, slopes = np.array(rows).T.copy()
+    outputs = np.interp(times, switches, loads) if delivery.slew < math.inf else np.array(
+        [request.load, *(x.load for x in levels)])[len(levels) - len(times):-1]
+    found = sampled(
+        switches, loads, slopes, times, replace(request.state, load=request.field),
+        request.material, RTOL, delivery.lag)
+    lags = delivery.lag > 0.0
+    return tuple(
+        State(stretch, rate, field if lags else output, output if lags else None, tuple(followed))
+        for output, (stretch, rate, field, *followed) in zip(
+            outputs.tolist(), found.T.tolist(), strict=True))
 
 
 def _ramped(

@@ -8,7 +8,7 @@ through ramps and at any time two heights and a time.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import pairwise, product
 import math
 
 from hmsa_ros.model import law
@@ -17,7 +17,7 @@ from hmsa_ros.model.moves import Level, Limits, Move
 from hmsa_ros.model.simulation import followed_by
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.planning.shapers.request import Request
-from hmsa_ros.planning.shooting import approach, Attempt, first_kept, on_time, solve, Template
+from hmsa_ros.planning.shooting import approach, Attempt, first_kept, solve, Template
 
 # Lengths of the settling push to try, in time constants of the lag. The first one passes the
 # holding level by as much as the level before falls short of it; shorter ones would save at most
@@ -195,13 +195,13 @@ def push_brake_push(
             Template.of(guess, [('time', 1), ('time', 2), ('time', 3)]), request,
             replace(delivery, lag=lag))
 
-    found = approach(plain, closer, _SHORTEST_STRIDE)
-    if found is None:
-        return None
-    times = [x.time for x in found[0]]
-    if any(late <= early for early, late in zip(times, times[1:], strict=False)):
-        return None
-    return on_time(found, 3, request)
+    return in_order(approach(plain, closer, _SHORTEST_STRIDE))
+
+
+def in_order(found: Attempt) -> Attempt:
+    """Return a command unless a level of it begins before the one before has."""
+    ordered = found and all(x.time < y.time for x, y in pairwise(found[0]))
+    return found if ordered else None
 
 
 def fastest_on_grid(request: Request, loads: tuple[float, float]) -> Attempt:

@@ -6,8 +6,9 @@ Here the nominal case is one of many: in the time of the chain, some levels of e
 chosen such that the largest vibration of all cases is as small as it can be (for linear
 oscillators: extra-insensitive shapers, W. E. Singhose, W. P. Seering, N. C. Singer, J. Mech. Des.
 116, 1994). The vibration that a case leaves is a vector, stretch and rate in units of its
-amplitude. Each pass takes it linear in the levels, and finds the least of the largest length by
-projected Newton steps on norms of growing power.
+amplitude: what of the state is in the oscillating mode of the motion about where it comes to rest,
+not in what branches creep. Each pass takes it linear in the levels, and finds the least of the
+largest length within bounds of the levels and of what ramps reach.
 """
 
 from collections.abc import Sequence
@@ -24,8 +25,10 @@ from hmsa_ros.model.delivery import late, ramps
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.mismatch import Ellipsoid, Errors
 from hmsa_ros.model.moves import Level, Move, State
+from hmsa_ros.model.simulation import followed_by
 from hmsa_ros.model.status import Code
-from hmsa_ros.planning.shapers.creeping import check
+from hmsa_ros.planning.shapers.creeping import arrival
+from hmsa_ros.planning.shapers.modes import oscillation
 from hmsa_ros.planning.shapers.request import as_errors, LARGEST_ERROR, Request
 from hmsa_ros.planning.shapers.robust import robust
 
@@ -36,19 +39,26 @@ _RTOL = 1e-9
 # Of the range of the levels: the change by which the vibration is differentiated, and the widest
 # change of a first pass.
 _CHANGE, _STRIDE = 1e-5, 0.3
-_PASSES = 12
+_PASSES = 24
 # Of the range of the levels.
 _MARGIN = 1e-3
+# Of the stride: bounds that are met are this far away, to begin inside of them.
+_LEAST_ROOM = 1e-3
 # Vibration that is rounding.
 _NOTHING = 1e-8
 # A pass that gains a smaller share is the last one.
-_GAIN = 0.003
-_POWERS = (4, 32, 128)
-_NEWTON_PASSES = 8
-_LEAST_SHARE = 1e-3
+_GAIN = 0.002
+# How the stride grows and shrinks; a step that gains a smaller share of what it should is tried
+# anew so often, and then shrinks it.
+_GROWN, _SHRUNK, _POOR, _CORRECTED = 2.0, 0.4, 0.3, 3
+# Of the interior point: length to begin with, how near to the least to come, the Newton decrement
+# from which on steps are whole, how fast the path goes to its end, and steps.
+_BEGIN, _NEAR, _STEEP, _CLOSER, _NEWTON_PASSES = 1.5, 1e-3, 0.3, 0.05, 60
 # Lengths of the push that settles a lagging field, in time constants, and how well it does.
 _PUSHES = (0.7, 1.0, 1.5, 2.2, 3.2, 4.6, 7.0)
 _SETTLED, _SECANTS = 1e-12, 8
+# Passes in which the last levels meet what branches hold at arrival, and how nearly.
+_CARRIED, _BALANCED = 6, 1e-8
 # Shorter than this share of the chain there is no use in it.
 _SHORTEST = 0.4
 # As a share of the move: from nearer to rest it is planned as from rest, and kept.
@@ -66,7 +76,6 @@ def minimax(request: Request) -> Move:
     the chain, it is what `robust` answers.
     """
     as_errors(request.errors)
-    check(request.material, 'minimax')
     state, packed = request.state, request.material.packed
     span = abs(request.target - state.stretch)
     held = float(law.elastic_force(state.stretch, packed))
@@ -96,10 +105,12 @@ class _Case:
     faster: float
     stretch: float
     rate: float
+    branches: Array  #: (n, 3), with what they follow at the start
     rest: float
-    decay: float
-    frequency: float
-    scale: float
+    force: float  #: that holds it
+    stiffness: float
+    mode: Array  #: (2, 2 + n), the vibration of a state about rest
+    tail: Array  #: (2, n), of levels that follow forces of the model's branches
 
 
 def _cases(request: Request, holding: float) -> list[_Case]:
@@ -122,24 +133,25 @@ def _case(request: Request, holding: float, errors: Errors) -> _Case | None:
     """Return an actuator in error, None if it does not oscillate about where it would rest."""
     state, nominal = request.state, request.material.packed
     stiffer, faster = errors.stiffer, errors.faster
-    packed = errors.actual(request.material).packed
+    material = errors.actual(request.material)
+    packed = material.packed
     rest = law.equilibrium_stretch(holding / stiffer, packed)
     # What the field in force holds is off by as much as its stretch.
     shift = law.equilibrium_stretch(request.field / stiffer, packed) - law.equilibrium_stretch(
         request.field, nominal)
-    ratio = packed[law.ZETA] / law.critical_zeta(rest, packed)
     stretch = state.stretch + shift
-    if not (ratio < 1.0 and packed[law.LOWER] < stretch < packed[law.UPPER]):
+    if not packed[law.LOWER] < stretch < packed[law.UPPER]:
         return None
-    root = math.sqrt(1.0 - ratio * ratio)
-    frequency = law.natural_frequency(rest, packed)
-    peaks = 1.0 + math.exp(-math.pi * ratio / root)
+    found = oscillation(material, rest)
+    if found is None:
+        return None
+    root, mode, tail = found
+    peaks = (1.0 + math.exp(math.pi * root.real / root.imag)) / abs(request.target - state.stretch)
     return _Case(
-        packed, stiffer, faster, stretch, state.rate / faster, rest, ratio * frequency,
-        root * frequency, peaks / abs(request.target - state.stretch))
-
-
-_NO_BRANCHES = np.empty((0, 3))
+        packed, stiffer, faster, stretch, state.rate / faster, np.column_stack([
+            material.branches, np.array(followed_by(state, request.material)) / stiffer]),
+        rest, law.elastic_force(rest, packed), law.elastic_stiffness(rest, packed), peaks * mode,
+        peaks / stiffer * tail)
 
 
 def left(
@@ -151,17 +163,24 @@ def left(
     faster, stiffer = np.array([(x.faster, x.stiffer) for x in cases]).T[:, :, np.newaxis]
     switches, loads, slopes = np.array(rows).T
     found = np.empty((len(cases), 2))
-    out = np.empty((3, 1))
+    ratios = request.material.branches[:, 0]
+    out = np.empty((3 + len(ratios), 1))
+    held: Array | float = 0.0
     for row, x, end, begins, heights, rises in zip(
             found, cases, arrival * faster, switches * faster, loads / stiffer,
             slopes / (stiffer * faster), strict=True):
         if not motion.sample(
                 x.stretch, x.rate, request.field / x.stiffer, begins, heights, rises,
-                delivery.lag * x.faster, end, x.packed, _NO_BRANCHES, _RTOL, out):
+                delivery.lag * x.faster, end, x.packed, x.branches, _RTOL, out):
             row[:] = math.inf
             continue
-        away = out[0, 0] - x.rest
-        row[:] = x.scale * away, x.scale * (out[1, 0] + x.decay * away) / x.frequency
+        followed = out[3:, 0]
+        if len(ratios) and x is cases[0]:
+            # What the levels afterwards follow is that of the model, which is the first.
+            held = ratios * (x.force - followed)
+        row[:] = x.mode[:, 0] * (out[0, 0] - x.rest) + x.mode[:, 1] * out[1, 0]
+        if len(ratios):
+            row += x.mode[:, 2:] @ ((followed - x.force) / x.stiffness) - x.tail @ held
     return found
 
 
@@ -174,7 +193,9 @@ def _designed(request: Request) -> Move:
     chain = robust(request)
     if chain.code not in (Code.ROBUST, Code.TWO_STEP):
         return chain
-    cases = _cases(request, chain.levels[-1].load)
+    cases = _cases(request, request.holding_load())
+    if not cases:
+        return chain
     before = largest(left(request, cases, chain.levels, chain.duration))
     found: tuple[tuple[Level, ...], float] = ((), math.inf)
     for length in _PUSHES if request.delivery.lag > 0.0 else (0.0,):
@@ -197,6 +218,7 @@ class _Frame:
     last: float  #: time of the level that holds the target
     low: Array
     high: Array
+    room: Array  #: from a level to the next one, as far as ramps reach
 
 
 def _frame(request: Request, chain: Move, length: float) -> _Frame | None:
@@ -229,11 +251,16 @@ def _frame(request: Request, chain: Move, length: float) -> _Frame | None:
     # A level in between must not look like one that holds start or target.
     margin = _MARGIN * (high - low)
     least, most = np.full(len(times) - 1, low + margin), np.full(len(times) - 1, high - margin)
+    # Less than ramps reach by what levels are changed to differentiate by them.
+    room = delivery.slew * np.diff(times) - 4.0 * _CHANGE * (high - low)
     if delivery.slew < math.inf:
         # So that the last ramp ends in time.
-        reach = delivery.slew * (chain.duration - np.array(times[1:]))
+        reach = delivery.slew * (chain.duration - times[-1]) + np.append(
+            np.cumsum(room[:0:-1])[::-1], 0.0)
         least, most = np.maximum(least, holding - reach), np.minimum(most, holding + reach)
-    return _Frame(times, last, least, most)
+        if not np.all(room > 0.0):
+            return None
+    return _Frame(times, last, least, most, room)
 
 
 def _search(
@@ -243,62 +270,110 @@ def _search(
     low, high = frame.low, frame.high
     span = float(np.max(high - low))
 
+    command: tuple[Level, ...] = ()
+
     def vibration(loads: Array) -> Array:
-        levels = _command(request, chain, frame, loads)
+        levels = _command(request, chain, frame, loads, command)
         return left(request, cases, levels, chain.duration) if levels else np.full(
             (len(cases), 2), math.inf)
 
-    starts = [_reached(request, frame, np.clip(x, low, high)) for x in _starts(
-        request, chain, frame.times)]
+    starts = [_reached(request, frame, x) for x in _starts(request, chain, frame)]
     now, loads = min(((vibration(x), x) for x in starts), key=lambda x: largest(x[0]))
     stride, change = _STRIDE * span, _CHANGE * span
-    room = request.delivery.slew * np.diff(frame.times)
+    differences = np.eye(len(loads))
+    if request.delivery.slew < math.inf:
+        differences = np.vstack([differences, differences - np.eye(len(loads), k=-1)])
     slopes = np.empty((*now.shape, len(loads)))
     renew = True
     for _ in range(_PASSES):
         if not _NOTHING < largest(now) < math.inf:
             break
         if renew:
-            # A level that a ramp just reaches has an effect to one side alone.
-            way = loads - np.array([request.load, *loads[:-1]])
             for i in range(len(loads)):
-                nudged, by = loads.copy(), math.copysign(change, -way[i])
-                nudged[i] += by
-                slopes[:, :, i] = (vibration(nudged) - now) / by
+                nudged = loads.copy()
+                nudged[i] += change
+                slopes[:, :, i] = (vibration(nudged) - now) / change
             if not np.all(np.isfinite(slopes)):
                 break
-            full = np.abs(way) >= (1.0 - 1e-9) * room
-        step = least_largest(
-            now, slopes, np.maximum(np.where(full & (way < 0.0), 0.0, low - loads), -stride),
-            np.minimum(np.where(full & (way > 0.0), 0.0, high - loads), stride))
-        if largest(now + slopes @ step) > (1.0 - _GAIN) * largest(now):
+        up, down = (np.minimum(x, stride) for x in (high - loads, loads - low))
+        if request.delivery.slew < math.inf:
+            way = np.diff(loads, prepend=request.load)
+            up, down = np.append(up, frame.room - way), np.append(down, frame.room + way)
+        rows = np.vstack([differences, -differences])
+        room = np.maximum(np.append(up, down), _LEAST_ROOM * stride)
+        step = least_largest(now, slopes, rows, room)
+        before = largest(now)
+        expected = before - largest(now + slopes @ step)
+        if not expected > _GAIN * before:
             break
-        there = _reached(request, frame, loads + step)
-        new = vibration(there)
-        renew = largest(new) < largest(now)
+        for _ in range(_CORRECTED):
+            there = _reached(request, frame, loads + step)
+            new = vibration(there)
+            gain = before - largest(new)
+            if gain > _POOR * expected or not largest(new) < math.inf:
+                break
+            # What is curved shows there: the same from what was found.
+            step = least_largest(new - slopes @ (there - loads), slopes, rows, room)
+        renew = gain > 0.0
         if renew:
-            loads, now = there, new
-        stride *= 1.5 if renew else 0.3
-    return _command(request, chain, frame, loads), largest(now)
+            loads, now, command = there, new, _command(request, chain, frame, there, command)
+        stride *= _GROWN if gain > _POOR * expected else _SHRUNK
+    return command or _command(request, chain, frame, loads), largest(now)
 
 
 def _reached(request: Request, frame: _Frame, loads: Array) -> Array:
-    """Return the loads that ramps reach, which make the same motion."""
-    slew = request.delivery.slew
-    if math.isinf(slew):
+    """Return the loads inside the bounds that ramps reach."""
+    loads = np.clip(loads, frame.low, frame.high)
+    if math.isinf(request.delivery.slew):
         return loads
     found, load = [], request.load
-    for level, span in zip(loads.tolist(), np.diff(frame.times).tolist(), strict=True):
-        load = min(max(level, load - slew * span), load + slew * span)
+    for level, room in zip(loads.tolist(), frame.room.tolist(), strict=True):
+        load = min(max(level, load - room), load + room)
         found.append(load)
     return np.array(found)
 
 
-def _command(request: Request, chain: Move, frame: _Frame, loads: Array) -> tuple[Level, ...]:
-    """Return levels, the push that settles a lagging field, if one does, and the last level."""
-    last = Level(frame.last, chain.levels[-1].load)
+def _command(
+        request: Request, chain: Move, frame: _Frame, loads: Array,
+        like: Sequence[Level] = ()) -> tuple[Level, ...]:
+    """
+    Return levels, the push that settles a lagging field, if one does, and the last level.
+
+    Branches hold at arrival about what they do after the levels ``like``, by default the chain's.
+    """
     levels = [Level(*x) for x in zip(frame.times, loads.tolist(), strict=False)]
+    holding = chain.levels[-1].load
+    if not request.material.creep or frame.last == chain.duration:
+        return _settled(request, chain, frame, levels, holding, holding)
+    # Field and amplifier meet what the branches hold, which hardly depends on how they do.
+    wanted, last = _balance(request, chain, like or chain.levels)
+    for _ in range(_CARRIED):
+        found = _settled(request, chain, frame, levels, wanted, last)
+        if not found:
+            break
+        before = wanted
+        wanted, last = _balance(request, chain, found)
+        if abs(wanted - before) <= _BALANCED * (1.0 + abs(wanted)):
+            break
+    return found
+
+
+def _balance(request: Request, chain: Move, levels: Sequence[Level]) -> tuple[float, float]:
+    """Return what field and amplifier are at arrival, from when on they follow the branches."""
+    ratios, speeds = request.material.branches.T
+    followed = arrival(request, replace(chain, levels=tuple(levels))).followed
+    holding = request.holding_load()
+    held = ratios * (holding - np.array(followed))
+    return holding + float(held.sum()), holding + float(
+        held @ (1.0 - request.delivery.lag * speeds))
+
+
+def _settled(
+        request: Request, chain: Move, frame: _Frame, levels: Sequence[Level], wanted: float,
+        load: float) -> tuple[Level, ...]:
+    """Return levels, the push after which the field is as wanted, and the last level."""
     delivery = request.delivery
+    last = Level(frame.last, load)
     if delivery.lag == 0.0:
         return (*levels, last)
 
@@ -306,9 +381,9 @@ def _command(request: Request, chain: Move, frame: _Frame, loads: Array) -> tupl
         rows, _ = ramps(
             [*levels, Level(frame.times[-1], push), last], request.load, chain.duration,
             delivery.slew)
-        return late(rows, chain.duration, request.field, delivery.lag) - last.load
+        return late(rows, chain.duration, request.field, delivery.lag) - wanted
 
-    push, now = last.load, off(last.load)
+    push, now = load, off(load)
     slope = off(push + 1.0) - now
     for _ in range(_SECANTS):
         if not abs(now) > _SETTLED:
@@ -319,13 +394,13 @@ def _command(request: Request, chain: Move, frame: _Frame, loads: Array) -> tupl
         then, now = now, off(push)
         slope = (now - then) / (push - before)
     kept = request.limits.minimum <= push <= request.limits.maximum and delivery.ramp(
-        push - last.load) <= chain.duration - last.time
+        push - load) <= chain.duration - last.time
     return (*levels, Level(frame.times[-1], push), last) if kept and abs(now) < _NOTHING else ()
 
 
-def _starts(request: Request, chain: Move, times: Sequence[float]) -> list[Array]:
+def _starts(request: Request, chain: Move, frame: _Frame) -> list[Array]:
     """Return the mean levels of a chain between times, and what its ramps reach at their ends."""
-    ends = [*(x.time for x in chain.levels[1:]), math.inf]
+    times, ends = frame.times, [*(x.time for x in chain.levels[1:]), math.inf]
     found: list[Array] = [np.array([
         sum(level.load * max(0.0, min(end, until) - max(level.time, begin))
             for level, end in zip(chain.levels, ends, strict=True)) / (until - begin)
@@ -334,64 +409,46 @@ def _starts(request: Request, chain: Move, times: Sequence[float]) -> list[Array
         rows, _ = ramps(chain.levels, request.load, chain.duration, request.delivery.slew)
         switches, loads, _ = zip(*rows, strict=True)
         found.append(np.interp(times[1:], switches, loads))
+        found.append(0.5 * (frame.low + frame.high))
     return found
 
 
-def least_largest(now: Array, slopes: Array, low: Array, high: Array) -> Array:
+def least_largest(now: Array, slopes: Array, rows: Array, room: Array) -> Array:
     """
-    Return what makes the longest of some vectors shortest, to a percent or so of the least.
+    Return what makes the longest of some vectors shortest, to a thousandth or so of the least.
 
-    Vectors are ``now`` (n, 2) at 0, with derivatives ``slopes`` (n, 2, m); the result (m,) is
-    between the bounds ``low`` and ``high`` around 0.
+    Vectors are ``now`` (n, 2) at 0, with derivatives ``slopes`` (n, 2, m). The result (m,) keeps
+    ``rows @ x`` (k, m) below ``room`` (k,), of which all are above 0.
     """
-    x: Array = np.zeros(len(low))
-    best, least, vectors = x, largest(now), now
-    rows = slopes.reshape(-1, len(x))
-    for power in _POWERS:
-        for _ in range(_NEWTON_PASSES):
-            length = np.sqrt((vectors * vectors).sum(axis=1)) + 1e-300
-            weight = (length / length.max()) ** (power - 2)
-            along = (slopes * (vectors / length[:, np.newaxis])[:, :, np.newaxis]).sum(axis=1)
-            curvature = (rows.T * weight.repeat(2)) @ rows + (
-                power - 2) * (along.T * weight) @ along
-            curvature.flat[::len(x) + 1] += 1e-10 * curvature.trace() + 1e-30
-            step = _newton((weight * length) @ along, curvature, low - x, high - x)
-            share = _share(vectors, (rows @ step).reshape(now.shape), power, length)
-            if share == 0.0:
+    # An interior point: Newton on length/path - sum ln(length^2 - |vector|^2) - sum ln(room left),
+    # shortened as self-concordance asks (S. Boyd, L. Vandenberghe, Convex Optimization, 2004).
+    count = slopes.shape[2]
+    size = largest(now)
+    x: Array = np.zeros(count)
+    length, path = _BEGIN * size, size
+    least = _NEAR * size / (2 * len(now) + len(room))
+    flat = slopes.reshape(-1, count)
+    hessian = np.empty((count + 1, count + 1))
+    gradient = np.empty(count + 1)
+    for _ in range(_NEWTON_PASSES):
+        vectors = now + slopes @ x
+        inside = 1.0 / (length * length - (vectors * vectors).sum(axis=1))
+        along = (slopes * (vectors * inside[:, np.newaxis])[:, :, np.newaxis]).sum(axis=1)
+        kept = 1.0 / (room - rows @ x)
+        near = rows * kept[:, np.newaxis]
+        gradient[:-1] = 2.0 * along.sum(axis=0) + near.sum(axis=0)
+        gradient[-1] = 1.0 / path - 2.0 * length * inside.sum()
+        hessian[:-1, :-1] = (
+            2.0 * (flat.T * inside.repeat(2)) @ flat + 4.0 * along.T @ along + near.T @ near)
+        hessian[-1, :-1] = hessian[:-1, -1] = -4.0 * length * (inside @ along)
+        hessian[-1, -1] = (4.0 * length * length * inside * inside - 2.0 * inside).sum()
+        step = -np.linalg.solve(hessian, gradient)
+        steep = math.sqrt(max(-float(gradient @ step), 0.0))
+        share = 1.0 if steep < _STEEP else 1.0 / (1.0 + steep)
+        x = x + share * step[:-1]
+        length += share * step[-1]
+        if steep < _STEEP:
+            if path <= least:
                 break
-            x = x + share * step
-            vectors = now + slopes @ x
-        worst = largest(vectors)
-        if worst < least:
-            best, least = x, worst
-    return best
-
-
-def _newton(gradient: Array, curvature: Array, low: Array, high: Array) -> Array:
-    """Return the Newton step that keeps within bounds."""
-    free = ~((low >= 0.0) & (gradient > 0.0) | (high <= 0.0) & (gradient < 0.0))
-    step = np.zeros(len(gradient))
-    while free.any():
-        step[free] = 0.0
-        rest = gradient + curvature @ step
-        step[free] = -np.linalg.solve(curvature[free][:, free], rest[free])
-        beyond = free & ((step < low) | (step > high))
-        if not beyond.any():
-            break
-        step[beyond] = np.clip(step, low, high)[beyond]
-        free &= ~beyond
-    return step
-
-
-def _share(vectors: Array, change: Array, power: int, length: Array) -> float:
-    """Return the share of a step with which the norm is less; 0 for none."""
-    top = length.max()
-    before = ((length / top) ** power).sum()
-    share = 1.0
-    while share > _LEAST_SHARE:
-        new = vectors + share * change
-        if (((new * new).sum(axis=1) / top ** 2) ** (power // 2)).sum() < (
-                1.0 - 1e-4 * share) * before:
-            return share
-        share *= 0.5
-    return 0.0
+            path = max(_CLOSER * path, least)
+    return x

@@ -5,7 +5,6 @@ import math
 
 from hmsa_ros.model.moves import Move
 from hmsa_ros.model.status import Code, RefusedError
-from hmsa_ros.planning.shapers.creeping import check
 from hmsa_ros.planning.shapers.push_brake import push_brake
 from hmsa_ros.planning.shapers.request import Request
 from hmsa_ros.planning.shapers.two_step import two_step
@@ -19,7 +18,6 @@ def minimum_time(request: Request) -> Move:
     rest, or the only one within the limits: it is used then, and the move's reason says so. Where
     neither is found: `RefusedError`.
     """
-    check(request.material, 'minimum_time')
     found: list[Move] = []
     refusals: list[RefusedError] = []
     for shaper in (push_brake, two_step):

@@ -12,9 +12,11 @@ from hmsa_ros.model import law
 from hmsa_ros.model.moves import Level, Move, State
 from hmsa_ros.model.simulation import sampled
 from hmsa_ros.model.status import Code, RefusedError
+from hmsa_ros.planning.shapers.creeping import with_branches
 from hmsa_ros.planning.shapers.lagged import (
     at_rest,
     fastest_on_grid,
+    in_order,
     push_brake_push,
     three_levels,
 )
@@ -73,14 +75,16 @@ def _late(request: Request, holding: float, reason: str) -> Move:
             return Move(Code.MINIMUM_TIME, *found, reason)
         return three_levels(request, Code.MINIMUM_TIME, reason)
     least, most = _bounds(request, holding)
+    elastic = replace(request, material=request.material.elastic)
     for share in _SHARES:
         low, high = holding + share * (least - holding), holding + share * (most - holding)
         direction = _direction(request, low, high)
         push, brake = (high, low) if direction > 0.0 else (low, high)
         with contextlib.suppress(RefusedError):
-            plain = _attempt(replace(request, delivery=replace(
+            found = _attempt(replace(elastic, delivery=replace(
                 request.delivery, lag=0.0, resolution=0.0)), holding, low, high)
-            found = plain and push_brake_push(request, plain[0], push, brake)
+            found = found and push_brake_push(elastic, found[0], push, brake)
+            found = in_order(_carried(request, found, 3))
             if found is not None and request.keeps(found[0]):
                 return Move(Code.MINIMUM_TIME, *found, reason)
     return three_levels(request, Code.MINIMUM_TIME, reason)
@@ -92,7 +96,8 @@ def _attempt(
     """Push and brake with given loads; None if no command comes of it."""
     direction = _direction(request, least, most)
     push, brake = (most, least) if direction > 0.0 else (least, most)
-    pushing, braking = _durations(request, direction, push, brake)
+    elastic = replace(request, material=request.material.elastic)
+    pushing, braking = _durations(elastic, direction, push, brake)
     if request.delivery.period > 0.0:
         return _on_grid(request, holding, (push, pushing), (brake, braking))
     delivery = request.delivery
@@ -100,7 +105,16 @@ def _attempt(
     down = delivery.ramp(push - brake)
     levels = (Level(0.0, push), Level(max(pushing, up), brake),
               Level(max(pushing, up) + max(braking, down), holding))
-    return on_time(solve(Template.of(levels, [('time', 1), ('time', 2)]), request), 2, request)
+    return _carried(request, solve(
+        Template.of(levels, [('time', 1), ('time', 2)]), elastic), 2)
+
+
+def _carried(request: Request, found: Attempt, switches: int) -> Attempt:
+    """Have the switches of levels be those with branches, at times that commands can carry."""
+    if found is not None and request.material.creep:
+        found = with_branches(
+            request, found[0], [('time', 1 + i) for i in range(switches)])
+    return on_time(found, switches, request)
 
 
 def _on_grid(

@@ -20,6 +20,9 @@ from hmsa_ros.planning.shapers.creeping import arrival
 from hmsa_ros.planning.shapers.request import Request
 from hmsa_ros.planning.shapers.two_step import two_step
 
+# Of times, as a share.
+_ROUNDING = 1e-12
+
 
 def robust(request: Request) -> Move:
     """
@@ -70,7 +73,7 @@ def _chain(request: Request, waypoints: list[float]) -> Move:
             begin = math.ceil(begin / request.delivery.period - 1e-9) * request.delivery.period
         levels += [Level(begin + x.time, x.load) for x in move.levels]
         begin += move.duration
-        if begin == levels[-1].time:
+        if levels[-1].time >= (1.0 - _ROUNDING) * begin:
             # No ramp to finish: the next command takes over at once.
             levels.pop()
         if request.material.creep:

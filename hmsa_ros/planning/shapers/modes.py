@@ -1,0 +1,52 @@
+"""The motion linearised about rest: its oscillating mode, with branches that creep."""
+
+import math
+
+import numpy as np
+
+from hmsa_ros.model import law
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.parameters import NondimensionalParameters
+
+
+def oscillation(
+        material: NondimensionalParameters,
+        stretch: float) -> tuple[complex, Array, Array] | None:
+    """
+    Return the mode that oscillates about rest at a stretch; None if none does.
+
+    First its root, -decay + i frequency. Then the rows (2, 2 + n) that make a vector of a state:
+    deviation of the stretch, rate, and what n branches follow, less the force at rest, over the
+    stiffness. The vector is as long as the amplitude of the stretch. Last the vector (2, n) of a
+    state that rests under 1 of load that decays as each branch does.
+    """
+    packed, branches = material.packed, material.branches
+    mass = law.mass(stretch, packed)
+    damped = law.damping(stretch, packed) / mass
+    squared = law.elastic_stiffness(stretch, packed) / mass
+    if not len(branches):
+        gap = squared - 0.25 * damped * damped
+        if not gap > 0.0:
+            return None
+        frequency = math.sqrt(gap)
+        rows = np.array([[1.0, 0.0], [0.5 * damped / frequency, 1.0 / frequency]])
+        return complex(-0.5 * damped, frequency), rows, np.empty((2, 0))
+    ratios, speeds = branches.T
+    count = 2 + len(branches)
+    matrix = np.zeros((count, count))
+    matrix[0, 1] = 1.0
+    matrix[1] = np.concatenate([[-squared * (1.0 + ratios.sum()), -damped], squared * ratios])
+    matrix[2:, 0] = speeds
+    matrix[2:, 2:] = -np.diag(speeds)
+    roots, modes = np.linalg.eig(matrix)
+    place = int(np.argmax(roots.imag))
+    root = complex(roots[place])
+    if not root.imag > 0.0:
+        return None
+    # The share of a state in the mode whose stretch is 1.
+    share = 2.0 * np.linalg.inv(modes)[place] * modes[0, place]
+    rows = np.array([share.real, -share.imag])
+    pushed = np.array([0.0, 1.0 / mass, *np.zeros(len(branches))])
+    tail = np.column_stack([
+        -rows @ np.linalg.solve(matrix + speed * np.eye(count), pushed) for speed in speeds])
+    return root, rows, tail
