@@ -3,9 +3,9 @@
 from dataclasses import replace
 import math
 
+from creep_oracle import elastic, ended, judged
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.creep import Creep
@@ -16,70 +16,16 @@ from hmsa_ros.model.status import RefusedError
 from hmsa_ros.planning.planner import Options, Planner
 from hmsa_ros.planning.sequence import plan_sequence
 from hmsa_ros.planning.setpoint import Setpoint
-from hmsa_ros.planning.shapers import get_shaper, SHAPERS
+from hmsa_ros.planning.shapers import get_shaper
 from hmsa_ros.planning.shapers.request import Request
 from hmsa_ros.planning.two_step import plan_two_step
 
 MS = 1_000_000
-J, ZETA, C1 = 5.0, 0.2, 2.0
 # Times in units of time: about as fast as the block, and from faster to much slower.
 ONE = NondimensionalParameters(creep=Creep((0.1,), (2.0,)))
 THREE = NondimensionalParameters(creep=Creep((0.1, 0.2, 0.05), (0.4, 3.0, 100.0)))
 # A fifth of what a move takes.
 SAMPLED = Delivery(0.27)
-
-
-def elastic(x):
-    """Return psi' and psi'' of a Gent block."""
-    above = x - x ** -2
-    g = 1.0 - (x * x + 2.0 / x - 3.0) / J
-    return above / g, ((1.0 + 2.0 * x ** -3) + 2.0 * above ** 2 / (J * g)) / g
-
-
-def motion(t, y, load, slope, lag, ratios, speeds):
-    """Return the derivative of stretch, rate, field and what the branches hold; t in a piece."""
-    x, v, field, held = y[0], y[1], y[2], y[3:]
-    field = field if lag else load + slope * t
-    force, stiffness = elastic(x)
-    mass = (x ** -3 + C1) / 6.0
-    return [v, (field - force - held.sum() - 0.5 * ZETA * C1 * v + 0.25 * x ** -4 * v * v) / mass,
-            (load + slope * t - field) / lag if lag else 0.0,
-            *(ratios * stiffness * v - speeds * held)]
-
-
-def ended(levels, creep, end, delivery):
-    """Return the state at the end; the field is that of the amplifier if it does not lag."""
-    levels = [x for x in levels if x[0] < end]
-    state = judged(levels, creep, end, delivery.slew, delivery.lag)[2]
-    if delivery.lag == 0.0:
-        state[2] = levels[-1][1]
-    return state
-
-
-def judged(levels, creep, end, slew=math.inf, lag=0.0):
-    """Return times and stretches under levels (time, load) from rest at 1, by SciPy; the end."""
-    state = np.zeros(3 + len(creep.ratios))
-    state[0], output = 1.0, 0.0
-    times, stretches = [], []
-    for (begin, load), until in zip(levels, [x[0] for x in levels[1:]] + [end], strict=True):
-        reached = min(begin + abs(load - output) / slew, until)
-        ramp = math.copysign(slew, load - output) if reached > begin else 0.0
-        after = output + ramp * (reached - begin) if reached == until else load
-        for start, stop, first, slope in (
-                (begin, reached, output, ramp), (reached, until, after, 0.0)):
-            if stop <= start:
-                continue
-            found = solve_ivp(
-                motion, (0.0, stop - start), state, method='DOP853', rtol=1e-11, atol=1e-12,
-                t_eval=np.linspace(0.0, stop - start, 9 + int(6 * (stop - start))),
-                # In longer steps it does not see a field that decays within some lags.
-                max_step=max(lag, (stop - start) / 1000.0) if lag else math.inf,
-                args=(first, slope, lag, np.array(creep.ratios), 1.0 / np.array(creep.times)))
-            times.append(start + found.t)
-            stretches.append(found.y[0])
-            state = found.y[:, -1]
-        output = after
-    return np.concatenate(times), np.concatenate(stretches), state
 
 
 def left(segments, creep, longest=40.0, delivery=IDEAL):
@@ -191,19 +137,76 @@ def test_levels_that_follow_creep_keep_inside_the_coil():
             [Setpoint(1.4, math.inf)], ONE, limits=Limits(-1.0, 0.999 * highest))
 
 
-@pytest.mark.parametrize('name', SHAPERS)
-def test_a_shaper_called_directly_knows_of_creep_or_refuses_it(name):
-    request = Request(State(1.0), 1.1, ONE, delivery=Delivery(slew=2.0, lag=0.1))
-    if name in ('two_step', 'robust', 'smooth', 'step'):
-        assert get_shaper(name)(request).levels
-        return
-    with pytest.raises(BadInputError, match=r'viscoelastic\.ratio'):
-        get_shaper(name)(request)
+@pytest.mark.parametrize('delivery', [
+    IDEAL, Delivery(slew=2.0), Delivery(lag=0.2), Delivery(slew=2.0, lag=0.1),
+    replace(SAMPLED, slew=2.0)], ids=str)
+def test_the_fastest_move_of_a_creeping_block_ends_at_rest_within_the_limits(delivery):
+    request = Request(State(1.0), 1.4, THREE, Limits(-3.0, 3.0), delivery)
+    move, slower = (get_shaper(x)(request) for x in ('minimum_time', 'two_step'))
+    assert move.duration <= slower.duration
+    assert all(-3.0 <= x.load <= 3.0 for x in move.levels)
+    end = ended([(x.time, x.load) for x in move.levels], THREE.creep, move.duration, delivery)
+    needed = elastic(1.4)[0] + end[3:].sum()
+    field = end[2] - needed if delivery.lag else 0.0
+    assert (*end[:2], field) == pytest.approx((1.4, 0.0, 0.0), abs=1e-9)
 
 
-def test_what_creep_is_not_planned_for_yet_is_refused():
-    sentence = 'shaper minimum_time does not know of viscoelastic.ratio'
-    with pytest.raises(BadInputError, match=sentence):
-        plan_sequence([Setpoint(1.4, math.inf)], ONE, shaper='minimum_time')
+@pytest.mark.parametrize('delivery', [IDEAL, Delivery(slew=1.0), Delivery(lag=0.2)], ids=str)
+def test_of_a_creeping_block_in_error_minimax_leaves_less_than_the_chain(delivery):
+    worst = []
+    for shaper in ('robust', 'minimax'):
+        move = plan_sequence(
+            [Setpoint(1.4, math.inf)], THREE, shaper=shaper, delivery=delivery)[0].move
+        assert str(move.code) == shaper
+        left = []
+        for error in (-0.1, 0.1):
+            # In units of the block in error.
+            stiffer, faster = 1.0 + error, math.sqrt(1.0 + error)
+            arrived = move.duration * faster
+            times, stretch, _ = judged(
+                [(x.time * faster, x.load / stiffer) for x in move.levels
+                 if x.time < move.duration + 2.6],
+                replace(THREE.creep, times=tuple(x * faster for x in THREE.creep.times)),
+                arrived + 2.6 * faster, delivery.slew / stiffer / faster, delivery.lag * faster,
+                0.2 / faster)
+            # Off by as much, it creeps on meanwhile.
+            after = times >= arrived
+            drift = np.polyfit(times[after], stretch[after], 1)
+            left.append(np.ptp(stretch[after] - np.polyval(drift, times[after])))
+        worst.append(max(left))
+    assert worst[1] < 0.7 * worst[0]
+
+
+@pytest.mark.parametrize('delivery', [IDEAL, Delivery(slew=2.0), Delivery(lag=0.1)], ids=str)
+@pytest.mark.parametrize('name', ['zv', 'zvd', 'ei', 'minimax'])
+def test_what_rings_on_after_a_move_is_predicted_at_the_levels_that_follow_creep(name, delivery):
+    move = plan_sequence(
+        [Setpoint(1.2, math.inf)], THREE, shaper=name, delivery=delivery)[0].move
+    levels = [(x.time, x.load) for x in move.levels]
+    place = len(levels) - len(move.tail)
+    for number in (place, place + 3, place + 9):
+        state = move.tail[number - place]
+        end = ended(levels[:number], THREE.creep, levels[number][0], delivery)
+        assert (state.stretch, state.rate, state.load) == pytest.approx(end[:3], abs=1e-9)
+        held = np.array(THREE.creep.ratios) * (elastic(state.stretch)[0] - np.array(
+            state.followed))
+        assert held == pytest.approx(end[3:], abs=1e-9)
+
+
+def test_a_shaped_step_of_a_creeping_block_leaves_less_than_a_step_and_holds_the_target():
+    left = {}
+    for name in ('step', 'zv', 'zvd', 'ei'):
+        move = plan_sequence([Setpoint(1.05, math.inf)], THREE, shaper=name)[0].move
+        arrived = min(move.duration, 3.0)
+        times, stretch, _ = judged(
+            [(x.time, x.load) for x in move.levels if x.time < 60.0], THREE.creep, 60.0)
+        left[name] = np.ptp(stretch[(times >= arrived) & (times < arrived + 2.6)]) / 0.05
+        if name != 'step':
+            assert stretch[-1] == pytest.approx(1.05, abs=1e-5)
+    assert max(left['zv'], left['zvd']) < 0.1 * left['step']
+    assert left['ei'] < 0.2 * left['step']
+
+
+def test_one_plan_from_two_ends_says_what_creep_is_not_planned_for():
     with pytest.raises(BadInputError, match='expected one without'):
         plan_two_step(1.0, 1.1, ONE)

@@ -120,26 +120,32 @@ def test_what_it_measures_is_the_peak_to_peak_of_an_integration():
 
 # SciPy before 1.16 says so of steps that it clips itself.
 @pytest.mark.filterwarnings('ignore:Values in x were outside bounds:RuntimeWarning')
-@pytest.mark.parametrize(('order', 'lag'), [(2, 0.0), (3, 0.0), (2, 0.2)])
-def test_no_other_optimiser_finds_much_better_levels(order, lag):
-    request = Request(State(1.0), 1.4, PAPER, WIDE, Delivery(lag=lag), order=order)
+@pytest.mark.parametrize(('order', 'delivery', 'share'), [
+    (2, IDEAL, 0.995), (3, IDEAL, 0.9), (2, Delivery(lag=0.2), 0.995),
+    # Along curved valleys between what ramps reach.
+    (2, Delivery(slew=3.0), 0.995), (2, Delivery(slew=1.0), 0.995),
+    (2, Delivery(slew=0.3), 0.99)], ids=str)
+def test_no_other_optimiser_finds_much_better_levels(order, delivery, share):
+    request = Request(State(1.0), 1.4, PAPER, WIDE, delivery, order=order)
     chain, move = (get_shaper(x)(request) for x in ('robust', 'minimax'))
     cases = _cases(request, chain.levels[-1].load)
     # A push that settles the field follows from the others.
     frame = _frame(request, chain, _PUSHES[0])
-    loads = [x.load for x in move.levels[:len(frame.low)]]
+    own = [x.load for x in move.levels[:len(frame.low)]]
 
     def lengths(free):
         levels = _command(request, chain, frame, np.clip(free, frame.low, frame.high))
         return 1e3 * np.hypot(*left(request, cases, levels, move.duration).T)
 
-    before = lengths(loads).max()
-    found = minimize(
-        lambda x: x[-1], [*loads, before], method='SLSQP',
-        bounds=[*zip(frame.low, frame.high, strict=True), (0.0, None)],
-        constraints={'type': 'ineq', 'fun': lambda x: x[-1] - lengths(x[:-1])})
+    before, found = lengths(own).max(), []
+    for loads in (own, 0.5 * (frame.low + frame.high)):
+        best = minimize(
+            lambda x: x[-1], [*loads, lengths(loads).max()], method='SLSQP',
+            bounds=[*zip(frame.low, frame.high, strict=True), (0.0, None)],
+            constraints={'type': 'ineq', 'fun': lambda x: x[-1] - lengths(x[:-1])})
+        found.append(lengths(best.x[:-1]).max())
     # Of the third order there are several minima, of which the best seen is 7 % lower.
-    assert lengths(found.x[:-1]).max() > 0.9 * before
+    assert min(found) > share * before
 
 
 def test_the_least_longest_vector_is_that_of_linear_programming():
@@ -147,7 +153,8 @@ def test_the_least_longest_vector_is_that_of_linear_programming():
     for _ in range(20):
         now, slopes = dice.normal(size=(9, 2)), dice.normal(size=(9, 2, 6))
         low, high = -dice.uniform(0.0, 0.4, 6), dice.uniform(0.0, 0.4, 6)
-        x = least_largest(now, slopes, low, high)
+        x = least_largest(
+            now, slopes, np.vstack([np.eye(6), -np.eye(6)]), np.concatenate([high, -low]))
         assert np.all((low <= x) & (x <= high))
         rows = np.stack([TURN.real, TURN.imag], axis=1)
         bound = np.einsum('kc,nc->nk', rows, now).ravel()
@@ -156,7 +163,7 @@ def test_the_least_longest_vector_is_that_of_linear_programming():
             [0.0] * 6 + [1.0], np.hstack([matrix, -np.ones((len(matrix), 1))]), -bound,
             bounds=[*zip(low, high, strict=True), (0.0, None)]).fun
         assert exact <= largest(now + slopes @ x) * 1.001
-        assert largest(now + slopes @ x) < 1.05 * exact
+        assert largest(now + slopes @ x) < 1.005 * exact
 
 
 @pytest.mark.parametrize(('delivery', 'share'), [

@@ -180,7 +180,7 @@ def left(
             held = ratios * (x.force - followed)
         row[:] = x.mode[:, 0] * (out[0, 0] - x.rest) + x.mode[:, 1] * out[1, 0]
         if len(ratios):
-            row += x.mode[:, 2:] @ ((followed - x.force) / x.stiffness) - x.tail @ held
+            row[:] += x.mode[:, 2:] @ ((followed - x.force) / x.stiffness) - x.tail @ held
     return found
 
 
@@ -343,7 +343,8 @@ def _command(
     """
     levels = [Level(*x) for x in zip(frame.times, loads.tolist(), strict=False)]
     holding = chain.levels[-1].load
-    if not request.material.creep or frame.last == chain.duration:
+    if not request.material.creep or (
+            request.delivery.lag == 0.0 and frame.last == chain.duration):
         return _settled(request, chain, frame, levels, holding, holding)
     # Field and amplifier meet what the branches hold, which hardly depends on how they do.
     wanted, last = _balance(request, chain, like or chain.levels)
