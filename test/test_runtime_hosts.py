@@ -90,6 +90,29 @@ def test_a_device_that_is_not_heard_any_more_is_sent_nothing_and_named():
     assert rig.residual(1.2) < 1e-6
 
 
+def test_a_device_in_slow_motion_is_heard_again_after_a_silence():
+    rig = Bench()
+    rig.runtime.one_clock = lambda: True
+    rig.runtime.request(trajectory((1.2, HOLD)))
+
+    def pass_slowly(seconds):
+        for _ in range(round(seconds / 0.1)):
+            rig.steady += 100 * MS
+            rig.now += MS
+            rig.tick()
+            if rig.linked:
+                newest = rig.sent[-1][1].stamp if rig.sent else 0
+                rig.runtime.received('a', rig.now, newest, cut_off=False)
+
+    pass_slowly(1.0)
+    rig.linked = False
+    pass_slowly(2.0)
+    assert 'no receipt of joint a' in rig.status.unheard
+    rig.linked = True
+    pass_slowly(0.5)
+    assert rig.status.unheard == ''
+
+
 def test_a_device_without_receipts_is_sent_everything():
     rig = Rig(settings=BEATING)
     rig.runtime.request(trajectory((1.2, HOLD)))

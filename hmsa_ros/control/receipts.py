@@ -91,13 +91,15 @@ class Receipts:
         """
         Take in that the newest command there is one of a stamp, by a time of the device.
 
-        The time now is that of our clock; the two are ``comparable`` where they are two.
+        The time now is that of our clock; the two are ``comparable`` where they are two. One clock
+        for both may be in slow motion, or stand still.
         """
         steady = self._steady()
         known = self._joints.get(joint)
         if known is None:
             known = self._joints[joint] = _Joint(steady)
-        if known.silent and time - known.time < steady - known.heard - _STALE:
+        if known.silent and comparable and (
+                time - known.time < steady - known.heard - _STALE):
             return
         known.heard, known.time, known.missing = steady, time, 0
         known.lags.append(now - time)
