@@ -1,14 +1,22 @@
-"""Entry points of all processes: signals are taken over before anything slow is imported."""
+"""
+Entry points of all processes: signals are taken over before anything slow is imported.
 
-from collections.abc import Sequence
-from functools import partial
+What is imported here is there as soon as Python has started. While that starts it answers a
+signal itself, with a traceback of its module ``site`` at worst: only who starts it with signals
+blocked could prevent that.
+"""
+
+# Beneath `signal`, which imports more than all of this.
+import _signal  # type: ignore[import-not-found]
+from collections.abc import Callable
+import os
 import sys
 
-from hmsa_ros.ending import ENDING
 
-
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: list[str] | None = None) -> int:
     """Run the ``hmsa`` command; return its exit status."""
+    _take_over()
+    from hmsa_ros.ending import ENDING
     ENDING.leave()
     from hmsa_ros.cli import main as command
     try:
@@ -20,14 +28,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     return status
 
 
-def _node(name: str) -> int:
-    """Run ``hmsa NAME`` as a program of its own."""
-    return main([name, *sys.argv[1:]])
+def _take_over() -> None:
+    """End the process at once on a signal, until `Ending` is there to answer it."""
+    for number in (_signal.SIGINT, _signal.SIGTERM, _signal.SIGHUP):
+        if _signal.getsignal(number) != _signal.SIG_IGN:
+            _signal.signal(number, lambda number, _: os._exit(128 + number))
 
 
-planner = partial(_node, 'planner')
-plant = partial(_node, 'plant')
-driver = partial(_node, 'driver')
-recorder = partial(_node, 'recorder')
-controller = partial(_node, 'controller')
-player = partial(_node, 'player')
+def _node(name: str) -> Callable[[], int]:
+    """Return what runs ``hmsa NAME`` as a program of its own."""
+    return lambda: main([name, *sys.argv[1:]])
+
+
+planner = _node('planner')
+plant = _node('plant')
+driver = _node('driver')
+recorder = _node('recorder')
+controller = _node('controller')
+player = _node('player')

@@ -1,5 +1,7 @@
 """How processes end when they are told to: at the start, at work, and twice."""
 
+from contextlib import suppress
+from random import Random
 import signal
 import subprocess
 import sys
@@ -41,6 +43,14 @@ sys.exit(main(['send', '1.1:1', '--timeout', '1000']))
 """
 
 
+# Runs the command line, and says when signals are no longer answered by Python itself.
+TOLD = """
+import os, sys
+from hmsa_ros import entry
+take_over = entry._take_over
+entry._take_over = lambda: (take_over(), os.write(1, b'.'))
+sys.exit(entry.main(sys.argv[1:]))
+"""
 # Ends in native code that holds the interpreter for ever.
 IN_NATIVE_CODE = """
 import atexit, ctypes, sys
@@ -79,6 +89,37 @@ def test_an_interrupt_that_python_drops_still_ends_a_command(ros_env):
         [sys.executable, '-c', IN_A_DESTRUCTOR], capture_output=True, text=True, check=False,
         timeout=60)
     assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
+
+
+@pytest.mark.parametrize('module', ['hmsa_ros.ending', 'ctypes'])
+def test_an_end_is_in_order_before_anything_of_ours_is_imported(module):
+    code = AT_IMPORT.replace('entry.{entry}()', "entry.main(['plan', '1.1:10'])")
+    done = subprocess.run(
+        [sys.executable, '-c', code.format(module=module, number=int(signal.SIGINT))],
+        capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(('words', 'statuses'), [
+    (['plan', '1.1:10'], {0, 130}), (['planner'], {0, 130}),
+    (['run', '1.1:1', '--simulate', '--out', 'out'], {0, 130})])
+def test_an_interrupt_in_the_first_second_ends_in_order(ros_env, tmp_path, words, statuses):
+    random = Random(1)
+    for number in range(14):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        with subprocess.Popen(
+                [sys.executable, '-c', TOLD, *words], cwd=folder, stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE) as process:
+            assert process.stdout.read(1) == b'.'
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(random.uniform(0.0, 1.0))
+            process.send_signal(signal.SIGINT)
+            out, err = process.communicate(timeout=60)
+        assert b'Traceback' not in out + err, err.decode()
+        assert process.returncode in statuses, err.decode()
+        assert not (words == ['planner'] and err), err.decode()
 
 
 @pytest.mark.parametrize(('number', 'status'), [
