@@ -25,6 +25,10 @@ class Shifted(PlannerNode):
 sys.exit(run(Shifted, []))
 """
 
+# For a machine that is busy: few samples, commands far ahead, and a patient watchdog.
+PLANT = ('plant', '--ros-args', '-p', 'publish_rate:=200.0', '-p', 'command_timeout:=3.0')
+PLANNER_AHEAD = ('planner', '--ros-args', '-p', 'lead_time:=3.0')
+
 pytestmark = [pytest.mark.slow, pytest.mark.ros]
 on_hosts = pytest.mark.skipif(bool(WHY), reason=WHY)
 
@@ -67,22 +71,24 @@ def laboratory(start, tmp_path, wait_until):
 
 
 @on_hosts
-@pytest.mark.parametrize('outage', [2.0, 25.0])
+@pytest.mark.parametrize('outage', [5.0, 25.0])
 def test_after_an_outage_nothing_moves_that_nobody_has_asked_for(laboratory, outage):
-    plant = laboratory.hmsa('bench', 'plant', '--ros-args', '-p', 'safe_flux:=zero')
-    planner = laboratory.hmsa('desk', 'planner')
+    plant = laboratory.hmsa('bench', *PLANT, '-p', 'safe_flux:=zero')
+    planner = laboratory.hmsa('desk', *PLANNER_AHEAD)
     laboratory.look_on('bench')
     sent = laboratory.hmsa('desk', 'send', '1.2:1', '--wait')
     assert sent.wait() == 0, sent.output
-    sent = laboratory.hmsa('desk', 'send', '1.1:1', '1.35:600')
-    assert sent.wait() == 0, sent.output
-    laboratory.wait(3.0)
+    sent = laboratory.hmsa('desk', 'send', '1.1:1', '1.35:600', '--wait')
+    sent.wait_for_output('setpoint 2 of 2: at_rest')
+    laboratory.wait(1.0)
     laboratory.hosts.cut('desk')
     cut = time()
     plant.wait_for_output('the field goes to zero')
     laboratory.wait(cut + outage - time())
-    assert 'no receipt' in planner.output
+    assert sent.wait() == 1
+    assert 'no receipt' in sent.output
     laboratory.hosts.join('desk')
+    joined = time()
     planner.wait_for_output('was cut off by the plant or driver')
     laboratory.wait(1.0)
     again = time()
@@ -91,7 +97,8 @@ def test_after_an_outage_nothing_moves_that_nobody_has_asked_for(laboratory, out
     stamps, _, stretches, fields = laboratory.seen()
     before = stretches[(stamps < cut) & (stamps > cut - 1.0)]
     assert before == pytest.approx(1.35, abs=1e-3)
-    waiting = (stamps > cut + 1.8) & (stamps < again)
+    waiting = (stamps > joined) & (stamps < again)
+    assert waiting.any()
     assert not fields[waiting].any()
     assert stretches[waiting] == pytest.approx(1.0, abs=1e-3)
     asked = stretches[stamps > again]
@@ -101,8 +108,8 @@ def test_after_an_outage_nothing_moves_that_nobody_has_asked_for(laboratory, out
 
 @on_hosts
 def test_a_recorder_whose_host_goes_away_holds_nobody_up(laboratory):
-    plant = laboratory.hmsa('bench', 'plant')
-    laboratory.hmsa('bench', 'planner')
+    plant = laboratory.hmsa('bench', *PLANT)
+    laboratory.hmsa('bench', *PLANNER_AHEAD)
     recorder = laboratory.run('desk', ONLOOKER, '/dev/null')
     recorder.wait_for_output('sees')
     laboratory.look_on('bench')
@@ -114,7 +121,7 @@ def test_a_recorder_whose_host_goes_away_holds_nobody_up(laboratory):
     laboratory.wait(cut + 10.0 - time())
     _, arrivals, _, _ = laboratory.seen()
     # By default a send waits there for up to 6 s.
-    assert np.diff(arrivals[arrivals > cut]).max() < 1.0
+    assert np.diff(arrivals[arrivals > cut]).max() < 3.0
     assert 'clock' not in plant.output
 
 
