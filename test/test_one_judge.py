@@ -117,6 +117,17 @@ def test_status_and_record_have_the_same_verdicts():
     assert said(range(12)) >= {'arrived', 'off_target', 'undecided'}
 
 
+@pytest.mark.parametrize('behind', [-1, 0, 1])
+def test_a_recorder_whose_clock_lags_shows_the_same_setpoints(behind):
+    for seed in range(4):
+        run = Drawn(seed).carry_out()
+        # Plans begin with the level in force, as of the time of the planner.
+        first = Level(START + behind * MS, 0.0, START, 1.0, 0.0)
+        shown = replace(run, plans=((first, *run.plans[0]), *run.plans[1:]))
+        assert [x.setpoint for x in findings_of(shown)] == [
+            x.setpoint for x in findings_of(run)], seed
+
+
 @pytest.mark.slow
 def test_status_and_record_have_the_same_verdicts_of_many_runs():
     assert said(range(12, 160)) >= {str(x) for x in VERDICTS} - {'unobserved'}

@@ -127,12 +127,18 @@ def _new(run: Run, place: int | None) -> int | None:
     if place is None:
         return None
     plan, before = run.plans[place], run.plans[place - 1] if place else ()
-    if not before and len(plan) > 1 and plan[0].stamp < plan[0].sent and (
+    if not before and len(plan) > 1 and (
+            plan[0].stamp < plan[0].sent or _uncommanded(run, plan[0])) and (
             abs(float(balance(run, plan[:1])[0]) - plan[0].stretch) <= _ROUNDED):
         # It was in force, and holds what was there.
         plan = plan[1:]
     fresh = _fresh(plan, before)
     return None if fresh == math.inf else int(fresh)
+
+
+def _uncommanded(run: Run, level: Level) -> bool:
+    """Return whether no command has the stamp of a level: simulated time of a recorder lags."""
+    return bool(run.commands) and all(x.stamp != level.stamp for x in run.commands)
 
 
 def _fresh(plan: Sequence[Level], before: Sequence[Level]) -> float:
