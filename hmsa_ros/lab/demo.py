@@ -25,7 +25,7 @@ from hmsa_ros.report.outcome import findings_of
 SEQUENCE = ((1.10, 10.0), (1.20, 10.0), (1.40, 10.0))
 REAL_TIME_FACTOR = 0.0125
 PUBLISH_RATE = 20_000.0
-LEAD_TIME = 0.01
+LEAD_TIME = 0.03
 #: Largest residual vibration, as a share of the step, of a setpoint that counts as held.
 LARGEST_RESIDUAL = 1e-6
 # Time stands still until all are ready.

@@ -14,8 +14,9 @@ from hmsa_ros.recordings.parameters import values_of
 # in a second of ours.
 _SAMPLES_A_PERIOD = 50.0
 _SAMPLES_A_SECOND = 1000.0
-# How far ahead in our time commands are sent: a busy machine may take that long.
-_LEAD_SECONDS = 0.5
+# How far ahead in our time commands are sent: a busy machine may take that long. Feedback is to
+# correct a move before the next one.
+_LEAD_SECONDS, _CORRECTED_SECONDS = 2.0, 0.5
 
 
 def simulated_nodes(
@@ -29,14 +30,16 @@ def simulated_nodes(
     rate = _number(settings, f'{PLANT}.publish_rate', max(1000.0, _SAMPLES_A_PERIOD / period))
     factor = _number(
         settings, f'{PLANT}.real_time_factor', min(1.0, _SAMPLES_A_SECOND / rate))
-    lead = _number(settings, f'{PLANNER}.lead_time', _LEAD_SECONDS * (factor or 1.0))
+    feedback = settings.get(f'{PLANNER}.feedback', 'off')
+    ahead = _LEAD_SECONDS if feedback in ('off', False) else _CORRECTED_SECONDS
+    lead = _number(settings, f'{PLANNER}.lead_time', ahead * (factor or 1.0))
     return (
         NodeProcess(PLANT, {
             'publish_clock': True, 'use_sim_time': False, 'start_paused': True,
             'publish_rate': rate, 'real_time_factor': factor}, namespace, params_file),
         NodeProcess(PLANNER, {
             'use_sim_time': True, 'lead_time': lead,
-            'feedback': settings.get(f'{PLANNER}.feedback', 'off')}, namespace, params_file))
+            'feedback': feedback}, namespace, params_file))
 
 
 def _number(settings: Mapping[str, object], name: str, default: float) -> float:
