@@ -50,7 +50,6 @@ EXTRAS_REQUIRE = {
         'pyte>=0.8',
         # From 9.2 on, groups of pytest-xdist 3.8 are lost: it writes to a private attribute.
         'pytest>=7.4,<9.2',
-        'pytest-rerunfailures>=12.0',
         'pytest-timeout>=2.2',
         'pytest-xdist>=3.7',
         'rosbags>=0.10',

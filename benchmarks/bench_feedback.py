@@ -54,6 +54,7 @@ class Graph:
     hold: float
     lead: float
     cautious: bool
+    factor: float = 1.0  # simulated s a second of ours
 
 
 GRAPHS = (
@@ -88,24 +89,29 @@ def run(
         **parameters_of(scenario.block), 'flux_density_min': -_LIMIT, 'flux_density_max': _LIMIT,
         'lead_time': graph.lead, 'feedback': 'adapt', 'feedback_cautious': graph.cautious,
         'feedback_tolerance': _TOLERANCE}
+    follows: dict[str, object] = {}
+    if graph.factor != 1.0:
+        follows = {'use_sim_time': True}
+        plant |= {'publish_clock': True, 'real_time_factor': graph.factor}
     with Rig(folder, ros_domain(), watch=False) as rig:
-        recorder = rig.start('recorder', {
+        recorder = rig.start('recorder', follows | {
             'storage.uri': bag, 'record.topics': f'[{", ".join(_TOPICS)}]'})
         if graph.together:
             rig.start('controller', plant | planner)
         else:
             rig.start('plant', plant)
-            rig.start('planner', planner)
+            rig.start('planner', planner | follows)
         rig.ready(topics.PLANNER, topics.PLANT, topics.RECORDER)
         for number in range(seeds + 1):
             if number == seeds:
                 rig.set_parameters(topics.PLANNER, feedback='off')
             else:
                 rig.call(topics.RESET_ESTIMATE, topics.PLANNER)
-            rig.spin(_BEFORE * scenario.period)
+            rig.spin(_BEFORE * scenario.period / graph.factor)
             for target in (*TARGETS, 1.0):
                 rig.publish_setpoint(target)
-                rig.spin(graph.hold * (_BACK if target == 1.0 else 1.0))
+                rig.spin(
+                    graph.hold * (_BACK if target == 1.0 else 1.0) / graph.factor)
         recorder.end()
     found = judge(read(bag), scenario.block.time_unit, cautious=graph.cautious)
     place = len(TARGETS) * seeds

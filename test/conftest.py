@@ -52,24 +52,6 @@ def pytest_configure(config: pytest.Config) -> None:
     settings.load_profile(config.getoption('--hypothesis-profile') or 'gate')
 
 
-# Tests that are tried once more if they fail, and why. Each holds a whole run on the wall clock to
-# its plan; where the machine stalls for longer than lead_time, commands come late, the planner
-# replans, and the run is rightly reported as another one than planned.
-_REAL_TIME = 'expects that no command is late on the wall clock'
-TRIED_AGAIN = {
-    'test_docs.py::test_page_does_what_it_says': _REAL_TIME,
-    'test_demo.py::test_every_setpoint_is_reached_and_held': _REAL_TIME,
-    'test_run.py::test_a_simulated_experiment_arrives_and_leaves_its_bag_and_a_report': _REAL_TIME,
-    'test_run.py::test_a_simulated_experiment_with_feedback': _REAL_TIME,
-    'test_run.py::test_an_interrupted_experiment_brings_the_running_actuator_to_rest': _REAL_TIME,
-    'test_launch.py::test_a_demonstration_is_recorded_and_its_replay_is_the_same': _REAL_TIME,
-    'test_bag_verify.py::test_a_second_plant_moves_the_same_when_the_bag_is_played': _REAL_TIME,
-    'test_init.py::test_planner_and_plant_take_the_file_and_arrive_when_it_says': _REAL_TIME,
-    'test_feedback_nodes.py::test_a_planner_that_observes_says_what_is_wrong': _REAL_TIME,
-    'test_feedback_nodes.py::test_a_planner_that_adapts_arrives': _REAL_TIME,
-}
-
-
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
     """Return a worker a core: the nodes of a test must keep up with real time."""
@@ -83,11 +65,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
     Long tests begin first.
     """
-    # Where the tests run without it (as colcon may), each is tried once.
-    retries = config.pluginmanager.hasplugin('rerunfailures')
     for item in items:
-        if retries and any(name in item.nodeid for name in TRIED_AGAIN):
-            item.add_marker(pytest.mark.flaky(reruns=1))
         if 'ros_domain_id' in getattr(item, 'fixturenames', ()):
             item.add_marker(pytest.mark.ros)
         if item.get_closest_marker('ros') or item.get_closest_marker('xdist_group'):

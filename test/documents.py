@@ -52,6 +52,15 @@ FOREIGN = {
     'wait', 'unset', 'echo', 'cp', 'openssl', 'scp', 'ssh', 'systemctl', 'ulimit', 'chrt'}
 KEYWORDS = {'do', 'done', 'else', 'fi', 'if', 'then', 'until', 'while'}
 PATIENCE_SECONDS = 200.0
+# Where a page does not say how far ahead commands are sent, it is so far that a busy machine sends
+# none late.
+AHEAD = """\
+case "$1" in planner|controller)
+  name=$1
+  shift
+  set -- "$name" --ros-args -p lead_time:=2.0 "$@" ;;
+esac
+"""
 NUMBER = re.compile(r'[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?')
 LARGEST_SHARE, LARGEST_DIFFERENCE = 1e-3, 1e-6
 
@@ -214,7 +223,8 @@ class Session:
                 shutil.copy(ROOT / name, self._folder / name)
         # The package as it lies here, whatever the environment has installed.
         for name, words in (('hmsa', '-m hmsa_ros '), ('python', ''), ('python3', '')):
-            (tools / name).write_text(f'#!/bin/sh\nexec {sys.executable} {words}"$@"\n')
+            (tools / name).write_text(
+                f'#!/bin/sh\n{AHEAD if words else ""}exec {sys.executable} {words}"$@"\n')
             (tools / name).chmod(0o755)
         self._environment = {
             **environment, 'PATH': f'{tools}:{os.environ["PATH"]}', 'MPLBACKEND': 'Agg',

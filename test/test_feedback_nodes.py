@@ -22,10 +22,11 @@ def begin(start, ros, mode, *more):
     """Start both and wait for them; return a function of the newest sentence and its values."""
     statuses = ros.collect(topics.STATUS.type, 'planner/status', topics.STATUS.qos)
     samples = ros.collect(topics.JOINT_STATES.type, 'joint_states', topics.JOINT_STATES.qos)
-    start.hmsa('plant', *PLANT)
-    # Commands far enough ahead for a busy machine.
+    # In slow motion, with commands far enough ahead for a busy machine.
+    start.hmsa('plant', *PLANT, '-p', 'publish_clock:=true', '-p', 'real_time_factor:=0.15')
     start.hmsa(
-        'planner', '--ros-args', '-p', f'feedback:={mode}', '-p', 'lead_time:=0.3', *more)
+        'planner', '--ros-args', '-p', f'feedback:={mode}', '-p', 'use_sim_time:=true', '-p',
+        'lead_time:=0.3', *more)
     ros.spin_until(lambda: statuses and samples, 'planner and plant', RUN_SECONDS)
     found = ros.collect(topics.ESTIMATE.type, 'planner/estimate', topics.ESTIMATE.qos)
 
@@ -95,8 +96,8 @@ def test_moves_in_a_bag_are_judged_from_samples_and_levels_alone():
 def test_from_a_bag_the_move_after_a_correction_rests_where_open_loop_misses(
         ros_domain_id, tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_DOMAIN_ID', str(ros_domain_id))
-    # Commands far enough ahead for a busy machine.
-    found = run(replace(GRAPHS[1], lead=0.3, hold=1.2), 0.2, tmp_path, 1)
+    # In slow motion, with commands far enough ahead for a busy machine.
+    found = run(replace(GRAPHS[1], lead=0.3, hold=1.2, factor=0.15), 0.2, tmp_path, 1)
     first, second = found['off']
     assert first.offset == pytest.approx(-0.18, abs=0.01)
     assert second.vibration > 0.1

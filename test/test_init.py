@@ -343,9 +343,10 @@ def test_planner_and_plant_take_the_file_and_arrive_when_it_says(start, tmp_path
     made = json.loads(out)
     file = str(tmp_path / 'actuator.yaml')
     arguments = ['--ros-args', '--params-file', file]
-    # Fewer samples and further ahead than the file says: for a busy machine.
-    start.hmsa('plant', *arguments, '-p', 'publish_rate:=500.0')
-    start.hmsa('planner', *arguments, '-p', 'lead_time:=3.0')
+    # Fewer samples and further ahead than the file says, and no time passes where the plant
+    # stands still: for a busy machine.
+    start.hmsa('plant', *arguments, '-p', 'publish_rate:=500.0', '-p', 'publish_clock:=true')
+    start.hmsa('planner', *arguments, '-p', 'lead_time:=3.0', '-p', 'use_sim_time:=true')
     recorder = start.hmsa(
         'recorder', '--ros-args', '-p', f'storage.uri:={tmp_path / "bag"}',
         '-p', 'record.all_topics:=true')

@@ -178,11 +178,13 @@ def test_a_demonstration_is_recorded_and_its_replay_is_the_same(start, tmp_path,
     bags = [tmp_path / 'first', tmp_path / 'second']
     launch = way(start)
     launch.run('demo', namespace='left', bag=str(bags[0]))
-    send = start.hmsa('send', '1.1:0.02', '0.9:0.02', '--wait', '--recorded', '--namespace',
+    send = start.hmsa('send', '1.1:0.05', '0.9:0.05', '--wait', '--recorded', '--namespace',
                       'left', '--timeout', str(SECONDS))
     assert send.wait(SECONDS) == 0, send.output
     launch.end()
-    launch.run('replay', namespace='left', bag=str(bags[0]), record_to=str(bags[1]))
+    # In slow motion: a busy machine may hold a command up for longer than it came ahead.
+    launch.run(
+        'replay', namespace='left', bag=str(bags[0]), record_to=str(bags[1]), rate='0.02')
     launch.wait()
     assert list(BagReader(bags[0]).messages(['/left/planner/joint_trajectory']))
     first, second = (verify(bag)[0] for bag in bags)

@@ -96,7 +96,10 @@ def test_an_interrupted_experiment_brings_the_running_actuator_to_rest(start, ro
     from hmsa_ros.interfaces import topics
 
     statuses = ros.collect(topics.STATUS.type, 'planner/status', topics.STATUS.qos)
-    nodes = [start.hmsa('plant'), start.hmsa('planner')]
+    # Far enough ahead for a busy machine, and no time passes where that stops the plant.
+    nodes = [
+        start.hmsa('plant', '--ros-args', '-p', 'publish_clock:=true'),
+        start.hmsa('planner', '--ros-args', '-p', 'use_sim_time:=true', '-p', 'lead_time:=3.0')]
 
     def now(key: str) -> str:
         return {x.key: x.value for x in statuses[-1].values}.get(key, '') if statuses else ''
@@ -161,7 +164,10 @@ def test_feedback_that_there_is_not_is_refused(start, tmp_path):
 def test_a_simulated_experiment_with_feedback_arrives_and_records_what_is_believed(
         start, tmp_path):
     file = tmp_path / 'mismatched.yaml'
-    file.write_text(MISMATCHED)
+    # In slow motion: a busy machine takes its time, and feedback shall correct a move in it.
+    file.write_text(
+        f'{MISMATCHED}    real_time_factor: 0.15\n    publish_rate: 500.0\n'
+        '/**/planner:\n  ros__parameters:\n    lead_time: 0.4\n')
     run = start.hmsa('run', '1.1:1.5', '1.3:1.5', '--simulate', '--feedback', 'adapt',
                      '--params-file', str(file), '--out', str(tmp_path / 'out'))
     assert run.wait(RUN_SECONDS) == 0, run.output
