@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.estimation.motion import behind, follow, Levels, rest
+from hmsa_ros.estimation.motion import follow, Levels, Motion, rest
 from hmsa_ros.estimation.prior import Prior
 from hmsa_ros.estimation.scatter import Scatter
 from hmsa_ros.estimation.screening import Screening
-from hmsa_ros.estimation.window import coordinates, Solution, Window
+from hmsa_ros.estimation.window import coordinates, Solution, Trial, Window
 from hmsa_ros.identification.fit import robust_scale
 from hmsa_ros.identification.quantities import actuator_of, derivative, QUANTITIES
 from hmsa_ros.model.equations import Array
@@ -168,11 +168,12 @@ class Estimator:
             return None
         window = self._window or self._new_window(*self._pending[0])
         self._window = window
-        self._take(window)
-        until = max(self._seconds(time), window.begin,
-                    float(window.time[-1]) if len(window.time) else 0.0)
+        levels = self._as_levels()
+        until = max([self._seconds(x) for x, _ in self._pending[-1:]] + window.time[-1:].tolist()
+                    + [self._seconds(time), window.begin])
+        here = self._take(window, levels, until)
         z = window.mean if self._solution is None else self._solution.z
-        found = window.solve(z, self._as_levels(), self.noise, until)
+        found = window.solve(z, levels, self.noise, until, here)
         if found is None:
             self.screening.trouble = 'no motion leads through the samples'
             return None
@@ -198,14 +199,20 @@ class Estimator:
             found = window.solve(window.mean, self._as_levels(), self.noise, window.begin)
         if found is None:
             return None
-        motion = follow(
-            found.values, self.prior.free, (float(found.z[-2]), float(found.z[-1])),
-            self._as_levels(), window.begin,
-            np.array([max(self._seconds(time), window.begin)]))
+        motion = self._follow(
+            found, window, max(self._seconds(time), window.begin), self.prior.free)
         if motion is None:
             return None
         return self._estimate(
             time, replace(found, motion=motion, residual=np.zeros(0)), window)
+
+    def _follow(
+            self, found: Solution, window: Window, time: float, free: Sequence[str] = ()
+    ) -> Motion | None:
+        """Return the motion of a solution at a time in s."""
+        return follow(
+            found.values, free, (float(found.z[-2]), float(found.z[-1])), self._as_levels(),
+            window.begin, np.array([time]))
 
     def _leave_behind(self, time: int) -> None:
         """Let samples of long before a time in ns go, and a window that nothing came after."""
@@ -257,23 +264,32 @@ class Estimator:
             dict(prior.values), prior.free, np.append(mean, [stretch, 0.0]), covariance,
             _bounds(self.prior), 0.0, np.zeros(0), np.zeros(0))
 
-    def _take(self, window: Window) -> None:
-        """Take what waits into the window, as far as it fits the motion believed."""
-        if not self._pending:
-            return
+    def _take(self, window: Window, levels: Levels, until: float) -> Trial | None:
+        """
+        Take what waits into the window, as far as it fits the motion believed.
+
+        Returned is what that motion, until a time in s, makes of all samples, if it is known.
+        """
         waiting, self._pending = self._pending, []
         times = np.array([self._seconds(x) for x, _ in waiting])
         stretch = np.array([x for _, x in waiting])
-        found = self._solution
-        if found is not None:
-            kept = self.screening.fitting(
-                window, found, self._as_levels(), times, stretch, self.noise)
-            times, stretch = times[kept], stretch[kept]
-        elif not self.options.noise and len(stretch) >= _FEWEST_FOR_NOISE:
+        found, count = self._solution, len(window.time)
+        if found is None and not self.options.noise and len(stretch) >= _FEWEST_FOR_NOISE:
             self.noise = max(robust_scale(np.diff(stretch, 2)) / math.sqrt(6.0), _LEAST_NOISE)
-        order = np.argsort(np.append(window.time, times), kind='stable')
-        window.time = np.append(window.time, times)[order]
-        window.stretch = np.append(window.stretch, stretch)[order]
+        both = np.append(window.time, times)
+        order = np.argsort(both, kind='stable')
+        window.time, window.stretch = both[order], np.append(window.stretch, stretch)[order]
+        here = None if found is None else window.simulate(found.z, levels, self.noise, until)
+        if found is None or here is None:
+            return None
+        new = np.flatnonzero(order >= count)
+        fits = self.screening.fitting(
+            window.stretch[new], here.residual[new], here.by[new], found.covariance, self.noise)
+        if np.all(fits):
+            return here
+        window.time, window.stretch = (
+            np.delete(x, new[~fits]) for x in (window.time, window.stretch))
+        return None
 
     def _follow_noise(self, found: Solution) -> None:
         if self.options.noise or len(found.residual) < _FEWEST_FOR_NOISE:
@@ -283,17 +299,11 @@ class Estimator:
         self.noise = math.exp(
             (1.0 - gain) * math.log(self.noise) + gain * math.log(seen))
 
-    def _behind(self, found: Solution, window: Window, time: float) -> dict[str, Any]:
-        """Return the values of a solution with what branches have followed at a time in s."""
-        return {**found.values, 'behind': behind(
-            found.values, (float(found.z[-2]), float(found.z[-1])), self._as_levels(),
-            window.begin, time)}
-
     def _estimate(self, time: int, found: Solution, window: Window) -> Estimate:
         state, covariance = found.at_end()
         values = found.values
         if 'creep' in values:
-            values = self._behind(found, window, max(self._seconds(time), window.begin))
+            values = {**values, 'behind': found.motion.behind}
         if self._fixed is not None:
             covariance[:-2, :-2] = self._fixed
         deviations = {
@@ -331,8 +341,10 @@ class Estimator:
         moved = window.move_on(place, time, found, self.noise, drift)
         self._fix(moved, found)
         if 'creep' in found.values:
-            found = replace(found, values=self._behind(found, window, time))
-            moved.values = {**moved.values, 'behind': found.values['behind']}
+            until_then = self._follow(found, window, time)
+            if until_then is not None:
+                found = replace(found, values={**found.values, 'behind': until_then.behind})
+                moved.values = {**moved.values, 'behind': until_then.behind}
         moved.begin -= seconds
         moved.time = moved.time - seconds
         self._origin += shift

@@ -1,9 +1,8 @@
 """Samples that cannot be right: no number, a frozen sensor, a jump."""
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hmsa_ros.estimation.motion import follow, Levels
-from hmsa_ros.estimation.window import Solution, Window
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.laws.coordinate import Coordinate
 
@@ -52,24 +51,17 @@ class Screening:
         return False
 
     def fitting(
-            self, window: Window, found: Solution, levels: Levels, times: Array,
-            stretch: Array, noise: float) -> Array:
+            self, stretch: Array, residual: Array, by: Array, covariance: Array, noise: float
+    ) -> NDArray[np.bool_]:
         """
         Return which samples fit the motion believed, shape (n,).
 
-        Their times are in s, increasing; the window does not have them yet.
+        Given are what they are off it, and its derivatives by coordinates of some covariance.
         """
-        kept = np.ones(len(times), dtype=bool)
-        motion = follow(
-            found.values, window.free, (float(found.z[-2]), float(found.z[-1])), levels,
-            window.begin, np.maximum(times - found.values['sensor_latency'], window.begin))
-        if motion is None:
-            return kept
-        shown, by = motion.measured(found.values, window.free)
-        spread = np.sqrt(np.einsum('ij,jk,ik->i', by, found.covariance, by) + noise ** 2)
-        for i, (value, expected) in enumerate(zip(stretch.tolist(), shown.tolist(), strict=True)):
-            kept[i] = self._judge(value, expected, float(spread[i]), noise)
-        return kept
+        spread = np.sqrt(np.sum(by @ covariance * by, axis=1) + noise ** 2)
+        return np.array([
+            self._judge(value, value - off, size, noise) for value, off, size in zip(
+                stretch.tolist(), residual.tolist(), spread.tolist(), strict=True)], dtype=bool)
 
     def _judge(self, value: float, expected: float, spread: float, noise: float) -> bool:
         self._last = [*self._last, (value, expected)][-_EQUAL:]

@@ -11,7 +11,7 @@ along with the motion (C. V. Rao, J. B. Rawlings and D. Q. Mayne, IEEE Trans. Au
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,17 @@ from hmsa_ros.model.equations import Array
 _PASSES, _HALVINGS, _SMALL = 6, 4, 0.03
 # A coordinate sought by its logarithm goes no further than this in one step.
 _STRIDE = 0.3
+
+
+class Trial(NamedTuple):
+    """What some coordinates make of the samples."""
+
+    values: dict[str, Any]  # of all quantities
+    motion: Motion  # at the samples, and at the time asked for last
+    residual: Array  # measured less simulated, shape (n,)
+    by: Array  # derivatives of what the sensor shows by the coordinates, shape (n, q)
+    weights: Array  # how far each sample counts, 0 to 1
+    cost: float  # negative logarithm of the probability
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,23 +86,24 @@ class Window:
             found[name] = clip(name, from_coordinate(name, x))
         return complete(found, self.free)
 
-    def solve(self, z: Array, levels: Levels, noise: float, until: float) -> Solution | None:
+    def solve(
+            self, z: Array, levels: Levels, noise: float, until: float, here: Trial | None = None
+    ) -> Solution | None:
         """
         Seek the most probable motion from coordinates on; None if none can be followed from there.
 
         The noise is the standard deviation of a sample. The motion is wanted until a time that is
-        not before the last sample.
+        not before the last sample. What `simulate` says of the coordinates may be given.
         """
         prior: Array = np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
-        times = np.append(self.time, until)
-        here = self._simulate(z, levels, times, noise, prior)
+        here = here or self.simulate(z, levels, noise, until, prior)
         if here is None:
-            here = self._simulate(self.mean, levels, times, noise, prior)
+            here = self.simulate(self.mean, levels, noise, until, prior)
             if here is None:
                 return None
             z = self.mean
         for _ in range(_PASSES):
-            values, motion, residual, by, weights, cost = here
+            residual, by, weights, cost = here[2:]
             weighted = weights[:, None] * by / noise ** 2
             matrix = prior + by.T @ weighted
             step: Array = np.asarray(np.linalg.solve(
@@ -104,7 +116,7 @@ class Window:
                 if QUANTITIES[name].scale == 'log' and abs(x) > _STRIDE])
             for _ in range(_HALVINGS):
                 trial = self._bounded(z + step)
-                there = self._simulate(trial, levels, times, noise, prior)
+                there = self.simulate(trial, levels, noise, until, prior)
                 if there is not None and there[-1] <= cost:
                     break
                 step *= 0.4
@@ -122,10 +134,13 @@ class Window:
         kept[:-2] = np.clip(z[:-2], self.bounds[:, 0], self.bounds[:, 1])
         return kept
 
-    def _simulate(
-            self, z: Array, levels: Levels, times: Array, noise: float, prior: Array
-    ) -> tuple[dict[str, Any], Motion, Array, Array, Array, float] | None:
-        values = self.values_at(z)
+    def simulate(
+            self, z: Array, levels: Levels, noise: float, until: float, prior: Array | None = None
+    ) -> Trial | None:
+        """Return what coordinates make of the samples; the prior is the inverse covariance."""
+        values, times = self.values_at(z), np.append(self.time, until)
+        if prior is None:
+            prior = np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
         motion = follow(
             values, self.free, (float(z[-2]), float(z[-1])), levels, self.begin,
             np.maximum(times - values['sensor_latency'], self.begin))
@@ -136,7 +151,7 @@ class Window:
         residual: Array = self.stretch - shown[:n]
         apart = z - self.mean
         cost = loss(residual, noise, convex=True) + 0.5 * float(apart @ prior @ apart)
-        return (
+        return Trial(
             values, motion, residual, by[:n], weights_of(residual, noise, convex=True), cost)
 
     def move_on(
