@@ -24,6 +24,25 @@ class Extras:
     force: float = 0.0
     bias: float = 0.0
     gain: float = 1.0
+    more: tuple = ()  # pairs of ratio and time of more branches
+    law: tuple = ()  # name and constants in Pa of a law in place of Gent's
+
+
+def stress(stretch, law):
+    """Return dW/dl in Pa of a law by name, as its energy has it."""
+    name, *constants = law
+    first, second = stretch ** 2 + 2.0 / stretch - 3.0, stretch - stretch ** -2
+    if name == 'mooney_rivlin':
+        return 2.0 * second * (constants[0] + constants[1] / stretch)
+    if name == 'yeoh':
+        return 2.0 * second * sum((i + 1) * c * first ** i for i, c in enumerate(constants))
+    if name == 'ogden':
+        return sum(mu * (stretch ** (alpha - 1.0) - stretch ** (-0.5 * alpha - 1.0))
+                   for mu, alpha in zip(constants[::2], constants[1::2], strict=True))
+    mu, most = constants
+    return 2.0 * second * mu * sum(
+        (i + 1) * c * (first + 3.0) ** i / most ** (2 * i) for i, c in enumerate(
+            (1.0 / 2.0, 1.0 / 20.0, 11.0 / 1050.0, 19.0 / 7000.0, 519.0 / 673750.0)))
 
 
 def force_of(stretch, limit):
@@ -61,23 +80,28 @@ def _simulated(times: bytes, level_times: bytes, levels: bytes, block: ActuatorP
     damping = block.damping_coefficient * block.half_thickness / (8.0 * block.half_length ** 2)
     load = x.force / (4.0 * block.half_length ** 2)
 
+    branches = ((x.ratio, x.time), *x.more)
+
+    def held(stretch):
+        return stress(stretch, x.law) if x.law else modulus * force_of(stretch, block.chain_limit)
+
     def slope(_, state, level):
-        stretch, rate, relaxed, field = state
-        elastic = force_of(stretch, block.chain_limit)
+        stretch, rate, field, *relaxed = state
+        elastic = held(stretch)
         acting = level if x.coil == 0.0 else field
         total = (
-            block.remanence * acting / mu_0 + load - modulus * elastic
-            - x.ratio * modulus * (elastic - relaxed) - damping * rate
-            + 0.25 * inertia * rate ** 2 / stretch ** 4)
+            block.remanence * acting / mu_0 + load - elastic
+            - sum(ratio * (elastic - y) for (ratio, _), y in zip(branches, relaxed, strict=True))
+            - damping * rate + 0.25 * inertia * rate ** 2 / stretch ** 4)
         return [rate, total / (inertia * (stretch ** -3 + c1) / 6.0),
-                (elastic - relaxed) / x.time,
-                (level - field) / x.coil if x.coil else 0.0]
+                (level - field) / x.coil if x.coil else 0.0,
+                *((elastic - y) / t for (_, t), y in zip(branches, relaxed, strict=True))]
 
     first = block.remanence * levels[0] / mu_0 + load
     rest = brentq(
-        lambda l: modulus * force_of(l, block.chain_limit) - first,  # noqa: E741
-        0.5, 0.999 * _upper(block.chain_limit), xtol=1e-15)
-    state = np.array([rest, 0.0, force_of(rest, block.chain_limit), levels[0]])
+        lambda y: held(y) - first, 0.5, 2.0 if x.law else 0.999 * _upper(block.chain_limit),
+        xtol=1e-15)
+    state = np.array([rest, 0.0, levels[0], *(held(rest) for _ in branches)])
     stretch = np.empty(len(times))
     ends = np.append(level_times[1:], max(times[-1], level_times[-1]) + 1e-9)
     for begin, end, level in zip(level_times, ends, levels, strict=True):

@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
+from hmsa_ros import motion
 from hmsa_ros.model import law
 from hmsa_ros.model.equations import (
     elastic_energy,
@@ -17,7 +18,7 @@ from hmsa_ros.model.equations import (
 from hmsa_ros.model.parameters import NondimensionalParameters
 from hmsa_ros.model.simulation import simulate
 from hmsa_ros.model.status import Code
-from hmsa_ros.motion import constant_slope
+from hmsa_ros.motion.theta import CONSTANT
 from hmsa_ros.planning.two_step import plan_two_step, plan_two_step_batch
 
 NEO_HOOKEAN = NondimensionalParameters(j_lim=math.inf)
@@ -73,7 +74,13 @@ def test_a_batch_plans_both_laws_side_by_side():
 def test_the_slope_of_the_force_by_the_chain_limit_is_that_of_finite_differences(stretch):
     high, low = (
         law.elastic_force(stretch, law.pack(0.3, 1.0 / (0.2 + x), 1.4)) for x in (1e-6, -1e-6))
-    assert constant_slope(stretch, 0, law.pack(0.3, 5.0, 1.4)) == pytest.approx(
+    material, slope = law.pack(0.3, 5.0, 1.4), np.empty(1)
+    theta = np.array([1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+    held = motion.rest(
+        theta, material, law.elastic_force(stretch, material), np.array([CONSTANT]), slope)
+    assert held == pytest.approx(stretch, rel=1e-14)
+    # Where it is held moves as far as the force grows less.
+    assert -slope[0] * law.elastic_stiffness(stretch, material) == pytest.approx(
         (high - low) / 2e-6, rel=1e-8)
 
 

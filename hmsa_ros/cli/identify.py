@@ -35,7 +35,8 @@ def add_parser(subparsers: Any) -> None:
          'parameters to identify (default shear_modulus, damping_coefficient, chain_limit, '
          'remanence, stretch_bias); others: density, time_unit, stretch_gain, sensor_latency, '
          'coil_time_constant, constant_force, initial_stretch, initial_rate, '
-         'viscoelastic_ratio, viscoelastic_time', {'default': ''}),
+         'viscoelastic_ratio and viscoelastic_time, for more branches with _2 and _3 after them; '
+         'with a law its constants, such as law.c10 and law.c01', {'default': ''}),
         ('--joint', 'NAME', str, 'joint to identify, if the bag has several', {'default': ''}),
         ('--profile', 'NAME', str, 'also print the profile likelihood of this parameter',
          {'default': ''}),

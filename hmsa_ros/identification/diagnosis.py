@@ -10,11 +10,13 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.fit import Fit
 from hmsa_ros.identification.noise import autocorrelation, inflation, Whiteness, whiteness
 from hmsa_ros.identification.quantities import (
+    BRANCHES,
     damping_unit,
     geometry_of,
     group_of,
     modulus_of,
     QUANTITIES,
+    quantity_of,
 )
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.response import complete, respond
@@ -24,6 +26,8 @@ from hmsa_ros.model.equations import Array
 
 # Deviation, in the coordinates, from which on a number is none: of positive values a quarter.
 _RELATIVE = 0.25
+# Chains that lock beyond such a stretch hardly show, and stresses below this share of the modulus.
+_LOOSE, _SMALL_STRESS = 10.0, 0.02
 # Components of a direction below this share of the largest are left out.
 _NAMED = 0.2
 # A signature counts from this share of the residuals and this many deviations on.
@@ -53,8 +57,19 @@ def allowed(fit: Fit) -> Array:
         'stretch_bias': 0.05, 'stretch_gain': 0.1, 'sensor_latency': 0.5 * unit,
         'coil_time_constant': max(_RELATIVE * values['coil_time_constant'], 0.1 * unit),
         'constant_force': 0.1 * load, 'initial_stretch': 0.05, 'initial_rate': 0.5 / unit,
-        'viscoelastic_ratio': 0.05, 'viscoelastic_time': 0.5}
-    return np.array([limits.get(x, _RELATIVE) for x in fit.free])
+        **{x: y for pair in BRANCHES for x, y in zip(pair, (0.05, 0.5), strict=True)}}
+    return np.array([limits.get(x, _of_law(fit, x)) for x in fit.free])
+
+
+def _of_law(fit: Fit, name: str) -> float:
+    """Return what is allowed of a constant of the law, and of all that has a logarithm."""
+    quantity, value = quantity_of(name), float(fit.values[name])
+    if quantity.scale == 'log':
+        return _RELATIVE
+    if quantity.scale == 'inverse':
+        return _RELATIVE / min(value, _LOOSE)
+    least = _SMALL_STRESS * float(fit.values['shear_modulus']) if quantity.unit == 'Pa' else 1.0
+    return _RELATIVE * max(abs(value), least)
 
 
 @dataclass(frozen=True)
@@ -98,7 +113,7 @@ def weakness(fit: Fit, deviation: float, factors: Array) -> Weakness | None:
                 f'{words} at the same time leaves the recorded motion unchanged within the '
                 'noise')
     advice = list(dict.fromkeys(
-        QUANTITIES[x].advice for x in names if QUANTITIES[x].advice))
+        quantity_of(x).advice for x in names if quantity_of(x).advice))
     if {'shear_modulus', 'density', 'remanence'} <= set(fit.free) or (
             {'shear_modulus', 'time_unit', 'remanence'} <= set(fit.free)):
         advice = [QUANTITIES['density'].advice]
@@ -112,12 +127,12 @@ def _change(fit: Fit, place: int, change: float, first: float) -> str:
     """Word a change of one parameter along a direction in which the first one grows."""
     name = fit.free[place]
     change = math.copysign(1.0, first) * change
-    kind = QUANTITIES[name].scale
+    kind = quantity_of(name).scale
     if kind == 'linear':
         value = fit.values[name]
         if name == 'damping_coefficient' and value > 0.0:
             return f'{name} {100.0 * change / value:+.3g} %'
-        unit = QUANTITIES[name].unit
+        unit = quantity_of(name).unit
         return f'{name} {change:+.3g}{" " + unit if unit else ""}'
     if kind == 'inverse':
         change = -change * fit.values[name]
@@ -130,18 +145,22 @@ def _listed(names: Sequence[str]) -> str:
 
 def _columns(fit: Fit) -> Iterator[tuple[str, Array]]:
     """Yield directions of the residuals that stand for something the model leaves out."""
-    def by(names: Sequence[str], **values: float) -> Array:
-        response = respond(recording, complete({**fit.values, **values}, fit.free), names)
-        return np.zeros((len(names), len(time))) if response is None else response.jacobian.T
-
     recording, time = fit.recording, fit.recording.time
-    if names := [x for x in _WORDS if x not in fit.free]:
-        yield from zip((_WORDS[x] for x in names), by(names), strict=True)
-    if 'viscoelastic_ratio' not in fit.free:
+    values = complete(fit.values, fit.free)
+    names = [x for x in _WORDS if x not in fit.free]
+    words = [_WORDS[x] for x in names]
+    if 'viscoelastic_ratio' not in fit.free and not values['viscoelastic_ratio']:
+        # Branches that hold nothing, all in one simulation.
         span = float(time[-1] - time[0])
-        for tau in (2.0 * fit.values['time_unit'], 0.03 * span, 0.3 * span):
-            column, = by(['viscoelastic_ratio'], viscoelastic_time=tau)
-            yield f'creep with a time of {tau:.2g} s', column
+        for (ratio, tau), seconds in zip(
+                BRANCHES, (2.0 * values['time_unit'], 0.03 * span, 0.3 * span), strict=True):
+            names.append(ratio)
+            words.append(f'creep with a time of {seconds:.2g} s')
+            values[tau] = seconds
+    if names:
+        response = respond(recording, values, names)
+        columns = np.zeros((len(names), len(time))) if response is None else response.jacobian.T
+        yield from zip(words, columns, strict=True)
     yield 'drift of the sensor or the temperature', time - 0.5 * (time[0] + time[-1])
     levels = recording.levels
     signs = np.sign(np.diff(levels, prepend=levels[0]))
@@ -164,9 +183,10 @@ def signatures(fit: Fit, found: Whiteness) -> tuple[Signature, ...]:
     size is held against the noise that would be left without it.
     """
     root = fit.root
-    known = np.hstack([fit.response.jacobian, fit.response.by_switch])
-    base, _ = np.linalg.qr(root[:, None] * known / np.maximum(
-        np.linalg.norm(known, axis=0), 1e-300))
+    base = root[:, None] * np.hstack([fit.response.jacobian, fit.response.by_switch])
+    base = base / np.maximum(np.linalg.norm(base, axis=0), 1e-300)
+    gram = base.T @ base
+    inverse = np.linalg.inv(gram + 1e-13 * np.trace(gram) * np.eye(len(gram)))
     residual = root * fit.residual
     total = float(residual @ residual)
     quantum = fit.recording.quantum
@@ -174,7 +194,8 @@ def signatures(fit: Fit, found: Whiteness) -> tuple[Signature, ...]:
     for name, column in _columns(fit):
         direction = root * column
         norm = float(np.linalg.norm(direction))
-        direction = direction - base @ (base.T @ direction)
+        for _ in range(2):
+            direction = direction - base @ (inverse @ (base.T @ direction))
         if norm == 0.0 or float(np.linalg.norm(direction)) < 1e-6 * norm or total == 0.0:
             continue
         direction /= np.linalg.norm(direction)

@@ -17,7 +17,7 @@ import numpy as np
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.known import Known, PREFIX
-from hmsa_ros.identification.quantities import actuator_of, QUANTITIES
+from hmsa_ros.identification.quantities import actuator_of, BRANCHES, constants_of, quantity_of
 from hmsa_ros.identification.result import Identification
 from hmsa_ros.interfaces.actuator import actuator_from, parameters_of
 from hmsa_ros.interfaces.parameters import BLOCK
@@ -31,8 +31,8 @@ from hmsa_ros.recordings.parameters import Entries, entries_of, number_of, value
 _OTHERS = {
     'coil_time_constant': 'coil_time_constant', 'stretch_bias': 'stretch_bias',
     'stretch_gain': 'stretch_gain', 'initial_stretch': 'initial_stretch'}
-_LISTS = {
-    'viscoelastic_ratio': 'viscoelastic.ratio', 'viscoelastic_time': 'viscoelastic.time'}
+_LISTS = dict(zip(
+    ('viscoelastic.ratio', 'viscoelastic.time'), zip(*BRANCHES, strict=True), strict=True))
 # Half of a 95 % interval, or half an axis of the ellipsoid of so many, in standard deviations.
 _HALF_95 = (0.0, 1.96, 2.448, 2.795, 3.080)
 # What changes how a block moves, in the order of `hmsa_ros.model.mismatch.Errors`.
@@ -85,16 +85,17 @@ def read_belief(path: Path | None, entries: Entries | None = None) -> Belief:
     values = values_of({f'{PLANNER}.{x}': y for x, y in settings.items()}, PLANNER, BLOCK)
     others = {name: _number(path, key, settings[key])
               for name, key in _OTHERS.items() if key in settings}
-    for name, key in _LISTS.items():
+    for key, names in _LISTS.items():
         value = settings.get(key)
-        if isinstance(value, list) and len(value) == 1:
-            others[name] = _number(path, key, value[0])
-        elif isinstance(value, list) and len(value) > 1:
+        if isinstance(value, list) and len(value) > len(names):
             raise BadInputError(
-                f'{path} gives {len(value)} values of {key}: expected one, since one branch of '
-                'creep is identified')
-    if others.get('viscoelastic_ratio') == 0.0:
-        others.pop('viscoelastic_time', None)
+                f'{path} gives {len(value)} values of {key}: expected at most {len(names)}, '
+                'since as many branches of creep are identified')
+        if isinstance(value, list):
+            others |= {x: _number(path, key, y) for x, y in zip(names, value, strict=False)}
+    for ratio, time in BRANCHES:
+        if others.get(ratio) == 0.0:
+            others.pop(time, None)
     try:
         known = Known.read(settings)
     except BadInputError as error:
@@ -176,14 +177,22 @@ def file_text(found: Identification, belief: Belief, run: str, now: datetime) ->
     for key, value in parameters_of(actuator).items():
         if key not in written:
             scale = key == f'law.{found.shown("shear_modulus")[0]}'
-            lines.append(_line(key, value, found, 'shear_modulus') if scale
-                         else f'    {key}: {yaml_text(value)}')
+            sought = ['shear_modulus'] if scale else [
+                x for x, (constant, _) in constants_of(actuator.law).items()
+                if constant.name == key and x in found.names]
+            lines.append(_line(key, value, found, *sought))
             written[key] = value
-    for name, key in {**_OTHERS, **_LISTS}.items():
+    for name, key in _OTHERS.items():
         if name in found.names:
-            value = found.values[name]
-            lines.append(_line(key, [value] if name in _LISTS else value, found, name))
-            written[key] = value
+            written[key] = found.values[name]
+            lines.append(_line(key, written[key], found, name))
+    held = [i for i, pair in enumerate(BRANCHES)
+            if found.values[pair[0]] > 0.0 or set(pair) & set(found.names)]
+    for key, names in _LISTS.items():
+        if any(x in found.names for pair in BRANCHES for x in pair):
+            written[key] = [found.values[names[i]] for i in held]
+            lines.append(_line(
+                key, written[key], found, *(names[i] for i in held if names[i] in found.names)))
     for key, value in belief.settings.items():
         if key not in written and not key.startswith(PREFIX):
             lines.append(f'    {key}: {yaml_text(value)}')
@@ -200,18 +209,21 @@ def known_lines(known: Known, joint: str = '') -> list[str]:
         *(f'    {joint}{key}: {yaml_text(x)}' for key, x in known.parameters().items())]
 
 
-def _line(key: str, value: Any, found: Identification, name: str) -> str:
-    """Return the line of a value with its deviation and interval."""
-    label, estimate = found.shown(name)
-    if not key.endswith(label):
-        label, estimate = name, found.parameters[name]
-    if not estimate.free:
-        return f'    {key}: {yaml_text(value)}  # not identified'
-    unit = f' {QUANTITIES[name].unit}' if QUANTITIES[name].unit else ''
-    of = '' if key.endswith(label) or '.' in key and name in _LISTS else f'{name} '
-    return (
-        f'    {key}: {yaml_text(value)}  # {of}standard deviation {estimate.std:.3g}{unit}, 95 % '
-        f'interval {estimate.low:.6g} to {estimate.high:.6g}')
+def _line(key: str, value: Any, found: Identification, *names: str) -> str:
+    """Return the line of a value with the deviations and intervals of what was sought of it."""
+    line, notes = f'    {key}: {yaml_text(value)}', []
+    for name in names:
+        label, estimate = found.shown(name)
+        if not key.endswith(label):
+            label, estimate = name, found.parameters[name]
+        if not estimate.free:
+            return f'{line}  # not identified'
+        unit = f' {quantity_of(name).unit}' if quantity_of(name).unit else ''
+        alone = len(names) == 1 and (key.endswith(label) or key in _LISTS)
+        notes.append(
+            f'{"" if alone else f"{name} "}standard deviation {estimate.std:.3g}{unit}, 95 % '
+            f'interval {estimate.low:.6g} to {estimate.high:.6g}')
+    return f'{line}  # {"; ".join(notes)}' if notes else line
 
 
 def yaml_text(value: Any) -> str:

@@ -7,13 +7,21 @@ from the residuals themselves. Under normal noise that costs 0.1 % of the accura
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 import math
 from typing import Any
 
 import numpy as np
 
-from hmsa_ros.identification.quantities import from_coordinate, to_coordinate
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification.quantities import (
+    from_coordinate,
+    QUANTITIES,
+    quantity_of,
+    to_coordinate,
+    with_constants,
+)
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.response import clip, respond, Response
 from hmsa_ros.model.equations import Array
@@ -74,9 +82,10 @@ class Fit:
 
 def robust_scale(residual: Array) -> float:
     """Return the standard deviation of residuals of which a few may be outliers."""
-    size = np.sort(np.abs(residual))
-    one, two = size[int(0.6827 * (len(size) - 1))], 0.5 * size[int(0.9545 * (len(size) - 1))]
-    return max(float(one), float(two), LEAST_SCALE)
+    last = len(residual) - 1
+    places = int(0.6827 * last), int(0.9545 * last)
+    size = np.partition(np.abs(residual), places)
+    return max(float(size[places[0]]), 0.5 * float(size[places[1]]), LEAST_SCALE)
 
 
 def weights_of(residual: Array, scale: float, *, convex: bool = False) -> Array:
@@ -105,11 +114,14 @@ def loss(residual: Array, scale: float, *, convex: bool = False) -> float:
 
 def moved(values: Mapping[str, float], free: Sequence[str], step: Array) -> dict[str, float]:
     """Return values after a step of the coordinates, kept in their ranges."""
-    done = dict(values)
+    done: dict[str, Any] = dict(values)
     for name, change in zip(free, step.tolist(), strict=True):
         done[name] = clip(name, from_coordinate(name, to_coordinate(name, values[name]) + change))
         if name == 'chain_limit' and not math.isfinite(done[name]):
             done[name] = 1e9
+    # Where constants make no law there is no motion either.
+    with suppress(BadInputError):
+        done = with_constants(done)
     return done
 
 
@@ -246,14 +258,15 @@ def _stride(values: Mapping[str, float], free: Sequence[str], step: Array) -> fl
     """Return the share of a step that no logarithm, and no chain limit, leaps with."""
     share = 1.0
     for name, change in zip(free, step.tolist(), strict=True):
-        if name in ('stretch_bias', 'sensor_latency', 'constant_force', 'initial_rate',
-                    'coil_time_constant', 'viscoelastic_ratio'):
-            continue
-        limit = _STRIDE
-        if name == 'chain_limit':
+        quantity, limit = quantity_of(name), _STRIDE
+        if quantity.scale == 'inverse':
             limit = max(0.5 / values[name], 0.02)
         elif name == 'damping_coefficient':
             limit = max(2.0 * values[name], 1e-6)
+        elif quantity.unit == 'Pa' and quantity.scale == 'linear':
+            limit = 0.5 * _STRIDE * values['shear_modulus']
+        elif name in QUANTITIES and quantity.scale == 'linear' and name != 'initial_stretch':
+            continue
         if abs(change) > limit:
             share = min(share, limit / abs(change))
     return share

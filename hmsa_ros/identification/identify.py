@@ -12,20 +12,24 @@ from hmsa_ros.identification import diagnosis
 from hmsa_ros.identification.fit import Fit, fit, LEAST_SCALE, loss, moved, robust_scale
 from hmsa_ros.identification.noise import errors_of_stamps, hinted, whiteness, widening
 from hmsa_ros.identification.quantities import (
+    BRANCHES,
     check_free,
+    constant_values,
+    constants_of,
     DEFAULT_FREE,
     derivative,
     from_coordinate,
     GEOMETRY,
     modulus_of,
     QUANTITIES,
+    quantity_of,
     to_coordinate,
     values_of,
 )
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.response import complete, respond
 from hmsa_ros.identification.result import Estimate, Identification, Verdict
-from hmsa_ros.identification.start import scan, segments, starts
+from hmsa_ros.identification.start import deviations, scan, segments, starts
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 
@@ -111,6 +115,15 @@ def identify(
             coordinate=actuator.coordinate)
     free = check_free(free, actuator.law)
     values = complete(values_of(actuator, known), ())
+    if actuator.law is not None and set(free) & set(constants_of(actuator.law)):
+        values |= constant_values(actuator.law, actuator.shear_modulus)
+    sought = [time for ratio, time in BRANCHES if ratio in free]
+    if len(sought) > 1:
+        # From the swing on to what is left at the end.
+        span = 0.2 * float(recording.time[-1] - recording.time[0])
+        values |= {x: y for x, y in zip(sought, np.geomspace(
+            min(2.0 * values['time_unit'], 0.2 * span), span, len(sought)).tolist(), strict=True)
+            if x in free and x not in (known or {})}
     if 'chain_limit' in free:
         # Endless chains are no start: the derivative by their inverse is taken of the limit.
         values['chain_limit'] = min(values['chain_limit'], 1e9)
@@ -125,7 +138,7 @@ def identify(
             f'{recording.label} has {len(recording.time)} samples for {len(free)} free '
             f'parameters: expected {2 * len(free)} or more')
     best, tried, agreed = _search(recording, values, free)
-    return _conclude(_with_errors_of_stamps(best), tried, agreed)
+    return _conclude(*_with_errors_of_stamps(best), tried, agreed)
 
 
 def _begins_at_rest(recording: Recording) -> bool:
@@ -137,10 +150,13 @@ def _begins_at_rest(recording: Recording) -> bool:
     if len(before) < 4:
         return True
     # Of white noise second differences have a deviation of sqrt(6).
-    tails = [recording.stretch[begin + (end - begin) * 2 // 3:end]
-             for begin, end, _, _ in spans if end - begin >= 15]
-    quiet = min((float(min(np.std(x), np.std(np.diff(x, 2)) / math.sqrt(6.0)))
-                 for x in tails), default=0.0)
+    tails = np.array([(begin + (end - begin) * 2 // 3, end)
+                      for begin, end, _, _ in spans if end - begin >= 15],
+                     np.int64).reshape(-1, 2)
+    quiet = float(min(
+        np.min(deviations(recording.stretch, tails), initial=math.inf),
+        np.min(deviations(np.diff(recording.stretch, 2), tails - np.array([0, 2])),
+               initial=math.inf) / math.sqrt(6.0))) if len(tails) else 0.0
     quiet = max(quiet, 0.5 * recording.quantum, 1e-6)
     return float(np.std(before)) < 4.0 * quiet
 
@@ -196,22 +212,26 @@ def _search(
     return best, len(found), agreed
 
 
-def _with_errors_of_stamps(best: Fit) -> Fit:
-    """Return a fit in which samples in motion count less, if errors of the stamps show there."""
+def _with_errors_of_stamps(best: Fit) -> tuple[Fit, Array]:
+    """
+    Return a fit in which samples in motion count less, if errors of the stamps show there.
+
+    With it comes the variance of its coordinates, with what is not known of these errors.
+    """
     found, recording = best, best.recording
     for _ in range(_MOST_SPREADS):
-        spread, _ = errors_of_stamps(found.jacobian, found.residual, found.response.rate)
+        spread, variance = errors_of_stamps(found.jacobian, found.residual, found.response.rate)
         if np.array_equal(spread, found.spread):
-            return found
+            return found, variance
         again = fit(recording, found.values, found.free, spread=spread)
         # What the model leaves out is larger in motion too, but not from sample to sample.
         if again is None or not again.converged or whiteness(
                 again.root * again.residual).p_value < _CERTAIN or (
                 robust_scale(again.residual) > 2.0 * diagnosis.DISTANT * float(
                     np.std(recording.stretch))):
-            return found
+            return found, variance
         found = again
-    return found
+    return found, errors_of_stamps(found.jacobian, found.residual, found.response.rate)[1]
 
 
 def _best(found: Sequence[Fit]) -> tuple[Fit, int]:
@@ -245,8 +265,8 @@ def _miss(recording: Recording, candidate: Mapping[str, float]) -> float:
         np.mean(np.abs(recording.stretch - response.stretch)))
 
 
-def _conclude(best: Fit, tried: int, agreed: int) -> Identification:
-    """Return the result of a fit."""
+def _conclude(best: Fit, variance: Array, tried: int, agreed: int) -> Identification:
+    """Return the result of a fit, with the variance of its coordinates where stamps may be off."""
     root, recording = best.root, best.recording
     weighted = root * best.residual
     counted = float(np.sum(best.weights))
@@ -257,8 +277,7 @@ def _conclude(best: Fit, tried: int, agreed: int) -> Identification:
     inverse = _inverse(best.information)
     columns = root[:, None] * best.jacobian
     correlated = widening(columns, weighted, inverse, found)
-    _, variance = errors_of_stamps(best.jacobian, best.residual, best.response.rate)
-    variance += _blurred(best, deviation, columns, inverse)
+    variance = variance + _blurred(best, deviation, columns, inverse)
     hint: Array = np.zeros(len(best.free))
     if not recording.earlier and not _DELAYS.intersection(best.free):
         hint = hinted(root * best.response.rate, columns, weighted, inverse, found)
@@ -373,8 +392,9 @@ def _estimates(
     scales = np.array([derivative(x, values[x]) for x in best.free])
     matrix = covariance * np.outer(scales, scales)
     estimates: dict[str, Estimate] = {}
-    for name, quantity in QUANTITIES.items():
-        value = values[name]
+    constants = [x for x in constants_of(values.get('law')) if x in values]
+    for name in (*QUANTITIES, *constants):
+        value, quantity = values[name], quantity_of(name)
         if name in lost:
             estimates[name] = Estimate(
                 math.nan, math.nan, math.nan, math.nan, quantity.unit, True)

@@ -94,24 +94,26 @@ def errors_of_stamps(jacobian: Array, residual: Array, rate: Array) -> tuple[Arr
     scaled = residual / min(spreads, key=lambda x: _surprise(residual, x))
     weights = weights_of(scaled, robust_scale(scaled))
     size = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-100)
-    freedom = max(float(np.sum(weights)) - jacobian.shape[1], 1.0)
-    logarithms, variances = [], []
-    for spread in spreads:
-        root = np.sqrt(weights) / spread
-        columns, values = root[:, None] * jacobian / size, root * residual
-        matrix = columns.T @ columns
-        matrix += 1e-13 * np.trace(matrix) * np.eye(len(matrix))
-        inverse = np.linalg.inv(matrix)
-        shift = inverse @ (columns.T @ values)
-        rest = max(float(np.sum((values - columns @ shift) ** 2)), freedom * LEAST_SCALE ** 2)
-        logarithms.append(-float(weights @ np.log(spread)) - 0.5 * (
-            float(np.linalg.slogdet(matrix)[1]) + freedom * math.log(rest)))
-        variances.append((rest / freedom * np.diag(inverse) + shift ** 2) / size ** 2)
-    share = np.exp(np.array(logarithms) - max(logarithms))
+    count = jacobian.shape[1]
+    freedom = max(float(np.sum(weights)) - count, 1.0)
+    both = np.column_stack([jacobian / size, residual])
+    products = np.array([both.T @ ((weights / x ** 2)[:, None] * both) for x in spreads])
+    matrix, cross = products[:, :count, :count], products[:, :count, count]
+    trace = np.trace(matrix, axis1=1, axis2=2)
+    matrix = matrix + 1e-13 * trace[:, None, None] * np.eye(count)
+    inverse = np.linalg.inv(matrix)
+    shift = np.einsum('kij,kj->ki', inverse, cross)
+    rest = np.maximum(
+        products[:, count, count] - np.sum(cross * shift, axis=1), freedom * LEAST_SCALE ** 2)
+    likely = -np.log(spreads) @ weights - 0.5 * (
+        np.linalg.slogdet(matrix)[1] + freedom * np.log(rest))
+    variances = (rest[:, None] / freedom * np.diagonal(
+        inverse, axis1=1, axis2=2) + shift ** 2) / size ** 2
+    share = np.exp(likely - np.max(likely))
     share[1:] /= max(len(share) - 1, 1)
     share /= np.sum(share)
     place = 0 if share[0] >= 0.5 else 1 + int(np.argmax(share[1:]))
-    return spreads[place], share @ np.array(variances)
+    return spreads[place], share @ variances
 
 
 def _surprise(residual: Array, spread: Array) -> float:

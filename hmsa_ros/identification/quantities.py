@@ -2,12 +2,14 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 import math
 from typing import Any
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.creep import Creep
-from hmsa_ros.model.laws.record import Elastic
+from hmsa_ros.model.laws import LAWS
+from hmsa_ros.model.laws.record import Constant, Elastic
 from hmsa_ros.model.parameters import ActuatorParameters, Geometry, NondimensionalParameters
 
 
@@ -56,7 +58,20 @@ QUANTITIES: dict[str, Quantity] = {
         '1/s', 0.0, 'linear', -math.inf, advice='begin to record at rest'),
     'viscoelastic_ratio': Quantity('', 0.0, 'linear', advice=_CREEP),
     'viscoelastic_time': Quantity('s', 0.01, advice=_CREEP),
+    'viscoelastic_ratio_2': Quantity('', 0.0, 'linear', advice=_CREEP),
+    'viscoelastic_time_2': Quantity('s', 0.1, advice=_CREEP),
+    'viscoelastic_ratio_3': Quantity('', 0.0, 'linear', advice=_CREEP),
+    'viscoelastic_time_3': Quantity('s', 1.0, advice=_CREEP),
 }
+#: Ratio and time of each branch of creep.
+BRANCHES = tuple((f'viscoelastic_ratio{x}', f'viscoelastic_time{x}') for x in ('', '_2', '_3'))
+#: Constants of the laws, by the name of their parameter.
+_OF_LAWS = {
+    x.name: Quantity(
+        x.unit, scale='inverse' if x.inverse else 'linear', least=x.minimum, most=x.maximum,
+        advice='record larger stretches of both signs, and rest at three or more levels; or '
+               'choose a law with fewer constants')
+    for law in LAWS.values() for x in law.constants if x.place >= 0}
 #: Free unless others are named.
 DEFAULT_FREE = (
     'shear_modulus', 'damping_coefficient', 'chain_limit', 'remanence', 'stretch_bias')
@@ -69,18 +84,29 @@ def check_free(names: Iterable[str], law: Elastic | None = None) -> tuple[str, .
     Return the names of free parameters, each once.
 
     ``actuator.`` or ``law.`` before a name is dropped, and the modulus may have the name that it
-    has in the law. With a law in place of Gent the chain limit is not sought. Raises
+    has in the law. With a law in place of Gent the chain limit is not sought, but constants of the
+    law may be: ``law.c10``, or for all of a list ``law.mu`` and for its first ``law.mu.1``. Raises
     `BadInputError` if a name is unknown, none is given, or two exclude each other.
     """
-    alias = modulus_of(law)[0]
-    free = tuple(dict.fromkeys(
-        'shear_modulus' if x == alias else x
-        for x in (y.strip().removeprefix('actuator.').removeprefix('law.') for y in names)))
-    unknown = [x for x in free if x not in QUANTITIES]
+    constants = constants_of(law)
+    whole = {'shear_modulus': ['shear_modulus'], modulus_of(law)[0]: ['shear_modulus']}
+    for name in constants:
+        whole.setdefault(name.removeprefix('law.'), [name])
+        first = '.'.join(name.split('.')[:2]).removeprefix('law.')
+        whole[first] = [x for x in constants if x.split('.')[1] == first]
+    free = tuple(dict.fromkeys(z for x in names for y in [
+        x.strip().removeprefix('actuator.').removeprefix('law.')] for z in whole.get(y, [y])))
+    unknown = [x for x in free if x not in QUANTITIES and x not in constants]
     if unknown or not free:
         raise BadInputError(
             f'free parameter {", ".join(map(repr, unknown)) or "missing"}: expected some of '
-            f'{", ".join(QUANTITIES)}')
+            f'{", ".join([*QUANTITIES, *constants])}')
+    sought = [x for x in free if x in constants]
+    scales = [x for x in free if x in ('shear_modulus', 'time_unit')]
+    if sought and scales:
+        raise BadInputError(
+            f'both {scales[0]} and {sought[0]} are free: expected one of them, since the shear '
+            'modulus follows from the constants of the law')
     if law is not None and 'chain_limit' in free:
         if free != DEFAULT_FREE:
             raise BadInputError(
@@ -92,6 +118,60 @@ def check_free(names: Iterable[str], law: Elastic | None = None) -> tuple[str, .
             'both time_unit and density are free: expected one of them, since one follows from '
             'the other')
     return free
+
+
+@lru_cache(maxsize=64)
+def constants_of(law: Elastic | None) -> dict[str, tuple[Constant, int]]:
+    """
+    Return the constants of a law that may be sought, by name.
+
+    With each comes its place in its list, of which it has the number after a point, from 1 on.
+    """
+    found = {}
+    for constant in LAWS[law.law].constants if law is not None else ():
+        if constant.place >= 0 and law is not None:
+            value = dict(law.given)[constant.name]
+            count = len(value) if isinstance(value, tuple) else 1
+            for i in range(count):
+                found[f'{constant.name}.{i + 1}' if count > 1 else constant.name] = constant, i
+    return found
+
+
+def constant_values(law: Elastic, modulus: float) -> dict[str, float]:
+    """Return the constants of a law in SI, by name, for a shear modulus in Pa."""
+    given, found = dict(law.given), {}
+    for name, (constant, i) in constants_of(law).items():
+        value = given[constant.name]
+        value = value[i] if isinstance(value, tuple) else value
+        found[name] = float(value * modulus if constant.unit == 'Pa' else value)
+    return found
+
+
+def with_constants(values: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Return values whose law and shear modulus are those of the constants among them, if any.
+
+    Raises `BadInputError` if there is no such law.
+    """
+    law: Elastic | None = values.get('law')
+    scaled = None if law is None else LAWS[law.law].scaled
+    names = constants_of(law)
+    if scaled is None or not any(x in values for x in names):
+        return dict(values)
+    given: dict[str, Any] = {}
+    for name, (constant, _) in names.items():
+        if constant.kind is list:
+            given.setdefault(constant.name, []).append(values[name])
+        else:
+            given[constant.name] = values[name]
+    modulus, elastic = scaled(given)
+    return {**values, 'law': elastic, 'shear_modulus': modulus}
+
+
+def quantity_of(name: str) -> Quantity:
+    """Return what is known of a parameter, a constant of a law included."""
+    found = QUANTITIES.get(name)
+    return found if found is not None else _OF_LAWS['.'.join(name.split('.')[:2])]
 
 
 def values_of(
@@ -157,13 +237,13 @@ def damping_unit(values: Mapping[str, Any]) -> float:
 
 def to_coordinate(name: str, value: float) -> float:
     """Return the coordinate of a value in the search."""
-    scale = QUANTITIES[name].scale
+    scale = quantity_of(name).scale
     return math.log(value) if scale == 'log' else 1.0 / value if scale == 'inverse' else value
 
 
 def from_coordinate(name: str, x: float) -> float:
     """Return the value of a coordinate; a chain limit beyond all data is infinite."""
-    scale = QUANTITIES[name].scale
+    scale = quantity_of(name).scale
     if scale == 'log':
         return math.exp(min(max(x, -230.0), 230.0))
     if scale == 'inverse':
@@ -173,5 +253,5 @@ def from_coordinate(name: str, x: float) -> float:
 
 def derivative(name: str, value: float) -> float:
     """Return the derivative of a value by its coordinate."""
-    scale = QUANTITIES[name].scale
+    scale = quantity_of(name).scale
     return value if scale == 'log' else -value * value if scale == 'inverse' else 1.0

@@ -1,6 +1,7 @@
 """What was measured: samples of the stretch and the levels of the field, as arrays."""
 
 from dataclasses import dataclass
+from functools import cached_property
 import math
 
 import numpy as np
@@ -199,7 +200,7 @@ class Recording:
         inside = (self.level_times > self.time[0]) & (self.level_times <= self.time[-1])
         return np.flatnonzero(inside)
 
-    @property
+    @cached_property
     def quantum(self) -> float:
         """Step in which the values come; 0 where they are not quantised."""
         values = np.unique(self.stretch)
@@ -245,8 +246,9 @@ def pieces(
     first = max(int(np.searchsorted(times, begin, side='right')) - 1, 0)
     level = float(levels[first])
     if math.isinf(slew):
-        return (np.append(begin, times[first + 1:]), np.append(level, levels[first + 1:]),
-                np.zeros(len(times) - first))
+        begins, heights = times[first:].copy(), levels[first:].copy()
+        begins[0] = begin
+        return begins, heights, np.zeros(len(begins))
     ahead = [Level(*x) for x in zip(
         times[first + 1:].tolist(), levels[first + 1:].tolist(), strict=True)]
     table = np.array([(begin, level, 0.0), *ramps(ahead, level, math.inf, slew)[0]])

@@ -10,19 +10,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmsa_ros import motion
-from hmsa_ros.identification.quantities import derivative, geometry_of, group_of, QUANTITIES
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification.quantities import (
+    BRANCHES,
+    constants_of,
+    derivative,
+    geometry_of,
+    quantity_of,
+    with_constants,
+)
 from hmsa_ros.identification.recording import Course, pieces, Recording
 from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.equations import Array
-from hmsa_ros.model.law import elastic_force, elastic_stiffness, equilibrium_stretch, KIND
-from hmsa_ros.model.laws.record import GENT
-from hmsa_ros.model.parameters import NondimensionalParameters
+from hmsa_ros.model.law import KIND, pack
+from hmsa_ros.model.laws.record import Elastic, GENT
 from hmsa_ros.model.units import MU_0
 from hmsa_ros.motion import theta as places
 
 #: Relative tolerance of the integration: far below the noise of any sensor.
 RTOL = 1e-8
+_NOTHING: Array = np.empty(0)
 _SENSOR = ('stretch_bias', 'stretch_gain', 'sensor_latency')
+# Parameters that are numbers of theta as they are.
+_PLACES = {
+    'coil_time_constant': places.LAG, 'initial_stretch': places.STRETCH,
+    'initial_rate': places.RATE,
+    **{x: places.FIRST_BRANCH + i for i, x in enumerate(y for z in BRANCHES for y in z)}}
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +50,11 @@ class Response:
 
 
 def _chain(
-        values: Mapping[str, float], branches: int) -> tuple[Array, dict[str, dict[int, float]]]:
-    """Return theta of the motion and, by name, its derivatives by the parameters."""
-    geometry = geometry_of(values)
-    inertia = values['density'] * geometry.half_length ** 2
+        values: Mapping[str, Any], branches: int, free: Sequence[str]
+) -> tuple[Array, dict[str, dict[int, float]]]:
+    """Return theta of the motion and, by name, its derivatives by the free parameters."""
+    geometry, density = geometry_of(values), values['density']
+    inertia = density * geometry.half_length ** 2
     a = values['shear_modulus'] / inertia
     per_damping = 0.5 * geometry.c1 * geometry.half_length / geometry.damped / inertia
     d = per_damping * values['damping_coefficient']
@@ -51,36 +65,54 @@ def _chain(
     theta[:places.FIRST_BRANCH] = (
         a, d, k, f, values['coil_time_constant'], values['initial_stretch'],
         values['initial_rate'])
-    density = values['density']
-    by_density = {
+    if 'creep' in values:
+        theta[places.FIRST_BRANCH::2] = values['creep'].ratios
+        theta[places.FIRST_BRANCH + 1::2] = values['creep'].times
+    else:
+        for name, i in _PLACES.items():
+            if places.FIRST_BRANCH <= i < len(theta):
+                theta[i] = values[name]
+    per_density = {
         places.STIFFNESS: -a / density, places.DAMPING: -d / density,
         places.DRIVE: -k / density, places.FORCE: -f / density}
-    by_modulus = {places.STIFFNESS: a / values['shear_modulus']}
-    chain = {
-        'density': by_density, 'shear_modulus': by_modulus,
-        'remanence': {places.DRIVE: k / values['remanence']},
-        'damping_coefficient': {places.DAMPING: per_damping},
-        'constant_force': {places.FORCE: per_force},
-        'chain_limit': {places.CONSTANT: -1.0 / values['chain_limit'] ** 2},
-        'coil_time_constant': {places.LAG: 1.0},
-        'initial_stretch': {places.STRETCH: 1.0}, 'initial_rate': {places.RATE: 1.0}}
-    if branches == 1:
-        theta[places.FIRST_BRANCH:] = values['viscoelastic_ratio'], values['viscoelastic_time']
-        chain['viscoelastic_ratio'] = {places.FIRST_BRANCH: 1.0}
-        chain['viscoelastic_time'] = {places.FIRST_BRANCH + 1: 1.0}
-    # The density that goes with a time unit, L sqrt(rho/G).
-    chain['time_unit'] = {i: x * 2.0 * density / values['time_unit']
-                          for i, x in by_density.items()}
+    chain: dict[str, dict[int, float]] = {}
+    for name in free:
+        if name in _PLACES:
+            chain[name] = {_PLACES[name]: 1.0}
+        elif name == 'shear_modulus':
+            chain[name] = {places.STIFFNESS: a / values[name]}
+            if 'time_unit' in free:
+                # The density that goes with a time unit, L sqrt(rho/G).
+                for i, x in per_density.items():
+                    chain[name][i] = chain[name].get(i, 0.0) + x * density / values[name]
+        elif name == 'time_unit':
+            chain[name] = {i: 2.0 * x * density / values[name] for i, x in per_density.items()}
+        elif name == 'density':
+            chain[name] = per_density
+        elif name == 'remanence':
+            chain[name] = {places.DRIVE: k / values[name]}
+        elif name == 'damping_coefficient':
+            chain[name] = {places.DAMPING: per_damping}
+        elif name == 'constant_force':
+            chain[name] = {places.FORCE: per_force}
+        elif name == 'chain_limit':
+            chain[name] = {places.CONSTANT: -1.0 / values[name] ** 2}
+        elif name not in _SENSOR:
+            constant, i = constants_of(values['law'])[name]
+            # The scale of the law stays: constants in Pa change its force in proportion.
+            chain[name] = {places.CONSTANT + constant.place + 2 * i: (
+                1.0 / values['shear_modulus'] if constant.unit == 'Pa' else 1.0)}
     return theta, chain
 
 
 def complete(values: Mapping[str, float], free: Sequence[str]) -> dict[str, float]:
     """
-    Return values in which the density and the time unit agree.
+    Return values in which the density and the time unit agree, and the law and its constants.
 
-    Where the time unit is free the density follows from it, else the other way round.
+    Where the time unit is free the density follows from it, else the other way round. Raises
+    `BadInputError` if there is no law with such constants.
     """
-    done = dict(values)
+    done = with_constants(values)
     if 'time_unit' in free:
         done['density'] = (
             done['shear_modulus'] * (done['time_unit'] / done['half_length']) ** 2)
@@ -90,10 +122,10 @@ def complete(values: Mapping[str, float], free: Sequence[str]) -> dict[str, floa
     return done
 
 
-@lru_cache(maxsize=8)
-def _packed(group: NondimensionalParameters) -> Array:
+@lru_cache(maxsize=32)
+def _packed(limit: float, c1: float, law: Elastic | None) -> Array:
     """Return the packed law; finding its limits takes a while."""
-    return group.packed
+    return pack(0.0, limit, c1, law)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,36 +141,34 @@ class Setup:
     mixing: Array
 
     @classmethod
-    def of(cls, values: Mapping[str, Any], free: Sequence[str]) -> 'Setup':
+    def of(
+            cls, values: Mapping[str, Any], free: Sequence[str], more: Sequence[int] = ()
+    ) -> 'Setup':
         """
         Work it out for values as `complete` returns them, with arrays of its own.
 
-        Maxwell branches may be given under the name ``creep``.
+        Maxwell branches may be given under the name ``creep``. More places to differentiate by
+        come last, and each is a column of its own.
         """
         given: Creep | None = values.get('creep')
-        branches = len(given.ratios) if given else int(
-            values['viscoelastic_ratio'] > 0.0 or 'viscoelastic_ratio' in free)
-        theta, chain = _chain(values, branches)
-        if given:
-            theta[places.FIRST_BRANCH::2] = given.ratios
-            theta[places.FIRST_BRANCH + 1::2] = given.times
-        if 'time_unit' in free and 'shear_modulus' in free:
-            extra = values['density'] / values['shear_modulus']
-            modulus = dict(chain['shear_modulus'])
-            for i, x in chain['density'].items():
-                modulus[i] = modulus.get(i, 0.0) + x * extra
-            chain['shear_modulus'] = modulus
-        inner = [x for x in free if x not in _SENSOR]
-        wanted = np.array(sorted({i for x in inner for i in chain[x]}), dtype=np.int64)
-        material = _packed(group_of(values)).copy()
+        branches = len(given.ratios) if given else max((
+            i for i, (ratio, time) in enumerate(BRANCHES, 1)
+            if values[ratio] > 0.0 or ratio in free or time in free), default=0)
+        theta, chain = _chain(values, branches, free)
+        inner = sorted({i for x in chain.values() for i in x})
+        rows = {x: i for i, x in enumerate(inner)}
+        material = _packed(values['chain_limit'], geometry_of(values).c1, values['law']).copy()
         if 'chain_limit' in free:
             material[KIND] = GENT
-        mixing = np.zeros((len(wanted), len(free)))
+        mixing = np.zeros((len(inner) + len(more), len(free) + len(more)))
         for j, name in enumerate(free):
-            if name not in _SENSOR:
+            if name in chain:
+                scale = derivative(name, values[name])
                 for i, x in chain[name].items():
-                    mixing[np.searchsorted(wanted, i), j] = derivative(name, values[name]) * x
-        return cls(theta, material, branches, wanted, mixing)
+                    mixing[rows[i], j] = scale * x
+        for j in range(1, len(more) + 1):
+            mixing[-j, -j] = 1.0
+        return cls(theta, material, branches, np.array([*inner, *more], dtype=np.int64), mixing)
 
 
 def respond(
@@ -151,7 +181,10 @@ def respond(
     ``initial_rate`` at the first sample. Shifts, shape (u,), say by how much in s the uncertain
     switches are later than recorded; by default half of what they may be earlier.
     """
-    values = complete(values, free)
+    try:
+        values = complete(values, free)
+    except BadInputError:
+        return None
     setup = Setup.of(values, free)
     theta, material, wanted = setup.theta, setup.material, setup.wanted
     branches = setup.branches
@@ -170,15 +203,18 @@ def respond(
         place = np.searchsorted(begins, level_times[uncertain])
         wanted = np.append(wanted, places.SWITCH + place)
     start = np.zeros(len(wanted))
-    if not recording.at_rest:
+    if recording.at_rest:
+        theta[places.STRETCH] = motion.rest(theta, material, float(levels[0]), wanted, start)
+        theta[places.RATE] = 0.0
+        if math.isnan(theta[places.STRETCH]):
+            return None
+    else:
         start[wanted == places.STRETCH] = 1.0
-    elif not set_rest(theta, material, float(levels[0]), wanted, start):
-        return None
     n = len(times)
     stretch, rate, raw = np.empty(n), np.empty(n), np.empty((n, len(wanted)))
     if not motion.respond(
             theta, material, branches, wanted, start, begins, levels, slopes, float(levels[0]),
-            0.0, times, rtol, stretch, rate, raw, np.empty((0, len(wanted)))):
+            0.0, times, rtol, stretch, rate, raw, _NOTHING, _NOTHING, _NOTHING):
         return None
     raw *= values['stretch_gain']
     shown, jacobian = sensed(values, free, stretch, rate, raw[:, :inner_count] @ setup.mixing)
@@ -203,31 +239,7 @@ def sensed(
     return gain * stretch + values['stretch_bias'], by
 
 
-def set_rest(
-        theta: Array, material: Array, level: float, wanted: NDArray[np.int64], start: Array
-) -> bool:
-    """
-    Begin at the rest of a level in T; return whether there is one.
-
-    Stretch and rate are set in ``theta``, and in ``start``, shape (w,), the derivatives of the
-    stretch by what is wanted.
-    """
-    a, k, f = theta[[places.STIFFNESS, places.DRIVE, places.FORCE]]
-    rest = equilibrium_stretch((k * level + f) / a, material)
-    force, stiffness = elastic_force(rest, material), elastic_stiffness(rest, material)
-    if not math.isfinite(stiffness):
-        return False
-    theta[places.STRETCH], theta[places.RATE] = rest, 0.0
-    slopes = {places.STIFFNESS: -force, places.DRIVE: level, places.FORCE: 1.0}
-    for j, i in enumerate(wanted.tolist()):
-        slope = slopes.get(i, 0.0)
-        if places.CONSTANT <= i < places.SWITCH:
-            slope = -a * motion.constant_slope(rest, i - places.CONSTANT, material)
-        start[j] = slope / (a * stiffness)
-    return True
-
-
 def clip(name: str, value: float) -> float:
     """Return a value within its range."""
-    quantity = QUANTITIES[name]
+    quantity = quantity_of(name)
     return min(max(value, quantity.least), quantity.most)

@@ -8,16 +8,26 @@ that several are handed out.
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 import math
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hmsa_ros.identification.quantities import damping_unit, group_of
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification.quantities import (
+    constants_of,
+    damping_unit,
+    group_of,
+    with_constants,
+)
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.response import respond
 from hmsa_ros.model import equations
 from hmsa_ros.model.equations import Array
+from hmsa_ros.model.law import EQUILIBRIUM, evaluate, FORCE, pack
 from hmsa_ros.model.units import MU_0
 
 _FEWEST = 6  # samples on a level that may ring
@@ -59,6 +69,28 @@ def segments(
     return found
 
 
+def deviations(values: Array, parts: NDArray[np.int64]) -> Array:
+    """Return the standard deviations of parts of values from first to last places, shape (n,)."""
+    apart = values - np.mean(values)
+    begins, ends = parts.T
+    sums = np.append(0.0, np.cumsum(apart)), np.append(0.0, np.cumsum(apart ** 2))
+    mean, square = ((x[ends] - x[begins]) / (ends - begins) for x in sums)
+    found: Array = np.sqrt(np.maximum(square - mean ** 2, 0.0))
+    return found
+
+
+def _median(values: Array) -> float:
+    """Return the median; NumPy's takes ten times as long for a few values."""
+    ordered = np.sort(values)
+    return 0.5 * float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
+
+
+def _evaluated(what: int, values: Array, material: Array) -> Array:
+    found = np.empty_like(values)
+    evaluate(what, values, material, found)
+    return found
+
+
 def static(
         recording: Recording, values: Mapping[str, float], free: Sequence[str]) -> Static:
     """Return what the levels at rest say; law and chain limit, unless that is free, are kept."""
@@ -67,24 +99,26 @@ def static(
     rests = []
     for begin, end, when, level in segments(recording, 1):
         tail = recording.stretch[begin + (end - begin) * 2 // 3:end]
-        rests.append((when, level, float(np.median(tail))))
+        rests.append((when, level, _median(tail)))
     # Each level once: short ones have not come to rest, but ring about it.
     fields = np.unique([x[1] for x in rests])
     if len(fields) < 2:
         return Static(math.nan, usual, tuple(rests))
-    stretch = np.array([np.median([x[2] for x in rests if x[1] == y]) for y in fields])
+    stretch = np.array([_median(np.array([x[2] for x in rests if x[1] == y])) for y in fields])
     low, high = float(np.min(recording.stretch)), float(np.max(recording.stretch))
     best = (math.inf, math.nan, usual)
-    for limit in limits:
-        group = group_of(values, j_lim=limit)
-        # Motion may go further than what can be held, but not where there is no force.
-        ends = group.rest + 1.002 * (np.array([low, high]) - group.rest)
-        if not np.all(np.isfinite(equations.elastic_force(ends, group))):
+    group = group_of(values)
+    # Motion may go further than what can be held, but not where there is no force.
+    ends = group.rest + 1.002 * (np.array([low, high]) - group.rest)
+    shape = np.full(len(limits), group.c1)
+    for limit, material in zip(
+            limits, pack(0.0 * shape, np.array(limits), shape, group.law), strict=True):
+        if not np.all(np.isfinite(_evaluated(FORCE, ends, material))):
             continue
-        force = np.asarray(equations.elastic_force(stretch, group))
+        force = _evaluated(FORCE, stretch, material)
         slope = float(fields @ force) / float(fields @ fields)
         if slope > 0.0:
-            held = np.asarray(equations.equilibrium_stretch(slope * fields, group))
+            held = _evaluated(EQUILIBRIUM, slope * fields, material)
             miss = float(np.sum((held - stretch) ** 2))
             if miss < 0.98 * best[0]:
                 best = miss, slope, limit
@@ -99,11 +133,14 @@ def ringing(recording: Recording, rests: Sequence[tuple[float, float, float]]) -
     For each frequency and decay of a grid the amplitude follows by least squares; how much of
     the motion they explain is added up over the levels, in units of the frequency at rest.
     """
-    spans = [x for x in segments(recording) if any(y[0] == x[2] for y in rests)]
-    spans.sort(key=lambda x: -float(np.std(recording.stretch[x[0]:x[1]])))
+    means = {when: mean for when, _, mean in rests}
+    spans = [x for x in segments(recording) if x[2] in means]
+    parts = np.array([x[:2] for x in spans], np.int64).reshape(-1, 2)
+    sizes = deviations(recording.stretch, parts)
     found: list[tuple[float, float, float, float]] = []
-    for begin, end, when, _ in spans[:_MOST_LEVELS]:
-        mean = next(x[2] for x in rests if x[0] == when)
+    for place in np.argsort(-sizes, kind='stable')[:_MOST_LEVELS].tolist():
+        begin, end, when, _ = spans[place]
+        mean = means[when]
         part = slice(begin, min(end, begin + _MOST_SAMPLES))
         t = recording.time[part] - recording.time[begin]
         y = recording.stretch[part] - mean
@@ -119,12 +156,13 @@ def _oscillations(t: Array, y: Array) -> list[tuple[float, float, float]]:
     if not 0.0 < lowest < highest:
         return []
     frequencies = np.geomspace(lowest, highest, _FREQUENCIES)
-    phase = np.exp(1j * np.outer(frequencies, t))
+    angle = np.outer(frequencies, t)
+    cosine, sine = np.cos(angle), np.sin(angle)
     power = np.zeros((len(_DECAYS), _FREQUENCIES))
     for i, ratio in enumerate(_DECAYS):
-        wave = phase * np.exp(-ratio * np.outer(frequencies, t))
-        c, s = wave.real, wave.imag
-        cc, ss, cs = (np.sum(a * b, axis=1) for a, b in ((c, c), (s, s), (c, s)))
+        fading = np.exp(-ratio * angle)
+        c, s = fading * cosine, fading * sine
+        cc, ss, cs = (np.einsum('ij,ij->i', a, b) for a, b in ((c, c), (s, s), (c, s)))
         yc, ys = c @ y, s @ y
         determinant = cc * ss - cs * cs
         good = determinant > 1e-9 * cc * ss
@@ -183,7 +221,7 @@ def scan(
         if first < len(recording.time) else recording
     shortest = _SHORTEST * float(np.median(np.diff(recording.time)))
     tried: list[tuple[float, float, dict[str, float]]] = []
-    timed = {'shear_modulus', 'density', 'time_unit'}.intersection(free)
+    timed = {'shear_modulus', 'density', 'time_unit', *_stresses(values)}.intersection(free)
     factors = np.geomspace(1.0 / _SCAN_RANGE, _SCAN_RANGE, _SCAN_POINTS) if timed else (1.0,)
     group = group_of(values)
     critical = float(equations.critical_zeta(group.rest, group))
@@ -208,6 +246,12 @@ def scan(
     return [x for _, x in best]
 
 
+def _stresses(values: Mapping[str, Any]) -> list[str]:
+    """Return the constants of the law that make its modulus."""
+    return [x for x, (constant, _) in constants_of(values.get('law')).items()
+            if constant.unit == 'Pa']
+
+
 def _candidate(
         given: Mapping[str, float], free: Sequence[str], unit: float, found: Static
 ) -> dict[str, float]:
@@ -216,8 +260,14 @@ def _candidate(
     if 'chain_limit' in free:
         values['chain_limit'] = found.chain_limit
     length = given['half_length']
-    if 'shear_modulus' in free and 'time_unit' not in free:
+    stresses = [x for x in _stresses(values) if x in free]
+    if ('shear_modulus' in free or stresses) and 'time_unit' not in free:
+        before = values['shear_modulus']
         values['shear_modulus'] = values['density'] * (length / unit) ** 2
+        for name in stresses:
+            values[name] *= values['shear_modulus'] / before
+        with suppress(BadInputError):
+            values = with_constants(values)
     elif 'time_unit' in free or 'density' in free:
         values['density'] = values['shear_modulus'] * (unit / length) ** 2
     values['time_unit'] = unit

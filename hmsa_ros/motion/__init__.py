@@ -7,7 +7,6 @@ nondimensional but `respond`, and nothing checks values: whoever calls these fun
 
 from hmsa_ros.motion._motion import (
     accelerations,
-    constant_slope,
     critical_zeta,
     damping,
     elastic_energy,
@@ -19,6 +18,7 @@ from hmsa_ros.motion._motion import (
     mass,
     natural_frequency,
     respond,
+    rest,
     sample,
     solve,
     staircase,
@@ -28,10 +28,10 @@ from hmsa_ros.motion._motion import (
 )
 
 __all__ = [
-    'accelerations', 'constant_slope', 'critical_zeta', 'damping', 'elastic_energy',
-    'elastic_force', 'elastic_stiffness', 'equilibrium_stretch', 'evaluate', 'follow', 'mass',
-    'natural_frequency', 'respond', 'sample', 'solve', 'staircase', 'turning_point', 'two_step',
-    'two_step_batch']
+    'accelerations', 'critical_zeta', 'damping', 'elastic_energy', 'elastic_force',
+    'elastic_stiffness', 'equilibrium_stretch', 'evaluate', 'follow', 'mass',
+    'natural_frequency', 'respond', 'rest', 'sample', 'solve', 'staircase', 'turning_point',
+    'two_step', 'two_step_batch']
 
 #: Statuses of a turning point: found; into an equilibrium instead; out of steps; against a
 #: limiting stretch too hard to be resolved. Those of `follow` are the first and the third.

@@ -137,23 +137,6 @@ PyObject *accelerations(PyObject *, Arguments arguments, Py_ssize_t count)
     });
     Py_RETURN_NONE;
 }
-// constant_slope(stretch, constant, material): of psi' by a constant of the law.
-PyObject *constant_slope(PyObject *, Arguments arguments, Py_ssize_t count)
-{
-    double x;
-    if (refused("constant_slope", 3, count) || !read(arguments, 1, &x))
-        return nullptr;
-    const long constant = PyLong_AsLong(arguments[1]);
-    const Buffer material(arguments[2]);
-    if (!material.there || PyErr_Occurred())
-        return nullptr;
-    using D = Dual<double, 1>;
-    Gent<D> law;
-    law.read(0, material.numbers() + constants_at);
-    law.seed(int(constant), 0);
-    return PyFloat_FromDouble(law.force(D{x, {0}}).d[0]);
-}
-
 // -- two-step plans ---------------------------------------------------------------------------------
 
 // turning_point(stretch, rate, direction, load, move, material, rtol)
@@ -384,34 +367,47 @@ PyObject *staircase(PyObject *, Arguments arguments, Py_ssize_t count)
 
 // -- recordings --------------------------------------------------------------------------------------
 
+using Four = Dual<double, 4>;
+using Eight = Dual<double, 8>;
+template <class S, class System, int NB> bool respond_as(const Recorded &of, int from)
+{
+    Response<S, System, NB> response{of, from};
+    return response();
+}
+// As for a batch: one source, two instruction sets.
+template <class S, int NB> __attribute__((target("avx2"), flatten)) bool respond_wide(
+    const Recorded &of, int from)
+{
+    return respond_as<S, Block<S, Gent>, NB>(of, from);
+}
 template <class S, int NB> bool respond_part(const Recorded &of, int from)
 {
-    if (int(of.material[kind_at]) > neo_hookean) {
-        Response<S, Any, NB> response{of, from};
-        return response();
-    }
-    Response<S, Block<S, Gent>, NB> response{of, from};
-    return response();
+    if (int(of.material[kind_at]) > neo_hookean)
+        return of.by_constants() ? respond_as<Eight, AnyOf<Eight>, NB>(of, from)
+                                 : respond_as<S, Any, NB>(of, from);
+    if constexpr (count_of<S> > 0)
+        if (__builtin_cpu_supports("avx2"))
+            return respond_wide<S, NB>(of, from);
+    return respond_as<S, Block<S, Gent>, NB>(of, from);
 }
 template <int NB> bool respond_all(const Recorded &of)
 {
     if (of.wanted_count == 0)
         return respond_part<double, NB>(of, 0);
-    for (int from = 0; from < of.wanted_count;) {
-        const int left = of.wanted_count - from;
-        if (!(left > 4 ? respond_part<Dual<double, 8>, NB>(of, from)
-                       : respond_part<Dual<double, 4>, NB>(of, from)))
+    const bool any = int(of.material[kind_at]) > neo_hookean && of.by_constants();
+    for (int from = 0; from < of.wanted_count; from += 8)
+        if (!(of.wanted_count - from > 4 || any ? respond_part<Eight, NB>(of, from)
+                                                : respond_part<Four, NB>(of, from)))
             return false;
-        from += left > 4 ? 8 : 4;
-    }
     return true;
 }
 // respond(theta, material, branches, wanted, start, begins, levels, ramps, field, field_lag, times,
-// rtol, stretch, rate, jacobian, by_rate): whether the motion was followed to its end
+// rtol, stretch, rate, jacobian, by_rate, behind, behind_last): whether the motion was followed to
+// its end
 PyObject *respond(PyObject *, Arguments arguments, Py_ssize_t count)
 {
     double number[3];
-    if (refused("respond", 16, count) || !read(arguments + 8, 2, number)
+    if (refused("respond", 18, count) || !read(arguments + 8, 2, number)
             || !read(arguments + 11, 1, number + 2))
         return nullptr;
     Recorded of{};
@@ -419,7 +415,8 @@ PyObject *respond(PyObject *, Arguments arguments, Py_ssize_t count)
     const Buffer theta(arguments[0]), material(arguments[1]), wanted(arguments[3], false, whole),
         start(arguments[4]), begins(arguments[5]), levels(arguments[6]), ramps(arguments[7]),
         times(arguments[10]), stretch(arguments[12], true), rate(arguments[13], true),
-        jacobian(arguments[14], true), by_rate(arguments[15], true);
+        jacobian(arguments[14], true), by_rate(arguments[15], true), behind(arguments[16]),
+        behind_last(arguments[17], true);
     if (PyErr_Occurred())
         return nullptr;
     of.wanted_count = wanted.count(), of.count = times.count(), of.pieces = begins.count();
@@ -428,6 +425,8 @@ PyObject *respond(PyObject *, Arguments arguments, Py_ssize_t count)
             || levels.count() != of.pieces || ramps.count() != of.pieces || !of.pieces
             || stretch.count() != of.count || rate.count() != of.count || jacobian.count() != cells
             || (by_rate.count() && by_rate.count() != cells)
+            || (behind.count() && behind.count() != of.branches)
+            || (behind_last.count() && behind_last.count() != of.branches)
             || of.branches < 0 || of.branches > most_branches) && !differ("respond"))
         return nullptr;
     of.theta = theta.numbers(), of.material = material.numbers();
@@ -436,11 +435,40 @@ PyObject *respond(PyObject *, Arguments arguments, Py_ssize_t count)
     of.field = number[0], of.field_lag = number[1], of.rtol = number[2];
     of.times = times.numbers(), of.stretch = stretch.numbers(), of.rate = rate.numbers();
     of.jacobian = jacobian.numbers(), of.by_rate = by_rate.count() ? by_rate.numbers() : nullptr;
+    of.behind = behind.count() ? behind.numbers() : nullptr;
+    of.behind_last = behind_last.count() ? behind_last.numbers() : nullptr;
     bool done;
     Py_BEGIN_ALLOW_THREADS;
     done = with_branches(of.branches, [&](auto n) { return respond_all<n()>(of); });
     Py_END_ALLOW_THREADS;
     return PyBool_FromLong(done);
+}
+
+// rest(theta, material, level, wanted, slopes): the stretch at which a level holds the actuator, no
+// number if there is none; its derivatives by what is wanted are written
+PyObject *rest(PyObject *, Arguments arguments, Py_ssize_t count)
+{
+    double level;
+    if (refused("rest", 5, count) || !read(arguments + 2, 1, &level))
+        return nullptr;
+    const Buffer theta(arguments[0]), material(arguments[1]), wanted(arguments[3], false, whole),
+        slopes(arguments[4], true);
+    if (PyErr_Occurred())
+        return nullptr;
+    if ((theta.count() < first_branch || wanted.count() != slopes.count()) && !differ("rest"))
+        return nullptr;
+    Recorded of{};
+    of.theta = theta.numbers(), of.material = material.numbers(), of.wanted_count = wanted.count();
+    of.wanted = static_cast<const int64_t *>(wanted.view.buf);
+    const double pull = of.theta[drive_of] * level + of.theta[force_of];
+    const double l = quantity(equilibrium_q, pull / of.theta[stiffness_of], of.material);
+    for (int from = 0; from < of.wanted_count; from += 8)
+        if (int(of.material[kind_at]) > neo_hookean)
+            Response<Eight, AnyOf<Eight>, 0>(of, from).hold(l, level, slopes.numbers());
+        else
+            Response<Eight, Block<Eight, Gent>, 0>(of, from).hold(l, level, slopes.numbers());
+    const bool held = hmsa::finite(quantity(stiffness_q, l, of.material));
+    return PyFloat_FromDouble(held ? l : __builtin_nan(""));
 }
 
 template <class F> PyCFunction fast(F f) { return (PyCFunction)(void (*)())f; }
@@ -455,7 +483,6 @@ PyMethodDef methods[] = {
     {"damping", fast(quantity_of<damping_q>), METH_FASTCALL, nullptr},
     {"evaluate", fast(evaluate), METH_FASTCALL, nullptr},
     {"accelerations", fast(accelerations), METH_FASTCALL, nullptr},
-    {"constant_slope", fast(constant_slope), METH_FASTCALL, nullptr},
     {"turning_point", fast(turning_point_of), METH_FASTCALL, nullptr},
     {"two_step", fast(two_step_of), METH_FASTCALL, nullptr},
     {"two_step_batch", two_step_batch, METH_VARARGS, nullptr},
@@ -464,6 +491,7 @@ PyMethodDef methods[] = {
     {"solve", fast(solve), METH_FASTCALL, nullptr},
     {"staircase", fast(staircase), METH_FASTCALL, nullptr},
     {"respond", fast(respond), METH_FASTCALL, nullptr},
+    {"rest", fast(rest), METH_FASTCALL, nullptr},
     {nullptr, nullptr, 0, nullptr}};
 PyModuleDef module = {PyModuleDef_HEAD_INIT, "_motion", nullptr, 0, methods, nullptr, nullptr, nullptr, nullptr};
 }  // namespace

@@ -15,4 +15,5 @@ def _scaled(values: Mapping[str, Any]) -> tuple[float, Elastic]:
 LAW = Law(
     'mooney_rivlin', 'c10 (I1 - 3) + c01 (I2 - 3)',
     'M. Mooney, J. Appl. Phys. 11, 582 (1940), doi:10.1063/1.1712836',
-    (Constant('law.c10', 'factor of I1 - 3'), Constant('law.c01', 'factor of I2 - 3')), _scaled)
+    (Constant('law.c10', 'factor of I1 - 3', place=1),
+     Constant('law.c01', 'factor of I2 - 3', place=0)), _scaled)

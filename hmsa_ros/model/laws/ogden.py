@@ -30,5 +30,5 @@ def _scaled(values: Mapping[str, Any]) -> tuple[float, Elastic]:
 LAW = Law(
     'ogden', 'sum mu_i/alpha_i (l^alpha_i + 2 l^(-alpha_i/2) - 3)',
     'R. W. Ogden, Proc. R. Soc. A 326, 565 (1972), doi:10.1098/rspa.1972.0026',
-    (Constant('law.mu', 'moduli of the terms', kind=list),
-     Constant('law.alpha', 'exponents of the terms', '', list, -50.0, 50.0)), _scaled)
+    (Constant('law.mu', 'moduli of the terms', kind=list, place=1),
+     Constant('law.alpha', 'exponents of the terms', '', list, -50.0, 50.0, place=2)), _scaled)

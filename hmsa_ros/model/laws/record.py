@@ -14,6 +14,7 @@ POLYNOMIAL = 2.0  # b, a_1 to a_5 of b (I2 - 3) + sum a_k (I1 - 3)^k
 OGDEN = 3.0  # number of terms, then mu and alpha of each
 TABLE = 4.0  # number of pieces, then what `hmsa_ros.model.laws.curve.Curve.packed` returns
 BEAM = 5.0  # what `hmsa_ros.model.laws.bending.packed` returns
+ARRUDA_BOYCE = 6.0  # mu, lambda_m
 
 #: Place of the constants in a packed material.
 CONSTANTS = 6
@@ -35,6 +36,10 @@ class Constant:
     minimum: float = -1e12  #: of the number, or of each in a list; closed range
     maximum: float = 1e12
     fixed: bool = False  #: whether it is read once, when a node starts
+    #: Among the constants of the family, the first of a list, which has every other place; -1 for
+    #: one that cannot be identified.
+    place: int = -1
+    inverse: bool = False  #: whether 1 over it goes to 0 where it is without effect
 
 
 @dataclass(frozen=True)

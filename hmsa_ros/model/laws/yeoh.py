@@ -15,5 +15,6 @@ def _scaled(values: Mapping[str, Any]) -> tuple[float, Elastic]:
 LAW = Law(
     'yeoh', 'c10 (I1 - 3) + c20 (I1 - 3)^2 + c30 (I1 - 3)^3',
     'O. H. Yeoh, Rubber Chem. Technol. 66, 754 (1993), doi:10.5254/1.3538343',
-    (Constant('law.c10', 'factor of I1 - 3'), Constant('law.c20', 'factor of (I1 - 3)^2'),
-     Constant('law.c30', 'factor of (I1 - 3)^3')), _scaled)
+    (Constant('law.c10', 'factor of I1 - 3', place=1),
+     Constant('law.c20', 'factor of (I1 - 3)^2', place=2),
+     Constant('law.c30', 'factor of (I1 - 3)^3', place=3)), _scaled)

@@ -76,12 +76,21 @@ template <class R, int N> HMSA_INLINE Dual<R, N> positive(Dual<R, N> x)
     x.v = positive(x.v);
     return x;
 }
-template <class S> HMSA_INLINE S power(const S &x, const real<S> &n)  // x^n, x > 0
+template <class R, int N> HMSA_INLINE Dual<R, N> exp(const Dual<R, N> &x)
 {
-    const real<S> y = exp(real<S>(n * log(value(x))));
-    if constexpr (count_of<S> > 0)
-        return through(x, y, real<S>(n * y / value(x)));
-    else
-        return y;
+    const R e = exp(x.v);
+    return through(x, e, e);
+}
+template <class S, class N> HMSA_INLINE S power(const S &x, const N &n)  // x^n, x > 0
+{
+    if constexpr (count_of<N> > 0)
+        return exp(n * through(x, log(x.v), real<S>(1.0 / x.v)));
+    else {
+        const real<S> y = exp(real<S>(n * log(value(x))));
+        if constexpr (count_of<S> > 0)
+            return through(x, y, real<S>(n * y / value(x)));
+        else
+            return y;
+    }
 }
 }  // namespace hmsa

@@ -1,6 +1,7 @@
 // Hyperelastic laws in units of the shear modulus at small strain. A law is its force over any
-// scalar, and its energy; derivatives come from Dual. It reads its constants from those of a packed
-// material (hmsa_ros/model/law.py). Where there is no energy, the force is not a number.
+// scalar, and its energy; derivatives come from Dual, those by its constants too: R is their type, and
+// seed makes one of them the parameter j. It reads them from those of a packed material
+// (hmsa_ros/model/law.py). Where there is no energy, the force is not a number.
 #pragma once
 #include "dual.hpp"
 
@@ -9,11 +10,7 @@ template <class R> struct Gent {
     // psi = -(J/2) ln(1 - (I1 - 3)/J), A. N. Gent, Rubber Chem. Technol. 69, 59 (1996).
     R i_j;  // 1/J_lim; 0 is neo-Hookean
     void read(int lane, const double *c) { set(i_j, lane, c[0]); }
-    void seed(int constant, int j)  // as the parameter j
-    {
-        if (constant == 0)
-            i_j.d[j] = 1;
-    }
+    void seed(int, int j) { i_j.d[j] = 1; }
     template <class S> HMSA_INLINE S force(const S &l) const
     {
         const S e = l - 1.0, lg = l - e * e * (l + 2.0) * i_j;
@@ -27,13 +24,14 @@ template <class R> struct Gent {
 };
 
 template <class R> struct Polynomial {
-    // b (I2 - 3) + sum a_k (I1 - 3)^k: Mooney-Rivlin, Yeoh, Arruda-Boyce.
+    // b (I2 - 3) + sum a_k (I1 - 3)^k: Mooney-Rivlin, Yeoh.
     R c[6];
     void read(int lane, const double *from)
     {
         for (int i = 0; i < 6; i++)
             set(c[i], lane, from[i]);
     }
+    void seed(int constant, int j) { c[constant].d[j] = 1; }
     template <class S> HMSA_INLINE S force(const S &l) const
     {
         // Free of cancellation near l = 1.
@@ -55,18 +53,56 @@ template <class R> struct Polynomial {
     }
 };
 
+template <class R> struct ArrudaBoyce : Polynomial<R> {
+    // mu sum C_i lambda_m^(2 - 2 i) (I1^i - 3^i), E. M. Arruda and M. C. Boyce, J. Mech. Phys. Solids
+    // 41, 389 (1993): a polynomial once I1 is 3 and what it is above.
+    R mu, lambda_m;
+    void read(int lane, const double *from)
+    {
+        set(mu, lane, from[0]);
+        set(lambda_m, lane, from[1]);
+        expand();
+    }
+    void seed(int constant, int j)
+    {
+        (constant == 0 ? mu : lambda_m).d[j] = 1;
+        expand();
+    }
+    void expand()
+    {
+        constexpr double terms[5] = {1. / 2, 1. / 20, 11. / 1050, 19. / 7000, 519. / 673750};
+        const R shrinks = inverse(lambda_m * lambda_m);
+        R factor = mu;
+        for (R &x : this->c)
+            x = 0.0 * mu;
+        for (int i = 1; i <= 5; i++) {
+            double binomial = terms[i - 1];  // times 3^(i - k) and i over k
+            for (int k = i; k > 0; k--) {
+                this->c[k] = this->c[k] + factor * binomial;
+                binomial *= 3.0 * k / (i - k + 1);
+            }
+            factor = factor * shrinks;
+        }
+    }
+};
+
 template <class R> struct Ogden {
     // sum mu/a (l^a + 2 l^(-a/2) - 3), R. W. Ogden, Proc. R. Soc. Lond. A 326, 565 (1972).
-    const double *terms;
-    void read(int, const double *c) { terms = c; }
-    int count() const { return int(terms[0]); }
+    int count;
+    R terms[6];  // mu and a of each
+    void read(int lane, const double *c)
+    {
+        count = int(c[0]);
+        for (int i = 0; i < 2 * count; i++)
+            set(terms[i], lane, c[1 + i]);
+    }
+    void seed(int constant, int j) { terms[constant - 1].d[j] = 1; }
     template <class S> HMSA_INLINE S force(const S &l) const
     {
         S sum = 0.0 * positive(l);
-        for (int i = 0; i < count(); i++) {
-            const double mu = terms[1 + 2 * i], a = terms[2 + 2 * i];
-            const S low = power(l, -0.5 * a), squared = low * low;
-            sum = sum + (inverse(squared) - low) * mu;
+        for (int i = 0; i < count; i++) {
+            const S low = power(l, R(-0.5 * terms[2 * i + 1])), squared = low * low;
+            sum = sum + (inverse(squared) - low) * terms[2 * i];
         }
         return sum * inverse(l);
     }
@@ -74,9 +110,9 @@ template <class R> struct Ogden {
     {
         const double logarithm = log(l);
         double total = 0;
-        for (int i = 0; i < count(); i++) {
-            const double a = terms[2 + 2 * i];
-            total += terms[1 + 2 * i] / a * (expm1(a * logarithm) + 2 * expm1(-0.5 * a * logarithm));
+        for (int i = 0; i < count; i++) {
+            const double mu = get(terms[2 * i], 0), a = get(terms[2 * i + 1], 0);
+            total += mu / a * (expm1(a * logarithm) + 2 * expm1(-0.5 * a * logarithm));
         }
         return total;
     }

@@ -34,6 +34,17 @@ struct Recorded {
     double rtol;
     double *stretch, *rate;  // (count,)
     double *jacobian, *by_rate;  // (count, wanted_count); the latter may be null
+    // How far what each branch follows is from the elastic force at the begin, and at the last time;
+    // null for not at all, and for not asked.
+    const double *behind;
+    double *behind_last;
+    bool by_constants() const
+    {
+        for (int j = 0; j < wanted_count; j++)
+            if (constant_of <= wanted[j] && wanted[j] < switch_of)
+                return true;
+        return false;
+    }
 };
 
 // N of the wanted parameters at a time, from one of them on; the motion is the same to the bit.
@@ -78,7 +89,7 @@ template <class C, class System, int NB> struct Response {
         if constexpr (System::direct)
             each([&](int j, int wanted) {
                 if (constant_of <= wanted && wanted < switch_of)
-                    system.law.seed(wanted - constant_of, j);
+                    system.seed(wanted - constant_of, j);
             });
         a = seeded_at(stiffness_of), damping = seeded_at(damping_of), drive = seeded_at(drive_of);
         force = seeded_at(force_of), lag = seeded_at(lag_of);
@@ -94,16 +105,8 @@ template <class C, class System, int NB> struct Response {
     {
         S now = plain(level + ramp * dt) - lag * ramp;
         if (value(lag) > 0)
-            now = now + excess * fading(inverse(lag) * -dt);
+            now = now + excess * exp(inverse(lag) * -dt);
         return now;
-    }
-    static S fading(const S &x)
-    {
-        const double e = exp(value(x));
-        if constexpr (N > 0)
-            return through(x, e, e);
-        else
-            return e;
     }
     HMSA_INLINE void change(const S *x, double dt, S *by) const
     {
@@ -140,6 +143,15 @@ template <class C, class System, int NB> struct Response {
                     of.by_rate[int64_t(i) * of.wanted_count + from + j] = v.d[j];
             });
     }
+    // Derivatives of the stretch at which a level holds the actuator at rest.
+    void hold(double l, double level, double *slopes)
+    {
+        set_up();
+        const double stiffness = value(a) * bare.elastic(l).d[0];
+        const S lacks = drive * level + force - a * system.force(plain(l));
+        if constexpr (N > 0)
+            each([&](int j, int) { slopes[from + j] = lacks.d[j] / stiffness; });
+    }
     bool operator()()
     {
         set_up();
@@ -148,7 +160,7 @@ template <class C, class System, int NB> struct Response {
         if constexpr (N > 0)
             each([&](int j, int) { y[0].d[j] = of.start[from + j]; });
         for (int b = 0; b < NB; b++)
-            y[2 + b] = system.force(y[0]);
+            y[2 + b] = system.force(y[0]) + (of.behind && b < of.branches ? of.behind[b] : 0);
         level = of.levels[0], ramp = of.ramps[0], piece_begin = of.begins[0];
         excess = plain(of.field - level) + lag * ramp;
         if constexpr (N > 0)
@@ -170,13 +182,18 @@ template <class C, class System, int NB> struct Response {
             fresh = false;
             for (; i < of.count && of.times[i] <= t; i++)  // before the begin it is uniform
                 put(i, y[0] + y[1] * (of.times[i] - t), y[1]);
-            if (i == of.count)
+            if (i == of.count) {
+                for (int b = 0; b < NB && of.behind_last && b < of.branches; b++)
+                    of.behind_last[b] = value(y[2 + b]) - value(system.force(y[0]));
                 return true;
+            }
             const double limit = piece + 1 < of.pieces ? of.begins[piece + 1] : infinity();
             const double l = value(y[0]);
             const double per_phase = sqrt(bare.mass(l) / (stiff * bare.elastic(l).d[0]));
             const double smooth = smooth_phase * per_phase;
-            const double target = min(limit, of.times[i] - t >= smooth ? of.times[i] : t + smooth);
+            double target = min(limit, of.times[i] - t >= smooth ? of.times[i] : t + smooth);
+            if (of.behind_last)
+                target = min(target, of.times[of.count - 1]);
             if (of.wanted_count > 0)
                 h = min(h, min(longest_phase * per_phase, relaxed));
             const double span = min(h, target - t), dt = t - piece_begin;

@@ -8,7 +8,7 @@
 namespace hmsa {
 // Places in a packed material, and the families of laws (hmsa_ros/model/law.py, laws/record.py).
 enum Place { kind_at, zeta_at, c1_at, damping_at, lower_at, upper_at, constants_at };
-enum Family { gent, neo_hookean, polynomial, ogden, table, beam };
+enum Family { gent, neo_hookean, polynomial, ogden, table, beam, arruda_boyce };
 
 // What depends on the stretch alone is differentiated by it, and by all else after; unless the
 // constants of the law have derivatives, too.
@@ -44,6 +44,7 @@ template <class C, template <class> class Law> struct Block {
         set(drag, lane, m[damping_at]);
         law.read(lane, m + constants_at);
     }
+    void seed(int constant, int j) { law.seed(constant, j); }
     // The acceleration under net(psi'(l)), the load less all that is elastic; also the square of the
     // natural frequency where it is asked for.
     template <class S, class D, class F> HMSA_INLINE S acceleration(
@@ -117,14 +118,14 @@ struct Beam {
 };
 
 // An actuator of any law beside Gent, chosen while it runs: a step with it calls, and a step with
-// Gent does not.
-struct Any {
-    static constexpr bool direct = false;
-    using Bare = Any;
+// Gent does not. C is the type of the constants.
+template <class C> struct AnyOf {
+    static constexpr bool direct = count_of<C> > 0;
+    using Bare = AnyOf<double>;
     int kind;
     double rest, c1, drag;
-    Polynomial<double> polynomial_law;
-    Ogden<double> ogden_law;
+    ArrudaBoyce<C> polynomial_law;
+    Ogden<C> ogden_law;
     Table<double> table_law;
     Beam beam_law;
 
@@ -133,16 +134,26 @@ struct Any {
         kind = int(m[kind_at]), c1 = m[c1_at], drag = m[damping_at];
         rest = kind == beam ? 0 : 1;
         switch (kind) {
-        case polynomial: return polynomial_law.read(0, m + constants_at);
+        case polynomial: return polynomial_law.Polynomial<C>::read(0, m + constants_at);
+        case arruda_boyce: return polynomial_law.read(0, m + constants_at);
         case ogden: return ogden_law.read(0, m + constants_at);
         case table: return table_law.read(0, m + constants_at);
         default: beam_law = {drag, m + constants_at};
         }
     }
+    void seed(int constant, int j)
+    {
+        switch (kind) {
+        case polynomial: return polynomial_law.Polynomial<C>::seed(constant, j);
+        case arruda_boyce: return polynomial_law.seed(constant, j);
+        case ogden: return ogden_law.seed(constant, j);
+        }
+    }
     template <class L> HMSA_APART L force(const L &l) const
     {
         switch (kind) {
-        case polynomial: return polynomial_law.force(l);
+        case polynomial:
+        case arruda_boyce: return polynomial_law.force(l);
         case ogden: return ogden_law.force(l);
         case table: return table_law.force(l);
         default: return beam_law.force(l);
@@ -167,20 +178,21 @@ struct Any {
     template <class S, class D, class F> HMSA_INLINE S acceleration(
         const S &l, const S &v, const D &damping, const F &net, real<S> *squared = nullptr) const
     {
-        using L = Along<S, double>;
-        const L x = inner<L, false>(l), pull = force(x);
+        using L = Along<S, C>;
+        const L x = inner<L, direct>(l), pull = force(x);
         L i_mass, falls, damps;
         inertia(x, i_mass, falls, damps);
-        if constexpr (count_of<S> > 0)
+        if constexpr (count_of<S> > 0 && !direct)
             if (squared)
                 *squared = pull.d[0] * i_mass.v;
-        return net(outer<false>(pull, l)) * outer<false>(i_mass, l)
-            - (outer<false>(damps, l) * damping + outer<false>(falls, l) * v) * v;
+        return net(outer<direct>(pull, l)) * outer<direct>(i_mass, l)
+            - (outer<direct>(damps, l) * damping + outer<direct>(falls, l) * v) * v;
     }
     double energy(double l) const
     {
         switch (kind) {
-        case polynomial: return polynomial_law.energy(l);
+        case polynomial:
+        case arruda_boyce: return polynomial_law.energy(l);
         case ogden: return ogden_law.energy(l);
         case table: return table_law.energy(l);
         default: return beam_law.energy(l);
@@ -200,6 +212,8 @@ struct Any {
         return damps / i_mass;
     }
 };
+
+using Any = AnyOf<double>;
 
 // Of small undamped motion about a stretch; where the force falls, the rate at which motion grows.
 template <class System> double frequency(const System &system, double l)
