@@ -29,8 +29,9 @@ from hmsa_ros.nodes.service_call import ServiceCall
 from hmsa_ros.nodes.visitor import leave, visit
 
 _SLICE_SECONDS = 0.05
-# How long a planner whose node is there may take to listen, on a busy machine.
-_LISTENS_SECONDS = 300.0
+# How long a planner whose node is there may take to listen: it configures itself in a fraction of
+# a second, which a machine that is busy with much else stretches.
+_LISTENS_SECONDS = 60.0
 # To come to rest, perhaps in slow motion; and until a planner that does not answer is gone.
 _STOP_SECONDS = 15.0
 _GONE_SECONDS = 3.0

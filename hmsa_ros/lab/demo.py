@@ -25,7 +25,7 @@ from hmsa_ros.report.outcome import findings_of
 SEQUENCE = ((1.10, 10.0), (1.20, 10.0), (1.40, 10.0))
 REAL_TIME_FACTOR = 0.0125
 PUBLISH_RATE = 20_000.0
-LEAD_TIME = 0.03
+LEAD_TIME = 0.05
 #: Largest residual vibration, as a share of the step, of a setpoint that counts as held.
 LARGEST_RESIDUAL = 1e-6
 # Time stands still until all are ready.
@@ -92,10 +92,12 @@ def _evaluate(bag: Path, picture: Path) -> tuple[SetpointResult, ...]:
 
     run, = read_runs(bag)
     levels = without_repeats(run.commands)[0]
-    if len(levels) != 2 * len(SEQUENCE):
-        raise HmsaError(
-            f'the bag holds {len(levels)} commands: expected {2 * len(SEQUENCE)}')
     evaluation = evaluate(run)
+    if len(evaluation.results) != len(SEQUENCE) or len(levels) != 2 * len(SEQUENCE):
+        raise HmsaError(
+            f'{len(evaluation.results)} of {len(SEQUENCE)} setpoints were carried out, with '
+            f'{len(levels)} commands: expected all, with {2 * len(SEQUENCE)}; on a machine so '
+            'busy that commands come late try again')
     found = findings_of(run, Tolerances(LARGEST_RESIDUAL, LARGEST_RESIDUAL, 0.0))
     results = tuple(
         SetpointResult(**asdict(x), finding=found[x.place].to_dict())
