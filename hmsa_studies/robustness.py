@@ -46,8 +46,8 @@ LARGEST = 0.9
 
 _NAMES = {
     'two_step': 'two-step', 'minimum_time': 'minimum time', 'step': 'plain step', 'zv': 'ZV',
-    'zvd': 'ZVD', 'ei': 'EI'}
-_LINEAR = ('zv', 'zvd', 'ei')
+    'zvd': 'ZVD', 'ei': 'EI', 'umzv': 'UM-ZV'}
+_LINEAR = ('zv', 'zvd', 'ei', 'umzv')
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.delivery import Delivery, pieces
 from hmsa_ros.model.equations import (
     acceleration,
@@ -305,6 +306,24 @@ def test_linear_shapers_leave_vibration_and_the_exact_ones_do_not():
         move = get_shaper(name)(request)
         assert move.code is Code.LINEAR
         assert least < distance_from_rest(move, request) < most
+
+
+def test_full_on_off_and_on_again_leaves_nothing_of_a_small_move_in_a_third_of_a_period():
+    for zeta, creep in (
+            (0.0, Creep()), (0.2, Creep()), (1.0, Creep()), (0.2, Creep((0.2,), (1.0,)))):
+        request = Request(
+            State(1.0), 1.0001, NondimensionalParameters(zeta=zeta, creep=creep), Limits())
+        move, slower, step = (get_shaper(x)(request) for x in ('umzv', 'zv', 'step'))
+        assert move.duration < 0.95 * slower.duration
+        full = move.levels[-1].load
+        assert [x.load for x in move.levels] == pytest.approx([full, 0.0, full], abs=1e-12)
+        left = [distance_from_rest(x, request) for x in (
+            move, Move(step.code, step.levels, move.duration))] if not creep else [0.0, 1.0]
+        assert left[0] < 2e-3 * left[1]
+    undamped = NondimensionalParameters(zeta=0.0)
+    small = get_shaper('umzv')(Request(State(1.0), 1.0 + 1e-7, undamped))
+    third = 2.0 * math.pi / 3.0 / float(natural_frequency(1.0, undamped))
+    assert small.duration == pytest.approx(third, rel=1e-5)
 
 
 def test_a_sequence_begins_each_move_where_the_last_one_really_ended():

@@ -16,10 +16,8 @@ ROS_ARGUMENTS = {
     '--params-file': 'file with parameters', '--log-level': 'lowest severity to log',
     '--enclave': 'security enclave', '--disable-rosout-logs': 'do not publish the log'}
 _ROS_FILES = ('--params-file',)
-# Values of options that are checked later than by the parser.
-_SHAPERS = (
-    'two_step', 'robust', 'minimax', 'minimum_time', 'smooth', 'step', 'zv', 'zvd', 'ei')
-VALUES = {'--shaper': _SHAPERS, '--shapers': _SHAPERS}
+# Options whose values are checked later than by the parser, those of a shaper.
+_OF_SHAPERS = ('--shaper', '--shapers')
 _FILES = ('FILE', 'FILE.csv', 'BAG')
 _FOLDERS = ('DIR',)
 
@@ -95,7 +93,11 @@ def _option(action: argparse.Action) -> Option:
     text = re.sub(r'\s+', ' ', (action.help or '') % vars(action)) if action.help else ''
     if action.nargs == 0:
         return Option(names, text)
-    choices = tuple(map(str, action.choices or ())) or VALUES.get(names[-1], ())
+    choices = tuple(map(str, action.choices or ()))
+    if names[-1] in _OF_SHAPERS:
+        from hmsa_ros.planning.shapers import SHAPERS  # imports NumPy, which not all commands need
+
+        choices = tuple(SHAPERS)
     kind = ('one' if choices else 'file' if action.metavar in _FILES
             else 'folder' if action.metavar in _FOLDERS else 'any')
     return Option(names, text, kind, choices)

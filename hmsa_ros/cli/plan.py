@@ -38,7 +38,7 @@ def add_parser(subparsers: Any) -> None:
          'initial stretch, at rest (default 1; 0 for the deflection of a beam)'),
         *((option, metavar, float, text) for option, metavar, text in MATERIAL),
         ('--shaper', 'NAME', str,
-         'two_step (default), robust, minimax, minimum_time, smooth, step, zv, zvd or ei'),
+         'two_step (default), robust, minimax, minimum_time, smooth, step, zv, zvd, ei or umzv'),
         ('--order', 'N', int,
          'two-step commands that robust chains; minimax takes as long (default 2)',
          {'default': 2}),

@@ -16,13 +16,17 @@ from hmsa_ros.planning.shapers.request import Shaper
 from hmsa_ros.planning.shapers.robust import robust
 from hmsa_ros.planning.shapers.smooth import smooth
 from hmsa_ros.planning.shapers.two_step import two_step
+from hmsa_ros.planning.shapers.umzv import umzv
 
 #: Shapers by name.
 SHAPERS: dict[str, Shaper] = {
-    **{x.__name__: advised(x) for x in (two_step, robust, minimax, minimum_time)},
+    'two_step': advised(two_step),
+    # They plan wherever two_step does.
+    **{x.__name__: advised(x, sooner=two_step) for x in (robust, minimax)},
+    'minimum_time': advised(minimum_time),
     # Whose search for a path that is not there takes long: what to ease, but not how much.
     'smooth': advised(smooth, (math.inf,)),
-    **{x.__name__: x for x in (step, zv, zvd, ei)},
+    **{x.__name__: x for x in (step, zv, zvd, ei, umzv)},
 }
 
 

@@ -19,21 +19,29 @@ _CODES = {'flux': Code.FLUX_LIMIT, 'slew': Code.SLEW_LIMIT, 'period': Code.NO_TW
 _FACTORS = (1.5, 3.0, 10.0, 30.0, math.inf)
 
 
-def advised(shaper: Shaper, factors: Sequence[float] = _FACTORS) -> Shaper:
-    """Return a shaper whose refusals name what limits, eased so much, it finds a command with."""
+def advised(
+        shaper: Shaper, factors: Sequence[float] = _FACTORS,
+        sooner: Shaper | None = None) -> Shaper:
+    """
+    Return a shaper whose refusals name what limits, eased so much, it finds a command with.
+
+    Another shaper that finds one for the same requests may be asked for that, and answer sooner.
+    """
+    asked = sooner or shaper
+
     @wraps(shaper)
     def shape(request: Request) -> Move:
         try:
             return shaper(request)
         except RefusedError as error:
-            ways = _ways(shaper, request) if error.code in _SEARCHED else []
+            ways = _ways(asked, request) if error.code in _SEARCHED else []
             what, _, advice = str(error).partition(': expected ')
             if not ways or (advice and ways == [('flux',)] and error.code is Code.FLUX_LIMIT):
                 raise
             raise RefusedError(
                 _CODES[ways[0][0]],
                 f'{what}: expected ' + ', or '.join(
-                    _advice(shaper, request, x, factors) for x in ways)) from error
+                    _advice(asked, request, x, factors) for x in ways)) from error
     return shape
 
 

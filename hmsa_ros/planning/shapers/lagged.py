@@ -28,9 +28,9 @@ _SHORTEST_STRIDE = 0.03
 # Lengths of three levels of free heights, in half periods at the target.
 _LENGTHS = (0.7, 0.85, 1.0, 1.2, 1.4, 1.7, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0)
 _FREE_LOADS = [('load', 0), ('load', 1), ('load', 2)]
-# Periods of the grid beyond the least number, and shares of the limits' heights.
+# Periods of the grid beyond the least number, and the share of a command by which longer ones are.
 _MORE_PERIODS = (0, 1, 2, 3, 4, 6, 9)
-_SHARES = (1.0, 0.5, 0.25, 0.1)
+_STRIDES = 12
 _AT_REST = 1e-9
 
 
@@ -206,17 +206,25 @@ def in_order(found: Attempt) -> Attempt:
 
 def fastest_on_grid(request: Request, loads: tuple[float, float]) -> Attempt:
     """Return the shortest three levels on the grid that keep the limits, if there are any."""
-    return first_kept(_on_grid(request, loads), request)
+    half = math.pi / request.frequency
+    most = math.ceil((2.0 * half + 3.0 * request.delivery.lag) / request.delivery.period) + 6
+    # On a fine grid long ones in strides, and then what the last stride has left out.
+    shortest = count = 3
+    while count < most:
+        found = first_kept([_on_grid(request, loads, count)], request)
+        if found is not None:
+            return first_kept(
+                (_on_grid(request, loads, x) for x in range(shortest, count)), request) or found
+        shortest, count = count + 1, count + max(1, count // _STRIDES)
+    return None
 
 
-def _on_grid(request: Request, loads: tuple[float, float]) -> Iterator[Template]:
+def _on_grid(request: Request, loads: tuple[float, float], count: int) -> Template:
+    """Return a guess of three levels that last so many periods."""
     period = request.delivery.period
     holding = request.holding_load()
-    half = math.pi / request.frequency
-    most = math.ceil((2.0 * half + 3.0 * request.delivery.lag) / period) + 6
-    for count in range(3, most):
-        last = max(1, min(count // 3, math.ceil(_PUSHES[0] * request.delivery.lag / period)))
-        first = max(1, (count - last) // 2)
-        guess = (Level(0.0, 0.5 * (loads[0] + holding)), Level(first * period, holding),
-                 Level((count - last) * period, holding), Level(count * period, holding))
-        yield Template.of(guess, _FREE_LOADS)
+    last = max(1, min(count // 3, math.ceil(_PUSHES[0] * request.delivery.lag / period)))
+    first = max(1, (count - last) // 2)
+    return Template.of(
+        (Level(0.0, 0.5 * (loads[0] + holding)), Level(first * period, holding),
+         Level((count - last) * period, holding), Level(count * period, holding)), _FREE_LOADS)

@@ -9,7 +9,8 @@ linearised about the target, branches that creep included. The actuator is not l
 vibration, the more the larger the move.
 """
 
-from itertools import accumulate
+from collections.abc import Callable
+from itertools import accumulate, starmap
 import math
 
 from hmsa_ros.model.delivery import ramps
@@ -18,6 +19,9 @@ from hmsa_ros.model.status import Code
 from hmsa_ros.planning.shapers.creeping import arrival
 from hmsa_ros.planning.shapers.modes import oscillation
 from hmsa_ros.planning.shapers.request import Request
+
+#: Impulses (time, share) for a root -decay + i frequency of the motion, by time.
+Impulses = Callable[[complex], list[tuple[float, float]]]
 
 _EI_TOLERANCE = 0.05
 # Passes in which the levels meet what branches hold at arrival.
@@ -31,12 +35,12 @@ def step(request: Request) -> Move:
 
 def zv(request: Request) -> Move:
     """Two impulses, half a damped period apart."""
-    return _shaped(request, (1.0, 1.0))
+    return shaped(request, _spaced(1.0, 1.0))
 
 
 def zvd(request: Request) -> Move:
     """Three impulses, a ZV shaper convolved with itself."""
-    return _shaped(request, (1.0, 2.0, 1.0))
+    return shaped(request, _spaced(1.0, 2.0, 1.0))
 
 
 def ei(request: Request) -> Move:
@@ -46,12 +50,23 @@ def ei(request: Request) -> Move:
     The undamped amplitudes are weighted with the decay over half a period, as is usual for
     light damping.
     """
-    return _shaped(
-        request, (1.0 + _EI_TOLERANCE, 2.0 * (1.0 - _EI_TOLERANCE), 1.0 + _EI_TOLERANCE))
+    return shaped(
+        request, _spaced(1.0 + _EI_TOLERANCE, 2.0 * (1.0 - _EI_TOLERANCE), 1.0 + _EI_TOLERANCE))
 
 
-def _shaped(request: Request, weights: tuple[float, ...]) -> Move:
-    """Shape the step with impulses half a damped period apart, decaying as the motion does."""
+def _spaced(*weights: float) -> Impulses:
+    """Return impulses half a damped period apart, decaying as the motion does."""
+    def impulses(root: complex) -> list[tuple[float, float]]:
+        half_period = math.pi / root.imag
+        decay = math.exp(root.real * half_period)
+        heights = [weight * decay ** i for i, weight in enumerate(weights)]
+        return [(i * half_period, x / sum(heights)) for i, x in enumerate(heights)]
+
+    return impulses
+
+
+def shaped(request: Request, impulses: Impulses) -> Move:
+    """Shape the step with impulses for the motion linearised about the target."""
     holding = request.holding_load()
     material, target = request.material, request.target
     mode = oscillation(material, target)
@@ -60,21 +75,19 @@ def _shaped(request: Request, weights: tuple[float, ...]) -> Move:
             Code.TOO_DAMPED,
             f'zeta {material.zeta:g} is above critical damping at {request.named_target}: there '
             'is no oscillation to shape for, the plain step is used')
-    half_period = math.pi / mode[0].imag
-    decay = math.exp(mode[0].real * half_period)
-    impulses = [weight * decay ** i for i, weight in enumerate(weights)]
-    times = [i * half_period for i in range(len(impulses))]
+    times, heights = map(list, zip(*impulses(mode[0]), strict=True))
+    shares = list(accumulate(heights))
     period = request.delivery.period
     if period > 0.0:
         times = [round(x / period) * period for x in times]
-    shares = [x / sum(impulses) for x in accumulate(impulses)]
 
-    def shaped(last: float) -> tuple[Level, ...]:
-        levels = [Level(time, request.load + share * (last - request.load))
-                  for time, share in zip(times, shares, strict=True)]
-        return (*levels[:-1], Level(levels[-1].time, last))
+    def levels_to(last: float) -> tuple[Level, ...]:
+        # On a coarse grid two may be at the same time: the later one counts.
+        loads = {time: request.load + share * (last - request.load)
+                 for time, share in zip(times, shares, strict=True)} | {times[-1]: last}
+        return tuple(starmap(Level, loads.items()))
 
-    levels = shaped(holding)
+    levels = levels_to(holding)
     end = levels[-1].time
     for _ in range(_PASSES if material.creep else 0):
         # Of what branches hold at arrival, after the last ramp, and what is followed afterwards.
@@ -83,6 +96,6 @@ def _shaped(request: Request, weights: tuple[float, ...]) -> Move:
         if period > 0.0:
             end = period * math.ceil(end / period - 1e-9)
         here = arrival(request, Move(Code.LINEAR, levels, end))
-        levels = shaped(request.balance(here.followed))
+        levels = levels_to(request.balance(here.followed))
     request.check(levels)
     return Move(Code.LINEAR, levels, end)
