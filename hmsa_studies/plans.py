@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hmsa_ros.errors import BadInputError, HmsaError
-from hmsa_ros.interfaces.settings import Setting
 from hmsa_ros.model import law
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.laws.record import Elastic
@@ -19,6 +18,7 @@ from hmsa_ros.planning.sequence import plan_sequence
 from hmsa_ros.planning.setpoint import Setpoint
 from hmsa_ros.planning.two_step import CODES, plan_two_step_batch
 from hmsa_studies.residual import Actual, arrival_of
+from hmsa_studies.settings import Setting
 
 #: All codes; plans have their places.
 STATUS = tuple(Code)

@@ -5,7 +5,6 @@ import math
 
 import numpy as np
 
-from hmsa_ros.interfaces.settings import Setting
 from hmsa_ros.model.delivery import Delivery, IDEAL, ramps
 from hmsa_ros.model.equations import (
     Array,
@@ -22,6 +21,7 @@ from hmsa_ros.model.residual import residual_vibration
 from hmsa_ros.model.simulation import simulate
 from hmsa_ros.model.status import Code
 from hmsa_ros.planning.two_step import plan_two_step
+from hmsa_studies.settings import Setting
 
 __all__ = ['Actual', 'arrival_of', 'Errors']
 

@@ -18,13 +18,13 @@ from numpy.typing import ArrayLike, NDArray
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import require_arrow
 from hmsa_ros.interfaces.parameters import LAW_NAME, present_name
-from hmsa_ros.interfaces.settings import FINITE, Nondimensional, Range, Setting, System
 from hmsa_ros.model.equations import Array, signed_root
 from hmsa_ros.model.laws import LAWS
 from hmsa_ros.planning.shapers import get_shaper
 from hmsa_studies.axes import parse_grid
 from hmsa_studies.chunks import LEAST_ROWS, MOST_ROWS
 from hmsa_studies.plans import by_batch, by_settings, carried_out, Plans, STATUS
+from hmsa_studies.settings import FINITE, Nondimensional, Range, Setting, System
 from hmsa_studies.views import Axis, View
 
 __all__ = ['parse_grid', 'ROW_BYTES', 'Rows', 'Sweep']

@@ -13,9 +13,9 @@ from matplotlib.ticker import NullLocator
 import numpy as np
 
 from hmsa_ros.interfaces.parameters import PLANNED
-from hmsa_ros.interfaces.settings import ACTUAL, BLOCK_OF, Nondimensional
 from hmsa_ros.model.equations import Array
 from hmsa_ros.report import style
+from hmsa_studies.settings import ACTUAL, BLOCK_OF, Nondimensional
 from hmsa_studies.views import Axis, View
 
 #: Shares of the samples between which the bands are, and the one that maps show.

@@ -13,7 +13,6 @@ import yaml
 from hmsa_ros.cli import main
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.interfaces.parameters import PLANNED
-from hmsa_ros.interfaces.settings import InSI, Nondimensional
 from hmsa_ros.model.equations import acceleration_si
 from hmsa_ros.model.laws import LAWS
 from hmsa_ros.model.moves import State
@@ -24,6 +23,7 @@ from hmsa_ros.planning.two_step import plan_two_step_batch
 from hmsa_ros.recordings.parameters import read_parameter_file, values_of
 from hmsa_studies.axes import Belief, draw, NOTHING, parse_values, Spread
 from hmsa_studies.residual import Actual, Errors
+from hmsa_studies.settings import InSI, Nondimensional
 from hmsa_studies.sweep import Sweep
 
 ACTUATOR = {

@@ -13,10 +13,14 @@ from hmsa_ros.files import json_text
 from hmsa_ros.planning.setpoint import impossible
 
 if TYPE_CHECKING:
-    from hmsa_ros.interfaces.settings import Setting
+    from hmsa_ros.model.delivery import Delivery
     from hmsa_ros.model.mismatch import Uncertainty
-    from hmsa_ros.model.moves import State
+    from hmsa_ros.model.moves import Limits, State
+    from hmsa_ros.model.parameters import NondimensionalParameters
+    from hmsa_ros.model.units import Units
     from hmsa_ros.planning.sequence import Segment
+
+    Nominal = tuple[NondimensionalParameters, Limits, Delivery, Units]
 
 
 def add_parser(subparsers: Any) -> None:
@@ -62,13 +66,13 @@ def run(arguments: argparse.Namespace) -> int:
     from hmsa_ros.planning.setpoint import Setpoint
     from hmsa_ros.planning.shapers.pace import Pace
 
-    model = nominal(arguments)
-    group, time, load = model.material, model.units.time, model.units.load
+    group, limits, delivery, units = nominal(arguments)
+    time, load = units.time, units.load
     segments = plan_sequence(
         [Setpoint(stretch, span / time)
          for stretch, span in _possible(arguments.setpoints, group.rest)],
         group, start=_start(arguments, group.rest), shaper=arguments.shaper or 'two_step',
-        limits=model.limits, delivery=model.delivery, units=model.units, order=arguments.order,
+        limits=limits, delivery=delivery, units=units, order=arguments.order,
         errors=_errors(arguments), pace=Pace(arguments.periods, arguments.max_rate * time))
     if arguments.params_file is None:
         facts = {}
@@ -90,23 +94,25 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def nominal(arguments: argparse.Namespace) -> 'Setting':
+def nominal(arguments: argparse.Namespace) -> 'Nominal':
     """Return what options or a file plan with; raise `BadInputError` if both say something."""
-    from hmsa_ros.interfaces.settings import Setting
+    from hmsa_ros.model.delivery import Delivery
+    from hmsa_ros.model.moves import Limits
     from hmsa_ros.model.parameters import NondimensionalParameters
+    from hmsa_ros.model.units import Units
     from hmsa_ros.recordings.model import model_of
 
     given = {name: value for name in ('zeta', 'j_lim', 'c1')
              if (value := getattr(arguments, name)) is not None}
     if arguments.params_file is None:
-        return Setting(NondimensionalParameters(**given))
+        return NondimensionalParameters(**given), Limits(), Delivery(), Units()
     if given:
         fixed = ', '.join(f'--{name.replace("_", "-")}' for name in given)
         raise BadInputError(
             f'both --params-file and {fixed} are given: expected only one of them, since the file '
             'sets these values')
     model = model_of(arguments.params_file)
-    return Setting(model.material, model.limits, model.delivery, model.units)
+    return model.material, model.limits, model.delivery, model.units
 
 
 def _possible(setpoints: Sequence[tuple[float, float]], rest: float) -> list[tuple[float, float]]:

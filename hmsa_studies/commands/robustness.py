@@ -94,16 +94,16 @@ def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> 
         study,
     )
 
-    model = nominal(arguments)
+    material, limits, delivery, _ = nominal(arguments)
     shapers = None
     if arguments.shapers is not None:
         shapers = tuple(name.strip() for name in arguments.shapers.split(','))
     compared = candidates(shapers, arguments.order or ORDERS)
     cases = [
-        Case(begin, target, model.material, model.limits, model.delivery, arguments.errors,
+        Case(begin, target, material, limits, delivery, arguments.errors,
              max(arguments.errors, min(2.0 * arguments.errors, LARGEST)))
         for begin, target in dict.fromkeys(
-            arguments.move or (_MOVES if model.material.rest else _BENDS))]
+            arguments.move or (_MOVES if material.rest else _BENDS))]
     tasks = list(product(cases, compared))
     folder: Path = arguments.out or Path('robustness')
 

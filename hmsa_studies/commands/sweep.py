@@ -153,8 +153,8 @@ class _Picture:
 
 def _sweep(arguments: argparse.Namespace) -> 'Sweep':
     """Return what the arguments ask for."""
-    from hmsa_ros.interfaces.settings import ACTUAL, BLOCK_OF, InSI, Nondimensional, System
     from hmsa_studies.axes import draw, NOTHING, parse_values, read_cases, Spread
+    from hmsa_studies.settings import ACTUAL, BLOCK_OF, InSI, Nondimensional, System
     from hmsa_studies.sweep import Sweep
 
     system: System = Nondimensional()
