@@ -122,13 +122,7 @@ class _Taker:
         return result
 
 
-@cache
-def _taker() -> _Taker | None:
-    """Return what tells publishers apart, None where rcl's library is not found."""
-    try:
-        return _Taker()
-    except (OSError, AttributeError):
-        return None
+_taker = cache(_Taker)
 
 
 class RawSubscription:
@@ -137,7 +131,6 @@ class RawSubscription:
     def __init__(
             self, node: Node, message_type: type[Any], topic: str, qos: QoSProfile) -> None:
         check_is_valid_msg_type(message_type)
-        self._type = message_type
         with node.handle:
             self.handle = _rclpy.Subscription(
                 node.handle, message_type, topic, qos.get_c_qos_profile())
@@ -146,24 +139,9 @@ class RawSubscription:
         """Take at most ``limit`` messages in order of arrival; none if there are none."""
         try:
             with self.handle:
-                taker = _taker()
-                return self._take_by_rclpy(limit) if taker is None else taker.take(
-                    self.handle.pointer, limit)
+                return _taker().take(self.handle.pointer, limit)
         except InvalidHandle:
             return []
-
-    def _take_by_rclpy(self, limit: int) -> list[Taken]:
-        """Take without knowing the publishers."""
-        result: list[Taken] = []
-        while len(result) < limit:
-            pair = self.handle.take_message(self._type, True)
-            if pair is None:
-                break
-            data, info = pair
-            result.append(Taken(
-                info['source_timestamp'], info['received_timestamp'],
-                info['publication_sequence_number'], b'', data))
-        return result
 
     def destroy(self) -> None:
         """Stop receiving."""

@@ -32,19 +32,12 @@ class Allegiance:
         self.refused = 0
 
     def accepts(self, publisher: bytes, present: Callable[[], Iterable[bytes]]) -> bool:
-        """Return whether to obey a publisher; an unknown one only if it is the only one."""
-        if publisher and publisher == self.source:
-            return True
-        others = [*present()]
-        if not publisher:
-            accepted = len(others) <= 1
-        else:
-            accepted = self.source is None or self.source not in others
-        if not accepted:
-            self.refused += 1
-        elif publisher:
+        """Return whether to obey a publisher, of those that are present."""
+        if self.source in (None, publisher) or self.source not in present():
             self.source = publisher
-        return accepted
+            return True
+        self.refused += 1
+        return False
 
 
 class CommandInput:
@@ -112,11 +105,8 @@ class CommandInput:
             found = {x: node == own for x, node in self._publishers().items()}
             if self._allegiance is not None:
                 self._allegiance.source = next((x for x in found if found[x]), None)
-            # Where the sender of a message is not known, it is the companion's if all are.
-            found[b''] = all(found.values())
             self._companions = found
-            return found.get(publisher, False)
-        return self._companions[publisher]
+        return self._companions.get(publisher, False)
 
     def _obey(self, data: bytes) -> None:
         try:
