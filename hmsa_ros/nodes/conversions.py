@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 import json
-from struct import unpack_from
 from typing import TYPE_CHECKING
 
 from builtin_interfaces.msg import Duration, Time
@@ -16,6 +15,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.schedule import obeyed
 from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.nodes.cdr import Cursor
 
 if TYPE_CHECKING:
     # It comes along with the planner, which a recorder has no use for.
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 #: What a receipt says while commands of before a cut-off are refused.
 CUT_OFF = 'cut_off'
-# Encapsulation and stamp: bytes at the beginning of a message with a header.
-_STAMPED = 12
 
 
 def to_time(nanoseconds: int) -> Time:
@@ -159,10 +157,10 @@ def to_status(
 
 def stamp_of(data: bytes) -> int:
     """Return the stamp in ns of a serialized message that begins with a header, else 0."""
-    if len(data) < _STAMPED:
+    try:
+        return Cursor(data).time()
+    except BadInputError:
         return 0
-    seconds, nanoseconds = unpack_from('<iI' if data[1] & 1 else '>iI', data, 4)
-    return int(seconds) * NANOSECONDS + int(nanoseconds)
 
 
 def to_diagnostics(stamp: int, *statuses: DiagnosticStatus) -> DiagnosticArray:

@@ -1,11 +1,10 @@
-"""Joint states as columns: read quickly, picked by joint, put in order."""
+"""Joint states as columns: read, picked by joint, put in order."""
 
 from array import array
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import chain
-import struct
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,6 @@ _CLOCK_JUMP = 100_000_000
 _FAR = 30 * 86_400 * NANOSECONDS
 # What lies beyond is no motion of a block, and nothing could be drawn beside it; the rate in 1/s.
 _LARGEST_STRETCH, _LARGEST_RATE = 1e6, 1e12
-_LITTLE_ENDIAN = b'\x00\x01'
 
 
 def nanoseconds_of(stamp: Any) -> int:
@@ -43,41 +41,21 @@ class _Columns:
 
 
 class SampleReader:
-    """
-    Reads joint states, quickly where they all have one layout.
-
-    Decoding field by field takes longer than everything else together. Joint states of one
-    sender differ in their numbers only, so that the places of these are worked out once for
-    each length and the rest is compared.
-    """
+    """Reads joint states, of all joints and shapes."""
 
     def __init__(self, decode: Callable[[bytes], Any]) -> None:
         self._decode = decode
-        self._layouts: dict[int, _Layout | None] = {}
         self._columns: defaultdict[_Shape, _Columns] = defaultdict(_Columns)
 
     def take(self, logged: int, data: bytes) -> None:
         """Take in a sample."""
-        length = len(data)
-        if length not in self._layouts:
-            self._layouts[length] = _Layout.find(data, self._decode)
-        layout = self._layouts[length]
-        if layout is not None and layout.fits(data):
-            sec, nanosec = layout.stamp.unpack_from(data, 4)
-            self._put(logged, sec * NANOSECONDS + nanosec, layout.names, [
-                x.unpack_from(data, offset) for x, offset in layout.numbers])
-            return
         message = self._decode(data)
-        self._put(logged, nanoseconds_of(message.header.stamp), tuple(message.name), [
-            tuple(x) for x in (message.position, message.velocity, message.effort)])
-
-    def _put(
-            self, logged: int, stamp: int, names: tuple[str, ...],
-            numbers: list[tuple[float, ...]]) -> None:
+        numbers = [tuple(x) for x in (message.position, message.velocity, message.effort)]
         position, velocity, effort = map(len, numbers)
-        columns = self._columns[names, position, velocity, effort]
         # Both are made first: what cannot be kept leaves no half of it behind.
-        times, row = array('q', (logged, stamp)), array('d', chain.from_iterable(numbers))
+        times = array('q', (logged, nanoseconds_of(message.header.stamp)))
+        row = array('d', chain.from_iterable(numbers))
+        columns = self._columns[tuple(message.name), position, velocity, effort]
         columns.times.extend(times)
         columns.numbers.extend(row)
 
@@ -133,54 +111,6 @@ class SampleReader:
         raise BadInputError(
             f'{where} has the joints {", ".join(sorted(names))}: expected one; name it with '
             '--joint')
-
-
-@dataclass(frozen=True)
-class _Layout:
-    """Where the numbers of a joint state lie, and the bytes between them."""
-
-    stamp: struct.Struct
-    numbers: tuple[tuple[struct.Struct, int], ...]
-    constant: tuple[tuple[int, int, bytes], ...]
-    names: tuple[str, ...]
-
-    def fits(self, data: bytes) -> bool:
-        """Return whether a payload of the same length has this layout."""
-        return all(data[i:j] == x for i, j, x in self.constant)
-
-    @classmethod
-    def find(cls, data: bytes, decode: Callable[[bytes], Any]) -> '_Layout | None':
-        """Return the layout of a payload, None if it is not the usual one."""
-        if data[:2] != _LITTLE_ENDIAN:
-            return None
-        message = decode(data)
-        place = 12
-
-        def count() -> int:
-            nonlocal place
-            place += -place % 4
-            number: int = struct.unpack_from('<I', data, place)[0]
-            place += 4
-            return number
-
-        numbers, constant, begin = [], [(0, 4, data[:4])], 12
-        try:
-            place += count()
-            for _ in range(count()):
-                length = count()
-                place += length
-            for values in (message.position, message.velocity, message.effort):
-                number = count()
-                # Doubles are aligned to 8 from the end of the encapsulation on.
-                start = place + (4 - place) % 8 if number else place
-                constant.append((begin, place, data[begin:place]))
-                numbers.append((struct.Struct(f'<{number}d'), start))
-                place = begin = start + 8 * number
-                if list(numbers[-1][0].unpack_from(data, start)) != list(values):
-                    return None
-        except struct.error:
-            return None
-        return cls(struct.Struct('<iI'), tuple(numbers), tuple(constant), tuple(message.name))
 
 
 @dataclass(frozen=True, eq=False)
