@@ -7,15 +7,10 @@ They hold everything that they need, so that no key press starts Python.
 import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 import re
 from typing import Any
 
-#: What follows ``--ros-args``.
-ROS_ARGUMENTS = {
-    '-p': 'set a parameter, NAME:=VALUE', '-r': 'remap a name, FROM:=TO',
-    '--params-file': 'file with parameters', '--log-level': 'lowest severity to log',
-    '--enclave': 'security enclave', '--disable-rosout-logs': 'do not publish the log'}
-_ROS_FILES = ('--params-file',)
 # Options whose values are checked later than by the parser, those of a shaper.
 _OF_SHAPERS = ('--shaper', '--shapers')
 _FILES = ('FILE', 'FILE.csv', 'BAG')
@@ -59,7 +54,13 @@ def run(arguments: argparse.Namespace) -> int:
     """Print the script."""
     from hmsa_ros.cli import build_parser
 
-    print(_SCRIPTS[arguments.shell](list(commands_of(build_parser()))), end='')
+    commands = list(commands_of(build_parser()))
+    fill, between = _SCRIPTS[arguments.shell]
+    text = Path(__file__).with_suffix(f'.{arguments.shell}').read_text(encoding='utf-8')
+    text = text.replace('@paths@', between.join(_quote(x.path) for x in commands if x.path))
+    for name, lines in fill(commands).items():
+        text = text.replace(f'@{name}@', '\n'.join(lines))
+    print(text, end='')
     return 0
 
 
@@ -118,36 +119,15 @@ def _valued(commands: list[Command]) -> Iterator[tuple[str, Option]]:
 
 # bash ----------------------------------------------------------------------------------------
 
-def _bash(commands: list[Command]) -> str:
-    """Return the script for bash."""
-    paths = ' | '.join(_quote(x.path) for x in commands if x.path)
-    values = [f'    {keys}) {_bash_value(x)}; return ;;' for keys, x in _valued(commands)]
-    values += [f"    '--ros-args:{x}') _hmsa_files -f; return ;;" for x in _ROS_FILES]
-    values.append("    --ros-args:-[pr] | '--ros-args:--log-level') return ;;")
+def _bash(commands: list[Command]) -> dict[str, list[str]]:
+    """Return what fills the script for bash."""
     words = []
     for command in commands:
         names = [*command.words, *(y for x in command.options for y in x.names)]
         also = '_hmsa_files -f; ' if command.files else ''
         words.append(f'    {_quote(command.path)}) {also}_hmsa_words {" ".join(names)} ;;')
-    words.append(f"    '--ros-args') _hmsa_words {' '.join(ROS_ARGUMENTS)} ;;")
-    return '\n'.join([
-        '# Completion of hmsa for bash: eval "$(hmsa completion bash)"',
-        '_hmsa_words() {', '  local each',
-        '  while IFS= read -r each; do COMPREPLY+=("$each"); done \\',
-        '    < <(compgen -W "$*" -- "$cur")', '}',
-        '_hmsa_files() {', '  local each', '  compopt -o filenames 2> /dev/null',
-        '  while IFS= read -r each; do COMPREPLY+=("$each"); done < <(compgen "$1" -- "$cur")',
-        '}',
-        '_hmsa() {',
-        '  local cur=${COMP_WORDS[COMP_CWORD]} prev=${COMP_WORDS[COMP_CWORD-1]}',
-        "  local at='' word i", '  COMPREPLY=()',
-        '  for ((i = 1; i < COMP_CWORD; i++)); do', '    word=${COMP_WORDS[i]}',
-        "    if [[ $word == --ros-args ]]; then at='--ros-args'; break; fi",
-        '    case "${at:+$at }$word" in', f'      {paths}) at="${{at:+$at }}$word" ;;',
-        '    esac', '  done',
-        '  case "$at:$prev" in', *values, '  esac',
-        '  case "$at" in', *words, '  esac', '}',
-        'complete -F _hmsa hmsa', ''])
+    return {'words': words, 'values': [
+        f'    {keys}) {_bash_value(x)}; return ;;' for keys, x in _valued(commands)]}
 
 
 def _bash_value(option: Option) -> str:
@@ -158,31 +138,15 @@ def _bash_value(option: Option) -> str:
 
 # zsh -----------------------------------------------------------------------------------------
 
-def _zsh(commands: list[Command]) -> str:
-    """Return the script for zsh."""
-    paths = ' | '.join(_quote(x.path) for x in commands if x.path)
-    values = [f'    ({keys}) {_zsh_value(x)}; return ;;' for keys, x in _valued(commands)]
-    values += [f"    ('--ros-args:{x}') _files; return ;;" for x in _ROS_FILES]
+def _zsh(commands: list[Command]) -> dict[str, list[str]]:
+    """Return what fills the script for zsh."""
     words = []
     for command in commands:
         also = '; _files' if command.files else ''
         words.append(
             f'    ({_quote(command.path)}) _hmsa_offer {_zsh_pairs(command)}{also} ;;')
-    pairs = ' '.join(_quote(f'{x}:{text}') for x, text in ROS_ARGUMENTS.items())
-    words.append(f"    ('--ros-args') _hmsa_offer {pairs} ;;")
-    return '\n'.join([
-        '#compdef hmsa',
-        '# Completion of hmsa for zsh: eval "$(hmsa completion zsh)" after compinit',
-        '_hmsa_offer() {', '  local -a pairs=("$@")', "  _describe 'hmsa' pairs", '}',
-        '_hmsa() {', "  local at='' word i",
-        '  for ((i = 2; i < CURRENT; i++)); do', '    word=${words[i]}',
-        "    if [[ $word == --ros-args ]]; then at='--ros-args'; break; fi",
-        '    case "${at:+$at }$word" in', f'      ({paths}) at="${{at:+$at }}$word" ;;',
-        '    esac', '  done',
-        '  case "$at:${words[CURRENT-1]}" in', *values, '  esac',
-        '  case "$at" in', *words, '  esac', '}',
-        'if [[ $zsh_eval_context[-1] == loadautofunc ]]; then', '  _hmsa "$@"', 'else',
-        '  compdef _hmsa hmsa', 'fi', ''])
+    return {'words': words, 'values': [
+        f'    ({keys}) {_zsh_value(x)}; return ;;' for keys, x in _valued(commands)]}
 
 
 def _zsh_value(option: Option) -> str:
@@ -201,17 +165,9 @@ def _zsh_pairs(command: Command) -> str:
 
 # fish ----------------------------------------------------------------------------------------
 
-def _fish(commands: list[Command]) -> str:
-    """Return the script for fish."""
-    paths = ' '.join(_quote(x.path) for x in commands if x.path)
-    lines = [
-        '# Completion of hmsa for fish: ~/.config/fish/completions/hmsa.fish',
-        'function __hmsa_at', "  set -l at ''",
-        '  for word in (commandline -opc)[2..-1]',
-        '    if test "$word" = --ros-args', '      set at --ros-args', '      break', '    end',
-        '    set -l next (string trim -- "$at $word")',
-        f'    if contains -- "$next" {paths}', '      set at $next', '    end', '  end',
-        '  test "$at" = "$argv[1]"', 'end', 'complete -c hmsa -f']
+def _fish(commands: list[Command]) -> dict[str, list[str]]:
+    """Return what fills the script for fish."""
+    lines = []
     for command in commands:
         begin = f'complete -c hmsa -n {_quote(f"__hmsa_at {chr(34)}{command.path}{chr(34)}")}'
         for word, text in command.words.items():
@@ -226,11 +182,8 @@ def _fish(commands: list[Command]) -> str:
                 'folder': " -x -a '(__fish_complete_directories)'",
                 'one': f' -x -a {_quote(" ".join(option.choices))}'}[option.value]
             lines.append(f'{begin} {names}{value} -d {_quote(option.text)}')
-    for name, text in ROS_ARGUMENTS.items():
-        files = ' -F' if name in _ROS_FILES else ''
-        lines.append(
-            f"complete -c hmsa -n '__hmsa_at \"--ros-args\"' -a {name} -d {_quote(text)}{files}")
-    return '\n'.join([*lines, ''])
+    return {'words': lines}
 
 
-_SCRIPTS = {'bash': _bash, 'zsh': _zsh, 'fish': _fish}
+# What fills the script of each shell, which lies beside this file, and joins its paths.
+_SCRIPTS = {'bash': (_bash, ' | '), 'zsh': (_zsh, ' | '), 'fish': (_fish, ' ')}

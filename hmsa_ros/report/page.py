@@ -10,6 +10,7 @@ from datetime import datetime
 from html import escape
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 
@@ -24,7 +25,6 @@ from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings.record import Run
 from hmsa_ros.recordings.topics import APPLIED
 from hmsa_ros.report import charts
-from hmsa_ros.report.assets import SCRIPT, STYLE
 from hmsa_ros.report.charts import Figure, NOT_MOVED, Part, percent, TimeUnit
 from hmsa_ros.report.evaluation import FEW_SAMPLES, period_of, plan_points
 
@@ -142,12 +142,18 @@ def document(title: str, body: Sequence[str], figures: Sequence[Figure]) -> str:
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
         '<link rel="icon" href="data:,">',
-        f'<title>{escape(title)}</title>', f'<style>{STYLE}</style>', '</head>',
+        f'<title>{escape(title)}</title>', f'<style>{_beside("page.css")}</style>', '</head>',
         '<body>', *body,
         # Inside a script "</" could end it, and "<!--" keep it from ending.
         '<script type="application/json" id="report-data">' + data.replace('<', '\\u003c')
         + '</script>',
-        f'<script>{_plotly()}</script>', f'<script>{SCRIPT}</script>', '</body>', '</html>', ''])
+        f'<script>{_plotly()}</script>', f'<script>{_beside("page.js")}</script>', '</body>',
+        '</html>', ''])
+
+
+def _beside(name: str) -> str:
+    """Return style or script of a page, from a file beside this one."""
+    return Path(__file__).with_name(name).read_text(encoding='utf-8')
 
 
 def placed(figure: Figure, heading: str = '') -> str:
