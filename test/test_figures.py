@@ -19,8 +19,10 @@ from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.two_step import plan_two_step
 from hmsa_ros.recordings.levels import Level
 from hmsa_ros.recordings.record import Run
+from hmsa_ros.report.charts import Part
 from hmsa_ros.report.evaluation import Evaluation, MoveResult
-from hmsa_ros.report.picture import draw_run
+from hmsa_ros.report.picture import draw
+from hmsa_ros.report.timing import timing
 from hmsa_studies import claims, paper_data
 from hmsa_studies.paper import FIGURES, write_figure
 
@@ -333,14 +335,14 @@ def run() -> tuple[Run, Evaluation]:
 
 
 def test_the_picture_of_a_run_is_written(run: tuple[Run, Evaluation], tmp_path: Path) -> None:
-    draw_run(tmp_path / 'run.png', *run)
+    draw(tmp_path / 'run.png', [Part(*run, timing(run[0]))])
     check_picture(tmp_path / 'run.png')
 
 
 def test_a_run_drawn_to_nowhere_is_refused(
         run: tuple[Run, Evaluation], tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match='cannot write .*nowhere'):
-        draw_run(tmp_path / 'nowhere' / 'run.png', *run)
+        draw(tmp_path / 'nowhere' / 'run.png', [Part(*run, timing(run[0]))])
 
 
 def test_the_comparison_with_the_paper_says_what_the_computation_says() -> None:

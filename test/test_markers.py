@@ -144,10 +144,6 @@ def test_markers_are_stamped_in_the_frame_and_live_as_long_as_told():
         assert abs(marker.pose.orientation.w) == 1.0
 
 
-def test_nothing_removes_all():
-    assert [x.action for x in scene('actuator').nothing().markers] == [Marker.DELETEALL]
-
-
 def test_block_without_a_name_is_refused():
     with pytest.raises(BadInputError, match='joint is empty'):
         Block('', 0.01, 0.01, 0.1)

@@ -88,7 +88,9 @@ def run_demo(
 
 def _evaluate(bag: Path, picture: Path) -> tuple[SetpointResult, ...]:
     """Read the run back from the bag, measure it and draw it."""
-    from hmsa_ros.report.picture import draw_run
+    from hmsa_ros.report.charts import Part
+    from hmsa_ros.report.picture import draw
+    from hmsa_ros.report.timing import timing
 
     run, = read_runs(bag)
     levels = without_repeats(run.commands)[0]
@@ -102,5 +104,5 @@ def _evaluate(bag: Path, picture: Path) -> tuple[SetpointResult, ...]:
     results = tuple(
         SetpointResult(**asdict(x), finding=found[x.place].to_dict())
         for x in evaluation.results)
-    draw_run(picture, run, evaluation)
+    draw(picture, [Part(run, evaluation, timing(run))])
     return results

@@ -162,11 +162,6 @@ class Scene:
                     stamp, block, TARGET, place, stretch, _TARGET_COLOUR))
         return MarkerArray(markers=markers)
 
-    def nothing(self) -> MarkerArray:
-        """Return the message that removes every marker of its topic."""
-        return MarkerArray(markers=[
-            Marker(header=Header(frame_id=self.frame), action=Marker.DELETEALL)])
-
     def _state(
             self, stamp: int, block: Block, place: tuple[float, float],
             state: State) -> Iterable[Marker]:

@@ -37,9 +37,9 @@ _MOST_PHASE_POINTS = 8_000
 _PHASE_GRID = 1000.0
 # Markers are smaller where there are more of them.
 _MANY_MARKERS = 100
-#: Of an arrival's panel: how long before and after, in durations of the move, and how many
-#: percent of the step at least.
-BEFORE, AFTER, LEAST_PERCENT = 0.6, 3.0, 5.0
+# Of an arrival's panel: how long before and after, in durations of the move, and how many
+# percent of the step at least.
+_BEFORE, _AFTER, _LEAST_PERCENT = 0.6, 3.0, 5.0
 # Of what a panel holds beyond what it shows at first.
 _PANEL_SPAN = 20.0
 #: Instead of a residual, which would be 0.
@@ -357,8 +357,20 @@ def percent(share: float, digits: int = 3) -> str:
 
 def reach(parts: Sequence[Part], number: int) -> float:
     """Return how far an arrival's panel reaches from 0, in percent of the step."""
-    return min(150.0, max([LEAST_PERCENT, *(
+    return min(150.0, max([_LEAST_PERCENT, *(
         110.0 * x.error for x in results_of(parts, number) if math.isfinite(x.error))]))
+
+
+def around(
+        part: Part, number: int, stretch: Array) -> tuple[Array, Array, tuple[float, float]]:
+    """Return a curve about an arrival, s after it and percent of the step; and what to show."""
+    found, x = part.evaluation, part.evaluation.results[number]
+    step = x.stretch - (found.results[number - 1].stretch if number else found.start)
+    duration = max(x.arrival - x.begin, 1e-9)
+    inside = (found.time >= x.begin) & (
+        found.time <= min(x.end, x.arrival + _PANEL_SPAN * duration))
+    return found.time[inside] - x.arrival, 100.0 * (stretch[inside] - x.stretch) / abs(step), (
+        -_BEFORE * duration, min(x.end - x.arrival, _AFTER * duration))
 
 
 def arrival(parts: Sequence[Part], number: int) -> Figure:
@@ -372,24 +384,15 @@ def arrival(parts: Sequence[Part], number: int) -> Figure:
         run, found = part.run, part.evaluation
         if number >= len(found.results):
             continue
-        result = found.results[number]
-        step = result.stretch - (
-            found.results[number - 1].stretch if number else found.start)
-        duration = max(result.arrival - result.begin, 1e-9)
-        inside = (found.time >= result.begin) & (
-            found.time <= min(result.end, result.arrival + _PANEL_SPAN * duration))
-        time = unit.of(found.time[inside] - result.arrival)
-        view = [min(view[0], -BEFORE * float(unit.of(duration))), max(
-            view[1], float(unit.of(min(result.end - result.arrival, AFTER * duration))))]
         for kind, stretch in (
                 ('plain steps', found.unshaped[0]), ('recorded', run.stretch),
                 ('plan', found.predicted[0])):
             if part.colour and kind in _SIMULATED:
                 continue
+            time, distance, (begin, end) = around(part, number, stretch)
+            view = [min(view[0], float(unit.of(begin))), max(view[1], float(unit.of(end)))]
             data.append(_curve(
-                part, kind, *decimate(
-                    time, 100.0 * (stretch[inside] - result.stretch) / abs(step),
-                    _PANEL_BUCKETS)))
+                part, kind, *decimate(unit.of(time), distance, _PANEL_BUCKETS)))
     height = reach(parts, number)
     return Figure(
         f'arrival{number}', f'Setpoint {_panel_title(parts, number)}', 300, _grouped(data), {

@@ -6,11 +6,9 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
-from hmsa_ros.recordings.record import Run
 from hmsa_ros.report import style
 from hmsa_ros.report.charts import (
-    AFTER,
-    BEFORE,
+    around,
     commanded,
     decimate,
     Part,
@@ -22,13 +20,13 @@ from hmsa_ros.report.charts import (
     TimeUnit,
     worst,
 )
-from hmsa_ros.report.evaluation import Evaluation, verdicts
+from hmsa_ros.report.evaluation import verdicts
 
 # Panels of arrivals in a row.
 _PANELS = 3
 
 
-def draw(path: Path, parts: Sequence[Part], kind: str) -> None:
+def draw(path: Path, parts: Sequence[Part], kind: str = 'png') -> None:
     """Write command, response, phase plane and the arrivals with most residual as PNG or PDF."""
     unit = time_unit(parts)
     shown = worst(parts, _PANELS)
@@ -67,45 +65,6 @@ def draw(path: Path, parts: Sequence[Part], kind: str) -> None:
         style.legend_below(figure, axes['response'], axes['phase'], most=4)
 
 
-def draw_run(path: Path, run: Run, found: Evaluation) -> None:
-    """Draw a run with commands as PNG: command, response and phase plane, as Figs. 4 and 5."""
-    time = found.time * 1e3
-    begin, end = float(time[0]), float(time[-1])
-    with style.picture(path, 3.9) as figure:
-        # A row of its own for the one legend, so that it covers nothing.
-        panels = figure.subplot_mosaic(
-            [['command', 'phase'], ['response', 'phase']], width_ratios=[1.45, 1.0],
-            height_ratios=[1.0, 1.45])
-        command, response, phase = (panels[x] for x in ('command', 'response', 'phase'))
-        # Drawn to the end of the record: the last level holds.
-        stamps = [found.seconds(x.stamp) * 1e3 for x in found.levels]
-        levels = [x.flux_density * 1e3 for x in found.levels]
-        command.step(
-            [*stamps, max(end, stamps[-1])], [*levels, levels[-1]], where='post', **style.SHAPED)
-        for i, x in enumerate(found.results):
-            response.plot(
-                [x.begin * 1e3, min(x.end * 1e3, end)], [x.stretch, x.stretch], **style.TARGET,
-                label='target, arrival' if i == 0 else None)
-            for axes in (command, response):
-                axes.axvline(x.arrival * 1e3, **style.TARGET)
-        command.axhline(0.0, color=style.GREY, linewidth=0.6, zorder=1)
-        response.plot(time, found.unshaped[0], label='unshaped', **style.UNSHAPED)
-        response.plot(time, run.stretch, label='shaped (recorded)', **style.SHAPED)
-        for axes in (command, response):
-            axes.set_xlim(begin, end)
-        phase.plot(*found.unshaped, **style.UNSHAPED)
-        phase.plot(run.stretch, run.rate, **style.SHAPED)
-        phase.plot(
-            [x.stretch for x in found.results], [0.0] * len(found.results), label='equilibrium',
-            **style.EQUILIBRIUM)
-        style.finish(command, '', 'flux density $B$ [mT]', 'a')
-        command.tick_params(labelbottom=False)
-        style.finish(response, 'time $t$ [ms]', r'stretch $\lambda$ [1]', 'b')
-        style.finish(phase, r'stretch $\lambda$ [1]', r'stretch rate $\dot{\lambda}$ [1/s]', 'c')
-        figure.align_ylabels([command, response])
-        style.legend_below(figure, response, phase)
-
-
 def _styled(kind: dict[str, Any], colour: str) -> dict[str, Any]:
     """Return how a curve looks, in the run's own colour if there are several."""
     return {**kind, 'color': colour} if colour else kind
@@ -140,20 +99,13 @@ def _draw_run(axes: dict[str, Axes], part: Part, unit: TimeUnit, colour: str) ->
 def _draw_arrival(
         panel: Axes, part: Part, number: int, height: float, colour: str) -> None:
     """Draw the zoom on one arrival, in ms and percent of the step."""
-    found = part.evaluation
-    x = found.results[number]
-    step = abs(x.stretch - (found.results[number - 1].stretch if number else found.start))
-    duration = x.arrival - x.begin
-    view = (-BEFORE * duration, min(x.end - x.arrival, AFTER * duration))
-    inside = (found.time >= x.arrival + view[0]) & (found.time <= x.arrival + view[1])
-    time = (found.time[inside] - x.arrival) * 1e3
-    curves = [(part.run.stretch, style.SHAPED)]
-    if not colour:
-        curves.append((found.unshaped[0], style.UNSHAPED))
-    for stretch, kind in curves:
-        panel.plot(
-            *decimate(time, 100.0 * (stretch[inside] - x.stretch) / step),
-            **_styled(kind, colour))
+    for stretch, kind in (
+            (part.run.stretch, style.SHAPED), (part.evaluation.unshaped[0], style.UNSHAPED)):
+        if kind is style.SHAPED or not colour:
+            time, distance, (begin, end) = around(part, number, stretch)
+            shown = (time >= begin) & (time <= end)
+            panel.plot(
+                *decimate(1e3 * time[shown], distance[shown]), **_styled(kind, colour))
     panel.axvline(0.0, **style.TARGET)
     panel.set_ylim(-height, height)
 
@@ -164,4 +116,4 @@ def _title(parts: Sequence[Part], number: int) -> str:
     if len(parts) > 1:
         return f'to {targets}'
     said = verdicts([x.evaluation for x in parts], number)
-    return f'to {targets}: {said}residual {residual_text(results, 2)}'
+    return f'to {targets}: {said}{residual_text(results, 2)}'
