@@ -4,7 +4,7 @@ Parameters that nodes, files and reports share: name, default, unit, range and d
 `ParameterSpec` is one entry. What only one node has is declared with that node.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import math
 from typing import Any
@@ -109,6 +109,24 @@ class ParameterSpec:
         if self.minimum is None:
             return f'at most {self.maximum:g}{unit}'
         return f'{self.minimum:g} to {self.maximum:g}{unit}'
+
+
+def duration_specs(
+        name: str, seconds: int, description: str, least: int = 0, most: int | None = None, *,
+        nanoseconds: int = 0) -> tuple[ParameterSpec, ParameterSpec]:
+    """Return a duration as rosbag2 names it: whole seconds, and nanoseconds to add to them."""
+    return (
+        ParameterSpec(f'{name}.sec', seconds, description, 's', least, most),
+        ParameterSpec(
+            f'{name}.nsec', nanoseconds, 'Nanoseconds to add to the seconds.', 'ns',
+            0, 999_999_999))
+
+
+def duration_from(values: Mapping[str, Any], name: str) -> int:
+    """Return a duration of `duration_specs` in ns, -1 for a negative one."""
+    seconds: int = values[f'{name}.sec']
+    nanoseconds: int = values[f'{name}.nsec']
+    return -1 if seconds < 0 else seconds * 10**9 + nanoseconds
 
 
 #: zeta of the example block, which nobody can look up for a block of their own.

@@ -11,7 +11,7 @@ As a managed node it opens the bag and offers its topics when it is configured, 
 active, and gives both up when it is cleaned up.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 import contextlib
 import os
 import sys
@@ -30,7 +30,7 @@ from hmsa_ros.bag.sender import CLOCK_WHILE_WAITING_SECONDS, ClockOut, Excerpt, 
 from hmsa_ros.bag.transport import Transport
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.parameters import ParameterSpec
+from hmsa_ros.interfaces.parameters import duration_from, duration_specs, ParameterSpec
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.audience import Audience
 from hmsa_ros.nodes.conversions import to_clock, to_status
@@ -57,15 +57,8 @@ PARAMETERS = (
                   read_only=False),
     ParameterSpec('play.loop', False, 'Whether to start again at the end.'),
     ParameterSpec('play.start_paused', False, 'Whether to start paused.'),
-    ParameterSpec('play.start_offset.sec', 0, 'Whole seconds to skip at the start.', 's', 0),
-    ParameterSpec(
-        'play.start_offset.nsec', 0, 'Nanoseconds to add to the seconds.', 'ns', 0, 999_999_999),
-    ParameterSpec(
-        'play.playback_duration.sec', -1,
-        'Whole seconds to play; negative for all.', 's', -1),
-    ParameterSpec(
-        'play.playback_duration.nsec', 0, 'Nanoseconds to add to the seconds.',
-        'ns', 0, 999_999_999),
+    *duration_specs('play.start_offset', 0, 'Whole seconds to skip at the start.'),
+    *duration_specs('play.playback_duration', -1, 'Whole seconds to play; negative for all.', -1),
     ParameterSpec(
         'play.seek', -1.0,
         'Set while playing to jump to this time after the first message of the bag.', 's',
@@ -107,9 +100,7 @@ PARAMETERS = (
         'play.discovery_time', 3.5,
         'How long to look for existing subscribers; ends early once every topic has one, or '
         'every topic in play.wait_for_subscribers.', 's', 0.0, 3600.0),
-    ParameterSpec('play.delay.sec', 0, 'Whole seconds to wait before playing.', 's', 0),
-    ParameterSpec('play.delay.nsec', 0,
-        'Nanoseconds to add to the seconds.', 'ns', 0, 999_999_999),
+    *duration_specs('play.delay', 0, 'Whole seconds to wait before playing.'),
     ParameterSpec(
         'play.read_ahead_queue_size', 1000, 'Number of messages to read ahead.',
         '', 1, 10_000_000),
@@ -117,14 +108,10 @@ PARAMETERS = (
         'play.realtime_priority', 1,
         'Real-time priority of the sending thread, if the system grants it; 0 for an ordinary '
         'thread.', '', 0, 99),
-    ParameterSpec(
-        'play.wait_acked_timeout.sec', 20,
+    *duration_specs(
+        'play.wait_acked_timeout', 20,
         'Whole seconds to wait at the end for acknowledgements of reliable subscribers; '
-        'negative for no wait.',
-        's', -1),
-    ParameterSpec(
-        'play.wait_acked_timeout.nsec', 0, 'Nanoseconds to add to the seconds.',
-        'ns', 0, 999_999_999),
+        'negative for no wait.', -1),
 )
 
 
@@ -224,8 +211,8 @@ class Player(ManagedNode):
     def _choose_excerpt(self) -> Excerpt:
         """Return what is played of the bag."""
         first, last = self._reader.start_time or 0, self._reader.end_time
-        start = first + _span(self._values, 'play.start_offset')
-        length = _span(self._values, 'play.playback_duration')
+        start = first + duration_from(self._values, 'play.start_offset')
+        length = duration_from(self._values, 'play.playback_duration')
         end = (first if last is None else last) if length < 0 else start + length
         return Excerpt(first, start, end, self._values['play.loop'],
                        self._values['play.read_ahead_queue_size'])
@@ -268,7 +255,7 @@ class Player(ManagedNode):
                 os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(priority))
         try:
             self._wait_for_audience(transport)
-            transport.rest(_span(self._values, 'play.delay') * 1e-9)
+            transport.rest(duration_from(self._values, 'play.delay') * 1e-9)
             self.get_logger().info(
                 f'playing {len(self._senders)} topics of {self._reader.path}, '
                 f'{max(0, self._excerpt.end - self._excerpt.start) * 1e-9:.3f} s at rate '
@@ -308,7 +295,7 @@ class Player(ManagedNode):
     def _finish(self, transport: Transport) -> None:
         """Wait for reliable subscribers and say what was sent."""
         self._tell_problems()
-        limit = _span(self._values, 'play.wait_acked_timeout')
+        limit = duration_from(self._values, 'play.wait_acked_timeout')
         waiting = list(self._senders.values()) if limit >= 0 else []
         end = time.monotonic() + limit * 1e-9
         while waiting and not transport.stopped:
@@ -385,13 +372,6 @@ class Player(ManagedNode):
         }
         yield to_status(
             f'{self.get_fully_qualified_name().lstrip("/")}: bag', '', 0, state, values)
-
-
-def _span(values: Mapping[str, Any], parameter: str) -> int:
-    """Return a duration given as seconds and nanoseconds, in nanoseconds."""
-    seconds: int = values[f'{parameter}.sec']
-    nanoseconds: int = values[f'{parameter}.nsec']
-    return -1 if seconds < 0 else seconds * 10**9 + nanoseconds
 
 
 def main(args: Sequence[str] | None = None) -> int:

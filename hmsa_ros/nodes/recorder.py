@@ -31,7 +31,7 @@ from hmsa_ros.bag.recording import Limits, lost_by_topic, Recording, Status
 from hmsa_ros.bag.writer import BagWriter, parse_custom_data
 from hmsa_ros.errors import BadInputError, BagError
 from hmsa_ros.interfaces import topics
-from hmsa_ros.interfaces.parameters import ParameterSpec
+from hmsa_ros.interfaces.parameters import duration_from, duration_specs, ParameterSpec
 from hmsa_ros.nodes import endpoints
 from hmsa_ros.nodes.capture import Capture, decode, SimulatedTime, Taken
 from hmsa_ros.nodes.conversions import from_time, to_status
@@ -80,13 +80,9 @@ PARAMETERS = (
         'record.exclude_regex', '',
         'Regular expression; topics that contain a match are not recorded.'),
     ParameterSpec('record.start_paused', False, 'Whether to start paused.'),
-    ParameterSpec(
-        'record.topic_polling_interval.sec', 0, 'Whole seconds between searches for new topics.',
-        's', 0, 3600),
-    ParameterSpec(
-        'record.topic_polling_interval.nsec', 100_000_000, 'Nanoseconds to add to the seconds.',
-        'ns',
-        0, 999_999_999),
+    *duration_specs(
+        'record.topic_polling_interval', 0, 'Whole seconds between searches for new topics.',
+        most=3600, nanoseconds=100_000_000),
     ParameterSpec(
         'record.queue_depth', 10_000,
         'Queue depth of each subscription in the middleware.', '', 1, 1_000_000),
@@ -171,8 +167,7 @@ class Recorder(ManagedNode):
         self._followed: dict[str, RemoteParameters] = {}
         self.create_subscription(
             ParameterEvent, '/parameter_events', self._on_parameter_event, 100)
-        interval = (self._parameters_in['record.topic_polling_interval.sec']
-                    + self._parameters_in['record.topic_polling_interval.nsec'] * 1e-9)
+        interval = duration_from(self._parameters_in, 'record.topic_polling_interval') * 1e-9
         self.every(max(interval, 1e-3), self._on_poll)
         self.diagnose(self._status_of_bag)
         self.get_logger().info(f'recording to {self.folder}')
