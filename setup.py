@@ -115,7 +115,8 @@ setup(
     packages=find_packages(include=[PACKAGE, PACKAGE + '.*', 'hmsa_studies', 'hmsa_studies.*']),
     package_data={PACKAGE: [
         'fastdds.xml', 'fastdds_localhost.xml', 'motion/_motion.pyi', 'report/page.css',
-        'report/page.js', *(f'cli/completion.{x}' for x in ('bash', 'zsh', 'fish')),
+        'report/page.js', 'report/style.mplstyle',
+        *(f'cli/completion.{x}' for x in ('bash', 'zsh', 'fish')),
         *(os.path.relpath(x, os.path.join(HERE, PACKAGE)) for x in sorted(glob(
             os.path.join(HERE, PACKAGE, 'motion', 'hmsa', '*.hpp'))))]},
     ext_modules=[MOTION],

@@ -40,31 +40,10 @@ EQUILIBRIUM: dict[str, Any] = {
 
 #: Width of a picture in inches: two columns of a journal.
 WIDTH = 7.2
-_RESOLUTION = 200
 _METADATA: dict[str, dict[str, Any]] = {
     'png': {'Software': None},
     'pdf': {'Creator': None, 'Producer': None, 'CreationDate': None}}
-_SETTINGS: dict[str, Any] = {
-    'font.family': 'DejaVu Sans',
-    'font.size': 9,
-    'mathtext.fontset': 'dejavusans',
-    'axes.labelsize': 9,
-    'axes.titlesize': 9,
-    'axes.linewidth': 0.7,
-    'axes.spines.top': False,
-    'axes.spines.right': False,
-    'axes.unicode_minus': True,
-    'xtick.labelsize': 8,
-    'ytick.labelsize': 8,
-    'legend.fontsize': 8,
-    'legend.frameon': False,
-    'legend.handlelength': 2.4,
-    'lines.solid_capstyle': 'round',
-    'savefig.dpi': _RESOLUTION,
-    'path.simplify': True,
-    # Letters stay letters, which journals ask for.
-    'pdf.fonttype': 42,
-}
+_SETTINGS = str(Path(__file__).with_name('style.mplstyle'))
 
 
 @contextmanager
