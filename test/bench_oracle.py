@@ -10,7 +10,7 @@ from scipy.constants import mu_0
 from scipy.integrate import solve_ivp
 
 from hmsa_ros.control.planner import PlannerRuntime
-from hmsa_ros.control.records import EstimateChanged, Send, Settings, Target
+from hmsa_ros.control.records import EstimateChanged, Send, Settings, StatusChanged, Target
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Options, Planner
@@ -99,7 +99,7 @@ class Bench:
         self.report = report
         self.effort: Callable = lambda: math.nan  # field in T that the device shows
         self.wire = []
-        self.estimates, self.sent, self.reported = [], [], []
+        self.estimates, self.sent, self.codes = [], [], []
         self.runtime = PlannerRuntime(
             PlannerGroup({'a': Planner(nominal, Options(
                 flux_density_min=-limit, flux_density_max=limit, lead_time=lead))}),
@@ -131,6 +131,8 @@ class Bench:
                     self.plant.command(x.stamp, x.flux_density)
                 elif isinstance(x, EstimateChanged):
                     self.estimates.append(x)
+                elif isinstance(x, StatusChanged):
+                    self.codes.append(x.verdict.code)
             self.now += MS
             stretch, changes = self.plant.advance(self.now)
             seen.append((self.now, stretch))

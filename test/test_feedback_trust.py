@@ -77,6 +77,23 @@ def check_harmless(slow, plant, factors, late):
     assert '~/reset_estimate' in it.message
 
 
+@pytest.mark.parametrize(('plant', 'gain'), [({'ratio': 0.05}, 1.0), ({}, 1.02)])
+def test_a_move_that_gets_worse_ends_feedback_and_what_it_did_is_taken_back(plant, gain):
+    left = {}
+    for mode in ('off', 'adapt'):
+        it = bench(False, 1e-3, plant, feedback=mode)
+        it.sense = lambda time, x: [(time, 1.0 + gain * (x - 1.0))]
+        left[mode] = np.sum(np.abs(moves(it)), axis=1)
+    assert np.count_nonzero(left['adapt'] > left['off'] + 0.5) <= 2
+    assert np.all(left['adapt'][2:] < left['off'][2:] + 0.1)
+    assert 'feedback has ended, open loop with the parameters given; ~/reset_' in it.message
+    assert it.estimates[-1].values['ended'] is True
+    assert 'feedback_ended' in it.codes
+    it.runtime.feedback.reset()
+    it.pass_time(300 * MS)
+    assert it.estimates[-1].values['ended'] is False
+
+
 NOT_ESTIMATED = pytest.mark.parametrize(('plant', 'factors', 'late'), [
     ({}, {'remanence': 1.05}, 0), ({'lag': 5e-4}, {}, 0), ({'lag': 5e-3}, {}, 0),
     ({'ratio': 0.05}, {}, 0), ({}, {}, 2)])

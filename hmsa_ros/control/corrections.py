@@ -1,6 +1,6 @@
 """Plans that are corrected from what feedback has seen."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 import math
@@ -10,7 +10,7 @@ from hmsa_ros.control.records import Severity, Verdict
 from hmsa_ros.control.slices import Clock, in_time, Work
 from hmsa_ros.control.trimming import trimmed
 from hmsa_ros.estimation import Estimate
-from hmsa_ros.estimation.correction import Course, expect, lengthening, worthwhile
+from hmsa_ros.estimation.correction import caution, Course, expect, worthwhile
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.drafting import Steps
@@ -23,6 +23,8 @@ from hmsa_ros.planning.timeline import Draft, Model, Plan
 _GAIN, _LITTLE = 5e-4, 5e-5
 # Units of time before its end from which on a move is not corrected any more.
 _SHORTEST = 0.3
+# Levels that differ by less, in units of load, are the same.
+_SAME = 1e-5
 # A step that is smaller counts as this one.
 _LEAST_STEP = 0.1
 
@@ -34,6 +36,8 @@ class Corrections:
         self._group, self._feedback, self._clock = group, feedback, clock
         # Times in ns at which moves that take longer are at rest.
         self._arrivals: dict[str, int] = {}
+        # What corrections that have been worked out are expected to leave.
+        self._after: dict[str, float] = {}
 
     def cautious(self, drafts: Mapping[str, Draft]) -> Mapping[str, Draft]:
         """
@@ -42,21 +46,22 @@ class Corrections:
         Their levels stay: the early effect of these shows what the actuator is.
         """
         self._arrivals = {x: y for x, y in self._arrivals.items() if x not in drafts}
-        if math.isinf(self._feedback.tolerance):
-            return drafts
         return {name: self._slowly(name, draft) for name, draft in drafts.items()}
 
     def _slowly(self, name: str, draft: Draft) -> Draft:
         segment, *rest = draft.segments
         estimate = self._feedback.foreseen(name, draft.begin)
+        model = draft.levels[-1].model
+        self._feedback.planned(name, model, 0.0)
         if estimate is None or segment.arrival is None or segment.code is Code.LEVELS:
             return draft
-        longer = lengthening(
-            estimate, _drafted(draft),
-            max(abs(segment.stretch - draft.levels[0].stretch), _LEAST_STEP),
-            self._group.planners[name].options.slew_limit, self._feedback.tolerance)
-        if longer == 1.0:
+        step = max(abs(segment.stretch - draft.levels[0].stretch), _LEAST_STEP)
+        size = expect(
+            estimate, _drafted(draft), self._group.planners[name].options.slew_limit)
+        self._feedback.planned(name, model, size)
+        if size <= self._feedback.tolerance * step:
             return draft
+        longer = caution(len(estimate.free), estimate.noise / step)
         arrival = segment.begin + round(longer * (segment.arrival - segment.begin))
         if rest:
             arrival = max(min(arrival, rest[0].begin), segment.arrival)
@@ -65,6 +70,8 @@ class Corrections:
 
     def due(self, now: int) -> Iterator[Work]:
         """Yield what may be worth correcting by a time in ns; the results are for `take`."""
+        for name in self._feedback.taken_back():
+            yield self._work(name, partial(self._take_back, name))
         for name, planner in self._feedback.news():
             if not planner.plan.segments or planner.as_sent(planner.soonest(now)):
                 continue
@@ -78,8 +85,27 @@ class Corrections:
                 steps = partial(self._correct, name)
             else:
                 continue
-            yield Work(frozenset([name]), in_time(
-                steps, self._group, frozenset([name]), self._clock), corrects=True)
+            yield self._work(name, steps)
+
+    def _work(self, name: str, steps: Callable[[int], Steps[Mapping[str, Draft]]]) -> Work:
+        joints = frozenset([name])
+        return Work(joints, in_time(steps, self._group, joints, self._clock), corrects=True)
+
+    def _take_back(self, name: str, now: int) -> Steps[Mapping[str, Draft]]:
+        """Go on by the model in force, whatever was corrected before."""
+        planner = self._group.planners[name]
+        plan, soonest = planner.plan, planner.soonest(now)
+        place = plan.under_way(soonest)
+        if place < 0 or planner.as_sent(soonest):
+            return {}
+        segment = plan.segments[place]
+        if place + 1 < len(plan.segments) or segment.arrival is None or segment.arrival > soonest:
+            draft = yield from planner.draft_resumption(now)
+            return {} if draft is None or draft.missed else {name: draft}
+        model, level = planner.model, plan.levels[-1].flux_density
+        holding = model.holding(segment.stretch) * model.units.load
+        return {} if abs(holding - level) < _SAME * model.units.load else {
+            name: (yield from planner.draft_trim(now, holding))}
 
     def _trim(self, name: str, level: float, now: int) -> Steps[Mapping[str, Draft]]:
         """Hold by another level in T."""
@@ -117,14 +143,17 @@ class Corrections:
         segment = draft.segments[0]
         before = expect(estimate, course, slew, segment.arrival or 0)
         after = expect(estimate, _drafted(draft), slew)
-        return {name: draft} if worthwhile(before, after, estimate.noise, gain) else {}
+        if not worthwhile(before, after, estimate.noise, gain):
+            return {}
+        self._after[name] = after
+        return {name: draft}
 
     def take(self, drafts: Mapping[str, Draft], now: int, request: str) -> Verdict | None:
         """Take a correction worked out for a time in ns; None where nothing changes."""
         for name, draft in drafts.items():
             words = self._feedback.words(name, self._clock())
             self._group.planners[name].take(draft, now)
-            self._feedback.corrections += 1
+            self._feedback.corrected(name, draft.begin, self._after.pop(name, 0.0))
             return Verdict(
                 Severity.OK, 'corrected', f'corrected from samples: {words}', request)
         return None

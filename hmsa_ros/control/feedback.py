@@ -8,7 +8,9 @@ import math
 import numpy as np
 
 from hmsa_ros.control.field import Field
+from hmsa_ros.control.holds import Hold
 from hmsa_ros.control.learnt import alike, differs, learnt_model, save
+from hmsa_ros.control.ledger import Ledger, Moves
 from hmsa_ros.control.records import EstimateChanged, Output, Settings, Severity
 from hmsa_ros.control.slices import Clock
 from hmsa_ros.control.tracked import Joint
@@ -28,7 +30,7 @@ from hmsa_ros.planning.timeline import Model
 MODES = ('off', 'observe', 'adapt')
 # How often samples are taken into account while a joint moves, at least and in units of its time,
 # and while it rests, and how often the estimate is told, in ns.
-_UPDATE, _OFTEN, _RESTING, _TELL = 20_000_000, 0.25, 200_000_000, 200_000_000
+_UPDATE, _OFTEN, _RESTING, _TELL = 20_000_000, 0.45, 200_000_000, 200_000_000
 # How many times as long as the last look took the next one is later, at least.
 _IDLE = 4
 # Samples of a natural period that are looked at, and how many fewer at rest.
@@ -54,6 +56,7 @@ class Feedback:
         self._joints: dict[str, Joint] = {}
         self._nominal: dict[str, Model] = {}
         self.corrections = 0  # plans that were corrected
+        self._ended: list[str] = []  # joints whose plans are to be taken back
         self.restart()
 
     @property
@@ -85,7 +88,7 @@ class Feedback:
                         slew_limit=model.options.slew_limit,
                         learn=not self._settings.feedback_frozen)),
                     Trust(self._clock(), at_once=self._settings.feedback_cautious), Field(),
-                    model.actuator.rest)
+                    Ledger(), model.actuator.rest)
                 for name, model in self._nominal.items()}
 
     def change(self, settings: Settings, models: Mapping[str, Model]) -> Mapping[str, Model]:
@@ -173,7 +176,7 @@ class Feedback:
         if joint is None:
             return
         now = self._clock()
-        lost = joint.field.measured(self._group.planners[name].plan, stamp, flux_density)
+        lost = joint.lost = joint.coil.measured(self._group.planners[name].plan, stamp, flux_density)
         if lost and joint.trust.why != lost and joint.trust.doubt(lost, now, at_once=True):
             joint.estimator.restart()
             joint.latest, joint.news = None, True
@@ -183,12 +186,12 @@ class Feedback:
         """Take in that a level in T has taken effect at a stamp in ns, before the plan does."""
         joint = self._joints.get(name)
         if joint is not None:
-            joint.field.applied(self._group.planners[name].plan, stamp, flux_density)
+            joint.coil.applied(self._group.planners[name].plan, stamp, flux_density)
 
     def possible(self, name: str) -> float:
         """Return the largest level in T that a joint's coil is known to follow."""
         joint = self._joints.get(name)
-        return math.inf if joint is None else joint.field.largest
+        return math.inf if joint is None else joint.coil.largest
 
     @property
     def wake(self) -> int | None:
@@ -216,7 +219,7 @@ class Feedback:
             found, joint.estimator.prior.values)
         self._outputs.append(EstimateChanged(
             now, name, Severity.WARN if bad else Severity.OK, self.words(name, now),
-            {'mode': self.mode, **joint.figures(),
+            {'mode': self.mode, **joint.figures(), **self.sensor(name).to_dict(),
              'used_by_plans': self.mode == 'adapt' and joint.acts,
              'corrections': self.corrections}))
 
@@ -277,6 +280,46 @@ class Feedback:
             (one, both), (_, two) = found.covariance[np.ix_(pair, pair)]
             together = float(both / math.sqrt(one * two))
         return Sensor(**figures, together=together)
+
+    # -- what moves have left ------------------------------------------------------------------
+
+    def audit(self, name: str, hold: Hold) -> str:
+        """Take in samples of a setpoint of a joint; return why that ends feedback, if it does."""
+        joint = self._joints.get(name)
+        if joint is None or self.mode != 'adapt' or joint.trust.ended or joint.lost:
+            return ''
+        plan = self._group.planners[name].plan
+        if joint.fresh:
+            joint.update(plan, self._clock())
+        why = joint.ledger.take(
+            hold, plan, self._nominal[name], joint.moves, self.sensor(name))
+        if not why:
+            joint.trust.confirm(plan.levels[-1].model, joint.ledger.left)
+            return ''
+        joint.trust.end(why)
+        joint.news, joint.fresh = True, True
+        self._ended.append(name)
+        return self.words(name, self._clock())
+
+    def taken_back(self) -> list[str]:
+        """Return joints, once, whose plans are to be as if nothing had been learnt."""
+        found, self._ended = self._ended, []
+        return found
+
+    def planned(self, name: str, model: Model, expected: float) -> None:
+        """Take in that moves were planned with a model, and the amplitude they may leave."""
+        joint = self._joints.get(name)
+        if joint is not None:
+            joint.moves = Moves(not alike(model, self._nominal[name]), expected)
+            joint.next_update = 0
+
+    def corrected(self, name: str, stamp: int, expected: float) -> None:
+        """Take in that a plan was corrected from a stamp in ns on."""
+        self.corrections += 1
+        joint = self._joints.get(name)
+        if joint is not None:
+            joint.moves.corrected.append(stamp)
+            joint.moves.expected = expected
 
     @property
     def trim(self) -> float:

@@ -25,6 +25,7 @@ _RARE = NANOSECONDS // 4
 _MOVING = 32
 # How long samples may stay away, by the steady clock, before it is judged without them.
 _PATIENCE = NANOSECONDS // 2
+_TOLERANCES = Tolerances()
 # How far in ns ahead of the clock a stamp may be: news of the time may be late.
 _AHEAD = NANOSECONDS // 20
 
@@ -40,6 +41,7 @@ class Hold:
         self.setpoint = setpoint
         self.found: Finding | None = None
         self.over = False
+        self.news = False  # whether samples have been judged that nobody has looked at
         self._last = last
         self._samples: dict[int, float] = {}
         self._moving: set[int] = set()  # parts of the move of which there is one
@@ -48,8 +50,8 @@ class Hold:
         # Largest that a stamp was ahead of the clock.
         self._ahead = 0
         # Arrival as it was requested, and by the newest plan.
-        self._asked = rests_from(setpoint)
-        self._begin_at(self._asked)
+        self.asked = rests_from(setpoint)
+        self._begin_at(self.asked)
 
     def _begin_at(self, begin: int) -> None:
         setpoint = self.setpoint
@@ -102,12 +104,12 @@ class Hold:
         self._newest = max(self._newest, stamp)
         if self._counts(stamp):
             self._samples.setdefault(stamp, stretch)
-            if stamp < self._asked:
+            if stamp < self.asked:
                 self._moving.add(self._cell(stamp))
 
     def _counts(self, stamp: int) -> bool:
         """Return whether a sample of a time is in one of the looks."""
-        begins, asked = self.setpoint.begins, self._asked
+        begins, asked = self.setpoint.begins, self.asked
         if stamp < min(asked, self._begin):
             return stamp >= begins and self._cell(stamp) not in self._moving
         if stamp > self._closes:
@@ -118,7 +120,7 @@ class Hold:
     def _cell(self, stamp: int) -> int:
         """Return which part of the move a time is in."""
         begins = self.setpoint.begins
-        return (stamp - begins) // max((self._asked - begins) // _MOVING, 1)
+        return (stamp - begins) // max((self.asked - begins) // _MOVING, 1)
 
     def _looks_at(self, after: int) -> bool:
         """Return whether a time in ns after an arrival is in one of the looks."""
@@ -143,7 +145,8 @@ class Hold:
         if self.over or not self._ready(now, steady, observable=observable):
             return None
         self.over = self.due >= self._closes
-        found = self._judged(tolerances, sensor)
+        found, self.news = self.judged(
+            self.setpoint, tolerances, sensor=sensor), bool(self._samples)
         after = self.due - self._begin
         self.due = min(self._begin + max(2 * after, self._length), self._closes)
         before, self.found = self.found, self._better_known(found)
@@ -170,15 +173,18 @@ class Hold:
         self.due = self._closes
         return True
 
-    def _judged(self, tolerances: Tolerances, sensor: Sensor) -> Finding:
+    def judged(
+            self, setpoint: Setpoint, tolerances: Tolerances = _TOLERANCES, *,
+            sensor: Sensor) -> Finding:
+        """Judge the samples that have come by now as those of a setpoint."""
         if not self._samples:
             return unobserved(
-                self.setpoint, self._ahead and (
+                setpoint, self._ahead and (
                     f'samples are stamped up to {self._ahead / NANOSECONDS:.3g} s ahead of the '
                     'clock') or '')
         stamps = np.fromiter(self._samples, dtype=np.int64, count=len(self._samples))
         values = np.fromiter(self._samples.values(), dtype=np.float64, count=len(stamps))
-        return judge(stamps, values, self.setpoint, tolerances, sensor=sensor)
+        return judge(stamps, values, setpoint, tolerances, sensor=sensor)
 
     def _better_known(self, found: Finding) -> Finding:
         """Return a finding, or the one before where the samples are too few for another."""

@@ -17,6 +17,7 @@ from hmsa_ros.control.corrections import Corrections
 from hmsa_ros.control.feedback import Feedback
 from hmsa_ros.control.following import Following
 from hmsa_ros.control.hearing import Hearing
+from hmsa_ros.control.holds import Hold
 from hmsa_ros.control.planning import Planning, SLICE
 from hmsa_ros.control.records import (
     Output,
@@ -79,7 +80,7 @@ class PlannerRuntime:
         self.sending = Sending(
             group, self.following, self.hearing.receipts, self._bulletin.outputs)
         self.feedback = Feedback(group, settings, self._bulletin.outputs, clock)
-        self._watch.sensor = self.feedback.sensor
+        self._watch.sensor, self._watch.audit = self.feedback.sensor, self._audit
         self.planning = Planning(
             group, self.following, Corrections(group, self.feedback, clock), self._bulletin,
             clock, steady, lambda: self.sending.send(clock()))
@@ -380,6 +381,13 @@ class PlannerRuntime:
             found.append(finding)
         if found or not self._watch.open:
             self._bulletin.found(found)
+
+    def _audit(self, name: str, hold: Hold) -> None:
+        """Hold what a setpoint has left against feedback."""
+        words = self.feedback.audit(name, hold)
+        if words:
+            self._bulletin.give(Verdict(
+                Severity.WARN, 'feedback_ended', words, self._bulletin.verdict.request), log=True)
 
     def report(self) -> tuple[Severity, str, dict[str, object]]:
         """Return how commands fare: severity, a sentence and counters."""

@@ -1,9 +1,10 @@
 """One joint that feedback looks at: its estimator, and what the estimate says of the plan."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 import math
 
 from hmsa_ros.control.field import Field
+from hmsa_ros.control.ledger import Ledger, Moves
 from hmsa_ros.control.trust import Trust
 from hmsa_ros.estimation import Estimate, Estimator
 from hmsa_ros.estimation.motion import held
@@ -15,8 +16,6 @@ from hmsa_ros.planning.timeline import Plan
 _BEFORE = 8
 # A sample may lie ahead of the clock by this share of the unit of time, since clocks differ.
 _AHEAD = 0.1
-# Smaller steps have no percentage.
-_STEP = 0.01
 
 
 @dataclass(eq=False)
@@ -25,7 +24,8 @@ class Joint:
 
     estimator: Estimator
     trust: Trust
-    field: Field
+    coil: Field
+    ledger: Ledger
     start: float  # stretch before the setpoint under way
     latest: Estimate | None = None
     newest: int = 0  # time of the newest sample
@@ -34,6 +34,8 @@ class Joint:
     amplitude: float = 0.0  # largest of the vibration since the last arrival
     setpoint: tuple[int, int] = (0, -1)  # number of the plan, and place of the setpoint under way
     fresh: bool = False  # whether there are samples that have not been looked at
+    lost: str = ''  # why the field is not as commanded; empty where it is
+    moves: Moves = field(default_factory=Moves)  # those of the plan in force
     news: bool = False  # whether the latest estimate has not been held against the plan yet
 
     @property
@@ -96,7 +98,7 @@ class Joint:
             self.start = plan.levels[0].stretch if self.latest is None else self.latest.stretch
 
     def _look_at_vibration(self, plan: Plan, found: Estimate) -> None:
-        """Keep the largest amplitude since the last arrival, and note what a move has left."""
+        """Keep the largest amplitude since the last arrival."""
         place = plan.under_way(found.time)
         segment = plan.segments[place] if place >= 0 else None
         if segment is None or segment.arrival is None or found.time < segment.arrival:
@@ -108,15 +110,14 @@ class Joint:
             return
         self.amplitude = max(self.amplitude, math.hypot(
             found.stretch - at[0], found.rate / at[1]))
-        step = abs(segment.stretch - self.start)
-        if step > _STEP:
-            self.trust.confirm(
-                level.model, max(abs(at[0] - segment.stretch), 2.0 * self.amplitude) / step)
 
     def words(self, plan: Plan, now: int, *, adapting: bool) -> str:
         """Say in a sentence without its stop what is wrong at a time."""
         trust = self.trust
         why = trust.why or self.estimator.screening.trouble
+        if trust.ended:
+            return (f'{why}: feedback has ended, open loop with {trust.parameters}; '
+                    '~/reset_estimate begins it anew')
         if why:
             more = f', with {trust.parameters}' if adapting else ''
             anew = ('; the estimate has begun anew and counts after a move that samples fit; '
@@ -149,4 +150,4 @@ class Joint:
             'rejected': screening.rejected, 'frozen': screening.frozen,
             'unreadable': screening.unreadable, 'repeated': screening.repeated,
             'too_late': screening.late, 'ahead_of_clock': screening.ahead,
-            'new_beginnings': self.trust.beginnings}
+            'new_beginnings': self.trust.beginnings, 'ended': self.trust.ended}

@@ -29,12 +29,15 @@ class Trust:
         self.beginnings = 0  # new ones
         self.acts = at_once
         self.why = ''  # for which samples are not trusted; empty where they are
+        self.ended = False  # whether moves got worse by what was learnt
         self._begin, self._doubts, self._rejected = begin, 0, 0
         # Estimates that moves had shown to fit, and which did not after all; moves still to fit.
         self._failures, self._moves = 0, 1
 
     def doubt(self, why: str, now: int, *, at_once: bool = False) -> bool:
         """Take in that samples do not fit at a time in ns; return whether to begin anew."""
+        if self.ended:
+            return False
         self.why = why
         self._doubts += 1
         if self.acts and self._doubts < _PERSISTENT and not at_once:
@@ -52,6 +55,8 @@ class Trust:
         """Take in that samples fit at a time in ns; return as `doubt`, since too few may fit."""
         # The unit of time is in s.
         self._doubts = 0
+        if self.ended:
+            return False
         if not self.acts:
             place = plan.place(self._begin) + 1
             begin = plan.levels[place].stamp if place < len(plan.levels) else now
@@ -71,6 +76,13 @@ class Trust:
         """Take in what a move planned with a model has left, as a share of its step."""
         if self.acts and left < _CONFIRMS:
             self.confirmed = model
+
+    def end(self, why: str) -> None:
+        """Take in that moves get worse by what is learnt: there is no feedback any more."""
+        if not self.why:
+            # Samples fit, and what they have confirmed is no better.
+            self.confirmed = None
+        self.why, self.ended, self.acts = why, True, False
 
     @property
     def parameters(self) -> str:

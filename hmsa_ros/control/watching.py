@@ -87,6 +87,8 @@ class Watch:
         self._group, self._steady, self._clock = group, steady, clock
         #: Returns what is known of the sensor of a joint.
         self.sensor: Callable[[str], Sensor] = lambda name: Sensor()
+        #: Looks at the samples of a setpoint of a joint, as soon as they have been judged.
+        self.audit: Callable[[str, Hold], None] = lambda name, hold: None
         self._joints: dict[str, _Joint] = {}
         # Reading a clock for each sample of each joint would take longer than all else.
         self._now = 0
@@ -245,6 +247,9 @@ class Watch:
             for hold in joint.holds:
                 found = hold.judge(
                     now, self._steady(), tolerances, self.sensor(name), observable=observable)
+                if hold.news:
+                    hold.news = False
+                    self.audit(name, hold)
                 if found is not None:
                     joint.newest = found
                     return found

@@ -86,20 +86,6 @@ def expect(
     return math.sqrt(float(misses @ misses) + max(spread, 0.0))
 
 
-def lengthening(
-        estimate: Estimate, course: Course, step: float, slew_limit: float = math.inf,
-        tolerance: float = TOLERANCE) -> float:
-    """
-    Return how many times as long a move is to take: 1, or `caution` where it may leave too much.
-
-    The estimate is of the begin of the move, the step its change of stretch, above 0, and the
-    tolerance the share of the step from which on that is too much.
-    """
-    if expect(estimate, course, slew_limit) <= tolerance * step:
-        return 1.0
-    return caution(len(estimate.free), estimate.noise / step)
-
-
 def worthwhile(before: float, after: float, noise: float, least: float = 0.0) -> bool:
     """Return whether a correction leaves enough less: sizes of `expect`, and the least gain."""
     return after < min(math.sqrt(_SHARE) * before, before - max(_GAIN * noise, least))

@@ -1,7 +1,7 @@
 """What is judged, by what, and what is found."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, fields, replace
 import math
 
 from hmsa_ros.model.status import Code
@@ -10,6 +10,8 @@ from hmsa_ros.model.status import Code
 VERDICTS = (
     Code.ARRIVED, Code.UNOBSERVED, Code.UNDECIDED, Code.LATE, Code.VIBRATING, Code.OFF_TARGET,
     Code.MISSED)
+# What its figures are called in an estimate.
+_SENSOR = 'sensor.'
 # Smaller steps have no percentage.
 _NO_STEP = 1e-9
 
@@ -90,6 +92,19 @@ class Sensor:
     latency_std: float = 0.0
     together: float = 0.0
     resolution: float = 0.0  #: step between values that it can show; 0 where not known
+
+    def to_dict(self) -> dict[str, str]:
+        """Return it as the estimate of a planner carries it."""
+        return {f'{_SENSOR}{key}': f'{x:.9g}' for key, x in asdict(self).items()}
+
+    @classmethod
+    def of(cls, values: Mapping[str, str]) -> 'Sensor':
+        """Return what `to_dict` is of, among other values; what is not there is as given."""
+        own = {x.name: values[_SENSOR + x.name] for x in fields(cls) if _SENSOR + x.name in values}
+        found = cls(**{key: float(x) for key, x in own.items()})
+        if not (all(map(math.isfinite, asdict(found).values())) and found.gain > 0.0):
+            raise ValueError(f'{own} is no sensor: expected finite numbers and a gain above 0')
+        return found
 
     def std(self, stretch: float) -> float:
         """Return how far off a stretch that it shows may be, as a standard deviation."""

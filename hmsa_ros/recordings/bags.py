@@ -16,14 +16,16 @@ from hmsa_ros.bag.info import BagSummary, summarize
 from hmsa_ros.bag.reader import BagReader, Message
 from hmsa_ros.errors import BadInputError, BagError
 from hmsa_ros.interfaces.status import whole
+from hmsa_ros.judge import Sensor
 from hmsa_ros.model.schedule import obeyed
 from hmsa_ros.recordings.levels import Level
 from hmsa_ros.recordings.parameters import actuators, named_joint, recorded
-from hmsa_ros.recordings.record import RecordedRequest, Run, Verdict
+from hmsa_ros.recordings.record import LearntSensor, RecordedRequest, Run, Verdict
 from hmsa_ros.recordings.samples import nanoseconds_of, SampleReader
 from hmsa_ros.recordings.topics import (
     APPLIED,
     COMMAND,
+    ESTIMATE,
     FORCE,
     JOINT_STATES,
     PLAN,
@@ -186,6 +188,8 @@ class _Collected:
     trajectories: list[_Trajectory] = field(default_factory=list)
     setpoints: dict[str, list[RecordedRequest]] = field(default_factory=dict)
     statuses: list[_Status] = field(default_factory=list)
+    # With the joint that each is of.
+    sensors: list[tuple[str, LearntSensor]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     left_out: int = 0
 
@@ -232,6 +236,10 @@ class _Collected:
         elif role == SETPOINT:
             self.setpoints.setdefault(joint, []).append(
                 RecordedRequest(sent, 0, ((float(content.data), None),)))
+        elif role == ESTIMATE:
+            self.sensors += (
+                (x.hardware_id, LearntSensor(sent, Sensor.of({y.key: y.value for y in x.values})))
+                for x in content.status)
         else:
             self.statuses.append(_Status.of(sent, content))
 
@@ -304,7 +312,9 @@ class _Collected:
             _begun(self.applied.get(key, ()), int(samples.time[0])),
             tuple(self.forces.get(key, ())), tuple(self._plans(joint)),
             tuple(self._requests(joint, key)),
-            tuple(self._verdicts(joint, list(dict.fromkeys(planned)))), {**parameters, **given},
+            tuple(self._verdicts(joint, list(dict.fromkeys(planned)))),
+            tuple(x for of, x in self.sensors if of == joint or len(
+                {y for y, _ in self.sensors}) == 1), {**parameters, **given},
             plant, planner, known, self.left_out + refused + samples.left_out,
             (*notes, *samples.notes, *more), topics, summary)
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from hmsa_ros.bag.info import BagSummary
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.judge import Sensor
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 from hmsa_ros.recordings.levels import in_force, Level
@@ -41,6 +42,14 @@ class Verdict:
     plan: int = 0  # number of the request that is carried out, from 1; 0 where not told
 
 
+@dataclass(frozen=True)
+class LearntSensor:
+    """What the planner took a sensor to be from a time on."""
+
+    sent: int  # time in ns at which it was recorded
+    sensor: Sensor
+
+
 @dataclass(frozen=True, eq=False)
 class Run:
     """What is known of one actuator in one run; tuples are in the order recorded."""
@@ -59,6 +68,7 @@ class Run:
     plans: tuple[tuple[Level, ...], ...] = ()
     requests: tuple[RecordedRequest, ...] = ()
     verdicts: tuple[Verdict, ...] = ()  # each once
+    sensors: tuple[LearntSensor, ...] = ()  # by time; as given before the first
     # Of the nodes, by ``'node.name'``
     parameters: Mapping[str, object] = field(default_factory=dict)
     plant: ActuatorParameters = field(default_factory=paper_actuator)  # as it was

@@ -12,8 +12,8 @@ TYPES = {
     declared.from_outside(x.name, declared.PLANNER): x.type for x in (
         declared.JOINT_STATES, declared.FLUX_DENSITY_COMMAND, declared.FLUX_DENSITY_APPLIED,
         declared.DISTURBANCE_FORCE, declared.PLAN, declared.JOINT_TRAJECTORY, declared.SETPOINT,
-        declared.STATUS)}
-JOINT_STATES, COMMAND, APPLIED, FORCE, PLAN, TRAJECTORY, SETPOINT, STATUS = TYPES
+        declared.STATUS, declared.ESTIMATE)}
+JOINT_STATES, COMMAND, APPLIED, FORCE, PLAN, TRAJECTORY, SETPOINT, STATUS, ESTIMATE = TYPES
 # Roles whose topics are one for each joint where there are several.
 _OF_A_JOINT = (COMMAND, APPLIED, FORCE, SETPOINT)
 

@@ -41,7 +41,8 @@ def _judged(run: Run, asked: Requested, tolerances: Tolerances) -> Finding:
     several = isinstance(joints, list) and len(joints) > 1
     hold = Hold(
         replace(asked.setpoint, joint=run.joint if several else ''), last=asked.last)
-    moves = list(asked.moves)
+    moves, sensors = list(asked.moves), list(run.sensors)
+    sensor = _SENSOR
 
     def move_until(sent: float) -> None:
         while moves and moves[0][0] < sent:
@@ -61,14 +62,16 @@ def _judged(run: Run, asked: Requested, tolerances: Tolerances) -> Finding:
         move_until(logged)
         if hold.over and not moves:
             break
+        while sensors and sensors[0].sent <= logged:
+            sensor = sensors.pop(0).sensor
         hold.add(stamp, stretch, stamp)
         if stamp >= hold.due:
-            hold.judge(stamp, logged, tolerances, _SENSOR, observable=True)
+            hold.judge(stamp, logged, tolerances, sensor, observable=True)
     move_until(math.inf)
     patience = _END
     while not hold.over:
         # No more samples are to come.
-        hold.judge(_END, patience, tolerances, _SENSOR, observable=False)
+        hold.judge(_END, patience, tolerances, sensor, observable=False)
         patience *= 2
     return hold.found or unobserved(hold.setpoint)
 
