@@ -176,7 +176,8 @@ class Feedback:
         if joint is None:
             return
         now = self._clock()
-        lost = joint.lost = joint.coil.measured(self._group.planners[name].plan, stamp, flux_density)
+        lost = joint.lost = joint.coil.measured(
+            self._group.planners[name].plan, stamp, flux_density)
         if lost and joint.trust.why != lost and joint.trust.doubt(lost, now, at_once=True):
             joint.estimator.restart()
             joint.latest, joint.news = None, True
