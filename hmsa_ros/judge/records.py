@@ -99,7 +99,11 @@ class Sensor:
 
     @classmethod
     def of(cls, values: Mapping[str, str]) -> 'Sensor':
-        """Return what `to_dict` is of, among other values; what is not there is as given."""
+        """
+        Return what `to_dict` is of, among other values; what is not there is as given.
+
+        Raises `ValueError` if figures are no numbers, or not finite.
+        """
         own = {x.name: values[_SENSOR + x.name] for x in fields(cls) if _SENSOR + x.name in values}
         found = cls(**{key: float(x) for key, x in own.items()})
         if not (all(map(math.isfinite, asdict(found).values())) and found.gain > 0.0):
