@@ -12,7 +12,7 @@ from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.delivery import Delivery, IDEAL
 from hmsa_ros.model.moves import Limits, State
 from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
-from hmsa_ros.model.status import RefusedError
+from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.planning.planner import Options, Planner
 from hmsa_ros.planning.sequence import plan_sequence
 from hmsa_ros.planning.setpoint import Setpoint
@@ -210,3 +210,21 @@ def test_a_shaped_step_of_a_creeping_block_leaves_less_than_a_step_and_holds_the
 def test_one_plan_from_two_ends_says_what_creep_is_not_planned_for():
     with pytest.raises(BadInputError, match='expected one without'):
         plan_two_step(1.0, 1.1, ONE)
+
+
+@pytest.mark.parametrize('start', [State(1.0), State(1.1, 0.2, 0.3)], ids=['rest', 'moving'])
+@pytest.mark.parametrize('creep', [Creep(), ONE.creep, THREE.creep], ids=['none', 'one', 'three'])
+@pytest.mark.parametrize('lag', [0.0, 0.1, 0.5])
+def test_one_search_finds_the_levels_to_which_others_lead_step_by_step(
+        lag, creep, start, monkeypatch):
+    request = Request(start, 1.25, replace(ONE, creep=creep), delivery=Delivery(lag=lag))
+    with monkeypatch.context() as alone:
+        alone.setattr('hmsa_ros.motion.solve', None)
+        move = get_shaper('two_step')(request)
+    assert move.code is Code.TWO_STEP
+    with monkeypatch.context() as without:
+        without.setattr('hmsa_ros.motion.two_step_late', lambda *_: (5, *[math.nan] * 5))
+        slowly = get_shaper('two_step')(request)
+    for level, expected in zip(move.levels, slowly.levels, strict=True):
+        assert level.load == pytest.approx(expected.load, rel=0.0, abs=2e-11)
+        assert level.time == pytest.approx(expected.time, rel=0.0, abs=2e-11)

@@ -25,13 +25,14 @@ from hmsa_ros.motion._motion import (
     turning_point,
     two_step,
     two_step_batch,
+    two_step_late,
 )
 
 __all__ = [
     'accelerations', 'critical_zeta', 'damping', 'elastic_energy', 'elastic_force',
     'elastic_stiffness', 'equilibrium_stretch', 'evaluate', 'follow', 'mass',
     'natural_frequency', 'respond', 'rest', 'sample', 'solve', 'staircase', 'turning_point',
-    'two_step', 'two_step_batch']
+    'two_step', 'two_step_batch', 'two_step_late']
 
 #: Statuses of a turning point: found; into an equilibrium instead; out of steps; against a
 #: limiting stretch too hard to be resolved. Those of `follow` are the first and the third.

@@ -23,6 +23,11 @@ def turning_point(
 def two_step(
     start: float, rate: float, target: float, material: Array, least: float, most: float,
     rtol: float, hold: float, /) -> tuple[int, float, float, float, int]: ...
+# Status, beta_p, tau_p, beta_1, and where the field lags the push that follows and when it ends.
+def two_step_late(
+    start: float, rate: float, target: float, least: float, most: float, rtol: float, hold: float,
+    material: Array, branches: Array, followed: tuple[float, ...], field: float, load: float,
+    lag: float, /) -> tuple[int, float, float, float, float, float]: ...
 def two_step_batch(
     start: Array, rate: Array, target: Array, materials: Array, stride: int, least: float,
     most: float, rtol: float, hold: float, wide: bool, status: NDArray[np.int64], beta_p: Array,

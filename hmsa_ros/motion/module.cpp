@@ -1,9 +1,11 @@
-// The motion as Python has it: functions over numbers and buffers, which check no values.
+// The motion as Python has it: functions over numbers and buffers, which check no values. Their
+// arguments and results are those of the functions here, by `bound`.
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
+#include <tuple>
 #include "hmsa/batch.hpp"
+#include "hmsa/late.hpp"
 #include "hmsa/response.hpp"
-#include "hmsa/shooting.hpp"
 #include "hmsa/tail.hpp"
 
 namespace {
@@ -22,62 +24,134 @@ template <class F> auto with_system(const double *m, const F &f)
     system.read(0, m);
     return f(system);
 }
+template <int n> constexpr std::integral_constant<int, n> fixed{};
+// What is used most has code of its own; the rest of it is compiled once.
+template <class System, int NB> constexpr bool usual = std::is_same_v<System, GentBlock> && NB <= 1;
 // Calls f with as many branches as there are, or with some that hold nothing.
-template <class F> auto with_branches(int count, const F &f)
+template <class System, class F> auto with_branches(int count, const F &f)
 {
     if (count == 0)
-        return f(std::integral_constant<int, 0>{});
-    if (count == 1)
-        return f(std::integral_constant<int, 1>{});
-    return f(std::integral_constant<int, most_branches>{});
+        return f(fixed<0>);
+    if constexpr (usual<System, 1>)
+        if (count == 1)
+            return f(fixed<1>);
+    return f(fixed<most_branches>);
 }
 
-// -- arguments -----------------------------------------------------------------------------------
+// -- arguments and results -----------------------------------------------------------------------
 
-// A contiguous array of double, int64 or bool, given back at the end; not there where there is an
-// error, which is set.
-struct Buffer {
-    Py_buffer view{};
-    bool there;
-    explicit Buffer(PyObject *from, bool writable = false, const char *types = "d")
-        : there(PyObject_GetBuffer(
-              from, &view, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | (writable ? PyBUF_WRITABLE : 0)) == 0)
-    {
-        if (there && !std::strchr(types, view.format[0])) {
-            PyErr_Format(PyExc_TypeError, "array of type %s: expected one of %s", view.format, types);
-            PyBuffer_Release(&view);
-            there = false;
-        }
-    }
-    Buffer(const Buffer &) = delete;
-    ~Buffer()
-    {
-        if (there)
-            PyBuffer_Release(&view);
-    }
-    double *numbers() const { return static_cast<double *>(view.buf); }
-    int count() const { return int(view.len / Py_ssize_t(sizeof(double))); }
+// A contiguous array that the caller keeps.
+template <class T> struct Array {
+    T *data;
+    int count;
+    T &operator[](int i) const { return data[i]; }
 };
-constexpr const char *whole = "lq", *truth = "?";
-bool refused(const char *function, Py_ssize_t expected, Py_ssize_t got)
+using Numbers = Array<const double>;
+using Results = Array<double>;
+using Places = Array<const int64_t>;
+using Statuses = Array<int64_t>;
+
+template <class T> struct Argument;
+template <> struct Argument<double> {
+    double got;
+    bool read(PyObject *from)
+    {
+        got = PyFloat_AsDouble(from);
+        return got != -1 || !PyErr_Occurred();
+    }
+};
+template <> struct Argument<int> {
+    int got;
+    bool read(PyObject *from)
+    {
+        got = int(PyLong_AsLong(from));
+        return got != -1 || !PyErr_Occurred();
+    }
+};
+// Given back at the end.
+template <class T> struct Argument<Array<T>> {
+    Py_buffer view{};
+    Array<T> got{};
+    bool read(PyObject *from)
+    {
+        using Number = std::remove_const_t<T>;
+        constexpr bool numbers = std::is_same_v<Number, double>, truth = std::is_same_v<Number, bool>;
+        constexpr const char *types = numbers ? "d" : truth ? "?" : "lq";
+        constexpr int writable = std::is_const_v<T> ? 0 : PyBUF_WRITABLE;
+        if (PyObject_GetBuffer(from, &view, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | writable) != 0)
+            return false;
+        if (!std::strchr(types, view.format[0])) {
+            PyErr_Format(PyExc_TypeError, "array of type %s: expected one of %s", view.format, types);
+            return false;
+        }
+        got = {static_cast<T *>(view.buf), int(view.len / Py_ssize_t(sizeof(T)))};
+        return true;
+    }
+    Argument() = default;
+    Argument(const Argument &) = delete;
+    ~Argument() { PyBuffer_Release(&view); }
+};
+// What the branches have followed, or nothing.
+struct Followed {
+    double values[most_branches];
+    int count;
+};
+template <> struct Argument<Followed> {
+    Followed got;
+    bool read(PyObject *from)
+    {
+        got.count = int(PyTuple_Size(from));
+        for (int b = 0; b < got.count && b < most_branches; b++)
+            got.values[b] = PyFloat_AsDouble(PyTuple_GET_ITEM(from, b));
+        return !PyErr_Occurred();
+    }
+};
+bool fit(bool is)
 {
-    if (got != expected)
-        PyErr_Format(PyExc_TypeError, "%s: expected %zd arguments, got %zd", function, expected, got);
-    return got != expected;
+    if (!is)
+        PyErr_SetString(PyExc_ValueError, "expected arrays that fit each other");
+    return is;
 }
-bool differ(const char *function)
+
+PyObject *made(double x) { return PyFloat_FromDouble(x); }
+PyObject *made(int x) { return PyLong_FromLong(x); }
+PyObject *made(bool x) { return PyBool_FromLong(x); }
+struct Nothing {};
+PyObject *made(Nothing) { Py_RETURN_NONE; }
+template <class... T> PyObject *made(const std::tuple<T...> &all)
 {
-    PyErr_Format(PyExc_ValueError, "%s: expected arrays that fit each other", function);
-    return false;
+    PyObject *out = PyTuple_New(sizeof...(T));
+    int i = 0;
+    std::apply([&](const T &...x) { (PyTuple_SET_ITEM(out, i++, made(x)), ...); }, all);
+    return out;
 }
-// Reads numbers; false where one is none, which is set as the error.
-bool read(PyObject *const *from, int count, double *to)
+template <class R, class... A, size_t... I> PyObject *call(
+    R (*f)(A...), PyObject *const *from, Py_ssize_t count, std::index_sequence<I...>)
 {
-    for (int i = 0; i < count; i++)
-        to[i] = PyFloat_AsDouble(from[i]);
-    return !PyErr_Occurred();
+    if (count != sizeof...(A))
+        return PyErr_Format(PyExc_TypeError, "expected %zu arguments, got %zd", sizeof...(A), count);
+    std::tuple<Argument<A>...> arguments;
+    if (!(std::get<I>(arguments).read(from[I]) && ...))
+        return nullptr;
+    const R result = f(std::get<I>(arguments).got...);
+    return PyErr_Occurred() ? nullptr : made(result);
 }
-using Arguments = PyObject *const *;
+template <class R, class... A> PyObject *call(R (*f)(A...), PyObject *const *from, Py_ssize_t count)
+{
+    return call(f, from, count, std::index_sequence_for<A...>{});
+}
+template <auto f> PyObject *bound(PyObject *, PyObject *const *arguments, Py_ssize_t count)
+{
+    return call(f, arguments, count);
+}
+// Does work while other threads of Python run.
+template <class F> auto apart(const F &f)
+{
+    PyThreadState *state = PyEval_SaveThread();
+    const auto result = f();
+    PyEval_RestoreThread(state);
+    return result;
+}
 
 // -- the law ---------------------------------------------------------------------------------------
 
@@ -97,81 +171,65 @@ double quantity(int what, double x, const double *m)
         }
     });
 }
-template <int what> PyObject *quantity_of(PyObject *, Arguments arguments, Py_ssize_t count)
+template <int what> double quantity_of(double x, Numbers material) { return quantity(what, x, material.data); }
+Nothing evaluate(int what, Numbers values, Numbers material, Results out)
 {
-    double x;
-    if (refused("a quantity of the law", 2, count) || !read(arguments, 1, &x))
-        return nullptr;
-    const Buffer material(arguments[1]);
-    return material.there ? PyFloat_FromDouble(quantity(what, x, material.numbers())) : nullptr;
+    if (fit(values.count == out.count))
+        for (int i = 0; i < out.count; i++)
+            out[i] = quantity(what, values[i], material.data);
+    return {};
 }
-PyObject *evaluate(PyObject *, Arguments arguments, Py_ssize_t count)
+Nothing accelerations(Numbers stretch, Numbers rate, Numbers load, Numbers material, Results out)
 {
-    if (refused("evaluate", 4, count))
-        return nullptr;
-    const long what = PyLong_AsLong(arguments[0]);
-    const Buffer values(arguments[1]), material(arguments[2]), out(arguments[3], true);
-    if (!values.there || !material.there || !out.there || PyErr_Occurred())
-        return nullptr;
-    if (values.count() != out.count() && !differ("evaluate"))
-        return nullptr;
-    for (int i = 0; i < out.count(); i++)
-        out.numbers()[i] = quantity(int(what), values.numbers()[i], material.numbers());
-    Py_RETURN_NONE;
-}
-PyObject *accelerations(PyObject *, Arguments arguments, Py_ssize_t count)
-{
-    if (refused("accelerations", 5, count))
-        return nullptr;
-    const Buffer l(arguments[0]), v(arguments[1]), load(arguments[2]), material(arguments[3]),
-        out(arguments[4], true);
-    if (!l.there || !v.there || !load.there || !material.there || !out.there)
-        return nullptr;
-    if ((l.count() != out.count() || v.count() != out.count() || load.count() != out.count())
-            && !differ("accelerations"))
-        return nullptr;
-    with_system(material.numbers(), [&](const auto &system) {
-        for (int i = 0; i < out.count(); i++)
-            out.numbers()[i] = system.acceleration(
-                l.numbers()[i], v.numbers()[i], system.drag, under(load.numbers()[i]));
-    });
-    Py_RETURN_NONE;
+    if (fit(stretch.count == out.count && rate.count == out.count && load.count == out.count))
+        with_system(material.data, [&](const auto &system) {
+            for (int i = 0; i < out.count; i++) {
+                const double x[2] = {stretch[i], rate[i]};
+                double by[2];
+                change(system, Branches<0>{}, x, load[i], by);
+                out[i] = by[1];
+            }
+        });
+    return {};
 }
 // -- two-step plans ---------------------------------------------------------------------------------
 
-// turning_point(stretch, rate, direction, load, move, material, rtol)
-PyObject *turning_point_of(PyObject *, Arguments arguments, Py_ssize_t count)
+auto turning_point_of(double stretch, double rate, double direction, double load, double move,
+    Numbers material, double rtol)
 {
-    double number[5], rtol;
-    if (refused("turning_point", 7, count) || !read(arguments, 5, number)
-            || !read(arguments + 6, 1, &rtol))
-        return nullptr;
-    const Buffer material(arguments[5]);
-    if (!material.there)
-        return nullptr;
-    const double *m = material.numbers();
-    const Event event = with_system(m, [&](const auto &system) {
-        return turning_point(
-            system, number[0], number[1], number[2], number[3], number[4], m[zeta_at], rtol);
+    const Event event = with_system(material.data, [&](const auto &system) {
+        return hmsa::turning_point(
+            system, stretch, rate, direction, load, move, material[zeta_at], rtol);
     });
-    return Py_BuildValue("idddd", int(event.status), event.time, event.stretch, event.by_load,
-        event.time_by_load);
+    return std::tuple{int(event.status), event.time, event.stretch, event.by_load, event.time_by_load};
 }
-// two_step(start, rate, target, material, least, most, rtol, hold)
-PyObject *two_step_of(PyObject *, Arguments arguments, Py_ssize_t count)
+auto two_step_of(double start, double rate, double target, Numbers material, double least, double most,
+    double rtol, double hold)
 {
-    double move[3], wanted[4];
-    if (refused("two_step", 8, count) || !read(arguments, 3, move) || !read(arguments + 4, 4, wanted))
-        return nullptr;
-    const Buffer material(arguments[3]);
-    if (!material.there)
-        return nullptr;
-    const Plan plan = with_system(material.numbers(), [&](const auto &system) {
+    const Plan plan = with_system(material.data, [&](const auto &system) {
         Planner<std::decay_t<decltype(system)>> planner;
-        return planner(system, material.numbers(), {move[0], move[1], move[2]},
-            {wanted[0], wanted[1], wanted[2], wanted[3]});
+        return planner(system, material.data, {start, rate, target}, {least, most, rtol, hold});
     });
-    return Py_BuildValue("idddi", plan.status, plan.beta_p, plan.tau_p, plan.beta_1, plan.passes);
+    return std::tuple{plan.status, plan.beta_p, plan.tau_p, plan.beta_1, plan.passes};
+}
+auto two_step_late(double start, double rate, double target, double least, double most, double rtol,
+    double hold, Numbers material, Numbers branches, Followed followed, double field, double load,
+    double lag)
+{
+    const int creeping = branches.count / 2;
+    const double *known = followed.count == creeping ? followed.values : nullptr;
+    Late found{};
+    if (fit(creeping <= most_branches))
+        found = with_system(material.data, [&](const auto &system) {
+            using System = std::decay_t<decltype(system)>;
+            return with_branches<System>(creeping, [&](auto n) {
+                constexpr int unknowns = usual<System, n()> ? 3 : most_unknowns;
+                return late<n(), unknowns>(system, material.data, {start, rate, target},
+                    {least, most, rtol, hold}, {field, load, lag, branches.data, creeping, known});
+            });
+        });
+    const Plan &plan = found.plan;
+    return std::tuple{plan.status, plan.beta_p, plan.tau_p, plan.beta_1, found.push, found.until};
 }
 // One source, two instruction sets: all that a step does is inlined into what names its own.
 __attribute__((target("avx2"), flatten)) void plan_wide(const Rows &rows)
@@ -179,75 +237,45 @@ __attribute__((target("avx2"), flatten)) void plan_wide(const Rows &rows)
     plan_lanes<four, Gent>(rows);
 }
 __attribute__((flatten)) void plan_narrow(const Rows &rows) { plan_lanes<two, Gent>(rows); }
-// two_step_batch(start, rate, target, materials, stride, least, most, rtol, hold, wide, status,
-// beta_p, tau_p, beta_1)
-PyObject *two_step_batch(PyObject *, PyObject *arguments)
+Nothing two_step_batch(Numbers start, Numbers rate, Numbers target, Numbers materials, int stride,
+    double least, double most, double rtol, double hold, int wide, Statuses status, Results beta_p,
+    Results tau_p, Results beta_1)
 {
-    PyObject *in[4], *out[4];
-    int wide;
-    Rows rows{};
-    if (!PyArg_ParseTuple(arguments, "OOOOiddddpOOOO", &in[0], &in[1], &in[2], &in[3], &rows.stride,
-            &rows.wanted.least, &rows.wanted.most, &rows.wanted.rtol, &rows.wanted.hold, &wide,
-            &out[0], &out[1], &out[2], &out[3]))
-        return nullptr;
-    const Buffer start(in[0]), rate(in[1]), target(in[2]), materials(in[3]),
-        status(out[0], true, whole),
-        beta_p(out[1], true), tau_p(out[2], true), beta_1(out[3], true);
-    if (PyErr_Occurred())
-        return nullptr;
-    rows.count = start.count();
-    for (const Buffer *x : {&rate, &target, &status, &beta_p, &tau_p, &beta_1})
-        if (x->count() != rows.count && !differ("two_step_batch"))
-            return nullptr;
-    if (rows.count == 0)
-        Py_RETURN_NONE;
-    rows.start = start.numbers(), rows.rate = rate.numbers(), rows.target = target.numbers();
-    rows.materials = materials.numbers();
-    rows.status = static_cast<int64_t *>(status.view.buf);
-    rows.beta_p = beta_p.numbers(), rows.tau_p = tau_p.numbers(), rows.beta_1 = beta_1.numbers();
-    Py_BEGIN_ALLOW_THREADS;
-    if (int(rows.materials[kind_at]) > neo_hookean)
-        plan_rows<Any>(rows);
-    else if (wide && __builtin_cpu_supports("avx2"))
-        plan_wide(rows);
-    else
-        plan_narrow(rows);
-    Py_END_ALLOW_THREADS;
-    Py_RETURN_NONE;
+    const int count = start.count;
+    for (const int other : {rate.count, target.count, status.count, beta_p.count, tau_p.count, beta_1.count})
+        if (!fit(other == count))
+            return {};
+    const Rows rows{count, start.data, rate.data, target.data, materials.data, stride,
+        {least, most, rtol, hold}, status.data, beta_p.data, tau_p.data, beta_1.data};
+    if (count > 0)
+        apart([&] {
+            if (int(materials[kind_at]) > neo_hookean)
+                plan_rows<Any>(rows);
+            else if (wide && __builtin_cpu_supports("avx2"))
+                plan_wide(rows);
+            else
+                plan_narrow(rows);
+            return Nothing{};
+        });
+    return {};
 }
 
 // -- motion over time -------------------------------------------------------------------------------
 
-// follow(first, last, wanted, state, drive, material, branches, durations, rtol, status): how many do
-// not get through
-PyObject *follow(PyObject *, Arguments arguments, Py_ssize_t count)
+// How many do not get through.
+int follow(int first, int last, Array<const bool> wanted, Results state, Results drive, Numbers material,
+    Results branches, Numbers durations, double rtol, Statuses status)
 {
-    if (refused("follow", 10, count))
-        return nullptr;
-    Plant plant{};
-    plant.first = int(PyLong_AsLong(arguments[0])), plant.last = int(PyLong_AsLong(arguments[1]));
-    if (!read(arguments + 8, 1, &plant.rtol))
-        return nullptr;
-    const Buffer wanted(arguments[2], false, truth), state(arguments[3], true), drive(arguments[4], true),
-        material(arguments[5]), branches(arguments[6], true), durations(arguments[7]),
-        status(arguments[9], true, whole);
-    if (PyErr_Occurred())
-        return nullptr;
-    const int rows = durations.count();
-    if ((state.count() != 3 * rows || drive.count() != 4 * rows || status.count() != rows
-            || wanted.view.len != rows || plant.first < 0 || plant.last > rows
-            || (branches.count() && branches.count() != 3 * most_branches * rows))
-            && !differ("follow"))
-        return nullptr;
-    plant.wanted = static_cast<const bool *>(wanted.view.buf);
-    plant.state = state.numbers(), plant.drive = drive.numbers();
-    plant.material = material.numbers(), plant.stride = rows ? material.count() / rows : 0;
-    plant.branches = branches.count() ? branches.numbers() : nullptr;
-    plant.durations = durations.numbers();
-    plant.status = static_cast<int64_t *>(status.view.buf);
-    long failed = 0;
-    for (int i = plant.first; i < plant.last; i++) {
-        if (!plant.wanted[i])
+    const int rows = durations.count;
+    if (!fit(state.count == 3 * rows && drive.count == 4 * rows && status.count == rows
+            && wanted.count == rows && first >= 0 && last <= rows
+            && (!branches.count || branches.count == 3 * most_branches * rows)))
+        return 0;
+    const Plant plant{state.data, drive.data, material.data, rows ? material.count / rows : 0,
+        branches.count ? branches.data : nullptr, durations.data, rtol};
+    int failed = 0;
+    for (int i = first; i < last; i++) {
+        if (!wanted[i])
             continue;
         int creeping = 0;
         if (plant.branches)
@@ -256,113 +284,85 @@ PyObject *follow(PyObject *, Arguments arguments, Py_ssize_t count)
                 creeping++;
         const bool done = with_system(plant.material + int64_t(plant.stride) * i,
             [&](const auto &system) {
-                return with_branches(creeping, [&](auto n) {
+                return with_branches<std::decay_t<decltype(system)>>(creeping, [&](auto n) {
                     return advance_row<n()>(plant, i, system);
                 });
             });
-        plant.status[i] = done ? turned : stuck;
+        status[i] = done ? turned : stuck;
         failed += !done;
     }
-    return PyLong_FromLong(failed);
+    return failed;
 }
-// sample(stretch, rate, field, switches, loads, slopes, lag, times, material, branches, rtol, out):
-// whether the motion was followed to its end
-PyObject *sample_of(PyObject *, Arguments arguments, Py_ssize_t count)
+// Whether the motion was followed to its end.
+bool sample_of(double stretch, double rate, double field, Numbers switches, Numbers loads, Numbers slopes,
+    double lag, Numbers times, Numbers material, Numbers branches, double rtol, Results out)
 {
-    if (refused("sample", 12, count))
-        return nullptr;
-    Course course{};
-    double start[3];
-    if (!read(arguments, 3, start) || !read(arguments + 6, 1, &course.lag)
-            || !read(arguments + 10, 1, &course.rtol))
-        return nullptr;
-    const Buffer switches(arguments[3]), loads(arguments[4]), slopes(arguments[5]),
-        times(arguments[7]), material(arguments[8]), branches(arguments[9]), out(arguments[11], true);
-    if (PyErr_Occurred())
-        return nullptr;
-    course.branch_count = branches.count() / 3;
-    if ((loads.count() != switches.count() || slopes.count() != switches.count()
-            || out.count() != (3 + course.branch_count) * times.count() || !switches.count()
-            || course.branch_count > most_branches) && !differ("sample"))
-        return nullptr;
-    course.pieces = switches.count(), course.count = times.count();
-    course.switches = switches.numbers(), course.loads = loads.numbers();
-    course.slopes = slopes.numbers(), course.times = times.numbers();
-    course.stretch = start[0], course.rate = start[1], course.field = start[2];
-    course.zeta = material.numbers()[zeta_at];
-    course.branches = branches.numbers(), course.out = out.numbers();
-    bool done;
-    Py_BEGIN_ALLOW_THREADS;
-    done = with_system(material.numbers(), [&](const auto &system) {
-        return with_branches(course.branch_count, [&](auto n) { return sample<n()>(system, course); });
+    const int creeping = branches.count / 3;
+    if (!fit(loads.count == switches.count && slopes.count == switches.count && switches.count
+            && out.count == (3 + creeping) * times.count && creeping <= most_branches))
+        return false;
+    const Course course{switches.count, times.count, switches.data, loads.data, slopes.data, times.data,
+        stretch, rate, field, lag, material[zeta_at], rtol, branches.data, creeping, out.data};
+    return apart([&] {
+        return with_system(material.data, [&](const auto &system) {
+            return with_branches<std::decay_t<decltype(system)>>(creeping, [&](auto n) {
+                return sample<n()>(system, course);
+            });
+        });
     });
-    Py_END_ALLOW_THREADS;
-    return PyBool_FromLong(done);
 }
 
 // -- levels ---------------------------------------------------------------------------------------
 
-// solve(times, loads, d_times, d_loads, stretch, rate, field, load, target, slew, lag, material,
-// branches, followed): whether it is solved, and the duration
-PyObject *solve(PyObject *, Arguments arguments, Py_ssize_t count)
+// Whether it is solved, and the duration.
+std::tuple<bool, double> solve(Results times, Results loads, Numbers d_times, Numbers d_loads,
+    double stretch, double rate, double field, double load, double target, double slew, double lag,
+    Numbers material, Numbers branches, Numbers followed)
 {
-    double number[7];
-    if (refused("solve", 14, count) || !read(arguments + 4, 7, number))
-        return nullptr;
-    const Buffer times(arguments[0], true), loads(arguments[1], true), d_times(arguments[2]),
-        d_loads(arguments[3]), material(arguments[11]), branches(arguments[12]),
-        followed(arguments[13]);
-    if (PyErr_Occurred())
-        return nullptr;
-    const int levels = times.count(), unknowns = levels ? d_times.count() / levels : 0;
-    const int creeping = followed.count();
-    if ((!levels || loads.count() != levels || d_times.count() != unknowns * levels
-            || d_loads.count() != unknowns * levels || branches.count() != 2 * creeping
-            || levels > most_levels || unknowns > most_unknowns || creeping > most_branches)
-            && !differ("solve"))
-        return nullptr;
-    const Shot shot{levels, unknowns, times.numbers(), loads.numbers(), d_times.numbers(),
-        d_loads.numbers(), number[0], number[1], number[2], number[3], number[4], number[5],
-        number[6], branches.numbers(), creeping, followed.numbers()};
+    const int levels = times.count, unknowns = levels ? d_times.count / levels : 0;
+    const int creeping = followed.count;
+    if (!fit(levels && loads.count == levels && d_times.count == unknowns * levels
+            && d_loads.count == unknowns * levels && branches.count == 2 * creeping
+            && levels <= most_levels && unknowns <= most_unknowns && creeping <= most_branches))
+        return {};
+    const Shot shot{levels, unknowns, times.data, loads.data, d_times.data, d_loads.data, stretch, rate,
+        field, load, target, slew, lag, branches.data, creeping, followed.data};
     double lasts = 0;
-    const bool solved = with_system(material.numbers(), [&](const auto &system) {
+    const bool solved = with_system(material.data, [&](const auto &system) {
         using System = std::decay_t<decltype(system)>;
-        return with_branches(creeping, [&](auto n) {
-            if (unknowns <= 2) {
-                Shooting<System, n(), 2> shooting{system, shot};
-                return shooting.solve(material.numbers(), lasts);
-            }
-            Shooting<System, n(), most_unknowns> shooting{system, shot};
-            return shooting.solve(material.numbers(), lasts);
+        return with_branches<System>(creeping, [&](auto n) {
+            const auto with = [&](auto p) {
+                Shooting<System, n(), p()> shooting{system, shot};
+                return shooting.solve(material.data, lasts);
+            };
+            if constexpr (n() == 0 || usual<System, n()>)
+                if (unknowns <= 2)
+                    return with(fixed<2>);
+            if constexpr (usual<System, n()>)
+                if (unknowns == 3)
+                    return with(fixed<3>);
+            return with(fixed<most_unknowns>);
         });
     });
-    return Py_BuildValue("Nd", PyBool_FromLong(solved), lasts);
+    return {solved, lasts};
 }
-// staircase(held, branches, stretch, material, lag, period, end, ripple, out): the number of levels
-// and a bound of their vibration
-PyObject *staircase(PyObject *, Arguments arguments, Py_ssize_t count)
+// The number of levels and a bound of their vibration.
+std::tuple<int, double> staircase(Numbers held, Numbers branches, double stretch, Numbers material,
+    double lag, double period, double end, double ripple, Results out)
 {
-    double stretch, number[4];
-    if (refused("staircase", 9, count) || !read(arguments + 2, 1, &stretch)
-            || !read(arguments + 4, 4, number))
-        return nullptr;
-    const Buffer held(arguments[0]), branches(arguments[1]), material(arguments[3]),
-        out(arguments[8], true);
-    if (PyErr_Occurred())
-        return nullptr;
     Tail tail{};
-    tail.count = held.count();
-    if ((branches.count() != 2 * tail.count || tail.count > most_branches) && !differ("staircase"))
-        return nullptr;
-    tail.held = held.numbers(), tail.branches = branches.numbers();
-    tail.lag = number[0], tail.period = number[1], tail.until = number[2];
-    tail.out = out.numbers(), tail.room = out.count() / columns;
+    tail.count = held.count;
+    if (!fit(branches.count == 2 * tail.count && tail.count <= most_branches))
+        return {};
+    tail.held = held.data, tail.branches = branches.data;
+    tail.lag = lag, tail.period = period, tail.until = end;
+    tail.out = out.data, tail.room = out.count / columns;
     double most = 0;
-    const int found = with_system(material.numbers(), [&](const auto &system) {
+    const int found = with_system(material.data, [&](const auto &system) {
         tail.set_up(system, stretch);
-        return tail.staircase(number[3], most);
+        return tail.staircase(ripple, most);
     });
-    return Py_BuildValue("id", found, most);
+    return {found, most};
 }
 
 // -- recordings --------------------------------------------------------------------------------------
@@ -401,98 +401,70 @@ template <int NB> bool respond_all(const Recorded &of)
             return false;
     return true;
 }
-// respond(theta, material, branches, wanted, start, begins, levels, ramps, field, field_lag, times,
-// rtol, stretch, rate, jacobian, by_rate, behind, behind_last): whether the motion was followed to
-// its end
-PyObject *respond(PyObject *, Arguments arguments, Py_ssize_t count)
+// Whether the motion was followed to its end.
+bool respond(Numbers theta, Numbers material, int branches, Places wanted, Numbers start, Numbers begins,
+    Numbers levels, Numbers ramps, double field, double field_lag, Numbers times, double rtol,
+    Results stretch, Results rate, Results jacobian, Results by_rate, Numbers behind, Results behind_last)
 {
-    double number[3];
-    if (refused("respond", 18, count) || !read(arguments + 8, 2, number)
-            || !read(arguments + 11, 1, number + 2))
-        return nullptr;
+    const int64_t cells = int64_t(times.count) * wanted.count;
+    if (!fit(branches >= 0 && branches <= most_branches && theta.count == first_branch + 2 * branches
+            && start.count == wanted.count && begins.count && levels.count == begins.count
+            && ramps.count == begins.count && stretch.count == times.count && rate.count == times.count
+            && jacobian.count == cells && (!by_rate.count || by_rate.count == cells)
+            && (!behind.count || behind.count == branches)
+            && (!behind_last.count || behind_last.count == branches)))
+        return false;
     Recorded of{};
-    of.branches = int(PyLong_AsLong(arguments[2]));
-    const Buffer theta(arguments[0]), material(arguments[1]), wanted(arguments[3], false, whole),
-        start(arguments[4]), begins(arguments[5]), levels(arguments[6]), ramps(arguments[7]),
-        times(arguments[10]), stretch(arguments[12], true), rate(arguments[13], true),
-        jacobian(arguments[14], true), by_rate(arguments[15], true), behind(arguments[16]),
-        behind_last(arguments[17], true);
-    if (PyErr_Occurred())
-        return nullptr;
-    of.wanted_count = wanted.count(), of.count = times.count(), of.pieces = begins.count();
-    const Py_ssize_t cells = Py_ssize_t(of.count) * of.wanted_count;
-    if ((theta.count() != first_branch + 2 * of.branches || start.count() != of.wanted_count
-            || levels.count() != of.pieces || ramps.count() != of.pieces || !of.pieces
-            || stretch.count() != of.count || rate.count() != of.count || jacobian.count() != cells
-            || (by_rate.count() && by_rate.count() != cells)
-            || (behind.count() && behind.count() != of.branches)
-            || (behind_last.count() && behind_last.count() != of.branches)
-            || of.branches < 0 || of.branches > most_branches) && !differ("respond"))
-        return nullptr;
-    of.theta = theta.numbers(), of.material = material.numbers();
-    of.wanted = static_cast<const int64_t *>(wanted.view.buf), of.start = start.numbers();
-    of.begins = begins.numbers(), of.levels = levels.numbers(), of.ramps = ramps.numbers();
-    of.field = number[0], of.field_lag = number[1], of.rtol = number[2];
-    of.times = times.numbers(), of.stretch = stretch.numbers(), of.rate = rate.numbers();
-    of.jacobian = jacobian.numbers(), of.by_rate = by_rate.count() ? by_rate.numbers() : nullptr;
-    of.behind = behind.count() ? behind.numbers() : nullptr;
-    of.behind_last = behind_last.count() ? behind_last.numbers() : nullptr;
-    bool done;
-    Py_BEGIN_ALLOW_THREADS;
-    done = with_branches(of.branches, [&](auto n) { return respond_all<n()>(of); });
-    Py_END_ALLOW_THREADS;
-    return PyBool_FromLong(done);
+    of.theta = theta.data, of.material = material.data, of.branches = branches;
+    of.wanted_count = wanted.count, of.wanted = wanted.data, of.start = start.data;
+    of.pieces = begins.count, of.begins = begins.data, of.levels = levels.data, of.ramps = ramps.data;
+    of.field = field, of.field_lag = field_lag, of.rtol = rtol;
+    of.count = times.count, of.times = times.data, of.stretch = stretch.data, of.rate = rate.data;
+    of.jacobian = jacobian.data, of.by_rate = by_rate.count ? by_rate.data : nullptr;
+    of.behind = behind.count ? behind.data : nullptr;
+    of.behind_last = behind_last.count ? behind_last.data : nullptr;
+    return apart([&] {
+        return with_branches<GentBlock>(branches, [&](auto n) { return respond_all<n()>(of); });
+    });
 }
-
-// rest(theta, material, level, wanted, slopes): the stretch at which a level holds the actuator, no
-// number if there is none; its derivatives by what is wanted are written
-PyObject *rest(PyObject *, Arguments arguments, Py_ssize_t count)
+// The stretch at which a level holds the actuator, no number if there is none; its derivatives by
+// what is wanted are written.
+double rest(Numbers theta, Numbers material, double level, Places wanted, Results slopes)
 {
-    double level;
-    if (refused("rest", 5, count) || !read(arguments + 2, 1, &level))
-        return nullptr;
-    const Buffer theta(arguments[0]), material(arguments[1]), wanted(arguments[3], false, whole),
-        slopes(arguments[4], true);
-    if (PyErr_Occurred())
-        return nullptr;
-    if ((theta.count() < first_branch || wanted.count() != slopes.count()) && !differ("rest"))
-        return nullptr;
+    if (!fit(theta.count >= first_branch && wanted.count == slopes.count))
+        return 0;
     Recorded of{};
-    of.theta = theta.numbers(), of.material = material.numbers(), of.wanted_count = wanted.count();
-    of.wanted = static_cast<const int64_t *>(wanted.view.buf);
-    const double pull = of.theta[drive_of] * level + of.theta[force_of];
-    const double l = quantity(equilibrium_q, pull / of.theta[stiffness_of], of.material);
+    of.theta = theta.data, of.material = material.data;
+    of.wanted_count = wanted.count, of.wanted = wanted.data;
+    const double pull = theta[drive_of] * level + theta[force_of];
+    const double l = quantity(equilibrium_q, pull / theta[stiffness_of], of.material);
     for (int from = 0; from < of.wanted_count; from += 8)
-        if (int(of.material[kind_at]) > neo_hookean)
-            Response<Eight, AnyOf<Eight>, 0>(of, from).hold(l, level, slopes.numbers());
+        if (int(material[kind_at]) > neo_hookean)
+            Response<Eight, AnyOf<Eight>, 0>(of, from).hold(l, level, slopes.data);
         else
-            Response<Eight, Block<Eight, Gent>, 0>(of, from).hold(l, level, slopes.numbers());
-    const bool held = hmsa::finite(quantity(stiffness_q, l, of.material));
-    return PyFloat_FromDouble(held ? l : __builtin_nan(""));
+            Response<Eight, Block<Eight, Gent>, 0>(of, from).hold(l, level, slopes.data);
+    return hmsa::finite(quantity(stiffness_q, l, of.material)) ? l : __builtin_nan("");
 }
 
-template <class F> PyCFunction fast(F f) { return (PyCFunction)(void (*)())f; }
+template <auto f> PyMethodDef method(const char *name)
+{
+    return {name, (PyCFunction)(void (*)())bound<f>, METH_FASTCALL, nullptr};
+}
 PyMethodDef methods[] = {
-    {"elastic_force", fast(quantity_of<force_q>), METH_FASTCALL, nullptr},
-    {"elastic_stiffness", fast(quantity_of<stiffness_q>), METH_FASTCALL, nullptr},
-    {"elastic_energy", fast(quantity_of<energy_q>), METH_FASTCALL, nullptr},
-    {"mass", fast(quantity_of<mass_q>), METH_FASTCALL, nullptr},
-    {"natural_frequency", fast(quantity_of<frequency_q>), METH_FASTCALL, nullptr},
-    {"critical_zeta", fast(quantity_of<critical_zeta_q>), METH_FASTCALL, nullptr},
-    {"equilibrium_stretch", fast(quantity_of<equilibrium_q>), METH_FASTCALL, nullptr},
-    {"damping", fast(quantity_of<damping_q>), METH_FASTCALL, nullptr},
-    {"evaluate", fast(evaluate), METH_FASTCALL, nullptr},
-    {"accelerations", fast(accelerations), METH_FASTCALL, nullptr},
-    {"turning_point", fast(turning_point_of), METH_FASTCALL, nullptr},
-    {"two_step", fast(two_step_of), METH_FASTCALL, nullptr},
-    {"two_step_batch", two_step_batch, METH_VARARGS, nullptr},
-    {"follow", fast(follow), METH_FASTCALL, nullptr},
-    {"sample", fast(sample_of), METH_FASTCALL, nullptr},
-    {"solve", fast(solve), METH_FASTCALL, nullptr},
-    {"staircase", fast(staircase), METH_FASTCALL, nullptr},
-    {"respond", fast(respond), METH_FASTCALL, nullptr},
-    {"rest", fast(rest), METH_FASTCALL, nullptr},
-    {nullptr, nullptr, 0, nullptr}};
+    method<quantity_of<force_q>>("elastic_force"),
+    method<quantity_of<stiffness_q>>("elastic_stiffness"),
+    method<quantity_of<energy_q>>("elastic_energy"),
+    method<quantity_of<mass_q>>("mass"),
+    method<quantity_of<frequency_q>>("natural_frequency"),
+    method<quantity_of<critical_zeta_q>>("critical_zeta"),
+    method<quantity_of<equilibrium_q>>("equilibrium_stretch"),
+    method<quantity_of<damping_q>>("damping"),
+    method<evaluate>("evaluate"), method<accelerations>("accelerations"),
+    method<turning_point_of>("turning_point"),
+    method<two_step_of>("two_step"), method<two_step_late>("two_step_late"),
+    method<two_step_batch>("two_step_batch"), method<follow>("follow"),
+    method<sample_of>("sample"), method<solve>("solve"), method<staircase>("staircase"),
+    method<respond>("respond"), method<rest>("rest"), {nullptr, nullptr, 0, nullptr}};
 PyModuleDef module = {PyModuleDef_HEAD_INIT, "_motion", nullptr, 0, methods, nullptr, nullptr, nullptr, nullptr};
 }  // namespace
 

@@ -90,7 +90,7 @@ def plan_two_step(
             f'start {start!r}, target {target!r}, rate {rate!r}: expected finite numbers')
     if not 1e-14 <= rtol <= 1e-4:
         raise BadInputError(f'rtol is {rtol!r}: expected 1e-14 to 1e-4')
-    if material.creep:
+    if material.creep.ratios and material.creep:
         raise BadInputError(
             'the group has Maxwell branches: expected one without, or plan_sequence for one that '
             'creeps')
@@ -151,21 +151,25 @@ def plan_two_step_batch(
     if not 1e-14 <= rtol <= 1e-4:
         raise BadInputError(f'rtol is {rtol!r}: expected 1e-14 to 1e-4')
     try:
-        arrays = np.broadcast_arrays(*(
-            np.asarray(a, dtype=np.float64) for a in (start, rate, target, zeta, j_lim, c1)))
+        given = [np.asarray(a, dtype=np.float64) for a in (start, rate, target, zeta, j_lim, c1)]
+        shape = np.broadcast_shapes(*(a.shape for a in given))
     except ValueError as error:
         raise BadInputError(f'the arrays do not broadcast against each other: {error}') from error
-    shape = arrays[0].shape
-    columns = [np.array(a).ravel() for a in arrays]
+    # Where there is but one material, it is packed once.
+    alike = all(a.size == 1 for a in given[3:])
+    columns = [np.broadcast_to(a, shape).flatten() for a in given[:3 if alike else 6]]
+    material = law.pack(
+        given[3].item(), given[4].item(), given[5].item(), elastic) if alike else None
     status = np.empty(columns[0].size, dtype=np.int64)
     results = [np.empty(status.size) for _ in range(3)]
     each = _MOST_NUMBERS // (CONSTANTS + (1 if elastic is None else len(elastic.constants)))
 
     def plan(part: slice) -> None:
-        start, rate, target, zeta, j_lim, c1 = (x[part] for x in columns)
-        materials = np.ascontiguousarray(law.pack(zeta, j_lim, c1, elastic))
+        start, rate, target, *groups = (x[part] for x in columns)
+        rows = material if material is not None else np.ascontiguousarray(
+            law.pack(groups[0], groups[1], groups[2], elastic))
         motion.two_step_batch(
-            start, rate, target, materials, materials.shape[1], *load_limits, rtol,
+            start, rate, target, rows, 0 if rows.ndim == 1 else rows.shape[1], *load_limits, rtol,
             HOLD_TOLERANCE, True, status[part], *(x[part] for x in results))
 
     count = max(min(workers or available_cores(), status.size // _PART), 1)

@@ -57,28 +57,36 @@ template <class S> constexpr int size_of = sizeof(S) / sizeof(real<S>);
 template <class S, int W> struct Step {
     using R = real<S>;
     S k[12][W];
+    // A row of the tableau for numbers m and on of a state: one at a time, or a pair.
+    template <class V> HMSA_INLINE static V load(const S *x, int m)
+    {
+        V numbers;
+        std::memcpy(&numbers, reinterpret_cast<const R *>(x) + m, sizeof numbers);
+        return numbers;
+    }
+    template <class V, int I, int... J>
+    HMSA_INLINE V row(int m, std::integer_sequence<int, J...>) const
+    {
+        V x{};
+        (dop853::add<I, J>(x, load<V>(k[J], m)), ...);
+        return x;
+    }
+    template <class V, int I> HMSA_INLINE void put(const S *y, const R &h, S *x, int m) const
+    {
+        V sum = load<V>(y, m);
+        if constexpr (I > 1)
+            sum = sum + h * row<V, I>(m, std::make_integer_sequence<int, I - 1>());
+        // What came last is added last: the rest is ready when it comes.
+        sum = sum + (dop853::a[I][I - 1] * h) * load<V>(k[I - 1], m);
+        std::memcpy(reinterpret_cast<R *>(x) + m, &sum, sizeof sum);
+    }
     template <int I> HMSA_INLINE void stage(const S *y, const R &h, S *x) const
     {
-        constexpr int n = size_of<S>;
-        for (int w = 0; w < W; w++) {
-            R *out = reinterpret_cast<R *>(&x[w]);
-            const R *from = reinterpret_cast<const R *>(&y[w]);
-            for (int m = 0; m < n; m++)
-                // What came last is added last: the rest is ready when it comes.
-                if constexpr (I == 1)
-                    out[m] = from[m] + (dop853::a[1][0] * h) * at(0, w, m);
-                else
-                    out[m] = (from[m] + h * row<I>(w, m, std::make_integer_sequence<int, I - 1>()))
-                        + (dop853::a[I][I - 1] * h) * at(I - 1, w, m);
-        }
-    }
-    HMSA_INLINE const R &at(int i, int w, int m) const { return reinterpret_cast<const R *>(&k[i][w])[m]; }
-    template <int I, int... J>
-    HMSA_INLINE R row(int w, int m, std::integer_sequence<int, J...>) const
-    {
-        R x{};
-        (dop853::add<I, J>(x, at(J, w, m)), ...);
-        return x;
+        constexpr int numbers = W * size_of<S>, paired = sizeof(Pair<R>) > sizeof(R) ? numbers / 2 * 2 : 0;
+        for (int m = 0; m < paired; m += 2)
+            put<Pair<R>, I>(y, h, x, m);
+        for (int m = paired; m < numbers; m++)
+            put<R, I>(y, h, x, m);
     }
     template <int I, class F> HMSA_INLINE void one(const F &f, const S *y, const R &h)
     {
@@ -91,39 +99,25 @@ template <class S, int W> struct Step {
     {
         (one<I + 1>(f, y, h), ...);
     }
-    // Where a state is more than two numbers and their derivatives by one, a loop over the stages:
+    template <int... I>
+    HMSA_INLINE void pick(int i, const S *y, const R &h, S *x, std::integer_sequence<int, I...>) const
+    {
+        ((i == I + 1 ? stage<I + 1>(y, h, x) : void()), ...);
+    }
+    // Where a state is more than three numbers and their derivatives by one, a loop over the stages:
     // the equation is then compiled once, and not twelve times.
-    static constexpr bool unrolled = W == 2 && count_of<S> <= 1;
+    static constexpr bool unrolled = W <= 3 && count_of<S> <= 1;
     template <class F> HMSA_INLINE void move(const F &f, const S *y, const R &h, S *end)
     {
-        if constexpr (unrolled) {
-            f(0, y, k[0]);
+        f(0, y, k[0]);
+        if constexpr (unrolled)
             all(f, y, h, std::make_integer_sequence<int, 11>());
-            stage<12>(y, h, end);
-        } else {
-            for (int i = 0; i < 12; i++) {
-                sum(i, y, h, end);
+        else
+            for (int i = 1; i < 12; i++) {
+                pick(i, y, h, end, std::make_integer_sequence<int, 11>());
                 f(i, end, k[i]);
             }
-            sum(12, y, h, end);
-        }
-    }
-    void sum(int row, const S *y, double h, S *to) const
-    {
-        constexpr int n = W * size_of<S>;
-        double *out = reinterpret_cast<double *>(to);
-        const double *from = reinterpret_cast<const double *>(y);
-        double total[n] = {};
-        for (int j = 0; j < row && j < 12; j++) {
-            const double weight = dop853::a[row][j];
-            if (weight == 0)
-                continue;
-            const double *add = reinterpret_cast<const double *>(k[j]);
-            for (int m = 0; m < n; m++)
-                total[m] += weight * add[m];
-        }
-        for (int m = 0; m < n; m++)
-            out[m] = from[m] + h * total[m];
+        stage<12>(y, h, end);
     }
     // The error of the first two alone, the second of which is small against ``fastest``.
     template <class F> HMSA_INLINE double scaled(

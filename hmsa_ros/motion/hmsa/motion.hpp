@@ -1,29 +1,10 @@
-// Motion over time, with Maxwell branches and behind a coil that lags. Branch i holds
-// ratio (psi'(l) - w), where w follows the elastic force, w' = speed (psi'(l) - w). Where the output
-// of the amplifier is linear in time, the field behind it is a line and an exponential.
+// Motion over time, with Maxwell branches and behind a coil that lags. Where the output of the
+// amplifier is linear in time, the field behind it is a line and an exponential.
 #pragma once
 #include "swing.hpp"
 
 namespace hmsa {
-constexpr int most_branches = 3, most_attempts = 200000;
-
-// Columns of a branch: ratio, 1/time, and where it goes on with the state, what it follows.
-enum Column { ratio_at, speed_at, follower_at };
-
-template <int NB> struct Branches {
-    double ratio[NB + 1] = {}, speed[NB + 1] = {};
-    double total = 1, fastest = 0;
-    // Fewer than NB are filled up by ones that hold nothing.
-    void read(const double *from, int columns, int count)
-    {
-        for (int b = 0; b < count && b < NB; b++) {
-            ratio[b] = from[columns * b + ratio_at];
-            speed[b] = from[columns * b + speed_at];
-            total += ratio[b];
-            fastest = max(fastest, speed[b]);
-        }
-    }
-};
+constexpr int most_attempts = 200000;
 
 // A load: line + slope t + rest exp(-decay t).
 template <class S> struct Drive {
@@ -41,21 +22,6 @@ template <class S, class System, int NB> struct Motion {
     Step<S, width> step;
     Motion(const System &a, const Branches<NB> &b) : system(a), branches(b) {}
 
-    // The derivative of a state by time.
-    HMSA_INLINE void change(const S *x, const S &load, S *by) const
-    {
-        by[0] = x[1];
-        by[1] = system.acceleration(x[0], x[1], system.drag, [&](const S &force)
-            __attribute__((always_inline)) {
-                S net = load - force;
-                for (int b = 0; b < NB; b++) {
-                    const S above = force - x[2 + b];
-                    net = net - above * branches.ratio[b];
-                    by[2 + b] = above * branches.speed[b];
-                }
-                return net;
-            });
-    }
     // Integrates over a duration; h is the step to begin with, 0 for none known, and to go on with.
     // Motion that meets a limiting stretch too hard to be resolved turns there, in no time and
     // without loss.
@@ -86,7 +52,7 @@ template <class S, class System, int NB> struct Motion {
                     S load = line + drive.slope * t;
                     if (fades)
                         load = load + rest * exp(-drive.decay * t);
-                    change(x, load, by);
+                    change(system, branches, x, load, by);
                 }, y, span, max(rtol, felt), end);
             if (!(error <= 1)) {
                 h = span * resized(error);
@@ -120,15 +86,12 @@ inline double faded(double line, double rest, double decay, double duration)
 // Actuators that are advanced together, each by a duration of its own: rows of stretch, rate and
 // step, of the drive, of the packed material, and of the branches (most_branches, 3).
 struct Plant {
-    int first, last;
-    const bool *wanted;
     double *state, *drive;
     const double *material;
     int stride;
     double *branches;  // null where nothing creeps
     const double *durations;
     double rtol;
-    int64_t *status;
 };
 template <int NB, class System> bool advance_row(const Plant &plant, int i, const System &system)
 {
@@ -163,7 +126,7 @@ struct Course {
     int pieces, count;
     const double *switches, *loads, *slopes, *times;
     double stretch, rate, field, lag, zeta, rtol;
-    double *branches;  // (NB, 3)
+    const double *branches;  // (NB, 3)
     int branch_count;
     double *out;
 };

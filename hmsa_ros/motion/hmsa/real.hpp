@@ -2,6 +2,7 @@
 #pragma once
 #include <cstdint>
 #include <cstring>
+#include <type_traits>
 
 // GCC stops inlining where a unit grows, and a step then takes twice as long.
 #define HMSA_INLINE inline __attribute__((always_inline))
@@ -13,6 +14,9 @@ template <class R> constexpr int lanes = sizeof(R) / sizeof(double);
 #if defined(__GNUC__) && !defined(HMSA_NO_LANES)
 typedef double two __attribute__((vector_size(16)));
 typedef double four __attribute__((vector_size(32)));
+template <class R> using Pair = std::conditional_t<lanes<R> == 1, two, R>;
+#else
+template <class R> using Pair = R;
 #endif
 
 HMSA_INLINE double get(double x, int) { return x; }

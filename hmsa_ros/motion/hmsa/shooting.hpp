@@ -129,7 +129,7 @@ template <class System, int NB, int P> struct Shooting {
             if constexpr (count_of<S> > 0) {
                 // By the length of the piece: the equation at its end.
                 S by[2 + NB];
-                motion.change(motion.y, field, by);
+                change(system, branches, motion.y, field, by);
                 const double change = slope[m] - value(rest) * decay * left;
                 for (int c = 0; c < shot.unknowns; c++) {
                     for (int w = 0; w < 2 + NB; w++)

@@ -13,26 +13,22 @@ struct Event {
 };
 
 // Steps of a swing, of a creep into an equilibrium, and of the search inside the last step.
-constexpr int most_steps = 20000, most_inside = 60;
+constexpr int most_steps = 20000, most_creeping = 2000, most_inside = 60;
 // A closer approach to an equilibrium than this share of the move counts as rest.
 constexpr double at_rest = 1e-12;
 // A stretch rounded to a part in 2^52 changes the acceleration by that share of l omega^2. Where
 // this is more than the tolerance keeps, motion close to a limiting stretch is not resolved.
 constexpr double rounding = 3e-16, resolved = 1e-8;
 
-// What acts on a stretch besides its elastic force.
-template <class L> auto under(const L &load)
-{
-    return [load](const auto &force) __attribute__((always_inline)) { return load - force; };
-}
-
-template <class R, class System> struct Swing {
-    static constexpr int n = lanes<R>;
+template <class R, class System, int NB = 0> struct Swing {
+    static constexpr int n = lanes<R>, W = 2 + NB;
+    static constexpr int most = NB ? most_creeping : most_steps;
     using S = Dual<R, 1>;
     using D = Dual<double, 1>;
     using Mask = decltype(R{} < R{});
     System system;
-    S y[2], end[2];
+    Branches<NB> branches;
+    S y[W], end[W];
     R beta, sign, h, t, rtol;
     R still, calm;  // a rate and an acceleration below both are rest
     R room;  // beyond this, l omega is felt by rounding
@@ -42,7 +38,7 @@ template <class R, class System> struct Swing {
     struct Bracket {
         double before, after, size, enough;
     } bracket[n];
-    Step<S, 2> step;
+    Step<S, W> step;
 
     static bool has(const Mask &mask, int i)
     {
@@ -72,12 +68,12 @@ template <class R, class System> struct Swing {
     // From a state, with the length against which closeness to an equilibrium is measured, the
     // natural frequency at the start, and zeta.
     HMSA_APART void begin(int i, double l, double v, double load, double direction, double move,
-        double frequency, double zeta, double tolerance)
+        double frequency, double zeta, double tolerance, const double *followed = nullptr)
     {
-        set(y[0].v, i, l);
-        set(y[1].v, i, v);
-        set(y[0].d[0], i, 0);
-        set(y[1].d[0], i, 0);
+        for (int w = 0; w < W; w++) {
+            set(y[w].v, i, w == 0 ? l : w == 1 ? v : followed[w - 2]);
+            set(y[w].d[0], i, 0);
+        }
         set(beta, i, load);
         set(sign, i, direction);
         set(rtol, i, tolerance);
@@ -104,9 +100,7 @@ template <class R, class System> struct Swing {
     {
         const S load{beta, {R{} + 1.0}};
         error = step([&](int stage, const S *x, S *change) {
-            change[0] = x[1];
-            change[1] = system.acceleration(
-                x[0], x[1], system.drag, under(load), stage == 0 ? &squared : nullptr);
+            hmsa::change(system, branches, x, load, change, stage == 0 ? &squared : nullptr);
         }, y, h, rtol, end);
         slope = step.k[0][1].v;
         steps = steps + 1.0;
@@ -114,9 +108,9 @@ template <class R, class System> struct Swing {
         const auto good = error <= 1.0;
         special = (good & (sign * y[1].v > 0.0) & (sign * end[1].v <= 0.0)) | inside
             | (y[0].v * y[0].v * abs(squared) > felt * felt)
-            | ((speed < still) & (abs(slope) < calm)) | (steps > double(most_steps));
+            | ((speed < still) & (abs(slope) < calm)) | (steps > double(most));
         const auto moves = good & !special;
-        for (int w = 0; w < 2; w++) {
+        for (int w = 0; w < W; w++) {
             y[w].v = select(moves, end[w].v, y[w].v);
             y[w].d[0] = select(moves, end[w].d[0], y[w].d[0]);
         }
@@ -141,13 +135,13 @@ template <class R, class System> struct Swing {
             return over(too_close);
         if (abs(v) < get(still, i) && abs(a) < get(calm, i))
             return over(no_turn);
-        if (get(steps, i) > most_steps)
+        if (get(steps, i) > most)
             return over(stuck);
         // The error counts against what rounding lets a step keep.
         const double counted = get(error, i) * (get(rtol, i) / max(get(rtol, i), kept));
         if (!(counted <= 1 && direction * v > 0 && direction * w <= 0)) {
             if (counted <= 1) {
-                for (int m = 0; m < 2; m++) {
+                for (int m = 0; m < W; m++) {
                     set(y[m].v, i, get(end[m].v, i));
                     set(y[m].d[0], i, get(end[m].d[0], i));
                 }
@@ -173,14 +167,20 @@ template <class R, class System> struct Swing {
     template <class One> HMSA_APART Event land(int i, const One &one)
     {
         const double w = get(end[1].v, i), all = get(h, i), direction = get(sign, i);
-        const D x{get(end[0].v, i), {get(end[0].d[0], i)}}, u{w, {get(end[1].d[0], i)}};
-        const D load{get(beta, i), {1}}, a = one.acceleration(x, u, one.drag, under(load));
+        D at[W], by[W];
+        for (int m = 0; m < W; m++)
+            at[m] = {get(end[m].v, i), {get(end[m].d[0], i)}};
+        change(one, branches, at, D{get(beta, i), {1}}, by);
+        const D &x = at[0], &u = at[1], &a = by[1];
         // Without deceleration it is too early or too late: outside, so that it is bisected.
         double left = -1 - all;
         if (direction * a.v < 0) {
             // The jerk is the derivative along the motion.
-            const double jerk = one.acceleration(
-                D{x.v, {w}}, D{w, {a.v}}, one.drag, under(load.v)).d[0];
+            D along[W], further[W];
+            for (int m = 0; m < W; m++)
+                along[m] = {at[m].v, {by[m].v}};
+            change(one, branches, along, get(beta, i), further);
+            const double jerk = further[1].d[0];
             left = -w / a.v;
             left -= 0.5 * jerk / a.v * left * left;
             if (abs(w) <= bracket[i].enough * bracket[i].size)

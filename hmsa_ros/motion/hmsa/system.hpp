@@ -215,6 +215,43 @@ template <class C> struct AnyOf {
 
 using Any = AnyOf<double>;
 
+constexpr int most_branches = 3;
+// Columns of a branch: ratio, 1/time, and where it goes on with the state, what it follows.
+enum Column { ratio_at, speed_at, follower_at };
+
+// Maxwell branches beside the law: branch i holds ratio (psi'(l) - w), where w follows the elastic
+// force, w' = speed (psi'(l) - w).
+template <int NB> struct Branches {
+    double ratio[NB + 1] = {}, speed[NB + 1] = {};
+    double total = 1, fastest = 0;
+    // Fewer than NB are filled up by ones that hold nothing.
+    void read(const double *from, int columns, int count)
+    {
+        for (int b = 0; b < count && b < NB; b++) {
+            ratio[b] = from[columns * b + ratio_at];
+            speed[b] = from[columns * b + speed_at];
+            total += ratio[b];
+            fastest = max(fastest, speed[b]);
+        }
+    }
+};
+// The derivative by time of a state: stretch, rate, what the branches follow.
+template <int NB, class System, class S, class L> HMSA_INLINE void change(const System &system,
+    const Branches<NB> &branches, const S *x, const L &load, S *by, real<S> *squared = nullptr)
+{
+    by[0] = x[1];
+    by[1] = system.acceleration(x[0], x[1], system.drag, [&](const auto &force)
+        __attribute__((always_inline)) {
+            auto net = load - force;
+            for (int b = 0; b < NB; b++) {
+                const auto above = force - x[2 + b];
+                net = net - above * branches.ratio[b];
+                by[2 + b] = above * branches.speed[b];
+            }
+            return net;
+        }, squared);
+}
+
 // Of small undamped motion about a stretch; where the force falls, the rate at which motion grows.
 template <class System> double frequency(const System &system, double l)
 {

@@ -21,6 +21,7 @@ struct Wanted {
     double least, most;  // admissible loads
     double rtol;
     double hold;  // deviation below which the actuator counts as being there already
+    bool rough = false;  // a guess for another search
 };
 
 // Sign of the deviation is decided by the linearised motion below this share of the move or of the
@@ -35,30 +36,57 @@ constexpr double coarse = 1e-7, farthest = 1e3;
 // the target by ln((l - lower)/(upper - l)), on which the load acts about linearly even close to a
 // limiting stretch. The first passes are coarse and only guess for the last ones, which bracket
 // anew. The search ends at the admissible loads, or far from the target's own where they are
-// infinite.
-template <class System> struct Search {
+// infinite. In place of beta_1, d counts from the load that holds the target while branches stay
+// where they are: under it the motion overshoots, too.
+template <class System, int NB = 0> struct Search {
     System system;
-    double start, rate, target, direction, zeta, lower, upper, beta_1, move, frequency_at_start;
+    Branches<NB> branches;
+    double followed[NB + 1];
+    double start, rate, target, direction, zeta, lower, upper, beta_1, held, move, frequency_at_start;
     double fine, enough, tolerance, least, most, top, guess, low, high, d;
     int pass, times_stuck;
+    bool rough;
     Plan plan;
 
-    double load() const { return beta_1 - direction * d; }
+    double load() const { return held - direction * d; }
+    // What holds a force while the branches stay, with what a motion feels of them.
+    double balance(double force, const double *felt) const
+    {
+        double load = force;
+        for (int b = 0; b < NB; b++)
+            load += felt[b] * (force - followed[b]);
+        return load;
+    }
     // Without damping the energy balance gives d. The linear oscillator says how it shrinks with
     // damping, by 2 K/(1 + K) with the decay K over half a period; its damping ratio is the damping
-    // force, at the rate that the balance gives half way, against that of the spring.
+    // force, at the rate that the balance gives half way, against that of the spring. Branches are
+    // springs to fast motion, dampers to slow motion.
     HMSA_APART double first_guess() const
     {
         if (target == start)
             return infinity();
-        const double e0 = system.energy(start) + 0.5 * system.mass(start) * rate * rate;
-        const double beta = (system.energy(target) - e0) / (target - start);
-        const double delta = direction * (beta_1 - beta), half = 0.5 * (start + target);
-        const double kinetic = e0 + beta * (half - start) - system.energy(half);
+        const double half = 0.5 * (start + target);
+        double felt[NB + 1], drag = system.drag * system.shape(half);
+        for (int b = 0; b < NB; b++) {
+            const double omega = frequency(system, target), phase = omega / branches.speed[b];
+            const double part = branches.ratio[b] * phase / (1 + phase * phase);
+            felt[b] = part * phase;
+            drag += part * system.elastic(target).d[0] / omega;
+        }
+        const auto energy = [&](double l) {
+            double sum = system.energy(l);
+            for (int b = 0; b < NB; b++)
+                sum += felt[b] * (system.energy(l) - followed[b] * l);
+            return sum;
+        };
+        const double e0 = energy(start) + 0.5 * system.mass(start) * rate * rate;
+        const double beta = (energy(target) - e0) / (target - start);
+        const double end = balance(beta_1, felt), delta = direction * (end - beta);
+        const double kinetic = e0 + beta * (half - start) - energy(half);
         const double fastest = sqrt(max(2 * kinetic / system.mass(half), 0.0));
-        const double xi = 0.5 * system.drag * system.shape(half) * fastest / abs(delta);
+        const double xi = 0.5 * drag * fastest / abs(delta);
         const double decay = xi < 0.9 ? exp(-3.141592653589793 * xi / sqrt(1 - xi * xi)) : 1e-3;
-        return delta * 2 * decay / (1 + decay);
+        return direction * (held - end) + delta * 2 * decay / (1 + decay);
     }
     // Returns whether there is something to search.
     HMSA_APART bool begin(const System &of, const double *m, const Move &from, double where, const Wanted &wanted)
@@ -68,25 +96,26 @@ template <class System> struct Search {
         zeta = m[zeta_at], lower = m[lower_at], upper = m[upper_at];
         const auto elastic = system.elastic(target);
         beta_1 = elastic.v;
-        frequency_at_start = frequency(system, start);
+        held = balance(beta_1, branches.ratio);
+        frequency_at_start = sqrt(branches.total) * frequency(system, start);
         move = abs(target - start) + abs(rate) / frequency(system, target);
         const double size = 1 + target;  // errors count against the move and the room that is left
         fine = max(min(wanted.rtol, 1e-10 * move / size), 1e-14);
         enough = max(0.1 * sqrt(fine), 1e-14 * size / move);
         tolerance = max(fine, coarse * min(min(size, move), min(target - lower, upper - target)) / size);
         // A smaller difference of loads is rounding of the elastic force.
-        least = 1e-14 * (abs(beta_1) + abs(target) * elastic.d[0]);
+        least = 1e-14 * (abs(held) + abs(target) * elastic.d[0]);
         most = infinity();
         if (rate == 0) {
-            most = direction * (beta_1 - system.elastic(start).v);
+            most = direction * (held - balance(system.elastic(start).v, branches.ratio));
             if (!(most > 0)) {
                 plan = without(no_two_step, beta_1);
                 return false;
             }
         }
-        top = direction * (beta_1 - (direction > 0 ? wanted.least : wanted.most));
+        top = direction * (held - (direction > 0 ? wanted.least : wanted.most));
         if (!(top < infinity()))
-            top = farthest * (1 + abs(beta_1));
+            top = farthest * (1 + abs(held));
         // From rest beta_p lies between the two holding loads: it is found there, inside or not.
         top = most < infinity() ? max(top, most) : top;
         guess = first_guess();
@@ -94,6 +123,7 @@ template <class System> struct Search {
             guess = most < infinity() ? 0.5 * most : 1;
         low = 0, high = most, d = guess;
         pass = times_stuck = 0;
+        rough = wanted.rough;
         return true;
     }
     bool ended(int status)
@@ -127,7 +157,7 @@ template <class System> struct Search {
         // Against beta_p, where that is the smaller one: close to a limit.
         double relative = abs(next - d) / min(d, 1 + abs(beta));
         if (!(low < next && next < high)) {
-            const bool lost = high < 8 * least, closed = high - low <= 4e-16 * (abs(beta_1) + high);
+            const bool lost = high < 8 * least, closed = high - low <= 4e-16 * (abs(held) + high);
             if (tolerance > fine && (lost || closed)) {
                 // Coarse passes have misled the search: begin again.
                 tolerance = fine;
@@ -146,7 +176,9 @@ template <class System> struct Search {
                 next = low == 0 ? 0.125 * high : 0.5 * (low + high);
             relative = abs(next - d) / min(d, 1 + abs(beta));
         }
-        if (tolerance <= fine && relative <= enough && turn && abs(miss) <= 1e-6 * move) {
+        const bool near = rough ? relative < 0.1 && next > 1e-3 * abs(guess)
+                                : tolerance <= fine && relative <= enough && abs(miss) <= 1e-6 * move;
+        if (turn && near) {
             if (next < least)
                 return ended(indistinguishable);
             const double moved = direction * (next - d);
@@ -191,9 +223,8 @@ template <class System> HMSA_APART bool crosses(const System &system, const doub
             return true;
         if (abs(x) < enough && abs(y[1]) < enough * abs(fast))
             return (y[1] - fast * x) * x < 0;
-        const double error = step([&](int, const double *at, double *change) {
-            change[0] = at[1];
-            change[1] = system.acceleration(at[0], at[1], system.drag, under(beta));
+        const double error = step([&](int, const double *at, double *by) {
+            change(system, Branches<0>{}, at, beta, by);
         }, y, h, rtol, end);
         if (error <= 1)
             y[0] = end[0], y[1] = end[1];
@@ -203,20 +234,20 @@ template <class System> HMSA_APART bool crosses(const System &system, const doub
 }
 
 // Plans moves from any state, one after the other.
-template <class System> struct Planner {
-    Search<System> search;
-    Swing<double, System> swing;
+template <class System, int NB = 0> struct Planner {
+    Search<System, NB> search;
+    Swing<double, System, NB> swing;
 
     void begin_pass()
     {
         swing.begin(0, search.start, search.rate, search.load(), search.direction, search.move,
-            search.frequency_at_start, search.zeta, search.tolerance);
+            search.frequency_at_start, search.zeta, search.tolerance, search.followed);
     }
     Plan shoot(const System &system, const double *m, const Move &move, double direction, const Wanted &wanted)
     {
         if (!search.begin(system, m, move, direction, wanted))
             return search.plan;
-        swing.system = system;
+        swing.system = system, swing.branches = search.branches;
         for (begin_pass();;)
             if (swing.advance()) {
                 const Event event = swing.decide(0, system);

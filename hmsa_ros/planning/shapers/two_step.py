@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 
+from hmsa_ros import motion
 from hmsa_ros.model.moves import Level, Limits, Move
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.planning.shapers.creeping import free_levels, two_levels
@@ -14,7 +15,7 @@ from hmsa_ros.planning.shapers.lagged import at_rest, settle, three_levels
 from hmsa_ros.planning.shapers.push_brake import push_brake
 from hmsa_ros.planning.shapers.request import Request
 from hmsa_ros.planning.shooting import approach, Attempt, first_kept, solve, Template
-from hmsa_ros.planning.two_step import plan_two_step
+from hmsa_ros.planning.two_step import CODES, HOLD_TOLERANCE, plan_two_step, RTOL
 
 # Where a search begins: shares of the way between the least and the largest level, and the longest
 # hold in eighths of a period.
@@ -39,10 +40,11 @@ def two_step(request: Request) -> Move:
     the target there is no such command; the plain step, which does not overshoot there, takes
     its place. Both say so in the move's reason.
     """
-    if request.delivery.lag > 0.0:
-        return _late(request)
-    if request.material.creep:
-        return _creeping(request)
+    delivery, creep = request.delivery, request.material.creep
+    if delivery.lag > 0.0 or creep:
+        # The rest is for what one search does not lead to.
+        move = _at_once(request) if delivery.period == 0.0 and delivery.slew == math.inf else None
+        return move or (_late if delivery.lag > 0.0 else _creeping)(request)
     holding = request.holding_load()
     state, material, target = request.state, request.material, request.target
     plan = plan_two_step(
@@ -61,6 +63,24 @@ def two_step(request: Request) -> Move:
     if request.delivery.period > 0.0:
         return _sampled(request, *ideal)
     return _ramped(request, *ideal)
+
+
+def _at_once(request: Request) -> Move | None:
+    """Return the move with branches or behind a lag, at any time and in steps; None if none."""
+    state, material, limits, lag = (
+        request.state, request.material, request.limits, request.delivery.lag)
+    least, most = limits.minimum, limits.maximum
+    found, beta_p, tau_p, beta_1, push, until = motion.two_step_late(
+        state.stretch, state.rate, request.target, least, most, RTOL, HOLD_TOLERANCE,
+        material.packed, material.branches, state.followed, request.field, request.load, lag)
+    if CODES[found] is not Code.TWO_STEP or not (
+            least <= beta_p <= most and least <= beta_1 <= most and least <= push <= most):
+        return None
+    levels = Level(0.0, beta_p), Level(tau_p, beta_1)
+    if lag == 0.0:
+        return Move(Code.TWO_STEP, levels, tau_p)
+    return Move(
+        Code.TWO_STEP, (levels[0], Level(tau_p, push), Level(until, beta_1)), until)
 
 
 def _without(request: Request, code: Code, holding: float) -> Move:

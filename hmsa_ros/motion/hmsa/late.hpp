@@ -1,0 +1,56 @@
+// The two-step command where branches hold and the field lags: stretch, rate and field arrive
+// together, by a short push more, which settles the field.
+#pragma once
+#include "shooting.hpp"
+#include "two_step.hpp"
+
+namespace hmsa {
+struct Late {
+    Plan plan;
+    double push, until;  // a level from tau_p to then; beta_1 where no field lags
+};
+struct Before {
+    double field, load;  // in force, and the amplifier's
+    double lag;
+    const double *branches;  // (branch_count, 2)
+    int branch_count;
+    const double *followed;  // null where they have relaxed
+};
+
+// P unknowns of the shooting, at least three.
+template <int NB, int P, class System> Late late(const System &system, const double *m, const Move &move,
+    const Wanted &wanted, const Before &before)
+{
+    // Of the push, in time constants: it passes the holding level by as much as the level before
+    // falls short of it.
+    constexpr double length = 0.6931471805599453;
+    Planner<System, NB> planner;
+    auto &search = planner.search;
+    search.branches.read(before.branches, 2, before.branch_count);
+    for (int b = 0; b < NB; b++)
+        search.followed[b] = before.followed && b < before.branch_count
+            ? before.followed[b] : system.elastic(move.start).v;
+    const bool lags = before.lag > 0;
+    Late found{planner(system, m, move, {wanted.least, wanted.most, wanted.rtol, wanted.hold, lags}), 0, 0};
+    Plan &plan = found.plan;
+    found.push = plan.beta_1, found.until = plan.tau_p;
+    if (plan.status != two_step || !lags)
+        return found;
+    double field = plan.beta_1;
+    for (int b = 0; b < NB; b++)
+        field += search.branches.ratio[b] * (plan.beta_1 - planner.swing.end[2 + b].v);
+    const double span = length * before.lag, turn = plan.tau_p + span;
+    double times[3] = {0, turn, turn + span}, loads[3] = {plan.beta_p, 2 * field - plan.beta_p, plan.beta_1};
+    const double d_times[9] = {0, 0, 0, 0, 0, 1, 0, 0, 1}, d_loads[9] = {1, 0, 0, 0, 1, 0, 0, 0, 0};
+    const Shot shot{3, 3, times, loads, d_times, d_loads, move.start, move.rate, before.field,
+        before.load, move.target, infinity(), before.lag, before.branches, before.branch_count,
+        search.followed};
+    Shooting<System, NB, P> shooting{system, shot};
+    double lasts;
+    if (!shooting.solve(m, lasts))
+        plan.status = not_converged;
+    plan.beta_p = loads[0], plan.tau_p = times[1];
+    found.push = loads[1], found.until = times[2];
+    return found;
+}
+}  // namespace hmsa
