@@ -4,6 +4,8 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 import math
 
+import numpy as np
+
 from hmsa_ros.control.lateness import Lateness
 from hmsa_ros.control.records import Note, Settings, Severity, Verdict
 from hmsa_ros.control.seldom import Seldom
@@ -15,9 +17,9 @@ from hmsa_ros.planning.drafting import Steps
 from hmsa_ros.planning.group import PlannerGroup, Resumption
 from hmsa_ros.planning.timeline import Draft, Options
 
-# Residual vibration from peak to peak, as a share of the step, from which on deviations count, and
-# how much less a new plan is to leave than one that goes on as it is.
-_SHARE, _GAIN, _CLEARLY = 5e-3, 5e-3, 0.6
+# Residual vibration from peak to peak, as a share of the step, from which on deviations count, how
+# much less a new plan is to leave, and which share of that it may leave more if all goes wrong.
+_SHARE, _GAIN, _RISK = 5e-3, 5e-3, 0.2
 # Share of a period by which commands may be sent late that are not left out.
 _PART = 0.25
 # How long samples may stay away, in ns, before nothing follows from their times.
@@ -110,10 +112,9 @@ class Following:
             for other in self._group.planners.values():
                 other.delay = self.lateness.expected
         self._strayed[joint] = self._strayed.get(joint, 0.0) + cost
-        again = self._again.get(joint)
-        if settings.replan_late and not planner.as_sent(stamp - max(found.late, 0) - 1) and (
-                self._strayed[joint] > _SHARE
-                or again is not None and (stamp >= again or not planner.awaiting)):
+        if (settings.replan_late and self._strayed[joint] > _SHARE
+                and not planner.as_sent(stamp - max(found.late, 0) - 1)
+                and (stamp >= self._again.get(joint, 0) or not planner.awaiting)):
             self.astray.add(joint)
         if found.asked is not None:
             return self._saturates(joint, found.asked, flux_density)
@@ -219,12 +220,13 @@ class Following:
             planner = self._group.planners[name]
             self._found.pop(name, None)
             plan, (start, levels) = planner.plan, planner.unknown(now)
-            if plan.segments and expected(
-                    start, levels, aims(plan, now), self.lateness) <= _SHARE:
+            wanted = aims(plan, now)
+            left = expected(start, levels, wanted, self.lateness) if wanted else np.array([np.inf])
+            if left.mean() <= _SHARE:
                 return {}
-            if (levels and not self.lateness.known
-                    and math.isfinite(self._strayed.get(name, 0.0))):
-                # Perhaps all are so late.
+            # Whether the next command shows more before it is too late.
+            waits = bool(levels) and levels[0].stamp <= wanted[0].arrival
+            if waits and self.lateness.unsure and left.min() <= _SHARE:
                 self._found[name] = Resumption(None)
                 return {}
             yield
@@ -232,8 +234,12 @@ class Following:
             if found.draft is None:
                 return {}
             before, after = compared(plan, start, levels, found.draft, now, self.lateness)
-            if after > min(_CLEARLY * before, before - _GAIN):
-                found = Resumption(None, left=before)
+            gain = before - after
+            if gain.mean() < _GAIN or gain.min() < -_GAIN - (
+                    _RISK if waits else 1.0) * gain.mean():
+                found = Resumption(None, left=float(before.mean()))
+                self._again[name] = 0 if self.lateness.unsure else (
+                    now + max(_PAUSE, planner.model.ns(1.0)))
             self._found[name] = found
             return {} if found.draft is None else {name: found.draft}
         joints = frozenset([name])
@@ -246,16 +252,14 @@ class Following:
         name, = work.joints
         found = self._found.pop(name, None)
         planner = self._group.planners[name]
+        self.astray.discard(name)
+        if found is not None and found.draft is None:
+            # To be looked at again when there is news.
+            if found.left and not planner.awaiting:
+                self._tell_kept()
+            return None
         self.dropped([name])
         if found is None:
-            return None
-        if found.draft is None:
-            if not self.lateness.known:
-                self._again[name] = 0
-            elif planner.awaiting:
-                self._again[name] = now + max(_PAUSE, planner.model.ns(1.0))
-            if not planner.awaiting:
-                self._tell_kept()
             return None
         self._group.resume(name, found, now)
         why = self._saturated[name][0] if name in self._saturated else ''

@@ -1,6 +1,7 @@
 """How late commands take effect, and what helps: delays of transport and of the driver differ."""
 
 from collections import deque
+from statistics import median_low
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +11,9 @@ from hmsa_ros.model.units import NANOSECONDS
 # Commands that are compared, and the least number that says something.
 _RECENT = 16
 _ENOUGH = 3
-# Commands that are taken to be in time before more is known.
-_TRUSTED = 6
+# How many times their usual difference others are apart that are exceptions, and the least share
+# of those that are none.
+_APART, _MOST = 5.0, 0.6
 # Commands of a joint whose time of sending is remembered.
 _REMEMBERED = 64
 # A driver's delay is called constant where sending earlier or later explains it less than this.
@@ -19,7 +21,7 @@ _CONSTANT = 0.5
 # Vibration, as a share of the step, that is not worth a word.
 _NOTHING = 1e-3
 # Shares of the last commands that were less late than what all of the next may be.
-_SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)
+_SHARES = (0.1, 0.5, 0.9)
 
 
 class Lateness:
@@ -35,6 +37,7 @@ class Lateness:
         self.largest = 0  # how late the latest was, in ns
         self.earliest = 0  # how long before its stamp a command took effect, in ns
         self._missed = False
+        self._effect = 0  # when the newest command took effect, in ns
         self._sent: dict[str, dict[int, int]] = {}
         # How late, in ns, and the vibration that each ns leaves, as a share of the step.
         self._recent: deque[tuple[int, float]] = deque(maxlen=_RECENT)
@@ -57,7 +60,11 @@ class Lateness:
 
         The cost is the vibration that each ns of that leaves, as a share of the step.
         """
-        self._recent.append((late, cost))
+        effect, before = stamp + late, self._effect
+        self._effect = effect
+        if late < 0 or effect - before > tolerance or not self._recent:
+            # Those that come with the one before were held up with it.
+            self._recent.append((late, cost))
         if late > tolerance:
             self.count += 1
             self.largest = max(self.largest, late)
@@ -75,32 +82,41 @@ class Lateness:
 
     # -- what is expected ----------------------------------------------------------------------
 
-    def _known(self) -> list[int]:
-        late = [x for x, _ in self._recent]
-        if self.known and 2 * min(late) > max(late):
-            return sorted(late)
-        # Until more is known, what is late is an exception.
-        return sorted(late + [0] * (_TRUSTED - len(late)))
+    def _likely(self) -> tuple[list[int], list[int]]:
+        """Return how late, in ns, commands usually are, sorted, and whether the newest is not."""
+        # Before anything is known they are in time.
+        late = [0, *(x for x, _ in self._recent)]
+        middle, newest = median_low(late), late[-_ENOUGH:]
+        spread = median_low(abs(x - middle) for x in late)
+        usual = sorted(x for x in late if abs(x - middle) <= _APART * spread)
+        if len(late) > _ENOUGH and (
+                _APART * (max(newest) - min(newest)) < abs(median_low(newest) - middle)):
+            # It has changed.
+            return sorted(newest), []
+        if len(usual) < _MOST * len(late):
+            return sorted(late), []
+        return usual, [] if late[-1] in usual else [late[-1]]
 
     @property
-    def known(self) -> bool:
-        """Whether there is news of enough commands to expect something."""
-        return len(self._recent) >= _ENOUGH
+    def unsure(self) -> bool:
+        """Whether the newest command is an exception, or the first of many."""
+        return bool(self._likely()[1])
 
     @property
     def expected(self) -> int:
         """How late, in ns, the next commands are expected to be."""
-        known = self._known()
-        return known[(len(known) - 1) // 2]
+        return median_low(self._likely()[0])
 
     def scenarios(self, count: int, most: int) -> NDArray[np.int64]:
         """Return how late commands to come may be, in ns; shape (at most `most`, count)."""
-        known = np.array(self._known(), dtype=np.int64)
-        if most == 1 or known[0] == known[-1]:
+        usual, exception = self._likely()
+        if most == 1 or not exception and usual[0] == usual[-1]:
             return np.full((1, count), self.expected)
-        alike = [known[int(x * len(known))] for x in _SHARES]
-        chance = np.random.default_rng(0).choice(known, (most, count))
-        chance[:len(alike)] = np.array(alike[:most])[:, None]
+        alike = np.array([*exception, *(usual[int(x * len(usual))] for x in _SHARES)])[:most, None]
+        if exception:
+            return np.repeat(alike, count, axis=1)
+        chance = np.random.default_rng(0).choice(np.array(usual), (count, most)).T
+        chance[:len(alike)] = alike
         return chance
 
     # -- words ---------------------------------------------------------------------------------

@@ -65,21 +65,19 @@ def aims(plan: Plan, now: int) -> list[Aim]:
 
 def expected(
         start: PlannedLevel, levels: Sequence[PlannedLevel], wanted: Sequence[Aim],
-        lateness: Lateness) -> float:
+        lateness: Lateness) -> NDArray[np.float64]:
     """
-    Return how far from rest at its aims an actuator is expected to be, in sum over them.
+    Return how far from rest at its aims an actuator may be, in sum over them, in several ways.
 
     That is the vibration from peak to peak, and twice the distance, as a share of the step. It
     starts in the state of a level, and the others follow.
     """
     levels = [x for x in levels if wanted[-1].end is None or x.stamp <= wanted[-1].end]
-    last = max(wanted[-1].arrival, levels[-1].stamp if levels else 0, start.stamp)
-    span = start.model.time(last - start.stamp) + 1.0
+    span = start.model.time(max(wanted[-1].arrival - start.stamp, 0)) + 1.0
     most = int(min(max(_LONGEST / span, 1.0), _WAYS))
     stamps = np.array([x.due for x in levels], dtype=np.int64)
-    ways = [_left(start, levels, stamps + late, wanted)
-            for late in lateness.scenarios(len(levels), most)]
-    return sum(ways) / len(ways)
+    return np.array([_left(start, levels, stamps + late, wanted)
+                     for late in lateness.scenarios(len(levels), most)])
 
 
 def _left(
@@ -126,7 +124,7 @@ def _looks(
 
 def compared(
         plan: Plan, start: PlannedLevel, levels: Sequence[PlannedLevel], draft: Draft,
-        now: int, lateness: Lateness) -> tuple[float, float]:
+        now: int, lateness: Lateness) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return what a plan leaves from a start on, by `expected`, and what a draft in its place."""
     first = max(plan.under_way(now), 0)
     kept = first if draft.resumed is None else draft.resumed + draft.missed

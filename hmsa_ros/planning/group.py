@@ -118,7 +118,7 @@ class PlannerGroup:
             tolerance: int) -> Deviation | None:
         """Take in a joint's change of level as `RunningPlan.applied` does."""
         found = self.planners[name].applied(stamp, flux_density, tolerance)
-        if found is not None and not found.beyond(tolerance):
+        if found is not None and found.effect == 0.0:
             self._attempts[name] = 0
         return found
 
