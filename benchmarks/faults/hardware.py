@@ -83,27 +83,24 @@ def _bench(rig: Rig, watchdog: float = 0.0, **parameters: object) -> Iterator[_B
         board.end()
 
 
-def _raised(rig: Rig, name: str, word: str) -> Seen:
-    """Have one call raise something."""
+def _failed(rig: Rig, words: str, reply: str, *texts: str) -> Seen:
+    """Have the next call of a kind answered by something wrong."""
     with _bench(rig) as bench:
         bench.switch_on()
         board = bench.board
 
         def answer(right: str) -> str:
-            if right[0] != word:
+            if right[0] not in words:
                 return right
             board.answer = str
-            return f'RAISE {name}'
+            return reply
 
         begin = monotonic()
         board.answer = answer
         status = bench.ends()
-        method = {'K': 'write', 'S': 'read'}[word]
-        said = f'SerialCoil.{method} of joint actuator raised {name}' in bench.last \
-            and 'the coil is switched off' in bench.last
         off = board.off_since(begin)
         return Seen(f'exit {status}, "{bench.last}"', f'off after {off:.2f} s',
-                    status == 1 and said and off < _TIMEOUT)
+                    status == 1 and all(x in bench.last for x in texts) and off < _TIMEOUT)
 
 
 for _name, _word, _call in (
@@ -113,27 +110,16 @@ for _name, _word, _call in (
         f'driver_{_name.lower()}', f'a driver whose {_call} raises {_name}',
         'a board on a serial line, 20 mT flow',
         'the coil is off within command_timeout, the call and the error are named, exit 1')(
-            lambda rig, name=_name, word=_word: _raised(rig, name, word))
+            lambda rig, name=_name, word=_word, call=_call: _failed(
+                rig, word, f'RAISE {name}',
+                f'SerialCoil.{call} of joint actuator raised {name}', 'the coil is switched off'))
 
 
-@FAULTS.fault(
+FAULTS.fault(
     'driver_garbage', 'a driver whose board answers garbage',
-    'half a line, then right answers again', 'the coil is off within command_timeout, exit 1')
-def _garbage(rig: Rig) -> Seen:
-    with _bench(rig) as bench:
-        bench.switch_on()
-        board = bench.board
-
-        def answer(_: str) -> str:
-            board.answer = str
-            return '#*;S 1.'
-
-        begin = monotonic()
-        board.answer = answer
-        status = bench.ends()
-        off = board.off_since(begin)
-        return Seen(f'exit {status}, "{bench.last}"', f'off after {off:.2f} s',
-                    status == 1 and 'SerialCoil.' in bench.last and off < _TIMEOUT)
+    'half a line, then right answers again',
+    'the coil is off within command_timeout, exit 1')(
+        lambda rig: _failed(rig, 'KS', '#*;S 1.', 'SerialCoil.'))
 
 
 @FAULTS.fault(

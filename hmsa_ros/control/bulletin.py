@@ -29,12 +29,14 @@ class Bulletin:
 
     def __init__(
             self, group: PlannerGroup, following: Following, watch: Watch, clock: Clock,
-            steady: Clock, unheard: Callable[[], str]) -> None:
+            steady: Clock, unheard: Callable[[], str], unseen: Callable[[], str]) -> None:
         self._group, self._following, self._watch = group, following, watch
-        self._clock, self._steady, self._look = clock, steady, unheard
+        self._clock, self._steady = clock, steady
+        self._looks = unheard, unseen
         self._look_again = 0
         self.unheard = ''  # why nobody carries out commands; empty where somebody does
-        self.verdict = Verdict(Severity.OK, 'none', 'no request yet')
+        self.unseen = ''  # of which joint samples have ceased; empty for none
+        self.verdict = Verdict(Severity.OK, Code.NONE, 'no request yet')
         self.outputs: list[Output] = []
         self.preview_again: int | None = None  # time in ns of the next part of a long plan
         self._told: tuple[Progress, Mapping[str, Progress], bool] | None = None
@@ -45,7 +47,7 @@ class Bulletin:
 
     def give(self, verdict: Verdict, *, log: bool = False) -> None:
         """Give a verdict; what went wrong is not taken back by a correction."""
-        if verdict.code != 'corrected' or not self._warned:
+        if verdict.code is not Code.CORRECTED or not self._warned:
             self.verdict = verdict
         if log:
             self.note(verdict.message)
@@ -67,7 +69,7 @@ class Bulletin:
         self.outputs.append(StatusChanged(
             self.verdict, progress, each, self._group.number, self._following.lateness.count,
             self._following.replanned, self._watch.findings, self._watch.worst, watching,
-            self.unheard, self._watch.measuring,
+            self.unheard, self.unseen, self._watch.measuring,
             {name: x.model.units.coordinate for name, x in self._group.planners.items()}))
 
     def tell_progress(self, now: int) -> None:
@@ -109,7 +111,7 @@ class Bulletin:
         fine = worst.arrived or worst.verdict is Code.UNOBSERVED and not self._watch.measuring
         self.give(
             Verdict(
-                Severity.OK if fine else Severity.WARN, str(worst.verdict), worst.message,
+                Severity.OK if fine else Severity.WARN, worst.verdict, worst.message,
                 self.verdict.request), log=worst.failed and worst in findings)
 
     def corrected(self, names: Iterable[str]) -> None:
@@ -118,13 +120,17 @@ class Bulletin:
             self._watch.corrected(name)
 
     def look_for_listeners(self) -> None:
-        """Warn where nobody carries out what is sent, and say when somebody does."""
+        """Warn where nobody carries out what is sent, or samples cease, and say when that ends."""
         now = self._steady()
         if now < self._look_again:
             return
         self._look_again = now + LOOK
-        before, self.unheard = self.unheard, self._look()
-        if self.unheard == before:
-            return
-        self.note(self.unheard or 'commands are carried out now')
-        self.tell()
+        before = self.unheard, self.unseen
+        self.unheard, self.unseen = (look() for look in self._looks)
+        for one, other, well in zip(
+                before, (self.unheard, self.unseen),
+                ('commands are carried out now', 'samples come again'), strict=True):
+            if one != other:
+                self.note(other or well)
+        if before != (self.unheard, self.unseen):
+            self.tell()

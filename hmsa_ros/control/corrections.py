@@ -155,7 +155,7 @@ class Corrections:
             self._group.planners[name].take(draft, now)
             self._feedback.corrected(name, draft.begin, self._after.pop(name, 0.0))
             return Verdict(
-                Severity.OK, 'corrected', f'corrected from samples: {words}', request)
+                Severity.OK, Code.CORRECTED, f'corrected from samples: {words}', request)
         return None
 
 

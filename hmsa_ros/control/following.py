@@ -10,16 +10,21 @@ from hmsa_ros.control.lateness import Lateness
 from hmsa_ros.control.records import Note, Settings, Severity, Verdict
 from hmsa_ros.control.seldom import Seldom
 from hmsa_ros.control.slices import Clock, in_time, Work
-from hmsa_ros.control.weighing import aims, compared, expected, step_of
+from hmsa_ros.control.weighing import (
+    aims,
+    compared,
+    expected,
+    SHARE,
+    step_of,
+    worthwhile,
+)
 from hmsa_ros.errors import HmsaError
+from hmsa_ros.model.status import Code
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.drafting import Steps
 from hmsa_ros.planning.group import PlannerGroup, Resumption
 from hmsa_ros.planning.timeline import Draft, Options
 
-# Residual vibration from peak to peak, as a share of the step, from which on deviations count, how
-# much less a new plan is to leave, and which share of that it may leave more if all goes wrong.
-_SHARE, _GAIN, _RISK = 5e-3, 5e-3, 0.2
 # Share of a period by which commands may be sent late that are not left out.
 _PART = 0.25
 # How long samples may stay away, in ns, before nothing follows from their times.
@@ -112,7 +117,7 @@ class Following:
             for other in self._group.planners.values():
                 other.delay = self.lateness.expected
         self._strayed[joint] = self._strayed.get(joint, 0.0) + cost
-        if (settings.replan_late and self._strayed[joint] > _SHARE
+        if (settings.replan_late and self._strayed[joint] > SHARE
                 and not planner.as_sent(stamp - max(found.late, 0) - 1)
                 and (stamp >= self._again.get(joint, 0) or not planner.awaiting)):
             self.astray.add(joint)
@@ -136,7 +141,7 @@ class Following:
         self._limit(
             joint, max(options.flux_density_min, reached if asked < 0.0 else -math.inf),
             min(options.flux_density_max, reached if asked > 0.0 else math.inf))
-        self.verdicts.append(Verdict(Severity.WARN, 'saturated', words, figures={
+        self.verdicts.append(Verdict(Severity.WARN, Code.SATURATED, words, figures={
             'commanded': asked, 'reached': reached}))
         return [Note(Severity.WARN, words)]
 
@@ -220,26 +225,24 @@ class Following:
             planner = self._group.planners[name]
             self._found.pop(name, None)
             plan, (start, levels) = planner.plan, planner.unknown(now)
-            wanted = aims(plan, now)
-            left = expected(start, levels, wanted, self.lateness) if wanted else np.array([np.inf])
-            if left.mean() <= _SHARE:
+            wanted = aims(plan, planner.soonest(now))
+            left = expected(start, levels, wanted, self.lateness) if wanted else np.zeros(1)
+            if left.mean() <= SHARE:
                 return {}
-            # Whether the next command shows more before it is too late.
-            waits = bool(levels) and levels[0].stamp <= wanted[0].arrival
-            if waits and self.lateness.unsure and left.min() <= _SHARE:
+            # Whether there will be news before the move under way ends.
+            news = bool(levels) and levels[0].due <= aims(plan, now)[0].arrival
+            unsure = self.lateness.unsure
+            if news and unsure and left.min() <= SHARE:
                 self._found[name] = Resumption(None)
                 return {}
             yield
             found = yield from self._group.draft_resumption(name, now)
             if found.draft is None:
                 return {}
-            before, after = compared(plan, start, levels, found.draft, now, self.lateness)
-            gain = before - after
-            if gain.mean() < _GAIN or gain.min() < -_GAIN - (
-                    _RISK if waits else 1.0) * gain.mean():
+            before, after = compared(plan, start, levels, found.draft, self.lateness)
+            if not worthwhile(before, after, news=news, unsure=unsure):
                 found = Resumption(None, left=float(before.mean()))
-                self._again[name] = 0 if self.lateness.unsure else (
-                    now + max(_PAUSE, planner.model.ns(1.0)))
+                self._again[name] = 0 if unsure else now + max(_PAUSE, planner.model.ns(1.0))
             self._found[name] = found
             return {} if found.draft is None else {name: found.draft}
         joints = frozenset([name])
@@ -265,13 +268,13 @@ class Following:
         why = self._saturated[name][0] if name in self._saturated else ''
         if found.refusal:
             return Verdict(
-                Severity.ERROR, 'saturated' if why else 'stopped', f'{why}; ' * bool(why) +
+                Severity.ERROR, Code.SATURATED if why else Code.STOPPED, f'{why}; ' * bool(why) +
                 f'joint {name} comes to rest, since its sequence cannot be resumed: '
                 f'{found.refusal}', request)
         self.replanned += 1
         missed = drafts[name].missed
         return Verdict(
-            Severity.WARN, 'saturated' if why else 'replanned',
+            Severity.WARN, Code.SATURATED if why else Code.REPLANNED,
             (why or 'commands did not take effect as planned') + ': the rest is replanned' + (
                 f', without {missed} setpoints whose time has passed' if missed else ''), request)
 
@@ -280,11 +283,11 @@ class Following:
         name, = work.joints
         self.dropped([name])
         return Verdict(
-            Severity.ERROR, 'not_converged', f'joint {name} cannot be replanned: {error}',
+            Severity.ERROR, Code.NOT_CONVERGED, f'joint {name} cannot be replanned: {error}',
             request)
 
     def _tell_kept(self) -> None:
         """Give the verdict where a new plan does not help."""
         self.verdicts.append(Verdict(
-            Severity.WARN, 'late', f'{self.advice}; a new plan would not leave less',
+            Severity.WARN, Code.LATE, f'{self.advice}; a new plan would not leave less',
             figures={'largest_lateness': self.lateness.largest / NANOSECONDS}))

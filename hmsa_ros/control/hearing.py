@@ -70,7 +70,7 @@ class Hearing:
         self._following.astray.discard(joint)
         self._group.planners[joint].abandon(self._clock())
         return Verdict(
-            Severity.ERROR, str(Code.CUT_OFF),
+            Severity.ERROR, Code.CUT_OFF,
             f'the coil of joint {joint} was cut off by the plant or driver: the rest of the '
             'sequence is dropped, and the next request starts from where the actuator is then')
 

@@ -22,6 +22,8 @@ _CONSTANT = 0.5
 _NOTHING = 1e-3
 # Shares of the last commands that were less late than what all of the next may be.
 _SHARES = (0.1, 0.5, 0.9)
+# Ways to go on after an exception, of which it lasts in one.
+_RARE = 8
 
 
 class Lateness:
@@ -37,7 +39,7 @@ class Lateness:
         self.largest = 0  # how late the latest was, in ns
         self.earliest = 0  # how long before its stamp a command took effect, in ns
         self._missed = False
-        self._effect = 0  # when the newest command took effect, in ns
+        self._effects: dict[str, int] = {}  # when the newest command took effect, in ns
         self._sent: dict[str, dict[int, int]] = {}
         # How late, in ns, and the vibration that each ns leaves, as a share of the step.
         self._recent: deque[tuple[int, float]] = deque(maxlen=_RECENT)
@@ -60,10 +62,9 @@ class Lateness:
 
         The cost is the vibration that each ns of that leaves, as a share of the step.
         """
-        effect, before = stamp + late, self._effect
-        self._effect = effect
-        if late < 0 or effect - before > tolerance or not self._recent:
-            # Those that come with the one before were held up with it.
+        before, self._effects[joint] = self._effects.get(joint), stamp + late
+        if late < 0 or before is None or stamp + late > before + tolerance:
+            # One that comes with the one before was held up with it.
             self._recent.append((late, cost))
         if late > tolerance:
             self.count += 1
@@ -83,14 +84,13 @@ class Lateness:
     # -- what is expected ----------------------------------------------------------------------
 
     def _likely(self) -> tuple[list[int], list[int]]:
-        """Return how late, in ns, commands usually are, sorted, and whether the newest is not."""
+        """Return how late, in ns, commands usually are, sorted, and the newest if that is not."""
         # Before anything is known they are in time.
-        late = [0, *(x for x, _ in self._recent)]
+        late = [0, 0, *(x for x, _ in self._recent)]
         middle, newest = median_low(late), late[-_ENOUGH:]
         spread = median_low(abs(x - middle) for x in late)
         usual = sorted(x for x in late if abs(x - middle) <= _APART * spread)
-        if len(late) > _ENOUGH and (
-                _APART * (max(newest) - min(newest)) < abs(median_low(newest) - middle)):
+        if _APART * (max(newest) - min(newest)) < abs(median_low(newest) - middle):
             # It has changed.
             return sorted(newest), []
         if len(usual) < _MOST * len(late):
@@ -112,9 +112,11 @@ class Lateness:
         usual, exception = self._likely()
         if most == 1 or not exception and usual[0] == usual[-1]:
             return np.full((1, count), self.expected)
-        alike = np.array([*exception, *(usual[int(x * len(usual))] for x in _SHARES)])[:most, None]
         if exception:
-            return np.repeat(alike, count, axis=1)
+            # It lasts, or it is over: the more probable the more were in time before.
+            ways = [*exception, *usual[::-(-len(usual) // (min(most, _RARE) - 1))]]
+            return np.repeat(np.array(ways)[:, None], count, axis=1)
+        alike = np.array([usual[int(x * len(usual))] for x in _SHARES])[:most, None]
         chance = np.random.default_rng(0).choice(np.array(usual), (count, most)).T
         chance[:len(alike)] = alike
         return chance

@@ -29,10 +29,11 @@ from hmsa_ros.control.records import (
     Verdict,
 )
 from hmsa_ros.control.sending import Sending
+from hmsa_ros.control.silence import Silence
 from hmsa_ros.control.slices import Clock, work_on
 from hmsa_ros.control.takeover import Seen, Takeover
 from hmsa_ros.control.watching import Watch
-from hmsa_ros.model.status import RefusedError
+from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.timeline import Model
@@ -40,7 +41,7 @@ from hmsa_ros.planning.timeline import Model
 # Clock jumps nearer to each other than this make one verdict.
 _STORM = NANOSECONDS
 _WAITING = Verdict(
-    Severity.OK, 'waiting', 'accepted: starts as soon as the current state is known')
+    Severity.OK, Code.WAITING, 'accepted: starts as soon as the current state is known')
 
 
 class PlannerRuntime:
@@ -72,11 +73,12 @@ class PlannerRuntime:
         self._clock, self._steady, self._observable = clock, steady, observable
         self._glance = glance
         self._takeover = Takeover(group, clock, steady, observable, unheard)
+        self._silence = Silence(clock, steady, observable)
         self._watch = Watch(group, steady, clock)
         self.hearing = Hearing(group, self.following, self._takeover, clock, steady)
         self._bulletin = Bulletin(
             group, self.following, self._watch, clock, steady,
-            lambda: unheard() or self.hearing.receipts.words)
+            lambda: unheard() or self.hearing.receipts.words, self._unseen)
         self.sending = Sending(
             group, self.following, self.hearing.receipts, self._bulletin.outputs)
         self.feedback = Feedback(group, settings, self._bulletin.outputs, clock)
@@ -135,6 +137,11 @@ class PlannerRuntime:
     def _look_at_samples(self) -> None:
         for joint, seen in self._glance():
             self._takeover.observe(joint, seen)
+            self._silence.heard(joint, seen.stamp)
+
+    def _unseen(self) -> str:
+        self._look_at_samples()
+        return self._silence.words
 
     def received(
             self, joint: str, time: int, command: int, *, cut_off: bool) -> None:
@@ -203,12 +210,13 @@ class PlannerRuntime:
         self.feedback.restart()
         self.hearing.receipts.clock_set_back()
         self._takeover.drop()
+        self._silence.restart()
         self._takeover.engaged = False
         last, self._last_jump = self._last_jump, self._steady()
         if last is not None and self._last_jump - last < _STORM:
             return
         self._bulletin.give(Verdict(
-            Severity.WARN, 'clock_jumped',
+            Severity.WARN, Code.CLOCK_JUMPED,
             f'the clock jumped back by {back / NANOSECONDS:.3f} s: the plan is dropped, and the '
             'actuator is assumed where it began, at initial_stretch, unless joint_states shows '
             'otherwise'),
@@ -229,7 +237,7 @@ class PlannerRuntime:
             self.planning.clear()
             self.sending.send(now, everything=True)
             self._watch.restart()
-            self._bulletin.give(Verdict(Severity.OK, 'stopped', 'deactivated: coming to rest'))
+            self._bulletin.give(Verdict(Severity.OK, Code.STOPPED, 'deactivated: coming to rest'))
         self._takeover.engaged = False
 
     def change(
@@ -294,8 +302,9 @@ class PlannerRuntime:
         if self._bulletin.preview_again is not None and now >= self._bulletin.preview_again:
             self._bulletin.show()
         self._bulletin.tell_progress(now)
-        if self.active and (self._watch.open or self._bulletin.unheard or self.hearing.receipts
-                            or self._bulletin.next_change is not None):
+        if self.active and (
+                self._watch.open or self._bulletin.unheard or self._bulletin.unseen
+                or self.hearing.receipts or self._bulletin.next_change is not None):
             self._bulletin.look_for_listeners()
             self._judge(now)
         self._begin_anew()
@@ -398,6 +407,10 @@ class PlannerRuntime:
             message = f'{late.count} commands late: {self.following.advice}'
         elif offset is not None and offset.beyond(limit):
             severity, message = Severity.WARN, offset.words
+        if self.active:
+            self._bulletin.look_for_listeners()
+        if self._bulletin.unseen:
+            severity, message = Severity.WARN, self._bulletin.unseen
         if self.hearing.receipts.words:
             severity, message = Severity.ERROR, self.hearing.receipts.words
         note = self.hearing.clocks_changed(limit)

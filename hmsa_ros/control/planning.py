@@ -73,7 +73,7 @@ class Planning:
                 self._queue.remove(old)
                 if old.request is not None:
                     self._bulletin.give(Verdict(
-                        Severity.WARN, 'superseded', 'another request came before this one was '
+                        Severity.WARN, Code.SUPERSEDED, 'another request came before this one was '
                         'planned', old.request.name))
 
     def work_on(self) -> None:
@@ -139,13 +139,13 @@ class Planning:
         self._bulletin.look_for_listeners()
         if warnings:
             self._bulletin.give(Verdict(
-                Severity.WARN, str(warnings[0].code), warnings[0].reason, request.name), log=True)
+                Severity.WARN, warnings[0].code, warnings[0].reason, request.name), log=True)
         elif changed:
             self._bulletin.give(Verdict(
-                Severity.OK, 'accepted', _accepted(drafts), request.name))
+                Severity.OK, Code.ACCEPTED, _accepted(drafts), request.name))
         else:
             self._bulletin.give(Verdict(
-                Severity.OK, 'unchanged', 'already on the way there: the plan is unchanged',
+                Severity.OK, Code.UNCHANGED, 'already on the way there: the plan is unchanged',
                 request.name))
 
     def refuse(self, error: HmsaError, request: Request) -> Verdict:
@@ -154,7 +154,7 @@ class Planning:
         if isinstance(error, RefusedError):
             code = error.code
         self.refused += 1
-        self._bulletin.give(Verdict(Severity.ERROR, str(code), str(error), request.name))
+        self._bulletin.give(Verdict(Severity.ERROR, code, str(error), request.name))
         self._bulletin.outputs.append(Note(Severity.ERROR, f'request refused ({code}): {error}'))
         return self._bulletin.verdict
 

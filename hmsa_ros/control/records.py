@@ -9,6 +9,7 @@ from hmsa_ros.estimation.correction import TOLERANCE
 from hmsa_ros.estimation.prior import TRACKED
 from hmsa_ros.identification.known import Known
 from hmsa_ros.judge import Finding, Tolerances
+from hmsa_ros.model.status import Code
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.group import Progress
 
@@ -103,7 +104,7 @@ class Verdict:
     """How a request fares; an error where it is not carried out."""
 
     severity: Severity
-    code: str  # one word for programs
+    code: Code
     message: str  # one sentence for people
     request: str = ''  # its name
     figures: Mapping[str, float] = field(default_factory=dict)  # what the sentence is about
@@ -141,6 +142,7 @@ class StatusChanged:
     worst: Finding | None = None  # of the last request
     watching: bool = False  # whether setpoints that have begun are still to be judged
     unheard: str = ''  # why nobody carries out commands; empty where somebody does
+    unseen: str = ''  # of which joint samples have ceased; empty for none
     measuring: bool = False  # whether samples have come lately
     # What each joint's position is called.
     coordinates: Mapping[str, str] = field(default_factory=dict)

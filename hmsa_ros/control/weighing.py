@@ -23,6 +23,13 @@ from hmsa_ros.planning.timeline import Draft, Plan, PlannedLevel
 
 #: A step that is smaller counts as this one.
 LEAST_STEP = 0.1
+#: Residual vibration from peak to peak, as a share of the step, from which on it counts.
+SHARE = 5e-3
+# How much less a new plan is to leave, and how much more it may; after an exception, which share of
+# that more if it was none, and which share of what is there where nothing more will be known.
+_GAIN, _RISK, _CLEARLY = 5e-3, 0.2, 0.5
+# What stands for a motion that cannot be predicted.
+_LOST = 1e3
 # Setpoints that are looked at, how far ahead the next one may begin, units of time that may be
 # simulated, and ways in which commands may be late.
 _SETPOINTS, _NEAR, _LONGEST, _WAYS = 2, 50.0, 2000.0, 16
@@ -103,7 +110,7 @@ def _left(
             stretch=state.stretch, rate=state.rate, slopes=slopes, lag=model.delivery.lag,
             field=state.load, followed=state.followed)
     except HmsaError:
-        return math.inf
+        return _LOST
     return sum(
         2.0 * math.hypot(x - aim.stretch, v / model.frequency(aim.stretch)) / aim.step
         for x, v, aim in zip(stretch.tolist(), rate.tolist(), wanted, strict=True))
@@ -124,19 +131,36 @@ def _looks(
 
 def compared(
         plan: Plan, start: PlannedLevel, levels: Sequence[PlannedLevel], draft: Draft,
-        now: int, lateness: Lateness) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        lateness: Lateness) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return what a plan leaves from a start on, by `expected`, and what a draft in its place."""
-    first = max(plan.under_way(now), 0)
+    first = max(plan.under_way(draft.begin), 0)
     kept = first if draft.resumed is None else draft.resumed + draft.missed
     wanted = []
-    for place, aim in enumerate(aims(plan, now), first):
-        # As late as the later of the two arrives.
+    for place, aim in enumerate(aims(plan, draft.begin), first):
+        # As late as the later of the two arrives; what a draft leaves, at its end.
         own = draft.segments[place - kept] if 0 <= place - kept < len(draft.segments) else None
-        arrival = aim.arrival if own is None or own.arrival is None else own.arrival
-        wanted.append(replace(aim, arrival=max(aim.arrival, arrival)))
+        arrival = own.arrival if own is not None else (
+            aim.end if draft.resumed is not None and place >= draft.resumed else None)
+        wanted.append(replace(aim, arrival=max(aim.arrival, arrival or aim.arrival)))
     anew = [*(x for x in levels if x.stamp < draft.begin), *draft.levels]
     # What a draft leaves out, beyond what is looked at, is missed by a step each.
     out = max(len(plan.segments) - first - len(wanted), 0) if draft.resumed is None else 0
     return (
         expected(start, levels, wanted, lateness),
         expected(start, anew, wanted, lateness) + 2.0 * out)
+
+
+def worthwhile(
+        before: NDArray[np.float64], after: NDArray[np.float64], *, news: bool,
+        unsure: bool) -> bool:
+    """
+    Return whether to take a draft, by what is left without it and with it in several ways.
+
+    It must do no harm in any way. Where the newest command was an exception (``unsure``), a little
+    is allowed; once there will be no ``news`` in time, it is enough that much less is left.
+    """
+    gain = before - after
+    mean, harm = float(gain.mean()), float(-gain.min())
+    if unsure and not news:
+        return mean >= max(_GAIN, (1.0 - _CLEARLY) * float(before.mean()))
+    return mean >= _GAIN >= harm - _RISK * mean * unsure

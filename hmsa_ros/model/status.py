@@ -10,8 +10,8 @@ class Code(str, Enum):
     """
     The outcome of a move or a request; the value is what messages and files carry.
 
-    The first eleven are plans that can be carried out, the next ones refusals, and the last seven
-    what was measured.
+    In this order: plans that can be carried out, refusals, what became of a request, and what was
+    measured.
     """
 
     TWO_STEP = 'two_step'
@@ -43,6 +43,17 @@ class Code(str, Enum):
     CLOCKS_DIFFER = 'clocks_differ'
     UNSEEN = 'unseen'
     CUT_OFF = 'cut_off'
+
+    NONE = 'none'
+    WAITING = 'waiting'
+    ACCEPTED = 'accepted'
+    UNCHANGED = 'unchanged'
+    SUPERSEDED = 'superseded'
+    CORRECTED = 'corrected'
+    REPLANNED = 'replanned'
+    SATURATED = 'saturated'
+    STOPPED = 'stopped'
+    CLOCK_JUMPED = 'clock_jumped'
 
     ARRIVED = 'arrived'
     OFF_TARGET = 'off_target'
@@ -142,6 +153,29 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'its state, and the rest of the sequence was dropped.',
         'Send the request again: it starts from where the actuator is by then. With '
         'after_cut_off resume the planner goes on by itself.'),
+    Code.NONE: ('No request has come yet.', ''),
+    Code.WAITING: (
+        'The request is accepted and starts as soon as the current state is known.', ''),
+    Code.ACCEPTED: ('The request is planned and is being carried out.', ''),
+    Code.UNCHANGED: ('The actuator is already on the way there: the plan is unchanged.', ''),
+    Code.SUPERSEDED: ('Another request came before this one was planned.', ''),
+    Code.CORRECTED: ('The plan was corrected from samples (feedback: adapt).', ''),
+    Code.REPLANNED: (
+        'Commands did not take effect as planned, and the rest was planned anew from the state '
+        'that they led to. Setpoints whose time had passed were left out; the message says how '
+        'many.',
+        'Raise lead_time, or see what delays or drops commands.'),
+    Code.SATURATED: (
+        'The amplifier did not reach a level that was commanded. Until the next request no level '
+        'beyond that is commanded, and the rest of the sequence is planned within it.',
+        'Set flux_density_max or flux_density_min to what the amplifier provides.'),
+    Code.STOPPED: (
+        'The actuator comes to rest: the planner was deactivated, or the rest of the sequence '
+        'could not be planned anew, for the reason that the message gives.',
+        'Send the request again.'),
+    Code.CLOCK_JUMPED: (
+        'The clock was set back, and the plan was dropped.',
+        'Send the request again; set clocks before the experiment.'),
     Code.ARRIVED: (
         'Measured: the stretch rests at the setpoint, within the tolerances.', ''),
     Code.OFF_TARGET: (

@@ -135,9 +135,10 @@ def to_planner_status(status: 'StatusChanged') -> DiagnosticStatus:
         values |= {f'{prefix}{key}': value for key, value in of_each.items()}
     values |= of_joints('coordinate', status.coordinates)
     severity, message = int(verdict.severity), verdict.message
-    if status.unheard:
-        values['unheard'] = status.unheard
-        severity, message = max(severity, 1), f'{message}; but {status.unheard}'
+    for key, trouble in (('unheard', status.unheard), ('unseen', status.unseen)):
+        if trouble:
+            values[key] = trouble
+            severity, message = max(severity, 1), f'{message}; but {trouble}'
     return to_status('planner: request', ', '.join(each), severity, message, values)
 
 

@@ -288,6 +288,7 @@ class PlannerNode(ManagedNode):
 
     def _report(self) -> Iterable[DiagnosticStatus]:
         severity, message, values = self._runtime.report()
+        self._serve()
         if crowded := self._crowd():
             severity, message = Severity.ERROR, crowded
             if crowded != self._crowded:
