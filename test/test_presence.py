@@ -94,3 +94,32 @@ def test_planner_that_is_not_active_yet_is_named_by_who_sends(serve, capfd, chan
         getattr(served.nodes[0], f'trigger_{name}')()
     assert main(['send', '1.1:0.1']) in (1, 2)
     assert f'hmsa: error: {sentence}' in capfd.readouterr().err
+
+
+@pytest.mark.slow
+def test_samples_that_cease_are_a_state_of_their_own(ros, serve):
+    serve(PlannerNode)
+    asking = Asking(ros)
+    statuses = ros.collect(topics.STATUS.type, '/planner/status')
+    samples = endpoints.publisher(ros.node, topics.JOINT_STATES)
+
+    def report() -> tuple[int, bool, bool]:
+        """Return the severity in diagnostics, and whether these and the status name samples."""
+        found, text = asking.reports.get('planner'), 'no sample of joint actuator'
+        return (
+            found.level[0] if found else -1, bool(found) and text in found.message,
+            bool(statuses) and text in statuses[-1].message)
+
+    def sampled() -> tuple[int, bool, bool]:
+        message = JointState(name=['actuator'], position=[1.0])
+        message.header.stamp = ros.node.get_clock().now().to_msg()
+        samples.publish(message)
+        return report()
+
+    ros.spin_until(samples.get_subscription_count, 'the planner')
+    for _ in range(2):
+        # A report is of samples that have come before the one before it.
+        asking.reports.clear()
+        ros.spin_until(lambda: sampled() == (0, False, False), 'samples')
+    ros.spin_until(lambda: report() == (1, True, True), 'that they have ceased')
+    ros.spin_until(lambda: sampled() == (0, False, False), 'that they come again')

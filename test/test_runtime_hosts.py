@@ -212,6 +212,33 @@ def test_a_move_does_not_start_where_samples_have_ceased():
     assert rig.runtime.request(Target('a', 1.1)).code == 'accepted'
 
 
+def test_samples_that_cease_are_named_when_they_do_and_when_they_come_again():
+    rig = Bench()
+    rig.runtime.request(Target('a', 1.2))
+    rig.run(START + 3000 * MS)
+    assert rig.status.unseen == ''
+    rig.samples = False
+    rig.run(START + 4900 * MS)
+    assert rig.status.unseen == ''
+    rig.run(START + 5400 * MS)
+    text = 'no sample of joint a for more than 2 s, though samples came before'
+    assert text in rig.status.unseen
+    assert sum(text in x for x in rig.notes()) == 1
+    severity, message, _ = rig.runtime.report()
+    assert (severity, text in message) == (Severity.WARN, True)
+    rig.samples = True
+    rig.run(START + 6000 * MS)
+    assert (rig.status.unseen, rig.runtime.report()[0]) == ('', Severity.OK)
+    # While the clock stands still none is to come, nor from a publisher that has ended in order.
+    rig.samples = False
+    rig.steady += 10_000 * MS
+    rig.runtime.report()
+    rig.observable = False
+    rig.run(START + 9000 * MS)
+    assert rig.status.unseen == ''
+    assert sum(text in x for x in rig.notes()) == 1
+
+
 @pytest.mark.parametrize(('lag', 'text'), [
     (600, 'come 0.600 s after their stamps'), (-600, 'come 0.600 s before their stamps'),
     (-100, 'stamped 0.100 s ahead of the clock of the planner'),
