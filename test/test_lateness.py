@@ -191,7 +191,8 @@ def test_a_plan_is_made_anew_where_that_helps(kind, monkeypatch):
 
 
 def test_jitter_is_not_made_worse(monkeypatch):
-    left = [_policies('jitter', x, monkeypatch, (0.0044, 50, 'two_step', 5 * MS)) for x in range(3)]
+    case = 0.0044, 50, 'two_step', 5 * MS
+    left = [_policies('jitter', x, monkeypatch, case) for x in range(3)]
     nothing, decide, always = (np.mean([x[key] for x in left]) for key in left[0])
     assert decide <= nothing + 0.5
     assert decide < always
@@ -208,8 +209,8 @@ def test_deciding_is_as_good_as_doing_nothing_and_as_always_replanning(monkeypat
         assert median['decide'] <= min(median['nothing'], median['always']) + 0.5
         worse += [
             (kind, seed) for seed, x in enumerate(cases) if x['decide'] > x['nothing'] + 0.5]
-    # Chance may have it otherwise.
-    assert len(worse) <= 0.01 * sum(map(len, rows.values())), worse
+    # Where all are late by chance, chance decides.
+    assert len(worse) <= 0.015 * sum(map(len, rows.values())), worse
 
 
 # -- lateness by its cost -----------------------------------------------------------------------
