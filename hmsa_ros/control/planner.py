@@ -396,7 +396,8 @@ class PlannerRuntime:
         words = self.feedback.audit(name, hold)
         if words:
             self._bulletin.give(Verdict(
-                Severity.WARN, 'feedback_ended', words, self._bulletin.verdict.request), log=True)
+                Severity.WARN, Code.FEEDBACK_ENDED, words, self._bulletin.verdict.request),
+                log=True)
 
     def report(self) -> tuple[Severity, str, dict[str, object]]:
         """Return how commands fare: severity, a sentence and counters."""

@@ -25,8 +25,8 @@ from hmsa_ros.planning.timeline import Draft, Plan, PlannedLevel
 LEAST_STEP = 0.1
 #: Residual vibration from peak to peak, as a share of the step, from which on it counts.
 SHARE = 5e-3
-# How much less a new plan is to leave, and how much more it may. After an exception, which share of
-# the gain it may leave more, and which share of what is there, once nothing more will be known.
+# How much less a new plan is to leave, and how much more it may. After an exception: which share
+# of the gain it may leave more, and which share of what is there, once no more will be known.
 _GAIN, _RISK, _CLEARLY = 5e-3, 0.2, 0.5
 # What stands for a motion that cannot be predicted.
 _LOST = 1e3

@@ -51,6 +51,7 @@ class Code(str, Enum):
     SUPERSEDED = 'superseded'
     CORRECTED = 'corrected'
     REPLANNED = 'replanned'
+    FEEDBACK_ENDED = 'feedback_ended'
     SATURATED = 'saturated'
     STOPPED = 'stopped'
     CLOCK_JUMPED = 'clock_jumped'
@@ -165,6 +166,9 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'that they led to. Setpoints whose time had passed were left out; the message says how '
         'many.',
         'Raise lead_time, or see what delays or drops commands.'),
+    Code.FEEDBACK_ENDED: (
+        'Moves got worse with feedback, as measured: plans use the parameters given, open loop.',
+        'See what the sensor shows, then call ~/reset_estimate.'),
     Code.SATURATED: (
         'The amplifier did not reach a level that was commanded. Until the next request no level '
         'beyond that is commanded, and the rest of the sequence is planned within it.',
