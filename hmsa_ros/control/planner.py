@@ -51,8 +51,9 @@ class PlannerRuntime:
     Two clocks return ns: `clock` the time of the stamps and of `tick`, `steady` the one that
     timeouts and the length of a slice are measured by. `observable` returns whether somebody may
     give samples, and `unheard` why nobody carries out commands (empty where somebody does): the
-    first request waits for both. `glance` returns the newest samples by joint, if there are new
-    ones: later requests are held against them.
+    first request waits for both. `found` returns whether a joint has a device that reports.
+    `glance` returns the newest samples by joint, if there are new ones: later requests are held
+    against them.
     """
 
     def __init__(
@@ -60,6 +61,7 @@ class PlannerRuntime:
             steady: Clock = monotonic_ns,
             observable: Callable[[], bool] = lambda: True,
             unheard: Callable[[], str] = str,
+            found: Callable[[str], bool] = lambda joint: True,
             glance: Callable[[], Iterable[tuple[str, Seen]]] = tuple) -> None:
         self.group = group
         self.settings = settings
@@ -80,7 +82,7 @@ class PlannerRuntime:
             group, self.following, self._watch, clock, steady,
             lambda: unheard() or self.hearing.receipts.words, self._unseen)
         self.sending = Sending(
-            group, self.following, self.hearing.receipts, self._bulletin.outputs)
+            group, self.following, self.hearing.receipts, self._bulletin.outputs, found)
         self.feedback = Feedback(group, settings, self._bulletin.outputs, clock)
         self._watch.sensor, self._watch.audit = self.feedback.sensor, self._audit
         self.planning = Planning(
@@ -157,12 +159,15 @@ class PlannerRuntime:
 
     def cut_off(self, joint: str, *, in_force: bool) -> None:
         """Take in whether a joint's device was cut off and refuses commands of before."""
-        verdict = self.hearing.cut_off(joint, self.settings, in_force=in_force)
+        self._drop(self.hearing.cut_off(joint, self.settings, in_force=in_force))
+        if in_force and self.active and self.hearing.may_acknowledge(joint):
+            self.sending.acknowledge(joint, self._clock())
+
+    def _drop(self, verdict: Verdict | None) -> None:
+        """Show and say that a plan was dropped, if a verdict says so."""
         if verdict is not None:
             self._bulletin.show()
             self._bulletin.give(replace(verdict, request=self._bulletin.verdict.request), log=True)
-        if in_force and self.active and self.hearing.may_acknowledge(joint):
-            self.sending.acknowledge(joint, self._clock())
 
     def applied(self, joint: str, stamp: int, flux_density: float) -> None:
         """Take in that a joint's level in T has really been in force from a stamp in ns on."""
@@ -322,7 +327,8 @@ class PlannerRuntime:
             # Before more of a plan is sent that does not hold.
             self._work_on()
         self.sending.send(now)
-        self.sending.beat(now, self.settings, self.hearing.cut)
+        for joint in self.sending.beat(now, self.settings, self.hearing.cut):
+            self._drop(self.hearing.appeared(joint, self.settings))
         return True
 
     def _taken(self) -> list[Output]:

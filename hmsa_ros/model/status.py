@@ -193,8 +193,9 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'late.',
         'Raise lead_time, or see what delays commands.'),
     Code.MISSED: (
-        'The setpoint was not carried out: a plan that was made anew left it out.',
-        'Raise lead_time, or see what delays or drops commands.'),
+        'The setpoint was not carried out: a plan that was made anew left it out, or plant or '
+        'driver came after its commands were sent.',
+        'Raise lead_time, or see what delays or drops commands; start plant or driver first.'),
     Code.UNDECIDED: (
         'Measured, but the samples show neither that the stretch rests within the tolerances nor '
         'that it does not.',

@@ -41,6 +41,14 @@ class JointChannel:
         self._command.publish(
             conversions.to_command(command.stamp, command.flux_density, frame))
 
+    @property
+    def found(self) -> bool:
+        """Whether somebody carries out the commands and reports what takes effect."""
+        return not self._applied or bool(
+            self._command.get_subscription_count() and (
+                self._node.count_publishers(self._applied)
+                or self._node.count_publishers(topics.JOINT_STATES.name)))
+
     def unheard(self) -> str:
         """Return why nobody carries out the commands; empty where somebody does."""
         if not self._applied:

@@ -85,7 +85,8 @@ class PlannerNode(ManagedNode):
     def _new_runtime(self) -> PlannerRuntime:
         runtime = PlannerRuntime(
             group_from(self._settings), settings_from(self._settings), clock=self.now,
-            observable=self._observable, unheard=self._unheard, glance=self._glance)
+            observable=self._observable, unheard=self._unheard, glance=self._glance,
+            found=lambda joint: self._channels[joint].found)
         runtime.one_clock = self._one_clock
         return runtime
 
