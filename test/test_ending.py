@@ -77,8 +77,9 @@ def test_a_process_ends_even_where_a_library_does_not(arguments, status):
         *((x, 'rclpy') for x in NODES), ('planner', 'numpy'), ('plant', 'numpy')])])
 def test_a_node_that_is_told_to_end_while_it_is_imported_ends_without_a_word(
         ros_env, node, module, number):
+    # Tests that run in the background of a shell have SIGINT ignored.
     done = subprocess.run(
-        [sys.executable, '-c', AT_IMPORT.format(
+        ['env', '--default-signal=INT', sys.executable, '-c', AT_IMPORT.format(
             module=module, number=int(number), entry=node)],
         capture_output=True, text=True, check=False, timeout=60)
     assert (done.returncode, done.stdout, done.stderr) == (0, '', '')

@@ -306,7 +306,7 @@ def test_studies_refuse_what_is_out_of_range(make, message):
 def test_shapers_are_compared_once_each_and_robust_with_each_order():
     assert [x.name for x in candidates()] == [
         'two-step', 'robust, order 2', 'robust, order 3', 'minimax, order 2',
-        'minimax, order 3', 'minimum time', 'smooth', 'plain step', 'ZV', 'ZVD', 'EI']
+        'minimax, order 3', 'minimum time', 'smooth', 'plain step', 'ZV', 'ZVD', 'EI', 'UM-ZV']
     assert candidates(['robust', 'zv', 'robust', 'zv'], [4, 1]) == (
         Candidate('robust', 4), Candidate('robust', 1), Candidate('zv'))
 

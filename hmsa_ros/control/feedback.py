@@ -292,6 +292,9 @@ class Feedback:
         plan = self._group.planners[name].plan
         if joint.fresh:
             joint.update(plan, self._clock())
+        if joint.estimator.screening.trouble:
+            # Of a sensor that fails, nothing follows for the move.
+            return ''
         why = joint.ledger.take(
             hold, plan, self._nominal[name], joint.moves, self.sensor(name))
         if not why:
