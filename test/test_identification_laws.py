@@ -6,10 +6,12 @@ import json
 from identification_oracle import BLOCK, Extras, simulate
 import numpy as np
 import pytest
+import yaml
 
 from hmsa_ros.cli import main
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification import identify, Recording
+from hmsa_ros.identification.known import Known
 from hmsa_ros.identification.quantities import check_free
 from hmsa_ros.interfaces.actuator import actuator_from, parameters_of
 
@@ -136,3 +138,10 @@ def test_command_writes_the_constants_that_a_planner_reads(tmp_path, capsys):
     assert 'law.c01: ' in text
     assert 'standard deviation' in text.split('law.c01: ')[1].split('\n')[0]
     assert main(['plan', '1.2:0.05', '--params-file', str(out), '--json']) == 0
+    # What a planner estimates on is known by itself.
+    settings = yaml.safe_load(text)['/**']['ros__parameters']
+    belief = Known.read(settings)
+    assert set(belief.names) == {'damping_coefficient', 'remanence', 'stretch_bias'}
+    assert belief.value('remanence') == pytest.approx(shown['remanence']['value'])
+    assert belief.covariance[belief.names.index('remanence')][
+        belief.names.index('remanence')] == pytest.approx(shown['remanence']['std'] ** 2)

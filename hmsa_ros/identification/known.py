@@ -51,9 +51,11 @@ class Known:
         """Return what parameters by dotted name say; `BadInputError` if they cannot be used."""
         names, values, flat = (
             settings.get(PREFIX + x) or [] for x in ('names', 'values', 'covariance'))
-        if not names:
+        # Constants of a law are not estimated on: what is known of the others stands by itself.
+        kept = [i for i, x in enumerate(names) if not x.startswith('law.')]
+        if not kept:
             return cls()
-        free = check_free(names)
+        free = check_free(names[i] for i in kept)
         try:
             matrix = np.array(flat, dtype=np.float64).ravel()
             numbers = tuple(float(x) for x in values)
@@ -61,8 +63,11 @@ class Known:
             raise BadInputError(
                 f'{PREFIX}values and {PREFIX}covariance are not all numbers: expected numbers') \
                 from None
-        square = matrix.size == len(free) ** 2
-        return cls(free, numbers, matrix.reshape(len(free), -1) if square else matrix)
+        if matrix.size == len(names) ** 2:
+            matrix = matrix.reshape(len(names), -1)[np.ix_(kept, kept)]
+        if len(numbers) == len(names):
+            numbers = tuple(numbers[i] for i in kept)
+        return cls(free, numbers, matrix)
 
     def value(self, name: str) -> float | None:
         """Return a value; None where there is none."""
