@@ -460,7 +460,7 @@ def test_of_two_clocks_one_is_followed_and_that_is_told(record, ros, make_ros):
         return recorder.says('clock_ignored') not in ('', '0')
 
     ros.spin_until(lambda: tick() or recorder.says('subscribed') == '1/1', 'the subscription')
-    ros.spin_until(tick, 'the other clock')
+    ros.spin_until(lambda: tick() and publisher.get_subscription_count(), 'the other clock')
     assert any('2 publishers of /clock, the first one is followed' in status.message
                for message in recorder.diagnostics for status in message.status)
     publisher.publish(Float64(data=1.0))
