@@ -90,6 +90,26 @@ def test_a_device_that_is_not_heard_any_more_is_sent_nothing_and_named():
     assert rig.residual(1.2) < 1e-6
 
 
+def test_a_device_that_comes_late_is_not_put_on_a_level_in_one_step():
+    rig = Rig(settings=BEATING)
+    rig.runtime._glance = lambda: [('a', Seen(
+        rig.now, rig.plant.stretch, rig.plant.rate, rig.plant.flux_density, 0))]
+    rig.found = False
+    rig.runtime.request(trajectory((1.1, HOLD)))
+    rig.run(START + 1000 * MS)
+    # What was sent so far has reached nobody.
+    rig.plants, rig.wire = {'a': type(rig.plant)(rig.blocks['a'], time=rig.now)}, []
+    rig.found = True
+    rig.run(rig.now + 1000 * MS)
+    assert rig.codes()[-1] == 'missed'
+    assert rig.plant.stretch == 1.0
+    rig.runtime.request(trajectory((1.1, HOLD)))
+    rig.run(rig.now + LEAD + HOLD)
+    assert rig.residual(1.1) < 1e-6
+    rig.run(rig.now + 1000 * MS)
+    assert rig.residual(1.1) < 1e-6
+
+
 def test_a_device_in_slow_motion_is_heard_again_after_a_silence():
     rig = Bench()
     rig.runtime.one_clock = lambda: True

@@ -55,11 +55,13 @@ class Rig:
         self.set_back_at = None
         self.observable = True
         self.unheard = ''
+        self.found = True
         self.group = PlannerGroup({
             x: Planner(block, self.options) for x, block in self.blocks.items()})
         self.runtime = PlannerRuntime(
             self.group, settings, clock=self.clock, steady=self.look,
-            observable=lambda: self.observable, unheard=lambda: self.unheard)
+            observable=lambda: self.observable, unheard=lambda: self.unheard,
+            found=lambda joint: self.found)
         self.runtime.active = True
         self.plants = {
             x: ActuatorSimulation(block, time=START) for x, block in self.blocks.items()}

@@ -74,19 +74,16 @@ class Hearing:
             f'the coil of joint {joint} was cut off by the plant or driver: the rest of the '
             'sequence is dropped, and the next request starts from where the actuator is then')
 
-    def appeared(self, joint: str, settings: Settings) -> Verdict | None:
+    def appeared(self, joint: str) -> Verdict | None:
         """Take in that a device is found that has heard nothing of a plan; return the verdict."""
         self._takeover.doubt(joint)
         self._following.newest.pop(joint, None)
-        if settings.after_cut_off == 'resume':
-            self._following.astray.add(joint)
-            return None
         self._following.astray.discard(joint)
         planner = self._group.planners[joint]
         done = not planner.plan.segments
         planner.restart()
         return None if done else Verdict(
-            Severity.ERROR, str(Code.MISSED),
+            Severity.ERROR, Code.MISSED,
             f'plant or driver of joint {joint} came after the commands were sent: what it has not '
             'heard is dropped, and the next request starts from where the actuator is then')
 

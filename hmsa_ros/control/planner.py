@@ -328,7 +328,7 @@ class PlannerRuntime:
             self._work_on()
         self.sending.send(now)
         for joint in self.sending.beat(now, self.settings, self.hearing.cut):
-            self._drop(self.hearing.appeared(joint, self.settings))
+            self._drop(self.hearing.appeared(joint))
         return True
 
     def _taken(self) -> list[Output]:
