@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 import fcntl
+import gc
 import itertools
 import os
 from pathlib import Path
@@ -146,6 +147,9 @@ def ros_domain_id() -> Iterator[int]:
     """Return a domain id that no other test on this machine uses at the same time."""
     with own_domain() as domain:
         yield domain
+        # Nodes that were destroyed stay in the domain until Python has collected them, and who has
+        # it next would meet them.
+        gc.collect()
 
 
 @pytest.fixture
@@ -312,6 +316,7 @@ class RosSide:
         self.executor.shutdown()
         self.node.destroy_node()
         self.context.try_shutdown()
+        del self.executor, self.node, self.context
 
     def spin_until(
             self, condition: Callable[[], Any], what: str = 'the condition',
@@ -474,6 +479,7 @@ class Served:
             thread.join(WAIT_SECONDS)
         for node in self.nodes:
             node.destroy_node()
+        self.nodes.clear()
         rclpy.try_shutdown()
         if self._failures:
             raise self._failures[0]
