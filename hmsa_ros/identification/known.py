@@ -57,7 +57,7 @@ class Known:
             return cls()
         free = check_free(names[i] for i in kept)
         try:
-            matrix = np.array(flat, dtype=np.float64).ravel()
+            matrix: Array = np.array(flat, dtype=np.float64).ravel()
             numbers = tuple(float(x) for x in values)
         except (TypeError, ValueError):
             raise BadInputError(

@@ -10,7 +10,7 @@ class Code(str, Enum):
     """
     The outcome of a move or a request; the value is what messages and files carry.
 
-    In this order: plans that can be carried out, refusals, what became of a request, and what was
+    In this order: plans that can be carried out, refusals, outcomes of a request, and what was
     measured.
     """
 
