@@ -10,7 +10,11 @@ PYTHONS ?= python3.10 python3.11 python3.12 python3.13
 
 BIN := $(VENV)/bin
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadgroup --no-loadscope-reorder
-INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet -c constraints.txt
+# Bytecode is written when a module is first imported, not for all of them now.
+INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet --no-compile \
+	-c constraints.txt
+# Of the package that is installed: to install it again would compile the motion again.
+EXTRAS := $(BIN)/python scripts/list_extras.py
 
 # The environment brings its own ROS: one that the calling shell has sourced is set aside, and
 # what it selects (middleware, profiles, security) with it.
@@ -103,16 +107,19 @@ $(VENV)/.installed: setup.py setup.cfg pyproject.toml package.xml constraints.tx
 	@touch $@ $(VENV)/.motion
 
 $(VENV)/.tools: $(VENV)/.installed
-	$(INSTALL) -e '.[test,studies,cluster,docs]'
+	$(EXTRAS) test studies cluster docs > $(VENV)/extras.txt
+	$(INSTALL) -r $(VENV)/extras.txt
 	@touch $@
 
 $(VENV)/.bench: $(VENV)/.installed
-	$(INSTALL) -e '.[bench,studies,cluster]'
+	$(EXTRAS) bench studies cluster > $(VENV)/extras.txt
+	$(INSTALL) -r $(VENV)/extras.txt
 	@touch $@
 
 # The installation compiles the motion, too; this is for when its sources change.
 $(VENV)/.motion: $(wildcard hmsa_ros/motion/*.cpp hmsa_ros/motion/hmsa/*.hpp) | $(VENV)/.installed
-	$(BIN)/python setup.py --quiet build_ext --inplace
+	@test -e $@ && test -z "$$(find $^ -newer $@)" \
+	|| { echo "Compiling the motion"; $(BIN)/python setup.py --quiet build_ext --inplace; }
 	@touch $@
 
 # An environment whose Python does not start (moved, or its base removed) is made anew too.
