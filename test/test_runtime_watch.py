@@ -43,7 +43,7 @@ class Loop:
             Settings(takeover_timeout=0, **changes), clock=lambda: self.now,
             steady=lambda: self.now, observable=lambda: rate > 1, unheard=lambda: self.unheard)
         self.runtime.active = True
-        self.outputs = []
+        self.outputs, self.times = [], []
         self.spoil = lambda samples: samples
         # Until when the device hears nothing of what is sent.
         self.deaf, self._waiting = 0, []
@@ -59,6 +59,7 @@ class Loop:
         while self.now < end:
             for x in self.runtime.tick(self.now):
                 self.outputs.append(x)
+                self.times.append(self.now)
                 if isinstance(x, Send):
                     self._waiting.append(x)
             if self.now >= self.deaf:
@@ -142,6 +143,21 @@ def test_samples_that_stay_away_or_are_too_few_are_no_verdict():
     loop.run((1.2, 50 * MS), (1.3, HOLD))
     assert loop.status.worst.verdict == 'undecided'
     assert 'expected at least 240 samples a second' in loop.status.worst.message
+
+
+@pytest.mark.parametrize(('rate', 'last', 'least', 'most'), [
+    (1000, 60 * MS, 140 * MS, 160 * MS), (1000, HOLD, HOLD, HOLD + 10 * MS),
+    (60, 60 * MS, 250 * MS, 800 * MS)])
+def test_the_last_setpoint_is_judged_when_its_time_is_over_or_rare_samples_are_there(
+        rate, last, least, most):
+    loop = Loop(rate=rate)
+    loop.run((1.2, HOLD), (1.3, last))
+    segment = loop.runtime.group.planners['a'].plan.segments[-1]
+    judged = [
+        time for x, time in zip(loop.outputs, loop.times) if isinstance(x, StatusChanged)
+        and x.findings and x.findings['a'].setpoint.number == 2 and not x.watching]
+    after = judged[0] - segment.since
+    assert (loop.status.verdict.code, least <= after <= most) == ('arrived', True)
 
 
 def test_a_source_that_lags_seconds_behind_is_waited_for_and_a_frozen_one_is_not():

@@ -26,6 +26,8 @@ _MOVING = 32
 # How long samples may stay away, by the steady clock, before it is judged without them.
 _PATIENCE = NANOSECONDS // 2
 _TOLERANCES = Tolerances()
+# What more samples may still change.
+_OPEN = (Code.UNOBSERVED, Code.UNDECIDED)
 # How far in ns ahead of the clock a stamp may be: news of the time may be late.
 _AHEAD = NANOSECONDS // 20
 
@@ -56,9 +58,10 @@ class Hold:
     def _begin_at(self, begin: int) -> None:
         setpoint = self.setpoint
         self._begin, self._length = begin, look_length(setpoint)
-        # The last one is held on, so that there is always time for a look.
-        least = begin + max(2 * self._length, _RARE) if self._last else begin
-        self._closes = least if setpoint.end is None else max(setpoint.end, least)
+        # The last one is held on, so that there is always time for a look, at rare samples too.
+        least = begin + 2 * self._length if self._last else begin
+        self._enough = least if setpoint.end is None else max(setpoint.end, least)
+        self._closes = max(self._enough, begin + _RARE) if self._last else self._enough
         if self._last and setpoint.end is not None and setpoint.moved is None:
             self.setpoint = replace(setpoint, end=self._closes)
         self.due = min(begin + self._length, self._closes)
@@ -144,11 +147,13 @@ class Hold:
         """Judge if that is due at a time in ns; None if not, or if that changes nothing."""
         if self.over or not self._ready(now, steady, observable=observable):
             return None
-        self.over = self.due >= self._closes
         found, self.news = self.judged(
             self.setpoint, tolerances, sensor=sensor), bool(self._samples)
+        self.over = self.due >= self._closes or (
+            self.due >= self._enough and found.verdict not in _OPEN)
         after = self.due - self._begin
-        self.due = min(self._begin + max(2 * after, self._length), self._closes)
+        due = self._begin + max(2 * after, self._length)
+        self.due = min(due, self._closes if self.due >= self._enough else self._enough)
         before, self.found = self.found, self._better_known(found)
         same = before is not None and before.verdict is self.found.verdict
         return None if same and not self.over else self.found
@@ -188,7 +193,7 @@ class Hold:
 
     def _better_known(self, found: Finding) -> Finding:
         """Return a finding, or the one before where the samples are too few for another."""
-        before, open_ = self.found, (Code.UNOBSERVED, Code.UNDECIDED)
-        if before is not None and found.verdict in open_ and before.verdict not in open_:
+        before = self.found
+        if before is not None and found.verdict in _OPEN and before.verdict not in _OPEN:
             return before
         return found

@@ -23,7 +23,7 @@ from hmsa_ros.report.outcome import findings_of
 
 #: The paper's first expansion sequence, (stretch, span) in nondimensional time (Figs. 4, 5).
 SEQUENCE = ((1.10, 10.0), (1.20, 10.0), (1.40, 10.0))
-REAL_TIME_FACTOR = 0.0125
+REAL_TIME_FACTOR = 0.02
 PUBLISH_RATE = 20_000.0
 LEAD_TIME = 0.05
 #: Largest residual vibration, as a share of the step, of a setpoint that counts as held.
