@@ -154,7 +154,8 @@ def test_the_last_setpoint_is_judged_when_its_time_is_over_or_rare_samples_are_t
     loop.run((1.2, HOLD), (1.3, last))
     segment = loop.runtime.group.planners['a'].plan.segments[-1]
     judged = [
-        time for x, time in zip(loop.outputs, loop.times) if isinstance(x, StatusChanged)
+        time for x, time in zip(loop.outputs, loop.times, strict=True)
+        if isinstance(x, StatusChanged)
         and x.findings and x.findings['a'].setpoint.number == 2 and not x.watching]
     after = judged[0] - segment.since
     assert (loop.status.verdict.code, least <= after <= most) == ('arrived', True)
