@@ -110,6 +110,29 @@ def test_a_device_that_comes_late_is_not_put_on_a_level_in_one_step():
     assert rig.residual(1.1) < 1e-6
 
 
+@pytest.mark.parametrize('outage', [10, 1500])
+@pytest.mark.parametrize('begin', [300, 1500])
+@pytest.mark.parametrize('reports', [False, True])
+def test_a_device_that_begins_anew_is_not_put_on_a_level_in_one_step(outage, begin, reports):
+    rig = Bench()
+    rig.runtime.request(trajectory((1.2, 400 * MS), (1.4, 60_000 * MS)))
+    rig.run(START + begin * MS)
+    rig.linked = False
+    rig.run(rig.now + outage * MS)
+    # Its process is another one, which the graph of nodes does not show.
+    rig.plants = {'a': type(rig.plant)(rig.blocks['a'], time=rig.now)}
+    rig.wire, rig._newest = [], 0
+    rig.linked, rig._next = True, rig.now
+    if reports:
+        rig.runtime.applied('a', rig.plant.time - 1, 0.0)
+    rig.run(rig.now + 1000 * MS)
+    assert (rig.status.verdict.code, rig.status.verdict.severity) == ('missed', Severity.ERROR)
+    assert rig.plant.stretch == 1.0
+    rig.runtime.request(trajectory((1.1, HOLD)))
+    rig.run(rig.now + 1000 * MS)
+    assert rig.residual(1.1) < 1e-6
+
+
 def test_a_device_in_slow_motion_is_heard_again_after_a_silence():
     rig = Bench()
     rig.runtime.one_clock = lambda: True

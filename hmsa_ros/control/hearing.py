@@ -1,5 +1,6 @@
 """Whether plant or driver hear the planner, what their clocks say, and coils that were cut off."""
 
+from collections.abc import Callable
 import math
 
 from hmsa_ros.control.following import Following
@@ -21,16 +22,20 @@ class Hearing:
     """
     Follows what devices say of themselves, and draws conclusions for the plans.
 
-    ``cut`` are the joints whose device refuses commands of before a cut-off, and ``until`` how
-    long to wait for it to obey, in ns by the steady clock.
+    `found` returns whether a joint has a device that reports. ``fresh`` are the joints whose
+    device has come after the last level, and has heard none. ``cut`` are those whose device
+    refuses commands of before a cut-off, and ``until`` how long to wait for it to obey, in ns by
+    the steady clock.
     """
 
     def __init__(
             self, group: PlannerGroup, following: Following, takeover: Takeover, clock: Clock,
-            steady: Clock) -> None:
+            steady: Clock, found: Callable[[str], bool]) -> None:
         self._group, self._following, self._takeover = group, following, takeover
-        self._clock, self._steady = clock, steady
+        self._clock, self._steady, self._found = clock, steady, found
         self.receipts = Receipts(steady)
+        self._absent: set[str] = set()
+        self.fresh: set[str] = set()
         self.cut: set[str] = set()
         self.until: int | None = None
         self._acknowledged: dict[str, int] = {}
@@ -51,7 +56,37 @@ class Hearing:
             for name in names:
                 self._takeover.doubt(name)
 
-    # -- cut-offs ------------------------------------------------------------------------------
+    def is_led(self, joint: str) -> bool:
+        """Return whether a device has been led to the last level, which may be repeated to it."""
+        return joint not in self.receipts.silent and joint not in self.cut and (
+            joint not in self.fresh)
+
+    # -- devices that are new, or cut off ------------------------------------------------------
+
+    def look_for_newcomers(self) -> Verdict | None:
+        """Find devices that were not found at the last look; return the verdict on a plan."""
+        absent = {x for x in self._group.planners if not self._found(x)}
+        come, self._absent = self._absent - absent, absent
+        verdicts = [self._appeared(x) for x in sorted(come)]
+        return next((x for x in verdicts if x is not None), None)
+
+    def received(
+            self, joint: str, time: int, command: int, *, comparable: bool) -> Verdict | None:
+        """Take in a receipt as `Receipts.received` does; return the verdict on a plan."""
+        anew = self.receipts.received(joint, time, command, self._clock(), comparable=comparable)
+        return self._appeared(joint) if anew and joint in self._group.planners else None
+
+    def _appeared(self, joint: str) -> Verdict | None:
+        """Take in that a device has come that has heard nothing of a plan."""
+        self.fresh.add(joint)
+        self._following.newest.pop(joint, None)
+        planner = self._group.planners[joint]
+        planned = bool(planner.plan.segments)
+        planner.restart()
+        verdict = self._dropped(
+            joint, Code.MISSED, f'plant or driver of joint {joint} came after the commands were '
+            'sent: what it has not heard is dropped')
+        return verdict if planned else None
 
     def cut_off(self, joint: str, settings: Settings, *, in_force: bool) -> Verdict | None:
         """Take in whether the coil of a joint was cut off; return the verdict on its plan."""
@@ -63,29 +98,22 @@ class Hearing:
         self.cut.add(joint)
         if not self._takeover.engaged:
             return None
-        self._takeover.doubt(joint)
         if settings.after_cut_off == 'resume':
+            self._takeover.doubt(joint)
             self._following.astray.add(joint)
             return None
-        self._following.astray.discard(joint)
         self._group.planners[joint].abandon(self._clock())
-        return Verdict(
-            Severity.ERROR, Code.CUT_OFF,
-            f'the coil of joint {joint} was cut off by the plant or driver: the rest of the '
-            'sequence is dropped, and the next request starts from where the actuator is then')
+        return self._dropped(
+            joint, Code.CUT_OFF, f'the coil of joint {joint} was cut off by the plant or driver: '
+            'the rest of the sequence is dropped')
 
-    def appeared(self, joint: str) -> Verdict | None:
-        """Take in that a device is found that has heard nothing of a plan; return the verdict."""
+    def _dropped(self, joint: str, code: Code, words: str) -> Verdict:
+        """Plan from a sample next, since a plan was dropped; return the verdict."""
         self._takeover.doubt(joint)
-        self._following.newest.pop(joint, None)
         self._following.astray.discard(joint)
-        planner = self._group.planners[joint]
-        done = not planner.plan.segments
-        planner.restart()
-        return None if done else Verdict(
-            Severity.ERROR, Code.MISSED,
-            f'plant or driver of joint {joint} came after the commands were sent: what it has not '
-            'heard is dropped, and the next request starts from where the actuator is then')
+        return Verdict(
+            Severity.ERROR, code,
+            f'{words}, and the next request starts from where the actuator is then')
 
     def may_acknowledge(self, joint: str) -> bool:
         """Return whether to tell a device that its cut-off is known: seldom, if it is off."""

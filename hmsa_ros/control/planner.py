@@ -77,12 +77,12 @@ class PlannerRuntime:
         self._takeover = Takeover(group, clock, steady, observable, unheard)
         self._silence = Silence(clock, steady, observable)
         self._watch = Watch(group, steady, clock)
-        self.hearing = Hearing(group, self.following, self._takeover, clock, steady)
+        self.hearing = Hearing(group, self.following, self._takeover, clock, steady, found)
         self._bulletin = Bulletin(
             group, self.following, self._watch, clock, steady,
             lambda: unheard() or self.hearing.receipts.words, self._unseen)
         self.sending = Sending(
-            group, self.following, self.hearing.receipts, self._bulletin.outputs, found)
+            group, self.following, self.hearing, self._bulletin.outputs)
         self.feedback = Feedback(group, settings, self._bulletin.outputs, clock)
         self._watch.sensor, self._watch.audit = self.feedback.sensor, self._audit
         self.planning = Planning(
@@ -153,8 +153,7 @@ class PlannerRuntime:
         A device that was cut off refuses commands of before.
         """
         self.following.seen(time)
-        self.hearing.receipts.received(
-            joint, time, command, self._clock(), comparable=not self.one_clock())
+        self._drop(self.hearing.received(joint, time, command, comparable=not self.one_clock()))
         self.cut_off(joint, in_force=cut_off)
 
     def cut_off(self, joint: str, *, in_force: bool) -> None:
@@ -327,9 +326,17 @@ class PlannerRuntime:
             # Before more of a plan is sent that does not hold.
             self._work_on()
         self.sending.send(now)
-        for joint in self.sending.beat(now, self.settings, self.hearing.cut):
-            self._drop(self.hearing.appeared(joint))
+        if self.settings.heartbeat_period and now >= self.sending.next_beat:
+            self._beat(now)
         return True
+
+    def _beat(self, now: int) -> None:
+        """Give signs of life, and look which devices do."""
+        self.sending.next_beat = now + self.settings.heartbeat_period
+        if self.settings.replan_late:
+            self.following.look_for_unheard(now)
+        self._drop(self.hearing.look_for_newcomers())
+        self.sending.beat(now)
 
     def _taken(self) -> list[Output]:
         outputs = self._bulletin.outputs.copy()

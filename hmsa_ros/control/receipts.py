@@ -45,6 +45,7 @@ class _Joint:
 
     heard: int  # when the newest receipt came
     time: int = 0  # when that was, by the clock of the device
+    command: int = 0  # the stamp that it named; 0 for none
     unanswered: int | None = None  # since when no command is known to have arrived
     silent: bool = False
     missing: int = 0  # how often nobody was found since who gives any
@@ -83,12 +84,13 @@ class Receipts:
             del known.sent[next(iter(known.sent))]
 
     def received(
-            self, joint: str, time: int, command: int, now: int, *, comparable: bool) -> None:
+            self, joint: str, time: int, command: int, now: int, *, comparable: bool) -> bool:
         """
         Take in that the newest command there is one of a stamp, by a time of the device.
 
         The time now is that of our clock; the two are ``comparable`` where they are two. One clock
-        for both may be in slow motion, or stand still.
+        for both may be in slow motion, or stand still. Returned is whether the device has begun
+        anew: it had received commands, and has received none now.
         """
         steady = self._steady()
         known = self._joints.get(joint)
@@ -96,15 +98,17 @@ class Receipts:
             known = self._joints[joint] = _Joint(steady)
         if known.silent and comparable and (
                 time - known.time < steady - known.heard - _STALE):
-            return
+            return False
+        anew, known.command = known.command != 0 and command == 0, command
         known.heard, known.time, known.missing = steady, time, 0
         known.lags.append(now - time)
         sent = known.sent.pop(command, None)
         if sent is None:
-            return
+            return anew
         known.unanswered = None
         if comparable and now >= sent:
             known.exchanges.append(Offset(time - (sent + now) // 2, (now - sent) // 2 + 1))
+        return anew
 
     def since(self, joint: str, time: int) -> bool:
         """Return whether a receipt of a joint is at least as new as a time of its device."""
