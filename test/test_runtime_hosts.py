@@ -127,7 +127,7 @@ def test_a_device_that_begins_anew_is_not_put_on_a_level_in_one_step(outage, beg
         rig.runtime.applied('a', rig.plant.time - 1, 0.0)
     rig.run(rig.now + 1000 * MS)
     assert (rig.status.verdict.code, rig.status.verdict.severity) == ('missed', Severity.ERROR)
-    assert rig.plant.stretch == 1.0
+    assert (rig.plant.stretch, rig.status.unheard) == (1.0, '')
     rig.runtime.request(trajectory((1.1, HOLD)))
     rig.run(rig.now + 1000 * MS)
     assert rig.residual(1.1) < 1e-6

@@ -100,6 +100,10 @@ class Receipts:
                 time - known.time < steady - known.heard - _STALE):
             return False
         anew, known.command = known.command != 0 and command == 0, command
+        if anew:
+            # What was sent has gone with the old one.
+            known.sent.clear()
+            known.unanswered = None
         known.heard, known.time, known.missing = steady, time, 0
         known.lags.append(now - time)
         sent = known.sent.pop(command, None)
