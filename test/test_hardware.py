@@ -5,6 +5,7 @@ from threading import Event
 from time import monotonic_ns
 
 from conftest import wait_until
+import numpy as np
 import pytest
 
 from hmsa_ros.device import StateLostError
@@ -194,7 +195,7 @@ def test_what_is_reported_is_what_was_really_set_and_saturation_is_named_once():
     assert [x.level for x in device.changes()] == [0.1, 0.2, 0.2, 0.15]
     (notice,) = device.notices()
     assert notice.kind == Kind.SATURATED
-    assert 'Amplifier.write was asked for 0.3 T and set 0.2 T' in notice.text
+    assert 'Amplifier was asked for 0.3 T and set 0.2 T' in notice.text
     assert device.counts == {'saturated': 2, 'state_lost': 0}
     with pytest.raises(BadInputError, match='expected at most 0.4 T'):
         device.receive(0, 0, 0.45)
@@ -275,6 +276,173 @@ def test_hardware_that_has_lost_its_state_begins_without_a_field():
         device.advance(START + 9 * MS)
         assert bench.levels[-1] == expected
     assert device.counts['state_lost'] == 1
+
+
+class Board:
+    """A board that keeps levels and has a clock of its own: it began later and runs fast."""
+
+    capacity = None
+    rate = 1.0 + 80e-6
+    # What it keeps is applied so much after its time, in ns of its clock.
+    late = 3000
+
+    def __init__(self):
+        self.host = START
+        self.begun = START - 5000 * MS
+        self.kept, self.told, self.calls, self.exposed = [], [], [], []
+        self.level = 0.0
+
+    def time_ns(self):
+        """Answer on the host: each look takes 20 us."""
+        self.host += 20_000
+        return self.host
+
+    def clock(self):
+        return round((self.host + 10_000 - self.begun) * self.rate)
+
+    def host_time(self, own):
+        return self.begun + own / self.rate
+
+    def run_until(self, host):
+        self.host = max(self.host, host)
+        while self.kept and self.host_time(self.kept[0][0]) <= self.host:
+            stamp, self.level = self.kept.pop(0)
+            self.told.append((stamp + self.late, self.level))
+
+    def write(self, level, now):
+        self.calls.append(('write', level))
+        self.kept, self.level = [], level
+        return now, level
+
+    def schedule(self, levels):
+        self.calls.append(('schedule', [x for _, x in levels]))
+        if levels:
+            self.kept = [x for x in self.kept if x[0] < levels[0][0]] + list(levels)
+
+    def applied(self):
+        told, self.told = self.told, []
+        return told
+
+    def read(self, now):
+        self.exposed.append(self.host - 2 * MS)
+        return [(1.1, 0.0, round((self.exposed[-1] - self.begun) * self.rate))]
+
+
+def board_driver(period=0, **changes):
+    board = type('Board', (Board,), changes)()
+    device = HardwareDevice(
+        [HardwareJoint(board, 0.5, Fallback(0.0))], time=START, period=period,
+        clock=board.time_ns)
+    assert device.switch_off(START + MS) == ''
+    device.changes()
+    return board, device
+
+
+def step(board, device, time):
+    board.run_until(time)
+    device.advance(time)
+
+
+def test_a_device_that_keeps_time_gets_levels_ahead_and_says_when_they_took_effect():
+    board, device = board_driver()
+    for stamp, level in ((50, 0.1), (60, 0.2), (70, 0.3), (60, 0.25)):
+        device.receive(0, START + stamp * MS, level)
+        step(board, device, START + 2 * MS)
+    # The last one replaced what was kept from its stamp on.
+    assert board.calls[1:] == [('schedule', [x]) for x in (0.1, 0.2, 0.3, 0.25)]
+    # Nothing is watched for, since the board keeps the time.
+    assert device.next_level is None
+    for k in range(3, 100):
+        step(board, device, START + k * MS)
+    changes = device.changes()
+    assert [x.level for x in changes] == [0.1, 0.25]
+    for x, due in zip(changes, (50, 60), strict=True):
+        # As the board says it, in the time of the host.
+        assert abs(x.stamp - (START + due * MS + board.late)) < 15_000
+    # Signs of life are passed on without disturbing what is kept.
+    device.receive(0, START + 300 * MS, 0.1)
+    step(board, device, START + 101 * MS)
+    assert board.calls[-1] == ('schedule', [0.1])
+    device.receive(0, START + 300 * MS, 0.1)
+    step(board, device, START + 102 * MS)
+    assert board.calls[-1] == ('schedule', [])
+    # A command for now goes past what is kept.
+    device.receive(0, 0, -0.1)
+    step(board, device, START + 103 * MS)
+    assert (board.calls[-1], board.kept) == (('write', -0.1), [])
+
+
+def test_a_device_with_little_room_gets_levels_as_it_has_room():
+    board, device = board_driver(capacity=2)
+    for k in range(1, 7):
+        device.receive(0, START + (10 + 10 * k) * MS, 0.05 * k)
+    for k in range(2, 100):
+        step(board, device, START + k * MS)
+        assert len(board.kept) <= 2
+    assert [x.level for x in device.changes()] == pytest.approx([
+        0.05 * k for k in range(1, 7)])
+    # What it keeps is taken back, also where nothing comes in its place.
+    device.receive(0, START + 150 * MS, 0.0)
+    step(board, device, START + 110 * MS)
+    device.receive(0, START + 120 * MS, 0.3)
+    step(board, device, START + 111 * MS)
+    assert [x for _, x in board.kept] == pytest.approx([0.3])
+
+
+def test_samples_of_a_device_with_a_clock_are_stamped_in_the_time_of_the_host():
+    board, device = board_driver(period=10 * MS)
+    for k in range(2, 2000, 5):
+        step(board, device, START + k * MS)
+    samples = device.samples()
+    assert len(samples) > 190
+    errors = np.array([x.time for x in samples]) - np.array(board.exposed)
+    assert np.abs(errors).max() < 30_000
+    assert np.abs(errors[100:]).max() < 10_000
+    assert device.instruments[0].clock_map.drift == pytest.approx(80e-6, abs=15e-6)
+    assert device.instruments[0].clock_map.error < 50e-6
+
+
+def test_a_board_whose_clock_begins_anew_has_lost_its_state():
+    board, device = board_driver()
+    device.receive(0, START + 50 * MS, 0.2)
+    for k in range(2, 100):
+        step(board, device, START + k * MS)
+    board.begun, board.kept, board.level = START + 99 * MS, [], 0.0
+    for k in range(100, 1200):
+        step(board, device, START + k * MS)
+    (notice,) = device.notices()
+    assert (notice.kind, device.levels) == (Kind.LOST, [0.0])
+    assert 'its clock is another one' in notice.text
+    # It goes on by the new clock.
+    device.receive(0, START + 1300 * MS, 0.1)
+    for k in range(1201, 1400):
+        step(board, device, START + k * MS)
+    stamp = device.changes()[-1].stamp
+    assert abs(stamp - START - 1300 * MS) < 50_000
+
+
+@pytest.mark.parametrize(('changes', 'expected'), [
+    ({'applied': lambda self: []}, 'does not say that 0.2 T took effect'),
+    ({'applied': lambda self: [1]}, 'expected a list of'),
+    ({'schedule': lambda self, levels: 1 / 0}, 'schedule of joint actuator raised ZeroDivision'),
+])
+def test_a_device_that_does_not_keep_levels_as_it_should_is_said_to(changes, expected):
+    board, device = board_driver(**changes)
+    device.receive(0, START + 10 * MS, 0.2)
+
+    def go_on():
+        for k in range(2, 3000, 5):
+            step(board, device, START + k * MS)
+
+    with pytest.raises(HmsaError, match=expected):
+        go_on()
+    assert device.switch_off(START + 3000 * MS) == ''
+
+
+@pytest.mark.parametrize('clock', [lambda self: 'now', lambda self: None])
+def test_a_clock_that_says_no_time_refuses_the_start(clock):
+    with pytest.raises(HmsaError, match='expected its time in ns'):
+        board_driver(clock=clock)
 
 
 @pytest.mark.parametrize(('change', 'expected'), [

@@ -1,21 +1,18 @@
 """Real hardware as a device: levels written at their stamps, a watchdog, and samples."""
 
-from bisect import bisect_right
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 import math
+from time import time_ns
 
 import numpy as np
 
+from hmsa_ros.device.coil import Coil
 from hmsa_ros.device.hardware import Calls, Hardware, HardwareError, Instrument
 from hmsa_ros.device.protocol import Change, Kind, Notice, Sample, StateLostError
 from hmsa_ros.device.watchdog import Device, Fallback
 from hmsa_ros.errors import BadInputError
-from hmsa_ros.model.schedule import CommandSchedule
 
-# Of the levels that took effect last, which tell at what level an older sample was taken.
-_REMEMBERED = 64
 # A level is not written again where the next one is due within so many of the longest writes.
 _ROOM = 2.0
 
@@ -43,26 +40,6 @@ class HardwareJoint:
             raise BadInputError(f'limit is {self.limit:g} T: expected a number above 0')
 
 
-class _Coil:
-    """What is known of a coil; NaN where a level in T is not known."""
-
-    def __init__(self, joint: HardwareJoint, calls: Calls) -> None:
-        self.instrument = Instrument(joint.hardware, joint.name, calls)
-        self.limit = min(joint.limit, self.instrument.limit or math.inf)
-        self.tolerance = self.instrument.tolerance(self.limit)
-        self.schedule = CommandSchedule(0.0)
-        self.heard: int | None = None  # when, in ns, since the watchdog was last looked at
-        self.repeat = False  # whether a sign of life is to be passed on
-        self.asked = self.level = math.nan
-        self.history: deque[tuple[int, float]] = deque(maxlen=_REMEMBERED)
-        self.saturated = self.lost = 0
-
-    def at(self, stamp: int) -> float:
-        """Return the level that was in force at a time in ns."""
-        known = bisect_right(self.history, stamp, key=lambda x: x[0])
-        return self.history[known - 1][1] if known else math.nan
-
-
 class HardwareDevice(Device):
     """
     Real actuators; their coils are not known to be off before `switch_off`.
@@ -77,23 +54,27 @@ class HardwareDevice(Device):
         Between samples, in ns; 0 for none.
     calls : Calls
         What is told of each call of hardware.
+    clock : callable
+        Returns the time in ns, as ``time`` is; for hardware with a clock of its own.
 
     Raises
     ------
     BadInputError
         If hardware is not as `Hardware` says.
+    HardwareError
+        If it does not answer what time it has.
 
     """
 
     def __init__(
             self, joints: Sequence[HardwareJoint], *, time: int, period: int = 0,
-            calls: Calls | None = None) -> None:
+            calls: Calls | None = None, clock: Callable[[], int] = time_ns) -> None:
         super().__init__(x.fallback for x in joints)
         self.calls = Calls(1.0) if calls is None else calls
         self._time = time
         self._period = period
         self._next_sample = time
-        self._coils = [_Coil(x, self.calls) for x in joints]
+        self._coils = [Coil(x.hardware, x.name, x.limit, self.calls, clock) for x in joints]
 
     @property
     def time(self) -> int:
@@ -103,13 +84,13 @@ class HardwareDevice(Device):
     @property
     def next_level(self) -> int | None:
         """Stamp of the next level, in ns; None if there is none ahead."""
-        return min((x.schedule.next_stamp for x in self._coils
-                    if x.schedule.next_stamp is not None), default=None)
+        return min((x.next_level for x in self._coils if x.next_level is not None), default=None)
 
     @property
     def due(self) -> int | None:
         """When to advance it next, in ns; None for not before a command comes."""
-        times = [self.next_level, *(x.due(self._time) for x in self._watchdogs)]
+        times = [self.next_level, *(x.due(self._time) for x in self._watchdogs),
+                 *(x.due(self._time) for x in self._coils)]
         if self._period:
             times.append(self._next_sample)
         return min((x for x in times if x is not None), default=None)
@@ -134,6 +115,16 @@ class HardwareDevice(Device):
         """How often a level was not reached, and hardware lost its state."""
         return {'saturated': sum(x.saturated for x in self._coils),
                 'state_lost': sum(x.lost for x in self._coils)}
+
+    @property
+    def clocks(self) -> dict[str, str]:
+        """What is known of the clocks of hardware, in words by name."""
+        found = {}
+        for x in self._coils:
+            if (known := x.instrument.clock_map) is not None:
+                found |= {f'clock of {x.name}: error in us': f'{known.error * 1e6:.1f}',
+                          f'clock of {x.name}: drift in ppm': f'{known.drift * 1e6:.2f}'}
+        return found
 
     # -- commands ------------------------------------------------------------------------------
 
@@ -167,7 +158,7 @@ class HardwareDevice(Device):
         if self._refuses(joint, stamp, level, coil.schedule.current):
             return
         coil.heard = self._time
-        changed = coil.schedule.insert(stamp, level)
+        changed = coil.insert(stamp, level)
         coil.repeat = coil.repeat or not changed
         late = self._time - stamp
         if changed and stamp and late > 0:
@@ -201,12 +192,30 @@ class HardwareDevice(Device):
         self._pass_to(time)
         for i, coil in enumerate(self._coils):
             self._watch(i)
-            level = coil.schedule.apply_until(self._time)
-            if level != coil.asked or coil.repeat and self._has_room(coil):
-                self._write(i, level)
+            try:
+                self._obey(i, coil)
+            except StateLostError as error:
+                self._lose(i, error)
         if self._period and self._time >= self._next_sample:
             self._next_sample = (self._time // self._period + 1) * self._period
             self._read()
+
+    def _obey(self, i: int, coil: Coil) -> None:
+        """Write what is due, or have the device keep it; raise StateLostError if it has not."""
+        level = coil.schedule.apply_until(self._time)
+        for when, asked, really in coil.pass_to(self._time):
+            self._took_effect(i, when, asked, really)
+        if level != coil.asked:
+            self._write(i, level)
+        coil.hand_over(self._time)
+        if coil.repeat and self._has_room(coil):
+            if coil.instrument.keeps_levels:
+                coil.instrument.schedule([])
+                coil.repeat = False
+            else:
+                self._write(i, level)
+        if not coil.ask_clock(self._time):
+            raise StateLostError('its clock is another one')
 
     def _watch(self, i: int) -> None:
         coil = self._coils[i]
@@ -214,47 +223,45 @@ class HardwareDevice(Device):
             self._feed(i, self._time)
             coil.heard = None
         for stamp, level in self._safe_levels(i, self._time, self._time, coil.schedule.current):
-            coil.schedule.insert(stamp, level)
+            coil.insert(stamp, level)
 
-    def _has_room(self, coil: _Coil) -> bool:
+    def _has_room(self, coil: Coil) -> bool:
         """Return whether there is time to write before the next level, which will do as well."""
-        ahead = coil.schedule.next_stamp
+        ahead = coil.next_level
         longest = max(self.calls.longest.values(), default=0.0)
         return ahead is None or ahead - self._time > _ROOM * longest * 1e9
 
     # -- calls of the hardware -----------------------------------------------------------------
 
     def _write(self, i: int, level: float) -> None:
+        """Write a level in T; raise StateLostError if that is lost."""
         coil = self._coils[i]
         try:
             when, really = coil.instrument.write(level, self._time)
-        except StateLostError as error:
-            self._lose(i, error)
-            return
         except HardwareError:
             self._set(i, self._time, math.nan, math.nan)
             raise
-        if abs(really - level) > coil.tolerance:
+        self._took_effect(i, when, level, really)
+        coil.superseded()
+        coil.repeat = False
+
+    def _took_effect(self, i: int, when: int, asked: float, really: float) -> None:
+        """Take in the level in T that hardware has set in place of the one asked for."""
+        coil = self._coils[i]
+        if abs(really - asked) > coil.tolerance:
             coil.saturated += 1
             if coil.saturated == 1:
                 self._notices.append(Notice(
-                    Kind.SATURATED, i, f'{coil.instrument.name}.write was asked for {level:g} T '
+                    Kind.SATURATED, i, f'{coil.instrument.name} was asked for {asked:g} T '
                     f'and set {really:g} T, and moves will not end where they should: lower '
                     'flux_density_max of the planner and flux_density_limit of the driver to '
                     'what the amplifier gives'))
-        self._set(i, when, level, really)
-        coil.repeat = False
+        self._set(i, when, asked, really)
 
     def _set(self, i: int, when: int, asked: float, level: float) -> None:
         """Note the level that is in force from a time in ns on; NaN if it is not known."""
-        coil = self._coils[i]
-        known = not math.isnan(level)
-        if asked != coil.asked and (known or not math.isnan(coil.level)) or (
-                abs(level - coil.level) > coil.tolerance):
+        if self._coils[i].set(when, asked, level):
             self._changes.append(Change(i, when, level))
-            coil.history.append((when, level))
-            coil.level = level
-        coil.asked = asked
 
     def _lose(self, i: int, error: StateLostError) -> None:
         """Take in that hardware has lost its state; it must obey again, or has failed."""
@@ -265,7 +272,7 @@ class HardwareDevice(Device):
             Kind.LOST, i, f'{coil.instrument.name} has lost its state{why} and its coil is off: '
             'what was commanded is forgotten, send a new request'))
         self._set(i, self._time, 0.0, 0.0)
-        coil.schedule = CommandSchedule(0.0)
+        coil.clear()
         coil.repeat = False
         self.cut_off(i, self._time)
         try:
@@ -301,9 +308,12 @@ class HardwareDevice(Device):
 
     def _switch_off(self, i: int) -> str:
         coil = self._coils[i]
-        coil.schedule = CommandSchedule(0.0)
+        coil.clear()
         try:
-            self._write(i, 0.0)
+            try:
+                self._write(i, 0.0)
+            except StateLostError as error:
+                self._lose(i, error)
         except HardwareError as error:
             return str(error)
         if coil.instrument.off(coil.level, coil.limit):

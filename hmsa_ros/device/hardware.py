@@ -11,11 +11,17 @@ import sys
 from time import monotonic
 from typing import Any, cast, NamedTuple, Protocol
 
+from hmsa_ros.device.clock_map import ClockMap
 from hmsa_ros.device.protocol import StateLostError
 from hmsa_ros.ending import Deadline, encoded
 from hmsa_ros.errors import BadInputError, excerpt, HmsaError
 from hmsa_ros.model.units import NANOSECONDS
 
+# What its methods take; all but the first two are optional.
+_TAKES: dict[str, tuple[str, ...]] = {
+    'write': ('level', 'now'), 'read': ('now',), 'open': (), 'close': (),
+    'schedule': ('levels',), 'applied': (), 'clock': ()}
+OPTIONAL = tuple(_TAKES)[2:]
 # What cannot be when a level took effect, in ns from now.
 _ABSURD = 10 * NANOSECONDS
 # A call that blocks lets Python run, or the process ends so many s after its time.
@@ -30,6 +36,13 @@ class Hardware(Protocol):
 
     # It may have `limit` (T), `resolution` (T), `slew` (T/s), `open()`, which connects again, and
     # `close()` too. All calls come from one thread, also that of the class, unless one blocks.
+    #
+    # What keeps time itself has `schedule(levels)`, which takes [(stamp, level), ...] ahead and
+    # replaces all that it has at or after the first stamp (an empty list is a sign of life), at
+    # most `capacity` of them at a time; `write` drops what is ahead. With `applied()`, it returns
+    # [(stamp, level), ...] that have taken effect since it was last called.
+    #
+    # With `clock()`, its own time in ns, all times that it takes and returns are of that clock.
 
     def write(self, level: float, now: int) -> int | tuple[int, float] | None:
         """
@@ -189,15 +202,15 @@ class Instrument:
     def __init__(self, hardware: Hardware, joint: str, calls: Calls) -> None:
         self._hardware, self._calls = hardware, calls
         self.name, self._joint = type(hardware).__name__, joint
-        self._names = {x: f'{self.name}.{x} of joint {joint}'
-                       for x in ('write', 'read', 'open', 'close')}
-        for method, arguments in (
-                ('write', (0.0, 0)), ('read', (0,)), ('open', ()), ('close', ())):
+        self._names = {x: f'{self.name}.{x} of joint {joint}' for x in _TAKES}
+        for method, arguments in _TAKES.items():
             self._check_signature(method, arguments)
-        self.limit, self.resolution, self.slew = (
-            self._number(x) for x in ('limit', 'resolution', 'slew'))
+        self.limit, self.resolution, self.slew, self._capacity = (
+            self._number(x) for x in ('limit', 'resolution', 'slew', 'capacity'))
+        #: The device's clock against that of this host; None where there is one clock.
+        self.clock_map = ClockMap() if self.has('clock') else None
 
-    def _check_signature(self, method: str, arguments: Sequence[object]) -> None:
+    def _check_signature(self, method: str, arguments: Sequence[str]) -> None:
         try:
             inspect.signature(getattr(self._hardware, method, lambda *_: 0)).bind(*arguments)
         except ValueError:  # of something that is no Python
@@ -205,8 +218,7 @@ class Instrument:
         except TypeError as error:
             raise BadInputError(
                 f'{self.name}.{method} does not take what it is given ({error}): expected '
-                f'{method}({", ".join(("level", "now")[-len(arguments):] if arguments else ())})'
-            ) from error
+                f'{method}({", ".join(arguments)})') from error
 
     def _number(self, name: str) -> float | None:
         value = getattr(self._hardware, name, None)
@@ -250,12 +262,23 @@ class Instrument:
             If the hardware says so.
 
         """
-        return self._written(self._call('write', level, now), level, now)
+        return self._written(self._call('write', level, self._theirs(now)), level, now)
+
+    def _theirs(self, time: int) -> int:
+        """Return a time in ns as the hardware counts it."""
+        return time if self.clock_map is None else self.clock_map.to_device(time)
+
+    def _ours(self, time: Any) -> int:
+        """Return a time in ns of the hardware as one of this host."""
+        return int(time) if self.clock_map is None else self.clock_map.to_host(int(time))
 
     def _written(self, answer: Any, level: float, now: int) -> tuple[int, float]:
         pair = isinstance(answer, (tuple, list)) and len(answer) == 2
         when, really = (answer[0], answer[1]) if pair else (answer, level)
-        when = now if when is None else when
+        if when is None:
+            when = now
+        elif _is_number(when):
+            when = self._ours(when)
         if not (_is_number(when) and abs(when - now) <= _ABSURD and _is_number(really)):
             raise HardwareError(
                 f'{self.name}.write of joint {self._joint} returned {excerpt(answer)}: expected '
@@ -275,19 +298,92 @@ class Instrument:
             If the hardware says so.
 
         """
-        answer = self._call('read', now)
+        answer = self._call('read', self._theirs(now))
         try:
             if isinstance(answer, (str, bytes)):
                 raise TypeError
             values = (answer,) if _is_number(answer, finite=False) else (*answer,)
             if any(_is_number(x, finite=False) for x in values):
-                return [_reading(values)]
-            return [_reading(x) for x in values]
+                return [self._reading(values)]
+            return [self._reading(x) for x in values]
         except (TypeError, ValueError) as error:
             raise HardwareError(
                 f'{self.name}.read of joint {self._joint} returned {excerpt(answer)}: expected '
                 'stretch, (stretch, rate), (stretch, rate, stamp in ns) or a list of the latter, '
                 'with NaN for what is not measured') from error
+
+    def _reading(self, values: Sequence[Any]) -> Reading:
+        found = _reading(values)
+        return found if found.stamp is None else found._replace(stamp=self._ours(found.stamp))
+
+    @property
+    def keeps_levels(self) -> bool:
+        """Whether it takes levels ahead."""
+        return self.has('schedule')
+
+    @property
+    def capacity(self) -> int | None:
+        """How many levels it takes ahead; None for any number."""
+        return None if self._capacity is None else int(self._capacity)
+
+    def schedule(self, levels: Sequence[tuple[int, float]]) -> None:
+        """
+        Have it keep levels in T from stamps in ns on; they replace all from the first one on.
+
+        Raises
+        ------
+        HardwareError
+            If it fails.
+        StateLostError
+            If the hardware says so.
+
+        """
+        self._call('schedule', [(self._theirs(x), y) for x, y in levels])
+
+    def applied(self) -> list[tuple[int, float]]:
+        """
+        Return stamps in ns and levels in T that have taken effect since it was last called.
+
+        Raises
+        ------
+        HardwareError
+            If it fails.
+        StateLostError
+            If the hardware says so.
+
+        """
+        answer = self._call('applied')
+        try:
+            found = [(x, y) for x, y in answer]
+            if not all(_is_number(x) and _is_number(y) for x, y in found):
+                raise TypeError
+        except (TypeError, ValueError) as error:
+            raise HardwareError(
+                f'{self._names["applied"]} returned {excerpt(answer)}: expected a list of '
+                '(stamp in ns, level in T)') from error
+        return [(self._ours(x), float(y)) for x, y in found]
+
+    def ask_clock(self, clock: Callable[[], int]) -> bool:
+        """
+        Compare its clock with that of this host, in ns; return whether it is still the same.
+
+        Raises
+        ------
+        HardwareError
+            If it fails, or answers no time.
+        StateLostError
+            If the hardware says so.
+
+        """
+        if self.clock_map is None:
+            return True
+        before = clock()
+        answer = self._call('clock')
+        after = clock()
+        if not _is_number(answer):
+            raise HardwareError(
+                f'{self._names["clock"]} returned {excerpt(answer)}: expected its time in ns')
+        return self.clock_map.add(before, int(answer), after)
 
     def open(self) -> None:
         """Connect again, where it can; an error is passed over, as the next `write` shows."""
@@ -312,7 +408,7 @@ class Instrument:
     def cut(self, now: int) -> bool:
         """Write 0 past the call that blocks, at a time in ns; return whether that is done."""
         try:
-            self._written(self._hardware.write(0.0, now), 0.0, now)
+            self._written(self._hardware.write(0.0, self._theirs(now)), 0.0, now)
         except BaseException:
             return False
         return True

@@ -77,6 +77,10 @@ class CommandSchedule(Superseding[float]):
         known = bisect_right(self._stamps, stamp)
         return self._things[known - 1] if known else self.current
 
+    def ahead(self, since: int = 0) -> list[tuple[int, float]]:
+        """Return stamps in ns and levels in T of the commands ahead, from a time on."""
+        return [(x, y) for x, y in zip(self._stamps, self._things, strict=True) if x >= since]
+
     @property
     def next_stamp(self) -> int | None:
         """Stamp in ns of the next command ahead, None if there is none."""

@@ -10,7 +10,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import ParameterDescriptor
 
 from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
-from hmsa_ros.device.hardware import Calls, load
+from hmsa_ros.device.hardware import Calls, load, OPTIONAL
 from hmsa_ros.device.health import judge_hardware, listed
 from hmsa_ros.device.worker import HardwareWorker
 from hmsa_ros.ending import Deadline, ENDING
@@ -160,7 +160,7 @@ class DriverNode(DeviceNode):
         level, message = judge_hardware(self.device.trouble, **device.counts)
         yield conversions.to_status(
             f'{self.get_name()}: hardware', ', '.join(self.values.names), level, message,
-            {**device.counts, **{
+            {**device.counts, **device.clocks, **{
                 f'longest {name} in ms': f'{seconds * 1e3:.3f}'
                 for name, seconds in [*device.calls.longest.items()]}})
 
@@ -185,12 +185,15 @@ def _described(device: HardwareDevice, values: JointParameters) -> str:
     for name, coil, limit in zip(values.names, device.instruments, device.limits, strict=True):
         own = values.of(name)
         rate, safe = own[PUBLISH_RATE.name], own['safe_flux']
-        optional = [x for x in ('open', 'close') if coil.has(x)]
+        optional = [x for x in OPTIONAL if coil.has(x)]
         each.append(
             f'{coil.name} for joint {name}'
             f'{f" with {listed(optional)}" if optional else ""}: limit {limit:g} T, resolution '
             f'{_known(coil.resolution, "T")}, slew {_known(coil.slew, "T/s")}, '
-            + (f'read at {rate:g} Hz' if rate else 'not read') + f', {safe} after '
+            + (f'read at {rate:g} Hz' if rate else 'not read')
+            + ('' if coil.clock_map is None else
+               f', its clock known to {coil.clock_map.error * 1e6:.0f} us')
+            + f', {safe} after '
             f'{own["command_timeout"]:g} s without a command')
     return f'{"; ".join(each)}; {TIMEOUT.name} {values[TIMEOUT.name]:g} s'
 
