@@ -14,13 +14,14 @@ from hmsa_ros.cli import Parser
 from hmsa_ros.errors import BadInputError, complain, HmsaError
 from hmsa_ros.model.moves import State
 from hmsa_ros.model.parameters import NondimensionalParameters
+from hmsa_ros.model.residual import percent
 from hmsa_ros.planning.shapers import SHAPERS
 from hmsa_ros.planning.shapers.pace import Pace
 from hmsa_ros.planning.shapers.request import Request
 from hmsa_studies.damped import damped_study, DampedStudy, LIMITS
 from hmsa_studies.pictures import draw_damped, draw_front, draw_robustness, draw_sampled
 from hmsa_studies.residual import Actual, Errors
-from hmsa_studies.robustness import Candidate, candidates, Case, PARAMETERS, percent, study
+from hmsa_studies.robustness import Candidate, candidates, Case, PARAMETERS, study
 from hmsa_studies.sampled import sampled_study
 from hmsa_studies.sweep import parse_grid, Sweep
 from hmsa_studies.sweep_pictures import draw_sweep

@@ -1,7 +1,7 @@
 """The paper's Figs. 2 to 10 (Polymers 2022, 14, 3037) as pictures and tables."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from pathlib import Path
 from typing import Any
@@ -11,24 +11,25 @@ from matplotlib.figure import Figure
 import numpy as np
 
 from hmsa_ros.model.equations import signed_root, stretch_limits
-from hmsa_ros.report import style
+from hmsa_ros.report import looks, style
+from hmsa_ros.report.paper import named, Paper
 from hmsa_studies import paper_data
 from hmsa_studies.paper_data import Data, Run, Sweep
 
-TAU = r'nondimensional time $\tau$ [1]'
-STRETCH = r'stretch $\lambda$ [1]'
-RATE = r'stretch rate $\dot{\lambda}=\mathrm{d}\lambda/\mathrm{d}\tau$ [1]'
-FLUX = 'nondim. flux density $b$ [1]'
-TAU_P = r'intermediate time $\tau_p$ [1]'
+TAU = style.axis('time', r'\tau')
+STRETCH = style.axis('stretch', r'\lambda')
+RATE = style.axis('stretch rate', r'\dot{\lambda}')
+FLUX = style.axis('flux density', 'b')
+TAU_P = style.axis('intermediate time', r'\tau_p')
 #: Critical damping as the paper quotes it, for 1 -> 1.1.
 PAPER_CRITICAL = 2.14
 _COMMANDS = (('unshaped', style.UNSHAPED), ('shaped', style.SHAPED))
-_ALONE: dict[str, Any] = {
-    'color': style.GREEN, 'linewidth': 1.2, 'linestyle': (0, (6, 1.5, 1, 1.5)), 'zorder': 2}
-_CASES: tuple[dict[str, Any], ...] = (
-    {'color': style.BLUE, 'linewidth': 1.0, 'linestyle': '-', 'zorder': 2},
-    {'color': style.ORANGE, 'linewidth': 1.5, 'linestyle': (0, (5, 1.5)), 'zorder': 3},
-    {'color': style.BLACK, 'linewidth': 1.2, 'linestyle': (0, (1, 1.2)), 'zorder': 4})
+_ALONE = looks.Look(looks.INDIGO, 1.2, (6.0, 1.5, 1.0, 1.5)).line()
+_CASES = (
+    looks.Look(looks.BLUE, 1.0), looks.Look(looks.ORANGE, 1.5, (5.0, 1.5), order=3),
+    looks.Look(looks.BLACK, 1.2, (1.0, 1.2), order=4))
+# Width in inches below which panels stand below each other.
+_NARROW = 4.0
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,7 @@ class PaperFigure:
     compute: Callable[[int], Data]  #: its data from the number of samples, or points of a sweep
     draw: Callable[[Figure, Any], None]
     height: float  #: in inches
+    stacked: float  #: the same where panels stand below each other
 
     @property
     def default_points(self) -> int:
@@ -48,15 +50,29 @@ class PaperFigure:
         return paper_data.SWEEP_POINTS if sweep else paper_data.SAMPLES
 
 
-def write_figure(figure: PaperFigure, folder: Path, *, points: int | None = None) -> list[Path]:
-    """Write PNG and CSV, with so many samples or points of a sweep, and return their paths."""
-    image = folder / f'figure_{figure.number:02d}.png'
-    table = image.with_suffix('.csv')
+def write_figure(
+        figure: PaperFigure, folder: Path, *, points: int | None = None,
+        paper: Paper | None = None, kinds: Sequence[str] = ('png',)) -> list[Path]:
+    """Write pictures and CSV, with so many samples or points of a sweep; return their paths."""
+    # The table is the picture's data.
+    paper = replace(paper or Paper(), data=False)
+    images = named(folder, f'figure_{figure.number:02d}', kinds)
+    table = images[0].with_suffix('.csv')
     data = figure.compute(points or figure.default_points)
     paper_data.write_csv(table, data)
-    with style.picture(image, figure.height) as canvas:
+    height = figure.stacked if paper.inches < _NARROW else figure.height
+    with style.picture(images, height, paper) as canvas:
         figure.draw(canvas, data)
-    return [image, table]
+    return [*images, table]
+
+
+def _stacked(figure: Figure) -> bool:
+    return bool(figure.get_figwidth() < _NARROW)
+
+
+def _pair(figure: Figure) -> Any:
+    """Return two panels beside or below each other."""
+    return figure.subplots(2, 1) if _stacked(figure) else figure.subplots(1, 2)
 
 
 def _find(runs: Sequence[Run], command: str) -> Run:
@@ -97,7 +113,7 @@ def _plot_phase(axes: Axes, runs: Sequence[Run]) -> None:
 
 def _draw_multi_step(figure: Figure, runs: tuple[Run, ...]) -> None:
     run, = runs
-    left, right = figure.subplots(1, 2)
+    left, right = _pair(figure)
     _plot_command(left, run, **style.UNSHAPED | {'linestyle': '-', 'linewidth': 1.4})
     for i, load in enumerate(run.loads):
         style.note(
@@ -111,7 +127,7 @@ def _draw_multi_step(figure: Figure, runs: tuple[Run, ...]) -> None:
         # Beside the panel, where no curve runs.
         style.note(
             right, rf'$\lambda(b_{i + 1})={target:.2f}$', (1.0, target), (3, 0),
-            xycoords=('axes fraction', 'data'), va='center', fontsize=8)
+            xycoords=('axes fraction', 'data'), va='center', fontsize='small')
     right.plot(
         run.time, run.stretch, **style.UNSHAPED | {'linestyle': '-', 'linewidth': 1.4})
     right.set_xlim(0.0, float(run.time[-1]))
@@ -122,14 +138,14 @@ def _draw_single_move(figure: Figure, runs: tuple[Run, ...]) -> None:
     shaped, plain, alone = (_find(runs, x) for x in ('shaped', 'unshaped', 'b_p alone'))
     tau_p = float(shaped.switches[1])
     b_p, b_1 = (float(x) for x in signed_root(shaped.loads))
-    left, right = figure.subplots(1, 2)
+    left, right = _pair(figure)
     _plot_command(left, plain, **style.UNSHAPED)
     _plot_command(left, shaped, **style.SHAPED)
     left.plot([tau_p, 10.0], [b_p, b_p], **_ALONE)
     left.plot([tau_p, tau_p], [b_p, b_1], **style.EQUILIBRIUM)
     left.annotate(
         '', (6.5, b_1), xytext=(6.5, b_p),
-        arrowprops={'arrowstyle': '<->', 'color': style.BLACK, 'linewidth': 0.8,
+        arrowprops={'arrowstyle': '<->', 'color': looks.BLACK, 'linewidth': 0.8,
                     'shrinkA': 0, 'shrinkB': 0})
     style.note(
         left, f'$b_a=b_1-b_p={b_1 - b_p:.4f}$', (6.5, 0.5 * (b_1 + b_p)), (-4, 0), ha='right',
@@ -161,7 +177,7 @@ def _draw_single_move(figure: Figure, runs: tuple[Run, ...]) -> None:
 
 
 def _draw_shaped_multi_step(figure: Figure, runs: tuple[Run, ...]) -> None:
-    left, right = figure.subplots(1, 2)
+    left, right = _pair(figure)
     shaped = _find(runs, 'shaped')
     _plot_command(left, _find(runs, 'unshaped'), **style.UNSHAPED)
     _plot_command(left, shaped, **style.SHAPED)
@@ -182,8 +198,11 @@ def _draw_shaped_multi_step(figure: Figure, runs: tuple[Run, ...]) -> None:
 
 def _draw_sequences(figure: Figure, runs: tuple[Run, ...]) -> None:
     """Draw Figs. 5 and 6: two sequences over time, the first one in the phase plane."""
-    panels = figure.subplot_mosaic(
-        [['first', 'phase'], ['second', 'phase']], width_ratios=[1.3, 1.0])
+    rows = [['first'], ['second'], ['phase']]
+    if not _stacked(figure):
+        rows = [['first', 'phase'], ['second', 'phase']]
+    panels: dict[str, Axes] = figure.subplot_mosaic(
+        rows, width_ratios=[1.3, 1.0][:len(rows[0])])  # type: ignore[arg-type]
     for name, part, letter in (('first', runs[:2], 'a'), ('second', runs[2:], '')):
         axes = panels[name]
         _plot_targets(axes, part[0])
@@ -201,7 +220,8 @@ def _draw_sequences(figure: Figure, runs: tuple[Run, ...]) -> None:
 
 
 def _draw_damping_cases(figure: Figure, runs: tuple[Run, ...]) -> None:
-    grid = figure.subplots(2, 2, sharex=True, sharey='col')
+    grid = figure.subplots(4, 1, sharex=True).reshape(2, 2).T if _stacked(figure) else (
+        figure.subplots(2, 2, sharex=True, sharey='col'))
     half = len(runs) // 2
     for column, (part, letter) in enumerate(((runs[:half], 'a'), (runs[half:], 'b'))):
         mode = 'expansion' if column == 0 else 'contraction'
@@ -211,51 +231,57 @@ def _draw_damping_cases(figure: Figure, runs: tuple[Run, ...]) -> None:
             chosen = [x for x in part if x.command == command]
             for run, look in zip(chosen, _CASES, strict=True):
                 axes.plot(
-                    run.time, run.stretch, label=rf'$\zeta={run.material.zeta:.2f}$', **look)
+                    run.time, run.stretch, **look.line(
+                        label=rf'$\zeta={run.material.zeta:.2f}$'))
             axes.set_xlim(0.0, float(part[0].time[-1]))
-            style.finish(axes, TAU if row else '', '' if column else STRETCH,
-                         letter if row == 0 else '')
+            first = not column or _stacked(figure)
+            style.finish(
+                axes, TAU if row else '', STRETCH if first else '', letter if row == 0 else '')
             axes.set_title(f'{mode}, {command}', loc='right')
     style.legend_below(figure, grid[0, 0])
 
 
 def _draw_damping_sweep(figure: Figure, sweep: Sweep) -> None:
-    left, right = figure.subplots(1, 2)
+    left, right = _pair(figure)
     for axes in (left, right):
         axes.plot(sweep.zeta, sweep.tau_p, label=r'$\tau_p$, $1\to1.1$', **style.SHAPED)
         axes.axvline(
-            PAPER_CRITICAL, color=style.ORANGE, linewidth=1.2, linestyle=(0, (4, 1.5)),
+            PAPER_CRITICAL, color=looks.VERMILION, linewidth=1.2, linestyle=(0, (4, 1.5)),
             label=f'critical, as the paper quotes it: {PAPER_CRITICAL}')
         axes.axvline(
-            sweep.critical, color=style.BLACK, linewidth=1.0, linestyle=(0, (1, 1.2)),
+            sweep.critical, color=looks.BLACK, linewidth=1.0, linestyle=(0, (1, 1.2)),
             label=f'critical, linearised at 1.1: {sweep.critical:.4f}')
     top = math.ceil(float(np.nanmax(sweep.tau_p))) + 0.5
     left.set_xlim(0.0, 1.05 * sweep.critical)
     left.set_ylim(0.0, top)
-    style.finish(left, r'nondimensional damping $\zeta$ [1]', TAU_P, 'a')
+    style.finish(left, style.axis('damping coefficient', r'\zeta'), TAU_P, 'a')
     near = 2.0
     right.set_xlim(near, near + 1.12 * (sweep.critical - near))
     right.set_ylim(0.0, top)
-    style.finish(right, r'nondimensional damping $\zeta$ [1] (close-up)', '', 'b')
+    style.finish(
+        right, style.axis('damping coefficient', r'\zeta') + ', close-up',
+        TAU_P if _stacked(figure) else '', 'b')
     style.legend_below(figure, left)
 
 
 def _draw_chain_limit_cases(figure: Figure, runs: tuple[Run, ...]) -> None:
     pairs = [runs[i:i + 2] for i in range(0, len(runs), 2)]
-    grid = figure.subplots(len(pairs), 2, sharex='col', width_ratios=[1.6, 1.0])
+    grid = figure.subplots(2 * len(pairs), 1).reshape(-1, 2) if _stacked(figure) else (
+        figure.subplots(len(pairs), 2, sharex='col', width_ratios=[1.6, 1.0]))
     begin = 2 * paper_data.SPAN
     for (left, right), pair, letter in zip(grid, pairs, 'abc', strict=True):
         limit = stretch_limits(pair[0].material)[1]
         for axes in (left, right):
             axes.axhline(
-                limit, color=style.BLACK, linewidth=0.9, linestyle=(0, (6, 2)),
+                limit, color=looks.BLACK, linewidth=0.9, linestyle=(0, (6, 2)),
                 label=r'limiting stretch $\lambda_m$')
             _plot_targets(axes, pair[0])
             _plot_responses(axes, pair)
         right.set_xlim(begin - 0.2, begin + 2.0)
         last = pair is pairs[-1]
         style.finish(left, TAU if last else '', STRETCH, letter)
-        style.finish(right, TAU + ' (close-up)' if last else '', '')
+        style.finish(
+            right, TAU + ', close-up' if last else '', STRETCH if _stacked(figure) else '')
         left.set_title(
             rf'$J_{{\mathrm{{lim}}}}={pair[0].material.j_lim:g}$, $\lambda_m={limit:.3f}$, '
             rf'$\tilde{{\lambda}}_m={paper_data.NEAR_LIMIT:g}\,\lambda_m'
@@ -265,9 +291,9 @@ def _draw_chain_limit_cases(figure: Figure, runs: tuple[Run, ...]) -> None:
 
 
 def _draw_chain_limit_sweep(figure: Figure, sweep: Sweep) -> None:
-    left, right = figure.subplots(1, 2)
+    left, right = _pair(figure)
     marks = np.searchsorted(sweep.j_lim, paper_data.J_LIMS)
-    extension = r'chain extensibility $J_{\mathrm{lim}}$ [1]'
+    extension = style.axis('chain extensibility', r'J_{\mathrm{lim}}')
     b_p = signed_root(sweep.beta_p)
     for axes, values in ((left, sweep.tau_p), (right, b_p)):
         axes.plot(sweep.j_lim, values, label=r'$1\to1.2$', **style.SHAPED)
@@ -277,25 +303,25 @@ def _draw_chain_limit_sweep(figure: Figure, sweep: Sweep) -> None:
     for axes in (left, right):
         axes.set_xlim(0.0, float(sweep.j_lim[-1]))
     style.finish(left, extension, TAU_P, 'a')
-    style.finish(right, extension, 'intermediate flux density $b_p$ [1]', 'b')
+    style.finish(right, extension, style.axis('intermediate flux density', 'b_p'), 'b')
     style.legend_below(figure, right)
 
 
 #: The figures by number.
 FIGURES: dict[int, PaperFigure] = {x.number: x for x in (
     PaperFigure(2, 'plain steps and the response', paper_data.multi_step,
-                _draw_multi_step, 2.7),
+                _draw_multi_step, 2.7, 4.6),
     PaperFigure(3, 'the command-shaping scheme, 1 to 1.1', paper_data.single_move,
-                _draw_single_move, 3.1),
+                _draw_single_move, 3.1, 5.4),
     PaperFigure(4, 'shaped steps and the response', paper_data.shaped_multi_step,
-                _draw_shaped_multi_step, 3.0),
-    PaperFigure(5, 'expansion', paper_data.expansion, _draw_sequences, 4.0),
-    PaperFigure(6, 'contraction', paper_data.contraction, _draw_sequences, 4.0),
-    PaperFigure(7, 'effect of damping', paper_data.damping_cases, _draw_damping_cases, 4.4),
+                _draw_shaped_multi_step, 3.0, 5.0),
+    PaperFigure(5, 'expansion', paper_data.expansion, _draw_sequences, 4.0, 6.4),
+    PaperFigure(6, 'contraction', paper_data.contraction, _draw_sequences, 4.0, 6.4),
+    PaperFigure(7, 'effect of damping', paper_data.damping_cases, _draw_damping_cases, 4.4, 7.6),
     PaperFigure(8, 'intermediate time over damping', paper_data.damping_sweep,
-                _draw_damping_sweep, 3.1),
+                _draw_damping_sweep, 3.1, 5.2),
     PaperFigure(9, 'effect of chain extensibility', paper_data.chain_limit_cases,
-                _draw_chain_limit_cases, 5.4),
+                _draw_chain_limit_cases, 5.4, 9.4),
     PaperFigure(10, 'intermediate time and flux density over chain extensibility',
-                paper_data.chain_limit_sweep, _draw_chain_limit_sweep, 3.0),
+                paper_data.chain_limit_sweep, _draw_chain_limit_sweep, 3.0, 5.0),
 )}

@@ -220,18 +220,6 @@ def _worst(residuals: Array, errors: Sequence[Errors]) -> Worst:
     return Worst(float(residuals[index]), errors[index])
 
 
-def percent(share: float) -> str:
-    """Word a residual in percent, without the sign; NaN where a motion could not be followed."""
-    if math.isnan(share):
-        return '?'
-    if share < 1e-8:
-        return '<1e-6'
-    value = 100.0 * share
-    if value < 1e-3:
-        return f'{value:.0e}'
-    return f'{value:.{1 if value >= 1.0 else 2 if value >= 0.1 else 3}f}'
-
-
 # What was varied is a parameter, or 'box' for the worst in the box; residual and offset, how far
 # beyond the target the actuator comes to rest, are shares of the step.
 _COLUMNS = (

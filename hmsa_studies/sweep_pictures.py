@@ -1,6 +1,7 @@
 """Pictures of sweeps: curves, maps with the region without a plan, and how samples spread."""
 
 from collections.abc import Mapping, Sequence
+import math
 from pathlib import Path
 from typing import Any
 
@@ -9,82 +10,96 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import NullLocator
+from matplotlib.ticker import FormatStrFormatter, MaxNLocator, NullLocator
 import numpy as np
 
 from hmsa_ros.interfaces.parameters import PLANNED
 from hmsa_ros.model.equations import Array
-from hmsa_ros.report import style
+from hmsa_ros.report import looks, style
+from hmsa_ros.report.paper import Paper
 from hmsa_studies.settings import ACTUAL, BLOCK_OF, Nondimensional
 from hmsa_studies.views import Axis, View
 
 #: Shares of the samples between which the bands are, and the one that maps show.
 BANDS, MAPPED = ((0.05, 0.95), (0.25, 0.75)), 0.95
 
-_PERCENT = '[% of the step]'
-_TIME = r'[$L\sqrt{\rho/G}$]'
+_STEP = '% of step'
 _NAMES = {
-    'start': r'start stretch $\lambda_0$ [1]', 'target': r'target stretch $\lambda_d$ [1]',
-    'zeta': r'$\zeta$ [1]', 'j_lim': r'$J_\mathrm{lim}$ [1]', 'c1': '$c_1$ [1]',
-    'load_min': r'least load $\beta$ [1]', 'load_max': r'largest load $\beta$ [1]',
-    'period': f'command period {_TIME}', 'lag': f'lag of the field {_TIME}',
-    'slew': r'slew limit [$\sqrt{G/\rho}/L$]', 'command_period': 'command period [s]',
-    'beta_p': r'first load $\beta_p$ [1]', 'b_p': 'first level $b_p$ [1]',
-    'tau_p': rf'duration $\tau_p$ {_TIME}', 'beta_1': r'holding load $\beta_1$ [1]',
-    'b_1': 'holding level $b_1$ [1]', 'flux_density_p': 'first flux density $B_p$ [T]',
-    'residual': f'residual vibration {_PERCENT}', 'offset': f'offset at rest {_PERCENT}',
-    'error.shear_modulus': 'error of $G$ [%]', 'error.j_lim': r'error of $J_\mathrm{lim}$ [%]',
-    'error.zeta': r'error of $\zeta$ [%]', 'error.remanence': 'error of $B_r$ [%]',
-    'time_p': 'duration $t_p$ [s]', 'flux_density_1': 'holding flux density $B_1$ [T]'}
+    'start': r'start $\lambda_0$', 'target': r'target $\lambda_d$',
+    'zeta': r'$\zeta$', 'j_lim': r'$J_\mathrm{lim}$', 'c1': '$c_1$',
+    'load_min': r'least load $\beta$', 'load_max': r'largest load $\beta$',
+    'period': r'command period $\tau$', 'lag': r'lag of the field $\tau$',
+    'slew': r'slew limit $\mathrm{d}\beta/\mathrm{d}\tau$',
+    'command_period': 'command period (s)',
+    'beta_p': r'first load $\beta_p$', 'b_p': 'first level $b_p$',
+    'tau_p': r'duration $\tau_p$', 'beta_1': r'holding load $\beta_1$',
+    'b_1': 'holding level $b_1$', 'flux_density_p': 'first flux density $B_p$ (T)',
+    'residual': f'residual vibration ({_STEP})', 'offset': f'offset at rest ({_STEP})',
+    'error.shear_modulus': 'error of $G$ (%)', 'error.j_lim': r'error of $J_\mathrm{lim}$ (%)',
+    'error.zeta': r'error of $\zeta$ (%)', 'error.remanence': 'error of $B_r$ (%)',
+    'time_p': 'duration $t_p$ (s)', 'flux_density_1': 'holding flux density $B_1$ (T)'}
 # Shares, drawn in percent.
 _SHARES = ('residual', 'offset', *Nondimensional.actual)
-_UNITS = {x.name: x.unit or '1' for x in PLANNED}
-_LOOKS: tuple[dict[str, Any], ...] = tuple(
-    {'color': colour, 'linestyle': dashes} for colour, dashes in (
-        (style.BLUE, '-'), (style.VERMILION, (0, (5, 1.5))), (style.GREEN, (0, (1, 1))),
-        (style.PURPLE, (0, (5, 1, 1, 1))), (style.ORANGE, '-'), (style.BLACK, (0, (3, 1))),
-        (style.SKY_BLUE, (0, (5, 1.5))), (style.GREY, '-')))
+_UNITS = {x.name: x.unit for x in PLANNED}
 _HATCH: dict[str, Any] = {'facecolor': '#F0F0F0', 'edgecolor': '#9A9A9A', 'hatch': '////'}
 _CONTOURS = 7
+# A map whose middle value is in this share of its scale shows a single colour; then the scale is
+# logarithmic, and ends where so many of the values do.
+_LOPSIDED, _MOST = 0.2, 0.97
 # A scale is logarithmic where numbers are all above 0 and spread by so much.
 _DECADES = 30.0
 
 
 def draw_sweep(
         paths: Sequence[Path], view: View, columns: Mapping[str, Array],
-        fixed: Mapping[str, float] | None = None) -> None:
-    """Draw a sweep's columns, NaN where there is no plan, titled by what is fixed; PNG or PDF."""
+        fixed: Mapping[str, float] | None = None, paper: Paper | None = None) -> None:
+    """Draw a sweep's columns, NaN where there is no plan, titled by what is fixed."""
     values = {name: _scale(name) * view.arranged(x) for name, x in columns.items()}
     rows = len(view.labels) if view.y else 1
-    with style.picture(paths, 1.1 + 2.6 * rows) as figure:
-        panels = figure.subplots(rows, len(values), squeeze=False)
+    paper = paper or Paper()
+    # Columns below each other where the paper is too narrow for them.
+    stacked = paper.columns(len(values)) < len(values)
+    with style.picture(paths, 1.1 + 2.5 * rows * (len(values) if stacked else 1), paper) as figure:
+        panels = figure.subplots(
+            rows * (len(values) if stacked else 1), 1 if stacked else len(values), squeeze=False)
+        if stacked:
+            panels = panels.reshape(rows, len(values))
+        letters = iter('abcdefghijklmnopqrstuvwxyz' if panels.size > 1 else '')
         for column, (name, found) in enumerate(values.items()):
             if view.x is None:
                 _shares(panels[0, column], view, name, found[:, 0, 0])
             elif view.y is None:
-                _curves(panels[0, column], view, view.x, name, found[:, 0])
+                _curves(figure, panels[0, column], view, view.x, name, found[:, 0])
             else:
                 for row, label in enumerate(view.labels):
                     _map(figure, panels[row, column], (view.x, view.y), name,
                          _quantile(found[row], MAPPED) if view.samples > 1
                          else found[row, :, :, 0])
-                    panels[row, column].set_title(label, fontsize=9)
+                    panels[row, column].set_title(label, loc='right')
+        for panel in figure.axes:
+            if panel.get_label() != '<colorbar>' and (letter := next(letters, '')):
+                panel.set_title(f'({letter})', loc='left', fontweight='bold')
         _notes(figure, panels[0, 0], view, values)
-        common = ', '.join(f'{label_of(x).rpartition(" [")[0]} = {_scale(x) * y:g}' for x, y in (
-            fixed or {}).items())
+        common = [_with_value(x, _scale(x) * y) for x, y in (fixed or {}).items()]
         if common:
-            figure.suptitle(common, fontsize=9)
+            figure.suptitle(', '.join(common))
+
+
+def _with_value(name: str, value: float) -> str:
+    """Return what a column is, and its value with the unit."""
+    quantity, bracket, unit = label_of(name).partition(' (')
+    return f'{quantity} = {value:g}{" " if bracket else ""}{unit.removesuffix(")")}'
 
 
 def label_of(name: str) -> str:
-    """Return what an axis or a column is, with its unit in brackets."""
+    """Return what an axis or a column is, with its unit if it has one."""
     if name in _NAMES:
         return _NAMES[name]
     planned = f'{BLOCK_OF}{name.removeprefix(ACTUAL)}'
     planned = planned if planned in _UNITS else name.removeprefix(ACTUAL)
     words = planned.removeprefix(BLOCK_OF).replace('_', ' ')
-    return (f'{"actual " if name.startswith(ACTUAL) else ""}{words} '
-            f'[{_UNITS.get(planned, "1")}]')
+    return style.axis(f'{"actual " if name.startswith(ACTUAL) else ""}{words}',
+                      unit=_UNITS.get(planned, ''))
 
 
 def _scale(name: str) -> float:
@@ -113,7 +128,9 @@ def _even(axis: Axis) -> bool:
     return bool(np.ptp(steps) / np.mean(steps) <= np.ptp(ratios) / np.mean(ratios))
 
 
-def _map(figure: Figure, panel: Axes, axes: tuple[Axis, Axis], name: str, values: Array) -> None:
+def _map(
+        figure: style.Picture, panel: Axes, axes: tuple[Axis, Axis], name: str,
+        values: Array) -> None:
     """Draw a map with contours; hatched where there is no plan."""
     places = [_scale(x.name) * View.places(x) for x in axes]
     orders = [np.argsort(x, kind='stable') for x in places]
@@ -124,70 +141,95 @@ def _map(figure: Figure, panel: Axes, axes: tuple[Axis, Axis], name: str, values
     panel.patch.set(linewidth=0.0, **_HATCH)
     known = np.isfinite(values)
     if known.any():
-        low, high = float(values[known].min()), float(values[known].max())
-        wide = _wide(values)
-        norm = (LogNorm if wide else Normalize)(low, high if high > low else low + 1e-12)
+        norm, (low, high) = _norm(values[known])
         mesh = panel.pcolormesh(
             x, y, values, cmap='cividis', norm=norm, shading='nearest', rasterized=True)
-        figure.colorbar(mesh, ax=panel, label=label_of(name), pad=0.02)
-        if high > low:
-            levels = np.geomspace(low, high, _CONTOURS + 2)[1:-1] if wide else _CONTOURS
+        bar = figure.colorbar(mesh, ax=panel, label=label_of(name), pad=0.02,
+                              extend='max' if values[known].max() > high else 'neither')
+        if isinstance(norm, LogNorm) and high < _DECADES * low:
+            # No power of ten may be on the scale.
+            bar.set_ticks([z for z in MaxNLocator(5).tick_values(low, high) if low <= z <= high])
+            bar.formatter = FormatStrFormatter('%g')
+            bar.minorticks_off()
+        # At quantiles of the values, lines are spread over the whole map.
+        levels = sorted({float(f'{z:.2g}') for z in np.quantile(
+            values[known], np.arange(1, _CONTOURS + 1) / (_CONTOURS + 1))})
+        levels = [z for z in levels if values[known].min() < z < values[known].max()]
+        if levels:
             lines = panel.contour(x, y, values, levels=levels, colors='white', linewidths=0.7)
-            for drawn in (lines, *panel.clabel(lines, fontsize=7, fmt='%.3g')):
+            for drawn in (lines, *panel.clabel(lines, fontsize='small', fmt='%.3g')):
                 drawn.set(path_effects=[withStroke(linewidth=1.6, foreground='#404040')])
+    figure.remember(panel, label_of(name), x, y, values)
     style.finish(panel, label_of(axes[0].name), label_of(axes[1].name))
     panel.grid(visible=False)
     for axis in (panel.xaxis, panel.yaxis):
         axis.set_minor_locator(NullLocator())
 
 
-def _curves(panel: Axes, view: View, axis: Axis, name: str, values: Array) -> None:
+def _norm(values: Array) -> tuple[Normalize, tuple[float, float]]:
+    """Return the scale of a map's colours, and its ends."""
+    low, middle, most, high = (float(x) for x in np.quantile(values, [0.0, 0.5, _MOST, 1.0]))
+    ends = low, high if high > low else low + 1e-12
+    if not _wide(values) and (low <= 0.0 or middle - low >= _LOPSIDED * (high - low)):
+        return Normalize(*ends), ends
+    if math.log(middle / low) < _LOPSIDED * math.log(high / low) and most > low:
+        ends = low, most
+    return LogNorm(*ends), ends
+
+
+def _curves(
+        figure: style.Picture, panel: Axes, view: View, axis: Axis, name: str,
+        values: Array) -> None:
     """Draw curves over one axis, or the bands between which samples lie."""
     x = _scale(axis.name) * View.places(axis)
     order = np.argsort(x, kind='stable')
     x, values = x[order], values[:, order]
-    for label, look, found in zip(view.labels, _LOOKS, values, strict=False):
+    for label, look, found in zip(view.labels, looks.CASES, values, strict=False):
         if view.samples > 1:
             for (low, high), alpha in zip(BANDS, (0.16, 0.3), strict=True):
+                edges = _quantile(found, low), _quantile(found, high)
                 panel.fill_between(
-                    x, _quantile(found, low), _quantile(found, high), color=look['color'],
-                    alpha=alpha, linewidth=0.0)
+                    x, *edges, color=look.colour, alpha=alpha, linewidth=0.0)
+                for share, edge in zip((low, high), edges, strict=True):
+                    figure.remember(panel, f'{label} {100.0 * share:g} %'.strip(), x, edge)
         middle = _quantile(found, 0.5)
         lonely = bool(np.isfinite(middle).sum() < 2)
         panel.plot(
-            x, middle, label=label, linewidth=1.5, marker='o' if lonely else None, **look)
+            x, middle, **look.line(
+                label=label or ('median' if view.samples > 1 else 'plan')),
+            marker=look.marker, markersize=4.0, markevery=1 if lonely else max(len(x) // 6, 1))
     style.finish(panel, label_of(axis.name), label_of(name))
     if not _even(axis):
         panel.set_xscale('log')
     if _wide(values):
         panel.set_yscale('log')
     panel.set_xlim(x[0], x[-1])
-    edges = np.concatenate([x[:1], 0.5 * (x[1:] + x[:-1]), x[-1:]])
+    borders = np.concatenate([x[:1], 0.5 * (x[1:] + x[:-1]), x[-1:]])
     missing = np.repeat(np.all(np.isnan(values), axis=(0, 2)), 2)
     panel.fill_between(
-        np.repeat(edges, 2)[1:-1], 0.0, 1.0, transform=panel.get_xaxis_transform(),
+        np.repeat(borders, 2)[1:-1], 0.0, 1.0, transform=panel.get_xaxis_transform(),
         where=missing.tolist(), linewidth=0.0, **_HATCH)
 
 
 def _shares(panel: Axes, view: View, name: str, values: Array) -> None:
     """Draw the share of the samples below a number, with the median and 5 to 95 %."""
-    for label, look, found in zip(view.labels, _LOOKS, values, strict=False):
+    for label, look, found in zip(view.labels, looks.CASES, values, strict=False):
         known = np.sort(found[np.isfinite(found)])
         if known.size == 0:
             continue
         low, middle, high = np.quantile(known, (BANDS[0][0], 0.5, BANDS[0][1])).tolist()
         panel.plot(
-            known, np.arange(1, known.size + 1) / found.size, linewidth=1.5,
-            label=f'{label + ": " if label else ""}{middle:.3g} ({low:.3g} to {high:.3g})',
-            **look)
+            known, np.arange(1, known.size + 1) / found.size, **look.line(
+                label=f'{label + ": " if label else ""}{middle:.3g} ({low:.3g} to {high:.3g})'))
         for x, y in ((low, BANDS[0][0]), (middle, 0.5), (high, BANDS[0][1])):
-            panel.plot([x], [y * known.size / found.size], 'o', color=look['color'], markersize=4)
-    style.finish(panel, label_of(name), 'share of the samples below [1]')
+            panel.plot([x], [y * known.size / found.size], look.marker, color=look.colour,
+                       markersize=4)
+    style.finish(panel, label_of(name), 'share of the samples below')
     if _wide(values):
         panel.set_xscale('log')
     panel.set_ylim(0.0, 1.0)
-    panel.legend(loc='upper center', bbox_to_anchor=(0.5, -0.22), fontsize=7,
-                 title='median (5 % to 95 %)', title_fontsize=8)
+    panel.legend(loc='upper center', bbox_to_anchor=(0.5, -0.22),
+                 title='median (5 % to 95 %)', title_fontsize='small')
 
 
 def _notes(figure: Figure, panel: Axes, view: View, values: Mapping[str, Array]) -> None:
@@ -209,5 +251,6 @@ def _notes(figure: Figure, panel: Axes, view: View, values: Mapping[str, Array])
     if missing and view.samples > 1:
         title += f'{"; " if title else ""}{100.0 * missing:.2g} % of the rows have no plan'
     if handles or title:
-        figure.legend(handles, labels, loc='outside lower center', ncols=4, title=title,
-                      title_fontsize=8)
+        figure.legend(
+            handles, labels, loc='outside lower center', title=title, title_fontsize='small',
+            ncols=max(1, round(figure.get_figwidth() / 1.8)))

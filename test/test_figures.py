@@ -13,16 +13,9 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 
 from hmsa_ros.cli import main
-from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.two_step import plan_two_step
-from hmsa_ros.recordings.levels import Level
-from hmsa_ros.recordings.record import Run
-from hmsa_ros.report.charts import Part
-from hmsa_ros.report.evaluation import Evaluation, MoveResult
-from hmsa_ros.report.picture import draw
-from hmsa_ros.report.timing import timing
+from hmsa_ros.report.paper import SCREEN
 from hmsa_studies import claims, paper_data
 from hmsa_studies.paper import FIGURES, write_figure
 
@@ -100,7 +93,7 @@ def printed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, str]:
         patch.chdir(tmp_path_factory.mktemp('work'))
         patch.setattr(paper_data, 'SAMPLES', POINTS)
         patch.setattr(paper_data, 'SWEEP_POINTS', POINTS)
-        assert main(['figures']) == 0
+        assert main(['figures', '--dpi', '200']) == 0
         return Path('figures').absolute(), out.getvalue(), err.getvalue()
 
 
@@ -282,7 +275,7 @@ def test_each_figure_is_a_picture_and_a_table(number: int, folder: Path) -> None
 def test_the_same_data_gives_the_same_bytes(folder: Path, tmp_path: Path) -> None:
     rcParams['lines.linewidth'] = 7.0
     try:
-        again = write_figure(FIGURES[5], tmp_path, points=POINTS)
+        again = write_figure(FIGURES[5], tmp_path, points=POINTS, paper=SCREEN)
         assert rcParams['lines.linewidth'] == 7.0
     finally:
         rcParams['lines.linewidth'] = 1.5
@@ -317,32 +310,6 @@ def test_a_file_that_cannot_be_written_is_refused_in_one_line(
     error = capsys.readouterr().err
     assert error.count('\n') == 1
     assert name in error
-
-
-@pytest.fixture
-def run() -> tuple[Run, Evaluation]:
-    """Return a run, made up, and its evaluation."""
-    time = np.linspace(-0.005, 0.05, 60)
-    stamps = np.rint((time + 1.0) * NANOSECONDS).astype(np.int64)
-    nothing = np.full(60, np.nan)
-    return (
-        Run('a run', '', Path('bag'), stamps, stamps, 1.0 + time, np.ones(60), nothing),
-        Evaluation(
-            NANOSECONDS, time, 1.0,
-            (Level(NANOSECONDS, 0.02, 0), Level(NANOSECONDS + 6_000_000, 0.034, 0)), (),
-            (MoveResult(1.1, 0.5, 1.0, 0.6, 0.0, 0.006, 0.05, 0.0, 0.0, 0.5, True),),
-            (1.0 + 2.0 * time, 2.0 * np.ones(60)), (), (nothing, nothing)))
-
-
-def test_the_picture_of_a_run_is_written(run: tuple[Run, Evaluation], tmp_path: Path) -> None:
-    draw(tmp_path / 'run.png', [Part(*run, timing(run[0]))])
-    check_picture(tmp_path / 'run.png')
-
-
-def test_a_run_drawn_to_nowhere_is_refused(
-        run: tuple[Run, Evaluation], tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match='cannot write .*nowhere'):
-        draw(tmp_path / 'nowhere' / 'run.png', [Part(*run, timing(run[0]))])
 
 
 def test_the_comparison_with_the_paper_says_what_the_computation_says() -> None:

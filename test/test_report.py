@@ -1,5 +1,6 @@
 """The report: what it says against what is in the bag, and that the page needs nothing else."""
 
+import csv
 from dataclasses import asdict, replace
 from html.parser import HTMLParser
 import json
@@ -24,7 +25,7 @@ from hmsa_ros.interfaces.actuator import parameters_of
 from hmsa_ros.interfaces.parameters import ACTUATOR_FIELDS
 from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator
-from hmsa_ros.model.residual import residual_vibration
+from hmsa_ros.model.residual import percent, residual_vibration
 from hmsa_ros.model.simulation import ActuatorSimulation, simulate
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.planner import Options, Planner
@@ -41,8 +42,11 @@ from hmsa_ros.recordings.topics import (
     TYPES,
 )
 from hmsa_ros.recordings.verify import verify
-from hmsa_ros.report import charts
+from hmsa_ros.report.arrivals import Part
+from hmsa_ros.report.charts import MOST_PANELS
+from hmsa_ros.report.curves import BUCKETS, decimate
 from hmsa_ros.report.evaluation import evaluate, period_of, plan_points
+from hmsa_ros.report.looks import RUNS
 from hmsa_ros.report.outcome import level_results
 from hmsa_ros.report.page import page
 from hmsa_ros.report.picture import draw
@@ -186,8 +190,8 @@ def bag(tmp_path_factory):
 def parts_of(*bags, **options):
     runs = [run for bag in bags for run in read_runs(bag, **options)]
     return [
-        charts.Part(run, evaluate(run), timing(run), colour if len(runs) > 1 else '')
-        for run, colour in zip(runs, charts.RUN_COLOURS, strict=False)]
+        Part(run, evaluate(run), timing(run), colour if len(runs) > 1 else '')
+        for run, colour in zip(runs, RUNS, strict=False)]
 
 
 def one(folder, messages, **custom_data):
@@ -292,7 +296,7 @@ def test_setpoints_are_found_and_measured_as_the_demo_measures_them(bag):
         # By definition, without what the report is made of.
         time = (part.run.time - part.run.commands[0].stamp) / NANOSECONDS
         assert x.residual == residual_vibration(
-            time, part.run.stretch, arrival=x.arrival, end=x.end, step=x.stretch - previous)
+            time, part.run.stretch, arrival=x.rests, end=x.end, step=x.stretch - previous)
         assert x.residual < ROUNDING
         assert 1.0 < x.residual_unshaped < 1.5
         previous = x.stretch
@@ -320,14 +324,15 @@ def test_plain_steps_and_predictions_are_those_of_a_creeping_block_and_its_ramps
     bag = tmp_path / 'bag'
     part = one(bag, simulated(creep=creep), **parameters(planner=ACTUATOR, plant=ACTUATOR), **told)
     found, run = part.evaluation, part.run
-    known = np.isfinite(found.predicted[0])
-    assert np.max(np.abs(found.predicted[0] - run.stretch)[known]) < 1e-6
+    known = np.isfinite(found.planned.at(found.time).stretch)
+    assert np.max(np.abs(found.planned.at(found.time).stretch - run.stretch)[known]) < 1e-6
     # The example block's steps, by the plant itself.
     steps = ActuatorSimulation(ACTUATOR, time=found.zero, creep=creep)
     for move in found.moves:
         steps.command(move.begin, move.flux_densities[-1])
     worst = 0.0
-    for time, stretch in zip(run.time.tolist(), found.unshaped[0].tolist(), strict=True):
+    plain = found.plain.at(found.time).stretch
+    for time, stretch in zip(run.time.tolist(), plain.tolist(), strict=True):
         if time > found.zero:
             steps.advance(time)
             worst = max(worst, abs(steps.stretch - stretch))
@@ -386,7 +391,7 @@ def test_plain_steps_are_simulated_with_the_plant_that_was_recorded(tmp_path):
     stretch, _ = simulate(
         [x.begin / plant.time_unit for x in found.results], loads, time / plant.time_unit,
         plant.nondimensional)
-    assert np.max(np.abs(found.unshaped[0][found.time >= 0.0] - stretch)) < SAME
+    assert np.max(np.abs(found.plain.at(time).stretch - stretch)) < SAME
 
 
 def test_plain_steps_are_measured_between_samples_that_are_too_few(tmp_path):
@@ -430,7 +435,7 @@ def test_the_plan_predicts_a_plant_that_is_as_planned(tmp_path, slew, lag):
     if lag:
         known |= {'planner.coil_time_constant': str(lag), 'plant.coil_time_constant': str(lag)}
     part = one(tmp_path / 'bag', simulated(slew=slew, lag=lag), **known)
-    difference = part.run.stretch - part.evaluation.predicted[0]
+    difference = part.run.stretch - part.evaluation.planned.at(part.evaluation.time).stretch
     assert np.count_nonzero(np.isfinite(difference)) > 2000
     assert np.nanmax(np.abs(difference)) < SAME
     points = plan_points(part.run, part.evaluation)
@@ -608,7 +613,8 @@ def test_each_joint_of_a_planner_of_several_is_a_run(tmp_path, bag):
         assert asdict(ours) == pytest.approx(asdict(theirs), rel=1e-6, abs=1e-9)
     assert max(x.residual for x in right.evaluation.results) > 0.01
     assert (left.run.plant, right.run.plant) == (ACTUATOR, other)
-    assert np.nanmax(np.abs(left.run.stretch - left.evaluation.predicted[0])) < SAME
+    planned = left.evaluation.planned.at(left.evaluation.time).stretch
+    assert np.nanmax(np.abs(left.run.stretch - planned)) < SAME
     only, = parts_of(folder, joints=['right'])
     assert only.evaluation.results == right.evaluation.results
     with pytest.raises(BadInputError, match=r'no joint up: expected one of left, right'):
@@ -842,7 +848,7 @@ def test_odd_recordings_are_shown_for_what_they_are(tmp_path, samples, levels, s
     assert len(part.evaluation.results) == setpoints
     report = Page(page([part]))
     assert len(report.trace('response', 'recorded')['y']) == samples
-    draw(tmp_path / 'run.pdf', [part], 'pdf')
+    draw(tmp_path / 'run.pdf', [part])
     assert (tmp_path / 'run.pdf').read_bytes().startswith(b'%PDF')
 
 
@@ -897,7 +903,8 @@ def test_every_figure_has_its_place_a_description_and_units(report):
         for name, axis in figure['layout'].items():
             if re.match('[xy]axis', name):
                 title = axis['title']['text']
-                assert re.search(r'\[.+\]$', title) or title == 'setpoint'
+                assert re.search(r'\(.+\)$', title) or title in (
+                    'setpoint', 'stretch λ', 'recorded − planned λ')
 
 
 def test_curves_are_what_was_recorded(report, bag):
@@ -922,9 +929,10 @@ def test_an_arrival_is_shown_in_percent_of_its_step(report, bag):
     x = part.evaluation.results[1]
     curve = report.trace('arrival1', 'recorded')
     assert curve['y'][0] == pytest.approx(-100.0, abs=0.1)
-    after = [y for t, y in zip(curve['x'], curve['y'], strict=True) if t >= 0]
+    after = [y for t, y in zip(curve['x'], curve['y'], strict=True)
+             if t >= 1e3 * x.arrival]
     assert max(after) - min(after) == pytest.approx(100.0 * x.residual, rel=0.5)
-    assert f'residual {100.0 * x.residual:.3g} %' in ' '.join(report.words)
+    assert f'residual {percent(x.residual)} %' in ' '.join(report.words)
 
 
 def test_the_table_has_the_measures_in_full_precision(report, bag):
@@ -933,7 +941,7 @@ def test_the_table_has_the_measures_in_full_precision(report, bag):
         for column, value in (
                 ('target λ [1]', x.stretch), ('b_p [1]', x.b_p), ('tau_p [1]', x.tau_p),
                 ('b_1 [1]', x.b_1), ('begin [ms]', x.begin * 1e3),
-                ('arrival [ms]', x.arrival * 1e3), ('until [ms]', x.end * 1e3),
+                ('arrival [ms]', x.arrival * 1e3), ('end [ms]', (x.end - x.begin) * 1e3),
                 ('largest error [%]', 100.0 * x.error), ('residual [%]', 100.0 * x.residual),
                 ('plain steps [%]', 100.0 * x.residual_unshaped)):
             assert report.value('setpoint-table', i, column) == value
@@ -993,8 +1001,8 @@ def test_thinning_out_keeps_every_peak_and_the_ends():
     x = np.arange(600_001.0)
     y = np.sin(x / 1e3) + 1e-3 * random.standard_normal(len(x))
     y[123_456], y[432_100], y[600_000] = 5.0, -7.0, 3.0
-    thin_x, thin_y = charts.decimate(x, y)
-    assert len(thin_x) <= 2 * charts.BUCKETS + 4
+    thin_x, thin_y = decimate(x, y)
+    assert len(thin_x) <= 2 * BUCKETS + 4
     assert np.all(np.diff(thin_x) > 0)
     assert set(zip(thin_x, thin_y, strict=True)) <= set(zip(x, y, strict=True))
     assert thin_y[thin_x == 123_456] == 5.0
@@ -1010,7 +1018,7 @@ def test_thinning_out_keeps_every_peak_and_the_ends():
 @pytest.mark.parametrize('count', [0, 1, 2, 3999, 4001, 6001])
 def test_thinning_out_takes_any_number_of_points(count):
     x = np.arange(float(count))
-    thin_x, thin_y = charts.decimate(x, x ** 2)
+    thin_x, thin_y = decimate(x, x ** 2)
     assert np.array_equal(thin_y, thin_x ** 2)
     if count:
         assert (thin_x[0], thin_x[-1]) == (0.0, count - 1.0)
@@ -1025,7 +1033,7 @@ def test_of_many_arrivals_the_worst_are_shown_and_the_table_has_all(tmp_path):
     shown = sorted(int(x.removeprefix('arrival')) for x in report.figures
                    if x.startswith('arrival'))
     ranked = sorted(range(20), key=lambda i: -part.evaluation.results[i].residual)
-    assert shown == sorted(ranked[:charts.MOST_PANELS])
+    assert shown == sorted(ranked[:MOST_PANELS])
     assert len(report.table('setpoint-table')) == 20
 
 
@@ -1034,16 +1042,27 @@ def test_of_many_arrivals_the_worst_are_shown_and_the_table_has_all(tmp_path):
 def test_the_command_writes_page_and_pictures_and_names_them(bag, tmp_path, capsys):
     names = [tmp_path / x for x in ('run.html', 'run.png', 'run.pdf')]
     out, png, pdf = map(str, names)
-    assert main(['report', str(bag), '--out', out, '--png', png, '--pdf', pdf]) == 0
-    assert capsys.readouterr().out.split() == [out, png, pdf]
+    words = ['report', str(bag), '--out', out, '--dpi', '200', '--picture']
+    assert main([*words, png, pdf, '--data']) == 0
+    assert capsys.readouterr().out.split() == [out, png, pdf, str(tmp_path / 'run.csv')]
     assert names[0].read_text(encoding='utf-8').startswith('<!DOCTYPE html>')
     assert names[1].read_bytes().startswith(b'\x89PNG')
     drawn = names[2].read_bytes()
     assert drawn.startswith(b'%PDF')
     # Lines, not pixels.
     assert b'/Subtype /Image' not in drawn
-    main(['report', str(bag), '--out', out, '--pdf', pdf])
+    main([*words, pdf])
     assert names[2].read_bytes() == drawn
+    # The data of the picture is what was recorded, and what was commanded.
+    run, = read_runs(bag)
+    with (tmp_path / 'run.csv').open(encoding='utf-8') as file:
+        rows = list(csv.DictReader(file))
+    shown = [float(x['y']) for x in rows if (x['panel'], x['curve']) == ('b', 'recorded')]
+    assert len(shown) > 1000
+    assert set(shown) <= set(run.stretch.tolist())
+    levels = [float(x['y']) for x in rows if x['curve'] == 'command']
+    assert levels[1:7] == pytest.approx([x.flux_density * 1e3 for x in run.commands])
+    assert {x['x_axis'] for x in rows if x['panel'] == 'b'} == {'time t (ms)'}
 
 
 def rounded(messages):
@@ -1173,7 +1192,7 @@ def _bad(tmp_path, case):
     if case == 'a bag to write':
         return [str(good), '--out', str(good / 'good_0.mcap')], 'may be part of a bag'
     if case == 'two files of one name':
-        return [str(good), '--png', 'x.html', '--out', 'x.html'], 'name the same file'
+        return [str(good), '--picture', 'x.png', '--out', 'x.png'], 'name the same file'
     if case == 'a full disk':
         return [str(good), '--out', '/dev/full'], 'cannot write /dev/full'
     (tmp_path / 'bad.yaml').write_text('a: [1')

@@ -9,7 +9,7 @@ from test_report import ACTUATOR, applied, parameters, parts_of, simulated, writ
 
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings.bags import read_runs
-from hmsa_ros.report import charts
+from hmsa_ros.report.arrivals import Part
 from hmsa_ros.report.evaluation import evaluate
 from hmsa_ros.report.page import page
 from hmsa_ros.report.timing import timing
@@ -197,7 +197,7 @@ def test_ten_minutes_at_1_khz_keep_their_peaks_on_a_page_that_opens(browser, bag
     ten_minutes = replace(
         run, time=time, logged=time + 1000, stretch=stretch, rate=np.gradient(stretch, 1e-3),
         flux_density=np.interp(time, run.time, run.flux_density))
-    text = page([charts.Part(ten_minutes, evaluate(ten_minutes), timing(ten_minutes))])
+    text = page([Part(ten_minutes, evaluate(ten_minutes), timing(ten_minutes))])
     assert len(text) < LARGEST_PAGE
     (tmp_path / 'long.html').write_text(text, encoding='utf-8')
     opened = browser.open(tmp_path / 'long.html')

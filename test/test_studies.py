@@ -22,6 +22,7 @@ from hmsa_ros.model.equations import (
 )
 from hmsa_ros.model.moves import Level, Limits, Move
 from hmsa_ros.model.parameters import ActuatorParameters, NondimensionalParameters, paper_actuator
+from hmsa_ros.model.residual import percent
 from hmsa_ros.model.status import Code
 from hmsa_ros.planning.two_step import plan_two_step
 from hmsa_studies.__main__ import main, pictures, tables
@@ -34,7 +35,6 @@ from hmsa_studies.robustness import (
     candidates,
     Case,
     PARAMETERS,
-    percent,
     study,
     write_csv,
 )

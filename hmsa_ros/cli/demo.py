@@ -11,6 +11,7 @@ from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.tables import table
 from hmsa_ros.ending import ENDING
 from hmsa_ros.files import json_text
+from hmsa_ros.model.residual import percent
 
 if TYPE_CHECKING:
     from hmsa_ros.lab.demo import DemoResult
@@ -67,13 +68,14 @@ def _print_table(result: 'DemoResult') -> None:
 
     console = Console()
     moves = table(
-        'b and tau nondimensional as in the paper; residual: peak-to-peak stretch after '
-        'arrival, share of the step; unshaped: simulated on the same plant',
-        ('target', 'b_p', 'tau_p', 'b_1', 'arrival ms', 'residual', 'unshaped'), 'verdict')
+        'b and tau nondimensional as in the paper; arrival from the begin of the move; residual: '
+        'peak-to-peak stretch after arrival, in % of the step; unshaped: simulated on the same '
+        'plant',
+        ('target', 'b_p', 'tau_p', 'b_1', 'arrival ms', 'residual %', 'unshaped %'), 'verdict')
     for x in result.setpoints:
         moves.add_row(
             f'{x.stretch:g}', f'{x.b_p:.5f}', f'{x.tau_p:.5f}', f'{x.b_1:.5f}',
-            f'{x.arrival * 1e3:.3f}', f'{x.residual:.1e}', f'{x.residual_unshaped:.1%}',
+            f'{x.arrival * 1e3:.3f}', percent(x.residual), percent(x.residual_unshaped),
             str(x.finding['verdict']).replace('_', ' '))
     console.print(moves)
     adapted = table(

@@ -5,9 +5,11 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.options import add_options
+from hmsa_ros.cli.pictures import add_picture_options, paper_of
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text, write_text
+from hmsa_ros.report.paper import kind_of
 
 if TYPE_CHECKING:
     from hmsa_ros.recordings.record import Run
@@ -21,7 +23,7 @@ def add_parser(subparsers: Any) -> None:
                     'command, phase plane, residuals against plain steps, plan against run, '
                     'timing and losses. Any bag with joint states works, in any namespace; '
                     'several bags share one page.',
-        epilog='example: hmsa report hmsa_demo/run --out run.html --pdf run.pdf')
+        epilog='example: hmsa report hmsa_demo/run --out run.html --picture run.pdf --width 85')
     parser.add_argument(
         'bags', nargs='+', type=Path, metavar='BAG', help='folder of a bag, or an .mcap file')
     add_options(
@@ -29,8 +31,6 @@ def add_parser(subparsers: Any) -> None:
         ('--out', 'FILE', Path,
          'page to write; an existing file is replaced (default: NAME_report.html in this folder, '
          'NAME being the first bag)'),
-        ('--png', 'FILE', Path, 'picture to write as well'),
-        ('--pdf', 'FILE', Path, 'picture to write as well, for a paper'),
         ('--json', 'print what was found of each setpoint, and the files, as JSON'))
     parser.add_argument(
         '--params-file', '--params', dest='params', type=Path, metavar='YAML',
@@ -38,19 +38,26 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         '--joint', default='', metavar='NAME',
         help='joint to show, or several separated by commas (default: those with commands)')
+    add_picture_options(parser, named='pictures to write as well')
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Read, evaluate and write."""
     bags: list[Path] = arguments.bags
     out = arguments.out or Path(f'{bags[0].resolve().stem}_report.html')
-    targets = [x for x in (out, arguments.png, arguments.pdf) if x is not None]
+    pictures: list[Path] = arguments.picture
+    paper = paper_of(arguments)
+    targets = [out, *pictures, *(
+        dict.fromkeys(x.with_suffix('.csv') for x in pictures) if paper.data else ())]
+    for picture in pictures:
+        kind_of(picture)
     _check_targets(targets, bags)
 
     from hmsa_ros.recordings.bags import read_runs
     from hmsa_ros.recordings.parameters import read_parameter_file
-    from hmsa_ros.report.charts import Part, RUN_COLOURS
+    from hmsa_ros.report.arrivals import Part
     from hmsa_ros.report.evaluation import evaluate
+    from hmsa_ros.report.looks import RUNS
     from hmsa_ros.report.page import page
     from hmsa_ros.report.timing import timing
 
@@ -66,13 +73,12 @@ def run(arguments: argparse.Namespace) -> int:
             update('evaluating', i / len(runs))
             parts.append(Part(
                 each, evaluate(each), timing(each),
-                RUN_COLOURS[i % len(RUN_COLOURS)] if len(runs) > 1 else ''))
+                RUNS[i % len(RUNS)] if len(runs) > 1 else ''))
         update('writing', None)
         write_text(out, page(parts))
-        for path, kind in ((arguments.png, 'png'), (arguments.pdf, 'pdf')):
-            if path is not None:
-                from hmsa_ros.report.picture import draw
-                draw(path, parts, kind)
+        if pictures:
+            from hmsa_ros.report.picture import draw
+            draw(pictures, parts, paper)
     if arguments.json:
         print(json_text({
             'runs': [{
@@ -105,7 +111,7 @@ def _check_targets(targets: list[Path], bags: list[Path]) -> None:
     """Refuse what cannot be written before the bags are read."""
     if len({x.resolve() for x in targets}) < len(targets):
         raise BadInputError(
-            'two of --out, --png and --pdf name the same file: expected different files')
+            'two of --out and --picture name the same file: expected different files')
     for target in targets:
         if target.is_dir():
             raise BadInputError(f'cannot write {target}: it is a folder; expected a file')

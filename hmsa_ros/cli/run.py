@@ -15,6 +15,7 @@ from hmsa_ros.cli.tables import table
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text
+from hmsa_ros.model.residual import percent
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -152,7 +153,7 @@ def _measure(
 def _report(bag: Path, path: Path) -> Path:
     from hmsa_ros.files import write_text
     from hmsa_ros.recordings.bags import read_runs
-    from hmsa_ros.report.charts import Part
+    from hmsa_ros.report.arrivals import Part
     from hmsa_ros.report.evaluation import evaluate
     from hmsa_ros.report.page import page
     from hmsa_ros.report.timing import timing
@@ -207,13 +208,14 @@ def findings_table(findings: 'list[Finding]') -> 'Table':
         'with their standard deviations',
         ('setpoint', 'target', 'offset %', '+-', 'vibration %', '+-', 'Hz'), 'verdict')
     for x in findings:
-        percent = x.setpoint.percent
+        share = x.setpoint.percent
         made.add_row(
             f'{x.setpoint.joint} {x.setpoint.number}'.strip(), f'{x.setpoint.target:g}', *(
-                f'{y:{form}}' if math.isfinite(y) else '-' for y, form in (
-                    (percent(x.offset), '+.3g'), (percent(x.offset_std), '.1g'),
-                    (percent(x.vibration), '.3g'), (percent(x.vibration_std), '.1g'),
-                    (x.frequency, '.3g'))), str(x.verdict).replace('_', ' '))
+                percent(0.01 * share(y), sign) if math.isfinite(y) else '-' for y, sign in (
+                    (x.offset, '+'), (x.offset_std, ''), (x.vibration, ''),
+                    (x.vibration_std, ''))),
+            f'{x.frequency:.3g}' if math.isfinite(x.frequency) else '-',
+            str(x.verdict).replace('_', ' '))
     return made
 
 

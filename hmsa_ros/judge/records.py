@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 import math
 
+from hmsa_ros.model.residual import percent, RESOLVED
 from hmsa_ros.model.status import Code
 
 #: Verdicts on a setpoint, the better ones first.
@@ -56,9 +57,11 @@ class Setpoint:
 
     def words(self, difference: float) -> str:
         """Return a size in stretch and in % of the step."""
-        percent = self.percent(difference)
-        share = '' if math.isnan(percent) else f' ({percent:.3g} %)'
-        return f'{difference:.3g}{share}'
+        share = self.percent(difference)
+        if math.isnan(share):
+            return f'{difference:.3g}'
+        shown = f'{share:.3g}' if share >= 100.0 * RESOLVED else percent(0.01 * share)
+        return f'{difference:.3g} ({shown} %)'
 
 
 @dataclass(frozen=True)

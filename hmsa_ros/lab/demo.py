@@ -88,7 +88,8 @@ def run_demo(
 
 def _evaluate(bag: Path, picture: Path) -> tuple[SetpointResult, ...]:
     """Read the run back from the bag, measure it and draw it."""
-    from hmsa_ros.report.charts import Part
+    from hmsa_ros.report.arrivals import Part
+    from hmsa_ros.report.paper import SCREEN
     from hmsa_ros.report.picture import draw
     from hmsa_ros.report.timing import timing
 
@@ -104,5 +105,5 @@ def _evaluate(bag: Path, picture: Path) -> tuple[SetpointResult, ...]:
     results = tuple(
         SetpointResult(**asdict(x), finding=found[x.place].to_dict())
         for x in evaluation.results)
-    draw(picture, [Part(run, evaluation, timing(run))])
+    draw(picture, [Part(run, evaluation, timing(run))], SCREEN)
     return results

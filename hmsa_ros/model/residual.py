@@ -1,9 +1,14 @@
 """What is left of a move: residual vibration after arrival."""
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from hmsa_ros.errors import HmsaError
+
+#: Shares of a step below this are rounding of times and numbers, and are not told apart.
+RESOLVED = 1e-8
 
 
 def residual_vibration(
@@ -23,3 +28,19 @@ def residual_vibration(
             f'{count} samples between {arrival:g} and {end:g} after a step of {step:g}: '
             'expected at least two samples and a step')
     return float(np.ptp(np.asarray(stretch, dtype=np.float64)[inside]) / abs(step))
+
+
+def percent(share: float, sign: str = '') -> str:
+    """
+    Word a share of a step in percent, without the unit; a question mark for what is not known.
+
+    What is below `RESOLVED` is said to be; ``sign`` is ``'+'`` to show the sign of others.
+    """
+    if math.isnan(share):
+        return '?'
+    if abs(share) < RESOLVED:
+        return f'<{100.0 * RESOLVED:.0e}'.replace('e-0', 'e-')
+    value, size = 100.0 * share, 100.0 * abs(share)
+    if size < 1e-3:
+        return f'{value:{sign}.0e}'.replace('e-0', 'e-')
+    return f'{value:{sign}.{1 if size >= 1.0 else 2 if size >= 0.1 else 3}f}'

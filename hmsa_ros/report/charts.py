@@ -2,7 +2,7 @@
 The figures of a report, as plain data for Plotly.
 
 Curves are thinned out to what a screen can show, peaks kept. Colours are those of
-`hmsa_ros.report.style`; the page replaces them by lighter ones in dark mode.
+`hmsa_ros.report.looks`; the page replaces them by lighter ones in dark mode.
 """
 
 from collections.abc import Sequence
@@ -13,49 +13,24 @@ from typing import Any
 
 import numpy as np
 
-from hmsa_ros.model.equations import Array
+from hmsa_ros.model.equations import Array, elastic_force
+from hmsa_ros.model.residual import RESOLVED
 from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.recordings.record import Run
-from hmsa_ros.report.evaluation import Evaluation, MoveResult, verdicts
-from hmsa_ros.report.timing import Timing
+from hmsa_ros.report import looks
+from hmsa_ros.report.arrivals import around, Part, reach, results_of, span, title, worst
+from hmsa_ros.report.curves import BUCKETS, Curve, decimate, numbers
+from hmsa_ros.report.evaluation import MoveResult
+from hmsa_ros.report.looks import BLACK, BLUE, GREY, VERMILION
 
-# Okabe and Ito's palette, told apart with every kind of colour vision.
-BLUE, ORANGE, GREEN, PURPLE = '#0072B2', '#E69F00', '#009E73', '#CC79A7'
-SKY_BLUE, VERMILION, BLACK, GREY = '#56B4E9', '#D55E00', '#000000', '#8A8A8A'
-RUN_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY_BLUE, VERMILION, BLACK)
-#: The same where the background is dark.
-DARK = {
-    BLUE: '#4DABE8', ORANGE: '#F2B93B', GREEN: '#2FC79A', PURPLE: '#E5A0C6',
-    SKY_BLUE: '#9AD6F7', VERMILION: '#FF8A4A', BLACK: '#F0F0F0', GREY: '#9A9A9A'}
-
-#: Intervals of a curve of which the least and the largest value are kept: more than a screen
-#: has columns.
-BUCKETS = 2000
 MOST_PANELS = 12
 _PANEL_BUCKETS = 300
 _MOST_PHASE_POINTS = 8_000
 _PHASE_GRID = 1000.0
 # Markers are smaller where there are more of them.
 _MANY_MARKERS = 100
-# Of an arrival's panel: how long before and after, in durations of the move, and how many
-# percent of the step at least.
-_BEFORE, _AFTER, _LEAST_PERCENT = 0.6, 3.0, 5.0
-# Of what a panel holds beyond what it shows at first.
-_PANEL_SPAN = 20.0
-#: Instead of a residual, which would be 0.
-NOT_MOVED = 'did not move'
 _LONGEST_IN_MS = 2.0
-_DIGITS = 9
-
-
-@dataclass(frozen=True)
-class Part:
-    """One run of a report; without a colour it is on its own and its curves differ in theirs."""
-
-    run: Run
-    evaluation: Evaluation
-    timing: Timing
-    colour: str = ''
+# Samples are drawn as points where there are so many of them at most.
+_MOST_SAMPLES = 500
 
 
 @dataclass(frozen=True)
@@ -86,37 +61,6 @@ def time_unit(parts: Sequence[Part]) -> TimeUnit:
     longest = max(
         float(np.max(np.abs(x.evaluation.time[[0, -1]]))) for x in parts)
     return TimeUnit(1e-3, 'ms') if longest <= _LONGEST_IN_MS else TimeUnit(1.0, 's')
-
-
-def decimate(x: Array, y: Array, buckets: int = BUCKETS) -> tuple[Array, Array]:
-    """Thin out a curve, keeping its ends and the extremes of intervals of many points."""
-    finite = np.isfinite(y)
-    if not finite.all():
-        x, y = x[finite], y[finite]
-    keep = _extremes(y, buckets)
-    return (x, y) if keep is None else (x[keep], y[keep])
-
-
-def _extremes(y: Array, buckets: int) -> Any:
-    """Return where the ends and the extremes of each interval are; None to keep all."""
-    size = -(-len(y) // buckets)
-    if size <= 2:
-        return None
-    whole = len(y) // size * size
-    begins = np.arange(0, whole, size)
-    rows = y[:whole].reshape(-1, size)
-    keep: list[Any] = [
-        begins + rows.argmin(axis=1), begins + rows.argmax(axis=1), [0, len(y) - 1]]
-    if whole < len(y):
-        rest = y[whole:]
-        keep.append([whole + int(rest.argmin()), whole + int(rest.argmax())])
-    return np.unique(np.concatenate(keep))
-
-
-def numbers(values: Any) -> list[float | None]:
-    """Return numbers for JSON, to nine digits; None for what is not finite."""
-    return [float(f'{x:.{_DIGITS}g}') if math.isfinite(x) else None
-            for x in np.asarray(values, dtype=np.float64).tolist()]
 
 
 def text(words: str) -> str:
@@ -168,16 +112,30 @@ def _grouped(data: list[dict[str, Any]]) -> list[dict[str, Any]]:
 _SIMULATED = ('plain steps', 'plan')
 # What each kind of curve looks like, everywhere: colour, and what distinguishes it without.
 _KINDS: dict[str, dict[str, Any]] = {
-    'recorded': {'color': BLUE, 'width': 2.2},
-    'plain steps': {'color': VERMILION, 'width': 1.2, 'dash': '5px,2px'},
-    'plan': {'color': BLACK, 'width': 1.4, 'dash': '1px,3px'},
-    'command': {'color': BLUE, 'width': 2.0, 'shape': 'hv'},
-    'field in force': {'color': GREEN, 'width': 1.4, 'dash': '7px,2px,1px,2px'},
-}
+    'recorded': looks.RECORDED.plotly(), 'plain steps': looks.PLAIN.plotly(),
+    'plan': looks.PLAN.plotly(), 'field in force': looks.FIELD.plotly(),
+    'command': {**looks.RECORDED.plotly(), 'shape': 'hv'}, 'target': looks.TARGET.plotly()}
 
 
-def _axis(title: str, **more: Any) -> dict[str, Any]:
-    return {'title': {'text': title}, 'exponentformat': 'power', **more}
+def label(quantity: str, symbol: str = '', unit: str = '') -> str:
+    """Return the label of an axis: its quantity, symbol, and unit if it has one."""
+    return ' '.join(x for x in (quantity, symbol, f'({unit})' if unit else '') if x)
+
+
+def axis(name: str, **more: Any) -> dict[str, Any]:
+    """Return an axis of Plotly."""
+    return {'title': {'text': name}, 'exponentformat': 'power', **more}
+
+
+def _recorded(part: Part, time: Any, curve: Curve, samples: tuple[Any, Any], *,
+              buckets: int = BUCKETS) -> list[dict[str, Any]]:
+    """Return what was recorded: the curve through the samples, and these where they are few."""
+    data = [_curve(part, 'recorded', *decimate(time, curve.stretch, buckets))]
+    if len(samples[0]) < len(curve.time) and len(samples[0]) <= _MOST_SAMPLES:
+        data.append(_curve(
+            part, 'recorded', *samples, mode='markers',
+            marker={'size': 5, 'color': part.colour or BLUE}))
+    return data
 
 
 def response(parts: Sequence[Part], unit: TimeUnit) -> Figure:
@@ -185,18 +143,18 @@ def response(parts: Sequence[Part], unit: TimeUnit) -> Figure:
     data = []
     for part in parts:
         run, found = part.run, part.evaluation
-        data += [
-            _curve(part, what, *decimate(unit.of(found.time), stretch)) for what, stretch in (
-                ('plain steps', found.unshaped[0]), ('recorded', run.stretch),
-                ('plan', found.predicted[0]))]
+        for kind, curve in (('plain steps', found.plain), ('plan', found.planned)):
+            data.append(_curve(part, kind, *decimate(unit.of(curve.time), curve.stretch)))
+        data[-1:-1] = _recorded(
+            part, unit.of(found.recorded.time), found.recorded,
+            (unit.of(found.time), run.stretch))
         if found.results:
             spans = [(x.begin, x.end, math.nan) for x in found.results]
             data.append(_curve(
                 part, 'target', unit.of(np.ravel(spans)),
-                np.ravel([(x.stretch, x.stretch, math.nan) for x in found.results]),
-                color=GREY, width=1.2, dash='2px,2px'))
+                np.ravel([(x.stretch, x.stretch, math.nan) for x in found.results])))
             data.append(_curve(
-                part, 'planned arrival', unit.of([x.arrival for x in found.results]),
+                part, 'planned arrival', unit.of([x.rests for x in found.results]),
                 [x.stretch for x in found.results], mode='markers',
                 marker={
                     'symbol': 'diamond-open', 'size': _size(9, found.results),
@@ -205,22 +163,33 @@ def response(parts: Sequence[Part], unit: TimeUnit) -> Figure:
     what = parts[0].run.plant.coordinate
     return Figure(
         'response', f'Flux density command and {what.name} over time', 560, _grouped(data), {
-            'xaxis': _axis(f'time from the first command [{unit.name}]', anchor='y'),
-            'yaxis': _axis(f'{what.name} {what.symbol} [1]', domain=[0.0, 0.6]),
-            'yaxis2': _axis('flux density B [mT]', domain=[0.68, 1.0], anchor='x')})
+            'xaxis': axis(label('time', 't', unit.name), anchor='y'),
+            'yaxis': axis(label(what.name, what.symbol), domain=[0.0, 0.6]),
+            'yaxis2': axis(label('flux density', 'B', 'mT'), domain=[0.68, 1.0], anchor='x')})
 
 
 def commanded(part: Part) -> tuple[list[float], list[float]]:
-    """Return times in s and levels in mT of the command, from the first sample to the last."""
+    """
+    Return times in s and levels in mT of the command, from the first sample to the last.
+
+    It begins with the level before the first: as measured, or the one that holds where the block
+    rests.
+    """
     run, found = part.run, part.evaluation
     times = [found.seconds(x.stamp) for x in found.levels]
     values = [x.flux_density * 1e3 for x in found.levels]
     # The last level holds to the end of the record.
     times.append(max(times[-1], float(found.time[-1])))
     values.append(values[-1])
-    if found.time[0] < times[0] and math.isfinite(run.flux_density[0]):
-        times.insert(0, float(found.time[0]))
-        values.insert(0, float(run.flux_density[0]) * 1e3)
+    # The step of the first level is drawn too, although the samples may begin with it.
+    before = int(np.searchsorted(found.time, times[0])) - 1
+    held = float(run.flux_density[before]) if before >= 0 else math.nan
+    if times[0] >= 0.0 and not math.isfinite(held):
+        held = float(elastic_force(found.start, run.plant.nondimensional)
+                     ) * run.plant.flux_density_unit
+    if math.isfinite(held):
+        times.insert(0, min(float(found.time[0]), times[0] - 0.02 * (times[-1] - times[0])))
+        values.insert(0, held * 1e3)
     return times, values
 
 
@@ -265,10 +234,9 @@ def phase(parts: Sequence[Part]) -> tuple[Figure, float]:
     # What moves on and on fills the plane, so that a part of it is enough.
     data, shown = [], 1.0
     for part in parts:
-        run, found = part.run, part.evaluation
-        for kind, (stretch, rate) in (
-                ('plain steps', found.unshaped), ('recorded', (run.stretch, run.rate))):
-            x, y, share = _orbit(stretch, rate)
+        found = part.evaluation
+        for kind, curve in (('plain steps', found.plain), ('recorded', found.recorded)):
+            x, y, share = _orbit(curve.stretch, curve.rate)
             shown = min(shown, share)
             data.append(_curve(part, kind, x, y))
         for symbol, size, places in (
@@ -282,8 +250,9 @@ def phase(parts: Sequence[Part]) -> tuple[Figure, float]:
     return Figure(
         'phase', f'{name.capitalize()} rate over {name}, with the equilibria', 480,
         _grouped(data), {
-            'xaxis': _axis(f'{name} {symbol} [1]', range=_room(data, 'x')),
-            'yaxis': _axis(f'{name} rate d{symbol}/dt [1/s]', range=_room(data, 'y'))}), shown
+            'xaxis': axis(label(name, symbol), range=_room(data, 'x')),
+            'yaxis': axis(label(f'{name} rate', f'd{symbol}/dt', '1/s'), range=_room(
+                data, 'y'))}), shown
 
 
 def _room(data: Sequence[dict[str, Any]], key: str) -> list[float | None]:
@@ -315,94 +284,42 @@ def _orbit(stretch: Array, rate: Array) -> tuple[Array, Array, float]:
 
 def panels(parts: Sequence[Part]) -> list[tuple[int, str]]:
     """Return number, from 0 on, and title of each arrival to show; those of a number share one."""
-    return [(i, _panel_title(parts, i)) for i in worst(parts, MOST_PANELS)]
-
-
-def worst(parts: Sequence[Part], most: int) -> list[int]:
-    """Return the numbers, from 0 on, of the setpoints with the largest residuals."""
-    count = max((len(x.evaluation.results) for x in parts), default=0)
-    ranked = sorted(range(count), key=lambda i: -max(
-        (x.residual if x.moved else math.inf for x in results_of(parts, i)
-         if math.isfinite(x.residual) or not x.moved), default=0.0))
-    return sorted(ranked[:most])
-
-
-def results_of(parts: Sequence[Part], number: int) -> list[MoveResult]:
-    """Return the results of one setpoint in all runs that have it."""
-    return [x.evaluation.results[number] for x in parts
-            if number < len(x.evaluation.results)]
-
-
-def _panel_title(parts: Sequence[Part], number: int) -> str:
-    results = results_of(parts, number)
-    targets = ', '.join(dict.fromkeys(f'{x.stretch:.6g}' for x in results))
-    said = verdicts([x.evaluation for x in parts], number)
-    left = residual_text(results, least=True)
-    return f'{results[0].place + 1}. to {targets}: {said}residual {left}'
-
-
-def residual_text(results: Sequence[MoveResult], digits: int = 3, *, least: bool = False) -> str:
-    """Return the largest residual of some moves in words, and the least before it if asked."""
-    if not all(x.moved for x in results):
-        return NOT_MOVED
-    shares = [x.residual for x in results if math.isfinite(x.residual)] or [math.nan]
-    return ' to '.join(dict.fromkeys(
-        percent(x, digits) for x in ([min(shares)] if least else []) + [max(shares)]))
-
-
-def percent(share: float, digits: int = 3) -> str:
-    """Return a share in percent to some significant digits; a dash for what is not known."""
-    return f'{100.0 * share:.{digits}g} %' if math.isfinite(share) else '–'
-
-
-def reach(parts: Sequence[Part], number: int) -> float:
-    """Return how far an arrival's panel reaches from 0, in percent of the step."""
-    return min(150.0, max([_LEAST_PERCENT, *(
-        110.0 * x.error for x in results_of(parts, number) if math.isfinite(x.error))]))
-
-
-def around(
-        part: Part, number: int, stretch: Array) -> tuple[Array, Array, tuple[float, float]]:
-    """Return a curve about an arrival, s after it and percent of the step; and what to show."""
-    found, x = part.evaluation, part.evaluation.results[number]
-    step = x.stretch - (found.results[number - 1].stretch if number else found.start)
-    duration = max(x.arrival - x.begin, 1e-9)
-    inside = (found.time >= x.begin) & (
-        found.time <= min(x.end, x.arrival + _PANEL_SPAN * duration))
-    return found.time[inside] - x.arrival, 100.0 * (stretch[inside] - x.stretch) / abs(step), (
-        -_BEFORE * duration, min(x.end - x.arrival, _AFTER * duration))
+    return [(i, title(parts, i)) for i in worst(parts, MOST_PANELS)]
 
 
 def arrival(parts: Sequence[Part], number: int) -> Figure:
     """Return the zoom on one arrival: distance from the target in percent of the step."""
     data = []
-    view = [0.0, 0.0]
-    results = [x for x in results_of(parts, number) if x.end > x.begin]
-    unit = TimeUnit(1e-3, 'ms') if max(
-        (x.arrival - x.begin for x in results), default=1.0) < 1.0 else TimeUnit(1.0, 's')
+    shown = span(parts, number)
+    unit = TimeUnit(1e-3, 'ms') if shown < 1.0 else TimeUnit(1.0, 's')
     for part in parts:
-        run, found = part.run, part.evaluation
+        found = part.evaluation
         if number >= len(found.results):
             continue
-        for kind, stretch in (
-                ('plain steps', found.unshaped[0]), ('recorded', run.stretch),
-                ('plan', found.predicted[0])):
-            if part.colour and kind in _SIMULATED:
-                continue
-            time, distance, (begin, end) = around(part, number, stretch)
-            view = [min(view[0], float(unit.of(begin))), max(view[1], float(unit.of(end)))]
-            data.append(_curve(
-                part, kind, *decimate(unit.of(time), distance, _PANEL_BUCKETS)))
+        for kind, curve in (('plain steps', found.plain), ('plan', found.planned)):
+            if not part.colour:
+                time, distance = around(part, number, curve)
+                data.append(_curve(
+                    part, kind, *decimate(unit.of(time), distance, _PANEL_BUCKETS)))
+        time, distance = around(part, number, found.recorded)
+        samples, away = around(
+            part, number, Curve(found.time, part.run.stretch, part.run.rate))
+        data += _recorded(
+            part, unit.of(time), Curve(time, distance, distance), (unit.of(samples), away),
+            buckets=_PANEL_BUCKETS)
+    arrivals = sorted({float(unit.of(x.arrival)) for x in results_of(parts, number)})
     height = reach(parts, number)
     return Figure(
-        f'arrival{number}', f'Setpoint {_panel_title(parts, number)}', 300, _grouped(data), {
+        f'arrival{number}', f'Setpoint {title(parts, number)}', 300, _grouped(data), {
             # There is no room in every panel for the names of several runs.
             'showlegend': len(parts) == 1,
-            'xaxis': _axis(f'time after arrival [{unit.name}]', range=numbers(view)),
-            'yaxis': _axis('distance [% of step]', range=[-height, height]),
+            'xaxis': axis(
+                label('time in the move', unit=unit.name),
+                range=numbers([0.0, unit.of(shown)])),
+            'yaxis': axis(label('off target', unit='% of the step'), range=[-height, height]),
             'shapes': [{
-                'type': 'line', 'x0': 0, 'x1': 0, 'yref': 'paper', 'y0': 0, 'y1': 1,
-                'line': {'color': GREY, 'width': 1, 'dash': '2px,2px'}}]})
+                'type': 'line', 'x0': x, 'x1': x, 'yref': 'paper', 'y0': 0, 'y1': 1,
+                'line': {'color': GREY, 'width': 1, 'dash': '2px,2px'}} for x in arrivals]})
 
 
 def residuals(parts: Sequence[Part]) -> Figure:
@@ -415,24 +332,24 @@ def residuals(parts: Sequence[Part]) -> Figure:
                 ('plain steps', [x.residual_unshaped for x in results], 'square-open')):
             data.append(_curve(
                 part, what, np.arange(1, len(results) + 1),
-                # A logarithmic axis has no place for 0.
-                [100.0 * x if x > 0.0 else math.nan for x in values], mode='markers',
+                # Below what is resolved there is nothing to see.
+                [100.0 * max(x, RESOLVED) for x in values], mode='markers',
                 marker={
                     'symbol': symbol, 'size': _size(10, results), 'line': {'width': 1.5},
                     'color': part.colour or _KINDS[what]['color']}))
             # Here both are results: one click for both.
             data[-1]['legendgroup'] = part.run.label if part.colour else what
     count = max((len(x.evaluation.results) for x in parts), default=0)
-    axis = _axis('setpoint', range=[0.5, count + 0.5])
+    numbered = axis('setpoint', range=[0.5, count + 0.5])
     if count <= MOST_PANELS:
-        axis |= {'tickmode': 'array', 'tickvals': list(range(1, count + 1)), 'ticktext': [
+        numbered |= {'tickmode': 'array', 'tickvals': list(range(1, count + 1)), 'ticktext': [
             f'{i + 1}: ' + '/'.join(dict.fromkeys(
                 f'{x.stretch:.5g}' for x in results_of(parts, i))) for i in range(count)]}
     return Figure(
         'residuals', 'Residual vibration of each setpoint, recorded and for plain steps', 340,
         _grouped(data), {
-            'xaxis': axis,
-            'yaxis': _axis('residual [% of step]', type='log', **_decades(data))})
+            'xaxis': numbered,
+            'yaxis': axis(label('residual', unit='% of the step'), type='log', **_decades(data))})
 
 
 def _decades(data: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -450,7 +367,7 @@ def prediction(parts: Sequence[Part], unit: TimeUnit) -> Figure:
     data = []
     for part in parts:
         found = part.evaluation
-        difference = part.run.stretch - found.predicted[0]
+        difference = part.run.stretch - found.planned.at(found.time).stretch
         if np.isfinite(difference).any():
             data.append(_curve(
                 part, 'recorded', *decimate(unit.of(found.time), difference), width=1.2))
@@ -459,8 +376,8 @@ def prediction(parts: Sequence[Part], unit: TimeUnit) -> Figure:
     what = parts[0].run.plant.coordinate
     return Figure(
         'prediction', f'Recorded minus predicted {what.name} over time', 300, _grouped(data), {
-            'xaxis': _axis(f'time from the first command [{unit.name}]'),
-            'yaxis': _axis(f'recorded − planned {what.symbol} [1]')})
+            'xaxis': axis(label('time', 't', unit.name)),
+            'yaxis': axis(label('recorded − planned', what.symbol))})
 
 
 def timings(parts: Sequence[Part], unit: TimeUnit) -> Figure:
@@ -494,9 +411,9 @@ def timings(parts: Sequence[Part], unit: TimeUnit) -> Figure:
             color=part.colour or BLACK, width=1.6))
     return Figure(
         'timing', 'Lead of the commands, delay and interval of the samples', 640, _grouped(data), {
-            'xaxis': _axis(f'time from the first command [{unit.name}]', anchor='y'),
-            'yaxis': _axis('sample interval [ms]', domain=[0.0, 0.28], rangemode='tozero'),
-            'yaxis2': _axis('sample delay [ms]', domain=[0.36, 0.64], anchor='x'),
-            'yaxis3': _axis(
-                'command lead [ms]' if not any(len(x.timing.lateness) for x in parts)
-                else 'lead, lateness [ms]', domain=[0.72, 1.0], anchor='x', rangemode='tozero')})
+            'xaxis': axis(label('time', 't', unit.name), anchor='y'),
+            'yaxis': axis('sample interval (ms)', domain=[0.0, 0.28], rangemode='tozero'),
+            'yaxis2': axis('sample delay (ms)', domain=[0.36, 0.64], anchor='x'),
+            'yaxis3': axis(
+                'command lead (ms)' if not any(len(x.timing.lateness) for x in parts)
+                else 'lead, lateness (ms)', domain=[0.72, 1.0], anchor='x', rangemode='tozero')})

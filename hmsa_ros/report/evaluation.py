@@ -1,7 +1,7 @@
 """
 The evaluation of a run: its setpoints, residual vibration, and prediction.
 
-Times are in s from the first command of the run; stamps stay integer nanoseconds.
+Times are in s from the first level of the run; stamps stay integer nanoseconds.
 """
 
 from collections.abc import Sequence
@@ -29,12 +29,11 @@ from hmsa_ros.model.simulation import RTOL, sampled, simulate
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings.levels import in_force, Level, without_repeats
 from hmsa_ros.recordings.parameters import creep_of
-from hmsa_ros.recordings.record import Run
+from hmsa_ros.recordings.record import Run, Times
 from hmsa_ros.recordings.setpoints import Requested, SAME, setpoints_of, start_of
+from hmsa_ros.report.curves import Curve, fine, through
 from hmsa_ros.report.outcome import findings_of
 
-# Plain steps are simulated with this many points a period of the actuator at least, up to so many.
-_POINTS_A_PERIOD, _MOST_POINTS = 100, 2_000_000
 #: Samples a period below which peaks are missed.
 FEW_SAMPLES = 10
 # Of the step: a block that covers less did not move.
@@ -76,10 +75,9 @@ class MoveResult:
     b_p: float
     tau_p: float
     b_1: float
-    #: in s of the run
-    begin: float
-    arrival: float
-    end: float
+    begin: float  #: in s of the run
+    arrival: float  #: of planned rest at the target, in s from the begin
+    end: float  #: in s of the run
     error: float  #: largest distance from the target after arrival, as a share of the step
     #: peak-to-peak stretch after arrival as a share of the step: recorded, and simulated for
     #: plain steps on the same plant; NaN where there are no samples, and of a block that did not
@@ -90,23 +88,29 @@ class MoveResult:
     moved: bool
     place: int = 0  #: of the setpoint among all that were requested, from 0
 
+    @property
+    def rests(self) -> float:
+        """Time of planned rest in s of the run."""
+        return self.begin + self.arrival
+
 
 @dataclass(frozen=True)
 class Evaluation:
     """A run, measured."""
 
-    zero: int  #: stamp in ns of time 0: the first command, or the first sample without one
+    #: stamp in ns of time 0: the first level of the run, or the first sample without one
+    zero: int
     time: Array  #: times of the samples in s, shape (n,)
     start: float  #: stretch at rest before the first move
     levels: tuple[Level, ...]  #: commands that came into force and changed the level, by stamp
     moves: tuple[Move, ...]  #: setpoints
     results: tuple[MoveResult, ...]  #: one a move
-    #: stretch, and stretch rate in 1/s, simulated for plain steps; NaN without a move, and where
-    #: they are too large to follow, shape (n,)
-    unshaped: tuple[Array, Array]
+    recorded: Curve  #: through the samples
+    #: simulated for plain steps; NaN without a move, and where they are too large to follow
+    plain: Curve
     plan: tuple[Level, ...]  #: changes of level that were planned and not replanned, by stamp
-    #: stretch, and stretch rate in 1/s, by the plan; NaN before and without one, shape (n,)
-    predicted: tuple[Array, Array]
+    #: by the plan, at the samples and between them; NaN before and without one
+    planned: Curve
     findings: tuple[Finding, ...] = ()  #: one a setpoint that was requested
 
     def seconds(self, stamp: int) -> float:
@@ -127,20 +131,39 @@ def evaluate(run: Run) -> Evaluation:
     levels = in_force((x,) for x in without_repeats(run.commands)[0])
     plan = in_force(run.plans)
     asked = setpoints_of(run)
-    start = asked[0].setpoint.start if asked else start_of(
-        run, levels[0].stamp if levels else int(run.time[0]))
+    first = _first(run, levels, asked)
+    start = asked[0].setpoint.start if asked else start_of(run, first)
     found = tuple(find_moves(run, levels, asked))
-    zero = levels[0].stamp if levels else int(run.time[0])
-    time = (run.time - zero) / NANOSECONDS
-    *unshaped, grid, fine = _unshaped(run, time, found, zero, start)
+    time = (run.time - first) / NANOSECONDS
+    period = period_of(run)
+    plain = _plain(run, time, found, first, start)
     results = []
     previous = start
     for move in found:
-        results.append(_measure(run, time, (grid, fine), move, move.stretch - previous, zero))
+        results.append(_measure(run, time, plain, move, move.stretch - previous, first))
         previous = move.stretch
+    stamps = run.time
+    if plan:
+        between = np.rint(fine(time, period) * NANOSECONDS).astype(np.int64) + first
+        stamps = np.unique(np.concatenate([run.time, between, [
+            x.stamp for x in plan if run.time[0] <= x.stamp <= run.time[-1]]]).astype(np.int64))
     return Evaluation(
-        zero, time, start, levels, found, tuple(results), (unshaped[0], unshaped[1]), plan,
-        _predict(run, plan), tuple(findings_of(run, asked=asked)))
+        first, time, start, levels, found, tuple(results),
+        through(Curve(time, run.stretch, run.rate), period), plain, plan,
+        Curve((stamps - first) / NANOSECONDS, *_predict(run, plan, stamps)),
+        tuple(findings_of(run, asked=asked)))
+
+
+def _first(run: Run, levels: Sequence[Level], asked: Sequence[Requested]) -> int:
+    """Return when the first level of a run begins, in ns; of an earlier run one may still hold."""
+    begins = asked[0].setpoint.begins if asked else int(run.time[0])
+    later = [x for x in levels if x.stamp >= begins]
+    if not later:
+        return levels[0].stamp if levels else int(run.time[0])
+    before = int(np.searchsorted(run.time, later[0].stamp)) - 1
+    held = next((x.flux_density for x in reversed(levels) if x.stamp < begins), float(
+        run.flux_density[max(before, 0)]))
+    return next((x for x in later if x.flux_density != held), later[0]).stamp
 
 
 def find_moves(run: Run, levels: Sequence[Level], setpoints: Sequence[Requested]) -> list[Move]:
@@ -164,19 +187,16 @@ def find_moves(run: Run, levels: Sequence[Level], setpoints: Sequence[Requested]
     return moves
 
 
-def _unshaped(
-        run: Run, time: Array, moves: Sequence[Move], zero: int,
-        start: float) -> tuple[Array, Array, Array, Array]:
-    """Simulate plain steps: stretch and rate at the samples; times and stretch between, too."""
-    stretch, rate = np.full_like(time, start), np.zeros_like(time)
-    nothing = np.full_like(time, np.nan), np.full_like(time, np.nan), time, \
-        np.full_like(time, np.nan)
+def _plain(
+        run: Run, time: Array, moves: Sequence[Move], zero: int, start: float) -> Curve:
+    """Simulate plain steps, at the samples and between them."""
+    nothing = Curve(time, np.full_like(time, np.nan), np.full_like(time, np.nan))
     if not moves:
         return nothing
     unit = run.plant.time_unit
     begins = [(x.begin - zero) / NANOSECONDS for x in moves]
-    running = time >= begins[0]
-    grid = _fine(time[running], period_of(run))
+    before = time[time < begins[0]]
+    grid = fine(np.union1d(begins[:1], time[len(before):]), period_of(run))
     lower, upper = stretch_limits(run.plant.nondimensional)
     margin = 1e-6 * (min(upper, 2.0) - lower)
     start = min(max(start, lower + margin), upper - margin)
@@ -189,30 +209,20 @@ def _unshaped(
             [PlannedLoad(x / unit, y.flux_densities[-1] / run.plant.flux_density_unit)
              for x, y in zip(begins, moves, strict=True)], held, float(grid[-1]) / unit,
             _slew(run, run.plant, 'plant'))
-        fine, fine_rate = simulate(
+        stretch, rate = simulate(
             switches, loads, grid / unit, material, stretch=start, slopes=slopes,
             lag=run.number('plant.coil_time_constant') / unit, field=held)
     except HmsaError:
         return nothing
-    places = np.searchsorted(grid, time[running])
-    stretch[running], rate[running] = fine[places], fine_rate[places] / unit
-    return stretch, rate, grid, fine
+    return Curve(
+        np.concatenate([before, grid]), np.concatenate([np.full_like(before, start), stretch]),
+        np.concatenate([np.zeros_like(before), rate / unit]))
 
 
 def _slew(run: Run, actuator: ActuatorParameters, node: str) -> float:
     """Return the slew limit of a node without a dimension; infinite for none."""
     return run.number(f'{node}.slew_limit') / actuator.flux_density_unit \
         * actuator.time_unit or math.inf
-
-
-def _fine(time: Array, period: float) -> Array:
-    """Return times with more between them where samples are too few for the peaks."""
-    if len(time) < 2:
-        return time
-    spacing = max(period / _POINTS_A_PERIOD, (time[-1] - time[0]) / _MOST_POINTS)
-    if np.max(np.diff(time)) <= spacing:
-        return time
-    return np.union1d(time, np.arange(time[0], time[-1], spacing))
 
 
 def period_of(run: Run) -> float:
@@ -222,14 +232,13 @@ def period_of(run: Run) -> float:
 
 
 def _measure(
-        run: Run, time: Array, unshaped: tuple[Array, Array], move: Move, step: float,
-        zero: int) -> MoveResult:
-    """Measure one setpoint; unshaped are times and stretch of plain steps."""
+        run: Run, time: Array, plain: Curve, move: Move, step: float, zero: int) -> MoveResult:
+    """Measure one setpoint."""
     begin, arrival, end = (
         (x - zero) / NANOSECONDS for x in (move.begin, move.arrival, move.end))
     window = {'arrival': arrival, 'end': end, 'step': step}
     after = (time >= arrival) & (time <= end)
-    error = residual = plain = math.nan
+    error = residual = unshaped = math.nan
     moved = True
     if np.count_nonzero(after) >= 2 and step != 0.0:
         error = float(np.max(np.abs(run.stretch[after] - move.stretch)) / abs(step))
@@ -237,19 +246,19 @@ def _measure(
         moved = bool((np.mean(run.stretch[after]) - before) / step >= _MOVED)
         if moved:
             residual = residual_vibration(time, run.stretch, **window)
-        plain = residual_vibration(*unshaped, **window)
+        unshaped = residual_vibration(plain.time, plain.stretch, **window)
     unit = run.planner.flux_density_unit
     return MoveResult(
         stretch=move.stretch, b_p=float(signed_root(move.flux_densities[0] / unit)),
         tau_p=(arrival - begin) / run.planner.time_unit,
-        b_1=float(signed_root(move.flux_densities[-1] / unit)), begin=begin, arrival=arrival,
-        end=end, error=error, residual=residual, residual_unshaped=plain, moved=moved,
-        place=move.place)
+        b_1=float(signed_root(move.flux_densities[-1] / unit)), begin=begin,
+        arrival=arrival - begin, end=end, error=error, residual=residual,
+        residual_unshaped=unshaped, moved=moved, place=move.place)
 
 
-def _predict(run: Run, plan: Sequence[Level]) -> tuple[Array, Array]:
-    """Return what the plan predicts for the samples: stretch and rate, from point to point."""
-    predicted = np.full((2, len(run.time)), np.nan)
+def _predict(run: Run, plan: Sequence[Level], stamps: Times) -> tuple[Array, Array]:
+    """Return what the plan predicts for some stamps: stretch and rate, from point to point."""
+    predicted = np.full((2, len(stamps)), np.nan)
     actuator: ActuatorParameters = run.planner
     creep = creep_of(run.parameters, run.joint, PLANNER)
     material = replace(actuator, creep=creep).nondimensional
@@ -274,11 +283,11 @@ def _predict(run: Run, plan: Sequence[Level]) -> tuple[Array, Array]:
         if lag:
             field = late(list(zip(switches, loads, slopes, strict=True)), duration, field, lag)
         part = slice(
-            int(np.searchsorted(run.time, point.stamp)), int(np.searchsorted(
-                run.time, until, side='right' if i + 1 == len(plan) else 'left')))
+            int(np.searchsorted(stamps, point.stamp)), int(np.searchsorted(
+                stamps, until, side='right' if i + 1 == len(plan) else 'left')))
         if part.start == part.stop and not creep:
             continue
-        times = (run.time[part] - point.stamp) / NANOSECONDS / actuator.time_unit
+        times = (stamps[part] - point.stamp) / NANOSECONDS / actuator.time_unit
         rate = point.rate * actuator.time_unit
         try:
             if creep:
@@ -314,7 +323,8 @@ class PlanPoint:
 def plan_points(run: Run, evaluation: Evaluation) -> list[PlanPoint]:
     """Compare the plan of a run with what was recorded, by time."""
     commanded = {x.stamp: x.flux_density for x in evaluation.levels}
-    stretch, rate = evaluation.predicted
+    planned = evaluation.planned.at(evaluation.time)
+    stretch, rate = planned.stretch, planned.rate
     # Of each point the first sample, and behind the last point the end.
     firsts = [int(np.searchsorted(run.time, x.stamp)) for x in evaluation.plan]
     firsts.append(len(run.time))

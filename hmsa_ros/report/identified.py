@@ -11,9 +11,12 @@ from hmsa_ros.identification.recording import Course
 from hmsa_ros.identification.response import respond
 from hmsa_ros.identification.result import Identification
 from hmsa_ros.model.equations import Array
-from hmsa_ros.report import charts
-from hmsa_ros.report.charts import decimate, Figure, numbers
-from hmsa_ros.report.page import Cell, cell, document, placed, table, text
+from hmsa_ros.report.charts import axis as _axis
+from hmsa_ros.report.charts import Figure, label
+from hmsa_ros.report.curves import BUCKETS, decimate, numbers
+from hmsa_ros.report.looks import BLACK, BLUE, GREY, VERMILION
+from hmsa_ros.report.page import document, placed, text
+from hmsa_ros.report.tables import Cell, cell, table
 
 _LAGS = 60
 # Points of the fitted curve, in time units, and how many at most.
@@ -26,14 +29,14 @@ _HEADINGS = {
 def page(found: Identification) -> str:
     """Return the HTML page of an identification."""
     figures = [_motion(found), _residuals(found), _correlation(found)]
-    label = found.recording.label
+    name = found.recording.label
     tiles = [
         (_HEADINGS[found.verdict], 'verdict'), (f'{found.noise_std:.3g}', 'noise of a sample'),
         (str(found.samples), 'samples'), (f'{found.residual_rms:.3g}', 'residual, rms'),
         (f'{float(found.whiteness.autocorrelation[1]):.2f}', 'autocorrelation at one sample')]
     notes = ''.join(f'<li>{escape(x)}</li>' for x in (found.reason, *found.warnings))
     body = [
-        f'<h1>{escape(label)}: identification</h1>',
+        f'<h1>{escape(name)}: identification</h1>',
         '<div class="tiles">' + ''.join(
             f'<div><b>{escape(x)}</b><span>{escape(y)}</span></div>' for x, y in tiles)
         + '</div>', f'<ul class="notes">{notes}</ul>',
@@ -48,7 +51,7 @@ def page(found: Identification) -> str:
             'lines.') + placed(figures[2]) + _marks(found) + '</section>',
         '<section id="pairs"><h2>What is confounded</h2>' + _pairs(found) + '</section>',
         f'<footer class="soft"><p>Written by hmsa_ros {__version__}.</p></footer>']
-    return document(f'{label} – identification', body, figures)
+    return document(f'{name} – identification', body, figures)
 
 
 def _unit(found: Identification) -> tuple[float, str]:
@@ -61,10 +64,6 @@ def _curve(name: str, x: Array, y: Array, **style: Any) -> dict[str, Any]:
             **style}
 
 
-def _axis(title: str, **more: Any) -> dict[str, Any]:
-    return {'title': {'text': title}, 'exponentformat': 'power', **more}
-
-
 def _motion(found: Identification) -> Figure:
     """Return level, measured and fitted motion over time."""
     size, unit = _unit(found)
@@ -73,20 +72,20 @@ def _motion(found: Identification) -> Figure:
     end = max(float(recording.time[-1]), float(recording.level_times[-1]))
     levels = np.append(recording.levels, recording.levels[-1]) * 1e3
     level_times = np.append(recording.level_times, end) / size
-    few = len(time) <= charts.BUCKETS
+    few = len(time) <= BUCKETS
     data = [
         _curve('measured', *decimate(time, recording.stretch), mode='markers' if few else 'lines',
-               marker={'size': 3 if len(time) > 200 else 6, 'color': charts.BLUE},
-               line={'color': charts.BLUE, 'width': 1.0}),
+               marker={'size': 3 if len(time) > 200 else 6, 'color': BLUE},
+               line={'color': BLUE, 'width': 1.0}),
         _curve('fitted', *_fitted(found, size),
-               line={'color': charts.VERMILION, 'width': 1.6}),
+               line={'color': VERMILION, 'width': 1.6}),
         _curve('level', level_times, levels, yaxis='y2',
-               line={'color': charts.BLACK, 'width': 1.6, 'shape': 'hv'})]
+               line={'color': BLACK, 'width': 1.6, 'shape': 'hv'})]
     what = recording.coordinate
     return Figure('motion', f'Level, measured and fitted {what.name} over time', 520, data, {
-        'xaxis': _axis(f'time [{unit}]', anchor='y', range=numbers([time[0], time[-1]])),
-        'yaxis': _axis(f'{what.name} {what.symbol} [1]', domain=[0.0, 0.66]),
-        'yaxis2': _axis('flux density B [mT]', domain=[0.74, 1.0], anchor='x')})
+        'xaxis': _axis(label('time', 't', unit), anchor='y', range=numbers([time[0], time[-1]])),
+        'yaxis': _axis(label(what.name, what.symbol), domain=[0.0, 0.66]),
+        'yaxis2': _axis(label('flux density', 'B', 'mT'), domain=[0.74, 1.0], anchor='x')})
 
 
 def _fitted(found: Identification, size: float) -> tuple[Array, Array]:
@@ -111,14 +110,14 @@ def _residuals(found: Identification) -> Figure:
     out = found.weights == 0.0
     data = [_curve(
         'residual', *decimate(time[~out], found.residual[~out]), mode='markers',
-        marker={'size': 3 if len(time) > 200 else 6, 'color': charts.BLUE})]
+        marker={'size': 3 if len(time) > 200 else 6, 'color': BLUE})]
     if np.any(out):
         data.append(_curve(
             'outlier', time[out], found.residual[out], mode='markers',
-            marker={'size': 6, 'symbol': 'x', 'color': charts.VERMILION}))
+            marker={'size': 6, 'symbol': 'x', 'color': VERMILION}))
     return Figure('residuals', 'Residuals over time', 300, data, {
-        'xaxis': _axis(f'time [{unit}]', range=numbers([time[0], time[-1]])),
-        'yaxis': _axis('measured less fitted [1]')})
+        'xaxis': _axis(label('time', 't', unit), range=numbers([time[0], time[-1]])),
+        'yaxis': _axis('measured less fitted')})
 
 
 def _correlation(found: Identification) -> Figure:
@@ -128,13 +127,13 @@ def _correlation(found: Identification) -> Figure:
     limit = 1.96 / math.sqrt(found.samples)
     data = [{
         'type': 'bar', 'name': 'autocorrelation', 'x': numbers(lags), 'y': numbers(rho),
-        'marker': {'color': charts.BLUE}}]
+        'marker': {'color': BLUE}}]
     ends = np.array([0.5, len(rho) + 0.5])
     data += [_curve(
         'white noise, 95 %', ends, np.full(2, x), showlegend=x > 0.0,
-        line={'color': charts.GREY, 'width': 1.2, 'dash': '5px,3px'}) for x in (limit, -limit)]
+        line={'color': GREY, 'width': 1.2, 'dash': '5px,3px'}) for x in (limit, -limit)]
     return Figure('correlation', 'Autocorrelation of the residuals over the lag', 260, data, {
-        'xaxis': _axis('lag [samples]'), 'yaxis': _axis('autocorrelation [1]')})
+        'xaxis': _axis('lag (samples)'), 'yaxis': _axis('autocorrelation')})
 
 
 def _parameters(found: Identification) -> str:

@@ -4,8 +4,7 @@ A report as one HTML page that needs nothing else: no network, no other file.
 What the page may load is nailed down in its content security policy, too.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 from datetime import datetime
 from html import escape
 import json
@@ -21,12 +20,15 @@ from hmsa_ros.interfaces.actuator import parameters_of
 from hmsa_ros.interfaces.parameters import ACTUATOR, ACTUATOR_FIELDS, LAW
 from hmsa_ros.model.equations import critical_zeta, stretch_limits
 from hmsa_ros.model.parameters import ActuatorParameters
+from hmsa_ros.model.residual import percent
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings.record import Run
 from hmsa_ros.recordings.topics import APPLIED
-from hmsa_ros.report import charts
-from hmsa_ros.report.charts import Figure, NOT_MOVED, Part, percent, TimeUnit
+from hmsa_ros.report import charts, curves, looks
+from hmsa_ros.report.arrivals import NOT_MOVED, Part, residual_text
+from hmsa_ros.report.charts import Figure, TimeUnit
 from hmsa_ros.report.evaluation import FEW_SAMPLES, period_of, plan_points
+from hmsa_ros.report.tables import Cell, cell, formatted, Row, table, Values
 
 _POLICY = (
     "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
@@ -34,21 +36,8 @@ _POLICY = (
 # Plans and requests of long runs are cut here; the figures show all of them.
 _MOST_ROWS = 1000
 _MOST_FINDINGS = 8
-_LONG_TABLE = 25
 # Stamps beyond this many seconds are dates.
 _A_DATE = 1e8
-
-
-@dataclass(frozen=True)
-class Cell:
-    """A cell of a table: the text, and the value that is copied in full precision instead."""
-
-    shown: str
-    value: float | None = None
-
-
-Row = list[Cell | str]
-_Values = list[Cell | str | float]
 
 
 def page(parts: Sequence[Part]) -> str:
@@ -125,7 +114,7 @@ def page(parts: Sequence[Part]) -> str:
         *(f'<section id="{key}"><h2>{escape(title)}</h2>{content}</section>'
           for key, title, content in sections),
         f'<footer class="soft"><p>Written by hmsa_ros {__version__}. Each curve shows the least '
-        f'and the largest value in each of {charts.BUCKETS} intervals, so that no peak is '
+        f'and the largest value in each of {curves.BUCKETS} intervals, so that no peak is '
         'lost.</p></footer>']
     return document(f'{names} – run report', body, figures)
 
@@ -136,7 +125,7 @@ def document(title: str, body: Sequence[str], figures: Sequence[Figure]) -> str:
         {'figures': [
             {'key': x.key, 'height': x.height, 'data': x.data, 'layout': x.layout}
             for x in figures],
-         'dark': charts.DARK}, separators=(',', ':'), allow_nan=False)
+         'dark': looks.DARK}, separators=(',', ':'), allow_nan=False)
     return '\n'.join([
         '<!DOCTYPE html>', '<html lang="en">', '<head>', '<meta charset="utf-8">',
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
@@ -209,8 +198,8 @@ def _tiles(parts: Sequence[Part]) -> str:
         'commands', 'samples a second', 'messages lost']
     rows = [[
         f'{sum(y.arrived for y in x.evaluation.findings)} of {len(x.evaluation.findings)}',
-        charts.residual_text(x.evaluation.results),
-        percent(largest(y.residual_unshaped for y in x.evaluation.results)),
+        residual_text(x.evaluation.results),
+        f'{percent(largest(y.residual_unshaped for y in x.evaluation.results))} %',
         f'{len(x.timing.commands)}' + (
             f' ({x.timing.late} late)' if len(x.timing.lead) or len(x.timing.lateness) else ''),
         f'{1.0 / np.median(x.timing.interval):.6g}' if len(x.timing.interval) else '–',
@@ -229,7 +218,7 @@ def _key(parts: Sequence[Part]) -> str:
     if len(parts) == 1:
         return ''
     return '<ul class="key">' + ''.join(
-        f'<li><i style="--light: {x.colour}; --dark: {charts.DARK[x.colour]}"></i>'
+        f'<li><i style="--light: {x.colour}; --dark: {looks.DARK[x.colour]}"></i>'
         f'{escape(x.run.label)}</li>' for x in parts) + '</ul>'
 
 
@@ -250,7 +239,7 @@ def _notes_of(part: Part) -> Iterable[str]:
     if part.run.commands and not part.evaluation.results:
         yield ('No setpoint could be identified from the commands: none of them holds a '
                f'requested {part.run.plant.coordinate.name} or lasts a period of the actuator.')
-    if part.evaluation.results and not np.isfinite(part.evaluation.unshaped[0]).any():
+    if part.evaluation.results and not part.evaluation.plain.known:
         yield 'Plain steps cannot be simulated: the levels are too large to follow.'
     samples = period_of(part.run) / np.median(part.timing.interval) \
         if len(part.timing.interval) else math.inf
@@ -272,56 +261,9 @@ def _notes_of(part: Part) -> Iterable[str]:
 
 # Tables --------------------------------------------------------------------------------------
 
-def table(
-        key: str, caption: str, header: Sequence[str],
-        rows: Sequence[Row]) -> str:
-    """Return a table with a button that copies it."""
-    if header[0] in ('run', 'bag') and len({row[0] for row in rows}) <= 1:
-        # A run on its own needs no name in every row.
-        header, rows = header[1:], [row[1:] for row in rows]
-    numeric = [any(
-        isinstance(row[i], Cell) for row in rows) for i in range(len(header))]
-    kinds = [' class="number"' if x else '' for x in numeric]
-    long = ' long' if len(rows) > _LONG_TABLE else ''
-    lines = [
-        f'<p class="soft" id="{key}-caption">{escape(caption)}</p>',
-        f'<div class="scroll{long}" tabindex="0" role="region" '
-        f'aria-labelledby="{key}-caption">'
-        f'<table id="{key}" aria-labelledby="{key}-caption"><thead><tr>',
-        *(f'<th scope="col"{kind}>{escape(x)}</th>'
-          for x, kind in zip(header, kinds, strict=True)), '</tr></thead><tbody>']
-    for row in rows:
-        lines.append('<tr>')
-        for cell, kind in zip(row, kinds, strict=True):
-            if isinstance(cell, str):
-                lines.append(f'<td{kind}>{escape(cell)}</td>')
-            else:
-                value = '' if cell.value is None else f' data-value="{cell.value!r}"'
-                lines.append(f'<td{kind}{value}>{escape(cell.shown)}</td>')
-        lines.append('</tr>')
-    return ''.join([
-        *lines, '</tbody></table></div>',
-        f'<button type="button" data-table="{key}">Copy table</button>'])
-
-
-def _table(
-        key: str, caption: str, columns: Mapping[str, str],
-        rows: Iterable[_Values]) -> str:
-    """Return a table of values, each in the format of its column; texts and cells as they are."""
-    return table(key, caption, list(columns), [[
-        x if isinstance(x, (str, Cell)) else cell(x, form)
-        for x, form in zip(row, columns.values(), strict=True)] for row in rows])
-
-
-def cell(value: float, form: str = '.6g') -> Cell:
-    """Return a number as a cell."""
-    value = float(value)
-    return Cell(f'{value:{form}}', value) if math.isfinite(value) else Cell('–', math.nan)
-
-
 def _setpoints(parts: Sequence[Part]) -> str:
     """Return the table of the setpoints and their results."""
-    rows: list[_Values] = []
+    rows: list[Values] = []
     for part in parts:
         moves = {x.place: (x, y) for x, y in zip(
             part.evaluation.moves, part.evaluation.results, strict=True)}
@@ -329,34 +271,35 @@ def _setpoints(parts: Sequence[Part]) -> str:
             move, x = moves.get(i, (None, None))
             levels = 0 if move is None else len(move.flux_densities)
             of_move = [math.nan] * 9 if x is None else [
-                x.b_p, x.tau_p, x.b_1, x.begin * 1e3, x.arrival * 1e3, x.end * 1e3,
+                x.b_p, x.tau_p, x.b_1, x.begin * 1e3, x.arrival * 1e3, (x.end - x.begin) * 1e3,
                 100.0 * x.error, 100.0 * x.residual if x.moved else NOT_MOVED,
                 100.0 * x.residual_unshaped]
-            percent = found.setpoint.percent
+            share = found.setpoint.percent
             rows.append([
                 part.run.label, Cell(str(i + 1), i + 1), found.setpoint.target,
-                Cell(str(found.verdict).replace('_', ' ')), percent(found.offset),
-                percent(found.offset_std), percent(found.vibration),
-                percent(found.vibration_std), found.frequency, *of_move,
+                Cell(str(found.verdict).replace('_', ' ')), share(found.offset),
+                share(found.offset_std), share(found.vibration),
+                share(found.vibration_std), found.frequency, *of_move,
                 'plain step' if levels == 1 else f'{levels} levels' if levels else '–'])
     if not rows:
         return text('No setpoint was carried out while the samples were recorded.')
-    return _table(
+    return formatted(
         'setpoint-table', 'Verdict by the samples, with offset and vibration (peak to peak) and '
         'their standard deviations. b and tau nondimensional as in the paper: of the first '
-        'level, the time until arrival, and of the level that holds the target. Error and '
+        'level, the time until arrival, and of the level that holds the target. Begin from the '
+        'first level of the run; arrival and end from the begin of the move. Error and '
         'residual from arrival on, noise included. All in percent of the step.', {
             'run': '', 'setpoint': '', f'target {parts[0].run.plant.coordinate.symbol} [1]': '.6g',
-            'verdict': '', 'offset [%]': '+.3g', '± [%]': '.1g', 'vibration [%]': '.3g',
-            '± of it [%]': '.1g', 'frequency [Hz]': '.3g',
+            'verdict': '', 'offset [%]': '+%', '± [%]': '%', 'vibration [%]': '%',
+            '± of it [%]': '%', 'frequency [Hz]': '.3g',
             'b_p [1]': '.5f', 'tau_p [1]': '.5f', 'b_1 [1]': '.5f', 'begin [ms]': '.3f',
-            'arrival [ms]': '.3f', 'until [ms]': '.3f', 'largest error [%]': '.3g',
-            'residual [%]': '.3g', 'plain steps [%]': '.3g', 'command': ''}, rows)
+            'arrival [ms]': '.3f', 'end [ms]': '.3f', 'largest error [%]': '%',
+            'residual [%]': '%', 'plain steps [%]': '%', 'command': ''}, rows)
 
 
 def _requests(parts: Sequence[Part], unit: TimeUnit) -> str:
     """Return the table of verdicts."""
-    rows: list[_Values] = []
+    rows: list[Values] = []
     for part in parts:
         before = None
         for x in part.run.verdicts:
@@ -365,7 +308,7 @@ def _requests(parts: Sequence[Part], unit: TimeUnit) -> str:
                 rows.append([
                     part.run.label, unit.of(part.evaluation.seconds(x.sent)).item(), x.level,
                     x.code, x.message])
-    return '' if not rows else _table(
+    return '' if not rows else formatted(
         'request-table', 'Verdicts of the planner on the requests.', {
             'run': '', f'time [{unit.name}]': '.3f', 'level': '', 'code': '', 'message': ''},
         rows[:_MOST_ROWS])
@@ -373,13 +316,13 @@ def _requests(parts: Sequence[Part], unit: TimeUnit) -> str:
 
 def _plan(parts: Sequence[Part], unit: TimeUnit) -> str:
     """Return the table of planned changes of level."""
-    rows: list[_Values] = [
+    rows: list[Values] = [
         [part.run.label, unit.of(x.time).item(), x.planned * 1e3, x.commanded * 1e3, x.stretch,
          x.recorded_stretch, x.rate, x.recorded_rate, x.deviation]
         for part in parts for x in plan_points(part.run, part.evaluation)]
     what = parts[0].run.plant.coordinate
     name, symbol = what.name, what.symbol
-    return _table(
+    return formatted(
         'plan-table', f'Each change of level: flux density planned and commanded; {name} and '
         'rate of the first sample from then on; and the largest distance of the recorded from '
         f'the predicted {name} until the next change.', {
@@ -396,7 +339,7 @@ def _repeats(parts: Sequence[Part]) -> str:
 
 def _timing(parts: Sequence[Part]) -> str:
     """Return the table of times."""
-    rows: list[_Values] = []
+    rows: list[Values] = []
     for part in parts:
         x = part.timing
         for name, values in (
@@ -410,7 +353,7 @@ def _timing(parts: Sequence[Part]) -> str:
                     part.run.label, name, Cell(str(len(values)), len(values)),
                     *np.quantile(values, [0.0, 0.5, 0.99, 1.0]) * 1e3,
                     float(np.std(values)) * 1e3])
-    return _table('timing-table', 'Jitter is the standard deviation.', {
+    return formatted('timing-table', 'Jitter is the standard deviation.', {
         'run': '', 'quantity': '', 'count': '', 'least [ms]': '.4f', 'median [ms]': '.4f',
         '99 % [ms]': '.4f', 'largest [ms]': '.4f', 'jitter [ms]': '.4f'}, rows)
 

@@ -1,95 +1,143 @@
-"""Runs as pictures: PNG, or PDF with lines instead of pixels."""
+"""Runs as pictures: command, response, phase plane, and the arrivals with most residual."""
 
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
+import numpy as np
 
-from hmsa_ros.report import style
-from hmsa_ros.report.charts import (
+from hmsa_ros.report import looks, style
+from hmsa_ros.report.arrivals import (
     around,
-    commanded,
-    decimate,
     Part,
     reach,
     residual_text,
     results_of,
-    RUN_COLOURS,
-    time_unit,
-    TimeUnit,
+    span,
+    step_of,
     worst,
 )
+from hmsa_ros.report.charts import commanded, time_unit, TimeUnit
+from hmsa_ros.report.curves import Curve, decimate
 from hmsa_ros.report.evaluation import verdicts
+from hmsa_ros.report.paper import Paper
 
-# Panels of arrivals in a row.
-_PANELS = 3
+# Samples are drawn as points where there are so many in a panel at most.
+_MOST_SAMPLES = 200
+# What follows the last arrival is shown for so many durations of its move where nothing but rest,
+# within a share of the step, follows.
+_REST, _STILL = 8.0, 0.02
 
 
-def draw(path: Path, parts: Sequence[Part], kind: str = 'png') -> None:
-    """Write command, response, phase plane and the arrivals with most residual as PNG or PDF."""
+def draw(paths: Path | Sequence[Path], parts: Sequence[Part], paper: Paper | None = None) -> None:
+    """Draw runs; as many arrivals as fit beside each other."""
+    paper = paper or Paper()
     unit = time_unit(parts)
-    shown = worst(parts, _PANELS)
-    rows = [['command'] * 3 + ['phase'] * 3, ['response'] * 3 + ['phase'] * 3]
+    columns = paper.columns(3)
+    shown = worst(parts, columns)
+    if columns > 1:
+        rows = [['command'] * 3 + ['phase'] * 3, ['response'] * 3 + ['phase'] * 3]
+    else:
+        rows = [[x] * 6 for x in ('command', 'response', 'phase')]
+    heights = [1.0, 1.45, 1.6][:len(rows)]
     if shown:
-        # Panels of two columns each; where there are fewer, they are wider.
-        width = 6 // len(shown)
-        rows.append([f'arrival{i}' for i in shown for _ in range(width)])
-    with style.picture(path, 5.9 if shown else 3.9, kind=kind) as figure:
+        # Where there are fewer, they are wider.
+        rows.append([f'arrival{i}' for i in shown for _ in range(6 // len(shown))])
+        heights.append(1.3)
+    letters = paper.letters / 8.0
+    times = _shown_times(parts)
+    with style.picture(paths, (0.5 + 1.35 * sum(heights)) * letters, paper) as figure:
         axes: dict[str, Axes] = figure.subplot_mosaic(
-            rows,  # type: ignore[arg-type]
-            height_ratios=[1.0, 1.45, 1.3][:len(rows)])
+            rows, height_ratios=heights)  # type: ignore[arg-type]
         for number, part in enumerate(parts):
-            colour = RUN_COLOURS[number % len(RUN_COLOURS)] if len(parts) > 1 else ''
-            _draw_run(axes, part, unit, colour)
+            look = looks.RECORDED if len(parts) == 1 else looks.CASES[number % len(looks.CASES)]
+            _draw_run(axes, part, unit, look, times, alone=len(parts) == 1)
             for i in shown:
                 if i < len(part.evaluation.results):
-                    _draw_arrival(
-                        axes[f'arrival{i}'], part, i, reach(parts, i), colour)
-        begin = float(unit.of(min(x.evaluation.time[0] for x in parts)))
-        end = float(unit.of(max(x.evaluation.time[-1] for x in parts)))
+                    _draw_arrival(axes[f'arrival{i}'], part, i, look, alone=len(parts) == 1)
         for key in ('command', 'response'):
-            axes[key].set_xlim(begin, end if end > begin else begin + 1.0)
+            axes[key].set_xlim(*unit.of(times))
+        time = style.axis('time', 't', unit.name)
+        style.finish(axes['command'], time, style.axis('flux density', 'B', 'mT'), 'a')
         axes['command'].tick_params(labelbottom=False)
-        style.finish(axes['command'], '', 'flux density $B$ [mT]', 'a')
+        axes['command'].xaxis.label.set_visible(False)
         what = parts[0].run.plant.coordinate
-        position = f'{what.name} ${what.tex}$ [1]'
-        style.finish(axes['response'], f'time $t$ [{unit.name}]', position, 'b')
-        style.finish(
-            axes['phase'], position, rf'{what.name} rate $\dot{{{what.tex}}}$ [1/s]', 'c')
+        position = style.axis(what.name, what.tex)
+        style.finish(axes['response'], time, position, 'b')
+        style.finish(axes['phase'], position, style.axis(
+            f'{what.name} rate', rf'\dot{{{what.tex}}}', '1/s'), 'c')
         for letter, i in zip('def', shown, strict=False):
             panel = axes[f'arrival{i}']
-            style.finish(panel, 'time after arrival [ms]', 'distance [% of step]', letter)
-            panel.set_title(_title(parts, i), loc='right', fontsize=8)
+            height = reach(parts, i)
+            panel.set_ylim(-height, height)
+            panel.set_xlim(0.0, 1e3 * span(parts, i))
+            style.finish(
+                panel, style.axis('time in the move', unit='ms'),
+                style.axis('off target', unit='% of step') if i == shown[0] else '', letter)
+            panel.set_title(_title(parts, i), loc='right', fontsize='small')
         figure.align_ylabels([axes['command'], axes['response']])
-        style.legend_below(figure, axes['response'], axes['phase'], most=4)
+        style.legend_below(figure, *(x for key, x in axes.items() if key != 'command'))
 
 
-def _styled(kind: dict[str, Any], colour: str) -> dict[str, Any]:
-    """Return how a curve looks, in the run's own colour if there are several."""
-    return {**kind, 'color': colour} if colour else kind
+def _shown_times(parts: Sequence[Part]) -> tuple[float, float]:
+    """Return from when to when a run is shown, in s: without what is at rest at both ends."""
+    begins, ends = [], []
+    for part in parts:
+        found = part.evaluation
+        begin, end = float(found.time[0]), float(found.time[-1])
+        if found.results:
+            last = found.results[-1]
+            step = abs(step_of(part, len(found.results) - 1))
+            quiet = max(last.rests, min(last.begin + _REST * last.arrival, end))
+            after = found.recorded.between(quiet, end).stretch
+            if len(after) and np.nanmax(np.abs(after - last.stretch)) <= _STILL * step:
+                end = quiet
+        # The first level is a step, which needs room before it.
+        begins.append(max(begin, -0.06 * end) if end > 0.0 else begin)
+        ends.append(end)
+    begin, end = min(*begins, -0.02 * max(ends)), max(ends)
+    return begin, end if end > begin else begin + 1.0
 
 
-def _draw_run(axes: dict[str, Axes], part: Part, unit: TimeUnit, colour: str) -> None:
+def _draw_recorded(
+        panel: Axes, part: Part, curve: tuple[Any, Any], samples: tuple[Any, Any],
+        look: looks.Look, *, alone: bool) -> None:
+    """Draw the curve through the samples, and these where they are few."""
+    panel.plot(*curve, **look.line(), label='recorded' if alone else part.run.label)
+    if len(samples[0]) < len(curve[0]) and len(samples[0]) <= _MOST_SAMPLES:
+        panel.plot(
+            *samples, linestyle='none', marker='o', markersize=2.2, color=look.colour, zorder=4,
+            label='samples')
+
+
+def _draw_run(
+        axes: dict[str, Axes], part: Part, unit: TimeUnit, look: looks.Look,
+        times: tuple[float, float], *, alone: bool) -> None:
     run, found = part.run, part.evaluation
-    time = unit.of(found.time)
     if found.levels:
-        times, values = commanded(part)
+        switches, values = commanded(part)
         axes['command'].step(
-            unit.of(times), values, where='post', **_styled(style.SHAPED, colour))
-    for i, x in enumerate(found.results):
+            unit.of(switches), values, where='post', **look.line(),
+            label='command' if alone else run.label)
+    for result in found.results:
         axes['response'].plot(
-            unit.of([x.begin, x.end]), [x.stretch, x.stretch], **style.TARGET,
-            label='target' if i == 0 else None)
-    if not colour:
+            unit.of([result.begin, result.end]), [result.stretch] * 2, **style.TARGET,
+            label='target')
+    plain, curve, samples = (
+        x.between(*times) for x in (
+            found.plain, found.recorded, Curve(found.time, run.stretch, run.rate)))
+    if alone:
         # Several runs are compared by what was recorded.
-        axes['response'].plot(
-            *decimate(time, found.unshaped[0]), **style.UNSHAPED, label='plain steps')
-        axes['phase'].plot(*found.unshaped, **style.UNSHAPED)
-    axes['response'].plot(
-        *decimate(time, run.stretch), **_styled(style.SHAPED, colour),
-        label=run.label if colour else 'recorded')
-    axes['phase'].plot(run.stretch, run.rate, **_styled(style.SHAPED, colour))
+        for panel, x, y in (('response', *decimate(unit.of(plain.time), plain.stretch)),
+                            ('phase', plain.stretch, plain.rate)):
+            axes[panel].plot(x, y, **style.UNSHAPED, label='plain steps (simulated)')
+    _draw_recorded(
+        axes['response'], part, decimate(unit.of(curve.time), curve.stretch),
+        (unit.of(samples.time), samples.stretch), look, alone=alone)
+    _draw_recorded(
+        axes['phase'], part, (curve.stretch, curve.rate), (samples.stretch, samples.rate), look,
+        alone=alone)
     places = sorted({x.stretch for x in found.results})
     if places:
         axes['phase'].plot(
@@ -97,17 +145,22 @@ def _draw_run(axes: dict[str, Axes], part: Part, unit: TimeUnit, colour: str) ->
 
 
 def _draw_arrival(
-        panel: Axes, part: Part, number: int, height: float, colour: str) -> None:
+        panel: Axes, part: Part, number: int, look: looks.Look, *, alone: bool) -> None:
     """Draw the zoom on one arrival, in ms and percent of the step."""
-    for stretch, kind in (
-            (part.run.stretch, style.SHAPED), (part.evaluation.unshaped[0], style.UNSHAPED)):
-        if kind is style.SHAPED or not colour:
-            time, distance, (begin, end) = around(part, number, stretch)
-            shown = (time >= begin) & (time <= end)
-            panel.plot(
-                *decimate(1e3 * time[shown], distance[shown]), **_styled(kind, colour))
-    panel.axvline(0.0, **style.TARGET)
-    panel.set_ylim(-height, height)
+    found = part.evaluation
+    end = span([part], number)
+
+    def shown(curve: Curve) -> tuple[Any, Any]:
+        time, distance = around(part, number, curve)
+        return 1e3 * time[time <= end], distance[time <= end]
+
+    if alone:
+        panel.plot(
+            *decimate(*shown(found.plain)), **style.UNSHAPED, label='plain steps (simulated)')
+    _draw_recorded(
+        panel, part, decimate(*shown(found.recorded)),
+        shown(Curve(found.time, part.run.stretch, part.run.rate)), look, alone=alone)
+    panel.axvline(1e3 * found.results[number].arrival, **style.TARGET)
 
 
 def _title(parts: Sequence[Part], number: int) -> str:
@@ -116,4 +169,4 @@ def _title(parts: Sequence[Part], number: int) -> str:
     if len(parts) > 1:
         return f'to {targets}'
     said = verdicts([x.evaluation for x in parts], number)
-    return f'to {targets}: {said}{residual_text(results, 2)}'
+    return f'to {targets}: {said}{residual_text(results)}'

@@ -8,58 +8,141 @@ gives the same bytes.
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+import csv
+import io
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-from matplotlib import style
+from matplotlib import rcParams, style
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_agg import FigureCanvasAgg, RendererAgg
+from matplotlib.backends.backend_mixed import MixedModeRenderer
+from matplotlib.backends.backend_pgf import RendererPgf
 from matplotlib.figure import Figure
 from matplotlib.ticker import AutoMinorLocator, NullLocator
+import numpy as np
 
 from hmsa_ros.files import replacing
+from hmsa_ros.report import looks
+from hmsa_ros.report.looks import BLACK
+from hmsa_ros.report.paper import kind_of, Paper
 
-# Okabe and Ito's palette, told apart with every kind of colour vision.
-BLACK = '#000000'
-ORANGE = '#E69F00'
-SKY_BLUE = '#56B4E9'
-GREEN = '#009E73'
-BLUE = '#0072B2'
-VERMILION = '#D55E00'
-PURPLE = '#CC79A7'
-GREY = '#8A8A8A'
-
-# What each kind of curve looks like, everywhere. Colour is never alone: style or width differ.
-SHAPED: dict[str, Any] = {'color': BLUE, 'linewidth': 1.8, 'zorder': 3}
-UNSHAPED: dict[str, Any] = {
-    'color': VERMILION, 'linewidth': 1.0, 'linestyle': (0, (4, 1.5)), 'zorder': 2}
-TARGET: dict[str, Any] = {
-    'color': GREY, 'linewidth': 0.8, 'linestyle': (0, (1, 1.5)), 'zorder': 1}
+SHAPED, UNSHAPED, TARGET = (x.line() for x in (looks.RECORDED, looks.PLAIN, looks.TARGET))
 EQUILIBRIUM: dict[str, Any] = {
-    'color': BLACK, 'linestyle': 'none', 'marker': 'o', 'markersize': 5, 'zorder': 5}
+    'color': BLACK, 'linestyle': 'none', 'marker': 'o', 'markersize': 4.5, 'zorder': 5}
+#: Of words beside curves.
+SOFT: dict[str, Any] = {'fontsize': 'small', 'color': '#555555'}
 
-#: Width of a picture in inches: two columns of a journal.
-WIDTH = 7.2
+# Without the entries that name matplotlib's version and the time.
 _METADATA: dict[str, dict[str, Any]] = {
     'png': {'Software': None},
-    'pdf': {'Creator': None, 'Producer': None, 'CreationDate': None}}
+    'pdf': {'Creator': None, 'Producer': None, 'CreationDate': None},
+    'svg': {'Creator': None, 'Date': None}}
 _SETTINGS = str(Path(__file__).with_name('style.mplstyle'))
+_COLUMNS = ('panel', 'curve', 'x_axis', 'y_axis', 'x', 'y')
+
+
+class Picture(Figure):
+    """A figure that remembers what is drawn on it otherwise than as lines, for its data."""
+
+    def __init__(self, **more: Any) -> None:
+        super().__init__(**more)
+        self.others: list[tuple[Axes, str, list[Any]]] = []
+
+    def remember(self, axes: Axes, curve: str, *columns: Any) -> None:
+        """Keep columns of numbers, or a grid of them (x, y, and z of shape (len(y), len(x)))."""
+        if len(columns) == 3:
+            x, y = np.meshgrid(*columns[:2])
+            columns = x, y, columns[2]
+        self.others.append((axes, curve, [np.ravel(x) for x in columns]))
+
+    def rows(self) -> Iterator[tuple[Any, ...]]:
+        """Return what is drawn: panel, curve, names of both axes, x, y, and z of a map."""
+        for number, axes in enumerate(x for x in self.axes if x.get_label() != '<colorbar>'):
+            letter = axes.get_title(loc='left').strip('()') or str(number + 1)
+            fixed = letter, *(_plain(x) for x in (axes.get_xlabel(), axes.get_ylabel()))
+            # Lines across a whole panel and those without a name are guides to the eye.
+            drawn = [
+                (str(line.get_label()), [line.get_xdata(orig=True), line.get_ydata(orig=True)])
+                for line in axes.get_lines()
+                if line.get_transform() == axes.transData
+                and not str(line.get_label()).startswith('_')]
+            for curve, columns in [*drawn, *(x[1:] for x in self.others if x[0] is axes)]:
+                for row in zip(*(np.asarray(x).tolist() for x in columns), strict=True):
+                    yield fixed[0], curve, *fixed[1:], *row
 
 
 @contextmanager
 def picture(
-        paths: Path | Sequence[Path], height: float, *, width: float = WIDTH,
-        kind: str = '') -> Iterator[Figure]:
-    """Yield a figure (sizes in inches), which the end of the block writes as PNG or PDF."""
-    with style.context(['default', _SETTINGS]):
-        figure = Figure(figsize=(width, height), layout='constrained')
+        paths: Path | Sequence[Path], height: float, paper: Paper | None = None
+) -> Iterator[Picture]:
+    """Yield a figure of a height in inches, which the end of the block writes to each path."""
+    paper = paper or Paper()
+    paths = [paths] if isinstance(paths, Path) else list(paths)
+    kinds = [kind_of(x) for x in paths]
+    settings = {'font.size': paper.letters, 'savefig.dpi': paper.dpi}
+    with style.context(['default', _SETTINGS, settings]):
+        figure = Picture(figsize=(paper.inches, height), layout='constrained')
         FigureCanvasAgg(figure)
         yield figure
-        for path in [paths] if isinstance(paths, Path) else paths:
-            form = kind or ('pdf' if path.suffix.lower() == '.pdf' else 'png')
+        for path, kind in zip(paths, kinds, strict=True):
             with replacing(path) as beside:
-                # Without the entries that name matplotlib's version and the time.
-                figure.savefig(beside, format=form, metadata=_METADATA[form])
+                if kind == 'pgf':
+                    beside.write_text(_pgf(figure, path), encoding='utf-8')
+                else:
+                    figure.savefig(beside, format=kind, metadata=_METADATA[kind])
+        for path in dict.fromkeys(x.with_suffix('.csv') for x in paths if paper.data):
+            with replacing(path) as beside, beside.open('w', newline='', encoding='utf-8') as file:
+                rows = list(figure.rows())
+                writer = csv.writer(file, lineterminator='\n')
+                size = max((len(x) for x in rows), default=len(_COLUMNS))
+                writer.writerow((*_COLUMNS, 'z')[:size])
+                writer.writerows(rows)
+
+
+class _Words(RendererPgf):
+    """Measures words as the other pictures do, so that no LaTeX is needed to write a file."""
+
+    def __init__(self, figure: Figure, file: Any) -> None:
+        super().__init__(figure, file)  # type: ignore[no-untyped-call]
+        self._ruler = RendererAgg(1, 1, figure.dpi)  # type: ignore[no-untyped-call]
+
+    def get_text_width_height_descent(
+            self, s: str, prop: Any, ismath: Any) -> tuple[float, float, float]:
+        """Return the size of a text in dots."""
+        size: tuple[float, float, float] = self._ruler.get_text_width_height_descent(  # type: ignore[no-untyped-call]
+            s, prop, ismath)
+        return size
+
+
+class _File(io.StringIO):
+    """A text in memory with the name of a file, beside which images of the picture go."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.name = str(path)
+
+
+def _pgf(figure: Figure, path: Path) -> str:
+    """Return a picture that LaTeX inputs; images in it are written beside the path."""
+    file = _File(path)
+    width, height = (float(x) for x in figure.get_size_inches())
+    file.write(
+        f'% \\usepackage{{pgf}}, and \\input{{{path.name}}}\n\\begingroup\n\\makeatletter\n'
+        '\\begin{pgfpicture}\n\\pgfpathrectangle{\\pgfpointorigin}'
+        f'{{\\pgfqpoint{{{width:.6f}in}}{{{height:.6f}in}}}}\n'
+        '\\pgfusepath{use as bounding box, clip}\n')
+    renderer: Any = MixedModeRenderer(  # type: ignore[no-untyped-call]
+        figure, width, height, figure.dpi, _Words(figure, file))
+    figure.draw(renderer)
+    return f'{file.getvalue()}\\end{{pgfpicture}}\n\\makeatother\n\\endgroup\n'
+
+
+def axis(quantity: str, symbol: str = '', unit: str = '') -> str:
+    """Return the label of an axis: its quantity, symbol, and unit if it has one."""
+    return ' '.join(x for x in (quantity, f'${symbol}$' if symbol else '',
+                                f'({unit})' if unit else '') if x)
 
 
 def finish(axes: Axes, x_label: str, y_label: str, letter: str = '') -> None:
@@ -68,22 +151,41 @@ def finish(axes: Axes, x_label: str, y_label: str, letter: str = '') -> None:
     axes.set_ylabel(y_label)
     if letter:
         axes.set_title(f'({letter})', loc='left', fontweight='bold')
-    for axis in (axes.xaxis, axes.yaxis):
-        if not isinstance(axis.get_major_locator(), NullLocator):
-            axis.set_minor_locator(AutoMinorLocator(2))
+    for one in (axes.xaxis, axes.yaxis):
+        if not isinstance(one.get_major_locator(), NullLocator):
+            one.set_minor_locator(AutoMinorLocator(2))
     axes.grid(visible=True, color='#E4E4E4', linewidth=0.5, zorder=0)
     axes.set_axisbelow(True)
 
 
-def legend_below(figure: Figure, *panels: Axes, most: int = 9) -> None:
+def legend_below(figure: Figure, *panels: Axes, most: int = 9, title: str = '') -> None:
     """Put one legend for all panels below them, each label once, in so many columns at most."""
     entries: dict[str, Any] = {}
-    for axes in panels:
+    for axes in panels or figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
+    if not entries:
+        return
+    # What fits beside each other: a handle is as wide as some eight letters.
+    letters = figure.get_figwidth() * 72.0 / (0.46 * float(rcParams['font.size']))
+    fits = int(letters // (max(len(_plain(x)) for x in entries) + 8))
+    columns = max(1, min(len(entries), most, fits))
     figure.legend(
-        entries.values(), entries.keys(), loc='outside lower center',
-        ncols=min(len(entries), most), columnspacing=1.8)
+        _by_rows(list(entries.values()), columns), _by_rows(list(entries), columns),
+        loc='outside lower center', ncols=columns, columnspacing=1.6, title=title or None,
+        title_fontsize='small')
+
+
+def _plain(label: str) -> str:
+    """Return a label without the marks of TeX, about as long as it is drawn."""
+    return label.replace(r'\mathrm', '').replace(r'\dot', 'd').translate(
+        {ord(x): None for x in '\\${}'})
+
+
+def _by_rows(entries: list[Any], columns: int) -> list[Any]:
+    """Return entries such that a legend, which fills columns, shows them row by row."""
+    rows = [entries[i:i + columns] for i in range(0, len(entries), columns)]
+    return [x for column in zip_longest(*rows, fillvalue=None) for x in column if x is not None]
 
 
 def note(axes: Axes, text: str, place: tuple[Any, Any], offset: Any, **more: Any) -> None:

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from hmsa_ros.cli.pictures import add_picture_options, formats_of, paper_of
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.files import make_folder
 
@@ -18,11 +19,14 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         '--out', type=Path, default=Path('figures'), metavar='DIR',
         help='output folder, created if missing (default figures)')
+    add_picture_options(parser, folder=True, data=False)
+    parser.set_defaults(format='png')
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the figures and print what was written."""
     folder: Path = arguments.out
+    paper, kinds = paper_of(arguments), formats_of(arguments)
     # Before the slow imports: a bad folder is reported immediately.
     make_folder(folder)
 
@@ -32,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
     with progress() as update:
         for i, (number, figure) in enumerate(FIGURES.items()):
             update(f'Figure {number}', i / len(FIGURES))
-            written += write_figure(figure, folder)
+            written += write_figure(figure, folder, paper=paper, kinds=kinds)
     for path in written:
         print(path)
     return 0

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.options import add_options, MATERIAL
+from hmsa_ros.cli.pictures import add_picture_options, formats_of, paper_of
 from hmsa_ros.cli.plan import nominal
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text, make_folder
@@ -42,8 +43,7 @@ def add_parser(subparsers: Any) -> None:
                     'the residuals: peak-to-peak stretch after arrival as a share of the step, '
                     'without the steady offset. Minimax plans for these errors. Prints a table '
                     'and writes robustness.csv, a picture of each move, and front.png, the worst '
-                    'residual over the duration; pictures as PDF too; existing files are '
-                    'replaced.',
+                    'residual over the duration; existing files are replaced.',
         epilog='example: hmsa robustness --move 1.0:1.4 1.2:0.8 --errors 0.05 --order 2 3 4')
     add_options(
         parser,
@@ -72,10 +72,12 @@ def add_parser(subparsers: Any) -> None:
          {'default': 10}),
         *chunked.options('processes (default 1)'),
         ('--json', 'print JSON in full precision'))
+    add_picture_options(parser, folder=True)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Study, print and write."""
+    paper_of(arguments), formats_of(arguments)
     in_chunks = bool(chunked.asked(arguments))
     start, _ = chunked.engine(arguments, 1)
     return (_feedback if arguments.feedback else _shapers)(arguments, start, in_chunks)
@@ -110,7 +112,8 @@ def _shapers(arguments: argparse.Namespace, start: 'Start', in_chunks: bool) -> 
     def finish(results: 'list[Result]', *files: Path) -> int:
         count = len(compared)
         studies = [(x, results[i * count:(i + 1) * count]) for i, x in enumerate(cases)]
-        return _show(studies, [*files, *_write(folder, studies)], as_json=arguments.json)
+        files = (*files, *_write(folder, studies, arguments))
+        return _show(studies, list(files), as_json=arguments.json)
 
     if in_chunks:
         table = folder / 'table.parquet'
@@ -142,22 +145,26 @@ def _show(
     return 0
 
 
-def _write(folder: Path, studies: 'list[tuple[Case, list[Result]]]') -> list[Path]:
+def _write(
+        folder: Path, studies: 'list[tuple[Case, list[Result]]]',
+        arguments: argparse.Namespace) -> list[Path]:
     """Write the numbers and the pictures."""
+    from hmsa_ros.report.paper import named
     from hmsa_studies.pictures import draw_front, draw_robustness
     from hmsa_studies.robustness import write_csv
 
+    paper, kinds = paper_of(arguments), formats_of(arguments)
     files = [folder / 'robustness.csv']
     write_csv(files[0], studies)
-    kinds = ('png', 'pdf')
-    for case, results in studies:
-        paths = [
-            folder / f'robustness_{case.start:g}_to_{case.target:g}.{kind}' for kind in kinds]
-        draw_robustness(paths, case, results)
-        files += paths
-    fronts = [folder / f'front.{kind}' for kind in kinds]
-    draw_front(fronts, studies)
-    return files + fronts
+    drawn = [named(folder, f'robustness_{case.start:g}_to_{case.target:g}', kinds)
+             for case, _ in studies]
+    for paths, study in zip(drawn, studies, strict=True):
+        draw_robustness(paths, *study, paper)
+    drawn.append(named(folder, 'front', kinds))
+    draw_front(drawn[-1], studies, paper)
+    for paths in drawn:
+        files += [*paths, *([paths[0].with_suffix('.csv')] if paper.data else [])]
+    return files
 
 
 def _record(case: 'Case', results: 'list[Result]') -> dict[str, Any]:
@@ -207,7 +214,7 @@ def _print_table(case: 'Case', results: 'list[Result]') -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from hmsa_studies.robustness import percent
+    from hmsa_ros.model.residual import percent
 
     error = f'{100.0 * case.box:g}'
     table = Table(

@@ -9,7 +9,9 @@ import shutil
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.options import add_options, MATERIAL
+from hmsa_ros.cli.pictures import add_picture_options, formats_of, paper_of
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.report.paper import kind_of, named, Paper
 from hmsa_studies.commands import chunked
 
 if TYPE_CHECKING:
@@ -75,15 +77,15 @@ def add_parser(subparsers: Any) -> None:
          'file to write, ending in .csv or .parquet; an existing file is replaced. Or a folder, '
          'which keeps the chunks and gets table.parquet once all are there (default: CSV on '
          'standard output)'),
-        ('--picture', 'FILE', Path,
-         'draw the results too, each name ending in .png or .pdf: curves over one column of '
-         'numbers, a map with contours over two, bands of quantiles of samples; hatched where '
-         'there is no plan. A folder of --out gets table.png and table.pdf',
-         {'nargs': '+', 'default': []}),
         ('--show', 'COLUMN,...', str,
          'columns to draw (default: duration and first level, or residual and offset)'),
         *chunked.options(
             'processes; 1 computes in this one (default: one a core for large sweeps)'))
+    add_picture_options(
+        parser, folder=True,
+        named='draw the results too: curves over one column of numbers, a map with contours over '
+              'two, bands of quantiles of samples; hatched where there is no plan. A folder of '
+              '--out gets pictures in any case, named table')
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -112,15 +114,20 @@ class _Picture:
         if wrong:
             raise BadInputError(
                 f'--show has {wrong[0]!r}: expected some of {", ".join(sweep.results)}')
+        self._paper = paper_of(arguments)
         for path in self._paths:
-            if path.suffix.lower() not in {'.png', '.pdf'}:
-                raise BadInputError(
-                    f'the format of {path} is unknown: expected a name that ends in .png or .pdf')
+            kind_of(path)
         out: Path | None = arguments.out
         asked = bool(self._paths)
-        self._default = arguments.show is None
+        self._default = arguments.show is None and self._paper == Paper()
         if out is not None and _is_folder(out) and not asked:
-            self._paths = [out / 'table.png', out / 'table.pdf']
+            self._paths = named(out, 'table', formats_of(arguments))
+        self._tables = list(dict.fromkeys(
+            x.with_suffix('.csv') for x in self._paths if self._paper.data))
+        if out is not None and out in self._tables:
+            raise BadInputError(
+                f'--data would write {out}, which is the table of --out: expected another name '
+                'for one of them')
         if not self._paths:
             return
         try:
@@ -143,12 +150,13 @@ class _Picture:
         """Draw all rows unless they are drawn already; return the files."""
         if self._view is None:
             return []
-        if not changed and self._default and all(x.exists() for x in self._paths):
-            return self._paths
+        written = [*self._paths, *self._tables]
+        if not changed and self._default and all(x.exists() for x in written):
+            return written
         from hmsa_studies.sweep_pictures import draw_sweep
 
-        draw_sweep(self._paths, self._view, self._columns, self._sweep.fixed)
-        return self._paths
+        draw_sweep(self._paths, self._view, self._columns, self._sweep.fixed, self._paper)
+        return written
 
 
 def _sweep(arguments: argparse.Namespace) -> 'Sweep':

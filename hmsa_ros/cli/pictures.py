@@ -1,0 +1,62 @@
+"""The options that every command has that draws pictures."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from hmsa_ros.cli.options import add_options
+from hmsa_ros.report.paper import KINDS, kinds_in, Paper
+
+_ENDS = f'{", ".join(f".{x}" for x in KINDS[:-1])} or .{KINDS[-1]}'
+
+
+def add_picture_options(
+        parser: Any, *, named: str = '', folder: bool = False, data: bool = True) -> None:
+    """
+    Add the options of pictures.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of a command.
+    named : str
+        What ``--picture`` is said to draw; without it there is no such option.
+    folder : bool
+        Whether the pictures go into a folder, so that ``--format`` names their formats.
+    data : bool
+        Whether there is ``--data``; a command that always writes it needs none.
+
+    """
+    if named:
+        add_options(parser, (
+            '--picture', 'FILE', Path, f'{named}; each name ends in {_ENDS}',
+            {'nargs': '+', 'default': []}))
+    group = parser.add_argument_group('pictures')
+    if folder:
+        add_options(group, (
+            '--format', 'NAME,...', str,
+            f'formats, of {", ".join(KINDS)} (default %(default)s)', {'default': 'png,pdf'}))
+    standard = Paper()
+    add_options(
+        group,
+        ('--width', 'MM', float,
+         'width in mm: 85 for a column, 120, or 183 for two (default %(default)g); panels stand '
+         'below each other where they do not fit beside each other',
+         {'default': standard.width}),
+        ('--font-size', 'PT', float, 'size of the letters in pt (default %(default)g)',
+         {'default': standard.letters}),
+        ('--dpi', 'N', float, 'dots an inch of PNG (default %(default)g)',
+         {'default': standard.dpi}),
+        *([('--data', 'write what each picture shows as CSV, too, under the same name')]
+          if data else []))
+
+
+def paper_of(arguments: argparse.Namespace) -> Paper:
+    """Return what the options ask for; raise `BadInputError` for what is out of range."""
+    return Paper(arguments.width, arguments.font_size, arguments.dpi,
+                 getattr(arguments, 'data', False))
+
+
+def formats_of(arguments: argparse.Namespace) -> tuple[str, ...]:
+    """Return the formats of pictures in a folder; raise `BadInputError` for unknown ones."""
+    return kinds_in(arguments.format)

@@ -1,0 +1,91 @@
+"""Runs side by side, and the arrivals of their moves."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.residual import percent
+from hmsa_ros.recordings.record import Run
+from hmsa_ros.report.curves import Curve
+from hmsa_ros.report.evaluation import Evaluation, MoveResult, verdicts
+from hmsa_ros.report.timing import Timing
+
+# Of what a panel holds beyond what it shows at first, in durations of the move.
+_PANEL_SPAN = 20.0
+# Of an arrival's panel: how long it is in durations of the move, and how many percent of the
+# step it shows at least.
+_SHOWN, _LEAST_PERCENT = 4.0, 5.0
+#: Instead of a residual, which would be 0.
+NOT_MOVED = 'did not move'
+
+
+@dataclass(frozen=True)
+class Part:
+    """One run of a report; without a colour it is on its own and its curves differ in theirs."""
+
+    run: Run
+    evaluation: Evaluation
+    timing: Timing
+    colour: str = ''
+
+
+def worst(parts: Sequence[Part], most: int) -> list[int]:
+    """Return the numbers, from 0 on, of the setpoints with the largest residuals."""
+    count = max((len(x.evaluation.results) for x in parts), default=0)
+    ranked = sorted(range(count), key=lambda i: -max(
+        (x.residual if x.moved else math.inf for x in results_of(parts, i)
+         if math.isfinite(x.residual) or not x.moved), default=0.0))
+    return sorted(ranked[:most])
+
+
+def results_of(parts: Sequence[Part], number: int) -> list[MoveResult]:
+    """Return the results of one setpoint in all runs that have it."""
+    return [x.evaluation.results[number] for x in parts
+            if number < len(x.evaluation.results)]
+
+
+def residual_text(results: Sequence[MoveResult], *, least: bool = False) -> str:
+    """Return the largest residual of some moves in words, and the least before it if asked."""
+    if not all(x.moved for x in results):
+        return NOT_MOVED
+    shares = [x.residual for x in results if math.isfinite(x.residual)]
+    if not shares:
+        return '–'
+    return ' to '.join(dict.fromkeys(
+        f'{percent(x)} %' for x in ([min(shares)] if least else []) + [max(shares)]))
+
+
+def reach(parts: Sequence[Part], number: int) -> float:
+    """Return how far an arrival's panel reaches from 0, in percent of the step."""
+    return min(150.0, max([_LEAST_PERCENT, *(
+        110.0 * x.error for x in results_of(parts, number) if math.isfinite(x.error))]))
+
+
+def around(part: Part, number: int, curve: Curve) -> tuple[Array, Array]:
+    """Return a curve about an arrival: s after the move began, and off target in % of the step."""
+    x = part.evaluation.results[number]
+    inside = curve.between(x.begin, min(x.end, x.begin + _PANEL_SPAN * max(x.arrival, 1e-9)))
+    return inside.time - x.begin, 100.0 * (inside.stretch - x.stretch) / abs(step_of(part, number))
+
+
+def step_of(part: Part, number: int) -> float:
+    """Return how far a move was to go."""
+    found = part.evaluation
+    return found.results[number].stretch - (
+        found.results[number - 1].stretch if number else found.start)
+
+
+def span(parts: Sequence[Part], number: int) -> float:
+    """Return how long after its begin an arrival's panel ends, in s."""
+    return max((
+        min(x.end - x.begin, _SHOWN * x.arrival) for x in results_of(parts, number)), default=1.0)
+
+
+def title(parts: Sequence[Part], number: int) -> str:
+    """Return the heading of an arrival."""
+    results = results_of(parts, number)
+    targets = ', '.join(dict.fromkeys(f'{x.stretch:.6g}' for x in results))
+    said = verdicts([x.evaluation for x in parts], number)
+    left = residual_text(results, least=True)
+    return f'{results[0].place + 1}. to {targets}: {said}residual {left}'

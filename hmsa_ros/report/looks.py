@@ -1,0 +1,65 @@
+"""
+What each kind of curve looks like, on every page and in every picture.
+
+Curves differ in colour and in dash or marker. The colours are distinct for deuteranopia and
+protanopia, too.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+BLACK, GREY, BLUE, VERMILION = '#000000', '#717171', '#0072B2', '#D55E00'
+GREEN, SKY_BLUE, ORANGE, PURPLE = '#264825', '#58BFFC', '#FFA900', '#590058'
+INDIGO, SILVER = '#2B098B', '#B0B0B0'
+#: Colours that have another where the background is dark.
+DARK = {
+    BLUE: '#4DABE8', ORANGE: '#F2B93B', GREEN: '#7DB07C', PURPLE: '#E08FE0',
+    SKY_BLUE: '#B5E2FF', VERMILION: '#FF8A4A', BLACK: '#F0F0F0', GREY: '#9A9A9A'}
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a curve is drawn."""
+
+    colour: str
+    width: float = 1.4  #: in pt
+    dash: tuple[float, ...] = ()  #: on and off in widths of the line; solid without
+    marker: str = ''  #: as matplotlib names it
+    order: int = 2  #: what is drawn later lies above
+
+    def line(self, **more: Any) -> dict[str, Any]:
+        """Return the line as matplotlib takes it, without the marker."""
+        return {
+            'color': self.colour, 'linewidth': self.width, 'zorder': self.order,
+            'linestyle': (0, self.dash) if self.dash else '-', **more}
+
+    def plotly(self) -> dict[str, Any]:
+        """Return the line as Plotly takes it."""
+        dash = ','.join(f'{x * max(self.width, 1.0):g}px' for x in self.dash)
+        return {'color': self.colour, 'width': 1.3 * self.width} | (
+            {'dash': dash} if dash else {})
+
+
+RECORDED = Look(BLUE, 1.6, order=3)
+PLAIN = Look(VERMILION, 1.0, (4.0, 1.5))
+PLAN = Look(BLACK, 1.1, (1.0, 2.0), order=4)
+FIELD = Look(ORANGE, 1.1, (6.0, 1.5, 1.0, 1.5))
+TARGET = Look(GREY, 0.9, (2.0, 2.0), order=1)
+
+#: Of the shapers, by name; `ordered` has those of several orders.
+SHAPERS = {
+    'two_step': Look(BLUE, 1.8, (), 'o', 6),
+    'robust': Look(GREEN, 1.3, (5.0, 1.5), 's', 5),
+    'minimax': Look(SKY_BLUE, 1.5, (5.0, 1.0, 1.0, 1.0), 'D', 5),
+    'minimum_time': Look(ORANGE, 1.5, (8.0, 2.0), '^', 4),
+    'smooth': Look(INDIGO, 1.3, (1.0, 1.0), 'P', 4),
+    'step': Look(VERMILION, 1.2, (3.0, 2.0), 'X', 3),
+    'zv': Look(SILVER, 1.5, (8.0, 1.5, 1.0, 1.5), 'v', 3),
+    'zvd': Look(GREY, 1.2, (2.0, 1.0), '<', 3),
+    'ei': Look(BLACK, 1.0, (6.0, 1.0, 1.0, 1.0, 1.0, 1.0), '>', 3),
+    'umzv': Look(PURPLE, 1.2, (1.0, 2.5), 'p', 3),
+}
+#: Curves without a name of their own, such as those of several runs, one after the other.
+CASES = tuple(SHAPERS[x] for x in (
+    'two_step', 'step', 'robust', 'minimum_time', 'umzv', 'ei', 'minimax', 'zvd'))
+RUNS = tuple(x.colour for x in CASES)

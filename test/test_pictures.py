@@ -1,0 +1,159 @@
+"""Pictures: their size on paper, their formats, colours and data, and the curves of a run."""
+
+import csv
+from pathlib import Path
+import re
+
+from matplotlib.image import imread
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from test_report import ACTUATOR, one, parameters, simulated
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.interfaces.topics import FLUX_DENSITY_COMMAND
+from hmsa_ros.model.residual import percent
+from hmsa_ros.report import style
+from hmsa_ros.report.charts import commanded
+from hmsa_ros.report.curves import Curve, decimate, through
+from hmsa_ros.report.looks import CASES, Look, SHAPERS
+from hmsa_ros.report.paper import KINDS, named, Paper
+from hmsa_ros.report.picture import draw
+
+# What deuteranopia and protanopia leave of linear red, green and blue (Machado and others, IEEE
+# Transactions on Visualization and Computer Graphics 15, 2009, full severity).
+VISIONS = {
+    'all': np.eye(3),
+    'deuteranopia': np.array([
+        [0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413],
+        [-0.011820, 0.042940, 0.968881]]),
+    'protanopia': np.array([
+        [0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216],
+        [-0.003882, -0.048116, 1.051998]])}
+#: Differences of CIELAB that are seen at a glance on thin lines.
+SEEN = 20.0
+INCH = 25.4
+PERIOD = 1.2e-2
+
+
+def cielab(colour: str, vision: np.ndarray) -> np.ndarray:
+    """Return a colour as it is seen."""
+    rgb = np.array([int(colour[i:i + 2], 16) / 255 for i in (1, 3, 5)])
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    xyz = np.array([
+        [0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+    ) @ np.clip(vision @ linear, 0.0, 1.0) / [0.9505, 1.0, 1.089]
+    f = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+@pytest.mark.parametrize('vision', VISIONS)
+@pytest.mark.parametrize('looks', [tuple(SHAPERS.values()), CASES], ids=['shapers', 'cases'])
+def test_shapers_differ_in_colour_dash_and_marker_for_every_vision(
+        looks: tuple[Look, ...], vision: str) -> None:
+    for part in ('colour', 'dash', 'marker'):
+        assert len({getattr(x, part) for x in looks}) == len(looks)
+    seen = [cielab(x.colour, VISIONS[vision]) for x in looks]
+    assert min(np.linalg.norm(x - y) for i, x in enumerate(seen) for y in seen[:i]) > SEEN
+
+
+@pytest.mark.parametrize(('width', 'letters'), [(85.0, 7.0), (120.0, 8.0), (183.0, 9.0)])
+def test_a_picture_is_as_wide_as_asked_in_every_format(
+        width: float, letters: float, tmp_path: Path) -> None:
+    paths = named(tmp_path, 'picture', KINDS)
+    with style.picture(paths, 2.0, Paper(width, letters, 300.0)) as figure:
+        axes = figure.add_subplot()
+        axes.plot([0.0, 1.0], [0.0, 2.0], label='line', **style.SHAPED)
+        style.finish(axes, style.axis('time', r'\tau'), style.axis('share', unit='%'), 'a')
+        assert axes.xaxis.label.get_fontsize() == letters
+    png, pdf, svg, pgf = paths
+    assert imread(png).shape[1] == int(width / INCH * 300)
+    box = re.search(rb'/MediaBox \[ ?0 0 ([\d.]+) ', pdf.read_bytes())
+    assert box is not None
+    assert float(box[1]) == pytest.approx(width / INCH * 72, abs=1e-3)
+    drawn = svg.read_text(encoding='utf-8')
+    assert float(re.findall(r'width="([\d.]+)pt"', drawn)[0]) == pytest.approx(
+        width / INCH * 72, abs=1e-3)
+    assert 'share' in drawn
+    words = pgf.read_text(encoding='utf-8')
+    assert rf'{{\pgfqpoint{{{width / INCH:.6f}in}}{{2.000000in}}}}' in words
+    assert 'share (%)' in words
+    assert words.count(r'\begin{pgfscope}') == words.count(r'\end{pgfscope}') > 10
+    assert words.rstrip().endswith(r'\endgroup')
+
+
+@pytest.mark.parametrize('numbers', [(30.0,), (85.0, 2.0), (85.0, 8.0, 5000.0), (float('nan'),)])
+def test_paper_that_is_none_is_refused(numbers: tuple[float, ...]) -> None:
+    with pytest.raises(BadInputError, match='of a picture is .* expected'):
+        Paper(*numbers)
+
+
+def test_what_is_below_what_is_resolved_is_said_to_be() -> None:
+    assert [percent(x) for x in (7e-17, 9.9e-9, 2e-8, 0.0128, -0.5, float('nan'))] == [
+        '<1e-6', '<1e-6', '2e-6', '1.3', '-50.0', '?']
+
+
+def oscillation(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the free motion of a nonlinear oscillator of period `PERIOD`, about."""
+    rate = 2.0 * np.pi / PERIOD
+    found = solve_ivp(
+        lambda _, y: (y[1], -rate**2 * (y[0] - 1.1) * (1.0 + 0.5 * (y[0] - 1.1)) - 60.0 * y[1]),
+        (0.0, times[-1]), (1.0, 0.0), t_eval=times, rtol=1e-10, atol=1e-12)
+    return found.y[0], found.y[1]
+
+
+def test_between_six_samples_a_period_the_curve_is_the_motion_and_no_polygon() -> None:
+    time = np.arange(0.0, 0.05, PERIOD / 6.0)
+    curve = through(Curve(time, *oscillation(time)), PERIOD)
+    truth, rate = oscillation(curve.time)
+    error = np.max(np.abs(curve.stretch - truth))
+    polygon = np.max(np.abs(np.interp(curve.time, time, oscillation(time)[0]) - truth))
+    assert error < 0.12 * polygon
+    assert np.max(np.abs(curve.rate - rate)) < 0.05 * np.max(np.abs(rate))
+    # All samples are on it, and nothing is drawn where samples are missing.
+    assert set(time) <= set(curve.time)
+    gapped = through(Curve(*(
+        np.delete(x, [8, 9, 10, 11]) for x in (time, *oscillation(time)))), PERIOD)
+    inside = (gapped.time > time[7]) & (gapped.time < time[12])
+    assert np.isnan(gapped.stretch[inside]).all()
+    assert np.isfinite(gapped.stretch[~inside]).all()
+    shown = decimate(gapped.time, gapped.stretch)[1]
+    assert np.count_nonzero(np.isnan(shown)) == 1
+
+
+def test_time_begins_at_the_first_level_of_the_run_and_its_step_is_drawn(tmp_path: Path) -> None:
+    told = parameters(planner=ACTUATOR, plant=ACTUATOR)
+    messages = simulated(period=1_000_000)
+    plain = one(tmp_path / 'plain', messages, **told)
+    # A sign of life with the level that an earlier run has left.
+    begin = min(x[0] for x in messages)
+    first = min((x for x in messages if x[1].endswith(FLUX_DENSITY_COMMAND.name)),
+                key=lambda x: x[0])
+    early = type(first[3])(**vars(first[3]))
+    early.header = type(early.header)(
+        stamp=type(early.header.stamp)(sec=0, nanosec=0), frame_id=early.header.frame_id)
+    early.header.stamp.sec, early.header.stamp.nanosec = divmod(begin - 2_000_000, 10**9)
+    early.magnetic_field = type(early.magnetic_field)(x=0.0, y=0.0, z=0.0)
+    later = one(tmp_path / 'later', [
+        (begin - 1_000_000, first[1], first[2], early), *messages], **told)
+    assert [x.stamp for x in later.evaluation.levels][1:] == [
+        x.stamp for x in plain.evaluation.levels]
+    assert later.evaluation.zero == plain.evaluation.zero == plain.evaluation.levels[0].stamp
+    assert later.evaluation.results == plain.evaluation.results
+    times, values = commanded(plain)
+    assert times[0] < times[1] == 0.0
+    assert values[0] == pytest.approx(0.0, abs=1e-9)
+    assert values[1] > 1.0
+    assert all(x.arrival == pytest.approx(5.8e-3, rel=0.05) for x in plain.evaluation.results)
+    # Twelve samples a period are drawn as points, with the motion between them.
+    draw(tmp_path / 'run.png', [plain], Paper(85.0, dpi=100.0, data=True))
+    with (tmp_path / 'run.csv').open(encoding='utf-8') as file:
+        rows = list(csv.DictReader(file))
+    panels = {
+        curve: np.array([(float(x['x']), float(x['y'])) for x in rows
+                         if (x['panel'], x['curve']) == ('c', curve)])
+        for curve in ('samples', 'recorded', 'plain steps (simulated)')}
+    assert len(panels['recorded']) > 5 * len(panels['samples']) > 100
+    assert len(panels['plain steps (simulated)']) > 5 * len(panels['samples'])
+    with pytest.raises(BadInputError, match='cannot write .*nowhere'):
+        draw(tmp_path / 'nowhere' / 'run.png', [plain])
