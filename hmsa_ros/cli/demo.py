@@ -11,7 +11,6 @@ from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.tables import table
 from hmsa_ros.ending import ENDING
 from hmsa_ros.files import json_text
-from hmsa_ros.model.residual import percent
 
 if TYPE_CHECKING:
     from hmsa_ros.lab.demo import DemoResult
@@ -65,6 +64,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _print_table(result: 'DemoResult') -> None:
     from rich.console import Console
+
+    from hmsa_ros.model.residual import percent
 
     console = Console()
     moves = table(

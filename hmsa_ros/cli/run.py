@@ -15,7 +15,6 @@ from hmsa_ros.cli.tables import table
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text
-from hmsa_ros.model.residual import percent
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -203,6 +202,8 @@ def _print(
 
 def findings_table(findings: 'list[Finding]') -> 'Table':
     """Return the table of what was found of setpoints."""
+    from hmsa_ros.model.residual import percent
+
     made = table(
         'offset: mean stretch less the target; vibration: peak to peak; both in % of the step, '
         'with their standard deviations',
