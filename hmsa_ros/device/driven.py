@@ -119,7 +119,7 @@ class HardwareDevice(Device):
     @property
     def clocks(self) -> dict[str, str]:
         """What is known of the clocks of hardware, in words by name."""
-        found = {}
+        found: dict[str, str] = {}
         for x in self._coils:
             if (known := x.instrument.clock_map) is not None:
                 found |= {f'clock of {x.name}: error in us': f'{known.error * 1e6:.1f}',

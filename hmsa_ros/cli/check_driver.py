@@ -1,0 +1,87 @@
+"""``hmsa check-driver``: whether a class of hardware does what a driver needs."""
+
+import argparse
+from pathlib import Path
+import sys
+from typing import Any, TYPE_CHECKING
+
+from hmsa_ros.cli.options import add_options, JSON
+from hmsa_ros.cli.progress import progress
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.files import json_text, write_text
+
+if TYPE_CHECKING:
+    from hmsa_ros.device.conformance import Conformance
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command."""
+    parser = subparsers.add_parser(
+        'check-driver', help='try a class of hardware at small levels',
+        description='Drive a class of hardware as hmsa driver does, without ROS, with flux '
+                    'densities up to --limit: levels, their timing, samples, polarity, and '
+                    'whether the coil is off after a silence, close, an exception and SIGTERM. '
+                    'It takes about ten seconds. Exit 0 only if all checks pass.',
+        epilog='example: hmsa check-driver my_lab:Coil --set port=/dev/ttyACM0')
+    parser.add_argument(
+        'hardware', metavar='MODULE:NAME', help='as in the parameter hardware of hmsa driver')
+    add_options(
+        parser,
+        ('--joint', 'NAME', str, 'name of the joint (default actuator)', {'default': 'actuator'}),
+        ('--set', 'KEY=VALUE', str, 'a setting of the class, as hardware.KEY of hmsa driver; may '
+         'be given several times', {'action': 'append', 'default': []}),
+        ('--limit', 'T', float, 'largest flux density that is set (default 0.001 T)',
+         {'default': 1e-3}),
+        ('--rate', 'HZ', float, 'rate at which it is read (default 200 Hz)',
+         {'default': 200.0}),
+        ('--report', 'HTML', Path, 'page with the checks and histograms of times'),
+        JSON)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Try it, and show what was found."""
+    from hmsa_ros.device.conformance import Trial
+
+    out: Path | None = arguments.report
+    if out is not None and not out.resolve().parent.is_dir():
+        raise BadInputError(f'cannot write {out}: expected a file in a folder that exists')
+    settings = dict(_setting(x) for x in arguments.set)
+    with progress() as update:
+        found = Trial(
+            arguments.hardware, arguments.joint, settings, level=arguments.limit,
+            rate=arguments.rate).run(update)
+    if out is not None:
+        from hmsa_ros.report.conformance import page
+
+        write_text(out, page(found))
+    if arguments.json:
+        print(json_text(found.as_json()))
+    else:
+        _show(found)
+        if out is not None:
+            print(f'{out} written')
+    return 0 if found.passed else 1
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    """Return a keyword argument; its value is read as YAML, as ROS reads parameters."""
+    import yaml
+
+    key, given, value = text.partition('=')
+    if not given or not key.isidentifier():
+        raise BadInputError(f'--set {text}: expected KEY=VALUE, as in --set port=/dev/ttyACM0')
+    try:
+        return key, yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise BadInputError(f'--set {text}: expected a value as in YAML') from error
+
+
+def _show(found: 'Conformance') -> None:
+    for x in found.checks:
+        print(f'{"ok" if x.passed else "FAILED":<7}{x.name:<18}{x.sentence}')
+    for text in found.untried:
+        print(f'{"-":<7}not tried: {text}')
+    failed = [x.name for x in found.checks if not x.passed]
+    print(f'{found.name}: ' + (
+        f'{len(failed)} of {len(found.checks)} checks failed: {", ".join(failed)}' if failed
+        else f'{len(found.checks)} checks passed'), file=sys.stderr)

@@ -1,0 +1,452 @@
+"""
+Whether a class of hardware does what a driver needs, tried at small levels.
+
+The trial drives it as a driver does, by a `HardwareWorker`, and judges by what it returned and by
+what its sensor saw.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+import json
+import math
+import signal
+import subprocess
+import sys
+from threading import Event
+from time import monotonic, sleep, time_ns
+from typing import Any, cast, NamedTuple
+
+import numpy as np
+
+from hmsa_ros.device.driven import HardwareDevice, HardwareJoint
+from hmsa_ros.device.hardware import Calls, Hardware, load
+from hmsa_ros.device.protocol import Change, Sample
+from hmsa_ros.device.watchdog import Fallback
+from hmsa_ros.device.worker import HardwareWorker
+from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.units import NANOSECONDS
+
+# In s: a phase of the trial, how far ahead levels are handed over, between signs of life, silence
+# after which the coil is cut off, and how long an end may take.
+_PHASE, _LEAD, _BEAT, _SILENCE, _END = 0.6, 0.1, 0.05, 0.5, 3.0
+# Levels that are timed, and between them in s.
+_TIMED, _APART = 30, 0.03
+# Limits: of a call in s, of the lateness of the median level in s, of the age of a sample in s, of
+# the error of a clock in s, of samples that repeat the one before.
+_CALL, _LATE, _AGE, _CLOCK, _REPEATED = 0.02, 2e-3, 0.5, 1e-3, 0.6
+# How many deviations of its mean a response must be to be seen.
+_SEEN = 6.0
+
+
+class Check(NamedTuple):
+    """One property: whether hardware has it, by a figure that must not exceed a limit."""
+
+    name: str
+    passed: bool
+    figure: float
+    unit: str
+    limit: float
+    sentence: str
+
+
+class Conformance(NamedTuple):
+    """What a trial has shown: checks, what could not be tried and why, and durations in s."""
+
+    name: str
+    checks: tuple[Check, ...]
+    untried: tuple[str, ...]
+    durations: dict[str, Array]
+
+    @property
+    def passed(self) -> bool:
+        """Whether all checks were passed."""
+        return all(x.passed for x in self.checks)
+
+    def as_json(self) -> dict[str, object]:
+        """Return it for JSON."""
+        return {
+            'passed': self.passed, 'checks': [x._asdict() for x in self.checks],
+            'untried': list(self.untried)}
+
+
+class _Probe:
+    """Hardware with the duration of each call noted, and an error to be raised when asked for."""
+
+    def __init__(self, hardware: Hardware) -> None:
+        self._hardware = hardware
+        self.durations: dict[str, list[float]] = {}
+        self.fails = False
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self._hardware, name)
+        return self._timed(name, found) if callable(found) else found
+
+    def _timed(self, name: str, act: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: object) -> Any:
+            if self.fails and name == 'read':
+                raise RuntimeError('raised by the trial')
+            begun = monotonic()
+            try:
+                return act(*arguments)
+            finally:
+                self.durations.setdefault(name, []).append(monotonic() - begun)
+        return call
+
+
+class _Seen(NamedTuple):
+    """What came of a phase."""
+
+    changes: list[Change]
+    samples: list[Sample]
+    asked: list[tuple[int, float]]
+
+    @property
+    def stretch(self) -> Array:
+        """Stretch of the samples that have one."""
+        found = np.array([x.stretch[0] for x in self.samples])
+        return found[np.isfinite(found)]
+
+
+class _Bench:
+    """A worker with one joint, and a commander that repeats the last level as a planner does."""
+
+    def __init__(self, make: Callable[[], Hardware], limit: float, rate: float) -> None:
+        self.probe: _Probe | None = None
+        self._rate = rate
+        self.worker = HardwareWorker(lambda: self._device(make, limit), time_ns)
+        if not self.worker.started(10.0):
+            raise HmsaError(
+                'the hardware has not started within 10 s, or its first write not returned: '
+                'expected one that does')
+        # The newest command, which is repeated as a sign of life, and when next.
+        self._newest, self._beat = (0, 0.0), 0.0
+
+    def _device(self, make: Callable[[], Hardware], limit: float) -> HardwareDevice:
+        self.probe = _Probe(make())
+        return HardwareDevice(
+            [HardwareJoint(cast(Hardware, self.probe), limit, Fallback(_SILENCE, 'zero'))],
+            time=time_ns(), period=round(NANOSECONDS / self._rate), calls=Calls(1.0))
+
+    def run(self, seconds: float, levels: Sequence[float] = (), *, beat: bool = True) -> _Seen:
+        """Let time pass; hand over levels in T, spread over it, and repeat the last in between."""
+        begin, seen = time_ns() + round(_LEAD * NANOSECONDS), _Seen([], [], [])
+        apart = seconds / max(len(levels), 1)
+        for i, level in enumerate(levels):
+            stamp = begin + round(i * apart * NANOSECONDS)
+            self.worker.receive(0, stamp, level)
+            seen.asked.append((stamp, level))
+            self._newest = stamp, level
+        until = monotonic() + seconds + (_LEAD if levels else 0.0)
+        while monotonic() < until and self.worker.failure is None:
+            if beat and monotonic() > self._beat:
+                self._beat = monotonic() + _BEAT
+                self.worker.receive(0, *self._newest)
+            sleep(2e-3)
+            self.worker.look_after()
+            self._collect(seen)
+        self._collect(seen)
+        return seen
+
+    def _collect(self, seen: _Seen) -> None:
+        seen.changes.extend(self.worker.changes())
+        seen.samples.extend(self.worker.samples())
+
+
+class Trial:
+    """
+    A trial of a class of hardware.
+
+    Parameters
+    ----------
+    name : str
+        Of what makes it, as MODULE:NAME.
+    joint : str
+        Name it is called with.
+    settings : mapping
+        Its keyword arguments.
+    level : float
+        Largest flux density in T that is set.
+    rate : float
+        Rate in Hz at which it is read, 1 to 10,000.
+
+    Raises
+    ------
+    BadInputError
+        If a number is out of range.
+
+    """
+
+    def __init__(
+            self, name: str, joint: str = 'actuator', settings: Mapping[str, Any] | None = None,
+            *, level: float = 1e-3, rate: float = 200.0) -> None:
+        if not 0.0 < level < math.inf:
+            raise BadInputError(f'limit is {level:g} T: expected a number above 0')
+        if not 1.0 <= rate <= 1e4:
+            raise BadInputError(f'rate is {rate:g} Hz: expected 1 to 10,000')
+        self.name, self._joint, self._settings = name, joint, dict(settings or {})
+        self._level, self._rate = level, rate
+        self._checks: list[Check] = []
+        self._untried: list[str] = []
+        # Mean stretch at rest and at the level, where the sensor tells them apart.
+        self._rest = self._lifted = math.nan
+        # Of a level, in T.
+        self._tolerance = 1e-3 * level
+
+    def run(self, progress: Callable[[str, float], None] = lambda text, part: None) -> Conformance:
+        """
+        Try it.
+
+        Parameters
+        ----------
+        progress : callable
+            Called with what is tried and the share that is done.
+
+        Raises
+        ------
+        BadInputError
+            If there is no such hardware, or it does not start.
+        HmsaError
+            If it fails at the first levels.
+
+        """
+        progress('levels and samples', 0.0)
+        bench = _Bench(self._make, self._level, self._rate)
+        self._tolerance = max(
+            bench.worker.device.instruments[0].resolution or 0.0, 1e-3 * self._level)
+        rest = self._guarded(bench, _PHASE, [0.0])
+        up, down = (self._guarded(bench, _PHASE, [x * self._level]) for x in (1.0, -1.0))
+        progress('timing', 0.3)
+        timed = self._guarded(bench, _TIMED * _APART, [
+            (0.5 if i % 2 else 1.0) * self._level for i in range(_TIMED)])
+        self._check_levels([rest, up, down, timed], timed)
+        self._check_samples([rest, up, down, timed], timed)
+        self._check_response(rest, up, down)
+        progress('silence and ends', 0.6)
+        self._check_silence(bench)
+        bench.worker.close()
+        self._check_end('off_at_close', 'after close', bench.worker.failure is None, str(
+            bench.worker.failure or ''))
+        assert bench.probe is not None  # it has started
+        durations = {x: np.array(y) for x, y in bench.probe.durations.items()}
+        self._check_calls(durations)
+        self._check_clock(bench)
+        self._check_exception()
+        progress('SIGTERM', 0.8)
+        self._check_sigterm()
+        lateness = np.array(_lateness(timed))
+        return Conformance(
+            self.name, tuple(self._checks), tuple(self._untried),
+            {**durations, 'lateness': lateness})
+
+    def _make(self) -> Hardware:
+        return load(self.name)(self._joint, self._settings)
+
+    def _guarded(self, bench: _Bench, seconds: float, levels: Sequence[float]) -> _Seen:
+        seen = bench.run(seconds, levels)
+        if bench.worker.failure is not None:
+            raise bench.worker.failure
+        return seen
+
+    def _note(
+            self, name: str, figure: float, unit: str, limit: float, text: str,
+            mend: str = '') -> None:
+        passed = bool(figure <= limit)
+        self._checks.append(Check(
+            name, passed, float(figure), unit, limit,
+            text if passed or not mend else f'{text}: {mend}'))
+
+    # -- levels --------------------------------------------------------------------------------
+
+    def _check_levels(self, phases: Sequence[_Seen], timed: _Seen) -> None:
+        wrong = max((
+            abs(change.level - asked[1]) for x in phases for change, asked in _matched(x)),
+            default=math.inf)
+        self._note(
+            'level_reached', wrong, 'T', self._tolerance,
+            f'levels of {self._level:g} T were set to within {wrong:g} T',
+            'return the level that was really set, and give resolution (T) if it is coarse')
+        missing = len(timed.asked) - len(_matched(timed))
+        self._note(
+            'levels_applied', float(missing), 'levels', 0.0,
+            f'{missing} of {len(timed.asked)} levels, {_APART * 1e3:g} ms apart, did not take '
+            'effect', 'write must return sooner, or the device take levels ahead (schedule)')
+        late = _lateness(timed)
+        median, most = (float(f(late)) if late else math.inf for f in (np.median, np.max))
+        self._note(
+            'lateness', abs(median), 's', _LATE,
+            f'levels took effect {median * 1e3:.3g} ms after their time (median; at most '
+            f'{most * 1e3:.3g})', 'make write faster, or have the device keep levels (schedule)')
+
+    # -- samples -------------------------------------------------------------------------------
+
+    def _check_samples(self, phases: Sequence[_Seen], timed: _Seen) -> None:
+        samples = [y for x in phases for y in x.samples]
+        if not any(np.isfinite(x.stretch[0]) for x in samples):
+            self._untried.append('samples: read returned none')
+            return
+        stamps = np.array([x.time for x in samples])
+        falling = int(np.count_nonzero(np.diff(stamps) <= 0))
+        self._note(
+            'stamps_rise', float(falling), 'samples', 0.0,
+            f'{falling} of {len(stamps)} samples are not stamped after the one before',
+            'return each sample once, with the time of its exposure')
+        ahead = max(0.0, (int(stamps[-1]) - time_ns()) / NANOSECONDS)
+        self._note(
+            'stamps_past', ahead, 's', 0.0, f'samples are stamped {ahead:.3g} s ahead',
+            'stamp by the clock of now, or have clock() answer the clock of the device')
+        moving = timed.stretch
+        repeated = float(np.mean(np.diff(moving) == 0.0)) if len(moving) > 1 else 0.0
+        self._note(
+            'samples_new', repeated, '', _REPEATED,
+            f'{repeated:.0%} of the samples repeat the value before',
+            'return [] where nothing is new, and batches as a list with a stamp each')
+        rate = 1e9 * (len(stamps) - 1) / max(int(stamps[-1] - stamps[0]), 1)
+        self._note(
+            'samples_lost', max(1.0 - rate / self._rate, 0.0), '', 0.5,
+            f'{rate:.3g} samples a second, read at {self._rate:g} Hz',
+            'read must return sooner; the sensor may be slower than it is asked')
+
+    def _check_response(self, rest: _Seen, up: _Seen, down: _Seen) -> None:
+        means = [float(np.mean(x)) if len(x) else math.nan for x in (
+            y.stretch[len(y.stretch) // 2:] for y in (rest, up, down))]
+        spread = float(np.std(rest.stretch)) if len(rest.stretch) else math.nan
+        apart = means[1] - means[2]
+        resolved = _SEEN * spread / math.sqrt(max(len(rest.stretch) // 2, 1))
+        if not abs(apart) > max(resolved, 1e-9):
+            self._untried.append(
+                f'polarity, and whether the coil is off: +-{self._level:g} T cannot be seen in '
+                'the samples; a larger --limit shows them')
+            return
+        self._note(
+            'polarity', -apart, '', 0.0,
+            f'{self._level:g} T lengthens the actuator by {apart / 2:.3g} of its length',
+            'turn the leads of the coil, or the sign of the sensor')
+        self._rest, self._lifted = means[0], means[1]
+
+    # -- ends ----------------------------------------------------------------------------------
+
+    def _check_silence(self, bench: _Bench) -> None:
+        self._guarded(bench, 0.2, [self._level])
+        begun = time_ns()
+        seen = bench.run(_SILENCE + 0.5, beat=False)
+        off = [x.stamp for x in seen.changes if abs(x.level) <= self._tolerance]
+        after = (off[0] - begun) / NANOSECONDS if off else math.inf
+        self._note(
+            'off_after_silence', after, 's', _SILENCE + 0.25,
+            f'without commands the coil was off after {after:.3g} s', 'write(0.0) must be obeyed')
+
+    def _off(self) -> bool | None:
+        """Return whether the sensor of new hardware sees rest; None if it cannot tell."""
+        if math.isnan(self._lifted):
+            return None
+        hardware = self._make()
+        found: list[float] = []
+        until = monotonic() + 2.0 * _PHASE
+        while monotonic() < until:
+            for x in _stretches(hardware.read(time_ns())):
+                found.append(x)
+            sleep(1.0 / self._rate)
+        getattr(hardware, 'close', lambda: None)()
+        if not found:
+            return None
+        last = float(np.mean(found[len(found) // 2:]))
+        return abs(last - self._rest) < 0.3 * abs(self._lifted - self._rest)
+
+    def _check_end(self, name: str, when: str, orderly: bool, why: str) -> None:
+        off = self._off()
+        if off is None:
+            self._untried.append(f'{name}: the sensor does not show whether the coil is off')
+        good = orderly and off is not False
+        self._note(
+            name, 0.0 if good else 1.0, '', 0.0,
+            f'{when} the coil is off' if good else
+            f'{when} the coil is NOT off' if off is False else f'{when}: {why}',
+            'write(0.0) and close must leave it without a current')
+
+    def _check_exception(self) -> None:
+        bench = _Bench(self._make, self._level, self._rate)
+        bench.run(0.2, [self._level])
+        assert bench.probe is not None
+        bench.probe.fails = True
+        bench.run(0.5)
+        failure = str(bench.worker.failure or 'nobody noticed')
+        bench.worker.close()
+        self._check_end('off_at_exception', 'after an exception', 'is switched off' in failure,
+                        failure)
+
+    def _check_sigterm(self) -> None:
+        with subprocess.Popen(
+                [sys.executable, '-m', __name__, self.name, self._joint,
+                 json.dumps(self._settings), repr(self._level), repr(self._rate)],
+                stdout=subprocess.PIPE, text=True) as child:
+            assert child.stdout is not None
+            ready = child.stdout.readline()
+            begun = monotonic()
+            child.send_signal(signal.SIGTERM)
+            try:
+                status = child.wait(_END)
+            except subprocess.TimeoutExpired:
+                child.kill()
+                status = child.wait()
+        self._check_end(
+            'off_at_sigterm', 'after SIGTERM', bool(ready) and status == 0,
+            f'a driver ended with status {status} after {monotonic() - begun:.1f} s')
+
+    # -- calls ---------------------------------------------------------------------------------
+
+    def _check_calls(self, durations: Mapping[str, Array]) -> None:
+        for name, found in durations.items():
+            longest = float(np.max(found))
+            self._note(
+                f'{name}_time', longest, 's', _CALL,
+                f'{name} takes {np.median(found) * 1e3:.3g} ms (at most {longest * 1e3:.3g})',
+                'give calls a time limit of their own; nothing else is written meanwhile')
+
+    def _check_clock(self, bench: _Bench) -> None:
+        known = bench.worker.device.instruments[0].clock_map
+        if known is not None:
+            self._note(
+                'clock', known.error, 's', _CLOCK,
+                f'its clock is known to {known.error * 1e6:.3g} us, and drifts by '
+                f'{known.drift * 1e6:.3g} ppm', 'clock() must answer at once')
+
+
+def _stretches(answer: Any) -> list[float]:
+    """Return the finite stretches of what read has returned."""
+    values = answer if isinstance(answer, list) else [answer]
+    found = [x[0] if isinstance(x, (tuple, list)) else x for x in values]
+    return [float(x) for x in found if x is not None and math.isfinite(x)]
+
+
+def _matched(seen: _Seen) -> list[tuple[Change, tuple[int, float]]]:
+    """Return which change belongs to which level asked for: the first one in its time."""
+    found, changes = [], list(seen.changes)
+    for i, (stamp, level) in enumerate(seen.asked):
+        until = seen.asked[i + 1][0] if i + 1 < len(seen.asked) else math.inf
+        near = [x for x in changes if stamp - 5e6 <= x.stamp < until]
+        if near:
+            found.append((near[0], (stamp, level)))
+            changes.remove(near[0])
+    return found
+
+
+def _lateness(seen: _Seen) -> list[float]:
+    """Return how much after their time levels took effect, in s."""
+    return [(x.stamp - stamp) / NANOSECONDS for x, (stamp, _) in _matched(seen)]
+
+
+def _serve(name: str, joint: str, settings: str, level: str, rate: str) -> int:
+    """Keep a level, as a driver does, until SIGTERM comes."""
+    ended = Event()
+    signal.signal(signal.SIGTERM, lambda *_: ended.set())
+    bench = _Bench(lambda: load(name)(joint, json.loads(settings)), float(level), float(rate))
+    bench.run(0.3, [float(level)])
+    print('ready', flush=True)
+    while not ended.is_set() and bench.worker.failure is None:
+        bench.run(0.02)
+    bench.worker.close()
+    return int(bench.worker.failure is not None)
+
+
+if __name__ == '__main__':
+    sys.exit(_serve(*sys.argv[1:]))

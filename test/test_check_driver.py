@@ -1,0 +1,116 @@
+"""Which classes of hardware pass ``hmsa check-driver``, and what is said of the others."""
+
+import json
+
+import pytest
+
+from hmsa_ros.cli import main
+
+# One class for all: a block at a level, whose state survives its process, in a file.
+BENCH = '''
+from pathlib import Path
+from time import sleep, time_ns
+
+
+class Coil:
+    """A block that follows its coil at once, and a sensor with noise."""
+
+    def __init__(self, joint, file='level.txt'):
+        self.file = Path(file)
+        self.count = 0
+
+    def write(self, level, now):
+        self.file.write_text(repr(level))
+
+    def read(self, now):
+        self.count += 1
+        level = float(self.file.read_text()) if self.file.exists() else 0.0
+        noise = 1e-5 * (self.count * 7919 % 101 / 50 - 1)
+        return [(1.0 + 5 * level + noise, 0.0, time_ns())]
+'''
+BROKEN = {
+    'levels': ('def write(self, level, now): super().write(0.9 * level, now); '
+               'return now, 0.9 * level', 'level_reached'),
+    'slow': ('def write(self, level, now): super().write(level, now); sleep(0.05)',
+             'write_time'),
+    'late': ('def write(self, level, now): super().write(level, now); return now + 8_000_000',
+             'lateness'),
+    'blocking': ('def read(self, now): sleep(0.1); return super().read(now)', 'read_time'),
+    'stamps': ('def read(self, now): return [(*super().read(now)[0][:2], 10**18)]',
+               'stamps_rise'),
+    'future': ('def read(self, now): return [(*super().read(now)[0][:2], time_ns() + 10**9)]',
+               'stamps_past'),
+    'staircase': ('def read(self, now): self.count -= self.count % 20 != 0; '
+                  'x = super().read(now)[0]; return [(round(x[0], 3), 0.0, x[2])]',
+                  'samples_new'),
+    'polarity': ('def write(self, level, now): super().write(-level, now)', 'polarity'),
+    'zero': ('def write(self, level, now): super().write(level or 1e-3, now)', 'off_at_close'),
+    'clock': ('def clock(self): sleep(0.01); return time_ns()', 'clock'),
+    'forgetful': ('def write(self, level, now): self.n = getattr(self, "n", 0) + 1; '
+                  'self.n % 7 and super().write(level, now); '
+                  'return now, float(self.file.read_text())', 'level_reached'),
+    'opened': ('def close(self): self.file.write_text("0.001")', 'off_at_close'),
+}
+
+
+@pytest.fixture
+def lab(tmp_path, monkeypatch):
+    """Write a module with a class of hardware, and try it; return what was found."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv('PYTHONPATH', str(tmp_path))
+
+    def check(capsys, name, body='', *arguments):
+        (tmp_path / f'{name}_lab.py').write_text(
+            f'{BENCH}\n\nclass Mine(Coil):\n    """Mine."""\n\n    {body}\n')
+        status = main(['check-driver', f'{name}_lab:Mine', *arguments, '--json'])
+        found = json.loads(capsys.readouterr().out)
+        assert status == int(not found['passed'])
+        return found
+    return check
+
+
+def failed(found):
+    return [x['name'] for x in found['checks'] if not x['passed']]
+
+
+def test_a_class_as_it_should_be_passes_and_the_page_shows_it(lab, capsys, tmp_path):
+    found = lab(capsys, 'good', '', '--set', f'file={tmp_path}/mine.txt', '--report', 'page.html')
+    assert (failed(found), found['untried']) == ([], [])
+    assert {'level_reached', 'polarity', 'off_after_silence', 'off_at_close', 'off_at_exception',
+            'off_at_sigterm'} <= {x['name'] for x in found['checks']}
+    assert (tmp_path / 'mine.txt').read_text() == '0.0'
+    text = (tmp_path / 'page.html').read_text()
+    assert 'good_lab:Mine' in text
+    assert 'lateness of levels' in text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('name', BROKEN)
+def test_a_broken_class_fails_the_check_that_is_for_it(lab, capsys, name):
+    body, check = BROKEN[name]
+    found = lab(capsys, name, body)
+    assert check in failed(found), found
+    (sentence,) = [x['sentence'] for x in found['checks'] if x['name'] == check]
+    assert ': ' in sentence  # what to do
+
+
+def test_without_a_sensor_it_says_what_it_could_not_try(lab, capsys):
+    found = lab(capsys, 'blind', 'def read(self, now): return []')
+    assert found['passed']
+    assert [x.partition(':')[0] for x in found['untried']] == [
+        'samples', 'polarity, and whether the coil is off', 'off_at_close', 'off_at_exception',
+        'off_at_sigterm']
+
+
+@pytest.mark.parametrize(('arguments', 'expected'), [
+    (['nowhere:Coil'], "hardware 'nowhere:Coil' cannot be loaded"),
+    (['json:loads', '--limit', '0'], 'limit is 0 T: expected a number above 0'),
+    (['json:loads', '--rate', 'nan'], 'rate is nan Hz'),
+    (['json:loads', '--set', 'port'], '--set port: expected KEY=VALUE'),
+    (['json:loads', '--set', 'port=['], 'expected a value as in YAML'),
+    (['json:loads', '--report', '/no/where.html'], 'expected a file in a folder that exists'),
+    (['json:loads'], 'does not start'),
+])
+def test_what_cannot_be_tried_is_refused(capsys, arguments, expected):
+    assert main(['check-driver', *arguments]) == 2
+    assert expected in capsys.readouterr().err
