@@ -71,9 +71,9 @@ docs: tools ## build the documentation into docs/_build/html, warnings as errors
 graph: tools ## draw docs/images/graph.svg anew, when a topic has changed
 	$(BIN)/python scripts/draw_graph.py
 
-.PHONY: theory
-theory: tools ## draw the figures of docs/theory.md and docs/laws.md anew
-	$(BIN)/python scripts/draw_theory.py
+.PHONY: pictures
+pictures: tools ## draw the pictures of the documentation anew
+	$(BIN)/python scripts/draw_docs.py $(ARGS)
 
 .PHONY: constraints
 constraints: ## write constraints.txt anew, with each of $(PYTHONS)

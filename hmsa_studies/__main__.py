@@ -1,27 +1,28 @@
 """
-``python -m hmsa_studies``: the pictures and tables of the documentation.
+``python -m hmsa_studies``: the tables of docs/studies.md, in Markdown; and its pictures.
 
-Pictures are written to a folder; tables are printed in Markdown.
+The script that draws all pictures of the documentation (``make pictures``) draws these too.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 import sys
 
 import numpy as np
 
-from hmsa_ros.cli import Parser
-from hmsa_ros.errors import BadInputError, complain, HmsaError
+from hmsa_ros.errors import complain, HmsaError
 from hmsa_ros.model.moves import State
 from hmsa_ros.model.parameters import NondimensionalParameters
 from hmsa_ros.model.residual import percent
 from hmsa_ros.planning.shapers import SHAPERS
 from hmsa_ros.planning.shapers.pace import Pace
 from hmsa_ros.planning.shapers.request import Request
+from hmsa_ros.report.paper import SCREEN
 from hmsa_studies.damped import damped_study, DampedStudy, LIMITS
 from hmsa_studies.pictures import draw_damped, draw_front, draw_robustness, draw_sampled
 from hmsa_studies.residual import Actual, Errors
-from hmsa_studies.robustness import Candidate, candidates, Case, PARAMETERS, study
+from hmsa_studies.robustness import Candidate, candidates, Case, PARAMETERS, Result, study
 from hmsa_studies.sampled import sampled_study
 from hmsa_studies.sweep import parse_grid, Sweep
 from hmsa_studies.sweep_pictures import draw_sweep
@@ -113,45 +114,46 @@ def tables() -> list[Table]:
         sampled_table(), damped_table(damped_study(1.0, 1.1, np.array(ZETAS)))]
 
 
-def pictures(folder: Path) -> list[Path]:
-    """Draw all pictures of the documentation into a folder; return their paths."""
+@cache
+def _compared() -> tuple[Case, list[Result]]:
+    """Return the move of the pictures, with what each shaper leaves of it."""
     case = Case(1.0, 1.4, MATERIAL)
-    written = [
-        folder / f'{x}.png' for x in ('robustness', 'sampled', 'damped', 'front', 'map')]
-    results = [study(case, x) for x in (*candidates(), Candidate('robust', 4))]
-    draw_robustness(written[0], case, results[:-1])
-    draw_front(written[3], [(case, results)])
-    draw_sampled(written[1], sampled_study(
-        1.0, 1.4, MATERIAL, np.geomspace(0.041, 0.99, 700)))
-    draw_damped(written[2], damped_study(1.0, 1.1, np.linspace(2.2, 6.0, 77)))
+    return case, [study(case, x) for x in (
+        *candidates(), Candidate('robust', 4), Candidate('minimax', 4))]
+
+
+def _robustness(path: Path) -> None:
+    case, results = _compared()
+    draw_robustness(path, case, results[:-2], SCREEN)
+
+
+def _map(path: Path) -> None:
     sweep = Sweep({
         'zeta': parse_grid('0:3:240', 'zeta'), 'j_lim': parse_grid('log:0.1:100:160', 'j_lim')})
     rows = sweep.rows(0, sweep.size).results
-    draw_sweep([written[4]], sweep.view(), {x: rows[x] for x in sweep.shown}, sweep.fixed)
-    return written
+    draw_sweep([path], sweep.view(), {x: rows[x] for x in sweep.shown}, sweep.fixed, SCREEN)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Draw the pictures and print the tables; return the exit status."""
-    parser = Parser(
-        prog='python -m hmsa_studies',
-        description='Draw the pictures of docs/studies.md and print its tables.')
-    parser.add_argument(
-        '--out', type=Path, default=Path('docs', 'images'), metavar='DIR',
-        help='folder that exists, for the pictures (default docs/images)')
-    arguments = parser.parse_args(argv)
+#: What draws each picture of the page, by its name.
+PICTURES: dict[str, Callable[[Path], None]] = {
+    'robustness': _robustness,
+    'front': lambda path: draw_front(path, [_compared()], SCREEN),
+    'sampled': lambda path: draw_sampled(path, sampled_study(
+        1.0, 1.4, MATERIAL, np.geomspace(0.041, 0.99, 700)), SCREEN),
+    'damped': lambda path: draw_damped(
+        path, damped_study(1.0, 1.1, np.linspace(2.2, 6.0, 77)), SCREEN),
+    'map': _map}
+
+
+def main() -> int:
+    """Print the tables; return the exit status."""
     try:
-        if not arguments.out.is_dir():
-            raise BadInputError(
-                f'{arguments.out} is no folder: expected one that exists (--out)')
         for table in tables():
             for number, row in enumerate(table):
                 print(f'| {" | ".join(row)} |')
                 if number == 0:
                     print(f'| --- |{" ---: |" * (len(row) - 1)}')
             print()
-        for path in pictures(arguments.out):
-            print(path)
     except HmsaError as error:
         return complain(error)
     return 0

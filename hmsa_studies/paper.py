@@ -60,10 +60,19 @@ def write_figure(
     table = images[0].with_suffix('.csv')
     data = figure.compute(points or figure.default_points)
     paper_data.write_csv(table, data)
-    height = figure.stacked if paper.inches < _NARROW else figure.height
-    with style.picture(images, height, paper) as canvas:
-        figure.draw(canvas, data)
+    _draw(figure, data, images, paper)
     return [*images, table]
+
+
+def draw_figure(figure: PaperFigure, paths: Sequence[Path], paper: Paper) -> None:
+    """Compute and draw a figure."""
+    _draw(figure, figure.compute(figure.default_points), paths, paper)
+
+
+def _draw(figure: PaperFigure, data: Data, paths: Sequence[Path], paper: Paper) -> None:
+    height = figure.stacked if paper.inches < _NARROW else figure.height
+    with style.picture(paths, height, paper) as canvas:
+        figure.draw(canvas, data)
 
 
 def _stacked(figure: Figure) -> bool:

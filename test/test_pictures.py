@@ -1,11 +1,14 @@
 """Pictures: their size on paper, their formats, colours and data, and the curves of a run."""
 
 import csv
+import importlib.util
 from pathlib import Path
 import re
+from types import ModuleType
 
 from matplotlib.image import imread
 import numpy as np
+from PIL import Image
 import pytest
 from scipy.integrate import solve_ivp
 from test_report import ACTUATOR, one, parameters, simulated
@@ -33,7 +36,12 @@ VISIONS = {
 #: Differences of CIELAB that are seen at a glance on thin lines.
 SEEN = 20.0
 INCH = 25.4
+#: Of shades from 0 to 255, mean and at a place, that a different release of the drawing library
+#: and of the letters may cause in a picture that is seen from afar.
+MEAN, PLACE, FEW = 1.0, 60.0, 2e-3
 PERIOD = 1.2e-2
+ROOT = Path(__file__).resolve().parent.parent
+IMAGES = ROOT / 'docs' / 'images'
 
 
 def cielab(colour: str, vision: np.ndarray) -> np.ndarray:
@@ -157,3 +165,47 @@ def test_time_begins_at_the_first_level_of_the_run_and_its_step_is_drawn(tmp_pat
     assert len(panels['plain steps (simulated)']) > 5 * len(panels['samples'])
     with pytest.raises(BadInputError, match='cannot write .*nowhere'):
         draw(tmp_path / 'nowhere' / 'run.png', [plain])
+
+
+def script() -> ModuleType:
+    """Return the script that draws the pictures of the documentation."""
+    path = ROOT / 'scripts' / 'draw_docs.py'
+    spec = importlib.util.spec_from_file_location('draw_docs', path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+DRAWN = script().PICTURES
+
+
+def from_afar(path: Path) -> Image.Image:
+    """Return a picture in shades of grey, eight dots as one."""
+    image = Image.open(path).convert('L')
+    return image.resize((image.width // 8, image.height // 8), Image.Resampling.BOX)
+
+
+@pytest.mark.parametrize('name', [
+    pytest.param(x, marks=[pytest.mark.slow] if x in ('robustness', 'front') else []) for x in DRAWN])
+def test_the_pictures_of_the_documentation_are_what_the_package_draws_now(
+        name: str, tmp_path: Path) -> None:
+    DRAWN[name](tmp_path / f'{name}.png')
+    drawn, shown = (from_afar(x / f'{name}.png') for x in (tmp_path, IMAGES))
+    assert drawn.size == pytest.approx(shown.size, abs=2)
+    shades = [np.asarray(x.resize(shown.size), dtype=np.float64) for x in (drawn, shown)]
+    apart = np.abs(shades[0] - shades[1])
+    again = f'draw it anew with make pictures ARGS={name}'
+    assert np.mean(apart) < MEAN, again
+    assert np.mean(apart > PLACE) < FEW, again
+
+
+def test_every_picture_of_the_documentation_is_drawn_by_the_script() -> None:
+    # The soak is a measurement of hours.
+    assert {x.stem for x in IMAGES.glob('*.png')} == {*DRAWN, 'soak'}
+    shown = {
+        name for page in [ROOT / 'README.md', *(ROOT / 'docs').rglob('*.md')]
+        for name in re.findall(r'!\[[^]]*\]\([^)]*images/(\w+)\.png\)',
+                               page.read_text(encoding='utf-8'))}
+    assert shown == {*DRAWN, 'soak'}

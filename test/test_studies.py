@@ -25,7 +25,7 @@ from hmsa_ros.model.parameters import ActuatorParameters, NondimensionalParamete
 from hmsa_ros.model.residual import percent
 from hmsa_ros.model.status import Code
 from hmsa_ros.planning.two_step import plan_two_step
-from hmsa_studies.__main__ import main, pictures, tables
+from hmsa_studies.__main__ import tables
 from hmsa_studies.axes import MOST_VALUES, parse_grid, read_cases
 from hmsa_studies.damped import damped_study, settling_time
 from hmsa_studies.pictures import draw_damped, draw_front, draw_robustness, draw_sampled
@@ -383,24 +383,6 @@ def test_tables_of_the_documentation_are_what_is_computed():
                     assert float(cell) == pytest.approx(float(expected), abs=1.01 * last)
                 else:
                     assert cell == expected
-
-
-def test_pictures_of_the_documentation_exist_where_it_shows_them():
-    shown = re.findall(r'!\[[^]]+\]\(([^)]+)\)', DOCS.read_text(encoding='utf-8'))
-    assert sorted(shown) == [
-        f'images/{x}.png' for x in ('damped', 'front', 'map', 'robustness', 'sampled')]
-    for name in shown:
-        assert (DOCS.parent / name).read_bytes().startswith(PNG)
-
-
-@pytest.mark.slow
-def test_documentation_is_drawn_into_a_folder_that_exists(tmp_path, capsys):
-    assert [x.name for x in pictures(tmp_path)] == [
-        'robustness.png', 'sampled.png', 'damped.png', 'front.png', 'map.png']
-    for path in tmp_path.iterdir():
-        assert path.read_bytes().startswith(PNG)
-    assert main(['--out', str(tmp_path / 'missing')]) == 2
-    assert 'missing' in capsys.readouterr().err
 
 
 @pytest.mark.slow

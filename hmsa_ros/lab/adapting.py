@@ -88,13 +88,14 @@ def _carry_out(
 def second_act(picture: Path) -> SecondAct:
     """Run it with feedback off and adapt, and draw both."""
     from hmsa_ros.report import style
+    from hmsa_ros.report.paper import SCREEN
 
     block = paper_actuator()
     block = replace(
         block, half_length=10.0 * block.half_length, half_thickness=10.0 * block.half_thickness,
         damping_coefficient=100.0 * block.damping_coefficient)
     results: list[AdaptingResult] = []
-    with style.picture(picture, 2.8) as figure:
+    with style.picture(picture, 2.8, SCREEN) as figure:
         axes = figure.add_subplot()
         for feedback, label, kind in (
                 ('off', 'open loop', style.UNSHAPED), ('adapt', 'adapting', style.SHAPED)):
@@ -105,7 +106,7 @@ def second_act(picture: Path) -> SecondAct:
             axes.plot([1e3 * i * _HOLD, 1e3 * (i + 1) * _HOLD], [target, target],
                       label=None if i else 'target', **style.TARGET)
         axes.set_title(
-            f'shear modulus {100.0 * FACTOR - 100.0:+.0f} %, unknown to the planner', fontsize=9)
-        style.finish(axes, 'time $t$ [ms]', r'stretch $\lambda$ [1]')
+            f'shear modulus {100.0 * FACTOR - 100.0:+.0f} %, unknown to the planner')
+        style.finish(axes, style.axis('time', 't', 'ms'), style.axis('stretch', r'\lambda'))
         axes.legend(loc='upper right')
     return SecondAct(tuple(results), picture)

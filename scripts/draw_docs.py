@@ -1,12 +1,16 @@
 """
-Draw the figures of docs/theory.md, laws.md and beam.md into docs/images, from the package itself.
+Draw the pictures of the documentation into docs/images, from the package itself.
 
-Used by ``make theory``.
+Used by ``make pictures``; names of pictures as arguments draw these alone. Of what is shown there
+only the graph of nodes (``make graph``) and the soak's memory, which takes hours, are
+made otherwise.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 import math
 from pathlib import Path
+import re
 import sys
 
 import numpy as np
@@ -17,40 +21,53 @@ sys.path.insert(0, str(ROOT))
 from benchmarks.beam_segments import Chain  # noqa: E402
 from hmsa_ros.interfaces.actuator import actuator_from  # noqa: E402
 from hmsa_ros.interfaces.parameters import BLOCK  # noqa: E402
+from hmsa_ros.lab.adapting import second_act  # noqa: E402
+from hmsa_ros.lab.demo import SEQUENCE  # noqa: E402
 from hmsa_ros.model.creep import Creep  # noqa: E402
 from hmsa_ros.model.delivery import Delivery, pieces  # noqa: E402
 from hmsa_ros.model.equations import elastic_force, stretch_limits  # noqa: E402
 from hmsa_ros.model.laws import LAWS  # noqa: E402
 from hmsa_ros.model.laws.bending import centreline  # noqa: E402
 from hmsa_ros.model.moves import State  # noqa: E402
-from hmsa_ros.model.parameters import NondimensionalParameters  # noqa: E402
-from hmsa_ros.model.simulation import simulate  # noqa: E402
+from hmsa_ros.model.parameters import NondimensionalParameters, paper_actuator  # noqa: E402
+from hmsa_ros.model.simulation import ActuatorSimulation, simulate  # noqa: E402
+from hmsa_ros.model.units import NANOSECONDS  # noqa: E402
+from hmsa_ros.planning.planner import Options, Planner  # noqa: E402
 from hmsa_ros.planning.sequence import plan_sequence, Setpoint  # noqa: E402
 from hmsa_ros.planning.two_step import plan_two_step  # noqa: E402
-from hmsa_ros.report import style  # noqa: E402
+from hmsa_ros.recordings.levels import Level  # noqa: E402
+from hmsa_ros.recordings.record import RecordedRequest, Run  # noqa: E402
+from hmsa_ros.report import looks, style  # noqa: E402
+from hmsa_ros.report.arrivals import Part  # noqa: E402
+from hmsa_ros.report.evaluation import evaluate  # noqa: E402
+from hmsa_ros.report.paper import SCREEN  # noqa: E402
+from hmsa_ros.report.picture import draw  # noqa: E402
+from hmsa_ros.report.timing import timing  # noqa: E402
+from hmsa_studies.__main__ import PICTURES as STUDIES  # noqa: E402
+from hmsa_studies.paper import draw_figure, FIGURES  # noqa: E402
 
 FOLDER = ROOT / 'docs' / 'images'
+STRETCH, TIME = style.axis('stretch', r'\lambda'), style.axis('time', r'\tau')
+LOAD = style.axis('load', r'\beta')
 MATERIAL = NondimensionalParameters(zeta=0.2, j_lim=5.0)
 
 
 def force(path: Path) -> None:
     """Draw the load that holds a stretch, and where the chains end it."""
-    with style.picture(path, 2.9, width=5.0) as figure:
+    with style.picture(path, 2.9, replace(SCREEN, width=120)) as figure:
         axes = figure.add_subplot()
-        looks = ((1.0, style.VERMILION, '--'), (3.0, style.GREEN, '-.'), (5.0, style.BLUE, '-'))
-        for j_lim, colour, line in looks:
+        for j_lim, look in zip((5.0, 1.0, 3.0), looks.CASES, strict=False):
             lower, upper = stretch_limits(j_lim)
             stretch = np.linspace(lower, upper, 2001)[1:-1]
             load = elastic_force(stretch, j_lim)
-            axes.plot(stretch, load, color=colour, linestyle=line,
-                      label=rf'$J_\mathrm{{lim}}$ = {j_lim:g}')
+            axes.plot(stretch, load, **look.line(label=rf'$J_\mathrm{{lim}}$ = {j_lim:g}'))
             for limit in (lower, upper):
-                axes.axvline(limit, color=colour, linestyle=':', linewidth=0.8)
-        axes.axhline(0.0, color=style.GREY, linewidth=0.6)
+                axes.axvline(limit, color=look.colour, linestyle=':', linewidth=0.8)
+        axes.axhline(0.0, color=looks.GREY, linewidth=0.6)
         axes.plot([1.0], [0.0], **style.EQUILIBRIUM)
         axes.set_ylim(-8.0, 8.0)
         axes.legend(loc=(0.22, 0.66))
-        style.finish(axes, r'stretch $\lambda$', r"load that holds it, $\beta_1 = \psi'$")
+        style.finish(axes, STRETCH, r"load that holds it, $\beta_1 = \psi'$")
 
 
 def two_steps(path: Path) -> None:
@@ -60,9 +77,9 @@ def two_steps(path: Path) -> None:
     shaped = simulate([0.0, plan.tau_p], [plan.beta_p, plan.beta_1], time, MATERIAL)
     weak = simulate([0.0], [plan.beta_p], time, MATERIAL)
     plain = simulate([0.0], [plan.beta_1], time, MATERIAL)
-    with style.picture(path, 3.1) as figure:
+    with style.picture(path, 3.1, SCREEN) as figure:
         left, right = figure.subplots(1, 2, width_ratios=[1.2, 1.0])
-        grey = {'color': style.GREEN, 'linewidth': 1.2, 'linestyle': '-.', 'zorder': 2}
+        grey = {'color': looks.INDIGO, 'linewidth': 1.2, 'linestyle': '-.', 'zorder': 2}
         left.plot(time, plain[0], label=r'$\beta_1$ alone', **style.UNSHAPED)
         left.plot(time, weak[0], label=r'$\beta_p$ alone', **grey)
         left.plot(time, shaped[0], label=r'$\beta_p$, then $\beta_1$', **style.SHAPED)
@@ -70,36 +87,36 @@ def two_steps(path: Path) -> None:
         left.annotate(r'$\tau_p$', (plan.tau_p, 1.0), (4, 0), textcoords='offset points')
         left.axhline(1.4, **style.TARGET)
         left.legend(loc='lower right')
-        style.finish(left, r'time $\tau$', r'stretch $\lambda$', 'a')
+        style.finish(left, TIME, STRETCH, 'a')
         right.plot(*plain, **style.UNSHAPED)
         right.plot(*weak, **grey)
         right.plot(*shaped, **style.SHAPED)
         right.plot([1.0, 1.4], [0.0, 0.0], **style.EQUILIBRIUM)
         right.annotate('start', (1.0, 0.0), (6, -12), textcoords='offset points')
         right.annotate('target', (1.4, 0.0), (6, -12), textcoords='offset points')
-        style.finish(right, r'stretch $\lambda$', r'stretch rate $\dot\lambda$', 'b')
+        style.finish(right, STRETCH, r'stretch rate $\dot\lambda$', 'b')
 
 
 def energy(path: Path) -> None:
     """Draw why two paths cannot cross: stretch rate over stretch for a range of loads."""
     plan = plan_two_step(1.0, 1.4, MATERIAL)
     time = np.linspace(0.0, 3.0, 1201)
-    with style.picture(path, 2.9, width=5.0) as figure:
+    with style.picture(path, 2.9, replace(SCREEN, width=120)) as figure:
         axes = figure.add_subplot()
         for share in (0.7, 0.85, 1.15, 1.3):
             stretch, rate = simulate([0.0], [plan.beta_p * share], time, MATERIAL)
             end = int(np.argmax(rate[1:] <= 0.0)) + 2
-            axes.plot(stretch[:end], rate[:end], color=style.GREY, linewidth=0.9)
+            axes.plot(stretch[:end], rate[:end], color=looks.GREY, linewidth=0.9)
             top = int(np.argmax(rate[:end]))
             axes.annotate(rf'{share:g} $\beta_p$', (stretch[top], rate[top]), (0, 3), ha='center',
-                          textcoords='offset points', fontsize=7, color='#555555')
+                          textcoords='offset points', **style.SOFT)
         stretch, rate = simulate([0.0], [plan.beta_p], time, MATERIAL)
         end = int(np.argmax(rate[1:] <= 0.0)) + 2
         axes.plot(stretch[:end], rate[:end], **style.SHAPED)
         axes.plot([1.0, 1.4], [0.0, 0.0], **style.EQUILIBRIUM)
         axes.set_ylim(top=0.7)
         style.finish(
-            axes, r'stretch $\lambda$', r'stretch rate $\dot\lambda$ until it turns')
+            axes, STRETCH, r'stretch rate $\dot\lambda$ until it turns')
 
 
 def deliveries(path: Path) -> None:
@@ -110,7 +127,7 @@ def deliveries(path: Path) -> None:
         ('ramped, 0.8 a unit of time', Delivery(slew=0.8)))
     time = np.linspace(0.0, 3.0, 601)
     holding = 0.0
-    with style.picture(path, 3.1) as figure:
+    with style.picture(path, 3.1, SCREEN) as figure:
         rows = figure.subplots(2, 3, sharex=True, sharey='row', height_ratios=[1.0, 1.2])
         for i, (title, delivery) in enumerate(cases):
             segment, = plan_sequence(
@@ -129,30 +146,29 @@ def deliveries(path: Path) -> None:
             if delivery.period:
                 for at in np.arange(0.0, 3.0, period):
                     rows[0, i].axvline(at, **style.TARGET)
-            style.finish(rows[0, i], '', '' if i else r'load $\beta$', 'abc'[i])
-            rows[0, i].set_title(title, fontsize=8)
-            style.finish(rows[1, i], r'time $\tau$', '' if i else r'stretch $\lambda$')
+            style.finish(rows[0, i], '', '' if i else LOAD, 'abc'[i])
+            rows[0, i].set_title(title, fontsize='small')
+            style.finish(rows[1, i], TIME, '' if i else STRETCH)
 
 
 def smooth(path: Path) -> None:
     """Draw the same move by the two-step command, the chain and a smooth path."""
     time = np.linspace(-0.3, 4.0, 1721)
-    looks = (('two_step', style.GREY, '--'), ('robust', style.GREEN, '-.'),
-             ('smooth', style.BLUE, '-'))
-    with style.picture(path, 2.9) as figure:
+    with style.picture(path, 2.9, SCREEN) as figure:
         left, right = figure.subplots(1, 2)
-        for shaper, colour, line in looks:
+        for shaper in ('two_step', 'robust', 'smooth'):
+            look = looks.SHAPERS[shaper]
             segment, = plan_sequence([Setpoint(1.4, math.inf)], MATERIAL, shaper=shaper)
             switches, loads = np.array([
                 (-0.3, 0.0), *((x.time, x.load) for x in segment.move.levels)]).T
             stretch, _ = simulate(switches, loads, time, MATERIAL)
             left.step(np.append(switches, time[-1]), np.append(loads, loads[-1]), where='post',
-                      color=colour, linestyle=line, label=shaper)
-            right.plot(time, stretch, color=colour, linestyle=line)
+                      **look.line(label=shaper))
+            right.plot(time, stretch, **look.line(label=shaper))
         left.legend(loc='lower right')
         right.axhline(1.4, **style.TARGET)
-        style.finish(left, r'time $\tau$', r'load $\beta$', 'a')
-        style.finish(right, r'time $\tau$', r'stretch $\lambda$', 'b')
+        style.finish(left, TIME, LOAD, 'a')
+        style.finish(right, TIME, STRETCH, 'b')
 
 
 def laws(path: Path) -> None:
@@ -165,20 +181,16 @@ def laws(path: Path) -> None:
     groups = {'gent, J 5': MATERIAL, 'neo_hookean': NondimensionalParameters(j_lim=np.inf)} | {
         name: NondimensionalParameters(law=LAWS[name].scaled(values)[1])
         for name, values in cases.items()}
-    looks = zip(
-        (style.BLUE, style.GREY, style.GREEN, style.VERMILION, style.PURPLE, style.ORANGE),
-        ('-', '-', '--', '-.', ':', '-'), strict=True)
-    with style.picture(path, 3.2, width=5.0) as figure:
+    with style.picture(path, 3.2, replace(SCREEN, width=120)) as figure:
         axes = figure.add_subplot()
         stretch = np.linspace(0.5, 2.6, 1001)
-        for (name, group), (colour, line) in zip(groups.items(), looks, strict=True):
-            axes.plot(stretch, elastic_force(stretch, group), color=colour, linestyle=line,
-                      label=name)
-        axes.axhline(0.0, color=style.GREY, linewidth=0.6)
+        for (name, group), look in zip(groups.items(), looks.CASES, strict=False):
+            axes.plot(stretch, elastic_force(stretch, group), **look.line(label=name))
+        axes.axhline(0.0, color=looks.GREY, linewidth=0.6)
         axes.plot([1.0], [0.0], **style.EQUILIBRIUM)
         axes.set_ylim(-4.0, 6.0)
         axes.legend(loc='upper left')
-        style.finish(axes, r'stretch $\lambda$', r"load that holds it, $\beta_1 = \psi'$")
+        style.finish(axes, STRETCH, r"load that holds it, $\beta_1 = \psi'$")
 
 
 def creep(path: Path) -> None:
@@ -187,11 +199,11 @@ def creep(path: Path) -> None:
     span, grid = 15.0, Delivery(0.25)
     setpoints = [Setpoint(1.4, span), Setpoint(1.1, math.inf)]
     time = np.linspace(0.0, 2.0 * span, 3001)
-    looks = ((MATERIAL, "the paper's two-step", style.UNSHAPED),
-             (creeping, 'two-step and staircase', style.SHAPED))
-    with style.picture(path, 4.2) as figure:
+    curves = ((MATERIAL, "the paper's two-step", style.UNSHAPED),
+              (creeping, 'two-step and staircase', style.SHAPED))
+    with style.picture(path, 4.2, SCREEN) as figure:
         rows = figure.subplots(3, 1, sharex=True, height_ratios=[1.0, 1.2, 0.9])
-        for material, name, look in looks:
+        for material, name, look in curves:
             segments = plan_sequence(setpoints, material, delivery=grid)
             levels = [(x.begin + y.time, y.load) for x in segments for y in x.move.levels]
             switches, loads = np.array([x for x in levels if x[0] < time[-1]]).T
@@ -203,9 +215,9 @@ def creep(path: Path) -> None:
             rows[2].plot(time, off / np.where(time < span, 0.4, 0.3), **look)
         rows[1].legend(loc='upper right')
         rows[2].set_ylim(-18.0, 18.0)
-        style.finish(rows[0], '', r'load $\beta$', 'a')
-        style.finish(rows[1], '', r'stretch $\lambda$', 'b')
-        style.finish(rows[2], r'time $\tau$', 'off target,\n% of the step', 'c')
+        style.finish(rows[0], '', LOAD, 'a')
+        style.finish(rows[1], '', STRETCH, 'b')
+        style.finish(rows[2], TIME, style.axis('off target', unit='% of step'), 'c')
 
 
 def beam(path: Path) -> None:
@@ -221,43 +233,99 @@ def beam(path: Path) -> None:
     unit, period, target = strip.flux_density_unit, chain.first_period, 0.3
     plan = plan_two_step(0.0, target, strip.nondimensional)
     hold, arrival = plan.beta_1 * unit, plan.tau_p * strip.time_unit
-    with style.picture(path, 2.9, width=7.5) as figure:
+    with style.picture(path, 2.9, replace(SCREEN, width=183)) as figure:
         shapes, move, left = figure.subplots(1, 3)
-        looks = ((0.1, style.GREEN), (0.3, style.BLUE), (0.6, style.VERMILION), (0.75, 'black'))
-        for deflection, colour in looks:
-            shapes.plot(*centreline(deflection, 41), color=colour)
+        for deflection, look in zip((0.3, 0.6, 0.1, 0.75), looks.CASES, strict=False):
+            shapes.plot(*centreline(deflection, 41), **look.line())
             flux = 1e3 * float(elastic_force(deflection, strip.nondimensional)) * unit
             x, y = (part[-1] for part in centreline(deflection, 41))
-            shapes.annotate(f'{flux:.1f} mT', (x + 0.02, y), color=colour, fontsize=8)
+            shapes.annotate(f'{flux:.1f} mT', (x + 0.02, y), color=look.colour, fontsize='small')
         shapes.plot([0.0, 0.0], [-0.08, 0.08], color='black', linewidth=3.0)
         shapes.set_aspect('equal')
         shapes.set_xlim(-0.05, 1.35)
-        for label, colour, levels in (
-                ('plain step', style.VERMILION, [(4.0 * period, hold)]),
-                ('two-step', style.BLUE, [
+        for label, kind, levels in (
+                ('plain step', style.UNSHAPED, [(4.0 * period, hold)]),
+                ('two-step', style.SHAPED, [
                     (arrival, plan.beta_p * unit), (4.0 * period - arrival, hold)])):
             time, deflection = chain.follow(levels, 400)
-            move.plot(1e3 * time, deflection, color=colour, label=label)
+            move.plot(1e3 * time, deflection, **kind, label=label)
         after = time > arrival
-        left.plot(1e3 * time[after], 100.0 * (deflection[after] / target - 1.0), color=style.BLUE)
-        move.legend(fontsize=8)
-        left.axhline(0.0, color='grey', linewidth=0.5)
+        left.plot(
+            1e3 * time[after], 100.0 * (deflection[after] / target - 1.0), **style.SHAPED)
+        move.legend(loc='lower right')
+        left.axhline(0.0, color=looks.GREY, linewidth=0.6)
         left.set_ylim(-0.5, 3.5)
         style.finish(shapes, 'along / length', 'across / length', 'a')
-        style.finish(move, 'time (ms)', 'deflection / length', 'b')
-        style.finish(left, 'time (ms)', 'off target, % of the move', 'c')
+        style.finish(move, style.axis('time', 't', 'ms'), style.axis('deflection', 'u'), 'b')
+        style.finish(
+            left, style.axis('time', 't', 'ms'), style.axis('off target', unit='% of step'), 'c')
+
+
+def simulated(*setpoints: tuple[float, float], rate: float) -> Run:
+    """Return the run of setpoints (stretch, span in s), as its recorder would see it."""
+    block, start, lead = paper_actuator(), NANOSECONDS, 5_000_000
+    ends = np.cumsum([round(x * NANOSECONDS) for _, x in setpoints]).tolist()
+    points = [(x, end) for (x, _), end in zip(setpoints, ends, strict=True)]
+    plan = Planner(block, Options(lead_time=lead)).request(points, None, start)
+    levels = tuple(
+        Level(x.stamp, x.flux_density, start, x.stretch, x.rate) for x in plan.levels
+        if x.stamp >= start)
+    plant = ActuatorSimulation(block, time=start)
+    for level in levels:
+        plant.command(level.stamp, level.flux_density)
+    samples = []
+    for stamp in range(start, start + lead + ends[-1], round(NANOSECONDS / rate)):
+        plant.advance(stamp)
+        samples.append((stamp, plant.stretch, plant.rate, plant.flux_density))
+    time, *motion = (np.array(x) for x in zip(*samples, strict=True))
+    return Run(
+        'run', 'actuator', Path('run'), time, time, *motion,
+        commands=tuple(Level(x.stamp, x.flux_density, x.sent) for x in levels), plans=(levels,),
+        requests=(RecordedRequest(start, 0, tuple(points)),), plant=block, planner=block,
+        parameters_known=True)
+
+
+def demo(path: Path) -> None:
+    """Draw the run of `hmsa demo`."""
+    run = simulated(*(
+        (x, span * paper_actuator().time_unit) for x, span in SEQUENCE), rate=20_000.0)
+    draw(path, [Part(run, evaluate(run), timing(run))], SCREEN)
+
+
+def adapting(path: Path) -> None:
+    """Draw the second act of `hmsa demo`."""
+    second_act(path)
+
+
+def moves(path: Path) -> None:
+    """Draw what the page on bags in a notebook draws, by its own code."""
+    page = (ROOT / 'docs' / 'tutorials' / 'bags-in-a-notebook.md').read_text(encoding='utf-8')
+    code, = re.findall(r'```python\n(import matplotlib.*?)```', page, flags=re.DOTALL)
+    run = simulated((1.2, 0.3), (0.9, 0.3), (1.0, 0.3), rate=1000.0)
+    names = {
+        'levels': [(x.stamp / NANOSECONDS, x.flux_density) for x in run.commands],
+        'time': run.time / NANOSECONDS, 'stretch': run.stretch}
+    exec(code.replace("'moves.png'", repr(str(path))), names)  # noqa: S102 - our own page
+
+
+def figure(number: int) -> Callable[[Path], None]:
+    """Return what draws a figure of the paper."""
+    return lambda path: draw_figure(FIGURES[number], [path], SCREEN)
+
+
+#: What draws each picture, by its name.
+PICTURES: dict[str, Callable[[Path], None]] = {
+    'demo': demo, 'adapting': adapting, 'moves': moves, 'figure_05': figure(5),
+    'figure_08': figure(8), 'theory_force': force, 'theory_two_steps': two_steps,
+    'theory_paths': energy, 'theory_deliveries': deliveries, 'theory_smooth': smooth,
+    'laws': laws, 'creep': creep, 'beam': beam, **STUDIES}
 
 
 def main() -> int:
-    """Draw all of them."""
-    force(FOLDER / 'theory_force.png')
-    two_steps(FOLDER / 'theory_two_steps.png')
-    energy(FOLDER / 'theory_paths.png')
-    deliveries(FOLDER / 'theory_deliveries.png')
-    smooth(FOLDER / 'theory_smooth.png')
-    laws(FOLDER / 'laws.png')
-    creep(FOLDER / 'creep.png')
-    beam(FOLDER / 'beam.png')
+    """Draw all of them, or those named."""
+    for name in sys.argv[1:] or PICTURES:
+        PICTURES[name](FOLDER / f'{name}.png')
+        print(FOLDER / f'{name}.png')
     return 0
 
 
