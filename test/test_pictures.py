@@ -179,6 +179,7 @@ def script() -> ModuleType:
 
 
 DRAWN = script().PICTURES
+SLOW = ('robustness', 'front')
 
 
 def from_afar(path: Path) -> Image.Image:
@@ -188,7 +189,7 @@ def from_afar(path: Path) -> Image.Image:
 
 
 @pytest.mark.parametrize('name', [
-    pytest.param(x, marks=[pytest.mark.slow] if x in ('robustness', 'front') else []) for x in DRAWN])
+    pytest.param(x, marks=[pytest.mark.slow] if x in SLOW else []) for x in DRAWN])
 def test_the_pictures_of_the_documentation_are_what_the_package_draws_now(
         name: str, tmp_path: Path) -> None:
     DRAWN[name](tmp_path / f'{name}.png')
