@@ -74,6 +74,27 @@ def test_a_history_forgets_what_has_left_the_chart():
     assert np.all(np.isnan(kept.ranges(1e6, 10)[0]))
 
 
+def test_a_target_that_holds_is_a_line_without_gaps():
+    history = History(10.0)
+    # Looks are further apart than the slots of a history.
+    for i in range(100):
+        history.hold(0.1 * i, 0.1 * (i + 1), 1.2)
+    assert np.array_equal(history.ranges(10.0, 140), np.full((2, 140), 1.2))
+    history.hold(10.0, 1e6, 1.3)
+    assert np.array_equal(history.ranges(1e6, 140), np.full((2, 140), 1.3))
+
+
+def test_words_that_do_not_fit_are_left_out_whole():
+    for width in range(30, 80):
+        lines = [x.plain for x in Screen(10.0).lines(scene(), width, 24)]
+        place = next(i for i, x in enumerate(lines) if x.startswith('actuator'))
+        assert re.fullmatch(
+            r'actuator  stretch 1\.10000(  target 1\.20000(  off -1\.0e-01'
+            r'(  rate \+0\.500 1/s)?)?)?', lines[place])
+        assert re.fullmatch(
+            r'flux density \+34\.500 mT(  commanded \+65\.000 mT)?', lines[place + 1])
+
+
 def test_a_chart_draws_a_line_where_its_values_are():
     flat = np.full(20, 0.0), np.full(20, 0.0)
     none = np.full(20, np.nan), np.full(20, np.nan)
@@ -127,7 +148,8 @@ def test_a_frame_of_80_by_24_says_everything():
     for words in (
             'domain 42', '12.500 s (simulated)', '1000 samples/s', 'q ends', 'stretch 1.10000',
             'target 1.20000', 'off -1.0e-01', 'rate +0.500 1/s', 'flux density +34.500 mT',
-            'commanded +65.000 mT', '10 s across', 'setpoint 1 of 3  moving', '25 %',
+            'commanded +65.000 mT', '└-10 s───', '-5 s──', '──now',
+            'setpoint 1 of 3  moving', '25 %',
             'verdict  OK    accepted', 'planner  WARN  2 commands sent late, late 2, sent 6',
             'plant    STALE silent for 9 s'):
         assert words in text

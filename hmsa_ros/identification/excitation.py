@@ -107,20 +107,25 @@ class Excitation:
     paper: Program  # the paper's shaped sequence
 
     @property
-    def improvement(self) -> float:
+    def gains(self) -> dict[str, float]:
         """
-        Smallest ratio of the deviations of the plain steps to those of the best.
+        Ratio of the deviations of the plain steps to those of the best, by parameter.
 
         The bias of the sensor is left out: it is the noise over the root of the number of
         samples, whatever moves.
         """
-        return min(_ratios(self.plain.std, self.best.std))
+        return _ratios(self.plain.std, self.best.std)
+
+    @property
+    def improvement(self) -> float:
+        """Smallest of the gains."""
+        return min(self.gains.values())
 
 
-def _ratios(one: Mapping[str, float], other: Mapping[str, float]) -> list[float]:
+def _ratios(one: Mapping[str, float], other: Mapping[str, float]) -> dict[str, float]:
     """Return how much larger deviations are than others, of all but the sensor's bias."""
     names = [x for x in one if x != 'stretch_bias'] or list(one)
-    return [one[x] / other[x] for x in names]
+    return {x: one[x] / other[x] for x in names}
 
 
 class Designer:
@@ -261,7 +266,7 @@ class Designer:
         if over > 0.0:
             return -math.inf
         # The volume, and with as much weight the worst parameter against plain steps.
-        worst = min(_ratios(self._reference, found.std))
+        worst = min(_ratios(self._reference, found.std).values())
         return found.information + _WEIGHT * len(self._free) * math.log(max(worst, 1e-300))
 
     def _judged(self, point: Array) -> tuple[float, Program | None]:

@@ -139,7 +139,7 @@ class Listener:
             joint.target = self._targets.get(name, math.nan)
             joint.coordinate = self._coordinates.get(name, joint.coordinate)
             if math.isfinite(joint.target):
-                joint.targets.put(self._looked, now, np.array([joint.target]))
+                joint.targets.hold(self._looked, now, joint.target)
         self._looked = now
         shown = [x for x in self._joints.values() if not self._wanted or x.name in self._wanted]
         return Scene(

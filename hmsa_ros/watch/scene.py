@@ -33,6 +33,11 @@ class History:
         np.fmin.at(self._low, slots[kept] % count, values[kept])
         np.fmax.at(self._high, slots[kept] % count, values[kept])
 
+    def hold(self, before: float, now: float, value: float) -> None:
+        """Take in a value that held between two looks (times in s)."""
+        before = max(before, now - self._slot * (len(self._low) + 1))
+        self.put(before, now, np.full(math.ceil((now - before) / self._slot) + 1, value))
+
     def _advance(self, now: float) -> None:
         newest, count = math.floor(now / self._slot), len(self._low)
         begun = np.arange(max(self._newest, newest - count) + 1, newest + 1) % count

@@ -1,6 +1,6 @@
 """The scene as text: a screen for a terminal, a line for a log, or JSON for a program."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import math
 from typing import Any
 
@@ -20,8 +20,8 @@ _STYLES = ('green', 'yellow', 'bold red', 'yellow')
 _VALUE, _TARGET, _SOFT, _WAITING = 'cyan', 'magenta', 'dim', 'bold yellow'
 # Width of the axis beside a chart.
 _GUTTER = 10
-# Rows of a joint with a chart of its own: two of text and at least so many of the chart.
-_TEXT_ROWS, _CHART_ROWS, _MOST_CHART_ROWS = 2, 3, 24
+# Rows of a joint with a chart of its own: of text and axis, and at least so many of the chart.
+_TEXT_ROWS, _CHART_ROWS, _MOST_CHART_ROWS = 3, 3, 24
 # What is around the lines of a table: its head, and how many joints are not shown.
 _ENDS = 2
 # Of a position and its name in a table.
@@ -29,8 +29,9 @@ _WIDE = 10
 # Smallest range of a chart's axis.
 _LEAST_RANGE = 1e-3
 _MOST_REPORTS = 4
-# A warning may take this share of the rows; what comes before it is its name and level.
-_SHARE, _INDENT = 6, 15
+# A warning may take this share of the rows, other words two; what comes before them is a name
+# and a level.
+_SHARE, _WORDS, _INDENT = 6, 2, 15
 # A node that reports once a second and has not for so long is silent, in s.
 SILENT_AFTER = 3.5
 
@@ -70,12 +71,16 @@ class Screen:
 
     def _head(self, scene: Scene, width: int) -> Text:
         left = f'hmsa watch  {scene.where}'
-        right = '' if math.isnan(scene.stamp) else f'{_time(scene.stamp)}  '
+        right = ['q ends']
+        if not math.isnan(scene.stamp):
+            right.insert(0, _time(scene.stamp))
         if math.isfinite(scene.sample_rate):
-            right += f'{scene.sample_rate:.0f} samples/s  '
-        right += 'q ends'
-        space = max(width - cell_len(left) - len(right), 2)
-        return Text(left + ' ' * space + right, style='bold')
+            right.insert(-1, f'{scene.sample_rate:.0f} samples/s')
+        while len(right) > 1 and cell_len(left) + 2 + len('  '.join(right)) > width:
+            right.pop(0)
+        end = '  '.join(right)
+        space = max(width - cell_len(left) - len(end), 2)
+        return Text(left + ' ' * space + end, style='bold')
 
     def _foot(self, scene: Scene, width: int, rows: int) -> list[Text]:
         lines = [Text(('─' if self._unicode else '-') * width, style=_SOFT)]
@@ -84,8 +89,9 @@ class Screen:
             count = f'setpoint {request.setpoint} of {request.setpoints}  ' \
                 if request.setpoints else ''
             line = Text(f'plan     {count}{request.state.replace("_", " ")}')
-            if math.isfinite(scene.progress):
-                line.append('  ').append(self._bar(scene.progress, max(width - 60, 10)))
+            room = width - cell_len(line.plain) - len('   100 %')
+            if math.isfinite(scene.progress) and room > 0:
+                line.append('  ').append(self._bar(scene.progress, min(room, max(width - 60, 10))))
                 line.append(f' {100.0 * scene.progress:.0f} %')
             lines.append(line)
             lines += _judged('verdict', request.level, request.message, width, rows)
@@ -122,14 +128,13 @@ class Screen:
         return lines
 
     def _joint(self, joint: Joint, now: float, width: int, rows: int) -> list[Text]:
-        first = Text(f'{joint.name}  ', style='bold')
-        first.append(f'{joint.coordinate} {number(joint.stretch)}', style=_VALUE)
-        first.append(f'  target {number(joint.target)}', style=_TARGET)
-        first.append(f'  off {_off(joint)}', style='not bold')
-        first.append(f'  rate {number(joint.rate, "+.3f")} 1/s', style='not bold')
-        second = Text(
-            f'flux density {_millitesla(joint.flux_density)}, '
-            f'commanded {_millitesla(joint.commanded)}')
+        first = _fitted(width, [
+            (joint.name, 'bold'), (f'{joint.coordinate} {number(joint.stretch)}', _VALUE),
+            (f'target {number(joint.target)}', _TARGET), (f'off {_off(joint)}', ''),
+            (f'rate {number(joint.rate, "+.3f")} 1/s', '')])
+        second = _fitted(width, [
+            (f'flux density {_millitesla(joint.flux_density)}', ''),
+            (f'commanded {_millitesla(joint.commanded)}', '')])
         chart, (low, high) = self._chart(joint, now, max(width - _GUTTER, 1), rows)
         lines = []
         for i, row in enumerate(chart):
@@ -137,8 +142,19 @@ class Screen:
             line = Text(f'{label:>{_GUTTER - 2}} ', style=_SOFT)
             line.append('│' if self._unicode else '|')
             lines.append(line.append(row))
-        second.append(f'   {self._span:g} s across', style=_SOFT)
-        return [first, second, *lines]
+        return [first, second, *lines, self._axis(width)]
+
+    def _axis(self, width: int) -> Text:
+        """Return the axis of time below a chart: how many s ago, up to now."""
+        rule, corner = ('─', '└') if self._unicode else ('.', '+')
+        across = max(width - _GUTTER, 1)
+        drawn = [rule] * across
+        # A label begins where its time is, the last ends there; those that overlap are left out.
+        for place, label in [(across - len('now'), 'now'), *(
+                (i * across // 4, f'{-self._span * (1.0 - i / 4.0):g} s') for i in (0, 2, 1, 3))]:
+            if place >= 0 and all(x == rule for x in drawn[place:place + len(label) + 1]):
+                drawn[place:place + len(label)] = label
+        return Text(f'{"":>{_GUTTER - 1}}{corner}{"".join(drawn)}', style=_SOFT)
 
     def _chart(
             self, joint: Joint, now: float, width: int, rows: int
@@ -184,14 +200,24 @@ class Screen:
         return lines
 
 
+def _fitted(width: int, parts: Sequence[tuple[str, str]]) -> Text:
+    """Return the parts of a line, each with its style, that fit whole; always the first."""
+    line = Text()
+    for words, style in parts:
+        gap = '  ' if line.plain else ''
+        if line.plain and cell_len(line.plain) + len(gap) + cell_len(words) > width:
+            break
+        line.append(gap).append(words, style=style or None)
+    return line
+
+
 def _judged(name: str, level: int, message: str, width: int, rows: int) -> list[Text]:
     """Return a level and its message; what is not OK takes up to some rows."""
     level = min(max(level, 0), len(LEVELS) - 1)
     first = Text(f'{name:<8} ')
     first.append(f'{LEVELS[level]:<5} ', style=_STYLES[level])
-    if level == 0 or rows < 2:
-        return [first.append(message)]
-    begin, *rest = _wrapped(message, width - _INDENT, rows) or ['']
+    begin, *rest = _wrapped(
+        message, width - _INDENT, max(min(rows, _WORDS) if level == 0 else rows, 1)) or ['']
     return [first.append(begin), *(Text(' ' * _INDENT + x) for x in rest)]
 
 
