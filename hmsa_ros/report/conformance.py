@@ -7,9 +7,11 @@ import numpy as np
 from hmsa_ros import __version__
 from hmsa_ros.device.conformance import Conformance
 from hmsa_ros.model.equations import Array
-from hmsa_ros.report import charts
-from hmsa_ros.report.charts import Figure, numbers
-from hmsa_ros.report.page import cell, document, placed, table, text
+from hmsa_ros.report.charts import axis, Figure, label
+from hmsa_ros.report.curves import numbers
+from hmsa_ros.report.looks import BLUE
+from hmsa_ros.report.page import document, placed, text
+from hmsa_ros.report.tables import cell, table
 
 _BINS = 40
 
@@ -44,5 +46,5 @@ def _histogram(name: str, times: Array) -> Figure:
     title = 'lateness of levels' if name == 'lateness' else f'duration of {name}'
     return Figure(f'times-{name}', title, 240, [{
         'type': 'bar', 'x': numbers((edges[1:] + edges[:-1]) / 2), 'y': numbers(counts),
-        'width': numbers(np.diff(edges)), 'marker': {'color': charts.BLUE}}], {
-        'xaxis': {'title': {'text': f'{title} [ms]'}}, 'yaxis': {'title': {'text': 'number'}}})
+        'width': numbers(np.diff(edges)), 'marker': {'color': BLUE}}], {
+        'xaxis': axis(label(title, unit='ms')), 'yaxis': axis('number')})
