@@ -88,5 +88,5 @@ def require_arrow() -> tuple[Any, Any]:
     except ImportError as error:
         raise BadInputError(
             'pyarrow, which writes Parquet, is not installed: install it (pip install '
-            '"hmsa_ros[studies]") or write to a file that ends in .csv') from error
+            'pyarrow) or write to a file that ends in .csv') from error
     return pyarrow, parquet

@@ -92,7 +92,7 @@ def dask(address: str, workers: int | None = None) -> Iterator[tuple[Executor, i
         from distributed import Client, LocalCluster
     except ImportError as error:
         raise BadInputError(
-            'dask.distributed is not installed: install it (pip install "hmsa_ros[cluster]") or '
+            'dask.distributed is not installed: install it (pip install distributed) or '
             'take --workers or --shard') from error
     with ExitStack() as stack:
         if address == 'local':

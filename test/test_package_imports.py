@@ -120,7 +120,7 @@ sys.exit(main({arguments!r}))
     assert (result.returncode, result.stdout) == (1, '')
     assert re.fullmatch(
         f'hmsa: error: hmsa {arguments[0]} needs ROS 2 Jazzy .*source /opt/ros/jazzy.*'
-        r'pip install "hmsa_ros\[ros\]"\)\n', result.stderr)
+        r'pip install "\.\[ros\]"\)\n', result.stderr)
     assert not [*tmp_path.iterdir()]
 
 

@@ -246,7 +246,7 @@ def test_a_missing_dask_is_said_with_how_to_get_it(run, monkeypatch):
     monkeypatch.setitem(sys.modules, 'distributed', None)
     status, _, err = run('--dask=local', '--out=a')
     assert (status, err.count('\n')) == (2, 1)
-    assert 'hmsa_ros[cluster]' in err
+    assert 'pip install distributed' in err
 
 
 def test_chunks_of_other_code_have_other_names(sweep, tmp_path, monkeypatch):

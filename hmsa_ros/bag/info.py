@@ -129,12 +129,12 @@ def to_json(summary: BagSummary) -> str:
         {key: shown.get(key, getattr(summary, key)) for key in _SHOWN}, indent=2, allow_nan=False)
 
 
-def to_text(summary: BagSummary) -> str:
-    """Return a summary in words, several lines."""
-    return '\n'.join(map(printable, _lines(summary)))
+def to_text(summary: BagSummary, *, parameters: bool = False) -> str:
+    """Return a summary in words, several lines; with the parameters if asked."""
+    return '\n'.join(map(printable, _lines(summary, parameters)))
 
 
-def _lines(summary: BagSummary) -> Iterator[str]:
+def _lines(summary: BagSummary, parameters: bool) -> Iterator[str]:
     """Return the lines of a summary."""
     yield f'bag       {summary.path}'
     for name, size in summary.files:
@@ -161,8 +161,13 @@ def _lines(summary: BagSummary) -> Iterator[str]:
             yield '  '.join(
                 text.rjust(width) if 2 <= i <= 4 else text.ljust(width)
                 for i, (text, width) in enumerate(zip(row, widths, strict=True))).rstrip()
+    if summary.parameters and not parameters:
+        nodes = ', '.join(dict.fromkeys(x.partition('.')[0] for x in summary.parameters))
+        yield ''
+        yield f'{len(summary.parameters)} parameters of {nodes}: --parameters shows them'
     for title, values in (
-            ('parameters', summary.parameters), ('custom data', summary.custom_data)):
+            ('parameters', summary.parameters if parameters else {}),
+            ('custom data', summary.custom_data)):
         if values:
             yield ''
             yield title

@@ -94,8 +94,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         return complain(HmsaError(
             f'{arguments.parser.prog} needs ROS 2 Jazzy ({error}): source its setup file (source '
-            '/opt/ros/jazzy/setup.bash), or install it with this package (pip install '
-            '"hmsa_ros[ros]")'))
+            '/opt/ros/jazzy/setup.bash), or install it with this package (in its '
+            'clone: pip install ".[ros]")'))
     except KeyboardInterrupt:
         return ENDING.status
     except BrokenPipeError:

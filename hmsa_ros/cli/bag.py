@@ -25,7 +25,8 @@ def add_parser(subparsers: Any) -> None:
     actions = parser.add_subparsers(metavar='ACTION', required=True)
     info = actions.add_parser(
         'info', help='print the contents of a bag',
-        description='Print topics, counts, rates, losses, duration and parameters of a bag.',
+        description='Print topics, counts, rates, losses and duration of a bag, and with '
+                    '--parameters the parameters of the nodes.',
         epilog='example: hmsa bag info hmsa_demo/run --json')
     recover = actions.add_parser(
         'recover', help='rescue a readable bag from a truncated one',
@@ -51,7 +52,9 @@ def add_parser(subparsers: Any) -> None:
         'largest chunk or message to read, in MiB (default %(default)g)',
         {'default': CHUNK_SIZE / MEBIBYTE})
     for action, function, options in (
-            (info, _info, [JSON]), (recover, _recover, [out]),
+            (info, _info, [
+                ('--parameters', 'print the parameters of the recorded nodes, too'), JSON]),
+            (recover, _recover, [out]),
             (verify, _verify, [tolerance, params_file, JSON])):
         action.add_argument('bag', metavar='BAG', help='folder of a bag, or an .mcap file')
         add_options(action, *options, max_chunk)
@@ -74,7 +77,8 @@ def _info(arguments: argparse.Namespace) -> int:
     from hmsa_ros.bag.info import summarize, to_json, to_text
     with progress('reading'):
         summary = summarize(arguments.bag, max_chunk_size=arguments.max_chunk_size)
-    print(to_json(summary) if arguments.json else to_text(summary))
+    print(to_json(summary) if arguments.json else to_text(
+        summary, parameters=arguments.parameters))
     return 0
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.options import add_options, JSON
+from hmsa_ros.cli.progress import progress
 from hmsa_ros.files import json_text, write_text
 
 if TYPE_CHECKING:
@@ -54,9 +55,11 @@ def run(arguments: argparse.Namespace) -> int:
         belief.number('flux_density_min', -0.5), belief.number('flux_density_max', 0.5),
         belief.number('slew_limit', 0.0) or math.inf, arguments.stretch_min,
         arguments.stretch_max)
-    found = excite(
-        belief.actuator, bounds, duration=arguments.duration, rate=arguments.rate,
-        noise=arguments.noise, free=[x for x in arguments.free.split(',') if x] or DEFAULT_FREE)
+    with progress('designing the sequence'):
+        found = excite(
+            belief.actuator, bounds, duration=arguments.duration, rate=arguments.rate,
+            noise=arguments.noise,
+            free=[x for x in arguments.free.split(',') if x] or DEFAULT_FREE)
     if arguments.out is not None:
         rows = zip(found.best.level_times, found.best.levels, strict=True)
         lines = ['time,flux_density', *(f'{x:.9f},{y:.9g}' for x, y in rows)]

@@ -6,6 +6,7 @@ import sys
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.options import add_options, JSON
+from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text, write_text
 
@@ -57,10 +58,12 @@ def run(arguments: argparse.Namespace) -> int:
     from hmsa_ros.identification.quantities import DEFAULT_FREE
 
     belief = read_belief(arguments.params_file)
-    recording, belief = _read(arguments, belief)
     free = [x for x in arguments.free.split(',') if x] or DEFAULT_FREE
-    found = identify(recording, free=free, actuator=belief.actuator, known=belief.others)
-    curve = profile(found, arguments.profile) if arguments.profile else []
+    with progress('reading') as update:
+        recording, belief = _read(arguments, belief)
+        update('fitting', None)
+        found = identify(recording, free=free, actuator=belief.actuator, known=belief.others)
+        curve = profile(found, arguments.profile) if arguments.profile else []
     good = found.verdict == 'identified'
     written = []
     if arguments.out is not None and good:

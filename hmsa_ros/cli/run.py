@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from hmsa_ros.report.outcome import LevelResult
 
 NOT_MEASURED = 'predicted, not measured'
+# What is slower than this share of real time is said to be.
+_SLOW = 0.9
 # Rows of the table of levels.
 _MOST_LEVELS = 12
 
@@ -178,7 +180,8 @@ def _verdict(
         return 'unobserved', (
             f'the bag shows {len(findings)} of {count} setpoints: expected all, with samples')
     if found.arrived:
-        return 'arrived', f'all {count} moves arrived and stayed within tolerance'
+        moves = f'all {count} moves' if count > 1 else 'the move'
+        return 'arrived', f'{moves} arrived and stayed within tolerance'
     others = sum(not x.arrived for x in findings) - 1
     return str(found.verdict), found.message + (
         f'; {others} more of {count} did not arrive' if others else '')
@@ -194,8 +197,12 @@ def _print(
         console.print(_level_table(levels))
     if findings:
         console.print(findings_table(findings))
+    parts = [f'{key} {x:.1f} s' for key, x in done.seconds.items()]
+    if done.pace < _SLOW:
+        parts[1] += f' (simulated time at {done.pace:.2g} of real time)'
     for line in (
-            *(f'note     {x}' for x in done.notes), f'verdict  {reason}', f'bag      {bag}',
+            *(f'note     {x}' for x in done.notes), f'time     {", ".join(parts)}',
+            f'verdict  {reason}', f'bag      {bag}',
             *([] if report is None else [f'report   {report}'])):
         console.print(line, highlight=False, soft_wrap=True)
 

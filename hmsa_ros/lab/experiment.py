@@ -13,6 +13,7 @@ from pathlib import Path
 from time import monotonic, time
 
 from diagnostic_msgs.msg import DiagnosticArray
+import numpy as np
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 
@@ -81,12 +82,14 @@ class Experiment:
 
 @dataclass(frozen=True)
 class Conducted:
-    """Exit statuses by process, whether samples came, notes, and what the planner said last."""
+    """What became of an experiment."""
 
-    exits: dict[str, int]
-    measured: bool
+    exits: dict[str, int]  #: by process
+    measured: bool  #: whether samples came
     notes: tuple[str, ...]
-    verdict: Verdict
+    verdict: Verdict  #: what the planner said last
+    seconds: dict[str, float]  #: what took how long, of our time
+    pace: float  #: of the nodes' time, as a share of ours
 
 
 def prepare(folder: Path) -> None:
@@ -146,10 +149,15 @@ def conduct(
             namespace=experiment.namespace, joints=experiment.joints,
             timeout=_START_SECONDS) as client:
         watch = _Watch(client, experiment, session.check)
+        times = [monotonic()]
         try:
             progress('starting the nodes' if experiment.nodes else 'looking for the nodes', 0.0)
             _begin(experiment, session, watch)
+            times.append(monotonic())
+            begin = watch.now
             verdict = _carry_out(experiment, watch, progress)
+            times.append(monotonic())
+            pace = (watch.now - begin) / (times[-1] - times[-2])
             measured = watch.measured
         except BaseException as error:
             resting = True
@@ -168,7 +176,9 @@ def conduct(
             if status:
                 raise HmsaError(
                     f'the {name} ended with status {status}: {session.last_words(name)}')
-    return Conducted(exits, measured, tuple(watch.notes), verdict)
+    times.append(monotonic())
+    seconds = dict(zip(('start', 'sequence', 'end'), np.diff(times).tolist(), strict=True))
+    return Conducted(exits, measured, tuple(watch.notes), verdict, seconds, pace)
 
 
 def _begin(experiment: Experiment, session: Session, watch: '_Watch') -> None:
@@ -206,9 +216,13 @@ def _carry_out(experiment: Experiment, watch: '_Watch', progress: Tell) -> Verdi
     total = experiment.duration + (
         float(lead) if isinstance(lead, (int, float)) else 0.0)
 
+    factor = watch.parameter('plant.real_time_factor') if experiment.nodes else None
+    slow = f' at {factor:.2g} of real time' if isinstance(factor, float) and (
+        0.0 < factor < 1.0) else ''
+
     def report() -> None:
         watch.look(begin + total)
-        progress('running the sequence', min((watch.now - begin) / total, 1.0))
+        progress(f'running the sequence{slow}', min((watch.now - begin) / total, 1.0))
 
     verdict = watch.client.follow(verdict, each=lambda _: report(), timeout=float('inf'))
     watch.client.spin_until(
