@@ -58,7 +58,8 @@ def page(parts: Sequence[Part]) -> str:
         ('response-section', 'Command and response', text(
             'Above, the flux density commanded: a dot where the level switches. Below, the '
             f'{what}: recorded, predicted by the plan, and simulated for plain steps to the '
-            'levels that hold the targets. Drag to zoom, double-click to go back, click in the '
+            'levels that hold the targets. Few samples are points, with the motion through their '
+            'stretches and rates as a line. Drag to zoom, double-click to go back, click in the '
             'legend to hide.' + (
                 '' if len(parts) == 1 else ' What is simulated is hidden until its name is '
                 'clicked.')) + place(charts.response(parts, unit))),
@@ -72,9 +73,9 @@ def page(parts: Sequence[Part]) -> str:
     if panels:
         sections += [
             ('arrivals', 'Arrivals', text(
-                'Distance from the target in percent of the step, over the time since planned '
-                'arrival. The residual is what is left of the vibration: peak to peak from '
-                'arrival to the next move.' + (
+                'Distance from the target in percent of the step, over the time since the move '
+                'began; the line is planned arrival. The residual is what is left of the '
+                'vibration: peak to peak from arrival to the next move.' + (
                     '' if count <= len(panels) else
                     f' The {len(panels)} of {count} setpoints with the largest residual; the '
                     'table has all.'))
