@@ -58,8 +58,8 @@ def page(parts: Sequence[Part]) -> str:
         ('response-section', 'Command and response', text(
             'Above, the flux density commanded: a dot where the level switches. Below, the '
             f'{what}: recorded, predicted by the plan, and simulated for plain steps to the '
-            'levels that hold the targets. Few samples are points, with the motion through their '
-            'stretches and rates as a line. Drag to zoom, double-click to go back, click in the '
+            'levels that hold the targets. Few samples are points, with the motion through '
+            'them and their rates as a line. Drag to zoom, double-click to go back, click in the '
             'legend to hide.' + (
                 '' if len(parts) == 1 else ' What is simulated is hidden until its name is '
                 'clicked.')) + place(charts.response(parts, unit))),
