@@ -75,7 +75,7 @@ def draw_sweep(
                     _map(figure, panels[row, column], (view.x, view.y), name,
                          _quantile(found[row], MAPPED) if view.samples > 1
                          else found[row, :, :, 0])
-                    panels[row, column].set_title(label, loc='right')
+                    panels[row, column].set_title(worded(label), loc='right')
         for panel in figure.axes:
             if panel.get_label() != '<colorbar>' and (letter := next(letters, '')):
                 panel.set_title(f'({letter})', loc='left', fontweight='bold')
@@ -83,6 +83,14 @@ def draw_sweep(
         common = [_with_value(x, _scale(x) * y) for x, y in (fixed or {}).items()]
         if common:
             figure.suptitle(', '.join(common))
+
+
+def worded(label: str) -> str:
+    """Return the label of a curve or map with the symbols of the columns that it names."""
+    parts = (x.rpartition(' ') for x in label.split(', '))
+    return ', '.join(
+        _with_value(name, float(value)) if name in _NAMES else f'{name}{space}{value}'
+        for name, space, value in parts)
 
 
 def _with_value(name: str, value: float) -> str:
@@ -177,6 +185,12 @@ def _norm(values: Array) -> tuple[Normalize, tuple[float, float]]:
     return LogNorm(*ends), ends
 
 
+def _apart(place: int, count: int, points: int) -> tuple[int, int]:
+    """Return first marker and distance of markers so that those of several curves stand apart."""
+    every = max(points // 6, 1)
+    return place * every // count, every
+
+
 def _curves(
         figure: style.Picture, panel: Axes, view: View, axis: Axis, name: str,
         values: Array) -> None:
@@ -184,7 +198,8 @@ def _curves(
     x = _scale(axis.name) * View.places(axis)
     order = np.argsort(x, kind='stable')
     x, values = x[order], values[:, order]
-    for label, look, found in zip(view.labels, looks.CASES, values, strict=False):
+    for place, (label, look, found) in enumerate(
+            zip(map(worded, view.labels), looks.CASES, values, strict=False)):
         if view.samples > 1:
             for (low, high), alpha in zip(BANDS, (0.16, 0.3), strict=True):
                 edges = _quantile(found, low), _quantile(found, high)
@@ -197,7 +212,8 @@ def _curves(
         panel.plot(
             x, middle, **look.line(
                 label=label or ('median' if view.samples > 1 else 'plan')),
-            marker=look.marker, markersize=4.0, markevery=1 if lonely else max(len(x) // 6, 1))
+            marker=look.marker, markersize=4.0, markevery=1 if lonely else _apart(
+                place, len(view.labels), len(x)))
     style.finish(panel, label_of(axis.name), label_of(name))
     if not _even(axis):
         panel.set_xscale('log')
@@ -213,7 +229,7 @@ def _curves(
 
 def _shares(panel: Axes, view: View, name: str, values: Array) -> None:
     """Draw the share of the samples below a number, with the median and 5 to 95 %."""
-    for label, look, found in zip(view.labels, looks.CASES, values, strict=False):
+    for label, look, found in zip(map(worded, view.labels), looks.CASES, values, strict=False):
         known = np.sort(found[np.isfinite(found)])
         if known.size == 0:
             continue

@@ -22,6 +22,7 @@ from hmsa_ros.report.curves import Curve, decimate, through
 from hmsa_ros.report.looks import CASES, Look, SHAPERS
 from hmsa_ros.report.paper import KINDS, named, Paper
 from hmsa_ros.report.picture import draw
+from hmsa_studies.sweep_pictures import label_of, worded
 
 # What deuteranopia and protanopia leave of linear red, green and blue (Machado and others, IEEE
 # Transactions on Visualization and Computer Graphics 15, 2009, full severity).
@@ -99,6 +100,14 @@ def test_paper_that_is_none_is_refused(numbers: tuple[float, ...]) -> None:
 def test_what_is_below_what_is_resolved_is_said_to_be() -> None:
     assert [percent(x) for x in (7e-17, 9.9e-9, 2e-8, 0.0128, -0.5, float('nan'))] == [
         '<1e-6', '<1e-6', '2e-6', '1.3', '-50.0', '?']
+
+
+def test_curves_of_a_sweep_are_named_by_symbols_and_axes_have_units_or_none() -> None:
+    assert worded('j_lim 5, two_step') == r'$J_\mathrm{lim}$ = 5, two_step'
+    assert worded('command_period 0.001, gent') == 'command period = 0.001 s, gent'
+    assert worded('') == ''
+    assert [label_of(x) for x in ('zeta', 'residual', 'actuator.density')] == [
+        r'$\zeta$', 'residual vibration (% of step)', 'density (kg/m^3)']
 
 
 def oscillation(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
