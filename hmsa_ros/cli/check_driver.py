@@ -39,7 +39,15 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Try it, and show what was found."""
+    """
+    Try it, and show what was found.
+
+    Raises
+    ------
+    BadInputError
+        If the page's folder does not exist, or a setting is none.
+
+    """
     from hmsa_ros.device.conformance import Trial
 
     out: Path | None = arguments.report

@@ -13,7 +13,7 @@ import subprocess
 import sys
 from threading import Event
 from time import monotonic, sleep, time_ns
-from typing import Any, cast, NamedTuple
+from typing import Any, cast, IO, NamedTuple
 
 import numpy as np
 
@@ -104,14 +104,17 @@ class _Seen(NamedTuple):
     def stretch(self) -> Array:
         """Stretch of the samples that have one."""
         found = np.array([x.stretch[0] for x in self.samples])
-        return found[np.isfinite(found)]
+        finite: Array = found[np.isfinite(found)]
+        return finite
 
 
 class _Bench:
     """A worker with one joint, and a commander that repeats the last level as a planner does."""
 
+    #: Set by the worker's thread before the worker has started.
+    probe: _Probe
+
     def __init__(self, make: Callable[[], Hardware], limit: float, rate: float) -> None:
-        self.probe: _Probe | None = None
         self._rate = rate
         self.worker = HardwareWorker(lambda: self._device(make, limit), time_ns)
         if not self.worker.started(10.0):
@@ -226,7 +229,6 @@ class Trial:
         bench.worker.close()
         self._check_end('off_at_close', 'after close', bench.worker.failure is None, str(
             bench.worker.failure or ''))
-        assert bench.probe is not None  # it has started
         durations = {x: np.array(y) for x, y in bench.probe.durations.items()}
         self._check_calls(durations)
         self._check_clock(bench)
@@ -366,7 +368,6 @@ class Trial:
     def _check_exception(self) -> None:
         bench = _Bench(self._make, self._level, self._rate)
         bench.run(0.2, [self._level])
-        assert bench.probe is not None
         bench.probe.fails = True
         bench.run(0.5)
         failure = str(bench.worker.failure or 'nobody noticed')
@@ -379,8 +380,7 @@ class Trial:
                 [sys.executable, '-m', __name__, self.name, self._joint,
                  json.dumps(self._settings), repr(self._level), repr(self._rate)],
                 stdout=subprocess.PIPE, text=True) as child:
-            assert child.stdout is not None
-            ready = child.stdout.readline()
+            ready = cast(IO[str], child.stdout).readline()
             begun = monotonic()
             child.send_signal(signal.SIGTERM)
             try:

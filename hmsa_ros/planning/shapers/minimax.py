@@ -443,7 +443,11 @@ def least_largest(now: Array, slopes: Array, rows: Array, room: Array) -> Array:
             2.0 * (flat.T * inside.repeat(2)) @ flat + 4.0 * along.T @ along + near.T @ near)
         hessian[-1, :-1] = hessian[:-1, -1] = -4.0 * length * (inside @ along)
         hessian[-1, -1] = (4.0 * length * length * inside * inside - 2.0 * inside).sum()
-        step = -np.linalg.solve(hessian, gradient)
+        try:
+            step = -np.linalg.solve(hessian, gradient)
+        except np.linalg.LinAlgError:
+            # Some direction changes nothing, as where fewer cases differ than there are levels.
+            step = -np.linalg.lstsq(hessian, gradient, rcond=None)[0]
         steep = math.sqrt(max(-float(gradient @ step), 0.0))
         share = 1.0 if steep < _STEEP else 1.0 / (1.0 + steep)
         x = x + share * step[:-1]
