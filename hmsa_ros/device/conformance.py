@@ -34,6 +34,8 @@ _TIMED, _APART = 30, 0.03
 # Limits: of a call in s, of the lateness of the median level in s, of the age of a sample in s, of
 # the error of a clock in s, of samples that repeat the one before.
 _CALL, _LATE, _AGE, _CLOCK, _REPEATED = 0.02, 2e-3, 0.5, 1e-3, 0.6
+# The share of calls that must keep their limit.
+_MOST = 0.95
 # How many deviations of its mean a response must be to be seen.
 _SEEN = 6.0
 
@@ -396,10 +398,10 @@ class Trial:
 
     def _check_calls(self, durations: Mapping[str, Array]) -> None:
         for name, found in durations.items():
-            longest = float(np.max(found))
+            # Not the longest: a busy host takes its time from any call.
             self._note(
-                f'{name}_time', longest, 's', _CALL,
-                f'{name} takes {np.median(found) * 1e3:.3g} ms (at most {longest * 1e3:.3g})',
+                f'{name}_time', float(np.quantile(found, _MOST)), 's', _CALL,
+                f'{name} takes {np.median(found) * 1e3:.3g} ms (at most {found.max() * 1e3:.3g})',
                 'give calls a time limit of their own; nothing else is written meanwhile')
 
     def _check_clock(self, bench: _Bench) -> None:
