@@ -25,9 +25,9 @@ class Shifted(PlannerNode):
 sys.exit(run(Shifted, []))
 """
 
-# For a machine that is busy: few samples, commands far ahead, and a patient watchdog.
-PLANT = ('plant', '--ros-args', '-p', 'publish_rate:=200.0', '-p', 'command_timeout:=3.0')
-PLANNER_AHEAD = ('planner', '--ros-args', '-p', 'lead_time:=3.0')
+PLANT = ('plant', '--ros-args')
+# Far ahead for a busy machine.
+PLANNER_AHEAD = ('planner', '--ros-args', '-p', 'lead_time:=0.5')
 
 pytestmark = [pytest.mark.slow, pytest.mark.ros]
 on_hosts = pytest.mark.skipif(bool(WHY), reason=WHY)
@@ -71,7 +71,7 @@ def laboratory(start, tmp_path, wait_until):
 
 
 @on_hosts
-@pytest.mark.parametrize('outage', [5.0, 25.0])
+@pytest.mark.parametrize('outage', [2.0, 25.0])
 def test_after_an_outage_nothing_moves_that_nobody_has_asked_for(laboratory, outage):
     plant = laboratory.hmsa('bench', *PLANT, '-p', 'safe_flux:=zero')
     planner = laboratory.hmsa('desk', *PLANNER_AHEAD)
@@ -84,12 +84,12 @@ def test_after_an_outage_nothing_moves_that_nobody_has_asked_for(laboratory, out
     laboratory.hosts.cut('desk')
     cut = time()
     plant.wait_for_output('the field goes to zero')
+    planner.wait_for_output('no receipt')
     laboratory.wait(cut + outage - time())
-    assert sent.wait() == 1
-    assert 'no receipt' in sent.output
     laboratory.hosts.join('desk')
     joined = time()
     planner.wait_for_output('was cut off by the plant or driver')
+    assert sent.wait() == 1, sent.output
     laboratory.wait(1.0)
     again = time()
     sent = laboratory.hmsa('desk', 'send', '1.2:1', '--wait')
@@ -121,7 +121,7 @@ def test_a_recorder_whose_host_goes_away_holds_nobody_up(laboratory):
     laboratory.wait(cut + 10.0 - time())
     _, arrivals, _, _ = laboratory.seen()
     # By default a send waits there for up to 6 s.
-    assert np.diff(arrivals[arrivals > cut]).max() < 3.0
+    assert np.diff(arrivals[arrivals > cut]).max() < 1.0
     assert 'clock' not in plant.output
 
 

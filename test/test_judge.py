@@ -70,6 +70,15 @@ def test_the_rest_of_the_hold_counts():
     assert judge(time, kicked, setpoint(end=1600 * MS)).arrived
 
 
+@pytest.mark.parametrize('seconds', [0.025, 0.08])
+@pytest.mark.parametrize(('creep', 'vibration', 'verdict'), [
+    (1.5, 1.0, 'arrived'), (6.0, 0.0, 'off_target'), (1.5, 5.0, 'vibrating')])
+def test_creep_that_is_no_straight_line_is_decided_upon(seconds, creep, vibration, verdict):
+    time, stretch = held(vibration=vibration, noise=0.01, rate=4000, seconds=seconds)
+    creeping = stretch + STEP * 0.01 * creep * np.exp(-2e-9 * time / seconds)
+    assert judge(time, creeping, setpoint()).verdict == verdict
+
+
 def test_a_plan_made_anew_is_judged_where_the_first_one_is_not_kept_to():
     time, stretch = held()
     moved = np.where(time < 100 * MS, 1.2, stretch)

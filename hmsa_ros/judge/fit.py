@@ -1,11 +1,13 @@
 """
 Bounds of an offset and of a vibration that samples allow, by profile likelihood.
 
-An offset with a drift and a decaying sinusoid are fitted for each frequency and decay of a grid.
+An offset with a drift, or with a creep, and a decaying sinusoid are fitted for each frequency and
+decay of a grid.
 Each fit that leaves little more than the best is possible, and the bounds hold for all of these:
 what samples do not tell apart widens them.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 from statistics import NormalDist
@@ -32,6 +34,9 @@ _TRIED, _REFINED, _ROUNDS = 3, 7, 3
 # frequency between these.
 _DECAYS = np.array([0.0, 0.07, 0.15, 0.27, 0.4, 0.6, 1.0])
 _FASTER, _LEAST, _MOST = 2.0, 0.1, 0.7
+# Time constants of an exponential creep in spans. It is looked for below this share of independent
+# samples, and shown where it leaves less than this share of the squares.
+_CREEPS, _INDEPENDENT, _EXPLAINED = np.geomspace(0.07, 3.0, 8), 0.4, 0.5
 # Figures that are fitted: offset, drift, two of the sinusoid, frequency and decay.
 _FITTED = 6
 # Phases at which a vibration is looked at, and how many possible ones.
@@ -72,7 +77,6 @@ def fit(time: Array, rest: Array, frequency: float, decay: float) -> Fit | None:
     periods = span * frequency / (2.0 * math.pi)
     if count < FEWEST or not periods >= SHORTEST:
         return None
-    problem = _Problem(time, rest, drifts=periods >= _DRIFTS)
     interval = float(np.median(np.diff(time)))
     dense = interval * frequency < 2.0 * math.pi * _DENSE
     low, high = (x * frequency for x in (
@@ -83,17 +87,24 @@ def fit(time: Array, rest: Array, frequency: float, decay: float) -> Fit | None:
         low, high, max(int((high - low) * span * _TRIED / (2.0 * math.pi)), _REFINED)
     ).astype(np.float64)
     decays = _DECAYS * min(max(_FASTER * decay, _LEAST * frequency), _MOST * frequency)
-    tried = problem.solve(omegas, decays)
     searched = 2.0 * math.log(max((high - low) * span / (2.0 * math.pi), 1.0))
-    width, spread = float(omegas[1] - omegas[0]), float(decays[1])
-    for _ in range(_ROUNDS):
-        best = tried.best
-        near = problem.solve(
-            np.clip(best.omega + width * np.linspace(-1.0, 1.0, _REFINED), low, high),
-            np.clip(best.decay + spread * np.linspace(-2.0, 2.0, 5), 0.0, decays[-1]))
-        tried = tried.joined(near)
-        width, spread = 2.0 * width / (_REFINED - 1), 0.5 * spread
-    return _bounds(problem, tried, searched)
+
+    coarse = _Sinusoids(time, omegas, decays)
+    problem = _Problem(time, rest, [time] if periods >= _DRIFTS else [])
+    solved = _refined(problem, problem.solve(coarse))
+    plain = _bounds(problem, solved, searched)
+    if plain.independent > _INDEPENDENT:
+        return plain
+    # What is left is not chance alone: it may creep.
+    creeps = [_Problem(time, rest, [np.exp(-time / (x * span))]) for x in _CREEPS]
+    fits = [x.solve(coarse) for x in creeps]
+    place = int(np.argmin([x.least for x in fits]))
+    for near in range(max(place - 1, 0), min(place + 2, len(creeps))):
+        fits[near] = _refined(creeps[near], fits[near])
+    place = int(np.argmin([x.least for x in fits]))
+    if fits[place].least > _EXPLAINED * solved.least:
+        return plain
+    return _bounds(creeps[place], _Solved.all(fits), searched)
 
 
 # -- fits of a grid -----------------------------------------------------------------------------
@@ -120,21 +131,38 @@ class _Solved(NamedTuple):
         place = int(np.argmin(self.squares))
         return _One(float(self.omega[place]), float(self.decay[place]))
 
-    def joined(self, other: '_Solved') -> '_Solved':
-        return _Solved(*(
-            np.concatenate(x, axis=-1) for x in zip(self, other, strict=True)))
+    @property
+    def least(self) -> float:
+        return float(np.min(self.squares))
+
+    @classmethod
+    def all(cls, parts: Sequence['_Solved']) -> '_Solved':
+        return cls(*(np.concatenate(x, axis=-1) for x in zip(*parts, strict=True)))
 
     def taken(self, places: NDArray[np.intp]) -> '_Solved':
         return _Solved(*(x[..., places] for x in self))
 
 
+class _Sinusoids:
+    """Sinusoids of each frequency of some and each decay of others, at some times."""
+
+    def __init__(self, time: Array, omegas: Array, decays: Array) -> None:
+        self.omegas, self.decays = omegas, decays
+        self.turning = np.exp(1j * np.outer(omegas, time))
+        self.fading = np.exp(-np.outer(time, decays))
+        self.plain = np.sum(self.fading**2, axis=0)
+        self.twice = self.turning**2 @ self.fading**2
+
+
 class _Problem:
     """Samples, with what an offset and a drift explain taken out."""
 
-    def __init__(self, time: Array, rest: Array, *, drifts: bool) -> None:
+    def __init__(self, time: Array, rest: Array, drifts: Sequence[Array]) -> None:
         self.time, self._rest = time, rest
-        middle = 0.5 * (time[0] + time[-1])
-        columns = [np.ones(len(time)), time - middle][:1 + drifts]
+        # Of an offset they have no part: their means over the time are 0.
+        share = np.diff(time) / (time[-1] - time[0])
+        columns = [np.ones(len(time)), *(
+            x - 0.5 * float(share @ (x[1:] + x[:-1])) for x in drifts)]
         self._straight, upper = np.linalg.qr(np.stack(columns, axis=1))
         self._explained = self._straight.T @ rest
         self._left = rest - self._straight @ self._explained
@@ -143,14 +171,12 @@ class _Problem:
         row[0] = 1.0
         self._middle = np.linalg.solve(upper.T, row)
 
-    def solve(self, omegas: Array, decays: Array) -> _Solved:
-        """Fit sinusoids of each frequency and decay."""
-        turning = np.exp(1j * np.outer(omegas, self.time))
-        fading = np.exp(-np.outer(self.time, decays))
-        plain = np.sum(fading**2, axis=0)
-        twice = turning**2 @ fading**2
-        mixed = [turning @ (fading * x[:, None]) for x in (*self._straight.T, self._left)]
-        *overlaps, right = mixed
+    def solve(self, tried: _Sinusoids) -> _Solved:
+        """Fit sinusoids."""
+        omegas, decays, plain, twice = tried.omegas, tried.decays, tried.plain, tried.twice
+        *overlaps, right = (
+            tried.turning @ (tried.fading * x[:, None])
+            for x in (*self._straight.T, self._left))
         one = 0.5 * (plain + twice.real) - sum(x.real**2 for x in overlaps)
         two = 0.5 * (plain - twice.real) - sum(x.imag**2 for x in overlaps)
         cross = 0.5 * twice.imag - sum(x.real * x.imag for x in overlaps)
@@ -183,11 +209,26 @@ class _Problem:
         return np.asarray(left - self._straight @ (self._straight.T @ left))
 
 
+def _refined(problem: _Problem, solved: _Solved) -> _Solved:
+    """Add fits about the best one of a grid."""
+    omegas, decays = np.unique(solved.omega), np.unique(solved.decay)
+    width, spread = float(omegas[1] - omegas[0]), float(decays[1])
+    parts = [solved]
+    for _ in range(_ROUNDS):
+        best = _Solved.all(parts).best
+        parts.append(problem.solve(_Sinusoids(
+            problem.time,
+            np.clip(best.omega + width * np.linspace(-1.0, 1.0, _REFINED), omegas[0], omegas[-1]),
+            np.clip(best.decay + spread * np.linspace(-2.0, 2.0, 5), 0.0, decays[-1]))))
+        width, spread = 2.0 * width / (_REFINED - 1), 0.5 * spread
+    return _Solved.all(parts)
+
+
 def _bounds(problem: _Problem, tried: _Solved, searched: float) -> Fit:
     """Return the figures of the best fit, and their bounds by all that are possible."""
     count = len(problem.time)
     place = int(np.argmin(tried.squares))
-    least = float(tried.squares[place])
+    least = tried.least
     left = problem.residuals(tried.best, tried.pair[:, place])
     together = _together(left)
     freedom = max(count - _FITTED, 1)
