@@ -1,5 +1,7 @@
 """Two planners, plants or drivers of one joint are noticed, refused and named."""
 
+import json
+
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import pytest
 from sensor_msgs.msg import JointState
@@ -8,6 +10,7 @@ from hmsa_ros.cli import main
 from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.status import Verdict
 from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes.conversions import to_trajectory
 from hmsa_ros.nodes.planner import PlannerNode
 from hmsa_ros.nodes.plant import PlantNode
 from hmsa_ros.watch.listener import Listener
@@ -94,6 +97,29 @@ def test_planner_that_is_not_active_yet_is_named_by_who_sends(serve, capfd, chan
         getattr(served.nodes[0], f'trigger_{name}')()
     assert main(['send', '1.1:0.1']) in (1, 2)
     assert f'hmsa: error: {sentence}' in capfd.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_request_that_no_planner_took_is_named_by_those_who_read_the_bag(
+        start, ros, tmp_path, capsys):
+    folder = tmp_path / 'run'
+    start.hmsa('planner', '--ros-args', '-p', 'autostart:=false')
+    start.hmsa('plant', '--ros-args', '-p', 'publish_rate:=1000.0')
+    recorder = start.hmsa('recorder', '--ros-args', '-p', f'storage.uri:={folder}')
+    asked = endpoints.publisher(ros.node, topics.JOINT_TRAJECTORY, topics.PLANNER)
+    # It subscribes twice: to record a request, and to name it in the summary.
+    ros.spin_until(lambda: asked.get_subscription_count() > 1, 'the recorder')
+    asked.publish(to_trajectory([(1.1, 500_000_000)], 'actuator', frame='mine'))
+    states = ros.collect(JointState, 'joint_states', topics.JOINT_STATES.qos)
+    ros.spin_until(lambda: len(states) > 1000, 'samples')
+    assert recorder.stop() == 0, recorder.output
+    assert main(['bag', 'info', str(folder)]) == 0
+    assert 'note: 1 request on /planner/joint_trajectory has no verdict' in capsys.readouterr().out
+    assert main(['bag', 'info', str(folder), '--json']) == 0
+    assert 'the planner was not active' in json.loads(capsys.readouterr().out)['notes'][0]
+    assert main(['report', str(folder), '--json']) == 0
+    found = json.loads(capsys.readouterr().out)['runs'][0]['setpoints']
+    assert [x['verdict'] for x in found] == ['missed']
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
 """What is in a bag, in figures and in words."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 import datetime
 import json
@@ -121,17 +121,20 @@ def missing_messages(custom_data: Mapping[str, str], key: str) -> dict[str, int]
     return counts if good else None
 
 
-def to_json(summary: BagSummary) -> str:
-    """Return a summary as one JSON object."""
+def to_json(summary: BagSummary, notes: Sequence[str] = ()) -> str:
+    """Return a summary, and what is notable besides, as one JSON object."""
     shown = asdict(summary) | {
         'files': [{'name': name, 'size': size} for name, size in summary.files]}
     return json.dumps(
-        {key: shown.get(key, getattr(summary, key)) for key in _SHOWN}, indent=2, allow_nan=False)
+        {key: shown.get(key, getattr(summary, key)) for key in _SHOWN} | {'notes': list(notes)},
+        indent=2, allow_nan=False)
 
 
-def to_text(summary: BagSummary, *, parameters: bool = False) -> str:
-    """Return a summary in words, several lines; with the parameters if asked."""
-    return '\n'.join(map(printable, _lines(summary, parameters)))
+def to_text(
+        summary: BagSummary, notes: Sequence[str] = (), *, parameters: bool = False) -> str:
+    """Return a summary and what is notable besides in words; with the parameters if asked."""
+    return '\n'.join(map(printable, (
+        *_lines(summary, parameters), *(f'note: {x}' for x in notes))))
 
 
 def _lines(summary: BagSummary, parameters: bool) -> Iterator[str]:

@@ -75,10 +75,15 @@ def run(arguments: argparse.Namespace) -> int:
 def _info(arguments: argparse.Namespace) -> int:
     """Print what is in a bag."""
     from hmsa_ros.bag.info import summarize, to_json, to_text
+    from hmsa_ros.bag.reader import BagReader
+    from hmsa_ros.recordings.answers import unanswered
+
     with progress('reading'):
         summary = summarize(arguments.bag, max_chunk_size=arguments.max_chunk_size)
-    print(to_json(summary) if arguments.json else to_text(
-        summary, parameters=arguments.parameters))
+        notes = tuple(unanswered(
+            BagReader(arguments.bag, max_chunk_size=arguments.max_chunk_size)))
+    print(to_json(summary, notes) if arguments.json else to_text(
+        summary, notes, parameters=arguments.parameters))
     return 0
 
 
