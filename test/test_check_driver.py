@@ -96,7 +96,7 @@ def test_a_broken_class_fails_the_check_that_is_for_it(lab, capsys, name):
 
 def test_without_a_sensor_it_says_what_it_could_not_try(lab, capsys):
     found = lab(capsys, 'blind', 'def read(self, now): return []')
-    assert found['passed']
+    assert failed(found) == []
     assert [x.partition(':')[0] for x in found['untried']] == [
         'samples', 'polarity, and whether the coil is off', 'off_at_close', 'off_at_exception',
         'off_at_sigterm']

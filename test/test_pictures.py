@@ -6,6 +6,7 @@ from pathlib import Path
 import re
 from types import ModuleType
 
+import matplotlib
 from matplotlib.image import imread
 import numpy as np
 from PIL import Image
@@ -189,6 +190,9 @@ def script() -> ModuleType:
 
 DRAWN = script().PICTURES
 SLOW = ('robustness', 'front')
+# With which they were drawn.
+NEWEST = re.findall(
+    r'^matplotlib==([\d.]+)', (ROOT / 'constraints.txt').read_text(encoding='utf-8'), re.M)[-1]
 
 
 def from_afar(path: Path) -> Image.Image:
@@ -204,6 +208,8 @@ def test_the_pictures_of_the_documentation_are_what_the_package_draws_now(
     DRAWN[name](tmp_path / f'{name}.png')
     drawn, shown = (from_afar(x / f'{name}.png') for x in (tmp_path, IMAGES))
     assert drawn.size == pytest.approx(shown.size, abs=2)
+    if matplotlib.__version__ != NEWEST:
+        return  # another one sets text in other places
     shades = [np.asarray(x.resize(shown.size), dtype=np.float64) for x in (drawn, shown)]
     apart = np.abs(shades[0] - shades[1])
     again = f'draw it anew with make pictures ARGS={name}'
