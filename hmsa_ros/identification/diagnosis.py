@@ -1,6 +1,6 @@
 """Whether data hold the parameters, and whether the model holds the data."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.fit import Fit
-from hmsa_ros.identification.noise import autocorrelation, inflation, Whiteness, whiteness
+from hmsa_ros.identification.noise import autocorrelation, Whiteness
 from hmsa_ros.identification.quantities import (
     BRANCHES,
     damping_unit,
@@ -18,9 +18,10 @@ from hmsa_ros.identification.quantities import (
     QUANTITIES,
     quantity_of,
 )
-from hmsa_ros.identification.recording import Recording
-from hmsa_ros.identification.response import complete, respond
+from hmsa_ros.identification.repeats import Repeated
+from hmsa_ros.identification.response import complete
 from hmsa_ros.identification.result import Signature
+from hmsa_ros.identification.start import segments
 from hmsa_ros.model import equations
 from hmsa_ros.model.equations import Array
 
@@ -30,13 +31,12 @@ _RELATIVE = 0.25
 _LOOSE, _SMALL_STRESS = 10.0, 0.02
 # Components of a direction below this share of the largest are left out.
 _NAMED = 0.2
-# A signature counts from this share of the residuals and this many deviations on.
-_SHARE, _DEVIATIONS = 0.02, 4.5
 # Residuals in motion this much above those at rest are of the model, not of the sensor.
 _IN_MOTION = 2.0
 _FEWEST_PARTS = 8
 _OUT = 0.5  # weight below which a sample does not count
 _SOON = 10  # samples after a change of level
+_CHANCE = 2e-3  # below it no chance makes residuals repeat
 _NUMERICAL = 1e-6  # residuals below this are those of the integration
 DISTANT = 0.1  # residual over motion from which on nothing was fitted
 # What soft actuators have, with a wide margin, in SI, and the power of the time in it.
@@ -143,114 +143,11 @@ def _listed(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f'{", ".join(names[:-1])} and {names[-1]}'
 
 
-def _columns(fit: Fit) -> Iterator[tuple[str, Array]]:
-    """Yield directions of the residuals that stand for something the model leaves out."""
-    recording, time = fit.recording, fit.recording.time
-    values = complete(fit.values, fit.free)
-    names = [x for x in _WORDS if x not in fit.free]
-    words = [_WORDS[x] for x in names]
-    if 'viscoelastic_ratio' not in fit.free and not values['viscoelastic_ratio']:
-        # Branches that hold nothing, all in one simulation.
-        span = float(time[-1] - time[0])
-        for (ratio, tau), seconds in zip(
-                BRANCHES, (2.0 * values['time_unit'], 0.03 * span, 0.3 * span), strict=True):
-            names.append(ratio)
-            words.append(f'creep with a time of {seconds:.2g} s')
-            values[tau] = seconds
-    if names:
-        response = respond(recording, values, names)
-        columns = np.zeros((len(names), len(time))) if response is None else response.jacobian.T
-        yield from zip(words, columns, strict=True)
-    yield 'drift of the sensor or the temperature', time - 0.5 * (time[0] + time[-1])
-    levels = recording.levels
-    signs = np.sign(np.diff(levels, prepend=levels[0]))
-    for i in range(1, len(signs)):
-        signs[i] = signs[i] or signs[i - 1]
-    place = np.searchsorted(recording.level_times, time, side='right').clip(1) - 1
-    if len(set(signs[place].tolist()) - {0.0}) > 1:
-        yield 'hysteresis: rest depends on whether the level was raised or lowered', signs[place]
-
-
-_WORDS = {
-    'coil_time_constant': 'lag of the coil', 'sensor_latency': 'latency of the sensor'}
-
-
-def signatures(fit: Fit, found: Whiteness) -> tuple[Signature, ...]:
-    """
-    Look in the residuals for what the model leaves out; the largest comes first.
-
-    Each candidate is a direction; what the free parameters could do of it is taken off first. Its
-    size is held against the noise that would be left without it.
-    """
-    root = fit.root
-    base = root[:, None] * np.hstack([fit.response.jacobian, fit.response.by_switch])
-    base = base / np.maximum(np.linalg.norm(base, axis=0), 1e-300)
-    gram = base.T @ base
-    inverse = np.linalg.inv(gram + 1e-13 * np.trace(gram) * np.eye(len(gram)))
-    residual = root * fit.residual
-    total = float(residual @ residual)
-    quantum = fit.recording.quantum
-    results = []
-    for name, column in _columns(fit):
-        direction = root * column
-        norm = float(np.linalg.norm(direction))
-        for _ in range(2):
-            direction = direction - base @ (inverse @ (base.T @ direction))
-        if norm == 0.0 or float(np.linalg.norm(direction)) < 1e-6 * norm or total == 0.0:
-            continue
-        direction /= np.linalg.norm(direction)
-        size = float(direction @ residual)
-        rest = residual - size * direction
-        spread = float(np.linalg.norm(rest)) / math.sqrt(max(len(rest) - len(fit.free) - 1, 1))
-        factor = 1.0 if found.white else inflation(direction, whiteness(rest))
-        deviations = abs(size) / max(spread * factor, 1e-300)
-        share = size * size / total
-        results.append(Signature(name, share, deviations, bool(
-            share > _SHARE and deviations > _DEVIATIONS
-            and abs(size) / math.sqrt(len(residual)) > 0.5 * quantum)))
-    if fit.recording.earlier:
-        # Switches at unknown times look like lag and latency, and stand for both.
-        results = [x for x in results if 'coil' not in x.name and 'latency' not in x.name]
-    results += _jitter(fit)
-    if not found.white:
-        results += _second_mode(fit)
-    return tuple(sorted(results, key=lambda x: (-x.found, -x.share)))
-
-
-def _jitter(fit: Fit) -> list[Signature]:
-    """Look for residuals that grow with the rate: stamps that are not those of the exposure."""
-    if fit.scale < _NUMERICAL:
-        return []
-    keep = fit.weights > 0.0
-    # A device that stamps evenly can be mended; of other stamps the errors are a part of the fit.
-    counted = fit.residual if _even(fit.recording) else fit.root * fit.residual
-    weighted = counted[keep]
-    squares, speed = weighted ** 2, fit.response.rate[keep] ** 2
-    centred = speed - np.mean(speed)
-    variance = float(centred @ centred)
-    if variance == 0.0 or not np.any(squares):
-        return []
-    slope = float(centred @ squares) / variance
-    rest = squares - np.mean(squares) - slope * centred
-    deviations = slope / math.sqrt(
-        max(float(np.sum((centred * rest) ** 2)), 1e-300)) * variance
-    share = max(slope * float(np.mean(speed)) / float(np.mean(squares)), 0.0)
-    near = autocorrelation(weighted)[1]
-    error = math.sqrt(max(slope, 0.0))
-    return [Signature(
-        f'jitter of the stamps of {error:.2g} s rms', min(share, 1.0), max(deviations, 0.0),
-        bool(share > 0.5 and deviations > _DEVIATIONS and abs(near) < 0.5))]
-
-
-def _even(recording: Recording) -> bool:
-    gaps = np.diff(recording.time)
-    return bool(np.max(gaps) <= 1.5 * np.min(gaps))
-
-
-def _second_mode(fit: Fit) -> list[Signature]:
+def second_mode(fit: Fit) -> list[Signature]:
     """Look for one sharp frequency in the residuals, of evenly spaced samples."""
     time = fit.recording.time
-    if not _even(fit.recording):
+    gaps = np.diff(time)
+    if np.max(gaps) > 1.5 * np.min(gaps):
         return []
     power = np.abs(np.fft.rfft(fit.residual * fit.weights)) ** 2
     power = power[3:]
@@ -262,14 +159,19 @@ def _second_mode(fit: Fit) -> list[Signature]:
     # Fisher's g: the chance of the largest of m exponential shares.
     chance = len(power) * math.exp(-len(power) * float(power[place]) / float(np.sum(power)))
     frequency = (place + 3) / (float(np.mean(np.diff(time))) * len(time))
-    group = group_of(fit.values)
-    own = float(equations.natural_frequency(group.rest, group)) / complete(
-        fit.values, fit.free)['time_unit'] / (2.0 * math.pi)
+    own = frequency_of(fit)
     apart = not 0.5 < frequency / own < 2.0
     return [Signature(
         f'a second mode at {frequency:.4g} Hz', share,
         math.sqrt(max(-2.0 * math.log(max(chance, 1e-300)), 0.0)),
         bool(share > 0.3 and chance < 1e-6 and apart and frequency > own))]
+
+
+def frequency_of(fit: Fit) -> float:
+    """Return the frequency in Hz at which it rings about rest."""
+    group = group_of(fit.values)
+    return float(equations.natural_frequency(group.rest, group)) / complete(
+        fit.values, fit.free)['time_unit'] / (2.0 * math.pi)
 
 
 def in_motion(fit: Fit) -> float:
@@ -337,7 +239,8 @@ def check_plausible(fit: Fit, unknown: Sequence[str] = ()) -> None:
             f'the actuator in --params-file{hint}')
 
 
-def misfit(fit: Fit, found: Whiteness, marks: Sequence[Signature]) -> str:
+def misfit(
+        fit: Fit, found: Whiteness, marks: Sequence[Signature], alike: Repeated | None) -> str:
     """Return why the model is rejected, with the figures; empty if it is not."""
     motion = float(np.std(fit.recording.stretch))
     figures = (
@@ -362,6 +265,11 @@ def misfit(fit: Fit, found: Whiteness, marks: Sequence[Signature]) -> str:
             f'{lost} samples right after changes of level are not those of the model, which '
             f'leaves {figures} elsewhere: the motion itself is not described; are the levels '
             'at their true times, and are enough samples in motion?')
+    if alike is not None:
+        return '' if alike.p_value > _CHANCE else (
+            f'the model leaves {figures}, and {alike.size:.2g} of them rms, after equal changes '
+            f'of level the same (by chance with a probability of {alike.p_value:.2g}): something '
+            'acts that the model does not have; compare --report')
     ratio = in_motion(fit)
     if not found.white and ratio > _IN_MOTION and fit.recording.quantum == 0.0 and (
             abs(float(found.autocorrelation[1])) > 0.3):
@@ -373,9 +281,38 @@ def misfit(fit: Fit, found: Whiteness, marks: Sequence[Signature]) -> str:
 
 def _remedy(seen: Sequence[Signature]) -> str:
     """Word which parameters to free for what explains nearly as much as the first."""
-    names = [
-        name for word, name in (
-            ('creep', 'viscoelastic_ratio,viscoelastic_time'),
-            ('coil', 'coil_time_constant'), ('latency', 'sensor_latency'))
-        if any(word in x.name and x.share > 0.8 * seen[0].share for x in seen)]
-    return f'; add {" or ".join(names)} to --free' if names else ''
+    names = dict.fromkeys(
+        x.remedy for x in seen if x.remedy and x.share > 0.8 * seen[0].share)
+    lines = ' or '.join(f'--free +{x.replace(",", ",+")}' for x in names)
+    return f'; try {lines}' if lines else ''
+
+
+def cost(fit: Fit, marks: Sequence[Signature], alike: Repeated | None) -> float:
+    """Return what the model lacks of the motion, peak to peak of a swing, over a step."""
+    if alike is not None and alike.p_value <= _CHANCE:
+        return alike.cost
+    share = max((x.share for x in marks if x.found), default=0.0)
+    ends = [float(fit.response.stretch[end - 1]) for _, end, _, _ in segments(fit.recording, 1)]
+    steps = np.abs(np.diff(ends))
+    step = float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 1.0
+    rms = float(np.sqrt(np.mean((fit.root * fit.residual) ** 2)))
+    return 2.0 * math.sqrt(2.0 * share) * rms / step
+
+
+def of_gain(considered: Array, inverse: Array, deviation: float, free: Sequence[str]) -> str:
+    """Return what a gain of the sensor may do that does not show."""
+    ratio = np.sqrt(np.diag(considered) / np.diag(inverse)) / deviation
+    place = int(np.argmax(ratio))
+    return (
+        f'the gain of the sensor is not given, and does not show in this recording: the intervals '
+        f'hold an error of 2 %, which moves {free[place]} by {ratio[place]:.2g} deviations; '
+        'calibrate the sensor, and give --known stretch_gain=1+-0.001')
+
+
+def alike(best: Fit, others: Sequence[Fit]) -> str:
+    """Return which frequencies fit the samples alike, and what to record instead."""
+    frequencies = sorted(frequency_of(x) for x in (best, *others))
+    return (
+        f'these frequencies fit alike: {_listed([f"{x:.4g} Hz" for x in frequencies])}; record '
+        f'at more than {2.0 * frequencies[-1]:.3g} samples per second, or give a --params-file '
+        'whose shear_modulus and density are known, and free what is not')

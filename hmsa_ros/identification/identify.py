@@ -9,8 +9,9 @@ from numpy.typing import ArrayLike
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification import diagnosis
-from hmsa_ros.identification.fit import Fit, fit, LEAST_SCALE, loss, moved, robust_scale
-from hmsa_ros.identification.noise import errors_of_stamps, hinted, whiteness, widening
+from hmsa_ros.identification.departures import dead_band, departures
+from hmsa_ros.identification.fit import Fit, fit, LEAST_SCALE, moved, robust_scale
+from hmsa_ros.identification.noise import errors_of_stamps, whiteness, widening
 from hmsa_ros.identification.quantities import (
     BRANCHES,
     check_free,
@@ -23,39 +24,25 @@ from hmsa_ros.identification.quantities import (
     modulus_of,
     QUANTITIES,
     quantity_of,
+    STATIC,
     to_coordinate,
     values_of,
 )
 from hmsa_ros.identification.recording import Recording
+from hmsa_ros.identification.repeats import repeated
 from hmsa_ros.identification.response import complete, respond
 from hmsa_ros.identification.result import Estimate, Identification, Verdict
-from hmsa_ros.identification.start import deviations, scan, segments, starts
+from hmsa_ros.identification.search import rivals, search
+from hmsa_ros.identification.start import deviations, segments
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
 
-# Of these, each does what an offset of the stamps does.
-_DELAYS = {'sensor_latency', 'coil_time_constant'}
-# Residuals this near to the scatter of their differences are white enough for a first look.
-_NEAR_WHITE = 1.5
-# Neighbours that are both outliers, as a share of all, from which on they may be motion.
-_ADJACENT = 0.002
-# Simulations for each of the starts; the best one goes on. Once there is a fit, the others get
-# fewer, and the rest only if the loss is within this factor of the best.
-_FIRST_PASSES, _FEW_PASSES, _PROMISING = 25, 8, 4.0
-# A time unit seen in the data is tried before the others up to this factor from the given one.
-_FAR = 4.0
-# Outliers so unlikely to lie in motion by chance make a fit one to go on from.
-_DOUBT = 0.05
-# As many fits at one optimum end the search.
-_ENOUGH = 2
 # Share of what is allowed from which on a deviation is looked at twice.
 _NEARLY_LOST = 0.3
 # Times that the errors of the stamps are estimated anew.
 _MOST_SPREADS = 3
 # Probability of residuals to be white below which no chance makes them look like this.
 _CERTAIN = 1e-4
-# Fits within this share of the deviations, or of the scale, are one optimum.
-_SAME = 0.02
 # A run whose fastest motion after a change of level is this much slower than a step's is shaped.
 _SHAPED = 0.15
 
@@ -64,7 +51,8 @@ def identify(
         time: ArrayLike | Recording, stretch: ArrayLike | None = None,
         level_times: ArrayLike | None = None, levels: ArrayLike | None = None, *,
         free: Sequence[str] = DEFAULT_FREE, actuator: ActuatorParameters | None = None,
-        known: Mapping[str, float] | None = None, slew_limit: float = math.inf
+        known: Mapping[str, float] | None = None,
+        uncertain: Mapping[str, float] | None = None, slew_limit: float = math.inf
 ) -> Identification:
     """
     Find the parameters of an actuator in a recording of its motion.
@@ -82,7 +70,10 @@ def identify(
     actuator : ActuatorParameters, optional
         The block as far as it is known, its law included; default the paper's.
     known : mapping of str to float, optional
-        Of coil and sensor, where they are not the defaults.
+        What is known besides, in SI: of coil and sensor, or of the block. A gain of the sensor
+        that is not among these may be 2 % off: where that would not show, intervals hold it.
+    uncertain : mapping of str to float, optional
+        Standard deviations of what is known, by name; intervals hold what they do.
     slew_limit : float
         Rate in T/s at which the amplifier ramps; infinite for steps.
 
@@ -114,7 +105,8 @@ def identify(
             np.atleast_1d(np.asarray(levels, dtype=np.float64)), slew_limit,
             coordinate=actuator.coordinate)
     free = check_free(free, actuator.law)
-    values = complete(values_of(actuator, known), ())
+    known, uncertain = known or {}, uncertain or {}
+    values = _values(actuator, known, uncertain, free)
     if actuator.law is not None and set(free) & set(constants_of(actuator.law)):
         values |= constant_values(actuator.law, actuator.shear_modulus)
     sought = [time for ratio, time in BRANCHES if ratio in free]
@@ -123,7 +115,7 @@ def identify(
         span = 0.2 * float(recording.time[-1] - recording.time[0])
         values |= {x: y for x, y in zip(sought, np.geomspace(
             min(2.0 * values['time_unit'], 0.2 * span), span, len(sought)).tolist(), strict=True)
-            if x in free and x not in (known or {})}
+            if x in free and x not in known}
     if 'chain_limit' in free:
         # Endless chains are no start: the derivative by their inverse is taken of the limit.
         values['chain_limit'] = min(values['chain_limit'], 1e9)
@@ -137,8 +129,30 @@ def identify(
         raise BadInputError(
             f'{recording.label} has {len(recording.time)} samples for {len(free)} free '
             f'parameters: expected {2 * len(free)} or more')
-    best, tried, agreed = _search(recording, values, free)
-    return _conclude(*_with_errors_of_stamps(best), tried, agreed)
+    best, tried, agreed = search(recording, values, free)
+    best, others = rivals(best)
+    return _conclude(
+        *_with_errors_of_stamps(best), others, tried, agreed,
+        {**dict.fromkeys(known), **uncertain})
+
+
+def _values(
+        actuator: ActuatorParameters, known: Mapping[str, float],
+        uncertain: Mapping[str, float], free: Sequence[str]) -> dict[str, float]:
+    """Return start values of all that there is, with what is known."""
+    actuator = replace(
+        actuator, half_length=known.get('half_length', actuator.half_length),
+        half_thickness=known.get('half_thickness', actuator.half_thickness))
+    both = [x for x in {**known, **uncertain} if x in free and x in uncertain]
+    bad = [x for x, y in uncertain.items() if not 0.0 <= y < math.inf]
+    if both or bad:
+        raise BadInputError(
+            f'{both[0]} is free and known to a standard deviation: expected one of the two'
+            if both else
+            f'the standard deviation of {bad[0]} is {uncertain[bad[0]]:g}: expected a finite '
+            'number of at least 0')
+    values = values_of(actuator, {x: y for x, y in known.items() if x not in GEOMETRY})
+    return complete(values, ('time_unit',) if 'time_unit' in known else ())
 
 
 def _begins_at_rest(recording: Recording) -> bool:
@@ -159,57 +173,6 @@ def _begins_at_rest(recording: Recording) -> bool:
                initial=math.inf) / math.sqrt(6.0))) if len(tails) else 0.0
     quiet = max(quiet, 0.5 * recording.quantum, 1e-6)
     return float(np.std(before)) < 4.0 * quiet
-
-
-def _good(found: Fit) -> bool:
-    """Whether a fit leaves little but white noise, and outliers here and there."""
-    differences = np.diff(found.residual)
-    out = found.weights < 0.5
-    return bool(
-        found.converged
-        and found.scale < _NEAR_WHITE * robust_scale(differences) / math.sqrt(2.0)
-        # Of few samples a level even what is far off differs from one to the next.
-        and found.scale < diagnosis.DISTANT * float(np.std(found.recording.stretch))
-        and np.count_nonzero(out[1:] & out[:-1]) <= _ADJACENT * len(out)
-        and not diagnosis.mistaken(found, _DOUBT))
-
-
-def _search(
-        recording: Recording, values: Mapping[str, float], free: Sequence[str]
-) -> tuple[Fit, int, int]:
-    """Return the best of the fits, how many there are, and how many ended there."""
-    found: list[Fit] = []
-
-    def tried(candidates: Sequence[Mapping[str, float]]) -> bool:
-        for candidate in candidates:
-            few = any(x.converged for x in found)
-            one = fit(recording, candidate, free, most=_FEW_PASSES if few else _FIRST_PASSES)
-            if few and one is not None and not one.converged and _promising(found, one):
-                one = fit(recording, one.values, free, most=_FIRST_PASSES)
-            if one is not None:
-                found.append(one)
-                if _good(one) or _settled(found):
-                    return True
-        return False
-
-    given = starts(recording, values, free)
-    nearest = min((given[0], given[-1]), key=lambda x: _miss(recording, x))
-    # A frequency far from that of the values given may be one of the noise.
-    near = abs(math.log(nearest['time_unit'] / values['time_unit'])) < math.log(_FAR)
-    if not near or not tried([nearest]):
-        # All time units, and what else was seen in the data; the likeliest first.
-        others = [*scan(recording, values, free),
-                  *(x for x in given if not near or x is not nearest)]
-        tried(sorted(others, key=lambda x: _miss(recording, x)))
-    if not found:
-        raise BadInputError(
-            f'no start value leads to a motion that {recording.label} could be compared with: '
-            'expected levels in T and an actuator as --params-file describes it; a level may be '
-            'more than it can hold')
-    best, agreed = _best(found)
-    if not best.converged:
-        best = fit(recording, best.values, free) or best
-    return best, len(found), agreed
 
 
 def _with_errors_of_stamps(best: Fit) -> tuple[Fit, Array]:
@@ -234,43 +197,18 @@ def _with_errors_of_stamps(best: Fit) -> tuple[Fit, Array]:
     return found, errors_of_stamps(found.jacobian, found.residual, found.response.rate)[1]
 
 
-def _best(found: Sequence[Fit]) -> tuple[Fit, int]:
-    """Return the likeliest fit, and how many ended there."""
-    scale = min(x.scale for x in found)
-    losses = [loss(x.residual, scale) for x in found]
-    agreed = sum(x < (1.0 + _SAME) * min(losses) for x in losses)
-    return found[int(np.argmin(losses))], agreed
+def _conclude(
+        best: Fit, variance: Array, others: Sequence[Fit], tried: int, agreed: int,
+        given: Mapping[str, float | None]) -> Identification:
+    """
+    Return the result of a fit.
 
-
-def _promising(found: Sequence[Fit], one: Fit) -> bool:
-    """Whether a fit that has not ended may still become the likeliest."""
-    best, _ = _best([x for x in found if x.converged])
-    return loss(one.residual, best.scale, convex=True) < _PROMISING * loss(
-        best.residual, best.scale, convex=True)
-
-
-def _settled(found: Sequence[Fit]) -> bool:
-    """Whether several starts ended at the likeliest fit, though it leaves more than noise."""
-    best, agreed = _best(found)
-    return (
-        agreed >= _ENOUGH and best.converged
-        and best.scale < diagnosis.DISTANT * float(np.std(best.recording.stretch))
-        and not diagnosis.mistaken(best, _DOUBT))
-
-
-def _miss(recording: Recording, candidate: Mapping[str, float]) -> float:
-    """Return how far the motion of some values is from the recorded one in the mean."""
-    response = respond(recording, candidate, (), rtol=1e-4)
-    return math.inf if response is None else float(
-        np.mean(np.abs(recording.stretch - response.stretch)))
-
-
-def _conclude(best: Fit, variance: Array, tried: int, agreed: int) -> Identification:
-    """Return the result of a fit, with the variance of its coordinates where stamps may be off."""
+    With it come the variance of its coordinates where stamps may be off, others that are nearly as
+    good, and what the caller knows, with standard deviations.
+    """
     root, recording = best.root, best.recording
     weighted = root * best.residual
-    counted = float(np.sum(best.weights))
-    freedom = max(counted - len(best.free), 1.0)
+    freedom = max(float(np.sum(best.weights)) - len(best.free), 1.0)
     deviation = max(math.sqrt(
         float(weighted @ weighted) / freedom), LEAST_SCALE)
     found = whiteness(weighted)
@@ -278,27 +216,34 @@ def _conclude(best: Fit, variance: Array, tried: int, agreed: int) -> Identifica
     columns = root[:, None] * best.jacobian
     correlated = widening(columns, weighted, inverse, found)
     variance = variance + _blurred(best, deviation, columns, inverse)
-    hint: Array = np.zeros(len(best.free))
-    if not recording.earlier and not _DELAYS.intersection(best.free):
-        hint = hinted(root * best.response.rate, columns, weighted, inverse, found)
+    missing = departures(best, found, inverse, deviation, given)
     # A hint that becomes a proof rejects the model: it does not make a recording a weak one.
     held, factors = (
         correlated * np.sqrt(np.maximum(x / np.diag(inverse) / deviation ** 2, 1.0))
-        for x in (variance, variance + hint))
+        for x in (variance, variance + missing.hint))
     bent = _bent(best, inverse, deviation, held)
     held, factors = bent * held, bent * factors
-    covariance = inverse * deviation ** 2 * np.outer(factors, factors)
+    covariance = inverse * deviation ** 2 * np.outer(factors, factors) + missing.considered
     weak = diagnosis.weakness(best, deviation, held)
-    marks = diagnosis.signatures(best, found)
-    reason = diagnosis.misfit(best, found, marks)
+    alike = repeated(
+        best, 1.0 / diagnosis.frequency_of(best), dead_band(best, deviation))
+    marks = missing.signatures
+    if not found.white:
+        marks = tuple(sorted(
+            [*marks, *diagnosis.second_mode(best)], key=lambda x: (-x.found, -x.share)))
+    reason = diagnosis.misfit(best, found, marks, alike)
     verdict: Verdict = 'model_rejected'
     distant = diagnosis.distant(best, found)
-    if not distant:
+    lost = set(best.free) if distant else set(weak.names if weak else ())
+    if not distant and not others:
         diagnosis.check_plausible(best, weak.names if weak else ())
     if weak is not None and not distant:
         # What the model lacks widens all intervals, and may be why nothing is held.
         verdict = 'not_identifiable'
         reason = f'{weak.words}; besides, {reason}' if reason else weak.words
+    elif others and not reason:
+        verdict, reason = 'not_identifiable', diagnosis.alike(best, others)
+        lost = set(best.free) - STATIC
     elif not reason and not best.converged:
         reason = (
             f'the search did not come to an end from {tried} starts: the best leaves residuals '
@@ -308,19 +253,20 @@ def _conclude(best: Fit, variance: Array, tried: int, agreed: int) -> Identifica
         reason = (
             f'{len(best.free)} parameters from {len(recording.time)} samples with a noise of '
             f'{deviation:.3g}')
-    lost = set(best.free) if verdict == 'model_rejected' and distant else set(
-        weak.names if weak else ())
     # A beam's modulus is known as Young's.
     reason = reason.replace('shear_modulus', modulus_of(best.values.get('law'))[0])
     parameters, matrix = _estimates(best, covariance, freedom, lost)
     outliers = int(np.count_nonzero(best.weights == 0.0))
-    warnings = (*recording.notes, *_warnings(
-        best, deviation, correlated, outliers, found.white))
+    warnings = [*recording.notes, *_warnings(
+        best, deviation, correlated, outliers, found.white)]
+    if missing.hidden:
+        warnings.append(diagnosis.of_gain(missing.considered, inverse, deviation, best.free))
     return Identification(
-        verdict, reason, warnings, parameters, best.free, matrix, deviation,
+        verdict, reason, tuple(warnings), parameters, best.free, matrix, deviation,
         float(np.sqrt(np.mean(best.residual ** 2))), len(recording.time), outliers, recording,
         best.response.stretch, best.residual, best.weights, best.spread, found, marks,
-        float(np.max(correlated)), complete(best.values, best.free), tried, agreed)
+        float(np.max(correlated)), complete(best.values, best.free), tried, agreed,
+        diagnosis.cost(best, marks, alike))
 
 
 def _stamp_error(best: Fit, deviation: float) -> float:

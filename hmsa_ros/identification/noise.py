@@ -23,9 +23,6 @@ _LAGS = 20
 _WINDOW = 6.0
 # Deviation at the fastest motion over that at rest, as tried.
 _LARGEST_SPREADS = np.geomspace(0.5, 200.0, 13)
-# Median of chi-squared with one degree of freedom: by so much the square of a deviation is too
-# large in the median.
-_MEDIAN = 0.455
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,29 +140,6 @@ def widening(jacobian: Array, residual: Array, inverse: Array, found: Whiteness)
     largest = np.maximum(np.maximum(by_noise, by_score), plain)
     factors: Array = np.sqrt(largest / np.maximum(plain, 1e-300))
     return factors
-
-
-def hinted(
-        column: Array, jacobian: Array, residual: Array, inverse: Array, found: Whiteness
-) -> Array:
-    """
-    Return the variance by what the residuals hint at, though too little to prove it.
-
-    An effect outside the model moves the estimates. How far it would is known from the residuals,
-    as far as it shows there; the interval is widened to hold the estimates with and without it.
-    The column is its effect on the samples, weighted; the rest is as for `widening`. What is
-    returned is to be added to the variances of the coordinates.
-    """
-    moved = inverse @ (jacobian.T @ column)
-    rest = column - jacobian @ moved
-    norm = float(rest @ rest)
-    if norm <= 1e-9 * float(column @ column):
-        return np.zeros(len(moved))
-    size = float(rest @ residual) / norm
-    variance = float(residual @ residual) / max(len(residual) - len(moved), 1) / norm
-    square = size ** 2 - _MEDIAN * variance * inflation(rest, found) ** 2
-    added: Array = moved ** 2 * max(square, 0.0)
-    return added
 
 
 def _sum_of_lags(columns: Array, weights: Array) -> Array:

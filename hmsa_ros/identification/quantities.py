@@ -75,6 +75,8 @@ _OF_LAWS = {
 #: Free unless others are named.
 DEFAULT_FREE = (
     'shear_modulus', 'damping_coefficient', 'chain_limit', 'remanence', 'stretch_bias')
+#: What levels at rest alone hold, if the frequency is not known.
+STATIC = {'chain_limit', 'stretch_bias', 'stretch_gain', 'initial_stretch'}
 #: Fields of `ActuatorParameters` that are measured with a ruler, and are never sought.
 GEOMETRY = ('half_length', 'half_thickness')
 

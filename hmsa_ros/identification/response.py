@@ -173,19 +173,21 @@ class Setup:
 
 def respond(
         recording: Recording | Course, values: Mapping[str, float], free: Sequence[str], *,
-        rtol: float = RTOL, shifts: Array | None = None) -> Response | None:
+        rtol: float = RTOL, shifts: Array | None = None, more: Sequence[int] = ()
+) -> Response | None:
     """
     Simulate what the sensor would have shown; None if the motion meets the limits of the chains.
 
     The motion begins at rest at its first level, or else with ``initial_stretch`` and
     ``initial_rate`` at the first sample. Shifts, shape (u,), say by how much in s the uncertain
-    switches are later than recorded; by default half of what they may be earlier.
+    switches are later than recorded; by default half of what they may be earlier. More places of
+    the motion to differentiate by are columns of the Jacobian, after those of the free parameters.
     """
     try:
         values = complete(values, free)
     except BadInputError:
         return None
-    setup = Setup.of(values, free)
+    setup = Setup.of(values, free, more)
     theta, material, wanted = setup.theta, setup.material, setup.wanted
     branches = setup.branches
     times = recording.time - values['sensor_latency']

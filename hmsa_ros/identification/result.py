@@ -57,6 +57,8 @@ class Signature:
         Its size in standard deviations.
     found : bool
         Whether it is there.
+    remedy : str
+        What to add to the free parameters for it; empty if there is nothing.
 
     """
 
@@ -64,6 +66,7 @@ class Signature:
     share: float
     deviations: float
     found: bool
+    remedy: str = ''
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +109,8 @@ class Identification:
         Of all quantities, and the law, at the optimum, whatever the verdict.
     starts, agreed : int
         Start values that were tried, and how many of them ended at this optimum.
+    cost : float
+        What the model lacks of the motion, peak to peak, over a step; 0 if nothing shows.
 
     """
 
@@ -130,6 +135,7 @@ class Identification:
     values: Mapping[str, Any]
     starts: int
     agreed: int
+    cost: float
 
     @property
     def actuator(self) -> ActuatorParameters:
@@ -181,4 +187,4 @@ class Identification:
                 'lag_one': float(self.whiteness.autocorrelation[1]),
                 'p_value': self.whiteness.p_value},
             'signatures': [asdict(x) for x in self.signatures],
-            'starts': self.starts, 'agreed': self.agreed}
+            'starts': self.starts, 'agreed': self.agreed, 'cost': self.cost}

@@ -246,6 +246,24 @@ def scan(
     return [x for _, x in best]
 
 
+def at_frequencies(
+        recording: Recording, values: Mapping[str, float], free: Sequence[str],
+        frequencies: Array) -> list[dict[str, float]]:
+    """Return start values that ring at frequencies in Hz; none if no time unit is sought."""
+    if not {'shear_modulus', 'density', 'time_unit', *_stresses(values)}.intersection(free):
+        return []
+    found, group = static(recording, values, free), group_of(values)
+    natural = float(equations.natural_frequency(group.rest, group)) / (2.0 * math.pi)
+    critical = float(equations.critical_zeta(group.rest, group))
+    candidates = [
+        _candidate(values, free, natural / x, found) for x in frequencies.tolist()]
+    if 'damping_coefficient' in free:
+        for candidate in candidates:
+            candidate['damping_coefficient'] = (
+                _SCAN_DECAYS[0] * 2.0 * critical * damping_unit(candidate))
+    return candidates
+
+
 def _stresses(values: Mapping[str, Any]) -> list[str]:
     """Return the constants of the law that make its modulus."""
     return [x for x, (constant, _) in constants_of(values.get('law')).items()

@@ -8,8 +8,12 @@
 namespace hmsa {
 // Places in theta; after first_branch gamma and tau of each branch in turn. Beyond all places:
 // constant i of the law is the first plus i, the time at which piece m begins the second plus m.
+// Two forces that no motion has are there to be differentiated by alone: one against the motion
+// whatever its rate, and one with the square of the rate.
 enum Theta { stiffness_of, damping_of, drive_of, force_of, lag_of, stretch_of, rate_of, first_branch };
-constexpr int constant_of = 500, switch_of = 1000;
+constexpr int friction_of = 400, square_of = 401, constant_of = 500, switch_of = 1000;
+// Rate over the fastest frequency at which the friction turns.
+constexpr double soft_rate = 3e-3;
 
 // Phase of the fastest motion over which a quintic interpolates to about 1e-8.
 constexpr double smooth_phase = 0.45;
@@ -60,6 +64,7 @@ template <class C, class System, int NB> struct Response {
     double level, ramp;
     S excess;  // of the field over the line, where the piece began
     double piece_begin, fastest;
+    int rubs, squares;  // places among the derivatives, -1 for none
     Step<S, width> step;
 
     static S plain(double x)
@@ -93,6 +98,11 @@ template <class C, class System, int NB> struct Response {
             });
         a = seeded_at(stiffness_of), damping = seeded_at(damping_of), drive = seeded_at(drive_of);
         force = seeded_at(force_of), lag = seeded_at(lag_of);
+        rubs = squares = -1;
+        each([&](int j, int wanted) {
+            rubs = wanted == friction_of ? j : rubs;
+            squares = wanted == square_of ? j : squares;
+        });
         for (int b = 0; b < NB; b++) {
             ratio[b] = per_time[b] = plain(0);
             if (b < of.branches) {
@@ -110,7 +120,14 @@ template <class C, class System, int NB> struct Response {
     }
     HMSA_INLINE void change(const S *x, double dt, S *by) const
     {
-        const S pull = drive * field(dt) + force;
+        S pull = drive * field(dt) + force;
+        if constexpr (N > 0) {
+            const double v = value(x[1]), soft = soft_rate * fastest;
+            if (rubs >= 0)
+                pull.d[rubs] -= v / sqrt(v * v + soft * soft);
+            if (squares >= 0)
+                pull.d[squares] -= abs(v) * v;
+        }
         by[0] = x[1];
         by[1] = system.acceleration(x[0], x[1], damping, [&](const S &elastic)
             __attribute__((always_inline)) {

@@ -1,0 +1,179 @@
+"""
+What the model may leave out, each as a direction of the residuals.
+
+A direction is what a little of it does to every sample: the derivative of the motion by a lag, a
+friction, a branch of creep. What the free parameters could do of it is taken off. How much of the
+rest is in the residuals says whether it is there, and how far it moves the estimates. Where that
+is not proved but hinted at, intervals hold the estimates with and without it. What leaves nothing
+in the residuals, as a gain that remanence makes up for, is considered: it widens the intervals by
+what it may be (S. F. Schmidt, "Application of state-space methods to navigation problems", 1966).
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from hmsa_ros.identification.fit import Fit
+from hmsa_ros.identification.noise import inflation, Whiteness, whiteness
+from hmsa_ros.identification.quantities import BRANCHES, QUANTITIES
+from hmsa_ros.identification.response import complete, respond
+from hmsa_ros.identification.result import Signature
+from hmsa_ros.model.equations import Array
+from hmsa_ros.motion import theta as places
+
+# A departure counts from this many deviations on, if it is this share of the residuals or moves an
+# estimate by a deviation.
+_DEVIATIONS, _SHARE, _MOVES = 4.5, 0.02, 1.0
+# From this many deviations on intervals hold it.
+_HINT = 2.0
+# Median of chi-squared with one degree of freedom: by so much the square of a deviation is too
+# large in the median.
+_MEDIAN = 0.455
+# What a gain that nobody gave may be off, and the deviation from which on it would not show.
+_GAIN, _HIDDEN_GAIN = 0.02, 0.006
+# Directions need no more than that of the integration.
+_RTOL = 1e-6
+_DELAYS = {'sensor_latency', 'coil_time_constant'}
+# Words, and what to free, by parameter.
+_PARAMETERS = {
+    'coil_time_constant': 'lag of the coil', 'sensor_latency': 'latency of the sensor',
+    'stretch_gain': 'gain of the sensor'}
+_FORCES = {
+    places.FRICTION: 'friction that does not depend on the rate',
+    places.SQUARE: 'damping by the square of the rate'}
+
+
+@dataclass(frozen=True, eq=False)
+class Departure:
+    """What a little of something does."""
+
+    name: str  # in words
+    column: Array  # change of each sample, shape (n,)
+    remedy: str = ''  # what to add to the free parameters
+
+
+def _columns(fit: Fit) -> Iterator[Departure]:
+    recording, time = fit.recording, fit.recording.time
+    values = complete(fit.values, fit.free)
+    # Switches at unknown times look like lag and latency, and stand for both.
+    names = [x for x in _PARAMETERS if x not in fit.free and not (
+        recording.earlier and x in _DELAYS)]
+    made = [(_PARAMETERS[x], x) for x in names]
+    if 'viscoelastic_ratio' not in fit.free and not values['viscoelastic_ratio']:
+        # Branches that hold nothing, all in one simulation.
+        span = float(time[-1] - time[0])
+        for (ratio, tau), seconds in zip(
+                BRANCHES, (2.0 * values['time_unit'], 0.03 * span, 0.3 * span), strict=True):
+            names.append(ratio)
+            made.append((f'creep with a time of {seconds:.2g} s',
+                         'viscoelastic_ratio,viscoelastic_time'))
+            values[tau] = seconds
+    made += [(x, '') for x in _FORCES.values()]
+    response = respond(recording, values, names, rtol=_RTOL, more=tuple(_FORCES))
+    if response is not None:
+        for (name, remedy), column in zip(made, response.jacobian.T, strict=True):
+            yield Departure(name, column, remedy)
+    yield Departure(
+        'drift of the sensor or the temperature', time - 0.5 * (time[0] + time[-1]))
+    levels = recording.levels
+    signs = np.sign(np.diff(levels, prepend=levels[0]))
+    for i in range(1, len(signs)):
+        signs[i] = signs[i] or signs[i - 1]
+    place = np.searchsorted(recording.level_times, time, side='right').clip(1) - 1
+    if len(set(signs[place].tolist()) - {0.0}) > 1:
+        yield Departure(
+            'hysteresis: rest depends on whether the level was raised or lowered', signs[place])
+
+
+@dataclass(frozen=True, eq=False)
+class Departures:
+    """All of them, against the residuals of a fit."""
+
+    signatures: tuple[Signature, ...]  # the largest first
+    hint: Array  # variance of the coordinates by what the residuals hint at, shape (p,)
+    considered: Array  # covariance by what they cannot show, shape (p, p)
+    hidden: bool  # whether a gain that nobody gave is among these
+
+
+def departures(
+        fit: Fit, found: Whiteness, inverse: Array, deviation: float,
+        given: Mapping[str, float | None]) -> Departures:
+    """
+    Hold all that may be missing against the residuals.
+
+    The inverse is that of the information for a noise of 1, the deviation that of a sample. Given
+    are names of what the caller knows, with the standard deviation of it, None for exactly.
+    """
+    root = fit.root
+    base = root[:, None] * np.hstack([fit.response.jacobian, fit.response.by_switch])
+    own = root[:, None] * fit.jacobian
+    scale = np.maximum(np.linalg.norm(base, axis=0), 1e-300)
+    base = base / scale
+    gram = base.T @ base
+    solved = np.linalg.inv(gram + 1e-13 * np.trace(gram) * np.eye(len(gram)))
+    residual = root * fit.residual
+    total = float(residual @ residual)
+    floor = dead_band(fit, deviation)
+    single = np.sqrt(np.diag(inverse)) * deviation
+    hint, considered = np.zeros(len(fit.free)), np.zeros_like(inverse)
+    signatures, hidden = [], False
+    for one in _columns(fit):
+        column = root * one.column
+        direction = column
+        for _ in range(2):
+            direction = direction - base @ (solved @ (base.T @ direction))
+        norm, length = float(np.linalg.norm(direction)), float(np.linalg.norm(column))
+        way = inverse @ (own.T @ column)
+        gain = 'stretch_gain' in one.remedy
+        if gain and 'stretch_gain' not in given and (
+                deviation / max(norm, 1e-300) > _HIDDEN_GAIN):
+            considered += np.outer(way, way) * _GAIN ** 2
+            hidden = True
+        if total == 0.0 or norm <= 3e-5 * length:
+            continue
+        direction = direction / norm
+        size = float(direction @ residual)
+        rest = residual - size * direction
+        spread = float(np.linalg.norm(rest)) / math.sqrt(max(len(rest) - len(fit.free) - 1, 1))
+        spread *= 1.0 if found.white else inflation(direction, whiteness(rest))
+        deviations, share = abs(size) / max(spread, 1e-300), size * size / total
+        moves = abs(size) / norm * np.abs(way)
+        signatures.append(Signature(one.name, share, deviations, bool(
+            deviations > _DEVIATIONS and abs(size) / math.sqrt(len(residual)) > floor
+            and (share > _SHARE or np.max(moves / single) > _MOVES)), one.remedy))
+        # An offset of the stamps is the commonest, and hides best.
+        least = 0.0 if 'latency' in one.name and not _DELAYS.intersection(fit.free) else _HINT
+        if deviations > least:
+            hint = np.maximum(
+                hint, (way / norm) ** 2 * max(size ** 2 - _MEDIAN * spread ** 2, 0.0))
+    for name, std in given.items():
+        if std and name not in fit.free:
+            way = inverse @ (own.T @ (root * _change(fit, name)))
+            considered += np.outer(way, way) * std ** 2
+    return Departures(tuple(sorted(
+        signatures, key=lambda x: (-x.found, -x.share))), hint, considered, hidden)
+
+
+def dead_band(fit: Fit, deviation: float) -> float:
+    """Return the root mean square of what steps of the values may do that noise does not hide."""
+    quantum = fit.recording.quantum
+    if not quantum:
+        return 0.0
+    # The first harmonic of the staircase, smoothed by normal noise.
+    noise = math.sqrt(max((deviation / quantum) ** 2 - 1.0 / 12.0, 0.0))
+    return quantum * min(0.3, math.exp(-2.0 * (math.pi * noise) ** 2) / math.pi)
+
+
+def _change(fit: Fit, name: str) -> Array:
+    """Return what a unit more of a given value does to the samples."""
+    values = complete(fit.values, fit.free)
+    timed = name in QUANTITIES and QUANTITIES[name].unit == 's'
+    little = 1e-3 * abs(values[name]) or (1e-3 * values['time_unit'] if timed else 1e-4)
+    ends = []
+    for change in (little, -little):
+        response = respond(fit.recording, {**fit.values, name: values[name] + change}, ())
+        ends.append(fit.response.stretch if response is None else response.stretch)
+    found: Array = (ends[0] - ends[1]) / (2.0 * little)
+    return found

@@ -1,0 +1,158 @@
+"""The search for the best fit, from as many starts as it takes, and for others as good."""
+
+from collections.abc import Mapping, Sequence
+import math
+
+import numpy as np
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification import diagnosis
+from hmsa_ros.identification.fit import Fit, fit, loss, robust_scale
+from hmsa_ros.identification.recording import Recording
+from hmsa_ros.identification.response import respond
+from hmsa_ros.identification.start import at_frequencies, scan, segments, starts
+
+# Residuals this near to the scatter of their differences are white enough for a first look.
+_NEAR_WHITE = 1.5
+# Neighbours that are both outliers, as a share of all, from which on they may be motion.
+_ADJACENT = 0.002
+# Simulations for each of the starts; the best one goes on. Once there is a fit, the others get
+# fewer, and the rest only if the loss is within this factor of the best.
+_FIRST_PASSES, _FEW_PASSES, _PROMISING = 25, 8, 4.0
+# A time unit seen in the data is tried before the others up to this factor from the given one.
+_FAR = 4.0
+# Outliers so unlikely to lie in motion by chance make a fit one to go on from.
+_DOUBT = 0.05
+# As many fits at one optimum end the search.
+_ENOUGH = 2
+# Fits within this share of the deviations, or of the scale, are one optimum.
+_SAME = 0.02
+# Fewer samples, or fewer of them a period, may be fitted by several frequencies.
+_FEW_SAMPLES, _FEW_A_PERIOD = 200, 2.0
+# Frequencies to start from, the highest in sampling rates.
+_FREQUENCIES, _HIGHEST = 33, 5.0
+# Fits whose chi-squared is this much larger at most are rivals, if their frequencies are this
+# factor apart.
+_RIVAL, _ANOTHER = 10.0, 1.05
+
+
+def _good(found: Fit) -> bool:
+    """Whether a fit leaves little but white noise, and outliers here and there."""
+    differences = np.diff(found.residual)
+    out = found.weights < 0.5
+    return bool(
+        found.converged
+        and found.scale < _NEAR_WHITE * robust_scale(differences) / math.sqrt(2.0)
+        # Of few samples a level even what is far off differs from one to the next.
+        and found.scale < diagnosis.DISTANT * float(np.std(found.recording.stretch))
+        and np.count_nonzero(out[1:] & out[:-1]) <= _ADJACENT * len(out)
+        and not diagnosis.mistaken(found, _DOUBT))
+
+
+def search(
+        recording: Recording, values: Mapping[str, float], free: Sequence[str]
+) -> tuple[Fit, int, int]:
+    """Return the best of the fits, how many there are, and how many ended there."""
+    found: list[Fit] = []
+
+    def tried(candidates: Sequence[Mapping[str, float]]) -> bool:
+        for candidate in candidates:
+            few = any(x.converged for x in found)
+            one = fit(recording, candidate, free, most=_FEW_PASSES if few else _FIRST_PASSES)
+            if few and one is not None and not one.converged and _promising(found, one):
+                one = fit(recording, one.values, free, most=_FIRST_PASSES)
+            if one is not None:
+                found.append(one)
+                if _good(one) or _settled(found):
+                    return True
+        return False
+
+    given = starts(recording, values, free)
+    nearest = min((given[0], given[-1]), key=lambda x: _miss(recording, x))
+    # A frequency far from that of the values given may be one of the noise.
+    near = abs(math.log(nearest['time_unit'] / values['time_unit'])) < math.log(_FAR)
+    if not near or not tried([nearest]):
+        # All time units, and what else was seen in the data; the likeliest first.
+        others = [*scan(recording, values, free),
+                  *(x for x in given if not near or x is not nearest)]
+        tried(sorted(others, key=lambda x: _miss(recording, x)))
+    if not found:
+        raise BadInputError(
+            f'no start value leads to a motion that {recording.label} could be compared with: '
+            'expected levels in T and an actuator as --params-file describes it; a level may be '
+            'more than it can hold')
+    best, agreed = _best(found)
+    if not best.converged:
+        best = fit(recording, best.values, free) or best
+    return best, len(found), agreed
+
+
+def _best(found: Sequence[Fit]) -> tuple[Fit, int]:
+    """Return the likeliest fit, and how many ended there."""
+    scale = min(x.scale for x in found)
+    losses = [loss(x.residual, scale) for x in found]
+    agreed = sum(x < (1.0 + _SAME) * min(losses) for x in losses)
+    return found[int(np.argmin(losses))], agreed
+
+
+def _promising(found: Sequence[Fit], one: Fit) -> bool:
+    """Whether a fit that has not ended may still become the likeliest."""
+    best, _ = _best([x for x in found if x.converged])
+    return loss(one.residual, best.scale, convex=True) < _PROMISING * loss(
+        best.residual, best.scale, convex=True)
+
+
+def _settled(found: Sequence[Fit]) -> bool:
+    """Whether several starts ended at the likeliest fit, though it leaves more than noise."""
+    best, agreed = _best(found)
+    return (
+        agreed >= _ENOUGH and best.converged
+        and best.scale < diagnosis.DISTANT * float(np.std(best.recording.stretch))
+        and not diagnosis.mistaken(best, _DOUBT))
+
+
+def _miss(recording: Recording, candidate: Mapping[str, float]) -> float:
+    """Return how far the motion of some values is from the recorded one in the mean."""
+    response = respond(recording, candidate, (), rtol=1e-4)
+    return math.inf if response is None else float(
+        np.mean(np.abs(recording.stretch - response.stretch)))
+
+
+
+
+def rivals(best: Fit) -> tuple[Fit, list[Fit]]:
+    """
+    Return the best fit, and those of other frequencies that are nearly as good.
+
+    Looked for where samples are few, or fewer than two a period: from frequencies all over the
+    range that they could have come from.
+    """
+    recording = best.recording
+    gap = float(np.median(np.diff(recording.time)))
+    many = diagnosis.frequency_of(best) * gap * _FEW_A_PERIOD < 1.0
+    if many and len(recording.time) >= _FEW_SAMPLES:
+        return best, []
+    longest = max((float(recording.time[end - 1] - recording.time[begin])
+                   for begin, end, _, _ in segments(recording)), default=0.0)
+    if not longest > gap:
+        return best, []
+    found = [best]
+    for start in at_frequencies(recording, best.values, best.free, np.geomspace(
+            1.0 / longest, _HIGHEST / gap, _FREQUENCIES)):
+        one = fit(recording, start, best.free, most=_FEW_PASSES)
+        if one is not None and not one.converged and _promising([best], one):
+            one = fit(recording, one.values, best.free, most=_FIRST_PASSES)
+        if one is not None:
+            found.append(one)
+    freedom = max(len(recording.time) - len(best.free), 1)
+    scale = min(x.scale for x in found) * math.sqrt(len(recording.time) / freedom)
+    deviances = [2.0 * loss(x.residual, scale) for x in found]
+    order = np.argsort(deviances, kind='stable')
+    best = found[order[0]]
+    others: list[Fit] = []
+    for i in order[1:].tolist():
+        if deviances[i] < deviances[order[0]] + _RIVAL and all(abs(math.log(
+                diagnosis.frequency_of(found[i]) / diagnosis.frequency_of(x))) > math.log(
+                    _ANOTHER) for x in (best, *others)):
+            others.append(found[i])
+    return best, others
