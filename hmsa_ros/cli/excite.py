@@ -48,7 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Design, write and print."""
     from hmsa_ros.identification.excitation import Bounds, excite
     from hmsa_ros.identification.files import read_belief
-    from hmsa_ros.identification.quantities import DEFAULT_FREE
+    from hmsa_ros.identification.quantities import free_of
 
     belief = read_belief(arguments.params_file)
     bounds = Bounds(
@@ -58,8 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
     with progress('designing the sequence'):
         found = excite(
             belief.actuator, bounds, duration=arguments.duration, rate=arguments.rate,
-            noise=arguments.noise,
-            free=[x for x in arguments.free.split(',') if x] or DEFAULT_FREE)
+            noise=arguments.noise, free=free_of(arguments.free, belief.actuator.law))
     if arguments.out is not None:
         rows = zip(found.best.level_times, found.best.levels, strict=True)
         lines = ['time,flux_density', *(f'{x:.9f},{y:.9g}' for x, y in rows)]

@@ -1,12 +1,14 @@
 """``hmsa identify``: the parameters of an actuator out of a recording."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.options import add_options, JSON
 from hmsa_ros.cli.progress import progress
+from hmsa_ros.cli.quantities import number_of
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text, write_text
 
@@ -34,16 +36,23 @@ def add_parser(subparsers: Any) -> None:
          'parameter file with what is known, such as geometry and density'),
         ('--free', 'NAME,...', str,
          'parameters to identify (default shear_modulus, damping_coefficient, chain_limit, '
-         'remanence, stretch_bias); others: density, time_unit, stretch_gain, sensor_latency, '
+         'remanence, stretch_bias); +NAME adds to these, and --free=-NAME takes from them; '
+         'others: density, time_unit, stretch_gain, sensor_latency, '
          'coil_time_constant, constant_force, initial_stretch, initial_rate, '
          'viscoelastic_ratio and viscoelastic_time, for more branches with _2 and _3 after them; '
          'with a law its constants, such as law.c10 and law.c01', {'default': ''}),
+        ('--known', 'NAME=VALUE[+-STD],...', str,
+         'what is known, kept as it is, such as sensor_latency=2ms or half_length=5mm+-1%%; '
+         'intervals hold what the standard deviation of it does', {'default': ''}),
         ('--joint', 'NAME', str, 'joint to identify, if the bag has several', {'default': ''}),
         ('--profile', 'NAME', str, 'also print the profile likelihood of this parameter',
          {'default': ''}),
         ('--out', 'YAML', Path,
-         'parameter file to write for planner and plant, only if identified; an existing file is '
-         'replaced'),
+         'parameter file to write for planner and plant, only if identified, or with --accept; an '
+         'existing file is replaced'),
+        ('--accept',
+         'also write the file of a model that is rejected for a defect that costs at most 5 %% of '
+         'a step; the exit status is 3 then'),
         ('--report', 'HTML', Path,
          'HTML page to write: data, fit, residuals and intervals; an existing file is replaced'),
         JSON)
@@ -55,16 +64,22 @@ def run(arguments: argparse.Namespace) -> int:
 
     from hmsa_ros.identification.files import file_text, read_belief
     from hmsa_ros.identification.identify import identify, profile
-    from hmsa_ros.identification.quantities import DEFAULT_FREE
+    from hmsa_ros.identification.quantities import free_of
 
     belief = read_belief(arguments.params_file)
-    free = [x for x in arguments.free.split(',') if x] or DEFAULT_FREE
+    known, uncertain = _known(arguments.known)
+    named = [x.strip(' +') for x in arguments.free.split(',')]
+    if both := [x for x in known if x in named]:
+        raise BadInputError(f'{both[0]} is free and known: expected it in --free or in --known')
     with progress('reading') as update:
         recording, belief = _read(arguments, belief)
+        belief = replace(belief, others={**belief.others, **known})
         update('fitting', None)
-        found = identify(recording, free=free, actuator=belief.actuator, known=belief.others)
+        found = identify(
+            recording, free=free_of(arguments.free, belief.actuator.law, known),
+            actuator=belief.actuator, known=belief.others, uncertain=uncertain)
         curve = profile(found, arguments.profile) if arguments.profile else []
-    good = found.verdict == 'identified'
+    good = found.verdict == 'identified' or arguments.accept and found.acceptable
     written = []
     if arguments.out is not None and good:
         from datetime import datetime
@@ -89,10 +104,39 @@ def run(arguments: argparse.Namespace) -> int:
             print(f'profile {arguments.profile} {value:.8g} deviance {deviance:.4g}')
         for path in written:
             print(f'{path} written')
-    if not good:
-        refused = f'; {arguments.out} was not written' if arguments.out is not None else ''
-        print(f'hmsa: {found.verdict}: {found.reason}{refused}', file=sys.stderr)
-    return 0 if good else 1
+    if found.verdict == 'identified':
+        return 0
+    note = ''
+    if good:
+        note = f'; accepted: what the model lacks costs {100.0 * found.cost:.2g} % of a step'
+    elif arguments.out is not None:
+        note = f'; {arguments.out} was not written' + (
+            f'; --accept writes it: what the model lacks costs {100.0 * found.cost:.2g} % of a '
+            'step' if found.acceptable else '')
+    print(f'hmsa: {found.verdict}: {found.reason}{note}', file=sys.stderr)
+    return 3 if good else 1
+
+
+def _known(text: str) -> tuple[dict[str, float], dict[str, float]]:
+    """Return values and standard deviations by name."""
+    from hmsa_ros.identification.quantities import GEOMETRY, QUANTITIES
+
+    values, deviations = {}, {}
+    for part in filter(None, (x.strip() for x in text.split(','))):
+        name, equals, rest = (x.strip() for x in part.partition('='))
+        name = name.removeprefix('actuator.')
+        if not equals or name not in QUANTITIES and name not in GEOMETRY:
+            raise BadInputError(
+                f'--known has {part!r}: expected NAME=VALUE or NAME=VALUE+-STD, with a name of '
+                f'{", ".join([*QUANTITIES, *GEOMETRY])}')
+        unit = QUANTITIES[name].unit if name in QUANTITIES else 'm'
+        value, _, std = (x.strip() for x in rest.partition('+-'))
+        values[name] = number_of(value, unit, name)
+        if std.endswith('%'):
+            deviations[name] = 0.01 * abs(values[name]) * number_of(std[:-1], '', name)
+        elif std:
+            deviations[name] = number_of(std, unit, name)
+    return values, deviations
 
 
 def _check_targets(arguments: argparse.Namespace) -> None:
@@ -110,7 +154,6 @@ def _check_targets(arguments: argparse.Namespace) -> None:
 def _read(
         arguments: argparse.Namespace, belief: 'Belief') -> 'tuple[Recording, Belief]':
     """Return the recording, and what is known with what the bag says of it."""
-    from dataclasses import replace
     import math
 
     path: Path = arguments.recording
@@ -135,14 +178,17 @@ def _read(
 
 def table(found: 'Identification') -> list[str]:
     """Return the result, aligned, a line each."""
-    lines = [f'{"parameter":<22}{"value":>14}{"std":>11}{"95 % interval":>28}  unit']
+    rows = [('parameter', 'value', 'std', '95 % interval', 'unit')]
     for key in found.names:
         name, x = found.shown(key)
-        if x.value != x.value:
-            lines.append(f'{name:<22}{"not identifiable":>53}  {x.unit}')
-            continue
-        interval = f'{x.low:.6g} to {x.high:.6g}'
-        lines.append(f'{name:<22}{x.value:>14.7g}{x.std:>11.2g}{interval:>28}  {x.unit}')
+        rows.append((
+            name, f'{x.value:.7g}', f'{x.std:.2g}', f'{x.low:.6g} to {x.high:.6g}', x.unit)
+            if x.value == x.value else (name, '', '', 'not identifiable', x.unit))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = [
+        f'{row[0]:<{widths[0]}}  '
+        + '  '.join(f'{x:>{n}}' for x, n in zip(row[1:4], widths[1:4], strict=True))
+        + f'  {row[4]}' for row in rows]
     lines.append(
         f'noise {found.noise_std:.3g}, residual rms {found.residual_rms:.3g}, '
         f'{found.samples} samples')

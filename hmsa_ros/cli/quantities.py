@@ -28,6 +28,8 @@ _UNITS: dict[str, dict[str, float]] = {
     'T/s': {'T/s': 1.0, 'mT/s': 1e-3},
     '': {},
     'N s/m': {'N s/m': 1.0, 'Ns/m': 1.0},
+    's': {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'µs': 1e-6},
+    'N': {'N': 1.0, 'mN': 1e-3},
 }
 _NUMBER = re.compile(r'\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*')
 _NAME = re.compile(r'[A-Za-z](?:_?[A-Za-z0-9])*')
@@ -35,6 +37,21 @@ _NAME = re.compile(r'[A-Za-z](?:_?[A-Za-z0-9])*')
 _BLOCK = dict(zip(ACTUATOR_FIELDS, ACTUATOR, strict=True))
 _REVIEW = 'Wu et al., Multifunctional Materials 3 (2020) 042003'
 _ZHAO = 'Zhao et al., J. Mech. Phys. Solids 124 (2019) 244'
+
+
+def number_of(text: str, unit: str, words: str) -> float:
+    """Read a number of what some words name, in an SI unit or with a unit of its own."""
+    found = _NUMBER.fullmatch(text)
+    units = _UNITS.get(unit, {unit: 1.0})
+    if found is None:
+        example = f' with or without a unit ({", ".join(units)})' if units else ''
+        raise BadInputError(f'{words} is {text!r}: expected a number{example}')
+    number, own = found.groups()
+    if own and own not in units:
+        raise BadInputError(
+            f'{words} has the unit {own!r}: expected '
+            + (f'one of {", ".join(units)}' if units else 'a number without a unit'))
+    return float(number) * (units[own] if own else 1.0)
 
 
 @dataclass(frozen=True)
@@ -71,17 +88,7 @@ class Quantity:
 
     def parse(self, text: str) -> float:
         """Read a number in SI units or with a unit, ``'10 mm'``, or raise `BadInputError`."""
-        found = _NUMBER.fullmatch(text)
-        units = _UNITS[self.unit]
-        if found is None:
-            example = f' with or without a unit ({", ".join(units)})' if units else ''
-            raise BadInputError(f'{self.words} is {text!r}: expected a number{example}')
-        number, unit = found.groups()
-        if unit and unit not in units:
-            raise BadInputError(
-                f'{self.words} has the unit {unit!r}: expected '
-                + (f'one of {", ".join(units)}' if units else 'a number without a unit'))
-        value = float(number) * (units[unit] if unit else 1.0)
+        value = number_of(text, self.unit, self.words)
         if not self.least <= value <= self.largest:
             raise BadInputError(
                 f'{self.words} is {self.show(value)}: expected {self.least:g} to '

@@ -30,7 +30,8 @@ from hmsa_ros.recordings.parameters import Entries, entries_of, number_of, value
 # What coil and sensor have, by the name in parameter files.
 _OTHERS = {
     'coil_time_constant': 'coil_time_constant', 'stretch_bias': 'stretch_bias',
-    'stretch_gain': 'stretch_gain', 'initial_stretch': 'initial_stretch'}
+    'stretch_gain': 'stretch_gain', 'sensor_latency': 'sensor_latency',
+    'initial_stretch': 'initial_stretch'}
 _LISTS = dict(zip(
     ('viscoelastic.ratio', 'viscoelastic.time'), zip(*BRANCHES, strict=True), strict=True))
 # Half of a 95 % interval, or half an axis of the ellipsoid of so many, in standard deviations.
@@ -164,6 +165,8 @@ def file_text(found: Identification, belief: Belief, run: str, now: datetime) ->
         f'# Parameters of an actuator, identified from {run}',
         f'# on {now.isoformat(" ", "seconds")} by hmsa identify.',
         f'# Verdict: {found.verdict}: {found.reason}.',
+        *([f'# Accepted: what the model lacks costs {100.0 * found.cost:.2g} % of a step.']
+          if found.verdict != 'identified' else []),
         f'# Noise {found.noise_std:.3g} of {found.recording.coordinate.name} a sample, '
         f'{found.samples} samples.',
         *(f'# Note: {x}.' for x in found.warnings),
@@ -183,7 +186,7 @@ def file_text(found: Identification, belief: Belief, run: str, now: datetime) ->
             lines.append(_line(key, value, found, *sought))
             written[key] = value
     for name, key in _OTHERS.items():
-        if name in found.names:
+        if name in found.names or name in belief.others:
             written[key] = found.values[name]
             lines.append(_line(key, written[key], found, name))
     held = [i for i, pair in enumerate(BRANCHES)

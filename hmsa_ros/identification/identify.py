@@ -223,7 +223,7 @@ def _conclude(
         for x in (variance, variance + missing.hint))
     bent = _bent(best, inverse, deviation, held)
     held, factors = bent * held, bent * factors
-    covariance = inverse * deviation ** 2 * np.outer(factors, factors) + missing.considered
+    covariance = inverse * deviation ** 2 * np.outer(factors, factors)
     weak = diagnosis.weakness(best, deviation, held)
     alike = repeated(
         best, 1.0 / diagnosis.frequency_of(best), dead_band(best, deviation))
@@ -255,7 +255,7 @@ def _conclude(
             f'{deviation:.3g}')
     # A beam's modulus is known as Young's.
     reason = reason.replace('shear_modulus', modulus_of(best.values.get('law'))[0])
-    parameters, matrix = _estimates(best, covariance, freedom, lost)
+    parameters, matrix = _estimates(best, covariance, missing.considered, freedom, lost)
     outliers = int(np.count_nonzero(best.weights == 0.0))
     warnings = [*recording.notes, *_warnings(
         best, deviation, correlated, outliers, found.white)]
@@ -326,9 +326,14 @@ def _inverse(information: Array) -> Array:
 
 
 def _estimates(
-        best: Fit, covariance: Array, freedom: float, lost: set[str]
+        best: Fit, covariance: Array, considered: Array, freedom: float, lost: set[str]
 ) -> tuple[dict[str, Estimate], Array]:
-    """Return all parameters with intervals, and the covariance of the free values in SI."""
+    """
+    Return all parameters with intervals, and the covariance of the free values in SI.
+
+    What is considered widens the intervals alone: with the same sizes and the same sensor what
+    the values predict is as good as without.
+    """
     # Slow to load, and no use to a planner that estimates.
     from scipy.special import stdtrit
 
@@ -346,7 +351,7 @@ def _estimates(
                 math.nan, math.nan, math.nan, math.nan, quantity.unit, True)
         elif name in best.free:
             place = best.free.index(name)
-            half = quantile * math.sqrt(covariance[place, place])
+            half = quantile * math.sqrt(covariance[place, place] + considered[place, place])
             x = to_coordinate(name, value)
             ends = sorted(from_coordinate(name, y) for y in (x - half, x + half))
             if quantity.scale == 'inverse' and x - half <= 1e-9:

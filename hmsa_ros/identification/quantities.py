@@ -122,6 +122,24 @@ def check_free(names: Iterable[str], law: Elastic | None = None) -> tuple[str, .
     return free
 
 
+def free_of(
+        text: str, law: Elastic | None = None, known: Iterable[str] = ()) -> tuple[str, ...]:
+    """
+    Return the names of free parameters that a text of a command line means.
+
+    Names replace the default list, without what is known; ``+NAME`` adds to it and ``-NAME``
+    takes from it.
+    """
+    names = [x.strip() for x in text.split(',') if x.strip()]
+    free = [x for x in names if x[0] not in '+-']
+    if not free:
+        free = [x for x in DEFAULT_FREE if x not in known and (
+            law is None or x != 'chain_limit')]
+    free += [x[1:] for x in names if x[0] == '+']
+    without = {x[1:] for x in names if x[0] == '-'}
+    return check_free((x for x in free if x not in without), law)
+
+
 @lru_cache(maxsize=64)
 def constants_of(law: Elastic | None) -> dict[str, tuple[Constant, int]]:
     """

@@ -22,6 +22,8 @@ _TIMES_SCATTER = 6.0
 # this share of the whole range.
 _CLIPPED_SLOPE = 0.01
 _CLIPPED_SAMPLES = 3
+# So many values in motion that come again, and more than half of all, are a staircase.
+_STAIRS = 4
 # The share of the samples on either side that may be none, and the largest flux density of a coil
 # in T.
 _FEW, _STRONGEST = 0.02, 5.0
@@ -132,7 +134,13 @@ class Recording:
                 f'the {self.coordinate.name} of {self.label} stays within {spread:.3g}, scatter '
                 f'{jitter:.2g}: expected a motion; was the coil on, and is it the column of the '
                 f'{self.coordinate.name}?')
-        clipped = self._clipped()
+        clipped, repeated = self._flat()
+        if repeated:
+            raise BadInputError(
+                f'the {self.coordinate.name} of {self.label} is a staircase: in motion most '
+                f'values come {repeated} times, as where a sensor is read more often than it '
+                'measures, or measures in batches; expected each measurement once, with the '
+                'stamp of its own')
         if clipped:
             raise BadInputError(
                 f'the {self.coordinate.name} of {self.label} is cut off {clipped} times at '
@@ -176,21 +184,27 @@ class Recording:
         quiet = float(np.std(self.stretch)) < 1.3 * jitter + 1e-12
         return same and quiet
 
-    def _clipped(self) -> int:
-        """Return how many crests are cut off by the end of the sensor's range."""
+    def _flat(self) -> tuple[int, int]:
+        """
+        Return how many crests are cut off by the end of the sensor's range, 0 for none.
+
+        With it comes how many times values in motion come, 0 unless most of them come again.
+        """
         y = self.stretch
-        steep = _CLIPPED_SLOPE * float(np.ptp(y))
-        count = 0
-        for extreme in (np.min(y), np.max(y)):
-            flat = np.concatenate([[0], (y == extreme).astype(np.int8), [0]])
-            begins, ends = np.flatnonzero(np.diff(flat) == 1), np.flatnonzero(
-                np.diff(flat) == -1)
-            for begin, end in zip(begins, ends, strict=True):
-                if (end - begin >= _CLIPPED_SAMPLES and begin > 0 and end < len(y)
-                        and abs(y[begin - 1] - extreme) > steep
-                        and abs(y[end] - extreme) > steep):
-                    count += 1
-        return count if count > 1 else 0
+        edges = np.flatnonzero(np.diff(y) != 0.0) + 1
+        if len(edges) < _CLIPPED_SAMPLES:
+            return 0, 0
+        # Runs of one value, between steep changes on either side.
+        lengths, values = np.diff(edges), y[edges[:-1]]
+        steep = np.abs(np.diff(y)[edges - 1]) > _CLIPPED_SLOPE * float(np.ptp(y))
+        moving = steep[:-1] & steep[1:]
+        lengths, values = lengths[moving], values[moving]
+        again = lengths > 1
+        inside = (values != np.min(y)) & (values != np.max(y))
+        if np.count_nonzero(again & inside) > max(0.5 * np.count_nonzero(inside), _STAIRS):
+            return 0, round(float(np.median(lengths[again & inside])))
+        clipped = int(np.count_nonzero(~inside & (lengths >= _CLIPPED_SAMPLES)))
+        return (clipped if clipped > 1 else 0), 0
 
     @property
     def uncertain(self) -> NDArray[np.int64]:

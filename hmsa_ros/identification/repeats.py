@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmsa_ros.identification.fit import Fit
 from hmsa_ros.identification.start import segments
 from hmsa_ros.model.equations import Array
 
-_DRAWS = 1999
+# Draws of the signs, first and where these do not make it clear.
+_DRAWS, _CLEAR = (199, 3999), 0.04
 _MOST = 48  # repeats of one change; of more several share a sign
 _FEWEST = 4  # samples on a level
 # Shares of the time on a level that are looked at, and the rest that its mean is of.
@@ -45,52 +45,61 @@ def repeated(fit: Fit, period: float, floor: float = 0.0) -> Repeated | None:
     groups: dict[tuple[float, float], list[tuple[int, int, float]]] = {}
     unit = 1e-6 * max(float(np.max(np.abs(fit.recording.levels))), 1e-12)
     for (*_, before), (begin, end, when, level) in zip(found[:-1], found[1:], strict=True):
-        key = round(before / unit), round(level / unit)
-        groups.setdefault(key, []).append((begin, end, when))
+        groups.setdefault((round(before / unit), round(level / unit)), []).append(
+            (begin, end, when))
     whole = [x for x in groups.values() if len(x) > 1]
     if not whole:
         return None
-    residual = fit.root * fit.residual
-    gap = float(np.median(np.diff(fit.recording.time)))
-    width = min(gap, period / _FINEST)
-    random = np.random.default_rng(0)
-    drawn = np.zeros((_DRAWS + 1, len(_WINDOWS) + 1))
+    residual, shown = fit.root * fit.residual, fit.response.stretch
+    width = min(float(np.median(np.diff(fit.recording.time))), period / _FINEST)
+    grams: list[list[Array]] = []
     squares, count, cost = 0.0, 0.0, 0.0
     for group in whole:
         table, seen = _folded(fit.recording.time, residual, group, width)
-        signs = np.ones((_DRAWS + 1, len(table)))
-        signs[1:] = random.choice([-1.0, 1.0], (_DRAWS, len(table)))
         size = table.shape[1]
-        products = [table[:, :max(int(x * size), 1)] for x in _WINDOWS]
-        late = seen[:, int(_REST * size):]
-        products.append(np.sum(table[:, int(_REST * size):], axis=1, keepdims=True) / np.maximum(
-            np.sum(late, axis=1, keepdims=True), 1.0))
-        for i, part in enumerate(products):
-            gram = part @ part.T
-            np.fill_diagonal(gram, 0.0)
-            drawn[:, i] += np.einsum('ij,ij->i', signs @ gram, signs)
-        both = seen @ seen.T
-        np.fill_diagonal(both, 0.0)
-        gram = table @ table.T
-        np.fill_diagonal(gram, 0.0)
-        pairs = float(np.sum(both))
-        mean = float(np.sum(gram)) / max(pairs, 1.0)
-        number = float(np.sum(seen))
-        squares, count = squares + mean * number, count + number
+        rest = np.sum(table[:, int(_REST * size):], axis=1, keepdims=True) / np.maximum(
+            np.sum(seen[:, int(_REST * size):], axis=1, keepdims=True), 1.0)
+        grams.append([_apart(x) for x in (
+            *(table[:, :max(int(x * size), 1)] for x in _WINDOWS), rest)])
+        mean = float(np.sum(grams[-1][-2])) / max(float(np.sum(_apart(seen))), 1.0)
+        squares += mean * float(np.sum(seen))
+        count += float(np.sum(seen))
         begin, end, _ = group[0]
-        step = abs(float(fit.response.stretch[end - 1] - fit.response.stretch[max(begin - 1, 0)]))
+        step = abs(float(shown[end - 1] - shown[max(begin - 1, 0)]))
         if step > 0.0:
             cost = max(cost, 2.0 * math.sqrt(2.0 * max(mean, 0.0)) / step)
-    middle, apart = np.mean(drawn[1:], axis=0), np.std(drawn[1:], axis=0)
-    scores = np.max((drawn - middle) / np.where(apart > 0.0, apart, 1.0), axis=1)
-    chance = (1.0 + np.count_nonzero(scores[1:] >= scores[0])) / (_DRAWS + 1.0)
     size = math.sqrt(max(squares, 0.0) / max(count, 1.0))
-    return Repeated(chance if size > floor else 1.0, size, cost)
+    return Repeated(_chance(grams) if size > floor else 1.0, size, cost)
+
+
+def _apart(rows: Array) -> Array:
+    """Return the products of each row with every other, and 0 with itself."""
+    gram: Array = rows @ rows.T
+    np.fill_diagonal(gram, 0.0)
+    return gram
+
+
+def _chance(grams: list[list[Array]]) -> float:
+    """Return how often random signs of the repeats agree in any window as well as none do."""
+    random = np.random.default_rng(0)
+    for draws in _DRAWS:
+        drawn: Array = np.zeros((draws + 1, len(grams[0])))
+        for group in grams:
+            signs = np.ones((draws + 1, len(group[0])))
+            signs[1:] = random.choice([-1.0, 1.0], (draws, len(group[0])))
+            drawn += np.stack([np.sum((signs @ x) * signs, axis=1) for x in group], axis=1)
+        spread = np.std(drawn[1:], axis=0)
+        scores = np.max((drawn - np.mean(drawn[1:], axis=0)) / np.where(
+            spread > 0.0, spread, 1.0), axis=1)
+        chance = (1.0 + np.count_nonzero(scores[1:] >= scores[0])) / (draws + 1.0)
+        if chance > _CLEAR:
+            break
+    return chance
 
 
 def _folded(
         time: Array, residual: Array, group: list[tuple[int, int, float]], width: float
-) -> tuple[Array, NDArray[np.float64]]:
+) -> tuple[Array, Array]:
     """Return residuals by repeat and place in time, 0 where none is, and how many there are."""
     places = [((time[begin:end] - when) / width).astype(np.int64) for begin, end, when in group]
     size = min(int(x[-1]) for x in places) + 1

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+import math
 from typing import Any, Literal
 
 from hmsa_ros.identification.noise import Whiteness
@@ -13,6 +14,8 @@ from hmsa_ros.model.parameters import ActuatorParameters
 Verdict = Literal['identified', 'not_identifiable', 'model_rejected']
 #: Correlation from which two parameters count as confounded.
 CONFOUNDED = 0.95
+#: Share of a step up to which what a model lacks may be accepted.
+ACCEPTABLE = 0.05
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,8 @@ class Estimate:
         Value and standard deviation in SI; NaN where the data do not hold it; ``std`` is 0 for
         one that was not free.
     low, high : float
-        Ends of the 95 % interval.
+        Ends of the 95 % interval, which also holds what does not show in the samples, such as
+        a gain of the sensor that nobody gave.
     unit : str
         In plain text.
     free : bool
@@ -141,6 +145,13 @@ class Identification:
     def actuator(self) -> ActuatorParameters:
         """The block at the optimum; trust it only if the verdict is ``identified``."""
         return actuator_of(self.values)
+
+    @property
+    def acceptable(self) -> bool:
+        """Whether the model lacks something that is known, and small enough to plan with."""
+        return (
+            self.verdict == 'model_rejected' and 0.0 < self.cost <= ACCEPTABLE
+            and all(math.isfinite(self.parameters[x].std) for x in self.names))
 
     @property
     def at_rest(self) -> bool:

@@ -97,7 +97,7 @@ def _best(found: Sequence[Fit]) -> tuple[Fit, int]:
 
 def _promising(found: Sequence[Fit], one: Fit) -> bool:
     """Whether a fit that has not ended may still become the likeliest."""
-    best, _ = _best([x for x in found if x.converged])
+    best, _ = _best([x for x in found if x.converged] or found)
     return loss(one.residual, best.scale, convex=True) < _PROMISING * loss(
         best.residual, best.scale, convex=True)
 
