@@ -59,7 +59,15 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Read, identify and print."""
+    """
+    Read, identify and print.
+
+    Raises
+    ------
+    BadInputError
+        If a parameter is both free and known.
+
+    """
     _check_targets(arguments)
 
     from hmsa_ros.identification.files import file_text, read_belief

@@ -40,7 +40,11 @@ _ZHAO = 'Zhao et al., J. Mech. Phys. Solids 124 (2019) 244'
 
 
 def number_of(text: str, unit: str, words: str) -> float:
-    """Read a number of what some words name, in an SI unit or with a unit of its own."""
+    """
+    Read a number of what some words name, in an SI unit or with a unit of its own.
+
+    Raises `BadInputError` for any other text.
+    """
     found = _NUMBER.fullmatch(text)
     units = _UNITS.get(unit, {unit: 1.0})
     if found is None:

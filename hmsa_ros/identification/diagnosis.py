@@ -37,6 +37,7 @@ _FEWEST_PARTS = 8
 _OUT = 0.5  # weight below which a sample does not count
 _SOON = 10  # samples after a change of level
 _CHANCE = 2e-3  # below it no chance makes residuals repeat
+_FEW_WORDS = 4  # frequencies that are named
 _NUMERICAL = 1e-6  # residuals below this are those of the integration
 DISTANT = 0.1  # residual over motion from which on nothing was fitted
 # What soft actuators have, with a wide margin, in SI, and the power of the time in it.
@@ -312,7 +313,10 @@ def of_gain(considered: Array, inverse: Array, deviation: float, free: Sequence[
 def alike(best: Fit, others: Sequence[Fit]) -> str:
     """Return which frequencies fit the samples alike, and what to record instead."""
     frequencies = sorted(frequency_of(x) for x in (best, *others))
+    words = [f'{x:.4g} Hz' for x in frequencies]
+    if len(words) > _FEW_WORDS:
+        words[2:-1] = [f'{len(words) - 3} between']
     return (
-        f'these frequencies fit alike: {_listed([f"{x:.4g} Hz" for x in frequencies])}; record '
+        f'these frequencies fit alike: {_listed(words)}; record '
         f'at more than {2.0 * frequencies[-1]:.3g} samples per second, or give a --params-file '
         'whose shear_modulus and density are known, and free what is not')

@@ -52,7 +52,11 @@ def _good(found: Fit) -> bool:
 def search(
         recording: Recording, values: Mapping[str, float], free: Sequence[str]
 ) -> tuple[Fit, int, int]:
-    """Return the best of the fits, how many there are, and how many ended there."""
+    """
+    Return the best of the fits, how many there are, and how many ended there.
+
+    Raises `BadInputError` if no start leads to a motion.
+    """
     found: list[Fit] = []
 
     def tried(candidates: Sequence[Mapping[str, float]]) -> bool:
@@ -116,7 +120,6 @@ def _miss(recording: Recording, candidate: Mapping[str, float]) -> float:
     response = respond(recording, candidate, (), rtol=1e-4)
     return math.inf if response is None else float(
         np.mean(np.abs(recording.stretch - response.stretch)))
-
 
 
 
