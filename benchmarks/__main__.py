@@ -12,7 +12,8 @@ one all of these are run. judge holds verdicts on simulated setpoints against th
 Those of recorder, player and crash take some seven minutes together. faults injects faults into
 running nodes and fails if one is not answered as it should be; soak runs for hours; feedback
 moves actuators that are not as planned with, in real time, for some three minutes;
-identification fits thousands of simulated runs; studies kills the workers of a study; rates
+identification fits thousands of simulated runs; defects those of actuators that are not as the
+model has them; studies kills the workers of a study; rates
 measures how many plans a second studies make, for some seven minutes; lockstep compares the kernel
 of batches with C.
 A page is a Markdown file with marks ``<!-- begin NAME -->`` and ``<!-- end NAME -->``, between
@@ -38,7 +39,7 @@ _WIDTH = 120
 NAMES = ('judge', 'planner', 'plant', 'preemption', 'joints', 'controller', 'recorder', 'player',
          'crash')
 #: Not run unless asked for: they take long and need the machine for themselves.
-LONG = ('faults', 'soak', 'feedback', 'identification', 'studies', 'rates', 'lockstep')
+LONG = ('faults', 'soak', 'feedback', 'identification', 'defects', 'studies', 'rates', 'lockstep')
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -56,8 +57,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument('--only', action='append', default=[], metavar='KEY',
                         help='faults: beginning of the key of a fault to inject')
     parser.add_argument('--runs', type=int, default=None,
-                        help='identification, judge: simulated runs of each kind (default 200), '
-                             'in identification at most 40 of those with bad samples')
+                        help='identification, judge, defects: simulated runs of each kind '
+                             '(default 200, defects 30), in identification at most 40 of those')
     parser.add_argument('--hours', type=float, default=8.0,
                         help='soak: simulated time (default 8)')
     parser.add_argument('--minutes', type=float, default=float('inf'),
@@ -130,6 +131,11 @@ def main(arguments: list[str] | None = None) -> int:
         add(bench_identification.robustness(
             quick=options.quick, runs=min(runs, bench_identification.ROBUST_RUNS)))
         add(bench_identification.compare(quick=options.quick, runs=runs))
+    if 'defects' in names:
+        from benchmarks import bench_defects
+
+        add(bench_defects.compare(
+            quick=options.quick, runs=options.runs or bench_defects.RUNS))
     if 'studies' in names:
         from benchmarks import bench_studies
 

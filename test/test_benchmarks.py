@@ -11,7 +11,7 @@ from rich.console import Console
 from scipy.integrate import solve_ivp
 
 from benchmarks import __main__ as program
-from benchmarks import bench_judge, bench_plant, contenders
+from benchmarks import bench_defects, bench_judge, bench_plant, contenders
 from benchmarks.measure import Contender, loosest, race, Report, Row, text_of_time
 from benchmarks.reference import Actuator, response, two_step
 from benchmarks.sheet import Sheet
@@ -120,6 +120,13 @@ def test_verdicts_on_runs_drawn_at_random_are_never_wrong_and_mostly_given():
     clear, undecided = (sum(x[key] for x in kinds) for key in ('clear', 'clear_undecided'))
     assert clear > 50
     assert undecided < 0.1 * clear
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_fit_of_what_the_model_lacks_is_never_called_identified_with_wrong_intervals():
+    sheet = bench_defects.compare(quick=False, runs=10)
+    assert sheet.passed, sheet.figures
 
 
 @pytest.mark.parametrize(('within', 'verdict', 'said'), [

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
+from benchmarks.defects import measured, motion, plants, Sensor, sequence
 from hmsa_ros.cli import main
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.files import read_belief
@@ -94,6 +95,57 @@ def test_what_is_not_identified_is_not_written_and_ends_with_1(folder, capsys):
     assert err.startswith('hmsa: not_identifiable: ')
     assert 'found.yaml was not written' in err
     assert not (folder / 'found.yaml').exists()
+
+
+def lagging(name, hysteresis):
+    """Write a recording of a coil with play by a late camera; return arguments, and how late."""
+    given = plants(1, 3, hysteresis=(hysteresis, 1.0001 * hysteresis), latency=(0.045, 0.0450001))
+    switches, levels, end = sequence(given)
+    seen = motion(given, switches, levels, end)
+    found = measured(0, given, seen, switches, levels, end, Sensor(25.0, 5e-4), 1)
+    write(f'{name}.csv', 'time,stretch', zip(found.time, found.stretch, strict=True))
+    write(f'{name}_levels.csv', 'time,flux_density', zip(
+        found.level_times, found.levels, strict=True))
+    return (f'{name}.csv', '--commands', f'{name}_levels.csv'), (
+        0.045 * given.block(0).time_unit)
+
+
+def test_a_small_defect_that_nothing_is_free_for_is_accepted_on_request(folder, capsys):
+    run, late = lagging('core', 0.004)
+    known = '--known', f'sensor_latency={late:.9g}'
+    status, out, err = identify(capsys, *run, *known, '--out', 'found.yaml')
+    assert status == 1
+    assert 'hysteresis' in err
+    assert re.search(r'--accept writes it: what the model lacks costs [\d.]+ % of a step', err)
+    assert not (folder / 'found.yaml').exists()
+    status, out, err = identify(capsys, *run, *known, '--out', 'found.yaml', '--accept')
+    assert status == 3
+    assert 'found.yaml written' in out
+    assert 'accepted: what the model lacks costs' in err
+    assert read_belief(folder / 'found.yaml').others['sensor_latency'] == pytest.approx(late)
+
+
+def test_what_is_free_can_be_added_and_what_is_known_is_kept(folder, capsys):
+    run, late = lagging('late', 1e-6)
+    status, _, err = identify(capsys, *run)
+    assert status == 1
+    assert '--free +sensor_latency' in err
+    status, out, _ = identify(capsys, *run, '--free', '+sensor_latency', '--json')
+    assert status == 0
+    found = json.loads(out)
+    assert found['names'][-1] == 'sensor_latency'
+    assert found['parameters']['sensor_latency']['value'] == pytest.approx(late, rel=0.05)
+    for known, sentence in (
+            ('sensor_latency', 'expected NAME=VALUE'), ('weight=2', "'weight=2'"),
+            ('sensor_latency=fast', 'expected a number'),
+            ('shear_modulus=4000', '')):
+        status, _, err = identify(capsys, *run, '--known', known)
+        assert status == (2 if sentence else 1)
+        assert sentence in err
+    status, _, err = identify(
+        capsys, *run, '--known', 'remanence=0.1', '--free', '+remanence')
+    assert status == 2
+    assert 'remanence is free and known' in err
 
 
 def test_levels_sampled_beside_the_stretch_serve_with_semicolons_and_units(folder, capsys):
