@@ -1,5 +1,5 @@
 """
-``python -m hmsa_studies``: the tables of docs/studies.md, in Markdown; and its pictures.
+``python -m hmsa_studies``: the tables on robustness in the documentation, and its pictures.
 
 The script that draws all pictures of the documentation (``make pictures``) draws these too.
 """

@@ -1,7 +1,7 @@
 """
 What the paper's text says, computed: ``python -m hmsa_studies.claims``.
 
-Every line that is printed is in docs/paper-comparison.md, which says what it means.
+Every line that is printed is in docs/validation/paper-comparison.md, which says what it means.
 """
 
 from collections.abc import Iterator, Sequence

@@ -1,4 +1,4 @@
-"""A beam of one mode, by the equations of docs/beam.md and SciPy alone."""
+"""A beam of one mode, by the equations of docs/explanation/beam.md and SciPy alone."""
 
 from functools import cache
 import math

@@ -75,7 +75,7 @@ def test_pages_are_built_without_a_warning(tmp_path):
     for node in ('planner', 'plant', 'recorder', 'player'):
         for spec in import_module(f'hmsa_ros.nodes.{node}').PARAMETERS:
             assert f'>{spec.name}<' in parameters
-    theory = (tmp_path / 'html' / 'theory.html').read_text(encoding='utf-8')
+    theory = (tmp_path / 'html' / 'explanation' / 'theory.html').read_text(encoding='utf-8')
     assert '<math' in theory
     assert '<script src="http' not in theory
 

@@ -313,7 +313,8 @@ def test_a_file_that_cannot_be_written_is_refused_in_one_line(
 
 
 def test_the_comparison_with_the_paper_says_what_the_computation_says() -> None:
-    page = (ROOT / 'docs' / 'paper-comparison.md').read_text(encoding='utf-8').splitlines()
+    page = (ROOT / 'docs' / 'validation' / 'paper-comparison.md').read_text(
+        encoding='utf-8').splitlines()
     computed = list(claims.lines())
     assert len(computed) > 60
     assert [line for line in computed if line not in page] == []

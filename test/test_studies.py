@@ -43,7 +43,7 @@ from hmsa_studies.sweep import Sweep
 from hmsa_studies.tables import open_writer
 
 COLUMNS = Sweep({}).columns
-DOCS = Path(__file__).resolve().parent.parent / 'docs' / 'studies.md'
+DOCS = Path(__file__).resolve().parent.parent / 'docs' / 'explanation' / 'robustness.md'
 MATERIAL = NondimensionalParameters()
 #: What is asked of the residual where there is no error.
 EXACT = 1e-8
