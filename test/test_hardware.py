@@ -19,6 +19,7 @@ from hmsa_ros.errors import BadInputError, HmsaError
 
 MS = 1_000_000
 START = 1000 * MS
+TODAY = 1_800_000_000_000 * MS
 
 
 class Bench:
@@ -212,7 +213,7 @@ def test_write_may_say_when_or_nothing(answer, stamp):
 
 
 @pytest.mark.parametrize('answer', [
-    'done', math.nan, (START, math.nan), (START, 0.1, 3), [], 1e9 + 5.0, True, object()])
+    'done', math.nan, (START, math.nan), (START, 0.1, 3), [], 1e9 + 5.0, True, object(), 10**400])
 def test_what_write_must_not_return_is_said_and_the_level_is_not_known(answer):
     amplifier, device = driver(bench=Amplifier())
     amplifier.answer = lambda: answer
@@ -244,13 +245,49 @@ def test_read_returns_what_is_new(readings, expected):
 
 @pytest.mark.parametrize('readings', [
     None, 'ok', b'ok', (1.0, 'x'), (1.0, 0.0, NAN), (1.0, 0.0, 3, 4), [(1.0, 'x', 5)],
-    (None, 1.0), object()])
+    (None, 1.0), object(), 10**400,
+    # Times of another clock than `now`: in s, in microseconds, since a start, and of none.
+    *((1.0, 0.0, x) for x in (TODAY / 1e9, TODAY // 1000, START, 0, -1, 10**30, 10**400)),
+    # Endless.
+    iter(lambda: (1.0, 0.0), None)])
 def test_what_read_must_not_return_is_said(readings):
     amplifier, device = driver(period=MS, bench=Amplifier())
     amplifier.readings = readings
     with pytest.raises(
             HmsaError, match='Amplifier.read of joint actuator returned .*: expected stretch'):
-        device.advance(START)
+        device.advance(TODAY)
+
+
+def yielding(blocked, go, error=None):
+    yield 1.0, 0.0
+    if error is not None:
+        raise error
+    blocked.set()
+    go.wait()
+
+
+def test_what_read_yields_is_part_of_the_call():
+    bench = Bench()
+    worker = serve(bench, period=MS)
+    bench.read = lambda now: yielding(None, None, OSError('no answer'))
+    wait_until(lambda: worker.failure is not None, 'the failure')
+    assert 'Bench.read of joint joint_0 raised OSError' in str(worker.failure)
+    blocked, go = Event(), Event()
+    bench = Bench()
+    worker = serve(bench, period=MS, limit=0.01)
+    bench.read = lambda now: yielding(blocked, go)
+    assert blocked.wait(60.0)
+    worker.receive(0, 0, 0.1)
+
+    def ended():
+        worker.look_after()
+        return worker.failure
+
+    wait_until(ended, 'the end')
+    assert 'Bench.read of joint joint_0 has not returned for 0.01 s' in str(worker.failure)
+    assert bench.levels[-1] == 0.0
+    go.set()
+    worker.close()
 
 
 def test_hardware_that_has_lost_its_state_begins_without_a_field():
@@ -290,7 +327,7 @@ class Board:
         self.host = START
         self.begun = START - 5000 * MS
         self.kept, self.told, self.calls, self.exposed = [], [], [], []
-        self.level = 0.0
+        self.level, self.asked = 0.0, 0
 
     def time_ns(self):
         """Answer on the host: each look takes 20 us."""
@@ -298,6 +335,7 @@ class Board:
         return self.host
 
     def clock(self):
+        self.asked += 1
         return round((self.host + 10_000 - self.begun) * self.rate)
 
     def host_time(self, own):
@@ -424,6 +462,7 @@ def test_a_board_whose_clock_begins_anew_has_lost_its_state():
 @pytest.mark.parametrize(('changes', 'expected'), [
     ({'applied': lambda self: []}, 'does not say that 0.2 T took effect'),
     ({'applied': lambda self: [1]}, 'expected a list of'),
+    ({'applied': lambda self: [(10**30, 0.2)]}, 'expected a list of'),
     ({'schedule': lambda self, levels: 1 / 0}, 'schedule of joint actuator raised ZeroDivision'),
 ])
 def test_a_device_that_does_not_keep_levels_as_it_should_is_said_to(changes, expected):
@@ -439,7 +478,19 @@ def test_a_device_that_does_not_keep_levels_as_it_should_is_said_to(changes, exp
     assert device.switch_off(START + 3000 * MS) == ''
 
 
-@pytest.mark.parametrize('clock', [lambda self: 'now', lambda self: None])
+def test_a_clock_is_asked_on_when_that_of_the_host_has_been_set_back():
+    board, device = board_driver()
+    for k in range(2, 500):
+        step(board, device, START + k * MS)
+    asked = board.asked
+    board.host -= 400 * MS
+    for k in range(100, 400):
+        step(board, device, START + k * MS)
+    assert board.asked > asked
+
+
+@pytest.mark.parametrize('clock', [
+    lambda self: 'now', lambda self: None, lambda self: 10**400])
 def test_a_clock_that_says_no_time_refuses_the_start(clock):
     with pytest.raises(HmsaError, match='expected its time in ns'):
         board_driver(clock=clock)
@@ -450,6 +501,7 @@ def test_a_clock_that_says_no_time_refuses_the_start(clock):
     ({'read': lambda: (1.0, 0.0)}, r'Coil.read does not take .*: expected read\(now\)'),
     ({'close': lambda x: None}, r'Coil.close does not take'),
     ({'limit': 'much'}, "Coil.limit is 'much': expected a number above 0"),
+    ({'limit': 10**400}, 'Coil.limit is 1000.*: expected a number above 0'),
     ({'slew': 0.0}, 'Coil.slew is 0.0: expected a number above 0')])
 def test_a_class_that_cannot_be_called_is_refused(change, expected):
     class Coil(Bench):
@@ -489,13 +541,20 @@ def test_a_worker_writes_each_level_at_its_stamp_and_switches_off_in_the_end():
     assert worker.failure is None
 
 
+class WordlessError(Exception):
+    """Cannot even be shown."""
+
+    def __str__(self):
+        raise SystemExit
+
+
 class Odd(BaseException):
     """What nobody expects."""
 
 
 @pytest.mark.parametrize('error', [
     OSError('no answer'), SystemExit(3), KeyboardInterrupt(), MemoryError(), Odd('who?'),
-    GeneratorExit(), RecursionError('deep')], ids=lambda x: type(x).__name__)
+    GeneratorExit(), RecursionError('deep'), WordlessError()], ids=lambda x: type(x).__name__)
 @pytest.mark.parametrize('method', ['write', 'read'])
 def test_whatever_hardware_raises_ends_the_worker_with_all_coils_switched_off(method, error):
     benches = [Bench(), Bench()]

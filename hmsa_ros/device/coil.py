@@ -177,7 +177,7 @@ class Coil:
         if not self._awaited:
             return []
         found = []
-        for when, level in self.instrument.applied():
+        for when, level in self.instrument.applied(now):
             asked = self._awaited.popleft()[1] if self._awaited else level
             found.append((when, asked, level))
         if self._awaited and now - self._awaited[0][0] > self._patience:
@@ -207,7 +207,10 @@ class Coil:
             If it fails; StateLostError if it has lost its state.
 
         """
-        if self._next_question is None or now < self._next_question:
+        if self._next_question is None:
+            return True
+        # Sooner than planned where the clock of the host was set back.
+        if now < self._next_question <= now + _ASK:
             return True
         self._next_question = now + _ASK
         return self.instrument.ask_clock(self._clock)

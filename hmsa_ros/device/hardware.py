@@ -1,9 +1,10 @@
 """Hardware as a laboratory writes it: found by its name, and called with care."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from importlib import import_module
 import inspect
+from itertools import islice
 import math
 from numbers import Real
 import os
@@ -13,6 +14,7 @@ from typing import Any, cast, NamedTuple, Protocol
 
 from hmsa_ros.device.clock_map import ClockMap
 from hmsa_ros.device.protocol import StateLostError
+from hmsa_ros.device.watchdog import ANOTHER_CLOCK
 from hmsa_ros.ending import Deadline, encoded
 from hmsa_ros.errors import BadInputError, excerpt, HmsaError
 from hmsa_ros.model.units import NANOSECONDS
@@ -22,8 +24,10 @@ _TAKES: dict[str, tuple[str, ...]] = {
     'write': ('level', 'now'), 'read': ('now',), 'open': (), 'close': (),
     'schedule': ('levels',), 'applied': (), 'clock': ()}
 OPTIONAL = tuple(_TAKES)[2:]
-# What cannot be when a level took effect, in ns from now.
+# In ns from now, besides the longest call: what cannot be the time of anything that has happened.
 _ABSURD = 10 * NANOSECONDS
+# Of one call that yields its answer piece by piece, which may never end.
+_MOST_PIECES = 100_000
 # A call that blocks lets Python run, or the process ends so many s after its time.
 _GRACE = 1.5
 # Of the limit: less than this is rounding where the hardware names no resolution, and no field
@@ -69,7 +73,11 @@ class HardwareError(HmsaError):
 
 def told(error: BaseException) -> str:
     """Return an exception for a sentence."""
-    name, text = type(error).__name__, str(error)
+    name = type(error).__name__
+    try:
+        text = str(error)
+    except BaseException as another:  # of an exception that cannot be written either
+        text = f'no text, since {type(another).__name__} was raised meanwhile'
     return f'{name}: {excerpt(text)}' if text else name
 
 
@@ -243,8 +251,15 @@ class Instrument:
 
     def _call(self, method: str, *arguments: object) -> Any:
         name = self._names[method]
+
+        def act() -> Any:
+            answer = getattr(self._hardware, method)(*arguments)
+            # What is yielded is waited for and fails as the call itself does.
+            return answer if not isinstance(answer, Iterator) else [
+                *islice(answer, _MOST_PIECES + 1)]
+
         try:
-            return self._calls(name, getattr(self._hardware, method), *arguments)
+            return self._calls(name, act)
         except StateLostError:
             raise
         except BaseException as error:  # whatever a laboratory's code raises, sys.exit too
@@ -272,6 +287,10 @@ class Instrument:
         """Return a time in ns of the hardware as one of this host."""
         return int(time) if self.clock_map is None else self.clock_map.to_host(int(time))
 
+    def _may_be(self, time: int, now: int) -> bool:
+        """Return whether a level may have taken effect at a time, both in ns."""
+        return abs(time - now) <= _ABSURD + self._calls.limit * NANOSECONDS
+
     def _written(self, answer: Any, level: float, now: int) -> tuple[int, float]:
         pair = isinstance(answer, (tuple, list)) and len(answer) == 2
         when, really = (answer[0], answer[1]) if pair else (answer, level)
@@ -279,7 +298,7 @@ class Instrument:
             when = now
         elif _is_number(when):
             when = self._ours(when)
-        if not (_is_number(when) and abs(when - now) <= _ABSURD and _is_number(really)):
+        if not (_is_number(when) and self._may_be(when, now) and _is_number(really)):
             raise HardwareError(
                 f'{self.name}.write of joint {self._joint} returned {excerpt(answer)}: expected '
                 'when the level took effect in ns, as now is, that and the level really set in '
@@ -303,18 +322,26 @@ class Instrument:
             if isinstance(answer, (str, bytes)):
                 raise TypeError
             values = (answer,) if _is_number(answer, finite=False) else (*answer,)
+            if len(values) > _MOST_PIECES:
+                raise ValueError
             if any(_is_number(x, finite=False) for x in values):
-                return [self._reading(values)]
-            return [self._reading(x) for x in values]
+                return [self._reading(values, now)]
+            return [self._reading(x, now) for x in values]
         except (TypeError, ValueError) as error:
             raise HardwareError(
                 f'{self.name}.read of joint {self._joint} returned {excerpt(answer)}: expected '
-                'stretch, (stretch, rate), (stretch, rate, stamp in ns) or a list of the latter, '
-                'with NaN for what is not measured') from error
+                'stretch, (stretch, rate), (stretch, rate, stamp in ns, as now is) or a list of '
+                f'the latter, at most {_MOST_PIECES}, with NaN for what is not measured'
+            ) from error
 
-    def _reading(self, values: Sequence[Any]) -> Reading:
+    def _reading(self, values: Sequence[Any], now: int) -> Reading:
         found = _reading(values)
-        return found if found.stamp is None else found._replace(stamp=self._ours(found.stamp))
+        if found.stamp is None:
+            return found
+        stamp = self._ours(found.stamp)
+        if abs(stamp - now) > ANOTHER_CLOCK:
+            raise ValueError
+        return found._replace(stamp=stamp)
 
     @property
     def keeps_levels(self) -> bool:
@@ -340,9 +367,9 @@ class Instrument:
         """
         self._call('schedule', [(self._theirs(x), y) for x, y in levels])
 
-    def applied(self) -> list[tuple[int, float]]:
+    def applied(self, now: int) -> list[tuple[int, float]]:
         """
-        Return stamps in ns and levels in T that have taken effect since it was last called.
+        Return stamps in ns and levels in T that have taken effect by a time, since the last call.
 
         Raises
         ------
@@ -354,14 +381,16 @@ class Instrument:
         """
         answer = self._call('applied')
         try:
-            found = [(x, y) for x, y in answer]
-            if not all(_is_number(x) and _is_number(y) for x, y in found):
+            if not all(_is_number(x) and _is_number(y) for x, y in answer):
                 raise TypeError
+            found = [(self._ours(x), float(y)) for x, y in answer]
+            if not all(self._may_be(x, now) for x, _ in found):
+                raise ValueError
         except (TypeError, ValueError) as error:
             raise HardwareError(
                 f'{self._names["applied"]} returned {excerpt(answer)}: expected a list of '
                 '(stamp in ns, level in T)') from error
-        return [(self._ours(x), float(y)) for x, y in found]
+        return found
 
     def ask_clock(self, clock: Callable[[], int]) -> bool:
         """
@@ -434,5 +463,9 @@ def _reading(values: Sequence[Any]) -> Reading:
 
 
 def _is_number(value: Any, *, finite: bool = True) -> bool:
-    real = type(value) is not bool and isinstance(value, Real)
-    return real and (not finite or math.isfinite(value))
+    if type(value) is bool or not isinstance(value, Real):
+        return False
+    try:
+        return math.isfinite(value) or not finite
+    except OverflowError:  # a whole number that no float can be
+        return False
