@@ -99,6 +99,15 @@ def test_planner_that_is_not_active_yet_is_named_by_who_sends(serve, capfd, chan
     assert f'hmsa: error: {sentence}' in capfd.readouterr().err
 
 
+def test_who_waits_for_a_sequence_hears_that_a_cut_off_has_ended_it(serve, capfd):
+    # Without heartbeats the watchdog trips.
+    serve(PlannerNode, PlantNode, *(x for name, value in (
+        ('heartbeat_period', 0.0), ('command_timeout', 0.3), ('safe_flux', 'zero'),
+        ('publish_rate', 200.0)) for x in ('-p', f'{name}:={value}')))
+    assert main(['send', '1.1:600', '--wait']) == 1
+    assert 'hmsa: error: the coil of joint actuator was cut off' in capfd.readouterr().err
+
+
 @pytest.mark.slow
 def test_a_request_that_no_planner_took_is_named_by_those_who_read_the_bag(
         start, ros, tmp_path, capsys):

@@ -301,6 +301,9 @@ class PlannerClient:
             ended = (
                 now.setpoint == now.setpoints and now.state in ('at_rest', 'settling')
                 and not now.watching)
+            if now.state == 'idle' and now.level >= DiagnosticStatus.ERROR[0]:
+                # Dropped: nothing more comes of it.
+                return True
             if not now.unheard:
                 heard = monotonic()
             elif monotonic() - heard > _UNHEARD_SECONDS:
