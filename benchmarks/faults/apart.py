@@ -106,25 +106,31 @@ for _seconds in (2.0, 25.0):
             lambda rig, seconds=_seconds: _outage(rig, seconds))
 
 
-@FAULTS.fault(
-    'hosts_recorder', "a subscriber's host goes away",
-    'link of the host of a subscriber to joint_states down, ARP entries removed, five moves',
-    'all moves arrive, and samples never stop for a second')
-def _recorder(rig: Rig) -> Seen:
+def _recorder(rig: Rig, where: str) -> Seen:
     if why := unavailable():
         return Seen(f'not tried: {why}', '-', met=True)
-    with hosts('bench', 'desk') as made:
+    with hosts('bench', 'desk', 'third') as made:
         apart = _Apart(rig, made)
         plant = apart.node('bench', 'plant')
-        apart.node('bench', 'planner')
-        apart.look_on('desk', 'recorder')
+        planner = apart.node(where, 'planner')
+        apart.look_on('third', 'recorder')
         onlooker = apart.look_on('bench')
-        made.cut('desk')
+        made.cut('third')
         status = apart.send(
-            'bench', *(f'{x}:1' for x in (1.2, 1.4, 1.1, 1.3, 1.0)), '--wait')
+            where, *(f'{x}:1' for x in (1.2, 1.4, 1.1, 1.3, 1.0)), '--wait')
         sleep(5.0)
         gap = float(np.diff(apart.seen(onlooker)[1]).max())
+        unheard = 'no receipt' in planner.said or 'heartbeat' in plant.said
         jumped = 'clock' in plant.said
     return Seen(
-        f'exit {status}, longest gap between samples {gap:.2f} s', '-',
-        status == 0 and gap < 1.0 and not jumped)
+        f'exit {status}, longest gap between samples {gap:.2f} s, planner and plant '
+        f'{"lost" if unheard else "heard"} each other', '-',
+        status == 0 and gap < 1.0 and not unheard and not jumped)
+
+
+for _where, _name in (('bench', 'one host'), ('desk', 'two hosts')):
+    FAULTS.fault(
+        f'hosts_recorder_{_where}', f"a subscriber's host goes away, the others on {_name}",
+        'link of the host of a subscriber to joint_states down, ARP entries removed, five moves',
+        'all moves arrive, samples never stop for a second, and planner and plant hear each '
+        'other')(lambda rig, where=_where: _recorder(rig, where))
