@@ -13,7 +13,11 @@ from pathlib import Path
 import re
 import sys
 
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 import numpy as np
+from PIL import Image
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
@@ -308,6 +312,48 @@ def moves(path: Path) -> None:
     exec(code.replace("'moves.png'", repr(str(path))), names)  # noqa: S102 - our own page
 
 
+def moving(path: Path) -> None:
+    """Draw two moves of the paper's block as an animation, unshaped and shaped."""
+    unit = paper_actuator().time_unit * 1e3
+    material = paper_actuator().nondimensional
+    setpoints = [Setpoint(1.4, 9.0), Setpoint(0.8, math.inf)]
+    time = np.linspace(-1.0, 19.0, 81)
+    fine = np.linspace(time[0], time[-1], 1601)
+    runs = []
+    for shaper in ('step', 'two_step'):
+        levels = [(x.begin + y.time, y.load) for x in plan_sequence(
+            setpoints, material, shaper=shaper) for y in x.move.levels]
+        switches, loads = np.array([(time[0], 0.0), *levels]).T
+        runs.append(simulate(switches, loads, fine, material)[0])
+    figure = Figure(figsize=(6.4, 2.9), dpi=100, layout='constrained')
+    canvas = FigureCanvasAgg(figure)
+    blocks, curves = figure.subplots(1, 2, width_ratios=[1.0, 1.5])
+    blocks.set(xlim=(-0.7, 1.7), ylim=(0.0, 2.1), xticks=[0, 1], yticks=[])
+    blocks.set_xticklabels(['unshaped step', 'two-step'])
+    curves.set(xlim=(time[0] * unit, time[-1] * unit), ylim=(0.4, 2.1))
+    style.finish(curves, style.axis('time', 't', 'ms'), STRETCH)
+    targets = [x.axhline(1.0, **style.TARGET) for x in (blocks, curves)]
+    looks_of = (style.UNSHAPED, style.SHAPED)
+    lines = [curves.plot([], [], **x)[0] for x in looks_of]
+    bodies = [blocks.add_patch(Rectangle((0.0, 0.0), 1.0, 1.0, facecolor=x['color'], alpha=0.8))
+              for x in looks_of]
+    frames = []
+    for now in time:
+        past = fine <= now + 1e-9
+        for target in targets:
+            target.set_ydata([1.0 if now < 0.0 else 1.4 if now < setpoints[0].span else 0.8] * 2)
+        for i, (line, body, stretch) in enumerate(zip(lines, bodies, runs, strict=True)):
+            line.set_data(fine[past] * unit, stretch[past])
+            height = stretch[past][-1]
+            width = 0.8 / math.sqrt(height)
+            body.set_bounds(i - width / 2, 0.0, width, height)
+        canvas.draw()
+        figure.set_layout_engine('none')
+        frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert('RGB').quantize(
+            32, dither=Image.Dither.NONE))
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=90, loop=0)
+
+
 def figure(number: int) -> Callable[[Path], None]:
     """Return what draws a figure of the paper."""
     return lambda path: draw_figure(FIGURES[number], [path], SCREEN)
@@ -319,13 +365,16 @@ PICTURES: dict[str, Callable[[Path], None]] = {
     'figure_08': figure(8), 'theory_force': force, 'theory_two_steps': two_steps,
     'theory_paths': energy, 'theory_deliveries': deliveries, 'theory_smooth': smooth,
     'laws': laws, 'creep': creep, 'beam': beam, **STUDIES}
+#: What draws each animation.
+ANIMATIONS: dict[str, Callable[[Path], None]] = {'moving': moving}
 
 
 def main() -> int:
     """Draw all of them, or those named."""
-    for name in sys.argv[1:] or PICTURES:
-        PICTURES[name](FOLDER / f'{name}.png')
-        print(FOLDER / f'{name}.png')
+    for name in sys.argv[1:] or [*PICTURES, *ANIMATIONS]:
+        path = FOLDER / f'{name}.{"gif" if name in ANIMATIONS else "png"}'
+        (PICTURES | ANIMATIONS)[name](path)
+        print(path)
     return 0
 
 

@@ -73,9 +73,9 @@ def test_tables_of_a_page_are_renewed_and_nothing_else():
 
 
 @pytest.mark.parametrize('name', [
-    'machine', 'planner', 'plant', 'start', 'choices', 'recorder', 'player', 'crash'])
-def test_page_about_the_method_has_marks_for_each_table(name):
-    page = (contenders.HERE.parent / 'docs' / 'explanation' / 'plans.md').read_text(
+    'machine', 'planner', 'plant', 'start', 'choices', 'recorder', 'player', 'crash', 'joints'])
+def test_page_on_speed_has_marks_for_each_table(name):
+    page = (contenders.HERE.parent / 'docs' / 'validation' / 'speed.md').read_text(
         encoding='utf-8')
     assert page.count(f'<!-- begin {name} -->') == page.count(f'<!-- end {name} -->') == 1
 

@@ -208,7 +208,7 @@ if REAL:
 
 
 def test_page_has_the_arguments_of_each_file():
-    page = (ROOT / 'docs' / 'guides' / 'desktop.md').read_text()
+    page = (ROOT / 'docs' / 'guides' / 'viewers.md').read_text()
     table = page.partition('| argument | of |')[2].partition('\n\n')[0]
     rows = re.findall(r'^\| ([^|]+) \| (both|demo|replay) \|', table, re.M)
     for file, name in ((DEMO, 'demo'), (REPLAY, 'replay')):

@@ -120,7 +120,8 @@ def public_members(module: str) -> Iterator[tuple[str, Any]]:
         yield f'{module}.{name}', thing
         if inspect.isclass(thing):
             for below, member in vars(thing).items():
-                if not below.startswith('_') and inspect.isfunction(member):
+                if not below.startswith('_') and inspect.isfunction(member) \
+                        and member.__module__ == module:
                     yield f'{module}.{name}.{below}', member
 
 
@@ -347,7 +348,12 @@ class Api(Generated):
                 for fault in faults(name, thing):
                     self.missing(f'docstring of {name}: {fault}')
                 if inspect.isclass(thing):
-                    lines += [f'.. autoclass:: {name}\n   :members:']
+                    # Matplotlib gives subclasses of its artists a method `set` of its own.
+                    foreign = ', '.join(
+                        x for x, member in vars(thing).items() if inspect.isfunction(member)
+                        and not x.startswith('_') and member.__module__ != module)
+                    lines += [f'.. autoclass:: {name}\n   :members:'
+                              + (f'\n   :exclude-members: {foreign}' if foreign else '')]
                 elif inspect.isroutine(thing) and name.rpartition('.')[0] == module:
                     lines += [f'.. autofunction:: {name}']
             sections.append(

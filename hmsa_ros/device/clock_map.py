@@ -64,7 +64,14 @@ class ClockMap:
 
     def add(self, before: int, device: int, after: int) -> bool:
         """
-        Take in that the device answered a time in ns between two times of the host.
+        Add one comparison of the two clocks.
+
+        Parameters
+        ----------
+        before, after : int
+            Times of the host in ns before the question and after the answer.
+        device : int
+            Time of the device in the answer, in ns.
 
         Returns
         -------

@@ -75,7 +75,16 @@ class Coil:
 
     def set(self, when: int, asked: float, level: float) -> bool:
         """
-        Note the level in force from a time in ns on, NaN if unknown, and the one asked for.
+        Record the level in force from a time on, and the requested one.
+
+        Parameters
+        ----------
+        when : int
+            Time in ns.
+        asked : float
+            Requested level in T.
+        level : float
+            Level in force in T, NaN if unknown.
 
         Returns
         -------

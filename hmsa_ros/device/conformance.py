@@ -203,12 +203,17 @@ class Trial:
 
     def run(self, progress: Callable[[str, float], None] = lambda text, part: None) -> Conformance:
         """
-        Try it.
+        Try the hardware.
 
         Parameters
         ----------
         progress : callable
-            Called with what is tried and the share that is done.
+            Called with the name of the current trial and the completed fraction.
+
+        Returns
+        -------
+        Conformance
+            The result of each check.
 
         Raises
         ------
