@@ -19,7 +19,7 @@ from typing import Any
 
 _NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # How long a process may take to end when all is done, in s.
-_LAST_SECONDS = 10
+_LAST_SECONDS = 3
 # How long writing a sentence may take, in s.
 _WRITTEN = 0.05
 # Sentence of a process that is ended, in bytes.

@@ -502,10 +502,16 @@ def test_a_clock_that_says_no_time_refuses_the_start(clock):
     ({'close': lambda x: None}, r'Coil.close does not take'),
     ({'limit': 'much'}, "Coil.limit is 'much': expected a number above 0"),
     ({'limit': 10**400}, 'Coil.limit is 1000.*: expected a number above 0'),
-    ({'slew': 0.0}, 'Coil.slew is 0.0: expected a number above 0')])
+    ({'slew': 0.0}, 'Coil.slew is 0.0: expected a number above 0'),
+    ({'out': True}, "Coil.resolution raised OSError: 'no device'")])
 def test_a_class_that_cannot_be_called_is_refused(change, expected):
     class Coil(Bench):
-        pass
+        out = False
+
+        @property
+        def resolution(self):
+            if self.out:
+                raise OSError('no device')
 
     coil = Coil()
     for name, value in change.items():

@@ -95,6 +95,16 @@ def test_bad_arguments_refuse_the_start_in_one_line_with_status_2(
     assert out == ''
 
 
+@pytest.mark.parametrize('words', [['planner'], ['send', '1.1:1']])
+def test_a_log_that_cannot_be_written_refuses_the_start(start, words):
+    # A process writes to one log.
+    process = start.hmsa(*words, ROS_LOG_DIR='/dev/null/log')
+    assert process.wait() == 2
+    assert re.fullmatch(
+        r'hmsa: error: ROS cannot write its log \(.*/dev/null/log.*\): set ROS_LOG_DIR .*\n',
+        process.stderr)
+
+
 @pytest.mark.parametrize('node', NODES)
 def test_process_that_refuses_to_start_says_why_and_has_no_traceback(start, node):
     arguments, fragment = BAD['missing_parameter_file']

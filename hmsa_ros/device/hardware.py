@@ -229,7 +229,10 @@ class Instrument:
                 f'{method}({", ".join(arguments)})') from error
 
     def _number(self, name: str) -> float | None:
-        value = getattr(self._hardware, name, None)
+        try:
+            value = getattr(self._hardware, name, None)
+        except BaseException as error:  # of a property
+            raise BadInputError(f'{self.name}.{name} raised {told(error)}') from error
         if value is not None and not (_is_number(value) and value > 0.0):
             raise BadInputError(
                 f'{self.name}.{name} is {excerpt(value)}: expected a number above 0, or None')

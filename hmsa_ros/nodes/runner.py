@@ -17,12 +17,11 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.logging import get_logger_level, LoggingSeverity, set_logger_level
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError, complain, HmsaError
-from hmsa_ros.middleware import prepare_middleware
+from hmsa_ros.nodes.visitor import start_ros
 
 # EventsExecutor.spin() without a time limit busy-loops and delivers nothing on this rclpy
 # (7.1); waiting for a future that never completes, a slice at a time, behaves as documented.
@@ -97,12 +96,12 @@ def _initialise(arguments: Sequence[str]) -> None:
     """Start rclpy, and refuse arguments that it or nobody understands."""
     if os.environ.get('NO_COLOR') and not os.environ.get('RCUTILS_COLORIZED_OUTPUT'):
         os.environ['RCUTILS_COLORIZED_OUTPUT'] = '0'
-    prepare_middleware()
     # What rcl says of bad arguments is in its error too, which is printed below in one line.
     set_logger_level('rcl', LoggingSeverity.FATAL)
     try:
-        rclpy.init(
-            args=['hmsa', *arguments], signal_handler_options=SignalHandlerOptions.NO)
+        start_ros(['hmsa', *arguments])
+    except BadInputError:
+        raise
     except Exception as error:  # rclpy raises errors of several unrelated classes here
         text = re.sub(r'^failed to initialize rcl: |, at \S+:\d+', '', str(error))
         raise BadInputError(
