@@ -31,7 +31,7 @@ def start_ros(
         rclpy.init(
             args=arguments, context=context, signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rclpy raises errors of several unrelated classes here
-        found = re.search(r"initialize logging: ([^\n]*?)(: \d+)?(, at |$)", str(error))
+        found = re.search(r'initialize logging: ([^\n]*?)(: \d+)?(, at |$)', str(error))
         if found is None:
             raise
         raise BadInputError(
