@@ -75,6 +75,12 @@ graph: tools ## draw docs/images/graph.svg anew, when a topic has changed
 pictures: tools ## draw the pictures of the documentation anew
 	$(BIN)/python scripts/draw_docs.py $(ARGS)
 
+.PHONY: release
+release: env ## build sdist and wheel into dist/, and test both in empty environments
+	$(EXTRAS) release > $(VENV)/extras.txt
+	$(INSTALL) -r $(VENV)/extras.txt
+	$(BIN)/python scripts/make_release.py $(ARGS)
+
 .PHONY: constraints
 constraints: ## write constraints.txt anew, with each of $(PYTHONS)
 	$(PYTHON) scripts/make_constraints.py $(PYTHONS)

@@ -74,6 +74,9 @@ EXTRAS_REQUIRE = {
     'viewers': [
         'rerun-sdk>=0.39',
     ],
+    'release': [
+        'build>=1.0',
+    ],
     'docs': [
         'furo>=2024.8',
         'myst-parser>=4.0',
