@@ -56,8 +56,8 @@ def build_parser() -> Parser:
     """Return the parser of the whole command line, with one subparser a command."""
     parser = Parser(
         prog='hmsa',
-        description='Move hard-magnetic soft actuators to a target stretch, fast and without '
-                    'residual vibration.',
+        description='Plan and send magnetic-field commands that take hard-magnetic soft actuators '
+                    'to a target stretch without residual vibration.',
         epilog='example: hmsa demo')
     parser.add_argument('--version', action='version', version=f'hmsa_ros {__version__}')
     subparsers = parser.add_subparsers(metavar='COMMAND', required=True)

@@ -24,25 +24,25 @@ def add_parser(subparsers: Any) -> None:
         epilog='example: hmsa bag info hmsa_demo/run')
     actions = parser.add_subparsers(metavar='ACTION', required=True)
     info = actions.add_parser(
-        'info', help='print the contents of a bag',
+        'info', help='list the contents of a bag',
         description='Print topics, counts, rates, losses and duration of a bag, and with '
                     '--parameters the parameters of the nodes.',
         epilog='example: hmsa bag info hmsa_demo/run --json')
     recover = actions.add_parser(
-        'recover', help='rescue a readable bag from a truncated one',
+        'recover', help='copy the readable messages of a damaged bag to a new bag',
         description='Copy everything readable in a bag to a new bag.',
         epilog='example: hmsa bag recover cut_off_run --out saved_run')
     verify = actions.add_parser(
-        'verify', help='integrate the recorded commands and compare with the recorded motion',
-        description='Integrate the recorded commands with the recorded parameters and print '
-                    'the largest difference from the recorded motion. The exit status is 1 if '
-                    'it is larger than the tolerance, if the bag is damaged, or if a command '
-                    'was never applied.',
+        'verify', help='simulate the recorded commands and compare with the recorded motion',
+        description='Simulate the recorded commands with the recorded parameters and print the '
+                    'maximum difference from the recorded motion. The exit status is 1 if it '
+                    'exceeds the tolerance, if the bag is damaged, or if a command was not '
+                    'applied.',
         epilog='example: hmsa bag verify hmsa_demo/run --tolerance 1e-6')
     tolerance = (
         '--tolerance', 'D', float,
-        'largest difference of the stretch, or of the deflection of a beam, that passes '
-        '(default %(default)g)', {'default': 1e-9})
+        'maximum difference in stretch, or in the deflection of a beam (default %(default)g)',
+        {'default': 1e-9})
     params_file = (
         '--params-file', 'YAML', Path,
         'parameter file (YAML) of the actuator, for a bag without its parameters')
@@ -53,7 +53,7 @@ def add_parser(subparsers: Any) -> None:
         {'default': CHUNK_SIZE / MEBIBYTE})
     for action, function, options in (
             (info, _info, [
-                ('--parameters', 'print the parameters of the recorded nodes, too'), JSON]),
+                ('--parameters', 'also print the parameters of the recorded nodes'), JSON]),
             (recover, _recover, [out]),
             (verify, _verify, [tolerance, params_file, JSON])):
         action.add_argument('bag', metavar='BAG', help='folder of a bag, or an .mcap file')

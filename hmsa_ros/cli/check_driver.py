@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
     parser = subparsers.add_parser(
-        'check-driver', help='try a class of hardware at small levels',
-        description='Drive a class of hardware as hmsa driver does, without ROS, with flux '
+        'check-driver', help='test a hardware class at small levels',
+        description='Test a hardware class as hmsa driver uses it, without ROS, with flux '
                     'densities up to --limit: levels, their timing, samples, polarity, and '
                     'whether the coil is off after a silence, close, an exception and SIGTERM. '
-                    'It takes about ten seconds. Exit 0 only if all checks pass.',
+                    'Takes about ten seconds. The exit status is 0 if all checks pass.',
         epilog='example: hmsa check-driver my_lab:Coil --set port=/dev/ttyACM0')
     parser.add_argument(
         'hardware', metavar='MODULE:NAME', help='as in the parameter hardware of hmsa driver')
@@ -30,9 +30,9 @@ def add_parser(subparsers: Any) -> None:
         ('--joint', 'NAME', str, 'name of the joint (default actuator)', {'default': 'actuator'}),
         ('--set', 'KEY=VALUE', str, 'a setting of the class, as hardware.KEY of hmsa driver; may '
          'be given several times', {'action': 'append', 'default': []}),
-        ('--limit', 'T', float, 'largest flux density that is set (default 0.001 T)',
+        ('--limit', 'T', float, 'maximum flux density (default 0.001 T)',
          {'default': 1e-3}),
-        ('--rate', 'HZ', float, 'rate at which it is read (default 200 Hz)',
+        ('--rate', 'HZ', float, 'sample rate (default 200 Hz)',
          {'default': 200.0}),
         ('--report', 'HTML', Path, 'page with the checks and histograms of times'),
         JSON)

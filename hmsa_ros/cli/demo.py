@@ -21,9 +21,9 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         'demo', help="run the paper's sequence on real ROS 2 processes",
         description="Start planner, plant and recorder, send the paper's sequence, and print "
-                    'the residual vibration. Then have a planner in this process learn a block '
-                    'that is 20 % stiffer than it knows. Writes a bag, two pictures and the '
-                    'logs.',
+                    'the residual vibration. Then move a block that is 20 % stiffer than the '
+                    "planner's model, in open loop and with feedback. Writes a bag, two figures "
+                    'and the logs.',
         epilog='example: hmsa demo --out my_first_run')
     add_options(
         parser,

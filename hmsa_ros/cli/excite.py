@@ -18,23 +18,23 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     parser = subparsers.add_parser(
         'excite', help='design the sequence to record for hmsa identify',
-        description='Design the sequence of levels that identifies the actuator best. It stays '
-                    'within the limits of coil and stretch and ends at rest. The table compares '
-                    "it with plain steps and with the paper's sequence, repeated for the same "
-                    'time.',
+        description='Design the sequence of levels that identifies the actuator best. It respects '
+                    'the limits of coil and stretch and ends at rest. The table compares it with '
+                    "unshaped steps and with the paper's sequence, repeated for the same "
+                    'duration.',
         epilog='example: hmsa excite --params-file actuator.yaml --duration 2 --out levels.csv')
     add_options(
         parser,
         ('--params-file', 'YAML', Path,
-         'parameter file with what is known of the block, flux_density_min, flux_density_max and '
+         'parameter file with estimates of the block, flux_density_min, flux_density_max and '
          'slew_limit (default: the defaults of the nodes)'),
         ('--duration', 'S', float, 'duration in s (default 180 periods of the block)'),
         ('--free', 'NAME,...', str, 'parameters to identify, as in hmsa identify',
          {'default': ''}),
         ('--stretch-min', 'X', float,
-         'smallest stretch allowed (default 0.6; a deflection of -0.6 for a beam)'),
+         'minimum stretch (default 0.6; a deflection of -0.6 for a beam)'),
         ('--stretch-max', 'X', float,
-         'largest stretch allowed (default 2; a deflection of 0.6 for a beam)'),
+         'maximum stretch (default 2; a deflection of 0.6 for a beam)'),
         ('--rate', 'HZ', float, 'sample rate of the sensor in Hz (default 1000)',
          {'default': 1000.0}),
         ('--noise', 'X', float, 'standard deviation of the stretch samples (default 0.001)',

@@ -14,8 +14,8 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         'export', help='write the samples and levels of a run as CSV or Parquet',
         description='Write the samples of a run (time in s from the first sample, stretch, '
-                    'stretch rate in 1/s, flux density in T) to FILE, and the levels that drove '
-                    'it (time, flux density) to a second file whose name ends in _levels.',
+                    'stretch rate in 1/s, flux density in T) to FILE, and its levels (time, flux '
+                    'density) to a second file whose name ends in _levels.',
         epilog='example: hmsa export hmsa_demo/run --out run.csv')
     parser.add_argument(
         'run_path', type=Path, metavar='RUN', help='folder of a bag, or an .mcap file')

@@ -33,7 +33,7 @@ def add_parser(subparsers: Any) -> None:
         ('--commands', 'CSV', Path,
          'CSV of time, flux_density: the level in force from that time on'),
         ('--params-file', 'YAML', Path,
-         'parameter file with what is known, such as geometry and density'),
+         'parameter file with the known values, such as geometry and density'),
         ('--free', 'NAME,...', str,
          'parameters to identify (default shear_modulus, damping_coefficient, chain_limit, '
          'remanence, stretch_bias); +NAME adds to these, and --free=-NAME takes from them; '
@@ -42,14 +42,14 @@ def add_parser(subparsers: Any) -> None:
          'viscoelastic_ratio and viscoelastic_time, for more branches with _2 and _3 after them; '
          'with a law its constants, such as law.c10 and law.c01', {'default': ''}),
         ('--known', 'NAME=VALUE[+-STD],...', str,
-         'what is known, kept as it is, such as sensor_latency=2ms or half_length=5mm+-1%%; '
-         'intervals hold what the standard deviation of it does', {'default': ''}),
+         'fixed values, such as sensor_latency=2ms or half_length=5mm+-1%%; the intervals include '
+         'the effect of a standard deviation', {'default': ''}),
         ('--joint', 'NAME', str, 'joint to identify, if the bag has several', {'default': ''}),
         ('--profile', 'NAME', str, 'also print the profile likelihood of this parameter',
          {'default': ''}),
         ('--out', 'YAML', Path,
-         'parameter file to write for planner and plant, only if identified, or with --accept; an '
-         'existing file is replaced'),
+         'parameter file to write for planner and plant, only if identified or with --accept; '
+         'replaces an existing file'),
         ('--accept',
          'also write the file of a model that is rejected for a defect that costs at most 5 %% of '
          'a step; the exit status is 3 then'),

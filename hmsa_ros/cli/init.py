@@ -46,17 +46,17 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         'init', help='write a parameter file for your own actuator',
         description='Write a parameter file of your own actuator for planner and plant '
-                    '(--params-file), and print what follows from it: times, damping, flux '
-                    'densities and reach. Asks for each value that no option gives. Numbers are '
-                    'in SI units unless a unit follows: 10mm, "50 kPa".',
+                    '(--params-file), and print the resulting times, damping, flux densities and '
+                    'reachable stretches. Asks for each value without an option. Numbers are in '
+                    'SI units unless a unit follows: 10mm, "50 kPa".',
         epilog='example: hmsa init --half-length 5mm --half-thickness 5mm --density 1.9g/cm3 \\\n'
                '    --shear-modulus 30kPa --j-lim 20 --zeta 0.1 --remanence 80mT \\\n'
                '    --flux-max 200mT --out my_actuator.yaml')
     add_options(
         parser,
         ('--beam',
-         'a beam, clamped at one end and free at the other, magnetised along its length, in a '
-         'field across it; its setpoints are deflections of the tip over the length'),
+         'a beam that is clamped at one end, magnetised along its length, in a field across it; '
+         'its setpoints are deflections of the tip over the length'),
         *(_option(x) for x in (
             *QUANTITIES, *(x for x in BEAM if x.key not in BY_KEY), DAMPING)),
         ('--joint', 'NAME', str,
@@ -64,7 +64,7 @@ def add_parser(subparsers: Any) -> None:
          {'default': ''}),
         ('--out', 'FILE', Path, f'file to write (default {_FILE})', {'default': _FILE}),
         ('--force', 'replace an existing file'),
-        ('--yes', 'do not ask; use the defaults for values that are not given'),
+        ('--yes', 'do not ask; use the defaults for values without an option'),
         JSON)
 
 

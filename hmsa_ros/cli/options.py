@@ -8,10 +8,10 @@ Row = tuple[Any, ...]
 
 JSON: Row = ('--json', 'print one JSON object')
 NAMESPACE: Row = ('--namespace', 'NS', str, 'namespace of the planner', {'default': ''})
-#: Nondimensional parameters of a block: option, metavar, and what it is.
+#: Dimensionless parameters of a block: option, metavar and meaning.
 MATERIAL = (
-    ('--zeta', 'Z', 'nondimensional damping coefficient, at least 0 (default 0.2)'),
-    ('--j-lim', 'J', 'chain limit of the Gent model, above 0 (default 5)'),
+    ('--zeta', 'Z', 'dimensionless damping, at least 0 (default 0.2)'),
+    ('--j-lim', 'J', 'Gent limiting extensibility J_lim, above 0 (default 5)'),
     ('--c1', 'C', 'shape 2 H^2/L^2, above 0 (default 2)'))
 
 

@@ -27,8 +27,8 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     parser = subparsers.add_parser(
         'plan', help='plan a sequence of setpoints without ROS',
-        description='Plan a sequence of setpoints, nondimensional as in the paper: each '
-                    'setpoint is a stretch and how long it lasts (move plus hold), in units of '
+        description='Plan a sequence of setpoints, dimensionless as in the paper: each '
+                    'setpoint is a stretch and its duration (move plus hold) in units of '
                     'L sqrt(rho/G). With --params-file times are in seconds and flux densities '
                     'in tesla.',
         epilog='example: hmsa plan 1.10:10 1.20:10 1.40:10 --json')
@@ -44,16 +44,16 @@ def add_parser(subparsers: Any) -> None:
         ('--shaper', 'NAME', str,
          'two_step (default), robust, minimax, minimum_time, smooth, step, zv, zvd, ei or umzv'),
         ('--order', 'N', int,
-         'two-step commands that robust chains; minimax takes as long (default 2)',
+         'number of two-step commands that robust cascades; minimax takes as long (default 2)',
          {'default': 2}),
         ('--errors', 'G,C,J', str,
-         'errors of shear modulus, damping coefficient and chain limit, as shares, for which '
-         'minimax plans (default 0.1,0.1,0.1, or where 95 %% of the covariance lie that hmsa '
-         'identify wrote to --params-file)'),
+         'relative errors in shear modulus, damping and J_lim that minimax must tolerate (default '
+         '0.1,0.1,0.1, or the 95 %% confidence ellipsoid that hmsa identify stored in '
+         '--params-file)'),
         ('--periods', 'N', float,
-         'natural periods that a move of smooth takes at the least (default 1)',
+         'minimum duration of a smooth move in natural periods (default 1)',
          {'default': 1.0}),
-        ('--max-rate', 'R', float, 'largest stretch rate on the way of smooth (default any)',
+        ('--max-rate', 'R', float, 'maximum stretch rate of a smooth move (default any)',
          {'default': math.inf}),
         ('--params-file', 'YAML', Path,
          'parameter file (YAML) of planner and plant, for a plan in seconds and tesla'),

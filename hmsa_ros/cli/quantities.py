@@ -146,7 +146,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         ((0.8, 1.3, 'that is air, or did you mean g/cm^3?'),
          (1.3, 10.0, 'did you mean g/cm^3?'), (7000.0, 9000.0, 'that is solid metal'))),
     Quantity.of(
-        'remanence', _BLOCK['remanence'], 'residual flux density Br along the thickness',
+        'remanence', _BLOCK['remanence'], 'remanence Br along the thickness',
         (0.005, 0.4),
         'isotropic NdFeB powder of 0.7 to 0.9 T diluted to 1 to 40 % by volume; 0.143 T in '
         + _ZHAO,
@@ -154,19 +154,19 @@ QUANTITIES: tuple[Quantity, ...] = (
           'mT?'), (0.9, 1.5, 'that is a solid magnet'))),
     Quantity.of(
         'j_lim', _BLOCK['chain_limit'],
-        'chain extensibility limit J_lim of the Gent model', (0.5, 200.0),
+        'Gent limiting extensibility J_lim', (0.5, 200.0),
         'Gent, Rubber Chem. Technol. 69 (1996) 59, fits rubber with some 30 to 100; the paper '
         'takes 1 to 5'),
     Quantity(
         'zeta', '', 'damping zeta, c/(8 L H sqrt(rho G))', '', ZETA, 0.0, 1e12, (0.005, 2.0),
         'where the paper takes 0.02 to 1.1'),
     Quantity.of(
-        'flux_max', FLUX_DENSITY_MAX, "coil's largest flux density", (1e-3, 2.0),
+        'flux_max', FLUX_DENSITY_MAX, "coil's maximum flux density", (1e-3, 2.0),
         'from Helmholtz coils, some 1 to 50 mT, to electromagnets, whose iron saturates near '
         '2 T', ((2.0, 1e3, 'did you mean mT?'),)),
     Quantity.of(
         'flux_min', FLUX_DENSITY_MIN,
-        "coil's least flux density, negative in the other direction", (-2.0, 0.0),
+        "coil's minimum flux density, negative in the other direction", (-2.0, 0.0),
         'since at 0 T the block is at rest, and coils reach some 2 T',
         ((-1e3, -2.0, 'did you mean mT?'),), follows=True),
     Quantity.of(
@@ -192,9 +192,9 @@ BEAM: tuple[Quantity, ...] = (
         ((1e9, 1e12, 'that is a hard plastic or a metal'), (0.0, 3e3, 'did you mean kPa?'))),
     BY_KEY['density'],
     replace(
-        BY_KEY['remanence'], text='residual flux density Br along the length'),
+        BY_KEY['remanence'], text='remanence Br along the length'),
     Quantity(
-        'damping_ratio', '', 'damping ratio about rest, as the ringing shows it', '', 0.05, 0.0,
+        'damping_ratio', '', 'damping ratio about rest, from the ringing', '', 0.05, 0.0,
         1e3, (0.005, 0.9), 'of silicone strips in air'),
     *(BY_KEY[x] for x in ('flux_max', 'flux_min', 'slew_limit')),
 )

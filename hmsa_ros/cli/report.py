@@ -20,9 +20,9 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         'report', help='write an HTML report of a run from its bag',
         description='Write a report of a run as one self-contained HTML page: response, '
-                    'command, phase plane, residuals against plain steps, plan against run, '
-                    'timing and losses. Any bag with joint states works, in any namespace; '
-                    'several bags share one page.',
+                    'command, phase plane, residual vibration compared with unshaped steps, plan '
+                    'compared with run, timing and losses. Any bag with joint states works, in '
+                    'any namespace; several bags share one page.',
         epilog='example: hmsa report hmsa_demo/run --out run.html --picture run.pdf --width 85')
     parser.add_argument(
         'bags', nargs='+', type=Path, metavar='BAG', help='folder of a bag, or an .mcap file')
@@ -31,14 +31,14 @@ def add_parser(subparsers: Any) -> None:
         ('--out', 'FILE', Path,
          'page to write; an existing file is replaced (default: NAME_report.html in this folder, '
          'NAME being the first bag)'),
-        ('--json', 'print what was found of each setpoint, and the files, as JSON'))
+        ('--json', 'print the results of each setpoint, and the files, as JSON'))
     parser.add_argument(
         '--params-file', '--params', dest='params', type=Path, metavar='YAML',
         help='parameter file (YAML) of the real actuator (default: the parameters in the bag)')
     parser.add_argument(
         '--joint', default='', metavar='NAME',
         help='joint to show, or several separated by commas (default: those with commands)')
-    add_picture_options(parser, named='pictures to write as well')
+    add_picture_options(parser, named='figures to write in addition')
 
 
 def run(arguments: argparse.Namespace) -> int:

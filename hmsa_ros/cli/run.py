@@ -33,33 +33,33 @@ _MOST_LEVELS = 12
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
     parser = subparsers.add_parser(
-        'run', help='carry out a whole experiment: check, record, send, measure',
-        description='Carry out an experiment with the planner and the plant or driver that run, '
-                    'or with simulated ones: check that all are there and agree, start a '
-                    'recorder and wait until it listens, send the sequence, close the bag, and '
-                    'measure whether each setpoint was reached. Ctrl-C brings the actuator to '
-                    'rest and closes the bag.',
+        'run', help='execute a whole experiment: check, record, send, measure',
+        description='Execute an experiment with the running planner and plant or driver, or with '
+                    'simulated ones: check that the nodes run and agree, record, send the '
+                    'sequence, close the bag, and measure whether each setpoint was reached. '
+                    'Ctrl-C brings the actuator to rest and closes the bag.',
         epilog='example: hmsa run 1.10:0.2 1.20:0.2 1.00:0.2 --simulate')
     add_sequence(parser)
     add_options(
         parser,
         ('--simulate',
-         'start a planner and a simulated plant for this run, which lead simulated time'),
+         'start a planner and a plant for this run, in simulated time'),
         ('--params-file', 'YAML', Path,
-         'parameter file: of the nodes to start, or to hold those that run against'),
+         'parameter file; with --simulate, used for the nodes started; otherwise the running '
+         'nodes are checked against it'),
         ('--feedback', 'MODE', str,
-         'off, observe or adapt: what the planner does with the samples; a planner that runs '
-         'already must be set to it (default as it is; off)',
+         'feedback mode: off, observe or adapt. With a running planner, fails unless the planner '
+         'is in this mode (default: do not check; off with --simulate)',
          {'choices': ('off', 'observe', 'adapt')}),
         ('--tolerance', 'X', float,
-         'offset and residual vibration of a setpoint that counts as arrived, as a share of the '
+         'steady-state error and residual vibration that count as arrived, as a fraction of the '
          "step (default: the planner's arrival_tolerance, vibration_tolerance and "
-         'stretch_tolerance, by which the end of --levels is judged, too)'),
-        ('--report', 'write report.html as well'),
-        ('--out', 'DIR', Path, 'folder for the output (default hmsa_run/ and the time of day)'),
+         'stretch_tolerance, which also apply to the end of --levels)'),
+        ('--report', 'also write report.html'),
+        ('--out', 'DIR', Path, 'folder for the output (default hmsa_run/ plus date and time)'),
         ('--json', 'print the result as JSON'),
         NAMESPACE,
-        ('--joint', 'NAMES', str, 'joint, or joints with commas between (default actuator)',
+        ('--joint', 'NAMES', str, 'joint, or several separated by commas (default actuator)',
          {'default': 'actuator'}))
 
 

@@ -14,21 +14,21 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     parser = subparsers.add_parser(
         'send', help='publish a sequence of setpoints to the running planner',
-        description='Publish a sequence of setpoints, or of levels, to the running planner, '
-                    'beginning now, and print its verdict.',
+        description='Publish a sequence of setpoints or levels to the running planner, starting '
+                    'now, and print the status.',
         epilog='example: hmsa send 1.10:2 1.20:2 --wait')
     add_sequence(parser)
     add_options(
         parser,
         ('--wait',
-         'report progress until the sequence has been carried out, and fail unless all setpoints '
-         'were measured to be arrived at, or nobody measures'),
+         'report progress until the end of the sequence, and fail unless the samples show that '
+         'all setpoints were reached, or there are no samples'),
         ('--recorded', 'wait until a recorder has subscribed, then send'),
         NAMESPACE,
         ('--joint', 'NAMES', str, 'joint, or several separated by commas (default actuator)',
          {'default': 'actuator'}),
         ('--timeout', 'S', float,
-         'seconds to wait for a reply, and past the end of the sequence (default 10 s)',
+         'time to wait for a reply, and beyond the end of the sequence (default 10 s)',
          {'default': 10.0}))
 
 

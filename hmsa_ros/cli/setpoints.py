@@ -12,14 +12,13 @@ def add_sequence(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that say what to send: setpoints, or a file of levels."""
     parser.add_argument(
         'setpoints', nargs='*', type=setpoint_of_joints, metavar='STRETCH:SECONDS',
-        help='stretch, or deflection of a beam, to come to rest at, and how long this setpoint '
-             'lasts in s (move plus hold); with several joints, one for all or one per joint, as '
-             'in 1.10,1.20:2')
+        help='target stretch, or deflection of a beam, and its duration in s (move plus hold); '
+             'with several joints, one stretch for all or one per joint, as in 1.10,1.20:2')
     parser.add_argument(
         '--levels', type=Path, metavar='CSV',
-        help='in place of setpoints: CSV of time, flux_density, as hmsa excite writes it. The '
-             'levels are sent as they are, if they keep the limits of coil and block; a shaped '
-             'move to rest ends those that do not end at rest')
+        help='instead of setpoints: CSV with the columns time and flux_density, as hmsa excite '
+             'writes it. The levels are sent unchanged if they respect the limits of coil and '
+             'block; levels that do not end at rest are followed by a shaped move to rest')
 
 
 def levels_of(arguments: argparse.Namespace) -> list[tuple[float, float]]:

@@ -29,8 +29,8 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     parser = subparsers.add_parser(
         'watch', help='show the running nodes live in the terminal',
-        description='Show stretch against target, command, progress of the plan, the verdict on '
-                    'the last request, and losses, live in the terminal. Quit with q or Ctrl-C. '
+        description='Show stretch and target, command, progress of the plan, status of the last '
+                    'request, and losses, live in the terminal. Quit with q or Ctrl-C. '
                     'Without a terminal it prints one line per second.',
         epilog='example: hmsa watch --joint actuator --span 5')
     add_options(

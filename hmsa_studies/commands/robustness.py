@@ -37,13 +37,13 @@ def _move(text: str) -> tuple[float, float]:
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
     parser = subparsers.add_parser(
-        'robustness', help='compare the shapers under model error',
+        'robustness', help='compare the shapers under parameter errors',
         description='Plan moves with each shaper and the nominal parameters, simulate them with '
-                    'errors in shear modulus G, damping coefficient zeta and J_lim, and compare '
-                    'the residuals: peak-to-peak stretch after arrival as a share of the step, '
-                    'without the steady offset. Minimax plans for these errors. Prints a table '
-                    'and writes robustness.csv, a picture of each move, and front.png, the worst '
-                    'residual over the duration; existing files are replaced.',
+                    'errors in shear modulus G, damping zeta and J_lim, and compare the residual '
+                    'vibration: peak-to-peak stretch after arrival as a fraction of the step, '
+                    'without the steady-state error. Minimax plans for these errors. Prints a '
+                    'table and writes robustness.csv, a figure of each move, and front.png, the '
+                    'worst residual vibration over the move time; replaces existing files.',
         epilog='example: hmsa robustness --move 1.0:1.4 1.2:0.8 --errors 0.05 --order 2 3 4')
     add_options(
         parser,
@@ -53,7 +53,7 @@ def add_parser(subparsers: Any) -> None:
         ('--shapers', 'NAME,...', str,
          'shapers, separated by commas (default all)'),
         ('--errors', 'E', float,
-         'largest error in the table and the box, as a share (default 0.1); the curves go to '
+         'maximum relative error in the table and the box (default 0.1); the curves extend to '
          'twice that', {'default': 0.1}),
         ('--order', 'N', int, 'orders of robust and minimax (default 2 3)', {'nargs': '+'}),
         *((option, metavar, float, text if option == '--c1' else f'nominal {text}')
@@ -61,13 +61,11 @@ def add_parser(subparsers: Any) -> None:
         ('--out', 'DIR', Path,
          'output folder, created if missing (default robustness; with --feedback feedback)'),
         ('--feedback',
-         'compare open loop with corrections from samples instead: vibration and offset after '
-         'moves with G up to 20 %% off, noise, delay and an unknown bias of the sensor; takes '
-         'minutes; of the other options --params-file, --seeds, --out, --json and those below; '
-         'writes files only with --out or --shard, --dask and --resume'),
+         'compare open loop with feedback instead (takes minutes). Can be combined only with '
+         '--params-file, --seeds, --out, --json, --workers, --shard, --dask, --resume'),
         ('--params-file', 'YAML', Path,
-         'actuator and coil in place of --zeta, --j-lim and --c1, of any law; with --feedback '
-         'seen by a camera (default: blocks and sensors of a list)'),
+         'actuator and coil instead of --zeta, --j-lim and --c1, with any hyperelastic model; '
+         'with --feedback a camera samples it (default: a list of blocks and sensors)'),
         ('--seeds', 'N', int, 'runs with different noise for --feedback (default 10)',
          {'default': 10}),
         *chunked.options('processes (default 1)'),
@@ -222,8 +220,8 @@ def _print_table(case: 'Case', results: 'list[Result]') -> None:
         title=f'{case.material.coordinate.name} {case.start:g} to {case.target:g}, '
               f'{case.nominal}',
         caption=f'residual: peak-to-peak {case.material.coordinate.name} after arrival in % of '
-                f'the step, without the steady offset; worst within {error} % of error, in the '
-                'last column of all at once; arrival in '
+                f'the step, without the steady-state error; worst case within {error} % of error, '
+                'in the last column for all errors at once; arrival in '
                 + ('L sqrt(rho/G)' if case.material.law is None else 'units of time'))
     table.add_column('shaper', no_wrap=True)
     for name in ('arrival', 'nominal', *case.parameters, 'all'):
@@ -245,9 +243,9 @@ def _print_table(case: 'Case', results: 'list[Result]') -> None:
     if linear:
         notes.append(f'{", ".join(linear)}: linear, designed at the target')
     if any(x.move is not None and math.isinf(x.move.duration) for x in results):
-        notes.append('an arrival in brackets is not one: where the motion is only approached, '
-                     'the residual counts from when the two-step command arrives, or from half '
-                     'a natural period on where there is none')
+        notes.append('unshaped steps have no arrival time; the residual is measured from the '
+                     'arrival of the two-step command (in brackets), or from half a natural '
+                     'period if there is none')
     if any(math.isnan(x.worst.residual) for x in results if x.move is not None):
         notes.append('a question mark marks a motion too close to a limiting stretch to '
                      'integrate')

@@ -28,7 +28,7 @@ _LARGE = 1_000_000
 # Option of a column, and what it is.
 _AXES = (
     ('--start', 'initial stretch, at rest (default 1; of a beam 0)'),
-    ('--target', 'stretch to come to rest at (default 1.1)'),
+    ('--target', 'target stretch (default 1.1)'),
     *((option, text) for option, _, text in MATERIAL),
 )
 
@@ -36,14 +36,13 @@ _AXES = (
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
     parser = subparsers.add_parser(
-        'sweep', help='plan over grids, tables and samples of parameters',
-        description='Plan a move for all combinations of the values given, nondimensional as '
-                    'in the paper, or in SI units with --params-file. GRID is a value, '
+        'sweep', help='plan over ranges, tables and samples of parameters',
+        description='Plan a move for all combinations of values, dimensionless as in the paper, '
+                    'or in SI units with --params-file. GRID is a value, '
                     'FIRST:LAST:POINTS or log:FIRST:LAST:POINTS, or several of these separated '
-                    'by commas; or sobol:LOW:HIGH or normal:MEAN:STD, of which samples are '
-                    'drawn. A case that cannot be planned gives the reason in its status; the '
-                    'others are still planned. The table is the same, to the byte, however many '
-                    'workers or shards compute it.',
+                    'by commas; or sobol:LOW:HIGH or normal:MEAN:STD for random samples. A case '
+                    'that cannot be planned contains the reason in its status. The table is '
+                    'identical, byte for byte, for any number of workers or shards.',
         epilog='example: hmsa sweep --zeta 0:2:1000 --j-lim log:0.1:100:50 --out sweep.csv')
     add_options(
         parser,
@@ -51,24 +50,25 @@ def add_parser(subparsers: Any) -> None:
         ('--vary', 'NAME=GRID', str,
          'another column: load_min, load_max, period, slew, lag or a constant of the law '
          '(law.c10, ...); with --params-file a parameter, such as actuator.shear_modulus, '
-         'flux_density_max, slew_limit, coil_time_constant or command_period. The actuator may '
-         'differ from what is planned with, in error.shear_modulus, error.zeta, error.j_lim and '
-         'error.remanence (shares); with --params-file in actual.shear_modulus, '
+         'flux_density_max, slew_limit, coil_time_constant or command_period. The simulated '
+         'actuator may differ from the model in error.shear_modulus, error.zeta, error.j_lim and '
+         'error.remanence (relative errors); with --params-file in actual.shear_modulus, '
          'actual.remanence, actual.coil_time_constant and so on (SI)',
          {'action': 'append', 'default': []}),
         ('--residual',
-         'carry out each plan too: columns residual (vibration after arrival, peak to peak) and '
-         'offset at rest, as shares of the step; so do columns of the actuator. With '
-         '--identified the samples are actuators, and plans are made with the file'),
-        ('--law', 'NAME,...', str, 'elastic laws to compare, separated by commas'),
+         'also simulate each plan, for the columns residual (residual vibration, peak to peak) '
+         'and offset (steady-state error), as fractions of the step. Columns of the simulated '
+         'actuator imply it. With --identified the samples are actuators, and the plans use the '
+         'file'),
+        ('--law', 'NAME,...', str, 'hyperelastic models to compare, separated by commas'),
         ('--shaper', 'NAME,...', str,
          'shapers to compare, separated by commas (default two_step)'),
         ('--params-file', 'YAML', Path,
          'parameter file (YAML) of planner and plant: plans in seconds and tesla, within the '
          'limits of its coil'),
         ('--identified',
-         'draw samples of what hmsa identify wrote to --params-file, normal with its covariance'),
-        ('--samples', 'N', int, 'how many samples are drawn (default 1024)'),
+         'sample the normal distribution that hmsa identify stored in --params-file'),
+        ('--samples', 'N', int, 'number of random samples (default 1024)'),
         ('--seed', 'S', int, 'of the samples (default 0)', {'default': 0}),
         ('--cases', 'FILE.csv', Path,
          'CSV with a header of columns; each row is combined with the samples, and with the '
@@ -83,9 +83,9 @@ def add_parser(subparsers: Any) -> None:
             'processes; 1 computes in this one (default: one a core for large sweeps)'))
     add_picture_options(
         parser, folder=True,
-        named='draw the results too: curves over one column of numbers, a map with contours over '
-              'two, bands of quantiles of samples; hatched where there is no plan. A folder of '
-              '--out gets pictures in any case, named table')
+        named='also draw the results: curves over one numeric column, a map with contours over '
+              'two, bands of quantiles for samples; hatched without a plan. A folder as --out '
+              'always gets figures, named table')
 
 
 def run(arguments: argparse.Namespace) -> int:
