@@ -229,6 +229,23 @@ def test_a_move_does_not_start_from_a_state_that_samples_contradict():
     assert max(x.flux_density for t, x in rig.sent if t > START + 800 * MS) < 0.06
 
 
+@pytest.mark.parametrize('level', [-1e12, 1e300, 1.7e308])
+def test_a_report_or_a_sample_that_cannot_be_is_ignored(level):
+    rig = Rig(settings=replace(QUIET, takeover_timeout=500 * MS))
+    rig.runtime.request(Target('a', 1.2))
+    for _ in range(50):
+        rig.runtime.observed('a', rig.now, 1.1, 1.0, level)
+        rig.steady += 20 * MS
+        rig.run(rig.now + 20 * MS)
+    rig.runtime.applied('a', rig.now - MS, level)
+    rig.run(rig.now + 1000 * MS)
+    assert sum('T took effect is ignored' in x for x in rig.notes()) == 1
+    assert any('sample of joint a ignored' in x for x in rig.notes())
+    rig.runtime.request(Target('a', 1.1))
+    rig.run(rig.now + 1000 * MS)
+    assert rig.residual(1.1) < 1e-6
+
+
 def test_a_wrong_model_is_no_contradiction():
     rig = Bench()
     rig.runtime.request(Target('a', 1.4))

@@ -28,6 +28,7 @@ from hmsa_ros.control.records import (
     Trajectory,
     Verdict,
 )
+from hmsa_ros.control.seldom import Seldom
 from hmsa_ros.control.sending import Sending
 from hmsa_ros.control.silence import Silence
 from hmsa_ros.control.slices import Clock, work_on
@@ -90,6 +91,7 @@ class PlannerRuntime:
             clock, steady, lambda: self.sending.send(clock()))
         self._last_jump: int | None = None
         self._set_back = 0
+        self._tell_impossible = Seldom()
 
     # -- in ------------------------------------------------------------------------------------
 
@@ -170,8 +172,14 @@ class PlannerRuntime:
 
     def applied(self, joint: str, stamp: int, flux_density: float) -> None:
         """Take in that a joint's level in T has really been in force from a stamp in ns on."""
-        if not math.isfinite(flux_density):
+        if math.isnan(flux_density):
             # Nobody knows what is in force.
+            return
+        if not self.group.planners[joint].follows(flux_density):
+            if self._tell_impossible():
+                self._bulletin.note(
+                    f'joint {joint}: a report that {flux_density:g} T took effect is ignored, since '
+                    'no motion can be predicted from there; see what publishes it')
             return
         self.feedback.applied(joint, stamp, flux_density)
         if self._takeover.engaged:

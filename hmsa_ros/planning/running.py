@@ -8,10 +8,10 @@ from bisect import bisect_left, bisect_right
 from dataclasses import replace
 import math
 
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.model.equations import elastic_stiffness, equilibrium_stretch
 from hmsa_ros.model.moves import State
-from hmsa_ros.model.simulation import check_stretch
+from hmsa_ros.model.simulation import check_stretch, longest_motion
 from hmsa_ros.planning.drafting import on_grid
 from hmsa_ros.planning.history import Deviation, History
 from hmsa_ros.planning.timeline import ALWAYS, Draft, Model, Plan, PlannedLevel, PlannedSegment
@@ -84,7 +84,20 @@ class RunningPlan:
         at_rest = abs(rate) * model.units.time <= _SAMPLED_AT_REST * self.model.frequency(stretch)
         if at_rest and level == in_force and abs(float(held) - stretch) > _AGREES:
             begin = replace(begin, stamp=ALWAYS, rate=0.0)
+        if not _can_be_followed(begin):
+            raise BadInputError(
+                f'state in force is stretch {stretch:g}, rate {rate:g} 1/s, flux density '
+                f'{in_force:g} T: expected one that the model can follow')
         self._begin_with(begin, keep=keep)
+
+    def follows(self, flux_density: float) -> bool:
+        """Return whether motion under a level in T can be predicted: what is planned can."""
+        options, model = self.model.options, self.model
+        # With room for the motion that it may find.
+        more = 2.0 * flux_density
+        return options.flux_density_min <= flux_density <= options.flux_density_max or (
+            math.isfinite(more) and _can_be_followed(PlannedLevel(
+                0, more, model.actuator.rest, 0.0, 0.0, model)))
 
     def abandon(self, now: int) -> None:
         """Drop what is ahead at a time in ns, sent or not, and the setpoints: nobody obeys."""
@@ -259,3 +272,17 @@ def _running(plan: Plan, begin: int, now: int) -> tuple[PlannedSegment, ...]:
     if running and running[-1].arrival is not None and running[-1].arrival > begin:
         running = (*running[:-1], replace(running[-1], arrival=None))
     return running
+
+
+def _can_be_followed(level: PlannedLevel) -> bool:
+    """Return whether motion from a level on can be predicted until it has settled."""
+    model, load = level.model, level.flux_density / level.model.units.load
+    if level.stamp == ALWAYS:
+        return True
+    period = 2.0 * math.pi / model.frequency(model.actuator.rest)
+    try:
+        for time in (period, longest_motion(load, model.material)):
+            model.follow(level.at(level.stamp), load, time)
+    except (HmsaError, OverflowError, ValueError):
+        return False
+    return True
