@@ -178,8 +178,8 @@ class PlannerRuntime:
         if not self.group.planners[joint].follows(flux_density):
             if self._tell_impossible():
                 self._bulletin.note(
-                    f'joint {joint}: a report that {flux_density:g} T took effect is ignored, since '
-                    'no motion can be predicted from there; see what publishes it')
+                    f'joint {joint}: a report that {flux_density:g} T took effect is ignored, '
+                    'since no motion can be predicted from there; see what publishes it')
             return
         self.feedback.applied(joint, stamp, flux_density)
         if self._takeover.engaged:
