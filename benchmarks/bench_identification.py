@@ -201,7 +201,8 @@ def robustness(*, quick: bool = False, runs: int = ROBUST_RUNS) -> Sheet:
         figures[kind] = {'verdicts': counts, 'runs': runs, 'row': row, 'biases': biases.tolist()}
     return Sheet(
         'identification_robustness',
-        f'{runs} runs each of 2 s at 1 kHz, plain steps repeated, noise 0.001; bias (of the worst '
+        f'{runs} runs each of 2 s at 1 kHz, unshaped steps repeated, noise 0.001; bias (of the '
+        'worst '
         f'parameter; chance alone makes {1.0 / np.sqrt(runs):.2f}) and error in standard '
         'deviations as they are said; width of the intervals and move of the result beside the '
         'same run with white noise alone',

@@ -1,7 +1,7 @@
 """
 The plant: time to simulate one unit of nondimensional time at an error of 1e-9.
 
-The paper's sequence 1 to 1.1 to 1.2 to 1.4 with plain steps, ten units each, rings all the way;
+The paper's sequence 1 to 1.1 to 1.2 to 1.4 with unshaped steps, ten units each, rings all the way;
 it is sampled ten times a unit, more often than a plant node at 1 kHz would. Errors are those of
 the samples against solutions in 40-digit arithmetic. Every method gets the loosest tolerance, or
 the longest step, that keeps the error.

@@ -151,7 +151,7 @@ def motion(plants: Plants, switches: Array, levels: Array, end: float) -> Callab
 
 def sequence(plants: Plants, targets: tuple[float, ...] = _STEPS, repeats: int = _REPEATS,
              dwell: float = _DWELL) -> tuple[Array, Array, float]:
-    """Return switches, loads and the end of plain steps to targets, which the model would hold."""
+    """Return switches, loads and the end of unshaped steps to targets that the model holds."""
     held = [np.zeros(len(plants.damping))]
     for target in targets * repeats:
         square = 2.0 / target + target ** 2 - 3.0

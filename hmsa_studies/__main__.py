@@ -98,7 +98,7 @@ def sampled_table() -> Table:
 def damped_table(found: DampedStudy) -> Table:
     """Return header and rows of times above critical damping, at the study's values of zeta."""
     rows: Table = [('time to', *(f'zeta = {x:g}' for x in found.zetas))]
-    rows.append(('plain step: within 1 %', *(f'{x:.2f}' for x in found.step)))
+    rows.append(('unshaped step: within 1 %', *(f'{x:.2f}' for x in found.step)))
     for (least, most), settled, arrival in zip(
             LIMITS, found.settled, found.arrival, strict=True):
         name = f'minimum time, {least:g} to {most:g} beta_1'

@@ -188,7 +188,7 @@ def _cycles() -> Iterator[str]:
 
 def _unshaped(
         targets: Sequence[float], material: NondimensionalParameters, span: float) -> Run:
-    """Return the response to plain steps with spans so long that each move starts from rest."""
+    """Return the response to unshaped steps with spans so long that each move starts from rest."""
     run, = paper_data.respond(
         '', targets, material, commands=('unshaped',), span=span, samples=30_001)
     return run
@@ -214,13 +214,13 @@ def _near_limit() -> Iterator[str]:
         run, = paper_data.respond('', (1.4, target), material, commands=('shaped',), span=2.0)
         after = run.time >= run.switches[3]
         error = float(np.max(np.abs(run.stretch[after] - target)))
-        # Undamped, the plain step turns back where the energy gained is stored in the chains.
+        # Undamped, the unshaped step turns back where the energy gained is stored in the chains.
         work = float(elastic_force(target, j_lim)) * (stretch_limits(j_lim)[1] - 1.4)
         stored = work + float(elastic_energy(1.4, j_lim))
         yield (f'  J_lim {j_lim:g}: b_p {float(signed_root(run.loads[2])):.4f}, '
                f'tau_p {run.switches[3] - run.switches[2]:.4f}, '
                f'b_1 {float(signed_root(run.loads[3])):.4f}, off target below {_power(error)}, '
-               f'plain step leaves 1e{-2.0 * stored / j_lim / math.log(10.0):.0f} of the '
+               f'unshaped step leaves 1e{-2.0 * stored / j_lim / math.log(10.0):.0f} of the '
                'extension')
 
 

@@ -1,7 +1,7 @@
 """
 Heavy damping: how long a move takes where no two-step command exists.
 
-Above critical damping the plain step creeps in without overshoot; the minimum-time command,
+Above critical damping the unshaped step creeps in without overshoot; the minimum-time command,
 which pushes and brakes within the load limits, arrives in finite time.
 """
 
@@ -34,7 +34,7 @@ class DampedStudy:
     start: float
     target: float
     zetas: Array
-    step: Array  #: (n,), settling time of the plain step
+    step: Array  #: (n,), settling time of the unshaped step
     arrival: Array  #: (m, n), of the minimum-time command under each of LIMITS
     settled: Array  #: (m, n), its settling time
 
@@ -66,7 +66,7 @@ def settling_time(
 
 
 def damped_study(start: float, target: float, zetas: Floats) -> DampedStudy:
-    """Compare the plain step with the minimum-time command over values of zeta above 0."""
+    """Compare the unshaped step with the minimum-time command over values of zeta above 0."""
     materials = [NondimensionalParameters(float(zeta)) for zeta in zetas]
     plain = np.array([
         settling_time(step(Request(State(start), target, x)), start, target, x)

@@ -318,7 +318,7 @@ def _draw_chain_limit_sweep(figure: Figure, sweep: Sweep) -> None:
 
 #: The figures by number.
 FIGURES: dict[int, PaperFigure] = {x.number: x for x in (
-    PaperFigure(2, 'plain steps and the response', paper_data.multi_step,
+    PaperFigure(2, 'unshaped steps and the response', paper_data.multi_step,
                 _draw_multi_step, 2.7, 4.6),
     PaperFigure(3, 'the command-shaping scheme, 1 to 1.1', paper_data.single_move,
                 _draw_single_move, 3.1, 5.4),

@@ -35,7 +35,7 @@ SINGLE = (1.10,)
 ZETAS = (0.02, 0.40, 1.10)
 J_LIMS = (1.0, 3.0, 5.0)
 #: Third stretch of Fig. 9 over the limiting stretch. The paper says only that it is near.
-#: Much nearer than this, the plain step, unlike the shaped one, cannot be followed: it would
+#: Much nearer than this, the unshaped step, unlike the shaped one, cannot be followed: it would
 #: swing closer to the limit than double precision can tell from it.
 NEAR_LIMIT = 0.95
 #: Range of Fig. 10.

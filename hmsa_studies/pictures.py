@@ -270,7 +270,7 @@ def draw_damped(
         panels = figure.subplot_mosaic(
             [['times', 'command'], ['times', 'response']], height_ratios=[1.0, 1.3])
         axes = panels['times']
-        axes.plot(study.zetas, study.step, label='plain step', **style.UNSHAPED)
+        axes.plot(study.zetas, study.step, label='unshaped step', **style.UNSHAPED)
         for row, look in enumerate(kinds):
             axes.plot(study.zetas, study.settled[row], **look, label=names[row])
         axes.set_xlim(study.zetas[0], study.zetas[-1])

@@ -36,7 +36,7 @@ _EXACT = Errors()
 def arrival_of(
         move: Move, start: float, target: float, material: NondimensionalParameters) -> float:
     """Return from when (in the model's time) what still moves counts as residual vibration."""
-    # The end of the command. A plain step, which never arrives, counts from when the two-step
+    # The end of the command. An unshaped step, which never arrives, counts from when the two-step
     # command would; where there is none, from half a natural period on.
     if math.isfinite(move.duration):
         return move.duration

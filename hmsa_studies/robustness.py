@@ -45,7 +45,7 @@ _BOX_POINTS = 9
 LARGEST = 0.9
 
 _NAMES = {
-    'two_step': 'two-step', 'minimum_time': 'minimum time', 'step': 'plain step', 'zv': 'ZV',
+    'two_step': 'two-step', 'minimum_time': 'minimum time', 'step': 'unshaped step', 'zv': 'ZV',
     'zvd': 'ZVD', 'ei': 'EI', 'umzv': 'UM-ZV'}
 _LINEAR = ('zv', 'zvd', 'ei', 'umzv')
 

@@ -248,7 +248,7 @@ def beam(path: Path) -> None:
         shapes.set_aspect('equal')
         shapes.set_xlim(-0.05, 1.35)
         for label, kind, levels in (
-                ('plain step', style.UNSHAPED, [(4.0 * period, hold)]),
+                ('unshaped step', style.UNSHAPED, [(4.0 * period, hold)]),
                 ('two-step', style.SHAPED, [
                     (arrival, plan.beta_p * unit), (4.0 * period - arrival, hold)])):
             time, deflection = chain.follow(levels, 400)

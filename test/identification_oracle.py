@@ -56,7 +56,7 @@ def level_of(stretch, block: ActuatorParameters = BLOCK) -> float:
 
 
 def steps(targets, span, repeats=1, begin=0.02):
-    """Return times and levels of plain steps, after a while without field."""
+    """Return times and levels of unshaped steps, after a while without field."""
     levels = [level_of(x) for _ in range(repeats) for x in targets]
     return (np.append(begin - 0.02, begin + span * np.arange(len(levels))),
             np.append(0.0, levels))

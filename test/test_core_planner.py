@@ -526,7 +526,7 @@ def test_a_stop_is_near_where_it_was_asked():
 
 @pytest.mark.parametrize('wait', [1.0, 2.75, 3.0, 3.5, 5.0, 6.5, 8.0, 9.25])
 def test_a_stop_beyond_what_the_limits_hold_comes_back_to_what_they_do(wait):
-    # The plain step overshoots to stretches that need more than the largest flux density.
+    # The unshaped step overshoots to stretches that need more than the largest flux density.
     most = 1.02 * float(elastic_force(1.4, 5.0)) * TESLA
     rig = Rig(shaper='step', flux_density_min=-0.02, flux_density_max=most, lead_time=0)
     rig.setpoint(1.4)

@@ -54,7 +54,7 @@ def test_the_unshaped_response_is_scipys(figure, zeta, j_lim, stretches):
     material = NondimensionalParameters(zeta=zeta, j_lim=j_lim)
     begins = SPAN * np.arange(3)
     loads = [holding_load(x, j_lim) for x in stretches]
-    # A plain step to 0.999 of the limit throws the actuator against it, where SciPy stops: see
+    # An unshaped step to 0.999 of the limit throws the actuator against it, where SciPy stops: see
     # below. Everything before is compared.
     times = SAMPLES[SAMPLES <= 20.0] if figure == 'fig_9' else SAMPLES
     stretch, _ = unshaped(stretches, begins, times, material)

@@ -46,7 +46,7 @@ def values_with(extras: Extras):
 
 def recorded(targets=SEQUENCE, *, noise=1e-3, seed=0, times=TIMES, extras=None, repeats=9,
              span=SPAN) -> Recording:
-    """Return a noisy recording of plain steps."""
+    """Return a noisy recording of unshaped steps."""
     level_times, levels = steps(targets, span, repeats)
     stretch = simulate(times, level_times, levels, extras=extras)
     noisy = stretch + noise * np.random.default_rng(seed).standard_normal(len(times))

@@ -33,7 +33,7 @@ def block_of(law: str, constants: dict):
 
 def recorded(extras: Extras, *, noise=NOISE, seed=0, levels=(0.05, -0.03, 0.07, 0.02, 0.0),
              repeats=4, span=0.06, rate=1e3) -> Recording:
-    """Return a recording of plain steps, large enough to tell laws apart."""
+    """Return a recording of unshaped steps, large enough to tell laws apart."""
     fields = np.append(0.0, np.tile(levels, repeats))
     begins = np.append(0.0, 0.02 + span * np.arange(len(fields) - 1))
     times = np.arange(0.0, begins[-1] + span, 1.0 / rate)

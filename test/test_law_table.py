@@ -150,7 +150,7 @@ def test_what_is_beyond_the_table_is_refused_and_the_block_stops_there():
     for target in (0.74, 1.6, 1.7):
         with pytest.raises(RefusedError, match='between the limits 0.7500 and 1.6000 of law tab'):
             plan_sequence([Setpoint(target, 50.0)], found)
-    # A plain step overshoots by nearly its height.
+    # An unshaped step overshoots by nearly its height.
     with pytest.raises(RefusedError, match=r'swings to 1\.6\d+: expected a motion between') as got:
         plan_sequence([Setpoint(1.5, 50.0)], found, shaper='step')
     assert got.value.code is Code.OUT_OF_RANGE

@@ -170,9 +170,9 @@ def test_time_begins_at_the_first_level_of_the_run_and_its_step_is_drawn(tmp_pat
     panels = {
         curve: np.array([(float(x['x']), float(x['y'])) for x in rows
                          if (x['panel'], x['curve']) == ('c', curve)])
-        for curve in ('samples', 'recorded', 'plain steps (simulated)')}
+        for curve in ('samples', 'recorded', 'unshaped steps (simulated)')}
     assert len(panels['recorded']) > 5 * len(panels['samples']) > 100
-    assert len(panels['plain steps (simulated)']) > 5 * len(panels['samples'])
+    assert len(panels['unshaped steps (simulated)']) > 5 * len(panels['samples'])
     with pytest.raises(BadInputError, match='cannot write .*nowhere'):
         draw(tmp_path / 'nowhere' / 'run.png', [plain])
 

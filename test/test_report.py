@@ -943,7 +943,7 @@ def test_the_table_has_the_measures_in_full_precision(report, bag):
                 ('b_1 [1]', x.b_1), ('begin [ms]', x.begin * 1e3),
                 ('arrival [ms]', x.arrival * 1e3), ('end [ms]', (x.end - x.begin) * 1e3),
                 ('largest error [%]', 100.0 * x.error), ('residual [%]', 100.0 * x.residual),
-                ('plain steps [%]', 100.0 * x.residual_unshaped)):
+                ('unshaped steps [%]', 100.0 * x.residual_unshaped)):
             assert report.value('setpoint-table', i, column) == value
     assert [x['command'][1] for x in report.table('setpoint-table')] == ['2 levels'] * 3
     buttons = {x['data-table'] for tag, x in report.tags if tag == 'button'}
@@ -969,7 +969,7 @@ def test_several_bags_lie_over_each_other_in_colours_of_their_own(tmp_path, bag)
     report = Page(page(parts_of(bag, other)))
     curves = [report.trace('response', name) for name in ('run', 'other')]
     shown = [x['name'] for x in report.figures['response']['data'] if x['showlegend']]
-    assert sorted(shown) == ['other', 'plain steps', 'plan', 'run']
+    assert sorted(shown) == ['other', 'unshaped steps', 'plan', 'run']
     assert curves[0]['line']['color'] != curves[1]['line']['color']
     assert curves[0]['legendgroup'] != curves[1]['legendgroup']
     rows = report.table('setpoint-table')

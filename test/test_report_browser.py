@@ -93,17 +93,17 @@ def test_a_click_in_the_legend_hides_a_curve(browser, files):
             f'document.getElementById("response")._fullData.find(x => x.name === "{name}")'
             '.visible')
 
-    assert shown('plain steps') is True
+    assert shown('unshaped steps') is True
     x, y = opened.evaluate(
         '(() => { const texts = [...document.querySelectorAll("#response .legend .traces")];'
-        'const one = texts.find(x => x.textContent === "plain steps");'
+        'const one = texts.find(x => x.textContent === "unshaped steps");'
         'one.scrollIntoView({block: "center"});'
         'const box = one.querySelector(".legendtoggle").getBoundingClientRect();'
         'return [box.x + box.width / 2, box.y + box.height / 2]; })()')
     opened.click(x, y)
     opened.wait_for(
         'document.getElementById("response")._fullData.some('
-        'x => x.name === "plain steps" && x.visible === "legendonly")')
+        'x => x.name === "unshaped steps" && x.visible === "legendonly")')
     assert shown('recorded') is True
 
 

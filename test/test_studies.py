@@ -156,7 +156,7 @@ def test_shapers_that_know_the_model_leave_nothing_without_errors(step, request)
     for name in ('ZV', 'ZVD', 'EI'):
         assert results[name].nominal > 1e-2
         assert 'linear, designed at the target' in results[name].candidate.label
-    assert results['plain step'].nominal > 1.0
+    assert results['unshaped step'].nominal > 1.0
 
 
 def test_two_step_leaves_one_percent_for_five_in_zeta_and_five_and_a_half_for_five_in_g(small):
@@ -226,7 +226,7 @@ def test_worst_alone_is_on_the_curve_and_within_the_box():
 
 def test_plain_step_counts_from_when_the_two_step_command_arrives(small):
     _, results = small
-    assert results['plain step'].arrival == results['two-step'].arrival
+    assert results['unshaped step'].arrival == results['two-step'].arrival
     damped = NondimensionalParameters(3.0)
     move = Move(Code.STEP, (Level(0.0, 0.3),), math.inf)
     assert arrival_of(move, 1.0, 1.1, damped) == pytest.approx(
@@ -306,7 +306,7 @@ def test_studies_refuse_what_is_out_of_range(make, message):
 def test_shapers_are_compared_once_each_and_robust_with_each_order():
     assert [x.name for x in candidates()] == [
         'two-step', 'robust, order 2', 'robust, order 3', 'minimax, order 2',
-        'minimax, order 3', 'minimum time', 'smooth', 'plain step', 'ZV', 'ZVD', 'EI', 'UM-ZV']
+        'minimax, order 3', 'minimum time', 'smooth', 'unshaped step', 'ZV', 'ZVD', 'EI', 'UM-ZV']
     assert candidates(['robust', 'zv', 'robust', 'zv'], [4, 1]) == (
         Candidate('robust', 4), Candidate('robust', 1), Candidate('zv'))
 

@@ -94,15 +94,15 @@ def table(found: 'Excitation', actuator: 'ActuatorParameters') -> list[str]:
         f'{len(found.best.levels)} levels in {found.duration:.4g} s, {actuator.coordinate.name} '
         f'{found.best.reach[0]:.3f} to {found.best.reach[1]:.3f}, '
         + ('at rest at the end' if found.best.ends_at_rest else 'still moving at the end'),
-        f'{"standard deviation":<22}{"this":>12}{"plain steps":>14}{"paper":>12}{"gain":>8}']
+        f'{"standard deviation":<22}{"this":>12}{"unshaped steps":>16}{"paper":>12}{"gain":>8}']
     gains = found.gains
     for name in found.best.std:
         cells = [_share(name, x.std[name]) for x in programs]
         gain = f'{gains[name]:.1f}' if name in gains else ''
         lines.append(
-            f'{labels.get(name, name):<22}{cells[0]:>12}{cells[1]:>14}{cells[2]:>12}{gain:>8}')
+            f'{labels.get(name, name):<22}{cells[0]:>12}{cells[1]:>16}{cells[2]:>12}{gain:>8}')
     least = min(gains, key=lambda x: gains[x])
-    return [*lines, f'gain: plain steps over this; the least, {gains[least]:.1f}, is that of '
+    return [*lines, f'gain: unshaped steps over this; the minimum, {gains[least]:.1f}, is that of '
             f'{labels.get(least, least)}']
 
 

@@ -42,7 +42,7 @@ _BEGIN = 0.2  # periods of rest before the first level
 _LAST = 3.0  # durations of a period that the last move and its rest take
 _SHORTEST = 3.0  # duration in periods that holds a sequence at all
 _MARGIN = 0.95  # of the way to the limits of the chains
-#: The paper's sequence, and a pass of plain steps; from rest.
+#: The paper's sequence, and a pass of unshaped steps; from rest.
 PAPER = (0.1, 0.2, 0.4)
 PLAIN = (0.1, 0.4, 0.0)
 _WEIGHT = 4.0  # of the worst parameter against the volume
@@ -109,7 +109,7 @@ class Excitation:
     @property
     def gains(self) -> dict[str, float]:
         """
-        Ratio of the deviations of the plain steps to those of the best, by parameter.
+        Ratio of the deviations of the unshaped steps to those of the best, by parameter.
 
         The bias of the sensor is left out: it is the noise over the root of the number of
         samples, whatever moves.
@@ -265,7 +265,7 @@ class Designer:
         over = max(low - found.reach[0], found.reach[1] - high)
         if over > 0.0:
             return -math.inf
-        # The volume, and with as much weight the worst parameter against plain steps.
+        # The volume, and with as much weight the worst parameter against unshaped steps.
         worst = min(_ratios(self._reference, found.std).values())
         return found.information + _WEIGHT * len(self._free) * math.log(max(worst, 1e-300))
 
@@ -345,7 +345,7 @@ class Designer:
         return score, best, point
 
     def plain(self, targets: Sequence[float] = PLAIN) -> Program | None:
-        """Return one pass of plain steps, smaller where they would break the limits."""
+        """Return one pass of unshaped steps, smaller where they would break the limits."""
         span = self.duration / len(targets)
         times = np.append(0.0, span * (np.arange(len(targets)) + 1e-3))
         for share in np.linspace(1.0, 0.1, 19).tolist():
@@ -375,7 +375,7 @@ def excite(
         duration: float | None = None, rate: float = 1000.0, noise: float = 1e-3,
         free: Sequence[str] = DEFAULT_FREE) -> Excitation:
     """
-    Design the sequence to record for identification, beside plain steps and the paper's.
+    Design the sequence to record for identification, beside unshaped steps and the paper's.
 
     The actuator is given as far as it is known, the duration in s (default 180 periods of the
     block), the rate in samples per second, and the noise as the standard deviation of a sample.

@@ -390,7 +390,7 @@ def _warnings(
     if _shaped(best):
         found.append(
             'all moves are shaped so that nothing rings: they carry about a sixth of the '
-            'information of plain steps; record what hmsa excite proposes')
+            'information of unshaped steps; record what hmsa excite proposes')
     return found
 
 

@@ -26,7 +26,7 @@ class Quantity:
     advice: str = ''  # what to record, or to measure, where the data do not hold it
 
 
-_STEP = 'record plain steps that ring, at a rate above twice the frequency of the ringing'
+_STEP = 'record unshaped steps that ring, at a rate above twice the frequency of the ringing'
 _SCALE = ('only ratios of shear_modulus, density and remanence act on the motion: measure one of '
           'them (weigh the actuator for the density) and leave it out of --free')
 _CREEP = 'record rest far from that without field for several times the time of the creep'
@@ -46,7 +46,7 @@ QUANTITIES: dict[str, Quantity] = {
         '', 1.0, advice='calibrate the sensor with a known length and leave stretch_gain out of '
         '--free: its gain looks like remanence and chain_limit'),
     'sensor_latency': Quantity(
-        's', 0.0, 'linear', -math.inf, advice='record plain steps with stamps of one clock'),
+        's', 0.0, 'linear', -math.inf, advice='record unshaped steps with stamps of one clock'),
     'coil_time_constant': Quantity(
         's', 0.0, 'linear', advice='record steps at more than two samples per time constant'),
     'constant_force': Quantity(

@@ -48,7 +48,7 @@ def read_bag(
     # Of levels at one time the last one holds.
     keep = np.append(np.diff(stamps) > 0.0, True)
     notes = () if actuator is not None else tuple(
-        x.rstrip('.') for x in run.notes if 'plain steps' not in x)
+        x.rstrip('.') for x in run.notes if 'unshaped steps' not in x)
     return (
         Recording(
             (run.time - zero) / NANOSECONDS, run.stretch, stamps[keep], fields[keep],

@@ -146,10 +146,10 @@ ACTUATOR = (
         'actuator.half_thickness', 0.01,
         'Half thickness H of the block, along the field.', 'm', 1e-9, 1e3),
     ParameterSpec(
-        'actuator.remanence', 0.1, 'Residual flux density Br.', 'T', 1e-9, 1e3),
+        'actuator.remanence', 0.1, 'Remanence Br.', 'T', 1e-9, 1e3),
     ParameterSpec(
         'actuator.chain_limit', 5.0,
-        'Chain extensibility limit J_lim of the Gent model; .inf gives neo-Hookean.', '',
+        'Gent limiting extensibility J_lim; .inf gives neo-Hookean.', '',
         1e-3, math.inf),
     ParameterSpec(
         'actuator.damping_coefficient', 8.0 * ZETA * 0.01 * 0.01 * math.sqrt(1900.0 * 1e4),
@@ -176,8 +176,8 @@ def _of_laws() -> tuple[ParameterSpec, ...]:
 
 LAW_NAME = ParameterSpec(
     'law.name', next(iter(LAWS)),
-    'Elastic law of the block. All but gent and neo_hookean have constants law.*, from which '
-    'the shear modulus follows.', choices=tuple(LAWS))
+    'Hyperelastic model of the block. All but gent and neo_hookean have constants law.*, from '
+    'which the shear modulus follows.', choices=tuple(LAWS))
 
 #: The elastic law of the block and its constants.
 LAW = (LAW_NAME, *_of_laws())
@@ -229,11 +229,11 @@ PLANNED = (*BLOCK, FLUX_DENSITY_MIN, FLUX_DENSITY_MAX, SLEW_LIMIT, COIL_TIME_CON
 VISCOELASTIC = (
     ParameterSpec(
         'viscoelastic.ratio', [],
-        'Creep: stiffness of up to three Maxwell branches in units of that of the elastic law, '
-        'which is what the elastomer holds in the end; empty for none.', '', 0.0, 1e3,
+        'Creep: stiffness of up to three viscoelastic branches in units of that of the '
+        'hyperelastic model, which describes the relaxed state; empty for none.', '', 0.0, 1e3,
         items=float),
     ParameterSpec(
-        'viscoelastic.time', [], 'Creep: relaxation time of each Maxwell branch.', 's',
+        'viscoelastic.time', [], 'Creep: relaxation time of each viscoelastic branch.', 's',
         1e-9, 1e9, items=float),
 )
 
@@ -241,10 +241,10 @@ VISCOELASTIC = (
 KNOWN = (
     ParameterSpec(
         'identification.names', [],
-        'Parameters that were identified: what feedback knows of them before the first sample.'),
+        'Identified parameters: the prior of feedback.'),
     ParameterSpec(
         'identification.values', [],
-        'Their values in SI; those that are parameters of the planner as well have them there.',
+        'Their values in SI; parameters of the planner take them from there.',
         items=float),
     ParameterSpec(
         'identification.covariance', [],
@@ -253,8 +253,8 @@ KNOWN = (
 
 CREEP_TOLERANCE = ParameterSpec(
     'creep_tolerance', 1e-4,
-    'Vibration that the levels which follow creep at rest may leave, peak to peak, as a share of '
-    'the move; the smaller, the more levels, up to 300 a move.', '', 1e-6, 1.0)
+    'Maximum vibration, peak to peak, that the levels which follow creep may cause, as a fraction '
+    'of the step; a smaller value needs more levels, up to 300 per move.', '', 1e-6, 1.0)
 
 PUBLISH_RATE = ParameterSpec(
     'publish_rate', 1000.0, "Sample rate, in the plant's own time.", 'Hz', 1e-3, 1e6)

@@ -72,11 +72,11 @@ _TRIGGER = 'std_srvs/srv/Trigger'
 
 JOINT_TRAJECTORY = Topic(
     '~/joint_trajectory', _TRAJECTORY, RELIABLE,
-    'A sequence of setpoints. Each point says: be at rest at `positions` by `time_from_start`, '
-    "having left the previous point at that point's `time_from_start`. Stamp 0 starts now; a "
-    'future stamp keeps the running plan until then; a sequence that began in the past is '
-    'joined in the middle. Points without `positions` and with `effort` are raw levels: the flux '
-    'density in tesla from `time_from_start` on; the planner checks them, and ends at rest.',
+    'A sequence of setpoints. The actuator leaves the previous point at its `time_from_start` and '
+    'is at rest at `positions` by that of this point. Timestamp 0 starts now; a future timestamp '
+    'keeps the current plan until then; a sequence that began in the past is joined in the '
+    'middle. Points without `positions` and with `effort` are raw levels: the flux density in '
+    'tesla from `time_from_start` on; the planner checks them and ends at rest.',
     subscribers=(PLANNER, RECORDER))
 SETPOINT = Topic(
     '~/setpoint', _FLOAT, RELIABLE,
@@ -88,39 +88,38 @@ PLAN = Topic(
     'flux density from then on.', publishers=(PLANNER,))
 STATUS = Topic(
     '~/status', 'diagnostic_msgs/msg/DiagnosticStatus', LATCHED,
-    'The verdict on the last request, with a code and a sentence, what was measured at the last '
-    'setpoint, and the progress of its sequence.', publishers=(PLANNER,))
+    'The status of the last request: a code and a sentence, the measured values of the last '
+    'setpoint, and the progress of the sequence.', publishers=(PLANNER,))
 ESTIMATE = Topic(
     '~/estimate', 'diagnostic_msgs/msg/DiagnosticArray', RELIABLE,
-    'With the parameter `feedback`: a status of each joint with what samples say of it in a '
-    'sentence, the parameters believed with their standard deviations (`NAME.std`) and the given '
-    'values (`NAME.nominal`), whether plans use them, and how many samples were rejected.',
+    'With the parameter `feedback`: a sentence for each joint, the estimated parameters with '
+    'their standard deviations (`NAME.std`) and the given values (`NAME.nominal`), whether plans '
+    'use them, and the number of rejected samples.',
     publishers=(PLANNER,))
 FLUX_DENSITY_COMMAND = Topic(
     'flux_density_command', _FIELD, COMMAND,
-    'The shaped command: from its stamp on, which may be in the future, z is the flux density '
-    'in tesla; x and y are 0. A message supersedes all earlier ones with the same or a later '
-    'stamp.',
+    'The shaped command: from its timestamp on, which may be in the future, z is the flux density '
+    'in tesla; x and y are 0. A message replaces all earlier ones with the same or a later '
+    'timestamp.',
     publishers=(PLANNER,), subscribers=(PLANT, DRIVER))
 FLUX_DENSITY_APPLIED = Topic(
     'flux_density_applied', _FIELD, CHANGES,
-    'The applied level: one message per change of level, stamped with the time at which it took '
-    'effect; z is the level from then on, in tesla: the one really set, and NaN where it is not '
-    'known.',
+    'The applied level: one message per change of level, timestamped when it took effect; z is '
+    'the actual level from then on, in tesla, and NaN if it is unknown.',
     publishers=(PLANT, DRIVER), subscribers=(PLANNER,))
 FLUX_DENSITY_RECEIVED = Topic(
     'flux_density_received', 'sensor_msgs/msg/TimeReference', NEWEST,
-    'A receipt for a command, and a sign of life five times a second: `header.stamp` is when the '
-    'newest command came, or the present time, by the clock of the sender; `time_ref` is the '
-    'stamp of that command (0 before the first), `source` the joint. `frame_id` is `cut_off` '
-    'while commands of before a cut-off of the coil are refused. The planner sees from it that '
-    'its commands arrive, and how far the two clocks are apart. Optional for a driver of your '
+    'A receipt for a command, and a heartbeat five times a second: `header.stamp` is when the '
+    'newest command arrived, or the current time, in the clock of the sender; `time_ref` is the '
+    'timestamp of that command (0 before the first), `source` the joint. `frame_id` is `cut_off` '
+    'while commands from before a cut-off of the coil are rejected. The planner uses it to check '
+    'that commands arrive, and to measure the offset of the clocks. Optional for a driver of your '
     'own.',
     publishers=(PLANT, DRIVER), subscribers=(PLANNER,))
 DISTURBANCE_FORCE = Topic(
     'disturbance_force', 'geometry_msgs/msg/WrenchStamped', RELIABLE,
-    'An unplanned force on the simulated actuator: from its stamp on (0: immediately) until the '
-    'next message, force.z pulls along the field, in newtons; all other components are 0.',
+    'An unplanned force on the simulated actuator: from its timestamp on (0: immediately) until '
+    'the next message, force.z pulls along the field, in newtons; all other components are 0.',
     subscribers=(PLANT,))
 JOINT_STATES = Topic(
     'joint_states', 'sensor_msgs/msg/JointState', SAMPLES,
@@ -150,11 +149,9 @@ STOP = Service('~/stop', _TRIGGER, {
     PLANNER: 'Drops the rest of the sequence and comes to rest without vibration.',
     PLAYER: 'Ends playback.'})
 RESET_ESTIMATE = Service('~/reset_estimate', _TRIGGER, {
-    PLANNER: 'Forgets what feedback has learnt: plans and estimates begin again with the '
-             'parameters as given.'})
+    PLANNER: 'Discards the estimate: plans and estimates restart from the given parameters.'})
 SAVE_ESTIMATE = Service('~/save_estimate', _TRIGGER, {
-    PLANNER: 'Writes what feedback has learnt to the file named by `feedback_file`, with its '
-             'covariance, as a parameter file.'})
+    PLANNER: 'Writes the estimate with its covariance to `feedback_file`, as a parameter file.'})
 RESET = Service('~/reset', _TRIGGER, {
     PLANT: 'Returns the actuators to their initial states, or to reset_stretch and reset_rate; '
            'time continues.'})

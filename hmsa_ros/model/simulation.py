@@ -261,7 +261,7 @@ def unshaped(
         targets: Sequence[float], begins: Sequence[float], times: ArrayLike,
         material: NondimensionalParameters, *, start: float | None = None) -> tuple[Array, Array]:
     """
-    Sample stretch and rate (n,) under plain steps to targets, the paper's unshaped input.
+    Sample stretch and rate (n,) under unshaped steps to targets, the paper's unshaped input.
 
     Each step begins at its time with the load that holds its target. The start is at rest, by
     default without a field. A stretch or times out of range are a `BadInputError`.

@@ -72,26 +72,27 @@ class Code(str, Enum):
 #: What each code means and what to do about it; the documentation shows it.
 EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
     Code.TWO_STEP: ('The two-step command: beta_p until tau_p, then beta_1.', ''),
-    Code.STEP: ('One step to the level that holds the target; it rings.', ''),
+    Code.STEP: ('Holding level of the target, applied at once; the actuator rings.', ''),
     Code.HOLD: ('The actuator is already there and is held.', ''),
-    Code.ROBUST: ('A chain of two-step commands, which tolerates model errors.', ''),
+    Code.ROBUST: ('Cascaded two-step commands, which tolerate parameter errors.', ''),
     Code.MINIMAX: (
-        'Levels that leave the least vibration at the worst, while the parameters are within the '
-        'errors given.', ''),
-    Code.MINIMUM_TIME: ('Full push, full brake, then the level that holds the target.', ''),
-    Code.SMOOTH: ('Levels without a step between them, along a smooth path of the stretch.', ''),
-    Code.LINEAR: ('A linear input shaper designed at the target; it leaves some vibration.', ''),
+        'Levels that minimise the worst residual vibration for parameter errors within the given '
+        'bounds.', ''),
+    Code.MINIMUM_TIME: ('Maximum push, maximum brake, then the holding level.', ''),
+    Code.SMOOTH: ('A continuous level along a smooth path of the stretch.', ''),
+    Code.LINEAR: ('A linear input shaper, designed at the target; it leaves residual '
+                  'vibration.', ''),
     Code.TOO_DAMPED: (
-        'The actuator is too heavily damped to overshoot, so there is no two-step command. A '
-        'plain step, which does not ring either, is used instead.',
+        'The actuator is too heavily damped to overshoot, so there is no two-step command. '
+        'The plan is an unshaped step, which does not ring either.',
         'No action needed; the shaper minimum_time arrives sooner.'),
     Code.INDISTINGUISHABLE: (
-        'So close to critical damping, beta_p and beta_1 agree to double precision; a plain '
-        'step is used instead.',
+        'So close to critical damping, beta_p and beta_1 agree to double precision; the '
+        'plan is an unshaped step.',
         'No action needed; the shaper minimum_time arrives sooner.'),
-    Code.LEVELS: ('Levels of the field as they were sent, up to rest at the end.', ''),
+    Code.LEVELS: ('Raw levels as sent, with rest at the end.', ''),
     Code.OUT_OF_RANGE: (
-        'The stretch is at or beyond a limit of the elastic law: the full extension of the '
+        'The stretch is at or beyond a limit of the hyperelastic model: the full extension of the '
         'polymer chains (J_lim), where the force falls, or the end of a table.',
         'Choose a stretch inside the interval that the message names, or correct '
         'actuator.chain_limit.'),
@@ -125,11 +126,11 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'Give each point a larger time_from_start than the one before.'),
     Code.IN_THE_PAST: (
         "By the planner's clock, the whole sequence is in the past.",
-        'Stamp with the same clock as the planner: use_sim_time must agree on both sides. '
-        'Stamp 0 means now.'),
+        'Use the clock of the planner for the timestamp: use_sim_time must agree on both sides. '
+        'Timestamp 0 means now.'),
     Code.TOO_LONG: (
         'The trajectory has more setpoints than the parameter max_points allows.',
-        'Send it in parts, each stamped with its start, or raise max_points.'),
+        'Send it in parts, each timestamped with its start, or raise max_points.'),
     Code.NO_TIME: (
         'The planner follows simulated time, and no message has arrived on /clock yet.',
         'Start the publisher of /clock, or set use_sim_time to false.'),
@@ -137,42 +138,42 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'The planner is a managed node and is not active.',
         'Activate it: ros2 lifecycle set /planner activate.'),
     Code.SEVERAL_PLANTS: (
-        'Several plants or drivers move one joint or measure it, such as a simulator beside the '
-        'real one: what the samples show is not one actuator.',
+        'Several plants or drivers move or measure one joint, such as a simulator beside the '
+        'physical one: the samples do not belong to one actuator.',
         'Stop all but one of the nodes that the message names.'),
     Code.CLOCKS_DIFFER: (
-        'The clocks of planner and plant, driver or sensor are too far apart: stamps do not say '
-        'when something was or is to be.',
+        'The clocks of planner and plant, driver or sensor are too far apart for timestamps to be '
+        'valid.',
         'Set the clocks of all hosts by one source, as with chrony; use_sim_time must agree on '
         'all sides.'),
     Code.UNSEEN: (
-        'Samples of the actuator came before and do not come any more, while joint_states has a '
-        'publisher: where the actuator is may not be what is predicted.',
-        'Mend the sensor, or end what publishes; without samples moves start as predicted.'),
+        'Samples have stopped while joint_states has a publisher: the actuator may not be where '
+        'the planner predicts.',
+        'Repair the sensor, or stop its publisher; without samples moves start as predicted.'),
     Code.CUT_OFF: (
-        'The coil was cut off, by the watchdog of plant or driver or since the hardware had lost '
-        'its state, and the rest of the sequence was dropped.',
-        'Send the request again: it starts from where the actuator is by then. With '
-        'after_cut_off resume the planner goes on by itself.'),
+        'The watchdog of plant or driver switched the coil off, or the hardware lost its state. '
+        'The rest of the sequence was dropped.',
+        'Send the request again: it starts from the current state. With after_cut_off resume the '
+        'planner continues by itself.'),
     Code.NONE: ('No request has come yet.', ''),
     Code.WAITING: (
         'The request is accepted and starts as soon as the current state is known.', ''),
-    Code.ACCEPTED: ('The request is planned and is being carried out.', ''),
-    Code.UNCHANGED: ('The actuator is already on the way there: the plan is unchanged.', ''),
-    Code.SUPERSEDED: ('Another request came before this one was planned.', ''),
+    Code.ACCEPTED: ('The request is planned and is being executed.', ''),
+    Code.UNCHANGED: ('The actuator is already moving there: the plan is unchanged.', ''),
+    Code.SUPERSEDED: ('Another request arrived before this one was planned.', ''),
     Code.CORRECTED: ('The plan was corrected from samples (feedback: adapt).', ''),
     Code.REPLANNED: (
-        'Commands did not take effect as planned, and the rest was planned anew from the state '
-        'that they led to. Setpoints whose time had passed were left out; the message says how '
-        'many.',
-        'Raise lead_time, or see what delays or drops commands.'),
+        'Commands did not take effect as planned, and the rest was planned again from the '
+        'resulting state. Setpoints whose time had passed were left out; the message contains '
+        'their number.',
+        'Raise lead_time, or find out what delays or drops commands.'),
     Code.FEEDBACK_ENDED: (
-        'Moves got worse with feedback, as measured: plans use the parameters given, open loop.',
-        'See what the sensor shows, then call ~/reset_estimate.'),
+        'Measured moves became worse with feedback: plans use the given parameters, in open loop.',
+        'Check the sensor, then call ~/reset_estimate.'),
     Code.SATURATED: (
-        'The amplifier did not reach a level that was commanded. Until the next request no level '
-        'beyond that is commanded, and the rest of the sequence is planned within it.',
-        'Set flux_density_max or flux_density_min to what the amplifier provides.'),
+        'The amplifier did not reach a commanded level. Until the next request no level beyond '
+        'that is commanded, and the rest of the sequence is planned within it.',
+        'Set flux_density_max or flux_density_min to the limit of the amplifier.'),
     Code.STOPPED: (
         'The actuator comes to rest: the planner was deactivated, or the rest of the sequence '
         'could not be planned anew, for the reason that the message gives.',

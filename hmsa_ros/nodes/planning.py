@@ -50,26 +50,27 @@ OWN = (
         'shaper', 'two_step', 'Shaper that plans each move.', choices=tuple(SHAPERS),
         read_only=False),
     ParameterSpec(
-        'robust_order', 2, 'Number of two-step commands that the shaper robust chains.', '',
+        'robust_order', 2, 'Number of two-step commands that the shaper robust cascades.', '',
         1, 16, read_only=False),
     ParameterSpec(
         'minimax_errors', list(ERRORS),
-        'Errors of shear modulus, damping coefficient and chain limit, as shares, within which '
-        'the shaper minimax leaves least vibration; it takes as long as robust.', '',
+        'Relative errors in shear modulus, damping coefficient and J_lim for which the shaper '
+        'minimax minimises the worst residual vibration; it takes as long as robust.', '',
         0.0, LARGEST_ERROR, read_only=False, items=float),
     ParameterSpec(
         'minimax_file', '',
-        'What hmsa identify --out wrote: the shaper minimax plans for the ellipsoid of its '
-        'covariance, and minimax_errors count for what was not identified; empty for none.',
+        'File of hmsa identify --out: the shaper minimax plans for the ellipsoid of its '
+        'covariance, and minimax_errors apply to parameters that were not identified; empty for '
+        'none.',
         read_only=False),
     ParameterSpec(
         'smooth_periods', _OPTIONS.pace.periods,
-        'Natural periods that a move of the shaper smooth takes at the least; it takes longer '
-        'where limits of flux density, slew or stretch rate ask for it.', '',
+        'Minimum duration of a move of the shaper smooth in natural periods; limits of flux '
+        'density, slew rate or stretch rate extend it.', '',
         LEAST_PERIODS, MOST_PERIODS, read_only=False),
     ParameterSpec(
         'stretch_rate_max', 0.0,
-        'Largest stretch rate on the way of the shaper smooth; 0 for any.', '1/s', 0.0, 1e12,
+        'Maximum stretch rate of the shaper smooth; 0 for any.', '1/s', 0.0, 1e12,
         read_only=False),
     replace(SLEW_LIMIT, read_only=False),
     replace(COIL_TIME_CONSTANT, read_only=False),
@@ -98,7 +99,8 @@ SPECS = (
     MARKER_SCALE,
     ParameterSpec(
         'lead_time', _OPTIONS.lead_time / NANOSECONDS,
-        'How long before its stamp a command is sent.', 's', 0.0, 1e6, read_only=False),
+        'Interval by which a command is sent ahead of its '
+        'timestamp.', 's', 0.0, 1e6, read_only=False),
     ParameterSpec(
         'command_mode', 'continuous',
         'Times at which commands may apply: any time, or only the grid of command_period.',
@@ -121,7 +123,7 @@ SPECS = (
         0.0, 1e3, read_only=False),
     ParameterSpec(
         'replan_late', _SETTINGS.replan_late,
-        'Whether to replan the rest of a sequence after a late command, where that leaves less '
+        'Whether to plan the rest of a sequence again after a late command, if that leaves less '
         'vibration.',
         read_only=False),
     ParameterSpec(
@@ -131,62 +133,60 @@ SPECS = (
         0.0, 1.0, read_only=False),
     ParameterSpec(
         'arrival_tolerance', _SETTINGS.tolerances.arrival,
-        'How far from its target, as a share of the step, a measured stretch may rest and '
-        'count as arrived.', '', 0.0, 1e3, read_only=False),
+        'Maximum steady-state error of an arrived setpoint, as a fraction of the '
+        'step.', '', 0.0, 1e3, read_only=False),
     ParameterSpec(
         'vibration_tolerance', _SETTINGS.tolerances.vibration,
-        'How large a measured vibration may be, peak to peak, as a share of the step.', '',
+        'Maximum residual vibration, peak to peak, as a fraction of the step.', '',
         0.0, 1e3, read_only=False),
     ParameterSpec(
         'stretch_tolerance', _SETTINGS.tolerances.stretch,
-        'Offset and vibration up to this stretch are tolerated however small the step is.', '',
+        'Steady-state error and residual vibration that are tolerated for any step.', '',
         0.0, 1e3, read_only=False),
     ParameterSpec(
         'feedback', _SETTINGS.feedback,
-        'What samples on joint_states are used for: off; observe estimates parameters and reports '
-        'them on ~/estimate; adapt also corrects plans and plans with what was learnt.',
+        'Use of the samples on joint_states: off; observe estimates the parameters and publishes '
+        'them on ~/estimate; adapt also corrects plans, and plans with the estimate.',
         choices=MODES, read_only=False),
     ParameterSpec(
         'feedback_parameters', list(_SETTINGS.feedback_parameters),
-        'What feedback estimates besides the state: shear_modulus, damping_coefficient, '
+        'Parameters that feedback estimates: shear_modulus, damping_coefficient, '
         'stretch_bias, remanence, chain_limit, coil_time_constant and others of hmsa identify.'),
     ParameterSpec(
         'feedback_cautious', _SETTINGS.feedback_cautious,
-        'Whether a move with an actuator that is not well known takes three times as long in '
-        'feedback adapt (five times where six parameters are estimated, and up to two times more '
-        'where the noise is large beside the step), and is corrected until then.',
+        'Whether feedback adapt extends moves whose predicted error exceeds feedback_tolerance, '
+        'to correct them on the way: three times (five times for six estimated parameters, and up '
+        'to twice that for large noise).',
         read_only=False),
     ParameterSpec(
         'feedback_tolerance', _SETTINGS.feedback_tolerance,
-        'Share of its step that a move may be expected to leave, as amplitude of its vibration '
-        'and offset together, before feedback_cautious gives it more time: the less, the more '
-        'moves take longer.', '', 0.0, 1.0, read_only=False),
+        'Predicted error (vibration amplitude plus steady-state error, as a fraction of the step) '
+        'above which feedback_cautious extends a move.', '', 0.0, 1.0, read_only=False),
     ParameterSpec(
         'feedback_trim', _SETTINGS.feedback_trim,
-        'How far feedback adapt may change a level that holds a setpoint to make up for a '
-        'constant force, in small moves one after the other; constant_force must be among '
+        'Maximum change of a holding level by which feedback adapt compensates a constant force, '
+        'in small moves; constant_force must be among '
         'feedback_parameters.', 'T', 0.0, 10.0, read_only=False),
     ParameterSpec(
         'feedback_frozen', _SETTINGS.feedback_frozen,
-        'Whether feedback keeps the parameters as it has learnt them, and follows the state '
-        'alone.', read_only=False),
+        'Whether feedback keeps its estimate of the parameters and estimates the state '
+        'only.', read_only=False),
     ParameterSpec(
         'feedback_file', _SETTINGS.feedback_file,
-        'File that ~/save_estimate writes what was learnt to; planner and plant take it as a '
-        'parameter file.', read_only=False),
+        'Parameter file to which ~/save_estimate writes the estimate.', read_only=False),
     ParameterSpec(
         'after_cut_off', _SETTINGS.after_cut_off,
-        'What to do when plant or driver has cut off the coil: drop the rest of the sequence and '
-        'wait for a request, or resume it with a shaped move from where the actuator is by then.',
+        'Reaction to a cut-off of the coil: drop the rest of the sequence and wait for a request, '
+        'or resume it with a shaped move from the current state.',
         choices=AFTER_CUT_OFF, read_only=False),
     ParameterSpec(
         'takeover_timeout', _SETTINGS.takeover_timeout / NANOSECONDS,
-        'How long the first request waits for a plant or a driver, and for a sample of the '
-        'current state if samples are published, and a later one for samples that have ceased; '
-        '0 for no wait.', 's', 0.0, 60.0),
+        'Time that the first request waits for a plant or driver and, if samples are published, '
+        'for a sample of the current state; later requests wait for samples that have stopped. 0 '
+        'for no wait.', 's', 0.0, 60.0),
     ParameterSpec(
         'takeover_max_age', _SETTINGS.takeover_max_age / NANOSECONDS,
-        'Largest age of a sample that is used for this.', 's', 0.0, 1e6),
+        'Maximum age of that sample.', 's', 0.0, 1e6),
     AUTOSTART,
 )
 

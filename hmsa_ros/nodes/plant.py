@@ -37,7 +37,8 @@ PARAMETERS = (
         'Simulated transport delay of commands.', 's', 0.0, 1e3),
     ParameterSpec(
         'measurement_delay', 0.0,
-        'Simulated transport delay of samples: they are published this long after their stamp.',
+        'Simulated transport delay of samples: they are published this long after their '
+        'timestamp.',
         's', 0.0, 1e3),
     ParameterSpec(
         'seed', 0, 'Seed of the noise; the same seed gives the same run.', '', 0, 2**31 - 1),

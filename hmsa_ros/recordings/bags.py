@@ -297,7 +297,7 @@ class _Collected:
         notes = [*self.notes, *summary.problems]
         if COMMAND not in topics:
             notes.append(
-                f'The recording has no {COMMAND}: setpoints, plain steps and lateness are '
+                f'The recording has no {COMMAND}: setpoints, unshaped steps and lateness are '
                 'unknown.')
         elif not self.commands.get(key):
             notes.append(

@@ -106,7 +106,7 @@ def actuators(
     if not found:
         notes.append(
             "The recording does not contain the actuator's parameters: those of the example "
-            'block are used, so what is simulated here (plain steps, prediction, equilibria, b '
+            'block are used, so what is simulated here (unshaped steps, prediction, equilibria, b '
             'and tau) may not match your actuator; name a parameter file with --params-file.')
     plant = found.get(PLANT) or found.get(PLANNER) or paper_actuator()
     planner = found.get(PLANNER) or plant

@@ -109,10 +109,10 @@ def _grouped(data: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 # Of several runs what was recorded is compared; what is simulated is shown on a click.
-_SIMULATED = ('plain steps', 'plan')
+_SIMULATED = ('unshaped steps', 'plan')
 # What each kind of curve looks like, everywhere: colour, and what distinguishes it without.
 _KINDS: dict[str, dict[str, Any]] = {
-    'recorded': looks.RECORDED.plotly(), 'plain steps': looks.PLAIN.plotly(),
+    'recorded': looks.RECORDED.plotly(), 'unshaped steps': looks.PLAIN.plotly(),
     'plan': looks.PLAN.plotly(), 'field in force': looks.FIELD.plotly(),
     'command': {**looks.RECORDED.plotly(), 'shape': 'hv'}, 'target': looks.TARGET.plotly()}
 
@@ -143,7 +143,7 @@ def response(parts: Sequence[Part], unit: TimeUnit) -> Figure:
     data = []
     for part in parts:
         run, found = part.run, part.evaluation
-        for kind, curve in (('plain steps', found.plain), ('plan', found.planned)):
+        for kind, curve in (('unshaped steps', found.plain), ('plan', found.planned)):
             data.append(_curve(part, kind, *decimate(unit.of(curve.time), curve.stretch)))
         data[-1:-1] = _recorded(
             part, unit.of(found.recorded.time), found.recorded,
@@ -235,7 +235,7 @@ def phase(parts: Sequence[Part]) -> tuple[Figure, float]:
     data, shown = [], 1.0
     for part in parts:
         found = part.evaluation
-        for kind, curve in (('plain steps', found.plain), ('recorded', found.recorded)):
+        for kind, curve in (('unshaped steps', found.plain), ('recorded', found.recorded)):
             x, y, share = _orbit(curve.stretch, curve.rate)
             shown = min(shown, share)
             data.append(_curve(part, kind, x, y))
@@ -296,7 +296,7 @@ def arrival(parts: Sequence[Part], number: int) -> Figure:
         found = part.evaluation
         if number >= len(found.results):
             continue
-        for kind, curve in (('plain steps', found.plain), ('plan', found.planned)):
+        for kind, curve in (('unshaped steps', found.plain), ('plan', found.planned)):
             if not part.colour:
                 time, distance = around(part, number, curve)
                 data.append(_curve(
@@ -323,13 +323,13 @@ def arrival(parts: Sequence[Part], number: int) -> Figure:
 
 
 def residuals(parts: Sequence[Part]) -> Figure:
-    """Return the residuals of all setpoints, shaped against plain steps."""
+    """Return the residuals of all setpoints, shaped against unshaped steps."""
     data = []
     for part in parts:
         results = part.evaluation.results
         for what, values, symbol in (
                 ('recorded', [x.residual for x in results], 'circle'),
-                ('plain steps', [x.residual_unshaped for x in results], 'square-open')):
+                ('unshaped steps', [x.residual_unshaped for x in results], 'square-open')):
             data.append(_curve(
                 part, what, np.arange(1, len(results) + 1),
                 # Below what is resolved there is nothing to see.
@@ -346,7 +346,7 @@ def residuals(parts: Sequence[Part]) -> Figure:
             f'{i + 1}: ' + '/'.join(dict.fromkeys(
                 f'{x.stretch:.5g}' for x in results_of(parts, i))) for i in range(count)]}
     return Figure(
-        'residuals', 'Residual vibration of each setpoint, recorded and for plain steps', 340,
+        'residuals', 'Residual vibration of each setpoint, recorded and for unshaped steps', 340,
         _grouped(data), {
             'xaxis': numbered,
             'yaxis': axis(label('residual', unit='% of the step'), type='log', **_decades(data))})

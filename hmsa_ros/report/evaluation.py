@@ -80,8 +80,8 @@ class MoveResult:
     end: float  #: in s of the run
     error: float  #: largest distance from the target after arrival, as a share of the step
     #: peak-to-peak stretch after arrival as a share of the step: recorded, and simulated for
-    #: plain steps on the same plant; NaN where there are no samples, and of a block that did not
-    #: move
+    #: unshaped steps on the same plant; NaN where there are no samples, and of a block that did
+    #: not move
     residual: float
     residual_unshaped: float
     #: whether the block covered a tenth of the step at least, on the mean after arrival
@@ -106,7 +106,7 @@ class Evaluation:
     moves: tuple[Move, ...]  #: setpoints
     results: tuple[MoveResult, ...]  #: one a move
     recorded: Curve  #: through the samples
-    #: simulated for plain steps; NaN without a move, and where they are too large to follow
+    #: simulated for unshaped steps; NaN without a move, and where they are too large to follow
     plain: Curve
     plan: tuple[Level, ...]  #: changes of level that were planned and not replanned, by stamp
     #: by the plan, at the samples and between them; NaN before and without one
@@ -177,7 +177,7 @@ def find_moves(run: Run, levels: Sequence[Level], setpoints: Sequence[Requested]
         if asked.missed or setpoint.step <= SAME or not inside:
             continue
         if arrival is None:
-            # A plain step has none: half a period on, when a shaped one would arrive.
+            # An unshaped step has none: half a period on, when a shaped one would arrive.
             arrival = inside[0].stamp + round(math.pi / setpoint.frequency * NANOSECONDS)
             inside = [x for x in inside if x.stamp <= arrival]
         if arrival < end:
@@ -189,7 +189,7 @@ def find_moves(run: Run, levels: Sequence[Level], setpoints: Sequence[Requested]
 
 def _plain(
         run: Run, time: Array, moves: Sequence[Move], zero: int, start: float) -> Curve:
-    """Simulate plain steps, at the samples and between them."""
+    """Simulate unshaped steps, at the samples and between them."""
     nothing = Curve(time, np.full_like(time, np.nan), np.full_like(time, np.nan))
     if not moves:
         return nothing

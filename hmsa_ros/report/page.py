@@ -57,7 +57,7 @@ def page(parts: Sequence[Part]) -> str:
     sections = [
         ('response-section', 'Command and response', text(
             'Above, the flux density commanded: a dot where the level switches. Below, the '
-            f'{what}: recorded, predicted by the plan, and simulated for plain steps to the '
+            f'{what}: recorded, predicted by the plan, and simulated for unshaped steps to the '
             'levels that hold the targets. Few samples are points, with the motion through '
             'them and their rates as a line. Drag to zoom, double-click to go back, click in the '
             'legend to hide.' + (
@@ -195,7 +195,7 @@ def _tiles(parts: Sequence[Part]) -> str:
         return max((x for x in values if math.isfinite(x)), default=math.nan)
 
     header = [
-        'setpoints arrived', 'largest residual, share of the step', 'the same with plain steps',
+        'setpoints arrived', 'largest residual, share of the step', 'the same with unshaped steps',
         'commands', 'samples a second', 'messages lost']
     rows = [[
         f'{sum(y.arrived for y in x.evaluation.findings)} of {len(x.evaluation.findings)}',
@@ -241,7 +241,7 @@ def _notes_of(part: Part) -> Iterable[str]:
         yield ('No setpoint could be identified from the commands: none of them holds a '
                f'requested {part.run.plant.coordinate.name} or lasts a period of the actuator.')
     if part.evaluation.results and not part.evaluation.plain.known:
-        yield 'Plain steps cannot be simulated: the levels are too large to follow.'
+        yield 'Unshaped steps cannot be simulated: the levels are too large to follow.'
     samples = period_of(part.run) / np.median(part.timing.interval) \
         if len(part.timing.interval) else math.inf
     if samples < FEW_SAMPLES:
@@ -281,7 +281,7 @@ def _setpoints(parts: Sequence[Part]) -> str:
                 Cell(str(found.verdict).replace('_', ' ')), share(found.offset),
                 share(found.offset_std), share(found.vibration),
                 share(found.vibration_std), found.frequency, *of_move,
-                'plain step' if levels == 1 else f'{levels} levels' if levels else '–'])
+                'unshaped step' if levels == 1 else f'{levels} levels' if levels else '–'])
     if not rows:
         return text('No setpoint was carried out while the samples were recorded.')
     return formatted(
@@ -295,7 +295,7 @@ def _setpoints(parts: Sequence[Part]) -> str:
             '± of it [%]': '%', 'frequency [Hz]': '.3g',
             'b_p [1]': '.5f', 'tau_p [1]': '.5f', 'b_1 [1]': '.5f', 'begin [ms]': '.3f',
             'arrival [ms]': '.3f', 'end [ms]': '.3f', 'largest error [%]': '%',
-            'residual [%]': '%', 'plain steps [%]': '%', 'command': ''}, rows)
+            'residual [%]': '%', 'unshaped steps [%]': '%', 'command': ''}, rows)
 
 
 def _requests(parts: Sequence[Part], unit: TimeUnit) -> str:

@@ -131,7 +131,7 @@ def _draw_run(
         # Several runs are compared by what was recorded.
         for panel, x, y in (('response', *decimate(unit.of(plain.time), plain.stretch)),
                             ('phase', plain.stretch, plain.rate)):
-            axes[panel].plot(x, y, **style.UNSHAPED, label='plain steps (simulated)')
+            axes[panel].plot(x, y, **style.UNSHAPED, label='unshaped steps (simulated)')
     _draw_recorded(
         axes['response'], part, decimate(unit.of(curve.time), curve.stretch),
         (unit.of(samples.time), samples.stretch), look, alone=alone)
@@ -156,7 +156,7 @@ def _draw_arrival(
 
     if alone:
         panel.plot(
-            *decimate(*shown(found.plain)), **style.UNSHAPED, label='plain steps (simulated)')
+            *decimate(*shown(found.plain)), **style.UNSHAPED, label='unshaped steps (simulated)')
     _draw_recorded(
         panel, part, decimate(*shown(found.recorded)),
         shown(Curve(found.time, part.run.stretch, part.run.rate)), look, alone=alone)

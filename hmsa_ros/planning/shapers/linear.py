@@ -1,5 +1,5 @@
 """
-The plain step and linear input shapers, as references for comparison.
+The unshaped step and linear input shapers, as references for comparison.
 
 ZV and ZVD (N. C. Singer, W. P. Seering, "Preshaping command inputs to reduce system
 vibration", J. Dyn. Syst. Meas. Control 112, 1990) and EI with 5 % tolerated vibration
@@ -74,7 +74,7 @@ def shaped(request: Request, impulses: Impulses) -> Move:
         return request.plain(
             Code.TOO_DAMPED,
             f'zeta {material.zeta:g} is above critical damping at {request.named_target}: there '
-            'is no oscillation to shape for, the plain step is used')
+            'is no oscillation to shape for, the unshaped step is used')
     times, heights = map(list, zip(*impulses(mode[0]), strict=True))
     shares = list(accumulate(heights))
     period = request.delivery.period

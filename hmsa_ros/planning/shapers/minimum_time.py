@@ -34,5 +34,5 @@ def minimum_time(request: Request) -> Move:
             f'{request.target:g} than the two-step command, which is used'))
     if refusals and math.isinf(fastest.duration):
         return replace(
-            fastest, reason=f'{refusals[0]}: the plain step approaches without overshoot')
+            fastest, reason=f'{refusals[0]}: the unshaped step approaches without overshoot')
     return fastest

@@ -106,7 +106,7 @@ class Request:
             self.limits.check(level.load, self.target, self.units)
 
     def plain(self, code: Code, reason: str) -> Move:
-        """Return the plain step instead, which approaches the target, with code and reason why."""
+        """Return the unshaped step instead, which approaches the target, with code and reason."""
         return Move(code, (Level(0.0, self.holding_load()),), math.inf, reason)
 
 

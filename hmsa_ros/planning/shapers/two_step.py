@@ -37,7 +37,7 @@ def two_step(request: Request) -> Move:
     On a grid, the second last period gets a level of its own and both levels are solved for;
     through ramps, beta_p and its duration are. From a moving start for which no single level
     leads to rest within the limits, two are used. Where the response is too damped to cross
-    the target there is no such command; the plain step, which does not overshoot there, takes
+    the target there is no such command; the unshaped step, which does not overshoot there, takes
     its place. Both say so in the move's reason.
     """
     delivery, creep = request.delivery, request.material.creep
@@ -92,12 +92,12 @@ def _without(request: Request, code: Code, holding: float) -> Move:
         return request.plain(
             code,
             f'zeta {zeta:g} is too damped for the response to cross {request.named_target}: no '
-            'two-step command exists, the plain step approaches without overshoot (shaper '
+            'two-step command exists, the unshaped step approaches without overshoot (shaper '
             'minimum_time can arrive in finite time)')
     return request.plain(
         code,
         f'zeta {zeta:g} is so close to critical damping at {request.named_target} that beta_p '
-        'equals beta_1 to rounding: the plain step is used')
+        'equals beta_1 to rounding: the unshaped step is used')
 
 
 def _elastic(request: Request, holding: float) -> Move | None:
