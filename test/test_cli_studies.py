@@ -135,7 +135,7 @@ def test_robustness_says_what_could_not_be_had(run):
         'robustness', '--move', '1:1.1', '--shapers', 'two_step,zv', '--zeta', 3)
     assert status == 0
     assert 'note: two-step: zeta 3 is too damped' in out
-    assert 'arrival in brackets' in out
+    assert 'arrival of the two-step command (in brackets)' in out
 
 
 @pytest.mark.slow
