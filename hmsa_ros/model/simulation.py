@@ -179,7 +179,37 @@ def longest_motion(load: float, material: NondimensionalParameters) -> float:
 
 
 class ActuatorSimulation:
-    """`Actuators` with one actuator, seen as numbers; the parameters are those of `Setup`."""
+    """
+    Simulate one actuator.
+
+    Set timestamped field levels with ``command(time_ns, tesla)``, step with
+    ``advance(time_ns)``, and read `stretch` and `rate`.
+
+    Parameters
+    ----------
+    actuator : ActuatorParameters
+        Parameters in SI units.
+    time : int
+        Initial time in ns.
+    stretch : float, optional
+        Initial stretch at rest; by default that without field.
+    slew_limit : float
+        Rate of the amplifier's ramps in T/s; infinite for steps.
+    coil_time_constant : float
+        Time constant of the first-order coil lag in s; 0 for none.
+    creep : Creep, optional
+        Viscoelastic branches; none by default.
+
+    Examples
+    --------
+    >>> from hmsa_ros.model.parameters import paper_actuator
+    >>> block = ActuatorSimulation(paper_actuator())
+    >>> block.command(0, 0.02)
+    >>> block.advance(200_000_000)
+    >>> print(f'{block.stretch:.3f}')
+    1.056
+
+    """
 
     def __init__(
             self, actuator: ActuatorParameters, *, time: int = 0, stretch: float | None = None,

@@ -140,7 +140,7 @@ def tidy(
     if not stamps.any():
         stamps = logged.copy()
         notes.append(
-            'The samples carry no stamps: the times at which they were recorded are taken.')
+            'The samples have no timestamps: the receive times are used.')
     near = np.abs(stamps - np.sort(stamps)[len(stamps) // 2]) < _FAR
     if not np.all(near):
         notes.append(

@@ -407,7 +407,7 @@ def timings(parts: Sequence[Part], unit: TimeUnit) -> Figure:
             part, 'interval as recorded', *decimate(time[1:], timing.arrival_interval * 1e3),
             color=colour, width=0.8, dash='2px,1px', opacity=0.8))
         data.append(_curve(
-            part, 'interval of the stamps', *decimate(time[1:], timing.interval * 1e3),
+            part, 'interval of the timestamps', *decimate(time[1:], timing.interval * 1e3),
             color=part.colour or BLACK, width=1.6))
     return Figure(
         'timing', 'Lead of the commands, delay and interval of the samples', 640, _grouped(data), {

@@ -248,7 +248,7 @@ def _notes_of(part: Part) -> Iterable[str]:
         yield (f'The recording has {samples:.3g} samples a period of the actuator: expected at '
                f'least {FEW_SAMPLES}, since peaks between samples are missed; raise publish_rate.')
     if not len(part.timing.lead) and part.run.commands:
-        yield ('The clock of the recorder differs from that of the stamps: the lead of the '
+        yield ('The clock of the recorder differs from that of the timestamps: the lead of the '
                'commands is unknown (record with use_sim_time if time is simulated).')
     if part.timing.unapplied:
         yield (f'{part.timing.unapplied} changes of level did not take effect according to '
@@ -347,7 +347,7 @@ def _timing(parts: Sequence[Part]) -> str:
                 ('command lead', x.lead),
                 ('lateness of the command', x.lateness[np.isfinite(x.lateness)]),
                 ('sample delay', x.delay),
-                ('interval of the stamps', x.interval),
+                ('interval of the timestamps', x.interval),
                 ('interval of the recorded samples', x.arrival_interval)):
             if len(values):
                 rows.append([
