@@ -1,10 +1,54 @@
 """
 Vibration-free command shaping for hard-magnetic soft actuators on ROS 2.
 
+In Python, without ROS, in seconds and tesla:
+
+>>> import hmsa_ros
+>>> block = hmsa_ros.Actuator(shear_modulus=30e3, half_length=5e-3, remanence=0.08, zeta=0.1)
+>>> plan = block.plan([(1.1, 0.5), (1.0, 0.5)])
+>>> print(plan.report())
+stretch  duration (s)  first level (T)  arrival (s)  last level (T)     status
+───────  ────────────  ───────────────  ───────────  ──────────────  ────────
+    1.1           0.5         0.0690131   0.00162989         0.13029  two_step
+      1           0.5         0.0633266   0.00165093               0  two_step
+>>> motion = plan.simulate(truth=block.scaled(shear_modulus=1.02), noise=1e-4)
+
 ``hmsa_ros.model`` is the actuator, ``hmsa_ros.planning`` the commands that move it, and
 ``hmsa_ros.device`` the simulated plant and drivers of hardware, all without ROS. ``hmsa_ros.bag``
 reads and writes recordings, ``hmsa_ros.nodes`` is the ROS 2 edge and ``hmsa_ros.cli`` the command
 line.
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING
+
 __version__ = '0.1.0'
+
+if TYPE_CHECKING:
+    from hmsa_ros.api.actuator import Actuator
+    from hmsa_ros.api.identified import Identified, identify
+    from hmsa_ros.api.motion import compare, Motion, read
+    from hmsa_ros.api.plan import Plan
+    from hmsa_ros.errors import BadInputError, HmsaError
+    from hmsa_ros.table import Table
+
+__all__ = [
+    'Actuator', 'BadInputError', 'HmsaError', 'Identified', 'Motion', 'Plan', 'Table', 'compare',
+    'identify', 'read']
+
+# Where each name is, so that it is loaded with its first use.
+_HOMES = {
+    'Actuator': 'api.actuator', 'BadInputError': 'errors', 'HmsaError': 'errors',
+    'Identified': 'api.identified', 'Motion': 'api.motion', 'Plan': 'api.plan', 'Table': 'table',
+    'compare': 'api.motion', 'identify': 'api.identified', 'read': 'api.motion'}
+
+if not TYPE_CHECKING:
+    def __getattr__(name):
+        if name not in _HOMES:
+            raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+        found = globals()[name] = getattr(import_module(f'{__name__}.{_HOMES[name]}'), name)
+        return found
+
+
+def __dir__() -> list[str]:
+    return __all__

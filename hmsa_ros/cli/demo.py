@@ -8,9 +8,9 @@ from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.options import add_options
 from hmsa_ros.cli.progress import progress
-from hmsa_ros.cli.tables import table
 from hmsa_ros.ending import ENDING
 from hmsa_ros.files import json_text
+from hmsa_ros.table import Column, Table
 
 if TYPE_CHECKING:
     from hmsa_ros.lab.demo import DemoResult
@@ -63,32 +63,24 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _print_table(result: 'DemoResult') -> None:
-    from rich.console import Console
-
-    from hmsa_ros.model.residual import percent
-
-    console = Console()
-    moves = table(
+    print(Table((
+        Column('target'), Column('b_p', '', '.5f'), Column('tau_p', '', '.5f'),
+        Column('b_1', '', '.5f'), Column('arrival', 'ms', '.3f'), Column('residual', '%', '%'),
+        Column('unshaped', '%', '%'), Column('verdict')), tuple((
+            x.stretch, x.b_p, x.tau_p, x.b_1, x.arrival * 1e3, 100.0 * x.residual,
+            100.0 * x.residual_unshaped, str(x.finding['verdict']).replace('_', ' '))
+            for x in result.setpoints),
         'b and tau nondimensional as in the paper; arrival from the begin of the move; residual: '
         'peak-to-peak stretch after arrival, in % of the step; unshaped: simulated on the same '
-        'plant',
-        ('target', 'b_p', 'tau_p', 'b_1', 'arrival ms', 'residual %', 'unshaped %'), 'verdict')
-    for x in result.setpoints:
-        moves.add_row(
-            f'{x.stretch:g}', f'{x.b_p:.5f}', f'{x.tau_p:.5f}', f'{x.b_1:.5f}',
-            f'{x.arrival * 1e3:.3f}', percent(x.residual), percent(x.residual_unshaped),
-            str(x.finding['verdict']).replace('_', ' '))
-    console.print(moves)
-    adapted = table(
+        'plant'))
+    print(Table((
+        Column('feedback'), Column('target'), Column('arrival', 'ms', '.1f'),
+        Column('vibration', '%', '.2f'), Column('offset', '%', '+.2f')), tuple((
+            x.feedback, x.stretch, x.arrival * 1e3, 100.0 * x.vibration, 100.0 * x.offset)
+            for x in result.adapting.results),
         'a larger block, simulated in this process, whose shear modulus is 20 % above that '
-        'planned with; vibration after the arrival and rest beside the target, share of the step',
-        ('feedback', 'target', 'arrival ms', 'vibration', 'offset'))
-    for y in result.adapting.results:
-        adapted.add_row(
-            y.feedback, f'{y.stretch:g}', f'{y.arrival * 1e3:.1f}', f'{y.vibration:.2%}',
-            f'{y.offset:+.2%}')
-    console.print(adapted)
+        'planned with; vibration after the arrival and rest beside the target, in % of the step'))
     for line in (
             f'bag      {result.bag}', f'picture  {result.picture}',
             f'         {result.adapting.picture}'):
-        console.print(line, highlight=False, soft_wrap=True)
+        print(line)

@@ -13,7 +13,7 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text, write_text
 
 if TYPE_CHECKING:
-    from hmsa_ros.identification import Identification, Recording
+    from hmsa_ros.identification import Recording
     from hmsa_ros.identification.files import Belief
 
 
@@ -106,8 +106,9 @@ def run(arguments: argparse.Namespace) -> int:
             record['profile'] = {'name': arguments.profile, 'points': curve}
         print(json_text(record))
     else:
-        for line in table(found):
-            print(line)
+        print(found.report())
+        if found.verdict == 'identified':
+            print(f'identified: {found.reason}')
         for value, deviance in curve:
             print(f'profile {arguments.profile} {value:.8g} deviance {deviance:.4g}')
         for path in written:
@@ -182,26 +183,3 @@ def _read(
     return read_csv(
         path, arguments.commands, slew_limit=slew,
         coordinate=belief.actuator.coordinate), belief
-
-
-def table(found: 'Identification') -> list[str]:
-    """Return the result, aligned, a line each."""
-    rows = [('parameter', 'value', 'std', '95 % interval', 'unit')]
-    for key in found.names:
-        name, x = found.shown(key)
-        rows.append((
-            name, f'{x.value:.7g}', f'{x.std:.2g}', f'{x.low:.6g} to {x.high:.6g}', x.unit)
-            if x.value == x.value else (name, '', '', 'not identifiable', x.unit))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = [
-        f'{row[0]:<{widths[0]}}  '
-        + '  '.join(f'{x:>{n}}' for x, n in zip(row[1:4], widths[1:4], strict=True))
-        + f'  {row[4]}' for row in rows]
-    lines.append(
-        f'noise {found.noise_std:.3g}, residual rms {found.residual_rms:.3g}, '
-        f'{found.samples} samples')
-    if found.verdict == 'identified':
-        lines += [f'{one} and {other} are confounded: correlation {x:.3f}'
-                  for one, other, x in found.confounded()]
-        lines.append(f'identified: {found.reason}')
-    return [*lines, *(f'note: {x}' for x in found.warnings)]

@@ -2,13 +2,13 @@
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 import math
 from pathlib import Path
 import sys
 from typing import Any, cast, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_options, JSON, Row
+from hmsa_ros.cli.options import add_options, JSON, law_of, LAW_OPTION, Row
 from hmsa_ros.cli.quantities import (
     BEAM,
     BY_KEY,
@@ -21,13 +21,17 @@ from hmsa_ros.cli.quantities import (
 )
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text, write_text
-from hmsa_ros.interfaces.parameters import LAW_NAME, PUBLISH_RATE
+from hmsa_ros.interfaces.parameters import LAW, LAW_NAME, PUBLISH_RATE
 
 if TYPE_CHECKING:
+    from hmsa_ros.api.actuator import Actuator
     from hmsa_ros.model.parameters import ActuatorParameters
-    from hmsa_ros.planning.scales import Coil, Scales
+    from hmsa_ros.planning.scales import Scales
 
 _JOINT = 'actuator'
+# What is of the coil, and what the actuator takes by another name.
+_COIL = ('flux_max', 'flux_min', 'slew_limit')
+_ARGUMENTS = {'j_lim': 'chain_limit'}
 # In place of which the damping coefficient may be given.
 _DAMPED = ('zeta', 'damping_ratio')
 _FILE = Path('actuator.yaml')
@@ -58,7 +62,7 @@ def add_parser(subparsers: Any) -> None:
          'a beam that is clamped at one end, magnetised along its length, in a field across it; '
          'its setpoints are deflections of the tip over the length'),
         *(_option(x) for x in (
-            *QUANTITIES, *(x for x in BEAM if x.key not in BY_KEY), DAMPING)),
+            *QUANTITIES, *(x for x in BEAM if x.key not in BY_KEY), DAMPING)), LAW_OPTION,
         ('--joint', 'NAME', str,
          f'joint name (default {_JOINT}), or several separated by commas for identical actuators',
          {'default': ''}),
@@ -92,7 +96,7 @@ def run(arguments: argparse.Namespace) -> int:
     if not path.resolve().parent.is_dir():
         raise BadInputError(
             f'cannot write {path}: {path.parent} is no folder; expected one that exists (--out)')
-    asked = BEAM if arguments.beam else QUANTITIES
+    asked = _asked(arguments)
     given = _given(arguments, asked)
     joints = joint_names(arguments.joint)
     by_key = {x.key: x for x in asked}
@@ -110,11 +114,9 @@ def run(arguments: argparse.Namespace) -> int:
         if not _known(key, given):
             given[key] = default_of(quantity, given)
 
-    from hmsa_ros.planning.scales import Coil, scales
-
-    actuator = _beam(given) if arguments.beam else _block(given)
-    coil = Coil(given['flux_min'], given['flux_max'], given['slew_limit'])
-    found = scales(actuator, coil)
+    made = _actuator(arguments, given)
+    actuator, found = made.block, made.scales
+    given.setdefault('shear_modulus', actuator.shear_modulus)
     doubts = _doubts(given, found)
     if guessed:
         doubts.append(
@@ -122,12 +124,12 @@ def run(arguments: argparse.Namespace) -> int:
             f'{"is a guess" if len(guessed) == 1 else "are guesses"}: a plan is only as exact '
             'as its parameters; measure them and pass the values')
     joints = joints or [_JOINT]
-    write_text(path, file_text(path, actuator, coil, joints, found))
+    write_text(path, file_text(path, made, joints))
     for doubt in doubts:
         print(f'hmsa: warning: {doubt}', file=sys.stderr)
     if arguments.json:
         print(json_text({
-            'file': str(path), 'joints': joints, 'parameters': _parameters(actuator, coil),
+            'file': str(path), 'joints': joints, 'parameters': _parameters(made),
             'scales': asdict(found), 'warnings': doubts}))
         return 0
     for line in table(found, actuator):
@@ -136,6 +138,21 @@ def run(arguments: argparse.Namespace) -> int:
     for node in ('plant', 'planner'):
         print(f'  hmsa {node} --ros-args --params-file {path}')
     return 0
+
+
+def _asked(arguments: argparse.Namespace) -> tuple[Quantity, ...]:
+    """Return what is to be given; a law has a modulus and a limit of its own."""
+    if arguments.law is None:
+        return BEAM if arguments.beam else QUANTITIES
+    from hmsa_ros.model.laws import LAWS
+
+    law = LAWS[law_of(arguments.law)[0]]
+    if arguments.beam or law.name == 'beam':
+        raise BadInputError(
+            f'--law {law.name} is given{" with --beam" if arguments.beam else ""}: expected '
+            '--beam for a beam, which has a law of its own, and --law for a block')
+    none = ('shear_modulus', 'j_lim') if law.scaled else ('j_lim',) if law.endless else ()
+    return tuple(x for x in QUANTITIES if x.key not in none)
 
 
 def _given(arguments: argparse.Namespace, asked: Sequence[Quantity]) -> dict[str, float]:
@@ -157,7 +174,8 @@ def _given(arguments: argparse.Namespace, asked: Sequence[Quantity]) -> dict[str
         raise BadInputError(
             f'{", ".join(sorted("--" + x.replace("_", "-") for x in others))} is given: expected '
             + ('sizes of a beam, --length, --thickness and --width, and no --zeta or --j-lim'
-               if arguments.beam else '--beam with it'))
+               if arguments.beam else '--beam with it' if others <= {x.key for x in BEAM}
+               else f'constants of --law {arguments.law.partition(":")[0]} in its place'))
     return given
 
 
@@ -218,36 +236,22 @@ def _answer(question: str) -> str:
     return line.strip()
 
 
-def _beam(given: Mapping[str, float]) -> 'ActuatorParameters':
-    """Return the beam."""
-    from hmsa_ros.interfaces.actuator import actuator_from
-    from hmsa_ros.interfaces.parameters import BLOCK
-    from hmsa_ros.model.equations import critical_zeta
+def _actuator(
+        arguments: argparse.Namespace, given: Mapping[str, float]) -> 'Actuator':
+    """Return the actuator with its coil."""
+    from hmsa_ros.api.actuator import Actuator
 
-    beam = actuator_from({x.name: x.default for x in BLOCK} | {
-        LAW_NAME.name: 'beam', 'actuator.damping_coefficient': 0.0} | {
-        x.parameter: given[x.key] * (0.5 if x.parameter.startswith('actuator.half_') else 1.0)
-        for x in BEAM if x.parameter and not x.parameter.startswith(('flux', 'slew'))})
-    damping = given.get(DAMPING.key)
-    if damping is None:
-        damping = given['damping_ratio'] * beam.damping_unit * float(
-            critical_zeta(beam.rest, beam.nondimensional))
-    return replace(beam, damping_coefficient=damping)
-
-
-def _block(given: Mapping[str, float]) -> 'ActuatorParameters':
-    """Return the block."""
-    from hmsa_ros.model.creep import Creep
-    from hmsa_ros.model.parameters import ActuatorParameters
-
-    damping = given.get(DAMPING.key)
-    if damping is None:
-        damping = (
-            8.0 * given['zeta'] * given['half_length'] * given['half_thickness']
-            * math.sqrt(given['density'] * given['shear_modulus']))
-    block = {x.parameter.partition('.')[2]: given[x.key] for x in QUANTITIES
-             if x.parameter.startswith('actuator.')}
-    return ActuatorParameters(damping_coefficient=damping, law=None, creep=Creep(), **block)
+    values: dict[str, Any] = {
+        'flux_density_limits': (given['flux_min'], given['flux_max']),
+        'slew_limit': given['slew_limit'] or math.inf}
+    sizes = [x.key for x in (BEAM if arguments.beam else QUANTITIES) if x.key not in _COIL]
+    values |= {_ARGUMENTS.get(x, x): given[x] for x in sizes if x in given}
+    if DAMPING.key in given:
+        values = {x: y for x, y in values.items() if x not in _DAMPED} | {
+            'damping_coefficient': given[DAMPING.key]}
+    if arguments.law is not None:
+        values['law'], values['constants'] = law_of(arguments.law)
+    return Actuator.beam(**values) if arguments.beam else Actuator(**values)
 
 
 def _doubts(given: Mapping[str, float], found: 'Scales') -> list[str]:
@@ -255,7 +259,7 @@ def _doubts(given: Mapping[str, float], found: 'Scales') -> list[str]:
     beam = 'length' in given
     values = {**given, 'zeta': found.zeta, 'damping_ratio': found.zeta / found.critical_zeta}
     doubts = [x for quantity in (BEAM if beam else QUANTITIES)
-              if (x := quantity.doubt(values[quantity.key]))]
+              if quantity.key in values and (x := quantity.doubt(values[quantity.key]))]
     if found.zeta >= found.critical_zeta:
         doubts.append(
             f'zeta {found.zeta:g} is above the critical {found.critical_zeta:g}: small motion '
@@ -285,43 +289,16 @@ def _doubts(given: Mapping[str, float], found: 'Scales') -> list[str]:
 
 def table(found: 'Scales', actuator: 'ActuatorParameters') -> list[str]:
     """Return what follows from the parameters, aligned, a line each."""
-    beam = actuator.rest == 0.0
-    words = 'deflections' if beam else 'stretches'
-    rows = [
-        ('time unit' if beam else 'time unit L sqrt(rho/G)', _time(found.time_unit)),
-        ('natural frequency at rest', f'{found.frequency:.5g} Hz'),
-        ('damping', f'{found.damping:.4g} N s/m, zeta {found.zeta:.4g}'),
-        ('critical damping at rest',
-         f'{found.critical_damping:.4g} N s/m, zeta {found.critical_zeta:.4g}'),
-        (f'limiting {words}', '{:.4f} and {:.4f}'.format(*found.stretch_limits)),
-        *([] if beam else [('shape c1', f'{found.c1:.4g}')]),
-        *((f'flux density for {stretch:.6g}', f'{1e3 * flux:.4g} mT')
-          for stretch, flux in found.flux_densities),
-        (f'coil holds {words}', _range(found.held)),
-        ('two steps reach from rest',
-         'nothing' if found.reached == (actuator.rest,) * 2 else _range(found.reached)),
-        ('a move from rest', 'none in two steps' if math.isnan(found.duration)
-         else f'{_time(found.duration)} to {found.target:.6g}'),
-    ]
-    return [f'{name:<26} {value}' for name, value in rows]
+    from hmsa_ros.api.actuator import facts
+
+    return [f'{name:<26} {value}' for name, value in facts(found, actuator)]
 
 
-def _range(ends: tuple[float, float]) -> str:
-    return f'{ends[0]:.6g} to {ends[1]:.6g}'
-
-
-def _time(seconds: float) -> str:
-    """Return a time in a unit that suits it."""
-    for size, unit in ((1.0, 's'), (1e-3, 'ms')):
-        if seconds >= size:
-            return f'{seconds / size:.4g} {unit}'
-    return f'{seconds * 1e6:.4g} us'
-
-
-def file_text(
-        path: Path, actuator: 'ActuatorParameters', coil: 'Coil', joints: list[str],
-        found: 'Scales') -> str:
+def file_text(path: Path, made: 'Actuator', joints: list[str]) -> str:
     """Return the parameter file in ROS 2's YAML; its name and the scales go into comments."""
+    from hmsa_ros.identification.files import yaml_text
+
+    actuator, found = made.block, made.scales
     lines = [
         '# Parameters of an actuator for planner and plant, written by hmsa init:',
         f'#   hmsa plant --ros-args --params-file {path.name}',
@@ -329,17 +306,18 @@ def file_text(
         '#', '# What follows from them (computed by hmsa init when it wrote this file):',
         *(f'#   {line}' for line in table(found, actuator)),
         '/**:', '  ros__parameters:']
-    texts = {x.parameter: (x.text, x.unit) for x in (*QUANTITIES, DAMPING)}
+    texts = {x.name: (x.description.rstrip('.'), x.unit) for x in LAW} | {
+        x.parameter: (x.text, x.unit) for x in (*QUANTITIES, DAMPING)}
     if not actuator.rest:
         texts |= {
             x.parameter: (('half of the ' if 'half_' in x.parameter else '') + x.text, x.unit)
             for x in BEAM} | {
             LAW_NAME.name: ('a beam: positions are deflections of the tip over the length', ''),
             DAMPING.parameter: ('damping coefficient of the tip', DAMPING.unit)}
-    for name, value in _parameters(actuator, coil).items():
+    for name, value in _parameters(made).items():
         text, unit = texts[name]
         lines += [f'    # {text[0].upper()}{text[1:]}{f" [{unit}]" if unit else ""}.',
-                  f'    {name}: {_number(value)}']
+                  f'    {name}: {yaml_text(value)}']
     if len(joints) == 1:
         lines += ['    # Name of the joint in trajectories and joint states.',
                   f"    joint: '{joints[0]}'"]
@@ -348,7 +326,7 @@ def file_text(
         lines += [
             '    # Names of the joints; all are identical except for what is set for one, such '
             'as',
-            f'    # {joints[0]}.actuator.remanence: {_number(actuator.remanence)}',
+            f'    # {joints[0]}.actuator.remanence: {yaml_text(actuator.remanence)}',
             f'    joints: [{names}]']
     return '\n'.join(lines + _sampling(actuator)) + '\n'
 
@@ -366,24 +344,14 @@ def _sampling(actuator: 'ActuatorParameters') -> list[str]:
     rate = min(math.ceil(enough / digits) * digits, largest)
     return [
         '    # Sample rate of the plant: at least 20 samples per period of the actuator [Hz].',
-        f'    publish_rate: {_number(rate)}']
+        f'    publish_rate: {rate:.1f}']
 
 
-def _parameters(actuator: 'ActuatorParameters', coil: 'Coil') -> dict[str, Any]:
+def _parameters(made: 'Actuator') -> dict[str, Any]:
     """Return the nodes' parameters by name."""
-    from hmsa_ros.interfaces.actuator import parameters_of
-
-    values = parameters_of(actuator)
-    if not actuator.rest:
+    values = made.parameters
+    del values['coil_time_constant']
+    if made.block.law is not None:
         # They follow from the others, or have no effect.
         del values['actuator.shear_modulus'], values['actuator.chain_limit']
-    return {**values, **asdict(coil)}
-
-
-def _number(value: float | str) -> str:
-    """Return a number that every reader of YAML takes for a float, or a word as it is."""
-    if isinstance(value, str):
-        return value
-    text = repr(float(value))
-    mantissa, letter, exponent = text.partition('e')
-    return f'{mantissa}.0e{exponent}' if letter and '.' not in mantissa else text
+    return values

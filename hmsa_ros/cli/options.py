@@ -1,6 +1,9 @@
 """Options of commands, as rows of tables."""
 
+import argparse
 from typing import Any
+
+from hmsa_ros.errors import BadInputError, excerpt
 
 #: Name, metavar, type, help and, where there are any, other settings of argparse; of a flag name
 #: and help.
@@ -8,11 +11,66 @@ Row = tuple[Any, ...]
 
 JSON: Row = ('--json', 'print one JSON object')
 NAMESPACE: Row = ('--namespace', 'NS', str, 'namespace of the planner', {'default': ''})
+TIMEOUT: Row = (
+    '--timeout', 'S', float, 'seconds to wait for a reply (default 10 s)', {'default': 10.0})
 #: Dimensionless parameters of a block: option, metavar and meaning.
 MATERIAL = (
     ('--zeta', 'Z', 'dimensionless damping, at least 0 (default 0.2)'),
     ('--j-lim', 'J', 'Gent limiting extensibility J_lim, above 0 (default 5)'),
     ('--c1', 'C', 'shape 2 H^2/L^2, above 0 (default 2)'))
+
+LAW_OPTION: Row = (
+    '--law', 'NAME:KEY=VALUE,...', str,
+    'hyperelastic model and its constants (moduli in Pa or with a unit, or in any unit where all '
+    'is nondimensional; values of a list with / between), such as yeoh:c10=15kPa,c20=500 or '
+    'ogden:mu=6e3/100,alpha=1.3/5')
+
+
+def law_of(text: str) -> tuple[str, dict[str, Any]]:
+    """Return name and constants of `LAW_OPTION`; `BadInputError` for what is none."""
+    from hmsa_ros.cli.quantities import number_of
+    from hmsa_ros.model.laws import LAWS
+
+    name, _, rest = text.partition(':')
+    if name not in LAWS:
+        raise BadInputError(f'--law is {excerpt(name)}: expected one of {", ".join(LAWS)}')
+    known = {x.name.partition('.')[2]: x for x in LAWS[name].constants}
+    constants: dict[str, Any] = {}
+    for part in filter(None, rest.split(',')):
+        key, equals, value = (x.strip() for x in part.partition('='))
+        if not equals or key not in known:
+            raise BadInputError(
+                f'--law {name} has {excerpt(part)}: expected KEY=VALUE with a key of '
+                f'{", ".join(known) or "none, since it has no constants"}')
+        kind, unit = known[key].kind, known[key].unit
+        constants[key] = value if kind is str else [
+            number_of(x, unit, key) for x in value.split('/')] if kind is list else number_of(
+                value, unit, key)
+    return name, constants
+
+
+def of_unit(option: str, unit: str, text: str) -> Row:
+    """Return an option that is a number above 0 in an SI unit or with a unit of its own."""
+    from hmsa_ros.cli.quantities import number_of
+
+    def read(words: str) -> float:
+        try:
+            value = number_of(words, unit, option)
+        except BadInputError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+        if not value > 0.0:
+            raise argparse.ArgumentTypeError(f'{value:g} {unit}: expected more than 0 {unit}')
+        return value
+
+    return option, 'X', read, f'{text} [{unit}]'
+
+
+def timeout_of(arguments: argparse.Namespace) -> float:
+    """Return the patience in s, or raise `BadInputError`."""
+    timeout: float = arguments.timeout
+    if not timeout > 0.0:
+        raise BadInputError(f'timeout is {timeout:g}: expected a number of seconds above 0')
+    return timeout
 
 
 def add_options(parser: Any, *rows: Row) -> None:

@@ -1,26 +1,30 @@
 """``hmsa plan``: plan a sequence without ROS."""
 
 import argparse
-from collections.abc import Mapping, Sequence
 import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from hmsa_ros.cli.options import add_options, MATERIAL
+from hmsa_ros.cli.options import add_options, law_of, LAW_OPTION, MATERIAL, of_unit
 from hmsa_ros.cli.setpoints import setpoint
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text
-from hmsa_ros.planning.setpoint import impossible
+from hmsa_ros.table import Column, Table
 
 if TYPE_CHECKING:
+    from hmsa_ros.api.actuator import Actuator
     from hmsa_ros.model.delivery import Delivery
-    from hmsa_ros.model.mismatch import Uncertainty
-    from hmsa_ros.model.moves import Limits, State
+    from hmsa_ros.model.moves import Limits
     from hmsa_ros.model.parameters import NondimensionalParameters
     from hmsa_ros.model.units import Units
     from hmsa_ros.planning.sequence import Segment
 
     Nominal = tuple[NondimensionalParameters, Limits, Delivery, Units]
+
+# Units of time and load of the paper, as messages and tables name them.
+_TIME, _LOAD = 'L sqrt(rho/G)', 'mu0 G/Br'
+# What the options say of a coil.
+_WINDING = ('inductance', 'resistance', 'tesla_per_ampere')
 
 
 def add_parser(subparsers: Any) -> None:
@@ -40,7 +44,7 @@ def add_parser(subparsers: Any) -> None:
         parser,
         ('--start', 'S', float,
          'initial stretch, at rest (default 1; 0 for the deflection of a beam)'),
-        *((option, metavar, float, text) for option, metavar, text in MATERIAL),
+        *((option, metavar, float, text) for option, metavar, text in MATERIAL), LAW_OPTION,
         ('--shaper', 'NAME', str,
          'two_step (default), robust, minimax, minimum_time, smooth, step, zv, zvd, ei or umzv'),
         ('--order', 'N', int,
@@ -57,40 +61,56 @@ def add_parser(subparsers: Any) -> None:
          {'default': math.inf}),
         ('--params-file', 'YAML', Path,
          'parameter file (YAML) of planner and plant, for a plan in seconds and tesla'),
+        of_unit('--tesla-per-ampere', 'T/A', 'field of the coil per current, for levels in A'),
+        ('--amplifier',
+         'with --params-file: also print what amplifiers from fast to slow have to give, and the '
+         'time that they lose; with --tesla-per-ampere, --inductance and --resistance also '
+         'current and voltage'),
+        of_unit('--inductance', 'H', 'inductance L of the coil'),
+        of_unit('--resistance', 'ohm', 'resistance R of the coil'),
         ('--json', 'print JSON in full precision'))
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Plan and print, in seconds and tesla for the actuator of a parameter file."""
-    from hmsa_ros.planning.sequence import plan_sequence
-    from hmsa_ros.planning.setpoint import Setpoint
-    from hmsa_ros.planning.shapers.pace import Pace
-
-    group, limits, delivery, units = nominal(arguments)
-    time, load = units.time, units.load
-    segments = plan_sequence(
-        [Setpoint(stretch, span / time)
-         for stretch, span in _possible(arguments.setpoints, group.rest)],
-        group, start=_start(arguments, group.rest), shaper=arguments.shaper or 'two_step',
-        limits=limits, delivery=delivery, units=units, order=arguments.order,
-        errors=_errors(arguments), pace=Pace(arguments.periods, arguments.max_rate * time))
-    if arguments.params_file is None:
-        facts = {}
+    si = arguments.params_file is not None
+    facts, amplifiers = {}, None
+    if si:
+        actuator = _actuator(arguments)
+        segments = actuator.plan(
+            arguments.setpoints, arguments.shaper or 'two_step', **_more(arguments)).segments
+        group, units = actuator.model.material, actuator.model.units
+        facts = {'c1': group.c1, 'zeta': group.zeta, 'j_lim': group.j_lim,
+                 'time_unit': units.time, 'flux_density_unit': units.load}
+        rows = [_si_row(x, units.time, units.load, arguments.tesla_per_ampere) for x in segments]
+        if arguments.amplifier:
+            amplifiers = actuator.amplifiers(
+                arguments.setpoints, shaper=arguments.shaper or 'two_step',
+                **_more(arguments), **{x: getattr(arguments, x) for x in _WINDING})
+        shown = [
+            Column('span', 's'), Column('flux_density_p', 'T'), Column('time_p', 's'),
+            Column('flux_density_1', 'T')]
+        if arguments.tesla_per_ampere is not None:
+            shown += [Column('current_p', 'A'), Column('current_1', 'A')]
+        caption = (f'c1 {group.c1:.6g}, zeta {group.zeta:.6g}, time unit L sqrt(rho/G) '
+                   f'{units.time:.6g} s')
+    else:
+        group = _group(arguments)
+        segments = _nondimensional(arguments, group)
         rows = [_row(x) for x in segments]
-        columns = 'stretch', 'span', 'b_p', 'tau_p', 'b_1'
-        caption = 'nondimensional: time in L sqrt(rho/G), b = sqrt(Br B/(mu0 G))'
-    else:
-        facts = {'c1': group.c1, 'zeta': group.zeta, 'j_lim': group.j_lim, 'time_unit': time,
-                 'flux_density_unit': load}
-        rows = [_si_row(x, time, load) for x in segments]
-        columns = 'stretch', 'span', 'flux_density_p', 'time_p', 'flux_density_1'
-        caption = (f'times in s, flux densities in T; c1 {group.c1:.6g}, zeta {group.zeta:.6g}, '
-                   f'time unit {time:.6g} s')
+        shown = [Column('span', _TIME), Column('b_p'), Column('tau_p', _TIME), Column('b_1')]
+        caption = 'nondimensional as in the paper, b = sqrt(Br B/(mu0 G)); in seconds and tesla ' \
+                  'with --params-file'
     if arguments.json:
-        print(json_text({**facts, 'segments': rows}))
-    else:
-        _print_table(rows, columns, caption, group.coordinate.name)
-        _print_reasons(segments)
+        print(json_text({**facts, 'segments': rows, **(
+            {} if amplifiers is None else {'amplifiers': amplifiers.records()})}))
+        return 0
+    print(Table(
+        (Column(group.coordinate.name), *shown, Column('status')),
+        tuple((x['stretch'], *(x[y.name] for y in shown), x['status']) for x in rows), caption,
+        tuple(note for x in segments for note in x.notes())))
+    if amplifiers is not None:
+        print(f'\n{amplifiers}')
     return 0
 
 
@@ -98,60 +118,107 @@ def nominal(arguments: argparse.Namespace) -> 'Nominal':
     """Return what options or a file plan with; raise `BadInputError` if both say something."""
     from hmsa_ros.model.delivery import Delivery
     from hmsa_ros.model.moves import Limits
-    from hmsa_ros.model.parameters import NondimensionalParameters
     from hmsa_ros.model.units import Units
-    from hmsa_ros.recordings.model import model_of
 
-    given = {name: value for name in ('zeta', 'j_lim', 'c1')
-             if (value := getattr(arguments, name)) is not None}
     if arguments.params_file is None:
-        return NondimensionalParameters(**given), Limits(), Delivery(), Units()
-    if given:
-        fixed = ', '.join(f'--{name.replace("_", "-")}' for name in given)
-        raise BadInputError(
-            f'both --params-file and {fixed} are given: expected only one of them, since the file '
-            'sets these values')
-    model = model_of(arguments.params_file)
+        return _group(arguments), Limits(), Delivery(), Units()
+    model = _actuator(arguments).model
     return model.material, model.limits, model.delivery, model.units
 
 
-def _possible(setpoints: Sequence[tuple[float, float]], rest: float) -> list[tuple[float, float]]:
-    """Return setpoints after checking that an actuator with a rest there may have them."""
-    for stretch, _ in setpoints:
-        if reason := impossible(stretch, rest):
-            raise BadInputError(reason)
-    return list(setpoints)
+def _actuator(arguments: argparse.Namespace) -> 'Actuator':
+    """Return the actuator of the file; options beside it that it sets are a `BadInputError`."""
+    from hmsa_ros.api.actuator import Actuator
+
+    fixed = [f'--{x.replace("_", "-")}' for x in ('zeta', 'j_lim', 'c1', 'law')
+             if getattr(arguments, x, None) is not None]
+    if fixed:
+        raise BadInputError(
+            f'both --params-file and {", ".join(fixed)} are given: expected only one of them, '
+            'since the file sets these values')
+    return Actuator.from_yaml(arguments.params_file)
 
 
-def _start(arguments: argparse.Namespace, rest: float) -> 'State':
-    """Return the state at the start, unless given at rest without a field."""
+def _more(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return how to plan, as `Actuator.plan` takes it."""
+    return {
+        'start': arguments.start, 'order': arguments.order, 'errors': _errors(arguments),
+        'periods': arguments.periods, 'max_rate': arguments.max_rate}
+
+
+def _group(arguments: argparse.Namespace) -> 'NondimensionalParameters':
+    """Return the parameters that options give."""
+    from hmsa_ros.interfaces.parameters import LAW
+    from hmsa_ros.model.laws import LAWS
+    from hmsa_ros.model.parameters import NondimensionalParameters
+
+    without = [f'--{x.replace("_", "-")}' for x in ('amplifier', *_WINDING)
+               if getattr(arguments, x, None)]
+    if without:
+        raise BadInputError(
+            f'{", ".join(without)} is given: expected --params-file with it, since an amplifier '
+            'has units')
+    given: dict[str, Any] = {
+        x: value for x in ('zeta', 'j_lim', 'c1') if (value := getattr(arguments, x)) is not None}
+    if getattr(arguments, 'law', None) is not None:
+        name, constants = law_of(arguments.law)
+        law = LAWS[name]
+        if law.endless:
+            given['j_lim'] = math.inf
+        elif law.scaled is not None:
+            # Without a dimension only ratios of moduli count.
+            given['law'] = law.scaled({x.name: x.default for x in LAW} | {
+                'actuator.remanence': 1.0} | {f'law.{x}': y for x, y in constants.items()})[1]
+    return NondimensionalParameters(**given)
+
+
+def _nondimensional(
+        arguments: argparse.Namespace,
+        group: 'NondimensionalParameters') -> tuple['Segment', ...]:
+    """Plan in the units of the paper."""
     from hmsa_ros.model.moves import State
-
-    return State(rest if arguments.start is None else arguments.start)
-
-
-def _errors(arguments: argparse.Namespace) -> 'Uncertainty':
-    """Return the errors for which minimax plans."""
+    from hmsa_ros.model.status import Code, RefusedError
+    from hmsa_ros.model.units import Units
+    from hmsa_ros.planning.sequence import plan_sequence
+    from hmsa_ros.planning.setpoint import impossible, Setpoint
+    from hmsa_ros.planning.shapers.pace import Pace
     from hmsa_ros.planning.shapers.request import as_errors, ERRORS
 
-    if arguments.errors is not None:
-        try:
-            return as_errors([float(x) for x in arguments.errors.split(',')])
-        except ValueError as error:
-            if isinstance(error, BadInputError):
-                raise
-            raise BadInputError(
-                f'--errors is {arguments.errors!r}: expected three numbers such as 0.1,0.1,0.05'
-            ) from None
-    if arguments.shaper != 'minimax' or arguments.params_file is None:
-        return ERRORS
-    from hmsa_ros.identification.files import errors_of, read_belief
+    for stretch, _ in arguments.setpoints:
+        if reason := impossible(stretch, group.rest):
+            raise BadInputError(reason)
+    errors = _errors(arguments)
+    try:
+        return plan_sequence(
+            [Setpoint(*x) for x in arguments.setpoints], group,
+            start=State(group.rest if arguments.start is None else arguments.start),
+            shaper=arguments.shaper or 'two_step', units=Units(
+                time_name=f' {_TIME}', load_name=f' {_LOAD}'), order=arguments.order,
+            errors=ERRORS if errors is None else as_errors(errors),
+            pace=Pace(arguments.periods, arguments.max_rate))
+    except RefusedError as error:
+        if error.code is not Code.SPELL_TOO_SHORT:
+            raise
+        raise RefusedError(
+            error.code, f'{error}; if seconds were meant, name the actuator with '
+            '--params-file') from error
 
-    return errors_of(read_belief(arguments.params_file), ERRORS)
+
+def _errors(arguments: argparse.Namespace) -> list[float] | None:
+    """Return the errors for which minimax plans, if they are given."""
+    if arguments.errors is None:
+        return None
+    try:
+        return [float(x) for x in arguments.errors.split(',')]
+    except ValueError:
+        raise BadInputError(
+            f'--errors is {arguments.errors!r}: expected three numbers such as 0.1,0.1,0.05'
+        ) from None
 
 
-def _si_row(segment: 'Segment', time: float, load: float) -> dict[str, Any]:
-    """Return a segment with its times in s and its flux densities in T as well."""
+def _si_row(
+        segment: 'Segment', time: float, load: float, per_ampere: float | None) -> dict[str, Any]:
+    """Return a segment with its times in s, its flux densities in T and currents in A as well."""
     row: dict[str, Any] = _row(segment)
     levels = segment.move.levels
     return row | {
@@ -159,20 +226,18 @@ def _si_row(segment: 'Segment', time: float, load: float) -> dict[str, Any]:
         'time_p': None if row['tau_p'] is None else row['tau_p'] * time,
         'flux_density_p': None if row['beta_p'] is None else row['beta_p'] * load,
         'flux_density_1': row['beta_1'] * load,
-        'levels': [[x.time * time, x.load * load] for x in levels]}
+        'levels': [[x.time * time, x.load * load] for x in levels]} | ({} if not per_ampere else {
+            'current_p': None if row['beta_p'] is None else row['beta_p'] * load / per_ampere,
+            'current_1': row['beta_1'] * load / per_ampere})
 
 
 def _row(segment: 'Segment') -> dict[str, float | str | None]:
     """Return a segment as the JSON output shows it; null where there is no such number."""
     from hmsa_ros.model.equations import signed_root
 
-    levels, tail = segment.move.levels, segment.move.tail
-    shaped = len(levels) > max(len(tail), 1)
-    beta_p = levels[0].load if shaped else None
-    # Where a span ends before the creep does, the last level is another.
-    beta_1 = segment.holding if tail else levels[-1].load
-    duration = segment.move.duration
-    told = {'vibration': segment.move.vibration} if tail else {}
+    move, shaped = segment.move, segment.shaped
+    beta_p = move.levels[0].load if shaped else None
+    beta_1, duration = segment.held, move.duration
     return {
         'stretch': segment.setpoint.stretch,
         'span': segment.setpoint.span,
@@ -183,34 +248,5 @@ def _row(segment: 'Segment') -> dict[str, float | str | None]:
         'b_1': float(signed_root(beta_1)),
         'start_stretch': segment.start.stretch,
         'start_rate': segment.start.rate,
-        'status': str(segment.move.code),
-    } | told
-
-
-def _print_table(
-        rows: Sequence[Mapping[str, float | str | None]], columns: Sequence[str], caption: str,
-        coordinate: str) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(caption=caption)
-    for name in columns:
-        table.add_column(coordinate if name == 'stretch' else name, justify='right')
-    table.add_column('status')
-    for row in rows:
-        table.add_row(*(
-            '-' if row[name] is None else f'{row[name]:.6g}' for name in columns),
-            str(row['status']))
-    Console().print(table)
-
-
-def _print_reasons(segments: Sequence['Segment']) -> None:
-    for segment in segments:
-        if segment.move.reason:
-            print(f'note: {segment.move.reason}')
-        if segment.move.tail:
-            step = abs(segment.setpoint.stretch - segment.start.stretch) or 1.0
-            print(
-                f'note: {len(segment.move.tail)} levels follow creep at stretch '
-                f'{segment.setpoint.stretch:g}; they leave a vibration of at most '
-                f'{100.0 * segment.move.vibration / step:.2g} % of the move')
+        'status': str(move.code),
+    } | ({'vibration': move.vibration} if move.tail else {})

@@ -30,6 +30,9 @@ _UNITS: dict[str, dict[str, float]] = {
     'N s/m': {'N s/m': 1.0, 'Ns/m': 1.0},
     's': {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'µs': 1e-6},
     'N': {'N': 1.0, 'mN': 1e-3},
+    'H': {'H': 1.0, 'mH': 1e-3, 'uH': 1e-6, 'µH': 1e-6},
+    'ohm': {'ohm': 1.0, 'mohm': 1e-3, 'Ω': 1.0},
+    'T/A': {'T/A': 1.0, 'mT/A': 1e-3},
 }
 _NUMBER = re.compile(r'\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*')
 _NAME = re.compile(r'[A-Za-z](?:_?[A-Za-z0-9])*')

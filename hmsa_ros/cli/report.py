@@ -56,6 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hmsa_ros.recordings.bags import read_runs
     from hmsa_ros.recordings.parameters import read_parameter_file
     from hmsa_ros.report.arrivals import Part
+    from hmsa_ros.report.comparison import labelled
     from hmsa_ros.report.evaluation import evaluate
     from hmsa_ros.report.looks import RUNS
     from hmsa_ros.report.page import page
@@ -69,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
             runs += read_runs(
                 bag, parameters=parameters, joints=joints, progress=update)
         parts = []
-        for i, each in enumerate(_labelled(runs)):
+        for i, each in enumerate(labelled(runs)):
             update('evaluating', i / len(runs))
             parts.append(Part(
                 each, evaluate(each), timing(each),
@@ -89,22 +90,6 @@ def run(arguments: argparse.Namespace) -> int:
     for target in targets:
         print(target)
     return 0
-
-
-def _labelled(runs: 'list[Run]') -> 'list[Run]':
-    """Return the runs with labels of their own."""
-    from dataclasses import replace
-
-    labels = [x.label for x in runs]
-    if len(set(labels)) == len(labels):
-        return runs
-    # Bags of one name lie in different folders, unless one is named twice.
-    labels = [
-        f'{run.path.resolve().parent.name}/{run.label}' if labels.count(run.label) > 1
-        else run.label for run in runs]
-    return [
-        replace(run, label=label if labels.count(label) == 1 else f'{label} ({i})')
-        for i, (run, label) in enumerate(zip(runs, labels, strict=True), 1)]
 
 
 def _check_targets(targets: list[Path], bags: list[Path]) -> None:

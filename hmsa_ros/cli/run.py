@@ -11,14 +11,11 @@ from typing import Any, TYPE_CHECKING
 from hmsa_ros.cli.options import add_options, NAMESPACE
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.setpoints import add_sequence, levels_of
-from hmsa_ros.cli.tables import table
 from hmsa_ros.ending import ENDING
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from hmsa_ros.judge import Finding, Tolerances
     from hmsa_ros.lab.experiment import Conducted, Experiment
     from hmsa_ros.report.outcome import LevelResult
@@ -26,8 +23,6 @@ if TYPE_CHECKING:
 NOT_MEASURED = 'predicted, not measured'
 # What is slower than this share of real time is said to be.
 _SLOW = 0.9
-# Rows of the table of levels.
-_MOST_LEVELS = 12
 
 
 def add_parser(subparsers: Any) -> None:
@@ -190,13 +185,12 @@ def _verdict(
 def _print(
         findings: 'list[Finding]', levels: 'list[LevelResult]', reason: str, done: 'Conducted',
         bag: Path, report: Path | None) -> None:
-    from rich.console import Console
+    from hmsa_ros.report.outcome import findings_table, level_table
 
-    console = Console()
     if levels:
-        console.print(_level_table(levels))
+        print(level_table(levels))
     if findings:
-        console.print(findings_table(findings))
+        print(findings_table(findings))
     parts = [f'{key} {x:.1f} s' for key, x in done.seconds.items()]
     if done.pace < _SLOW:
         parts[1] += f' (simulated time at {done.pace:.2g} of real time)'
@@ -204,42 +198,4 @@ def _print(
             *(f'note     {x}' for x in done.notes), f'time     {", ".join(parts)}',
             f'verdict  {reason}', f'bag      {bag}',
             *([] if report is None else [f'report   {report}'])):
-        console.print(line, highlight=False, soft_wrap=True)
-
-
-def findings_table(findings: 'list[Finding]') -> 'Table':
-    """Return the table of what was found of setpoints."""
-    from hmsa_ros.model.residual import percent
-
-    made = table(
-        'offset: mean stretch less the target; vibration: peak to peak; both in % of the step, '
-        'with their standard deviations',
-        ('setpoint', 'target', 'offset %', '+-', 'vibration %', '+-', 'Hz'), 'verdict')
-    for x in findings:
-        share = x.setpoint.percent
-        made.add_row(
-            f'{x.setpoint.joint} {x.setpoint.number}'.strip(), f'{x.setpoint.target:g}', *(
-                percent(0.01 * share(y), sign) if math.isfinite(y) else '-' for y, sign in (
-                    (x.offset, '+'), (x.offset_std, ''), (x.vibration, ''),
-                    (x.vibration_std, ''))),
-            f'{x.frequency:.3g}' if math.isfinite(x.frequency) else '-',
-            str(x.verdict).replace('_', ' '))
-    return made
-
-
-def _level_table(levels: 'list[LevelResult]') -> 'Table':
-    """Return the table of the levels that were in force for the longest."""
-    longest = sorted(levels, key=lambda x: -x.duration)[:_MOST_LEVELS]
-    chosen = [x for x in levels if x in longest or x is levels[-1]]
-    short = len(levels) - len(chosen)
-    few = f'; {short} short ones left out' if short else ''
-    made = table(
-        'rest: what the level holds by the parameters; then what was measured while it '
-        f'was in force; the last row is the end{few}',
-        ('level mT', 'times', 'in all ms', 'rest', 'mean', 'least', 'greatest'))
-    for x in chosen:
-        name = f'{x.joint} ' if len({y.joint for y in levels}) > 1 else ''
-        made.add_row(
-            f'{name}{x.flux_density * 1e3:.4g}', str(x.times), f'{x.duration * 1e3:.4g}', *(
-                f'{y:.5f}' for y in (x.rest, x.mean, x.least, x.greatest)))
-    return made
+        print(line)

@@ -4,10 +4,10 @@ import argparse
 import sys
 from typing import Any
 
-from hmsa_ros.cli.options import add_options, NAMESPACE
+from hmsa_ros.cli.options import add_options, NAMESPACE, timeout_of
 from hmsa_ros.cli.setpoints import add_sequence, levels_of
 from hmsa_ros.ending import ENDING
-from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.errors import HmsaError
 
 
 def add_parser(subparsers: Any) -> None:
@@ -36,14 +36,12 @@ def run(arguments: argparse.Namespace) -> int:
     """Send and, if asked to, wait; raise `HmsaError` if the sequence is not carried out."""
     from hmsa_ros.lab.client import PlannerClient
 
-    if not arguments.timeout > 0.0:
-        raise BadInputError(
-            f'timeout is {arguments.timeout:g}: expected a number of seconds above 0')
+    timeout = timeout_of(arguments)
     levels = levels_of(arguments)
     ENDING.note()
     with PlannerClient(
             namespace=arguments.namespace, joints=arguments.joint.split(','),
-            timeout=arguments.timeout) as client:
+            timeout=timeout) as client:
         client.find_planner()
         client.check_alone()
         if arguments.recorded:
@@ -63,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
                 print(line, file=sys.stderr, flush=True)
 
         length = levels[-1][0] if levels else sum(span for _, span in arguments.setpoints)
-        verdict = client.follow(verdict, each=report, timeout=length + arguments.timeout)
+        verdict = client.follow(verdict, each=report, timeout=length + timeout)
         if verdict.failure:
             raise HmsaError(verdict.failure)
         print(f'done: {verdict.state}, {verdict.basis}')

@@ -10,6 +10,7 @@ from hmsa_ros.identification.quantities import actuator_of, modulus_of
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.parameters import ActuatorParameters
+from hmsa_ros.table import Column, Table
 
 Verdict = Literal['identified', 'not_identifiable', 'model_rejected']
 #: Correlation from which two parameters count as confounded.
@@ -183,6 +184,24 @@ class Identification:
             (names[i], names[j], float(matrix[i, j]))
             for i in range(len(names)) for j in range(i)
             if abs(matrix[i, j]) >= CONFOUNDED]
+
+    def report(self) -> Table:
+        """Return the free parameters with their deviations and 95 % intervals."""
+        rows = []
+        for key in self.names:
+            name, x = self.shown(key)
+            known = x.value == x.value
+            rows.append((
+                name, x.value, x.std,
+                f'{x.low:.6g} to {x.high:.6g}' if known else 'not identifiable', x.unit))
+        confounded = self.confounded() if self.verdict == 'identified' else []
+        return Table((
+            Column('parameter'), Column('value', '', '.7g'), Column('std', '', '.2g'),
+            Column('95 % interval'), Column('unit')), tuple(rows),
+            f'noise {self.noise_std:.3g}, residual rms {self.residual_rms:.3g} of '
+            f'{self.recording.coordinate.name}, {self.samples} samples', (
+                *(f'{one} and {other} are confounded: correlation {x:.3f}'
+                  for one, other, x in confounded), *self.warnings))
 
     def record(self) -> dict[str, Any]:
         """Return what ``hmsa identify --json`` prints, with NaN where that has null."""

@@ -9,8 +9,9 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.model.units import NANOSECONDS
-from hmsa_ros.recordings.bags import read_runs
+from hmsa_ros.recordings.bags import read_run
 from hmsa_ros.recordings.levels import in_force, without_repeats
+from hmsa_ros.recordings.record import Run
 
 
 def read_bag(
@@ -23,19 +24,20 @@ def read_bag(
     the planner took it to be, and what the planner knew of the coil. Raises `BadInputError` if
     there is no bag, or several actuators and none is named.
     """
-    runs = read_runs(path, joints=[joint] if joint else [])
-    if len(runs) > 1:
-        raise BadInputError(
-            f'{path} has the actuators {", ".join(x.joint or x.label for x in runs)}: name one '
-            'with --joint')
-    run = runs[0]
+    return recording_of(read_run(path, joint=joint), actuator)
+
+
+def recording_of(
+        run: Run, actuator: ActuatorParameters | None = None
+) -> tuple[Recording, ActuatorParameters, dict[str, float]]:
+    """Return the recording that a run is, as `read_bag`; no level is a `BadInputError`."""
     block = actuator or run.planner
     # A recorder gets the latched changes of before after the first new one.
     levels = sorted(run.applied, key=lambda x: x.stamp) or in_force(
         (x,) for x in without_repeats(run.commands)[0])
     if not levels:
         raise BadInputError(
-            f'{path} has no command that took effect: expected the levels of the field')
+            f'{run.path} has no command that took effect: expected the levels of the field')
     zero = int(run.time[0])
     stamps = np.array([(x.stamp - zero) / NANOSECONDS for x in levels])
     fields = np.array([x.flux_density for x in levels])

@@ -198,6 +198,11 @@ class PlannerClient:
         self.spin_until(
             recorded, f'no recorder of {self._publisher.topic_name}; start one with hmsa recorder')
 
+    @property
+    def message(self) -> str:
+        """What the planner said last."""
+        return self._verdict.message
+
     def find_plant(self) -> None:
         """Wait until the commands reach somebody, for a short time: the planner reports it."""
         with suppress(HmsaError):

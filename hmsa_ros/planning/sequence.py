@@ -39,6 +39,27 @@ class Segment:
     move: Move  #: its times count from begin
     holding: float  #: load that holds the stretch once nothing creeps
 
+    @property
+    def shaped(self) -> bool:
+        """Whether another level comes before the one that holds the target."""
+        return len(self.move.levels) > max(len(self.move.tail), 1)
+
+    @property
+    def held(self) -> float:
+        """Load at the end of the move: where a span ends before creep does, what it comes to."""
+        return self.holding if self.move.tail else self.move.levels[-1].load
+
+    def notes(self) -> list[str]:
+        """Return what is not as requested, a sentence each."""
+        move = self.move
+        found = [move.reason] if move.reason else []
+        if move.tail:
+            step = abs(self.setpoint.stretch - self.start.stretch) or 1.0
+            found.append(
+                f'{len(move.tail)} levels follow creep at stretch {self.setpoint.stretch:g}; they '
+                f'leave a vibration of at most {100.0 * move.vibration / step:.2g} % of the move')
+        return found
+
 
 def plan_sequence(
         setpoints: Sequence[Setpoint], material: NondimensionalParameters, *,

@@ -104,6 +104,18 @@ def read_runs(
     return runs
 
 
+def read_run(
+        path: Path, *, joint: str = '',
+        progress: Callable[[str, float], None] = lambda what, share: None) -> Run:
+    """Read the one run of a bag, as `read_runs`; several of them are a `BadInputError`."""
+    runs = read_runs(path, joints=[joint] if joint else [], progress=progress)
+    if len(runs) > 1:
+        raise BadInputError(
+            f'{path} has the runs {", ".join(x.label for x in runs)}: expected one; name its '
+            'actuator (--joint)')
+    return runs[0]
+
+
 def _collect(
         reader: BagReader, spaces: Mapping[str, Mapping[str, Mapping[str, str]]],
         progress: Callable[[str, float], None]) -> 'dict[str, _Collected]':

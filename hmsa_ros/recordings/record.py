@@ -80,6 +80,7 @@ class Run:
     # Of each role (`hmsa_ros.recordings.topics`)
     topics: Mapping[str, str] = field(default_factory=dict)
     summary: BagSummary | None = None  # None for a table
+    origin: str = 'recorded'  # or simulated
 
     def __post_init__(self) -> None:
         """Check the arrays."""

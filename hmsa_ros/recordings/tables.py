@@ -14,7 +14,7 @@ from hmsa_ros.model.equations import Array
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings.record import Run
 
-SUFFIXES = ('.csv', '.parquet')
+SUFFIXES = ('.csv', '.parquet', '.mat')
 
 
 def samples_of(run: Run) -> dict[str, Array]:
@@ -50,9 +50,28 @@ def _seconds(run: Run, stamps: NDArray[np.int64]) -> Array:
     return np.asarray((stamps - run.time[0]) / NANOSECONDS, dtype=np.float64)
 
 
+def write_run(path: Path, run: Run) -> list[Path]:
+    """
+    Write samples and levels; return the files.
+
+    The levels go to a file whose name ends in _levels, or into that of Matlab as ``level_time``
+    and ``level_flux_density``. Raises `BadInputError` as `write_table`.
+    """
+    samples, levels = samples_of(run), levels_of(run)
+    if path.suffix.lower() == '.mat':
+        write_table(path, samples | {f'level_{x}': y for x, y in levels.items()})
+        return [path]
+    write_table(path, samples)
+    if not run.levels:
+        return [path]
+    beside = path.with_name(f'{path.stem}_levels{path.suffix}')
+    write_table(beside, levels)
+    return [path, beside]
+
+
 def write_table(path: Path, columns: Mapping[str, Array]) -> None:
     """
-    Write columns as CSV or Parquet, by the ending of the name, in full double precision.
+    Write columns as CSV, Parquet or Matlab file, by the ending of the name, in full precision.
 
     NaN is left empty in CSV. Raises `BadInputError` if the name ends otherwise, pyarrow is
     missing, or the file cannot be written.
@@ -66,6 +85,12 @@ def write_table(path: Path, columns: Mapping[str, Array]) -> None:
         arrow, parquet = require_arrow()
         with replacing(path) as beside:
             parquet.write_table(arrow.table(dict(columns)), beside)
+        return
+    if kind == '.mat':
+        from scipy.io import savemat  # not all need it
+
+        with replacing(path) as beside:
+            savemat(beside, dict(columns), appendmat=False, oned_as='column')
         return
     with replacing(path) as beside, beside.open('w', newline='', encoding='utf-8') as file:
         writer = csv.writer(file)

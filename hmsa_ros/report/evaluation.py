@@ -162,7 +162,7 @@ def _first(run: Run, levels: Sequence[Level], asked: Sequence[Requested]) -> int
         return levels[0].stamp if levels else int(run.time[0])
     before = int(np.searchsorted(run.time, later[0].stamp)) - 1
     held = next((x.flux_density for x in reversed(levels) if x.stamp < begins), float(
-        run.flux_density[max(before, 0)]))
+        run.flux_density[before]) if before >= 0 else math.nan)
     return next((x for x in later if x.flux_density != held), later[0]).stamp
 
 

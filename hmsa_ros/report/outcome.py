@@ -13,11 +13,14 @@ from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.recordings.parameters import number_of, of_joint
 from hmsa_ros.recordings.record import Run
 from hmsa_ros.recordings.setpoints import Requested, setpoints_of
+from hmsa_ros.table import Column, Table
 
 _LEFT_OUT = 'no time was left for it'
 _SENSOR = Sensor()
 # Later than any stamp, in ns.
 _END = 2**62
+# Rows of the table of levels.
+_MOST_LEVELS = 12
 
 
 def tolerances_of(run: Run) -> Tolerances:
@@ -112,3 +115,36 @@ def level_results(run: Run) -> list[LevelResult]:
             run.joint, flux_density, len(spans), sum(y - x for x, y in spans) / NANOSECONDS, rest,
             *figures))
     return results
+
+
+def findings_table(findings: Sequence[Finding]) -> Table:
+    """Return the table of what was found of setpoints."""
+    return Table((
+        Column('setpoint'), Column('target'), Column('offset', '%', '+%'),
+        Column('offset std', '%', '%'), Column('vibration', '%', '%'),
+        Column('vibration std', '%', '%'), Column('frequency', 'Hz', '.3g'), Column('verdict')),
+        tuple((
+            f'{x.setpoint.joint} {x.setpoint.number}' if x.setpoint.joint else x.setpoint.number,
+            x.setpoint.target, *(
+                x.setpoint.percent(y) if math.isfinite(y) else math.nan for y in (
+                    x.offset, x.offset_std, x.vibration, x.vibration_std)),
+            x.frequency, str(x.verdict).replace('_', ' ')) for x in findings),
+        'offset: mean stretch less the target; vibration: peak to peak; both in % of the step, '
+        'with their standard deviations')
+
+
+def level_table(levels: Sequence[LevelResult]) -> Table:
+    """Return the table of the levels that were in force for the longest."""
+    longest = sorted(levels, key=lambda x: -x.duration)[:_MOST_LEVELS]
+    chosen = [x for x in levels if x in longest or x is levels[-1]]
+    short = len(levels) - len(chosen)
+    several = len({x.joint for x in levels}) > 1
+    return Table((
+        *([Column('joint')] if several else []), Column('level', 'mT', '.4g'), Column('times'),
+        Column('in all', 'ms', '.4g'), *(
+            Column(x, '', '.5f') for x in ('rest', 'mean', 'least', 'greatest'))), tuple(
+        (*([x.joint] if several else []), x.flux_density * 1e3, x.times, x.duration * 1e3, x.rest,
+         x.mean, x.least, x.greatest) for x in chosen),
+        'rest: the stretch that the level holds by the parameters; mean, least and greatest: '
+        'while it was in force; the last row is the end' + (
+            f'; {short} short ones are left out' if short else ''))

@@ -30,8 +30,10 @@ _MOST_SAMPLES = 200
 _REST, _STILL = 8.0, 0.02
 
 
-def draw(paths: Path | Sequence[Path], parts: Sequence[Part], paper: Paper | None = None) -> None:
-    """Draw runs; as many arrivals as fit beside each other."""
+def draw(
+        paths: Path | Sequence[Path], parts: Sequence[Part],
+        paper: Paper | None = None) -> style.Picture:
+    """Draw runs, as many arrivals as fit beside each other; return the figure."""
     paper = paper or Paper()
     unit = time_unit(parts)
     columns = paper.columns(3)
@@ -78,6 +80,7 @@ def draw(paths: Path | Sequence[Path], parts: Sequence[Part], paper: Paper | Non
             panel.set_title(_title(parts, i), loc='right', fontsize='small')
         figure.align_ylabels([axes['command'], axes['response']])
         style.legend_below(figure, *(x for key, x in axes.items() if key != 'command'))
+    return figure
 
 
 def _shown_times(parts: Sequence[Part]) -> tuple[float, float]:
@@ -104,8 +107,9 @@ def _draw_recorded(
         panel: Axes, part: Part, curve: tuple[Any, Any], samples: tuple[Any, Any],
         look: looks.Look, *, alone: bool) -> None:
     """Draw the curve through the samples, and these where they are few."""
-    panel.plot(*curve, **look.line(), label='recorded' if alone else part.run.label)
-    if len(samples[0]) < len(curve[0]) and len(samples[0]) <= _MOST_SAMPLES:
+    panel.plot(*curve, **look.line(), label=part.run.origin if alone else part.run.label)
+    exact = part.run.origin == 'simulated' and not part.run.number('plant.stretch_noise')
+    if not exact and len(samples[0]) < len(curve[0]) and len(samples[0]) <= _MOST_SAMPLES:
         panel.plot(
             *samples, linestyle='none', marker='o', markersize=2.2, color=look.colour, zorder=4,
             label='samples')

@@ -40,6 +40,8 @@ _METADATA: dict[str, dict[str, Any]] = {
     'pdf': {'Creator': None, 'Producer': None, 'CreationDate': None},
     'svg': {'Creator': None, 'Date': None}}
 _SETTINGS = str(Path(__file__).with_name('style.mplstyle'))
+# Dots an inch of a notebook.
+_NOTEBOOK = 150.0
 _COLUMNS = ('panel', 'curve', 'x_axis', 'y_axis', 'x', 'y')
 
 
@@ -49,6 +51,13 @@ class Picture(Figure):
     def __init__(self, **more: Any) -> None:
         super().__init__(**more)
         self.others: list[tuple[Axes, str, list[Any]]] = []
+
+    def _repr_png_(self) -> bytes:
+        """Return what a notebook shows."""
+        file = io.BytesIO()
+        with style.context(['default', _SETTINGS]):
+            self.savefig(file, format='png', dpi=_NOTEBOOK, metadata=_METADATA['png'])
+        return file.getvalue()
 
     def remember(self, axes: Axes, curve: str, *columns: Any) -> None:
         """Keep columns of numbers, or a grid of them (x, y, and z of shape (len(y), len(x)))."""

@@ -1,0 +1,674 @@
+"""An actuator with its coil: what plans, simulates and writes parameter files."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+import math
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hmsa_ros.api.columns import columns_of, number
+from hmsa_ros.errors import BadInputError, excerpt
+from hmsa_ros.files import write_text
+from hmsa_ros.interfaces.actuator import actuator_from, model_from, parameters_of
+from hmsa_ros.interfaces.parameters import (
+    ACTUATOR,
+    CREEP_TOLERANCE,
+    FLUX_DENSITY_MAX,
+    LAW_NAME,
+    PLANNED,
+    VISCOELASTIC,
+    ZETA,
+)
+from hmsa_ros.interfaces.topics import PLANNER
+from hmsa_ros.model.delivery import IDEAL
+from hmsa_ros.model.equations import critical_zeta, elastic_force, equilibrium_stretch
+from hmsa_ros.model.laws import LAWS
+from hmsa_ros.model.mismatch import Uncertainty
+from hmsa_ros.model.moves import Limits, State
+from hmsa_ros.model.parameters import ActuatorParameters
+from hmsa_ros.planning.scales import Coil, Scales, scales
+from hmsa_ros.planning.sequence import plan_sequence
+from hmsa_ros.planning.setpoint import impossible, Setpoint
+from hmsa_ros.planning.shapers.pace import Pace
+from hmsa_ros.planning.shapers.request import as_errors, ERRORS
+from hmsa_ros.planning.timeline import Model
+from hmsa_ros.recordings.parameters import read_parameter_file, values_of
+from hmsa_ros.table import Column, Table
+
+if TYPE_CHECKING:
+    from hmsa_ros.api.motion import Motion
+    from hmsa_ros.api.plan import Plan
+    from hmsa_ros.identification.files import Belief
+
+_DEFAULTS = {x.name.partition('.')[2]: x.default for x in ACTUATOR}
+_STRONGEST: Any = FLUX_DENSITY_MAX.default
+# Nobody has to send the levels of such a plan: unless a file says how fine, they are very fine.
+_SPECS = (*PLANNED, *VISCOELASTIC, replace(CREEP_TOLERANCE, default=IDEAL.ripple))
+
+
+class Actuator:
+    """
+    A block of 2L x 2L x 2H of hard-magnetic elastomer, or a beam, with its coil; all in SI units.
+
+    Parameters
+    ----------
+    shear_modulus : float, optional
+        G in Pa; default 10 kPa. With a law that has moduli of its own it follows from these.
+    density : float
+        rho in kg/m^3.
+    half_length : float
+        L in m, across the field.
+    half_thickness : float, optional
+        H in m, along the field; default as the half length.
+    remanence : float
+        Residual flux density Br in T.
+    chain_limit : float
+        J_lim of the Gent model; infinite for neo-Hookean.
+    zeta, damping_coefficient : float, optional
+        Damping, without a dimension or in N s/m; default zeta 0.2.
+    law : str
+        Hyperelastic model, a name in `hmsa_ros.model.laws.LAWS`, such as ``'yeoh'``.
+    constants : mapping of str, optional
+        Constants of that model in SI units, as in ``{'c10': 5e3, 'c20': 200.0, 'c30': 0.0}``.
+    creep : sequence of (float, float)
+        Maxwell branches: stiffness in units of that of the law, and relaxation time in s.
+    flux_density_limits : float or (float, float)
+        Of the coil in T; one number for both directions.
+    slew_limit : float
+        Of the amplifier in T/s; infinite for steps.
+    coil_time_constant : float
+        L/R of the coil in s; 0 for none.
+
+    Raises
+    ------
+    BadInputError
+        If a value is of another type or out of range.
+
+    Examples
+    --------
+    >>> from hmsa_ros import Actuator
+    >>> block = Actuator(shear_modulus=30e3, half_length=5e-3, remanence=0.08, zeta=0.1)
+    >>> round(1e3 * block.flux_density(1.1), 1)   # mT that hold a stretch of 1.1
+    130.3
+    >>> silicone = Actuator(law='yeoh', constants={'c10': 15e3, 'c20': 500.0, 'c30': 20.0})
+    >>> silicone.shear_modulus
+    30000.0
+
+    """
+
+    def __init__(
+            self, *, shear_modulus: float | None = None, density: float = 1900.0,
+            half_length: float = 0.01, half_thickness: float | None = None,
+            remanence: float = 0.1, chain_limit: float = 5.0, zeta: float | None = None,
+            damping_coefficient: float | None = None, law: str = 'gent',
+            constants: Mapping[str, Any] | None = None,
+            creep: Sequence[tuple[float, float]] = (),
+            flux_density_limits: float | tuple[float, float] = _STRONGEST,
+            slew_limit: float = math.inf, coil_time_constant: float = 0.0) -> None:
+        values = {f'actuator.{name}': number(value, name, unit) for name, value, unit in (
+            ('density', density, 'kg/m^3'), ('half_length', half_length, 'm'),
+            ('half_thickness', half_length if half_thickness is None else half_thickness, 'm'),
+            ('remanence', remanence, 'T'), ('chain_limit', chain_limit, ''))}
+        values |= _of_law(law, constants or {}, shear_modulus) | _of_creep(creep)
+        low, high = _limits(flux_density_limits)
+        slew_limit = number(slew_limit, 'slew_limit', 'T/s')
+        values |= {
+            'flux_density_min': low, 'flux_density_max': high,
+            'slew_limit': 0.0 if math.isinf(slew_limit) else slew_limit,
+            'coil_time_constant': number(coil_time_constant, 'coil_time_constant', 's')}
+        if slew_limit <= 0.0:
+            raise BadInputError(
+                f'slew_limit is {slew_limit:g} T/s: expected more than 0, or inf for steps')
+        if zeta is not None and damping_coefficient is not None:
+            raise BadInputError(
+                'both zeta and damping_coefficient are given: expected one of them')
+        if damping_coefficient is None:
+            undamped = actuator_from(_checked(values | {'actuator.damping_coefficient': 0.0}))
+            zeta = ZETA if zeta is None else number(zeta, 'zeta')
+            if not 0.0 <= zeta < math.inf:
+                raise BadInputError(f'zeta is {zeta:g}: expected a finite number of at least 0')
+            damping_coefficient = zeta * undamped.damping_unit
+        self._take(values | {'actuator.damping_coefficient': number(
+            damping_coefficient, 'damping_coefficient', 'N s/m')})
+
+    def _take(self, values: Mapping[str, Any], belief: 'Belief | Path | None' = None) -> None:
+        #: What plans are made with.
+        self.model = model_from(_checked(values))
+        self._belief = belief
+
+    @classmethod
+    def from_parameters(
+            cls, values: Mapping[str, Any], belief: 'Belief | Path | None' = None) -> 'Actuator':
+        """
+        Return the actuator of parameters as the nodes have them, ``{'actuator.remanence': 0.1}``.
+
+        What is left out has its default. ``belief`` is how well they are known, if it is, or the
+        file with it. A value of another type or out of range is a `BadInputError`.
+        """
+        made = cls.__new__(cls)
+        made._take(values, belief)
+        return made
+
+    @classmethod
+    def from_yaml(cls, path: str | Path) -> 'Actuator':
+        """
+        Return the actuator of a parameter file, as ``hmsa init`` and ``hmsa identify`` write it.
+
+        Raises
+        ------
+        BadInputError
+            If the file cannot be read, or a value in it is out of range.
+
+        """
+        if not isinstance(path, (str, Path)):
+            raise BadInputError(f'path is {excerpt(path)}: expected the path of a YAML file')
+        return cls.from_parameters(
+            {name.partition('.')[2]: value for name, value in read_parameter_file(path).items()
+             if name.startswith(f'{PLANNER}.')}, Path(path))
+
+    @classmethod
+    def beam(
+            cls, *, length: float, thickness: float, width: float, youngs_modulus: float,
+            damping_ratio: float | None = None, damping_coefficient: float | None = None,
+            **more: Any) -> 'Actuator':
+        """
+        Return a beam, clamped at one end and magnetised along its length.
+
+        Its positions are deflections of the tip over the length.
+
+        Parameters
+        ----------
+        length, thickness, width : float
+            In m; the field is along the thickness.
+        youngs_modulus : float
+            E in Pa.
+        damping_ratio, damping_coefficient : float, optional
+            Of the first mode, or c of the tip in N s/m; default a ratio of 0.05.
+        **more
+            Density, remanence, creep and coil, as of `Actuator`.
+
+        Returns
+        -------
+        Actuator
+            With the law ``beam``.
+
+        Raises
+        ------
+        BadInputError
+            If a value is of another type or out of range.
+
+        Examples
+        --------
+        >>> from hmsa_ros import Actuator
+        >>> strip = Actuator.beam(length=25e-3, thickness=1e-3, width=5e-3, youngs_modulus=1e6)
+        >>> strip.plan([(0.1, 0.5)]).report()['status']
+        ['two_step']
+
+        """
+        made = {
+            'half_length': 0.5 * number(length, 'length', 'm'),
+            'half_thickness': 0.5 * number(thickness, 'thickness', 'm'), 'law': 'beam',
+            'constants': {'youngs_modulus': youngs_modulus, 'width': width}, **more}
+        if damping_coefficient is None:
+            undamped = cls(**made, zeta=0.0).model.material
+            ratio = number(0.05 if damping_ratio is None else damping_ratio, 'damping_ratio')
+            return cls(**made, zeta=ratio * float(critical_zeta(undamped.rest, undamped)))
+        return cls(**made, damping_coefficient=damping_coefficient)
+
+    # -- what it is ----------------------------------------------------------------------------
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """All parameters by the names that the nodes have for them."""
+        actuator, options = self.block, self.model.options
+        values = parameters_of(actuator)
+        if actuator.creep:
+            values |= {'viscoelastic.ratio': list(actuator.creep.ratios),
+                       'viscoelastic.time': list(actuator.creep.times)}
+        return values | {
+            'flux_density_min': options.flux_density_min,
+            'flux_density_max': options.flux_density_max,
+            'slew_limit': 0.0 if math.isinf(options.slew_limit) else options.slew_limit,
+            'coil_time_constant': options.coil_time_constant}
+
+    @property
+    def block(self) -> ActuatorParameters:
+        """Parameters of the block alone."""
+        return self.model.actuator
+
+    @property
+    def shear_modulus(self) -> float:
+        """G in Pa at small strain."""
+        return self.block.shear_modulus
+
+    @property
+    def zeta(self) -> float:
+        """Damping without a dimension."""
+        return self.model.material.zeta
+
+    @property
+    def law(self) -> str:
+        """Name of the hyperelastic model."""
+        return 'gent' if self.block.law is None else self.block.law.law
+
+    @property
+    def flux_density_limits(self) -> tuple[float, float]:
+        """Limits of the coil in T."""
+        return self.model.options.flux_density_min, self.model.options.flux_density_max
+
+    @cached_property
+    def scales(self) -> Scales:
+        """What follows from the parameters: times in s, flux densities in T, and reach."""
+        return scales(
+            self.block, Coil(*self.flux_density_limits, self.parameters['slew_limit']))
+
+    def flux_density(self, stretch: ArrayLike) -> Any:
+        """Return the flux density in T that holds a stretch, or an array of them."""
+        return elastic_force(stretch, self.model.material) * self.model.units.load
+
+    def stretch(self, flux_density: ArrayLike) -> Any:
+        """Return the stretch that a flux density in T holds, or an array of them."""
+        load = np.asarray(flux_density, dtype=np.float64) / self.model.units.load
+        return equilibrium_stretch(load, self.model.material)
+
+    def report(self) -> Table:
+        """Return what follows from the parameters as a table."""
+        return Table(
+            (Column('quantity'), Column('value')), tuple(facts(self.scales, self.block)))
+
+    def __repr__(self) -> str:
+        return f'Actuator.from_parameters({self.parameters!r})'
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Actuator) and self.model == other.model
+
+    def __hash__(self) -> int:
+        return hash(self.model)
+
+    def _repr_html_(self) -> str:
+        return self.report()._repr_html_()
+
+    # -- another one ---------------------------------------------------------------------------
+
+    def replace(self, **parameters: Any) -> 'Actuator':
+        """
+        Return the actuator with other parameters.
+
+        Parameters
+        ----------
+        **parameters
+            As `Actuator` takes them; zeta stays unless damping is given.
+
+        Returns
+        -------
+        Actuator
+            All else is as it was.
+
+        Raises
+        ------
+        BadInputError
+            If a name is not one of these, or a value is of another type or out of range.
+
+        Examples
+        --------
+        >>> from hmsa_ros import Actuator
+        >>> Actuator().replace(slew_limit=50.0).parameters['slew_limit']
+        50.0
+
+        """
+        unknown = [x for x in parameters if x not in _KEYS]
+        if unknown:
+            raise BadInputError(
+                f'{unknown[0]} is no parameter of an actuator: expected {", ".join(_KEYS)}')
+        block, options = self.block, self.model.options
+        now: dict[str, Any] = {x: getattr(block, x) for x in (
+            'density', 'half_length', 'half_thickness', 'remanence', 'chain_limit')} | {
+            'zeta': self.zeta, 'law': self.law,
+            'creep': tuple(zip(block.creep.ratios, block.creep.times, strict=True)),
+            'flux_density_limits': self.flux_density_limits, 'slew_limit': options.slew_limit,
+            'coil_time_constant': options.coil_time_constant}
+        if parameters.get('law', self.law) == self.law:
+            now['constants'] = {
+                name.partition('.')[2]: value for name, value in parameters_of(block).items()
+                if name.startswith('law.') and name != LAW_NAME.name}
+        if 'constants' in parameters:
+            now['constants'] = {**now.get('constants', {}), **parameters.pop('constants')}
+        if LAWS[self.law].scaled is None:
+            now['shear_modulus'] = block.shear_modulus
+        if 'damping_coefficient' in parameters:
+            del now['zeta']
+        return Actuator(**(now | parameters))
+
+    def scaled(self, **factors: float) -> 'Actuator':
+        """
+        Return the actuator that differs from this one by factors on its parameters.
+
+        Parameters
+        ----------
+        **factors
+            By name, of `shear_modulus`, `density`, `half_length`, `half_thickness`, `remanence`,
+            `chain_limit` and `damping_coefficient`; above 0. A factor on the shear modulus is one
+            on all moduli of a law.
+
+        Returns
+        -------
+        Actuator
+            All else is as it was.
+
+        Raises
+        ------
+        BadInputError
+            If a name is not one of these, or a factor is out of range.
+
+        Examples
+        --------
+        >>> from hmsa_ros import Actuator
+        >>> Actuator().scaled(shear_modulus=1.2).shear_modulus
+        12000.0
+
+        """
+        unknown = [x for x in factors if x not in _DEFAULTS]
+        if unknown:
+            raise BadInputError(
+                f'{unknown[0]} has no factor: expected {", ".join(_DEFAULTS)}')
+        values = _checked(self.parameters)
+        made = Actuator.__new__(Actuator)
+        made._belief = None
+        made.model = Model(replace(actuator_from(values | {
+            f'mismatch.{name}': number(x, f'the factor on {name}')
+            for name, x in factors.items()}), creep=self.block.creep), self.model.options)
+        return made
+
+    # -- what it does --------------------------------------------------------------------------
+
+    def plan(
+            self, setpoints: Any, shaper: str = 'two_step', *,
+            limits: float | tuple[float, float] | None = None, start: float | None = None,
+            order: int = 2, errors: Sequence[float] | None = None, periods: float = 1.0,
+            max_rate: float = math.inf, period: float = 0.0,
+            short_spell: str = 'refuse') -> 'Plan':
+        """
+        Plan a command without residual vibration.
+
+        Parameters
+        ----------
+        setpoints : pairs, array of shape (n, 2), mapping or DataFrame
+            Stretch, or deflection of a beam, and duration in s (move and dwell) of each; columns
+            are named ``stretch`` and ``duration``.
+        shaper : str
+            A name in `hmsa_ros.planning.shapers.SHAPERS`.
+        limits : float or (float, float), optional
+            Flux densities in T; default those of the coil.
+        start : float, optional
+            Stretch at rest before; default without a field.
+        order : int
+            Of the shapers robust and minimax, at least 1.
+        errors : (float, float, float), optional
+            Relative errors of shear modulus, damping and J_lim that minimax must tolerate; default
+            what the parameter file contains of them, else 0.1 each.
+        periods, max_rate : float
+            Of smooth: natural periods that a move takes at the least, and largest rate in 1/s.
+        period : float
+            Of the sampling grid of the command in s; 0 for any time.
+        short_spell : {'refuse', 'continue'}
+            What to do with a duration that ends before the move.
+
+        Returns
+        -------
+        Plan
+            Times and levels, and the motion they predict.
+
+        Raises
+        ------
+        BadInputError
+            If an argument is of another type or out of range.
+        RefusedError
+            If a setpoint cannot be reached, with why.
+
+        Examples
+        --------
+        >>> from hmsa_ros import Actuator
+        >>> plan = Actuator().plan([(1.1, 0.5), (1.0, 0.5)], limits=0.5)
+        >>> plan.times.round(6).tolist()
+        [0.0, 0.005735, 0.5, 0.505838]
+        >>> plan.flux_densities.round(6).tolist()
+        [0.020118, 0.034571, 0.01651, 0.0]
+
+        """
+        from hmsa_ros.api.plan import Plan
+
+        model = self.model
+        if not isinstance(shaper, str):
+            raise BadInputError(f'shaper is {excerpt(shaper)}: expected a name such as two_step')
+        stretches, durations = columns_of(setpoints, ('stretch', 'duration'), 'setpoints')
+        for stretch in stretches.tolist():
+            if reason := impossible(stretch, model.material.rest):
+                raise BadInputError(reason)
+        if limits is not None:
+            low, high = _limits(limits)
+            model = Model(model.actuator, replace(
+                model.options, flux_density_min=low, flux_density_max=high))
+        unit = model.units.time
+        segments = plan_sequence(
+            [Setpoint(x, y / unit) for x, y in zip(
+                stretches.tolist(), durations.tolist(), strict=True)],
+            model.material, shaper=shaper, limits=model.limits, units=model.units, order=order,
+            start=State(model.material.rest if start is None else number(start, 'start')),
+            delivery=replace(model.delivery, period=number(period, 'period', 's') / unit),
+            errors=self._errors(shaper) if errors is None else as_errors(errors),
+            pace=Pace(periods, max_rate * unit), short_spell=short_spell)
+        return Plan(self, segments, shaper)
+
+    def _errors(self, shaper: str) -> Uncertainty:
+        """Return for which errors minimax plans unless given."""
+        if shaper != 'minimax' or self._belief is None:
+            return ERRORS
+        from hmsa_ros.identification.files import errors_of, read_belief
+
+        if isinstance(self._belief, Path):
+            self._belief = read_belief(self._belief)
+        return errors_of(self._belief, ERRORS)
+
+    def simulate(
+            self, levels: Any, *, until: float | None = None, rate: float | None = None,
+            noise: float = 0.0, seed: int = 0, start: float | None = None,
+            label: str = 'simulated') -> 'Motion':
+        """
+        Simulate the response to a command of your own.
+
+        Parameters
+        ----------
+        levels : pairs, array of shape (n, 2), mapping, DataFrame or path
+            Time in s and flux density in T from then on; columns, also of a CSV, are named
+            ``time`` and ``flux_density``.
+        until : float, optional
+            End in s; default when the last level has settled.
+        rate : float, optional
+            Samples a second in Hz; default 1000, or 40 a period of the actuator if these are more.
+        noise : float
+            Standard deviation of the samples of the stretch.
+        seed : int
+            Of the noise.
+        start : float, optional
+            Stretch at rest before; default without a field.
+        label : str
+            Name in pictures and comparisons.
+
+        Returns
+        -------
+        Motion
+            Samples and levels.
+
+        Raises
+        ------
+        BadInputError
+            If an argument is of another type or out of range.
+        HmsaError
+            If a level is too large to follow.
+
+        Examples
+        --------
+        >>> from hmsa_ros import Actuator
+        >>> motion = Actuator().simulate([(0.0, 0.0346)], until=0.2)
+        >>> round(float(motion.stretches.max()), 3)
+        1.162
+
+        """
+        from hmsa_ros.api.motion import simulated
+        from hmsa_ros.identification.tables import read_levels
+
+        if isinstance(levels, (str, Path)):
+            times, values, _ = read_levels(Path(levels))
+        else:
+            times, values = columns_of(levels, ('time', 'flux_density'), 'levels')
+        return simulated(
+            self, times, values, until=until, rate=rate, noise=noise, seed=seed, start=start,
+            label=label)
+
+    def amplifiers(self, setpoints: Any, **more: Any) -> Table:
+        """
+        Plan a sequence for amplifiers from fast to slow: what each has to give, and the time lost.
+
+        Parameters
+        ----------
+        setpoints : pairs, array of shape (n, 2), mapping or DataFrame
+            As for `plan`.
+        **more
+            ``slew_limits`` in T/s and ``bandwidths`` in Hz to try, by default about the fastest
+            move; ``inductance`` in H, ``resistance`` in ohm and ``tesla_per_ampere`` of the coil,
+            for currents and voltages; ``shaper`` and other arguments of `plan`.
+
+        Returns
+        -------
+        Table
+            A row for each amplifier, the first with ideal steps.
+
+        Raises
+        ------
+        BadInputError
+            If an argument is of another type or out of range.
+
+        Examples
+        --------
+        >>> from hmsa_ros import Actuator
+        >>> block = Actuator(shear_modulus=30e3, half_length=5e-3, remanence=0.08, zeta=0.1)
+        >>> found = block.amplifiers([(1.1, 0.5)], slew_limits=[200.0, 50.0], bandwidths=[])
+        >>> [round(x, 2) for x in found['longest move']]
+        [1.65, 1.98, 2.97]
+
+        """
+        from hmsa_ros.api.amplifier import amplifiers
+
+        return amplifiers(self, setpoints, **more)
+
+    def to_yaml(self, path: str | Path) -> None:
+        """
+        Write the parameter file that the commands and nodes take (``--params-file``).
+
+        Raises
+        ------
+        BadInputError
+            If it cannot be written.
+
+        """
+        from hmsa_ros.identification.files import yaml_text
+
+        write_text(Path(path), '\n'.join([
+            '/**:', '  ros__parameters:',
+            *(f'    {x}: {yaml_text(y)}' for x, y in self.parameters.items())]) + '\n')
+
+
+_KEYS = tuple(x for x in Actuator.__init__.__annotations__ if x != 'return')
+
+
+def _checked(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return all parameters that a plan needs, checked."""
+    return values_of({f'{PLANNER}.{x}': y for x, y in values.items()}, PLANNER, _SPECS)
+
+
+def _of_law(
+        name: Any, constants: Mapping[str, Any], modulus: float | None) -> dict[str, Any]:
+    """Return the parameters of a law."""
+    if not isinstance(name, str) or name not in LAWS:
+        raise BadInputError(f'law is {excerpt(name)}: expected one of {", ".join(LAWS)}')
+    law = LAWS[name]
+    names = {x.name.partition('.')[2]: x for x in law.constants}
+    unknown = [x for x in constants if x not in names]
+    if unknown:
+        raise BadInputError(
+            f'law {name} has no constant {unknown[0]!r}: expected '
+            + (', '.join(names) or 'none'))
+    if law.scaled is not None and modulus is not None:
+        raise BadInputError(
+            f'shear_modulus is given with law {name}, whose constants it follows from: expected '
+            f'constants={{...}} of {", ".join(names)} alone')
+    values: dict[str, Any] = {LAW_NAME.name: name}
+    for key, value in constants.items():
+        kind = names[key].kind
+        values[names[key].name] = (
+            number(value, key, names[key].unit) if kind is float
+            else [number(x, key) for x in value] if kind is list else str(value))
+    if law.scaled is None:
+        values['actuator.shear_modulus'] = number(
+            _DEFAULTS['shear_modulus'] if modulus is None else modulus, 'shear_modulus', 'Pa')
+    return values
+
+
+def _of_creep(creep: Any) -> dict[str, Any]:
+    """Return the parameters of Maxwell branches."""
+    if not len(creep):
+        return {}
+    ratios, times = columns_of(creep, ('ratio', 'time'), 'branches of creep')
+    return {'viscoelastic.ratio': ratios.tolist(), 'viscoelastic.time': times.tolist()}
+
+
+def _limits(limits: Any) -> tuple[float, float]:
+    """Return the least and the largest flux density in T."""
+    if isinstance(limits, Limits):
+        raise BadInputError('limits are without a dimension: expected flux densities in T')
+    if isinstance(limits, (tuple, list, np.ndarray)):
+        if len(limits) != 2:
+            raise BadInputError(
+                f'limits are {excerpt(limits)}: expected the least and the largest flux density '
+                'in T, or one number for both directions')
+        low, high = (number(x, 'a flux density limit', 'T') for x in limits)
+    else:
+        high = number(limits, 'flux density limit', 'T')
+        low = -high
+    if not low < high:
+        raise BadInputError(
+            f'flux densities from {low:g} to {high:g} T: expected the least below the largest')
+    return low, high
+
+
+def facts(found: Scales, block: ActuatorParameters) -> list[tuple[str, str]]:
+    """Return what follows from parameters, as names and values with their units."""
+    beam = block.rest == 0.0
+    words = block.coordinate.plural
+    return [
+        ('time unit' if beam else 'time unit L sqrt(rho/G)', time_text(found.time_unit)),
+        ('natural frequency at rest', f'{found.frequency:.5g} Hz'),
+        ('damping', f'{found.damping:.4g} N s/m, zeta {found.zeta:.4g}'),
+        ('critical damping at rest',
+         f'{found.critical_damping:.4g} N s/m, zeta {found.critical_zeta:.4g}'),
+        (f'limiting {words}', '{:.4f} and {:.4f}'.format(*found.stretch_limits)),
+        *([] if beam else [('shape c1', f'{found.c1:.4g}')]),
+        *((f'flux density for {stretch:.6g}', f'{1e3 * flux:.4g} mT')
+          for stretch, flux in found.flux_densities),
+        (f'coil holds {words}', '{:.6g} to {:.6g}'.format(*found.held)),
+        ('two steps reach from rest', 'nothing' if found.reached == (block.rest,) * 2
+         else '{:.6g} to {:.6g}'.format(*found.reached)),
+        ('a move from rest', 'none in two steps' if math.isnan(found.duration)
+         else f'{time_text(found.duration)} to {found.target:.6g}')]
+
+
+def time_text(seconds: float) -> str:
+    """Return a time in a unit that suits it."""
+    for size, unit in ((1.0, 's'), (1e-3, 'ms')):
+        if seconds >= size:
+            return f'{seconds / size:.4g} {unit}'
+    return f'{seconds * 1e6:.4g} us'

@@ -1,0 +1,139 @@
+"""Which amplifier a plan needs: slew rate, bandwidth, current and voltage against time lost."""
+
+from collections.abc import Sequence
+import math
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+
+from hmsa_ros.api.columns import number
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.status import RefusedError
+from hmsa_ros.table import Column, Table
+
+if TYPE_CHECKING:
+    from hmsa_ros.api.actuator import Actuator
+    from hmsa_ros.api.plan import Plan
+
+# Of the slew rates and bandwidths that are tried, in units of what the plan with ideal steps
+# changes in the time of its fastest move.
+_SLOWEST, _FASTEST = 0.1, 15.0
+_DECADE = (1.0, 2.0, 5.0)
+
+
+def amplifiers(
+        actuator: 'Actuator', setpoints: Any, *, shaper: str = 'two_step',
+        slew_limits: Sequence[float] | None = None, bandwidths: Sequence[float] | None = None,
+        inductance: float | None = None, resistance: float | None = None,
+        tesla_per_ampere: float | None = None, **more: Any) -> Table:
+    """
+    Plan a sequence for amplifiers from fast to slow; see `Actuator.amplifiers`.
+
+    Raises
+    ------
+    BadInputError
+        If an argument is of another type or out of range.
+
+    """
+    coil = {'inductance': (inductance, 'H'), 'resistance': (resistance, 'ohm'),
+            'tesla_per_ampere': (tesla_per_ampere, 'T/A')}
+    numbers = {x: number(y, x, unit) for x, (y, unit) in coil.items() if y is not None}
+    bad = [x for x, y in numbers.items() if not 0.0 < y < math.inf]
+    if bad:
+        raise BadInputError(
+            f'{bad[0]} is {numbers[bad[0]]:g}: expected a finite number above 0')
+    if numbers and 'tesla_per_ampere' not in numbers:
+        raise BadInputError(
+            'tesla_per_ampere is missing: expected it with inductance and resistance')
+    ideal = actuator.replace(slew_limit=math.inf, coil_time_constant=0.0)
+    best = ideal.plan(setpoints, shaper, **more)
+    fastest = float(np.min(best.arrivals))
+    swing = float(np.max(np.abs(np.diff(np.append(_before(best), best.flux_densities)))))
+    if not 0.0 < fastest < math.inf or not swing:
+        raise BadInputError(
+            f'shaper {shaper} has no moves of a finite duration here: expected one that has, such '
+            'as two_step')
+    if slew_limits is None:
+        slew_limits = _series(swing / fastest)
+    if bandwidths is None:
+        bandwidths = _series(1.0 / fastest)
+    rows = [_row(best, best, math.inf, math.inf, numbers)]
+    notes = []
+    for slew, band in [*((x, math.inf) for x in slew_limits), *(
+            (math.inf, x) for x in bandwidths)]:
+        try:
+            plan = ideal.replace(
+                slew_limit=number(slew, 'slew limit', 'T/s'), coil_time_constant=0.0
+                if math.isinf(band) else 0.5 / (math.pi * number(band, 'bandwidth', 'Hz'))
+            ).plan(setpoints, shaper, **more)
+        except RefusedError as error:
+            rows.append((slew, band, *(None for _ in rows[0][2:])))
+            notes.append(f'{_named(slew, band)}: {error}')
+            continue
+        rows.append(_row(plan, best, slew, band, numbers))
+    columns = [Column('slew', 'T/s', '.4g'), Column('bandwidth', 'Hz', '.4g'),
+               Column('longest move', 'ms', '.4g'), Column('lost', 'ms', '.3g'),
+               Column('field', 'mT', '.4g')]
+    if 'tesla_per_ampere' in numbers:
+        columns += [Column('current', 'A', '.3g'), Column('change', 'A/s', '.3g')]
+    if len(numbers) == len(coil):
+        columns += [Column('voltage', 'V', '.3g'), Column('power', 'W', '.3g')]
+    return Table(tuple(columns), tuple(rows), (
+        'slew: of ramps; bandwidth: of a first-order lag; lost: against ideal steps, in the '
+        'longest move; field: largest magnitude of a level' + (
+            '; voltage: L dI/dt + R I, its largest magnitude; power: that voltage times the '
+            'largest current' if len(numbers) == len(coil) else '')), tuple(notes))
+
+
+def _named(slew: float, band: float) -> str:
+    return f'{slew:g} T/s' if math.isinf(band) else f'{band:g} Hz'
+
+
+def _series(middle: float) -> list[float]:
+    """Return round numbers about one, the largest first."""
+    decades = range(
+        math.floor(math.log10(_SLOWEST * middle)), math.ceil(math.log10(_FASTEST * middle)) + 1)
+    found = [x * 10.0 ** y for y in decades for x in _DECADE]
+    return [float(f'{x:g}') for x in reversed(found)
+            if _SLOWEST * middle <= x <= _FASTEST * middle]
+
+
+def _before(plan: 'Plan') -> float:
+    """Return the flux density in T before a plan."""
+    return float(plan.actuator.flux_density(plan.segments[0].start.stretch))
+
+
+def _row(
+        plan: 'Plan', best: 'Plan', slew: float, band: float,
+        coil: dict[str, float]) -> tuple[Any, ...]:
+    """Return what an amplifier has to give for a plan."""
+    from hmsa_ros.api.motion import response
+
+    longest, lost = (1e3 * float(np.max(x)) for x in (
+        plan.arrivals, plan.arrivals - best.arrivals))
+    most = float(np.max(np.abs(plan.flux_densities)))
+    row: tuple[Any, ...] = (slew, band, longest, lost, 1e3 * most)
+    if 'tesla_per_ampere' not in coil:
+        return row
+    factor = coil['tesla_per_ampere']
+    # The field of each level where it begins, and where the next one does.
+    fields = response(
+        plan.actuator, plan.times, plan.flux_densities,
+        np.append(plan.times, plan.times[-1] + 1.0), plan.segments[0].start.stretch)[2]
+    if math.isinf(slew) and math.isinf(band):
+        change = np.array([math.inf, math.inf])
+        current = np.zeros(2)
+    elif math.isinf(band):
+        change = np.array([slew, slew]) / factor
+        current = np.array([most, -most]) / factor
+    else:
+        at = np.concatenate([fields[:-1], fields[1:]])
+        wanted = np.concatenate([plan.flux_densities] * 2)
+        change = 2.0 * math.pi * band * (wanted - at) / factor
+        current = at / factor
+    row += (most / factor, float(np.max(np.abs(change))))
+    if len(coil) == 3:
+        volts = float(np.max(np.abs(
+            coil['inductance'] * change + coil['resistance'] * current)))
+        row += (volts, volts * most / factor)
+    return row

@@ -1,0 +1,189 @@
+"""Identification of an actuator from samples and commands."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from hmsa_ros.api.actuator import Actuator
+from hmsa_ros.api.columns import columns_of
+from hmsa_ros.api.motion import Motion
+from hmsa_ros.errors import BadInputError, excerpt
+from hmsa_ros.files import write_text
+from hmsa_ros.identification.files import Belief, file_text, read_belief
+from hmsa_ros.identification.identify import identify as find
+from hmsa_ros.identification.known import Known
+from hmsa_ros.identification.quantities import free_of
+from hmsa_ros.identification.recording import Recording
+from hmsa_ros.identification.result import Identification
+from hmsa_ros.identification.runs import recording_of
+from hmsa_ros.identification.tables import read_csv
+from hmsa_ros.recordings.bags import read_run
+from hmsa_ros.table import Table
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """
+    What an identification has found; `identify` makes them.
+
+    Attributes
+    ----------
+    result : Identification
+        Values, covariance, residuals and verdict, whole.
+    actuator : Actuator
+        With these values, and the coil as it was given; trust it only if the verdict is
+        ``identified``.
+
+    """
+
+    result: Identification
+    actuator: Actuator
+    _text: str  # of the parameter file
+
+    @property
+    def verdict(self) -> str:
+        """``identified``, ``not_identifiable`` or ``model_rejected``."""
+        return self.result.verdict
+
+    @property
+    def reason(self) -> str:
+        """Why, in sentences."""
+        return self.result.reason
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Values of the free parameters in SI units, by name."""
+        return {x: self.result.parameters[x].value for x in self.result.names}
+
+    @property
+    def intervals(self) -> dict[str, tuple[float, float]]:
+        """95 % intervals of the free parameters, by name."""
+        found = self.result.parameters
+        return {x: (found[x].low, found[x].high) for x in self.result.names}
+
+    def report(self, path: str | Path | None = None) -> Table:
+        """Return the table of ``hmsa identify``; a path writes its page, or `BadInputError`."""
+        if path is not None:
+            from hmsa_ros.report.identified import page
+
+            write_text(Path(path), page(self.result))
+        return self.result.report()
+
+    def to_yaml(self, path: str | Path) -> None:
+        """
+        Write the parameter file with the covariance, as ``hmsa identify --out`` does.
+
+        Raises
+        ------
+        BadInputError
+            If nothing was identified, or the file cannot be written.
+
+        """
+        if self.verdict != 'identified':
+            raise BadInputError(
+                f'{path} was not written: the verdict is {self.verdict} ({self.reason})')
+        write_text(Path(path), self._text)
+
+    def _repr_html_(self) -> str:
+        return self.report()._repr_html_()
+
+
+def identify(
+        samples: Any, commands: Any = None, *, actuator: Actuator | None = None,
+        free: Sequence[str] | None = None, known: Mapping[str, float] | None = None,
+        uncertain: Mapping[str, float] | None = None) -> Identified:
+    """
+    Find the parameters of an actuator in samples of its motion.
+
+    Parameters
+    ----------
+    samples : Motion, path, pairs, array of shape (n, 2), mapping or DataFrame
+        Times in s and stretches, in columns ``time`` and ``stretch``; or a motion, a bag or a CSV.
+    commands : pairs, array of shape (m, 2), mapping, DataFrame or path, optional
+        Times in s and flux densities in T from then on, in columns ``time`` and
+        ``flux_density``; a motion and a bag have their own.
+    actuator : Actuator, optional
+        What is known of it, such as sizes, density, law and coil; default the example block.
+    free : sequence of str, optional
+        Names of the parameters to find; default shear modulus, damping, J_lim, remanence and bias
+        of the sensor.
+    known, uncertain : mapping of str to float, optional
+        What is known besides, in SI units, such as ``{'sensor_latency': 2e-3}``, and standard
+        deviations of it.
+
+    Returns
+    -------
+    Identified
+        Values with their 95 % intervals, or why the samples cannot determine them.
+
+    Raises
+    ------
+    BadInputError
+        If samples, commands or names cannot be used.
+
+    Examples
+    --------
+    >>> import hmsa_ros
+    >>> block = hmsa_ros.Actuator(remanence=0.12)
+    >>> levels = [(0.0, 0.0), (0.05, 0.03), (0.2, -0.02), (0.35, 0.02), (0.5, 0.0)]
+    >>> motion = block.simulate(levels, until=0.7, noise=1e-4)
+    >>> found = hmsa_ros.identify(motion, free=['remanence', 'stretch_bias'])
+    >>> found.verdict, round(found.values['remanence'], 3)
+    ('identified', 0.12)
+
+    """
+    block = None if actuator is None else actuator.block
+    given: dict[str, float] = {} if actuator is None else {
+        'coil_time_constant': actuator.model.options.coil_time_constant}
+    slew = math.inf if actuator is None else actuator.model.options.slew_limit
+    coordinate = (actuator or Actuator()).block.coordinate
+    if isinstance(samples, (str, Path)) and (
+            Path(samples).is_dir() or Path(samples).suffix == '.mcap'):
+        samples = Motion(read_run(Path(samples)))
+    if isinstance(samples, Motion):
+        if commands is not None:
+            raise BadInputError(
+                'commands are given with a motion that has its own: expected samples alone as '
+                'pairs of time and stretch, or no commands')
+        recording, found, theirs = recording_of(samples.run, block)
+        given = {**theirs, **given}
+        actuator = actuator or Actuator.from_parameters(samples.actuator.parameters)
+        block = found
+    elif isinstance(samples, (str, Path)):
+        if not (commands is None or isinstance(commands, (str, Path))):
+            raise BadInputError(
+                f'commands are {excerpt(commands)} with the file {samples}: expected a file, too')
+        recording = read_csv(
+            Path(samples), None if commands is None else Path(commands), slew_limit=slew,
+            coordinate=coordinate)
+    else:
+        if commands is None:
+            raise BadInputError(
+                'commands are missing: expected times in s and flux densities in T from then on')
+        time, stretch = columns_of(samples, ('time', 'stretch'), 'samples')
+        times, levels = columns_of(commands, ('time', 'flux_density'), 'commands')
+        if times[0] > time[0]:
+            # As a coil is before anybody commands it.
+            times, levels = np.append(time[0], times), np.append(0.0, levels)
+        recording = Recording(
+            time - time[0], stretch, times - time[0], levels, slew, coordinate=coordinate)
+    base = actuator or Actuator()
+    others = {x: y for x, y in {**given, **(known or {})}.items() if y or known and x in known}
+    result = find(
+        recording, free=free_of('' if free is None else ','.join(free), base.block.law, others),
+        known=others,
+        actuator=block or base.block, uncertain=uncertain)
+    text = file_text(
+        result, Belief(result.actuator, others, base.parameters, Known()),
+        recording.label, datetime.now().astimezone())
+    # The file is the one place that has all of it under the names of the nodes.
+    settings = yaml.safe_load(text)['/**']['ros__parameters']
+    return Identified(result, Actuator.from_parameters(
+        settings, read_belief(None, [('', x, y) for x, y in settings.items()])
+        if result.verdict == 'identified' else None), text)

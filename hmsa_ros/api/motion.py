@@ -1,0 +1,370 @@
+"""A motion, simulated or recorded: its samples, what drove it, and what came of it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+
+from hmsa_ros.api.columns import number
+from hmsa_ros.errors import BadInputError, excerpt
+from hmsa_ros.model.delivery import ramps
+from hmsa_ros.model.equations import Array, elastic_force, natural_frequency
+from hmsa_ros.model.moves import Level as Load
+from hmsa_ros.model.moves import State
+from hmsa_ros.model.simulation import check_stretch, longest_motion, RTOL, sampled
+from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.recordings.levels import Level
+from hmsa_ros.recordings.record import RecordedRequest, Run
+from hmsa_ros.recordings.tables import levels_of, samples_of, write_run
+from hmsa_ros.table import frame, Table
+
+if TYPE_CHECKING:
+    from hmsa_ros.api.actuator import Actuator
+    from hmsa_ros.api.plan import Plan
+    from hmsa_ros.report.arrivals import Part
+    from hmsa_ros.report.paper import Paper
+
+# Samples a second and, where these are more, a period of the actuator.
+_RATE, _A_PERIOD = 1000.0, 40.0
+_MOST_SAMPLES = 5_000_000
+# When a simulated sequence was sent before it began, in ns.
+_AHEAD = 50_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """
+    Samples of a motion, and the levels that drove it.
+
+    `read` returns those of a bag, `Plan.simulate` and `Actuator.simulate` simulated ones.
+
+    Examples
+    --------
+    >>> from hmsa_ros import Actuator
+    >>> motion = Actuator().plan([(1.1, 0.2)]).simulate(rate=500.0)
+    >>> len(motion.times), round(float(motion.stretches[-1]), 6)
+    (101, 1.1)
+
+    """
+
+    run: Run  #: the whole record
+
+    @property
+    def times(self) -> Array:
+        """Times of the samples in s from the first, shape (n,)."""
+        return samples_of(self.run)['time']
+
+    @property
+    def stretches(self) -> Array:
+        """Stretches, or deflections of a beam, shape (n,)."""
+        return self.run.stretch
+
+    @property
+    def rates(self) -> Array:
+        """Stretch rates in 1/s, shape (n,)."""
+        return self.run.rate
+
+    @property
+    def flux_densities(self) -> Array:
+        """Flux densities in T in force at the samples, NaN where unknown, shape (n,)."""
+        return samples_of(self.run)['flux_density']
+
+    @property
+    def levels(self) -> Array:
+        """Times in s and flux densities in T of the levels that drove it, shape (m, 2)."""
+        return np.column_stack(list(levels_of(self.run).values()))
+
+    @property
+    def actuator(self) -> 'Actuator':
+        """The actuator that moved, as far as the record contains its parameters."""
+        from hmsa_ros.api.actuator import Actuator
+        from hmsa_ros.interfaces.actuator import parameters_of
+
+        coil = {x: self.run.number(f'plant.{x}') or self.run.number(f'planner.{x}')
+                for x in ('slew_limit', 'coil_time_constant')}
+        return Actuator.from_parameters({**parameters_of(self.run.plant), **coil})
+
+    def report(self, path: str | Path | None = None) -> Table:
+        """
+        Return what was measured of each setpoint, or, without setpoints, of each level.
+
+        A path writes the page of ``hmsa report`` as well; if it cannot be written, this is a
+        `BadInputError`.
+        """
+        if path is not None:
+            from hmsa_ros.files import write_text
+            from hmsa_ros.report.page import page
+
+            write_text(Path(path), page([self._part()]))
+        from hmsa_ros.report.outcome import findings_of, findings_table, level_results, level_table
+
+        found = findings_of(self.run)
+        return findings_table(found) if found else level_table(level_results(self.run))
+
+    def plot(self, path: str | Path | Sequence[str | Path] | None = None, **paper: Any) -> Any:
+        """
+        Draw command, response, phase plane and the moves, as ``hmsa report --picture`` does.
+
+        Parameters
+        ----------
+        path : str, Path or sequence of these, optional
+            Files to write, each of a name that ends in .png, .pdf, .svg or .pgf.
+        **paper
+            ``width`` in mm, ``letters`` in pt, ``dpi``, and ``data`` for a CSV of the curves, as
+            of `hmsa_ros.report.paper.Paper`.
+
+        Returns
+        -------
+        Figure
+            Of matplotlib, which a notebook shows.
+
+        Raises
+        ------
+        BadInputError
+            If an argument is out of range, or a file cannot be written.
+
+        """
+        return self.draw(_paths(path), _paper(paper))
+
+    def draw(self, paths: Sequence[Path], paper: 'Paper') -> Any:
+        """Draw as `plot` does; raise `BadInputError` for what cannot be written."""
+        return draw_all([self], paths, paper)
+
+    def _part(self, colour: str = '') -> 'Part':
+        from hmsa_ros.report.arrivals import Part
+        from hmsa_ros.report.evaluation import evaluate
+        from hmsa_ros.report.timing import timing
+
+        return Part(self.run, evaluate(self.run), timing(self.run), colour)
+
+    def save(self, path: str | Path) -> list[Path]:
+        """
+        Write the samples, and the levels beside them, as ``hmsa export`` does.
+
+        A name ends in .csv, .parquet or .mat. What cannot be written is a `BadInputError`.
+        """
+        return write_run(Path(path), self.run)
+
+    def to_pandas(self) -> Any:
+        """Return the samples as a DataFrame: time, stretch, stretch_rate and flux_density."""
+        return frame(dict(samples_of(self.run)))
+
+    def __repr__(self) -> str:
+        times = self.times
+        return (f'<Motion {self.run.label}: {len(times)} samples in {times[-1]:.6g} s, '
+                f'{len(self.levels)} levels>')
+
+    def _repr_html_(self) -> str:
+        return self.report()._repr_html_()
+
+
+def read(path: str | Path, *, joint: str = '') -> Motion:
+    """
+    Read a bag, without ROS.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder of a bag, or an ``.mcap`` file, in the format of rosbag2.
+    joint : str
+        Actuator to read, if the bag has several.
+
+    Returns
+    -------
+    Motion
+        Samples, levels and parameters.
+
+    Raises
+    ------
+    BadInputError
+        If there is no bag, it has no samples, or it has several actuators and none is named.
+
+    """
+    from hmsa_ros.recordings.bags import read_run
+
+    if not isinstance(path, (str, Path)):
+        raise BadInputError(f'path is {excerpt(path)}: expected the folder of a bag')
+    return Motion(read_run(Path(path), joint=joint))
+
+
+def compare(*motions: Motion, picture: str | Path | None = None, **paper: Any) -> Table:
+    """
+    Compare motions in numbers: arrival, offset and vibration of each setpoint, and the curves.
+
+    Parameters
+    ----------
+    *motions : Motion
+        Two or more; the others are compared with the first.
+    picture : str or Path, optional
+        Picture of all of them to write.
+    **paper
+        As of `Motion.plot`.
+
+    Returns
+    -------
+    Table
+        A row for each setpoint and motion.
+
+    Raises
+    ------
+    BadInputError
+        If there are fewer than two, or they have no setpoint.
+
+    Examples
+    --------
+    >>> import hmsa_ros
+    >>> block = hmsa_ros.Actuator()
+    >>> runs = [block.plan([(1.1, 0.3)], shaper=x).simulate() for x in ('two_step', 'step')]
+    >>> hmsa_ros.compare(*runs)['verdict']
+    ['arrived', 'vibrating']
+
+    """
+    if len(motions) < 2 or not all(isinstance(x, Motion) for x in motions):
+        raise BadInputError(
+            f'got {excerpt(list(motions))} to compare: expected two motions or more, as read and '
+            'simulate return them')
+    if picture is not None:
+        draw_all(motions, _paths(picture), _paper(paper))
+    from hmsa_ros.report.comparison import comparison
+
+    return comparison([x._part() for x in motions])
+
+
+def draw_all(motions: Sequence[Motion], paths: Sequence[Path], paper: 'Paper') -> Any:
+    """Draw motions over each other; return the figure of matplotlib."""
+    from hmsa_ros.report.comparison import labelled
+    from hmsa_ros.report.looks import RUNS
+    from hmsa_ros.report.picture import draw
+
+    runs = labelled([x.run for x in motions])
+    return draw(paths, [
+        Motion(x)._part(RUNS[i % len(RUNS)] if len(runs) > 1 else '')
+        for i, x in enumerate(runs)], paper)
+
+
+def _paths(path: Any) -> list[Path]:
+    if path is None:
+        return []
+    return [Path(x) for x in ([path] if isinstance(path, (str, Path)) else path)]
+
+
+def _paper(settings: dict[str, Any]) -> 'Paper':
+    from hmsa_ros.report.paper import Paper
+
+    try:
+        return Paper(**settings)
+    except TypeError as error:
+        raise BadInputError(
+            f'pictures have {", ".join(settings)}: expected numbers for width (mm), letters (pt) '
+            'and dpi, and data') from error
+
+
+def simulated(
+        truth: 'Actuator', times: Array, levels: Array, *, until: float | None,
+        rate: float | None, noise: float, seed: int, start: float | None, label: str,
+        plan: 'Plan | None' = None) -> Motion:
+    """
+    Simulate levels in T from times in s on; a plan adds what was asked and predicted.
+
+    Other arguments are as of `Actuator.simulate`. Raises `BadInputError` for what cannot be used,
+    `HmsaError` for levels that cannot be followed.
+    """
+    back = np.flatnonzero(np.diff(times) <= 0.0)
+    if len(back) or times[0] < 0.0 or not np.all(np.isfinite(times) & np.isfinite(levels)):
+        place = int(back[0]) + 1 if len(back) else 0
+        raise BadInputError(
+            f'levels have the time {times[place]:g} s and the flux density {levels[place]:g} T in '
+            f'row {place + 1}: expected finite numbers, and increasing times from 0 s on')
+    model = truth.model
+    begin = number(model.material.rest if start is None else start, 'start')
+    check_stretch(begin, model.material, 'start stretch')
+    end = _end(truth, times, levels, until, plan)
+    hertz = _rate(truth, rate)
+    if end * hertz > _MOST_SAMPLES:
+        raise BadInputError(
+            f'{end:g} s at {hertz:g} Hz are {end * hertz:.3g} samples: expected at most '
+            f'{_MOST_SAMPLES}; give a lower rate or an earlier end (until)')
+    noise = number(noise, 'noise')
+    if not 0.0 <= noise < math.inf:
+        raise BadInputError(f'noise is {noise:g}: expected a finite number of at least 0')
+    stamps = np.round(np.arange(int(end * hertz * (1.0 + 1e-12)) + 1) / hertz * NANOSECONDS
+                      ).astype(np.int64)
+    stretch, speed, field = response(truth, times, levels, stamps / NANOSECONDS, begin)
+    switched = np.round(times * NANOSECONDS).astype(np.int64).tolist()
+    stretch = stretch + noise * np.random.default_rng(seed).standard_normal(len(stretch))
+    commands = tuple(
+        Level(stamp, level, -_AHEAD) for stamp, level in zip(
+            switched, levels.tolist(), strict=True))
+    asked: tuple[RecordedRequest, ...] = ()
+    planned: tuple[Level, ...] = ()
+    believed = truth if plan is None else plan.actuator
+    if plan is not None:
+        ends = np.cumsum(plan.setpoints[:, 1])
+        asked = (RecordedRequest(-_AHEAD, 0, tuple(
+            (x.setpoint.stretch, round(y * NANOSECONDS) if math.isfinite(y) else None)
+            for x, y in zip(plan.segments, ends.tolist(), strict=True))),)
+        predicted = response(believed, times, levels, times, begin)
+        planned = tuple(
+            Level(stamp, level, -_AHEAD, x, y) for stamp, level, x, y in zip(
+                switched, levels.tolist(), *(z.tolist() for z in predicted[:2]), strict=True))
+    parameters = {
+        f'{node}.{name}': value for node, each in (('planner', believed), ('plant', truth))
+        for name, value in each.parameters.items()} | {'plant.stretch_noise': noise}
+    return Motion(Run(
+        str(label), '', Path(str(label)), stamps, stamps, stretch, speed, field,
+        commands, commands, plans=(planned,) if planned else (), requests=asked,
+        parameters=parameters, plant=truth.block, planner=believed.block, parameters_known=True,
+        origin='simulated'))
+
+
+def response(
+        truth: 'Actuator', times: Array, levels: Array, at: Array,
+        start: float) -> tuple[Array, Array, Array]:
+    """Return stretch, rate in 1/s and flux density in T at times in s."""
+    model = truth.model
+    units, material, delivery = model.units, model.material, model.delivery
+    held = float(elastic_force(start, material))
+    loads = [Load(x / units.time, y / units.load) for x, y in zip(
+        times.tolist(), levels.tolist(), strict=True)]
+    if loads[0].time > 0.0:
+        loads.insert(0, Load(0.0, held))
+    wanted = at / units.time
+    parts, _ = ramps(loads, held, max(float(wanted[-1]), loads[-1].time), delivery.slew)
+    switches, values, slopes = np.array(parts).T.copy()
+    rows = sampled(
+        switches, values, slopes, wanted, State(start, load=held), material, RTOL, delivery.lag)
+    return rows[0], rows[1] / units.time, rows[2] * units.load
+
+
+def _end(
+        truth: 'Actuator', times: Array, levels: Array, until: float | None,
+        plan: 'Plan | None') -> float:
+    """Return when a simulation ends, in s."""
+    if until is not None:
+        end = number(until, 'until', 's')
+        if not 0.0 < end < math.inf:
+            raise BadInputError(f'until is {end:g} s: expected a finite number above 0')
+        return end
+    if plan is not None and math.isfinite(end := float(np.sum(plan.setpoints[:, 1]))):
+        return end
+    model = truth.model
+    left = longest_motion(float(levels[-1]) / model.units.load, model.material)
+    return float(times[-1]) + model.units.time * (left + model.delivery.settling(0.0))
+
+
+def _rate(truth: 'Actuator', rate: float | None) -> float:
+    """Return the sample rate in Hz."""
+    if rate is None:
+        material = truth.model.material
+        frequency = float(natural_frequency(material.rest, material)) / (
+            2.0 * math.pi * truth.model.units.time)
+        wanted = max(_RATE, _A_PERIOD * frequency)
+        digits = 10 ** (math.floor(math.log10(wanted)) - 1)
+        return float(math.ceil(wanted / digits) * digits)
+    hertz = number(rate, 'rate', 'Hz')
+    if not 0.0 < hertz <= 1e9:
+        raise BadInputError(f'rate is {hertz:g} Hz: expected more than 0 and at most 1e9')
+    return hertz

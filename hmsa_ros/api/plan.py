@@ -1,0 +1,177 @@
+"""A plan: what to send to the coil and when, and the motion that it predicts."""
+
+from dataclasses import dataclass
+from functools import cached_property
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hmsa_ros.api.actuator import Actuator
+from hmsa_ros.api.columns import number
+from hmsa_ros.api.motion import Motion, simulated
+from hmsa_ros.errors import BadInputError, excerpt
+from hmsa_ros.model.equations import Array
+from hmsa_ros.planning.sequence import Segment
+from hmsa_ros.recordings.tables import write_table
+from hmsa_ros.table import Column, frame, Table
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """
+    A planned command: levels of the field, each in force from its time on.
+
+    `Actuator.plan` makes plans.
+
+    Examples
+    --------
+    >>> from hmsa_ros import Actuator
+    >>> plan = Actuator().plan([(1.1, 0.5), (1.0, 0.5)])
+    >>> plan.levels.shape
+    (4, 2)
+    >>> plan.report()['status']
+    ['two_step', 'two_step']
+    >>> plan.simulate().report()['verdict']
+    ['arrived', 'arrived']
+
+    """
+
+    actuator: Actuator  #: for which it was planned
+    segments: tuple[Segment, ...]  #: one a setpoint, without a dimension
+    shaper: str = 'two_step'
+
+    @cached_property
+    def levels(self) -> Array:
+        """Times in s and flux densities in T, shape (m, 2)."""
+        units = self.actuator.model.units
+        rows: list[tuple[float, float]] = []
+        for i, segment in enumerate(self.segments):
+            last = i + 1 == len(self.segments)
+            rows += [(segment.begin + x.time, x.load) for x in segment.move.levels
+                     if last or x.time < segment.setpoint.span]
+        found: Array = np.array(rows) * (units.time, units.load)
+        return found
+
+    @property
+    def times(self) -> Array:
+        """Times in s from which on the levels are in force, shape (m,)."""
+        return self.levels[:, 0]
+
+    @property
+    def flux_densities(self) -> Array:
+        """Levels in T, shape (m,)."""
+        return self.levels[:, 1]
+
+    @property
+    def setpoints(self) -> Array:
+        """Stretches and durations in s, shape (n, 2)."""
+        return np.array([
+            (x.setpoint.stretch, x.setpoint.span * self.actuator.model.units.time)
+            for x in self.segments])
+
+    @property
+    def arrivals(self) -> Array:
+        """Durations in s of the moves; infinite where a target is only approached, shape (n,)."""
+        return np.array([x.move.duration for x in self.segments]) * self.actuator.model.units.time
+
+    def currents(self, tesla_per_ampere: float) -> Array:
+        """
+        Return the levels in A, for a coil of so many T per A, shape (m,).
+
+        Raises
+        ------
+        BadInputError
+            If this is not a number above 0.
+
+        """
+        factor = number(tesla_per_ampere, 'tesla_per_ampere', 'T/A')
+        if not factor > 0.0:
+            raise BadInputError(f'tesla_per_ampere is {factor:g}: expected a number above 0 T/A')
+        return self.flux_densities / factor
+
+    def report(self) -> Table:
+        """Return the first and last level of each setpoint, its move time and its status."""
+        units, name = self.actuator.model.units, self.actuator.block.coordinate.name
+        rows = []
+        for x in self.segments:
+            shaped = x.shaped
+            rows.append((
+                x.setpoint.stretch, x.setpoint.span * units.time,
+                x.move.levels[0].load * units.load if shaped else None,
+                x.move.duration * units.time if shaped and math.isfinite(x.move.duration)
+                else None, x.held * units.load, str(x.move.code)))
+        return Table((
+            Column(name), Column('duration', 's'), Column('first level', 'T'),
+            Column('arrival', 's'), Column('last level', 'T'), Column('status')), tuple(rows),
+            notes=tuple(note for x in self.segments for note in x.notes()))
+
+    def simulate(
+            self, *, truth: Actuator | None = None, noise: float = 0.0,
+            rate: float | None = None, until: float | None = None, seed: int = 0,
+            label: str = 'simulated') -> Motion:
+        """
+        Simulate the plan, on the actuator it was made for or on another one.
+
+        Parameters
+        ----------
+        truth : Actuator, optional
+            What the actuator and its amplifier really are; default as planned.
+        noise : float
+            Standard deviation of the samples of the stretch.
+        rate : float, optional
+            Samples a second in Hz; default 1000, or 40 a period of the actuator if these are more.
+        until : float, optional
+            End in s; default that of the last setpoint.
+        seed : int
+            Of the noise.
+        label : str
+            Name in pictures and comparisons.
+
+        Returns
+        -------
+        Motion
+            Samples, levels and setpoints.
+
+        Raises
+        ------
+        BadInputError
+            If an argument is of another type or out of range.
+
+        Examples
+        --------
+        >>> from hmsa_ros import Actuator
+        >>> block = Actuator()
+        >>> plan = block.plan([(1.1, 0.5)])
+        >>> plan.simulate(truth=block.scaled(shear_modulus=1.1)).report()['verdict']
+        ['off_target']
+
+        """
+        if truth is not None and not isinstance(truth, Actuator):
+            raise BadInputError(
+                f'truth is {excerpt(truth)}: expected an Actuator, such as '
+                'block.scaled(shear_modulus=1.1)')
+        return simulated(
+            truth or self.actuator, self.times, self.flux_densities, until=until, rate=rate,
+            noise=noise, seed=seed, start=self.segments[0].start.stretch, label=label, plan=self)
+
+    def plot(self, path: str | Path | None = None, **paper: Any) -> Any:
+        """Draw the motion that the plan predicts, as `Motion.plot` does."""
+        return self.simulate().plot(path, **paper)
+
+    def save(self, path: str | Path) -> None:
+        """
+        Write the levels as CSV, Parquet or Matlab file (``.csv``, ``.parquet``, ``.mat``).
+
+        ``hmsa simulate`` and ``hmsa run --levels`` take the CSV. What cannot be written is a
+        `BadInputError`.
+        """
+        write_table(Path(path), {'time': self.times, 'flux_density': self.flux_densities})
+
+    def to_pandas(self) -> Any:
+        """Return the levels as a DataFrame."""
+        return frame({'time': self.times, 'flux_density': self.flux_densities})
+
+    def _repr_html_(self) -> str:
+        return self.report()._repr_html_()

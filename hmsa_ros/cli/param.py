@@ -1,0 +1,65 @@
+"""``hmsa param``: parameters of running nodes, where there is no ``ros2``."""
+
+import argparse
+from typing import Any
+
+from hmsa_ros.cli.options import add_options, JSON, NAMESPACE, TIMEOUT, timeout_of
+from hmsa_ros.ending import ENDING
+from hmsa_ros.files import json_text
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command."""
+    parser = subparsers.add_parser(
+        'param', help='read and change parameters of running nodes',
+        description='Read and change parameters of running nodes, as ros2 param does.',
+        epilog='example: hmsa param set planner shaper robust')
+    actions = parser.add_subparsers(metavar='ACTION', required=True)
+    get = actions.add_parser(
+        'get', help='print parameters of a node', description='Print parameters of a node.',
+        epilog='example: hmsa param get planner shaper')
+    set_ = actions.add_parser(
+        'set', help='change a parameter of a node',
+        description='Change a parameter of a node, such as shaper of the planner: it holds from '
+                    'the next request on.',
+        epilog='example: hmsa param set planner shaper robust')
+    for action in (get, set_):
+        action.add_argument('node', metavar='NODE', help='name of the node, such as planner')
+    get.add_argument('names', nargs='*', metavar='NAME', help='parameters (default all)')
+    set_.add_argument('name', metavar='NAME', help='the parameter')
+    set_.add_argument('value', metavar='VALUE', help='the value, as in YAML: 0.5, robust, [1, 2]')
+    for action, function in ((get, _get), (set_, _set)):
+        add_options(action, NAMESPACE, TIMEOUT, *([JSON] if action is get else []))
+        action.set_defaults(action=function)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Carry out one action."""
+    arguments.timeout = timeout_of(arguments)
+    ENDING.note()
+    status: int = arguments.action(arguments)
+    return status
+
+
+def _get(arguments: argparse.Namespace) -> int:
+    from hmsa_ros.lab.remote import RemoteNode
+
+    with RemoteNode(arguments.node, arguments.namespace, arguments.timeout) as node:
+        found = node.get(arguments.names)
+    if arguments.json:
+        print(json_text(found))
+        return 0
+    from hmsa_ros.identification.files import yaml_text
+
+    for name, value in found.items():
+        print(f'{name}: {yaml_text(value)}')
+    return 0
+
+
+def _set(arguments: argparse.Namespace) -> int:
+    from hmsa_ros.lab.remote import RemoteNode
+
+    with RemoteNode(arguments.node, arguments.namespace, arguments.timeout) as node:
+        before, after = node.set(arguments.name, arguments.value)
+    print(f'{arguments.name}: {after} (was {before})')
+    return 0

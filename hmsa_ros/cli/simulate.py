@@ -1,0 +1,66 @@
+"""``hmsa simulate``: the response to a command of one's own, without ROS."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from hmsa_ros.cli.options import add_options, JSON
+from hmsa_ros.cli.pictures import add_picture_options, paper_of
+from hmsa_ros.cli.progress import progress
+from hmsa_ros.files import json_text
+from hmsa_ros.report.paper import kind_of
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command."""
+    parser = subparsers.add_parser(
+        'simulate', help='simulate the response to levels of the field without ROS',
+        description='Simulate how an actuator responds to levels of the field, without ROS: a CSV '
+                    'with the columns time (s) and flux_density (T), each in force from its time '
+                    'on. Print what each level leads to; write samples with --out and a picture '
+                    'with --picture.',
+        epilog='example: hmsa simulate levels.csv --params-file actuator.yaml --picture run.png')
+    parser.add_argument(
+        'levels', type=Path, metavar='LEVELS.csv', help='CSV of time, flux_density')
+    add_options(
+        parser,
+        ('--params-file', 'YAML', Path,
+         'parameter file of the actuator (default: the example block)'),
+        ('--until', 'S', float, 'end in s (default: when the last level has settled)'),
+        ('--start', 'X', float, 'stretch at rest before (default 1; 0 for a beam)'),
+        ('--rate', 'HZ', float,
+         'samples a second in Hz (default 1000, or 40 a period of the actuator)'),
+        ('--noise', 'X', float, 'standard deviation of the stretch samples (default 0)',
+         {'default': 0.0}),
+        ('--seed', 'N', int, 'of the noise (default 0)', {'default': 0}),
+        ('--out', 'FILE', Path,
+         'samples to write, ending in .csv, .parquet or .mat; an existing file is replaced'),
+        JSON)
+    add_picture_options(parser, named='pictures to write')
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Simulate, write and print."""
+    paper = paper_of(arguments)
+    for picture in arguments.picture:
+        kind_of(picture)
+    from hmsa_ros.api.actuator import Actuator
+
+    actuator = Actuator() if arguments.params_file is None else Actuator.from_yaml(
+        arguments.params_file)
+    with progress('simulating'):
+        motion = actuator.simulate(arguments.levels, **{
+            x: getattr(arguments, x) for x in ('until', 'start', 'rate', 'noise', 'seed')})
+        written = [] if arguments.out is None else motion.save(arguments.out)
+        if arguments.picture:
+            motion.draw(arguments.picture, paper)
+    report = motion.report()
+    if arguments.json:
+        print(json_text({
+            'samples': len(motion.times), 'duration': float(motion.times[-1]),
+            'rows': report.records(), 'files': [str(x) for x in (*written, *arguments.picture)]}))
+        return 0
+    print(report)
+    for path in (*written, *arguments.picture):
+        print(path)
+    return 0

@@ -1,0 +1,132 @@
+"""Parameters of a running node, read and changed while its caller waits."""
+
+from collections.abc import Sequence
+from time import monotonic
+from typing import Any
+
+from rcl_interfaces.msg import Parameter, ParameterType
+from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.parameter import get_parameter_value, parameter_value_to_python
+
+from hmsa_ros.ending import ENDING
+from hmsa_ros.errors import BadInputError, HmsaError
+from hmsa_ros.nodes.service_call import ServiceCall
+from hmsa_ros.nodes.visitor import leave, visit
+
+_SLICE_SECONDS = 0.05
+
+
+class RemoteNode:
+    """
+    The parameters of one node; a context manager.
+
+    Parameters
+    ----------
+    name : str
+        Name of the node.
+    namespace : str
+        Its namespace.
+    timeout : float
+        Patience in s.
+
+    """
+
+    def __init__(self, name: str, namespace: str = '', timeout: float = 10.0) -> None:
+        self._name, self._where, self._timeout = name, namespace, timeout
+        self._node = visit('parameters', namespace)
+        self._executor = EventsExecutor(context=self._node.context)
+        self._executor.add_node(self._node)
+
+    def __enter__(self) -> 'RemoteNode':
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._executor.shutdown()
+        leave(self._node)
+
+    def _ask(self, kind: Any, service: str, **request: Any) -> Any:
+        call = ServiceCall(
+            self._node, kind, f'{self._name}/{service}', kind.Request(**request))
+        deadline = monotonic() + self._timeout
+        try:
+            while (answer := call.answer()) is None:
+                if monotonic() > deadline:
+                    raise HmsaError(
+                        f'waited {self._timeout:g} s: no node {self._name} in namespace '
+                        f'{self._where or "/"} replies; start it (hmsa {self._name}) with the '
+                        'same ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE as here')
+                ENDING.check()
+                self._executor.spin_once(timeout_sec=_SLICE_SECONDS)
+        finally:
+            call.close()
+        return answer
+
+    def _values(self, names: Sequence[str]) -> dict[str, Any]:
+        """Return the messages of some parameters, by name."""
+        known = list(self._ask(ListParameters, 'list_parameters').result.names)
+        unknown = [x for x in names if x not in known]
+        if unknown:
+            raise BadInputError(
+                f'{self._name} has no parameter {unknown[0]!r}: expected one of '
+                f'{", ".join(sorted(known))}')
+        # rclpy gives none at all where one has no value: they are asked for one by one then.
+        wanted = sorted(names or known)
+        values = list(self._ask(GetParameters, 'get_parameters', names=wanted).values)
+        if len(values) != len(wanted):
+            values = [
+                next(iter(self._ask(GetParameters, 'get_parameters', names=[x]).values), None)
+                for x in wanted]
+        return dict(zip(wanted, values, strict=True))
+
+    def get(self, names: Sequence[str] = ()) -> dict[str, Any]:
+        """
+        Return parameters by name, all of them unless some are named.
+
+        Raises
+        ------
+        BadInputError
+            If the node has no parameter of a name.
+        HmsaError
+            If it does not reply.
+
+        """
+        found = {
+            x: None if y is None else parameter_value_to_python(y)
+            for x, y in self._values(names).items()}
+        return {x: list(y or ()) if hasattr(y, 'typecode') else y for x, y in found.items()}
+
+    def set(self, name: str, text: str) -> tuple[Any, Any]:
+        """
+        Change a parameter to a value as in YAML; return the values before and after.
+
+        Raises
+        ------
+        BadInputError
+            If the node refuses it, with its reason.
+        HmsaError
+            If it does not reply.
+
+        """
+        before = self._values([name])[name]
+        value = get_parameter_value(text)
+        if before is not None:
+            value = _as(value, before.type)
+            if before.type == ParameterType.PARAMETER_STRING:
+                value.type, value.string_value = before.type, text
+        result = self._ask(SetParameters, 'set_parameters', parameters=[
+            Parameter(name=name, value=value)]).results[0]
+        if not result.successful:
+            raise BadInputError(f'{self._name} refused {name} {text}: {result.reason}')
+        return (None if before is None else parameter_value_to_python(before)), (
+            self.get([name])[name])
+
+
+def _as(value: Any, kind: int) -> Any:
+    """Return a value as the type that a parameter has: 1 for 1.0, [] for no numbers."""
+    if kind == ParameterType.PARAMETER_DOUBLE and value.type == ParameterType.PARAMETER_INTEGER:
+        value.type, value.double_value = kind, float(value.integer_value)
+    if kind == ParameterType.PARAMETER_DOUBLE_ARRAY and (
+            value.type == ParameterType.PARAMETER_INTEGER_ARRAY):
+        value.type, value.double_array_value = kind, [float(x) for x in value.integer_array_value]
+    return value

@@ -1,0 +1,94 @@
+"""Several runs, compared in numbers."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+import math
+
+import numpy as np
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.recordings.record import Run
+from hmsa_ros.report.arrivals import around, Part, step_of
+from hmsa_ros.table import Column, Table
+
+
+def labelled(runs: list[Run]) -> list[Run]:
+    """Return the runs with labels of their own."""
+    labels = [x.label for x in runs]
+    if len(set(labels)) == len(labels):
+        return runs
+    # Bags of one name lie in different folders, unless one is named twice.
+    labels = [
+        f'{run.path.resolve().parent.name}/{run.label}'
+        if labels.count(run.label) > 1 and run.origin == 'recorded'
+        else run.label for run in runs]
+    return [
+        replace(run, label=label if labels.count(label) == 1 else f'{label} ({i})')
+        for i, (run, label) in enumerate(zip(runs, labels, strict=True), 1)]
+
+
+def comparison(parts: Sequence[Part]) -> Table:
+    """
+    Return what was measured of each setpoint in each run, and how far its curve is from the first.
+
+    Raises
+    ------
+    BadInputError
+        If no run has a setpoint.
+
+    """
+    count = max(len(x.evaluation.findings) for x in parts)
+    if not count:
+        raise BadInputError(
+            f'{", ".join(x.run.label for x in parts)} have no setpoint: expected runs with '
+            'requests or levels that hold a stretch')
+    rows = []
+    labels = [x.label for x in labelled([x.run for x in parts])]
+    for number in range(count):
+        for label, part in zip(labels, parts, strict=True):
+            findings = part.evaluation.findings
+            if number >= len(findings):
+                continue
+            found = findings[number]
+            place = _place(part, number)
+            arrival = math.nan if place is None else part.evaluation.results[place].arrival
+            rows.append((
+                number + 1, label, found.setpoint.target, 1e3 * arrival,
+                *(found.setpoint.percent(x) if math.isfinite(x) else math.nan for x in (
+                    found.offset, found.offset_std, found.vibration, found.vibration_std)),
+                _apart(parts[0], part, number), str(found.verdict).replace('_', ' ')))
+    return Table((
+        Column('setpoint'), Column('run'), Column('target'), Column('arrival', 'ms', '.4g'),
+        Column('offset', '%', '+%'), Column('offset std', '%', '%'), Column('vibration', '%', '%'),
+        Column('vibration std', '%', '%'), Column('apart', '%', '%'), Column('verdict')),
+        tuple(rows),
+        'arrival from the begin of the move; offset: mean less the target; vibration: peak to '
+        f'peak; apart: largest distance from the curve of {labels[0]}, from the begin of the '
+        'move on; all of these in % of the step')
+
+
+def _place(part: Part, number: int) -> int | None:
+    """Return the place of a setpoint among the moves that were reached; None for another."""
+    return next(
+        (i for i, x in enumerate(part.evaluation.results) if x.place == number), None)
+
+
+def _apart(first: Part, part: Part, number: int) -> float:
+    """Return the largest distance of two curves about an arrival, in percent of the step."""
+    places = _place(first, number), _place(part, number)
+    if part is first or None in places:
+        return math.nan
+    curves = []
+    for each, place in zip((first, part), places, strict=True):
+        time, off = around(each, place or 0, each.evaluation.recorded)
+        known = np.isfinite(off)
+        step = step_of(each, place or 0)
+        curves.append((time[known], off[known], each.evaluation.results[place or 0].stretch, step))
+    (time, off, target, step), (other, values, its, size) = curves
+    if len(other) < 2 or len(time) < 2:
+        return math.nan
+    inside = (time >= other[0]) & (time <= other[-1])
+    # Each is in percent of its own step, about its own target.
+    shift = 100.0 * (its - target) / abs(step)
+    away = np.interp(time[inside], other, values) * abs(size / step) + shift - off[inside]
+    return float(np.max(np.abs(away), initial=0.0))
