@@ -185,7 +185,7 @@ def _source(run: Run) -> str:
     """Return where a run is from."""
     return (
         f'<p class="soft"><b>{escape(run.label)}</b>: {escape(str(run.path))}, samples on '
-        f'{escape(run.topics["joint_states"])} from {_time(int(run.time[0]))}, '
+        f'{escape(run.topics.get("joint_states", run.origin))} from {_time(int(run.time[0]))}, '
         f'{(run.time[-1] - run.time[0]) / NANOSECONDS:.6g} s</p>')
 
 
