@@ -117,7 +117,7 @@ setup(
     version=VERSION,
     packages=find_packages(include=[PACKAGE, PACKAGE + '.*', 'hmsa_studies', 'hmsa_studies.*']),
     package_data={PACKAGE: [
-        'fastdds.xml', 'fastdds_localhost.xml', 'motion/_motion.pyi', 'report/page.css',
+        'fastdds.xml', 'fastdds_localhost.xml', 'motion/_motion.pyi', 'py.typed', 'report/page.css',
         'report/page.js', 'report/style.mplstyle',
         *(f'cli/completion.{x}' for x in ('bash', 'zsh', 'fish')),
         *(os.path.relpath(x, os.path.join(HERE, PACKAGE)) for x in sorted(glob(

@@ -7,10 +7,10 @@ In Python, without ROS, in seconds and tesla:
 >>> block = hmsa_ros.Actuator(shear_modulus=30e3, half_length=5e-3, remanence=0.08, zeta=0.1)
 >>> plan = block.plan([(1.1, 0.5), (1.0, 0.5)])
 >>> print(plan.report())
-stretch  duration (s)  first level (T)  arrival (s)  last level (T)     status
-───────  ────────────  ───────────────  ───────────  ──────────────  ────────
-    1.1           0.5         0.0690131   0.00162989         0.13029  two_step
-      1           0.5         0.0633266   0.00165093               0  two_step
+stretch  duration (s)  first level (T)  move time (s)  last level (T)  status
+───────  ────────────  ───────────────  ─────────────  ──────────────  ────────
+    1.1           0.5        0.0710244     0.00165067         0.12964  two_step
+      1           0.5         0.062155     0.00165032               0  two_step
 >>> motion = plan.simulate(truth=block.scaled(shear_modulus=1.02), noise=1e-4)
 
 ``hmsa_ros.model`` is the actuator, ``hmsa_ros.planning`` the commands that move it, and

@@ -47,7 +47,7 @@ def amplifiers(
             'tesla_per_ampere is missing: expected it with inductance and resistance')
     ideal = actuator.replace(slew_limit=math.inf, coil_time_constant=0.0)
     best = ideal.plan(setpoints, shaper, **more)
-    fastest = float(np.min(best.arrivals))
+    fastest = float(np.min(best.move_times))
     swing = float(np.max(np.abs(np.diff(np.append(_before(best), best.flux_densities)))))
     if not 0.0 < fastest < math.inf or not swing:
         raise BadInputError(
@@ -110,7 +110,7 @@ def _row(
     from hmsa_ros.api.motion import response
 
     longest, lost = (1e3 * float(np.max(x)) for x in (
-        plan.arrivals, plan.arrivals - best.arrivals))
+        plan.move_times, plan.move_times - best.move_times))
     most = float(np.max(np.abs(plan.flux_densities)))
     row: tuple[Any, ...] = (slew, band, longest, lost, 1e3 * most)
     if 'tesla_per_ampere' not in coil:

@@ -72,7 +72,7 @@ class Plan:
             for x in self.segments])
 
     @property
-    def arrivals(self) -> Array:
+    def move_times(self) -> Array:
         """Durations in s of the moves; infinite where a target is only approached, shape (n,)."""
         return np.array([x.move.duration for x in self.segments]) * self.actuator.model.units.time
 
@@ -104,7 +104,7 @@ class Plan:
                 else None, x.held * units.load, str(x.move.code)))
         return Table((
             Column(name), Column('duration', 's'), Column('first level', 'T'),
-            Column('arrival', 's'), Column('last level', 'T'), Column('status')), tuple(rows),
+            Column('move time', 's'), Column('last level', 'T'), Column('status')), tuple(rows),
             notes=tuple(note for x in self.segments for note in x.notes()))
 
     def simulate(
@@ -145,7 +145,7 @@ class Plan:
         >>> block = Actuator()
         >>> plan = block.plan([(1.1, 0.5)])
         >>> plan.simulate(truth=block.scaled(shear_modulus=1.1)).report()['verdict']
-        ['off_target']
+        ['off target']
 
         """
         if truth is not None and not isinstance(truth, Actuator):

@@ -16,7 +16,7 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     parser = subparsers.add_parser(
         'compare', help='compare runs in numbers, and in a picture',
-        description='Print arrival, offset and residual vibration of each setpoint for several '
+        description='Print move time, offset and residual vibration of each setpoint for several '
                     'runs, and how far each curve is from that of the first run.',
         epilog='example: hmsa compare run_zv run_two_step --picture both.pdf --width 85')
     parser.add_argument(

@@ -29,7 +29,7 @@ def run(arguments: argparse.Namespace) -> int:
         client.find_planner()
         if not client.stop():
             raise HmsaError(
-                f'the planner has not come to rest: {client.message}; hmsa watch shows what it '
-                'does')
-        print(f'stopped: {client.message}')
+                f'the planner has not come to rest ({client.verdict.state}: '
+                f'{client.verdict.message}): expected rest; hmsa watch shows the motion')
+        print(f'stopped: {client.verdict.state.replace("_", " ")}')
     return 0

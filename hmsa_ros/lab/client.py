@@ -199,9 +199,9 @@ class PlannerClient:
             recorded, f'no recorder of {self._publisher.topic_name}; start one with hmsa recorder')
 
     @property
-    def message(self) -> str:
+    def verdict(self) -> Verdict:
         """What the planner said last."""
-        return self._verdict.message
+        return self._verdict
 
     def find_plant(self) -> None:
         """Wait until the commands reach somebody, for a short time: the planner reports it."""

@@ -1,6 +1,7 @@
 """Parameters of a running node, read and changed while its caller waits."""
 
 from collections.abc import Sequence
+from difflib import get_close_matches
 from time import monotonic
 from typing import Any
 
@@ -67,9 +68,11 @@ class RemoteNode:
         known = list(self._ask(ListParameters, 'list_parameters').result.names)
         unknown = [x for x in names if x not in known]
         if unknown:
+            near = get_close_matches(unknown[0], known, cutoff=0.5)
             raise BadInputError(
-                f'{self._name} has no parameter {unknown[0]!r}: expected one of '
-                f'{", ".join(sorted(known))}')
+                f'{self._name} has no parameter {unknown[0]!r}: expected '
+                + (f'{" or ".join(near)}; ' if near else 'another; ')
+                + f'hmsa param get {self._name} lists all')
         # rclpy gives none at all where one has no value: they are asked for one by one then.
         wanted = sorted(names or known)
         values = list(self._ask(GetParameters, 'get_parameters', names=wanted).values)

@@ -1,0 +1,311 @@
+"""The public face: what ``import hmsa_ros`` offers, without ROS, in seconds and tesla."""
+
+import doctest
+from importlib import import_module
+import json
+from pathlib import Path
+import subprocess
+import sys
+
+from core_oracle import follow
+import numpy as np
+import pytest
+from scipy.io import loadmat
+
+import hmsa_ros
+from hmsa_ros.cli import main
+from hmsa_ros.table import Column, Table
+
+FACE = {'Actuator', 'BadInputError', 'HmsaError', 'Identified', 'Motion', 'Plan', 'Table',
+        'compare', 'identify', 'read'}
+LEVELS = [(0.0, 0.0), (0.02, 0.03), (0.12, -0.02), (0.25, 0.02), (0.4, 0.0)]
+MU_0 = 1.25663706127e-6
+
+
+class Frame:
+    """As much of a DataFrame as is needed to take columns from it."""
+
+    def __init__(self, columns):
+        self.columns = columns
+        self._columns = columns
+
+    def __getitem__(self, name):
+        return self._columns[name]
+
+    def __iter__(self):
+        return iter(self._columns)
+
+    def __contains__(self, name):
+        return name in self._columns
+
+
+@pytest.fixture(scope='module')
+def block():
+    return hmsa_ros.Actuator(shear_modulus=30e3, half_length=5e-3, remanence=0.08, zeta=0.1)
+
+
+def followed(block, levels, end):
+    """Return stretch and rate at an end in s as SciPy integrates Eq. 11, from SI parameters."""
+    time = 5e-3 * (1900.0 / block.shear_modulus) ** 0.5
+    load = MU_0 * block.shear_modulus / 0.08
+    spans = np.diff([*(x for x, _ in levels), end]) / time
+    return follow((1.0, 0.0), [(x, y / load) for x, (_, y) in zip(spans, levels, strict=True)],
+                  block.zeta, 5.0, 2.0)
+
+
+def test_the_package_shows_its_face_and_no_more_and_loads_nothing_for_it():
+    assert set(dir(hmsa_ros)) == FACE
+    seen = subprocess.run(
+        [sys.executable, '-c', 'import sys, hmsa_ros; print(sorted({x.partition(".")[0] for x in '
+         'sys.modules} & {"numpy", "scipy", "matplotlib", "rclpy", "rich", "yaml"}))'],
+        capture_output=True, text=True, check=True)
+    assert seen.stdout == '[]\n'
+    with pytest.raises(AttributeError, match="no attribute 'plans'"):
+        hmsa_ros.plans  # noqa: B018
+
+
+@pytest.mark.parametrize('name', [
+    '', '.api.actuator', '.api.identified', '.api.motion', '.api.plan'])
+def test_examples_in_docstrings_print_what_they_show(name):
+    found = doctest.testmod(import_module(f'hmsa_ros{name}'))
+    assert found.attempted
+    assert found.failed == 0
+
+
+def test_a_plan_rests_at_its_targets_as_another_integrator_finds(block):
+    plan = block.plan(np.array([[1.1, 0.05], [0.95, 0.05]]))
+    for end, target in ((0.05, 1.1), (0.1, 0.95)):
+        before = [x for x in plan.levels.tolist() if x[0] < end]
+        assert followed(block, before, end) == pytest.approx((target, 0.0), abs=1e-6)
+    motion = plan.simulate(rate=1000.0)
+    assert motion.stretches[[49, 99]] == pytest.approx([1.1, 0.95], abs=1e-6)
+    assert plan.move_times == pytest.approx([0.00165, 0.00165], abs=2e-5)
+
+
+def test_what_is_simulated_with_another_truth_is_the_motion_of_that_one(block):
+    truth = block.scaled(shear_modulus=1.2, remanence=1.0)
+    motion = block.plan([(1.1, 0.02)]).simulate(truth=truth, rate=4000.0)
+    assert motion.actuator.block == truth.block
+    end = followed(truth, block.plan([(1.1, 0.02)]).levels.tolist(), 0.02)
+    assert motion.stretches[-1] == pytest.approx(end[0] - 0.0, abs=1e-7)
+
+
+def test_setpoints_and_levels_are_taken_from_pairs_arrays_mappings_and_frames(block):
+    pairs = [(1.1, 0.5), (1.0, 0.5)]
+    columns = {'stretch': [1.1, 1.0], 'duration': [0.5, 0.5]}
+    plans = [block.plan(x).levels.tolist() for x in (
+        pairs, np.array(pairs), (np.array([1.1, 1.0]), np.array([0.5, 0.5])), columns,
+        Frame(columns))]
+    assert all(x == plans[0] for x in plans)
+    with pytest.raises(hmsa_ros.BadInputError, match='expected one named duration'):
+        block.plan({'stretch': [1.1]})
+
+
+def test_limits_laws_creep_lag_and_beams_reach_the_plan(block):
+    with pytest.raises(hmsa_ros.HmsaError, match=r'needs a flux density of .* expected -0.1 T to'):
+        block.plan([(1.4, 0.5)], limits=0.1)
+    slow = block.replace(coil_time_constant=1e-3, creep=[(0.2, 1.0)])
+    made = slow.plan([(1.1, 0.5)])
+    assert len(made.times) > 3
+    assert made.simulate().report()['verdict'] == ['arrived']
+    yeoh = hmsa_ros.Actuator(law='yeoh', constants={'c10': 5e3, 'c20': 300.0})
+    assert yeoh.shear_modulus == 1e4
+    assert yeoh.scaled(shear_modulus=1.1).parameters['law.c20'] == pytest.approx(330.0)
+    beam = hmsa_ros.Actuator.beam(length=0.025, thickness=1e-3, width=5e-3, youngs_modulus=1e6)
+    report = beam.plan([(0.1, 0.4)]).simulate().report()
+    assert report['verdict'] == ['arrived']
+
+
+def test_a_parameter_file_is_the_actuator_again(block, tmp_path):
+    laws = hmsa_ros.Actuator(
+        law='ogden', constants={'mu': [6e3, 100.0], 'alpha': [1.3, 5.0]}, slew_limit=20.0,
+        creep=[(0.1, 0.5)], flux_density_limits=(-0.1, 0.3))
+    for number, one in enumerate((block, laws, block.replace(chain_limit=np.inf))):
+        path = tmp_path / f'{number}.yaml'
+        one.to_yaml(path)
+        again = hmsa_ros.Actuator.from_yaml(path)
+        assert again.block.numbers == pytest.approx(one.block.numbers)
+        assert again.parameters.keys() == one.parameters.keys()
+        assert again.plan([(1.05, 0.5)]).levels == pytest.approx(
+            one.plan([(1.05, 0.5)]).levels, rel=1e-12)
+
+
+def test_what_is_identified_plans_and_is_written_with_its_covariance(tmp_path):
+    true = hmsa_ros.Actuator(remanence=0.12)
+    motion = true.simulate(LEVELS, until=0.6, noise=1e-4, rate=500.0)
+    free = ['remanence', 'shear_modulus']
+    samples = np.column_stack([motion.times, motion.stretches])
+    for found in (hmsa_ros.identify(motion, actuator=hmsa_ros.Actuator(), free=free),
+                  hmsa_ros.identify(samples, LEVELS, free=free)):
+        assert found.verdict == 'identified', found.reason
+        low, high = found.intervals['remanence']
+        assert low - 1e-4 < 0.12 < high + 1e-4
+        assert found.actuator.plan([(1.1, 0.5)]).flux_densities == pytest.approx(
+            true.plan([(1.1, 0.5)]).flux_densities, rel=1e-3)
+    found.to_yaml(tmp_path / 'found.yaml')
+    assert 'identification.covariance' in (tmp_path / 'found.yaml').read_text()
+    minimax = found.actuator.plan([(1.1, 1.0)], 'minimax')
+    assert minimax.segments[0].move.duration < true.plan(
+        [(1.1, 1.0)], 'minimax').segments[0].move.duration * 1.5
+
+
+@pytest.mark.parametrize(('call', 'said'), [
+    (lambda x: hmsa_ros.Actuator(shear_modulus='30kPa'), "shear_modulus is '30kPa': expected"),
+    (lambda x: hmsa_ros.Actuator(half_length=-1.0), 'half_length is -1: expected 1e-09 to 1000 m'),
+    (lambda x: hmsa_ros.Actuator(zeta=-1.0), 'zeta is -1'),
+    (lambda x: hmsa_ros.Actuator(zeta=0.1, damping_coefficient=0.1), 'expected one of them'),
+    (lambda x: hmsa_ros.Actuator(law='rubber'), "law is 'rubber': expected one of gent"),
+    (lambda x: hmsa_ros.Actuator(law='yeoh', constants={'c50': 1}), "no constant 'c50'"),
+    (lambda x: hmsa_ros.Actuator(law='yeoh', shear_modulus=1e4), 'whose constants it follows'),
+    (lambda x: hmsa_ros.Actuator(flux_density_limits=(1, -1)), 'the least below the largest'),
+    (lambda x: hmsa_ros.Actuator(slew_limit=0.0), 'or inf for steps'),
+    (lambda x: hmsa_ros.Actuator.from_yaml(5), 'path is 5: expected the path'),
+    (lambda x: hmsa_ros.Actuator.from_yaml('nothing.yaml'), 'cannot be read'),
+    (lambda x: x.replace(stiffness=1.0), 'stiffness is no parameter'),
+    (lambda x: x.scaled(law=1.0), 'law has no factor'),
+    (lambda x: x.plan(1.1), r'setpoints have the shape \(\)'),
+    (lambda x: x.plan([('a', 'b')]), 'expected pairs of stretch and duration'),
+    (lambda x: x.plan([(1.1, 0.5)], shaper=3), 'shaper is 3'),
+    (lambda x: x.plan([(1.1, 0.5)], limits='0.1 T'), "limit is '0.1 T': expected a number in T"),
+    (lambda x: x.plan([(1.1, 0.0005)]), 'takes 0.00165'),
+    (lambda x: x.plan([(1.1, 0.5)]).simulate(truth=1.1), 'truth is 1.1: expected an Actuator'),
+    (lambda x: x.plan([(1.1, 0.5)]).simulate(noise=-1), 'noise is -1'),
+    (lambda x: x.plan([(1.1, 0.5)]).currents(0.0), 'expected a number above 0 T/A'),
+    (lambda x: x.plan([(1.1, 0.5)]).plot('a.bmp'), 'expected a name that ends in'),
+    (lambda x: x.plan([(1.1, 0.5)]).plot(size=1), 'pictures have size'),
+    (lambda x: x.plan([(1.1, 0.5)]).report()['nothing'], "no column 'nothing'"),
+    (lambda x: x.simulate([(0.1, 0.0), (0.0, 0.1)]), 'increasing times from 0 s on'),
+    (lambda x: x.simulate([(0.0, 0.01)], rate=0), 'rate is 0 Hz'),
+    (lambda x: x.amplifiers([(1.1, 0.5)], inductance=1e-3), 'tesla_per_ampere is missing'),
+    (lambda x: hmsa_ros.identify([(0.0, 1.0)]), 'commands are missing'),
+    (lambda x: hmsa_ros.compare(1, 2), 'expected two motions or more'),
+    (lambda x: hmsa_ros.read(3), 'path is 3: expected the folder of a bag'),
+    (lambda x: hmsa_ros.read('nothing'), 'does not exist'),
+])
+def test_wrong_types_units_and_ranges_get_a_sentence(block, tmp_path, monkeypatch, call, said):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(hmsa_ros.HmsaError, match=said) as found:
+        call(block)
+    assert '\n' not in str(found.value)
+
+
+def test_a_notebook_shows_tables_and_pictures(block, tmp_path):
+    plan = block.plan([(1.1, 0.02)])
+    motion = plan.simulate()
+    for thing in (block, plan, motion, plan.report()):
+        assert thing._repr_html_().startswith('<table>')
+    figure = motion.plot(tmp_path / 'motion.svg', width=85, data=True)
+    assert figure._repr_png_().startswith(b'\x89PNG')
+    assert (tmp_path / 'motion.csv').read_text().startswith('panel,curve,')
+    page = tmp_path / 'motion.html'
+    motion.report(page)
+    assert '<h1>simulated</h1>' in page.read_text()
+    table = Table(
+        (Column('a<b', 'T', '.2f'), Column('what')), ((1.0, 'x'), (None, 'y')), 'c', ('n',))
+    assert '<th>a&lt;b (T)</th>' in table._repr_html_()
+    assert str(table).splitlines() == [
+        'a<b (T)  what', '───────  ────', '   1.00  x', '      –  y', 'c', 'note: n']
+
+
+# -- the commands that use it -------------------------------------------------------------------
+
+@pytest.fixture
+def files(block, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    block.to_yaml('actuator.yaml')
+    block.plan([(1.1, 0.05), (1.0, 0.05)]).save('levels.csv')
+    return tmp_path
+
+
+def test_the_command_simulates_levels_and_writes_them_for_matlab(block, files, capsys):
+    assert main([
+        'simulate', 'levels.csv', '--params-file', 'actuator.yaml', '--out', 'run.mat',
+        '--picture', 'run.svg', '--width', '85', '--until', '0.1', '--json']) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said['files'] == ['run.mat', 'run.svg']
+    assert [x['verdict'] for x in said['rows']] == ['arrived', 'arrived']
+    matrix = loadmat(files / 'run.mat')
+    motion = block.simulate(Path('levels.csv'), until=0.1)
+    assert np.array_equal(matrix['stretch'].ravel(), motion.stretches)
+    assert matrix['level_flux_density'].ravel() == pytest.approx(motion.levels[:, 1])
+    assert main(['simulate', 'levels.csv', '--params-file', 'actuator.yaml']) == 0
+    assert 'vibration (%)' in capsys.readouterr().out
+
+
+def test_the_plan_names_units_currents_and_amplifiers(files, capsys):
+    assert main([
+        'plan', '1.1:0.5', '--params-file', 'actuator.yaml', '--amplifier', '--inductance', '5mH',
+        '--resistance', '2', '--tesla-per-ampere', '20mT/A']) == 0
+    said = capsys.readouterr().out
+    for name in ('span (s)', 'flux_density_p (T)', 'time_p (s)', 'current_1 (A)', 'slew (T/s)',
+                 'bandwidth (Hz)', 'voltage (V)'):
+        assert name in said
+    # 200 T/s at 0.02 T/A: 10 kA/s through 5 mH, and 6.48 A through 2 ohm.
+    row = next(x.split() for x in said.splitlines() if x.split()[:2] == ['200', 'inf'])
+    assert [float(row[i]) for i in (2, 5, 7)] == pytest.approx([1.975, 6.48, 63.0], rel=1e-3)
+
+
+def test_a_law_is_chosen_by_option(files, capsys):
+    law = 'mooney_rivlin:c10=12kPa,c01=3kPa'
+    assert main(['plan', '1.1:10', '--law', law, '--zeta', '0.1', '--json']) == 0
+    alone = json.loads(capsys.readouterr().out)['segments'][0]
+    assert main(['init', '--law', law, '--zeta', '0.1', '--half-length', '5mm', '--yes', '--out',
+                 'law.yaml']) == 0
+    capsys.readouterr()
+    assert main(['plan', '1.1:10', '--params-file', 'law.yaml', '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['segments'][0]['beta_p'] == pytest.approx(
+        alone['beta_p'], rel=1e-9)
+
+
+@pytest.mark.parametrize(('words', 'said'), [
+    (['plan', '1.1:0.5'], 'if seconds were meant, name the actuator with --params-file'),
+    (['plan', '1.1:10', '--law', 'rubber'], 'expected one of gent'),
+    (['plan', '1.1:10', '--law', 'yeoh:c10'], 'expected KEY=VALUE'),
+    (['plan', '1.1:10', '--law', 'gent', '--params-file', 'actuator.yaml'], 'both --params-file'),
+    (['plan', '1.1:10', '--amplifier'], 'expected --params-file with it'),
+    (['plan', '1.1:1', '--inductance', '-5mH'], 'expected more than 0 H'),
+    (['init', '--beam', '--law', 'yeoh:c10=1kPa', '--yes', '--out', 'b.yaml'], 'with --beam'),
+    (['init', '--law', 'yeoh:c10=1kPa', '--j-lim', '5', '--yes', '--out', 'b.yaml'], 'constants'),
+    (['simulate', 'nothing.csv'], 'nothing.csv cannot be read'),
+    (['simulate', 'levels.csv', '--noise', '-1'], 'noise is -1'),
+    (['simulate', 'levels.csv', '--out', 'run.txt'], 'expected a name that ends in .csv'),
+    (['compare', 'one'], 'expected two runs or more'),
+    (['compare', 'one', 'two'], 'one does not exist'),
+    (['export', 'one', '--out', 'run.mat'], 'one does not exist'),
+    (['stop', '--timeout', '0'], 'timeout is 0'),
+    (['param', 'get', 'planner', '--timeout', '0'], 'timeout is 0'),
+    (['param', 'set', 'planner', 'shaper'], 'required: VALUE'),
+])
+def test_bad_input_of_the_commands_is_one_line_with_status_2(files, capsys, words, said):
+    try:
+        status = main(words)
+    except SystemExit as end:
+        status = end.code
+    found = capsys.readouterr()
+    assert (status, found.out) == (2, '')
+    assert found.err.startswith('hmsa: error: ')
+    assert found.err.count('\n') == 1
+    assert said in found.err
+
+
+@pytest.mark.ros
+def test_parameters_change_and_a_stop_comes_to_rest_without_ros2(start, ros):
+    start.hmsa('planner', '--ros-args', '-p', 'lead_time:=0.5')
+    start.hmsa('plant')
+
+    def said(*words):
+        done = start.hmsa(*words, '--timeout', '100')
+        assert done.wait(150.0) == 0, done.output
+        return done.stdout
+
+    assert said('param', 'get', 'planner', 'shaper') == "shaper: 'two_step'\n"
+    assert said('param', 'set', 'planner', 'shaper', 'robust') == 'shaper: robust (was two_step)\n'
+    assert 'was 0.0' in said('param', 'set', 'planner', 'slew_limit', '20')
+    # Constants first: a law without them is none.
+    for name, value in (('law.c10', '5e3'), ('law.c20', '200'), ('law.name', 'yeoh')):
+        said('param', 'set', 'planner', name, value)
+    refused = start.hmsa('param', 'set', 'planner', 'shaper', 'nonsense', '--timeout', '100')
+    assert refused.wait(150.0) == 2
+    assert 'expected one of two_step' in refused.stderr
+    said('send', '1.1:300', '1.2:300')
+    assert said('stop').startswith('stopped: ')
