@@ -117,8 +117,8 @@ setup(
     version=VERSION,
     packages=find_packages(include=[PACKAGE, PACKAGE + '.*', 'hmsa_studies', 'hmsa_studies.*']),
     package_data={PACKAGE: [
-        'fastdds.xml', 'fastdds_localhost.xml', 'motion/_motion.pyi', 'py.typed', 'report/page.css',
-        'report/page.js', 'report/style.mplstyle',
+        'fastdds.xml', 'fastdds_localhost.xml', 'motion/_motion.pyi', 'py.typed',
+        'report/page.css', 'report/page.js', 'report/style.mplstyle',
         *(f'cli/completion.{x}' for x in ('bash', 'zsh', 'fish')),
         *(os.path.relpath(x, os.path.join(HERE, PACKAGE)) for x in sorted(glob(
             os.path.join(HERE, PACKAGE, 'motion', 'hmsa', '*.hpp'))))]},
