@@ -13,9 +13,9 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         'export', help='write the samples and levels of a run as CSV, Parquet or Matlab file',
         description='Write the samples of a run (time in s from the first sample, stretch, '
-                    'stretch rate in 1/s, flux density in T) to FILE, and its levels (time in s, flux '
-                    'density in T) to a second file whose name ends in _levels; a Matlab file '
-                    'contains both.',
+                    'stretch rate in 1/s, flux density in T) to FILE, and its levels (time in s, '
+                    'flux density in T) to a second file whose name ends in _levels; a Matlab '
+                    'file contains both.',
         epilog='example: hmsa export hmsa_demo/run --out run.csv')
     parser.add_argument(
         'run_path', type=Path, metavar='RUN', help='folder of a bag, or an .mcap file')
