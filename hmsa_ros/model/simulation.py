@@ -204,7 +204,7 @@ class ActuatorSimulation:
     --------
     >>> from hmsa_ros.model.parameters import paper_actuator
     >>> block = ActuatorSimulation(paper_actuator())
-    >>> block.command(0, 0.02)
+    >>> lateness = block.command(0, 0.02)
     >>> block.advance(200_000_000)
     >>> print(f'{block.stretch:.3f}')
     1.056
