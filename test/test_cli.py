@@ -104,7 +104,7 @@ def test_send_reports_until_the_sequence_has_been_carried_out(start, ros):
     # Nobody carries it out yet.
     send = start.hmsa('send', '1.1:0.05', '--wait', '--timeout', '200')
     assert send.wait(300.0) == 1, send.output
-    assert 'not carried out: nobody subscribes to /flux_density_command' in send.stderr
+    assert 'not carried out: no node subscribes to /flux_density_command' in send.stderr
     start.hmsa('plant')
     ros.spin_until(lambda: ros.node.count_publishers('joint_states'), 'the plant')
     send = start.hmsa('send', '1.0:0.5', '1.1:0.1', '1.2:0.1', '--wait', '--timeout', '200')
@@ -139,7 +139,7 @@ def test_send_trusts_a_driver_that_publishes_samples_alone(start, ros):
     ros.spin_until(lambda: ros.node.count_publishers('flux_density_command'), 'the planner')
     send = start.hmsa('send', '1.1:0.1', '--wait')
     assert send.wait(30.0) == 1, send.output
-    assert 'nobody reports levels that take effect' in send.stderr
+    assert 'no node reports applied levels' in send.stderr
     endpoints.publisher(ros.node, topics.JOINT_STATES)
     send = start.hmsa('send', '1.2:0.1', '--wait')
     assert send.wait(30.0) == 0, send.output

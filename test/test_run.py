@@ -136,7 +136,7 @@ def test_commands_that_nobody_takes_fail_before_anything_is_sent(start, tmp_path
     start.hmsa('planner')
     run = start.hmsa('run', '1.1:0.1', '--out', str(tmp_path / 'out'))
     assert run.wait(RUN_SECONDS) == 1
-    assert 'nobody takes the commands' in run.stderr
+    assert 'no node receives the commands' in run.stderr
     assert not (tmp_path / 'out' / 'run').exists()
 
 

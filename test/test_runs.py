@@ -60,7 +60,7 @@ def moved(*, applied=True, commands=((10, 0.01),), creep=None, told=None):
 def test_a_command_that_nobody_applied_is_said_though_the_motion_fits():
     found = verify_run(moved(applied=False))
     assert (found.largest_difference, found.unapplied_count) == (0.0, 1)
-    assert 'nobody applied them' in found.note
+    assert 'no node applied them' in found.note
     found = verify_run(moved())
     assert (found.unapplied_count, found.note) == (0, '')
     assert found.largest_difference < 1e-12

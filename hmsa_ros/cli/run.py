@@ -164,11 +164,12 @@ def _verdict(
     from hmsa_ros.judge import worst
 
     if experiment.levels or not done.measured:
-        nobody = 'nobody publishes joint_states' if not done.measured else 'the levels end at rest'
+        reason = ('the levels end at rest' if done.measured
+                  else 'no node publishes joint_states')
         if done.verdict.failure:
             return done.verdict.measured or done.verdict.code, done.verdict.failure
         return done.verdict.measured or NOT_MEASURED, (
-            done.verdict.finding or f'{NOT_MEASURED}: {nobody}')
+            done.verdict.finding or f'{NOT_MEASURED}: {reason}')
     count = len(experiment.setpoints) * len(experiment.joints)
     found = worst(findings)
     if found is None or len(findings) < count:

@@ -155,7 +155,7 @@ class Lateness:
         elif self.earliest:
             said = f'commands take effect up to {self.earliest / 1e6:.3g} ms early'
         else:
-            return 'commands are lost, or overridden by somebody else'
+            return 'commands are lost, or overridden by another publisher'
         if self.cost < _NOTHING:
             return f'{said}, all alike, which leaves no vibration'
         return f'{said}: some {100.0 * self.cost:.2g} % of the step of residual vibration'
@@ -163,13 +163,13 @@ class Lateness:
     def advice(self, lead_time: int) -> str:
         """Return what helps, the rest of a sentence; commands are sent `lead_time` ns ahead."""
         if not self.largest:
-            return 'let the driver apply commands at their stamps' if self.earliest else (
-                'see who else publishes commands, or what drops them')
+            return 'let the driver apply commands at their timestamps' if self.earliest else (
+                'find out which other node publishes commands, or what drops them')
         by_driver = self._by_driver()
         if by_driver:
             return (
-                'the driver applies them so long after their stamps however early they are sent, '
-                'so a larger lead_time does not help: ' + (
+                'the driver applies them this long after their timestamps however early they are '
+                'sent, so a larger lead_time does not help: ' + (
                     'nothing needs to be done, but it may write that much earlier'
                     if self.cost < _NOTHING else 'have it write at more even times'))
         needed = (lead_time + self.largest) / NANOSECONDS

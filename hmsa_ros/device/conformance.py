@@ -383,7 +383,7 @@ class Trial:
         bench.run(0.2, [self._level])
         bench.probe.fails = True
         bench.run(0.5)
-        failure = str(bench.worker.failure or 'nobody noticed')
+        failure = str(bench.worker.failure or 'not noticed')
         bench.worker.close()
         self._check_end('off_at_exception', 'after an exception', 'is switched off' in failure,
                         failure)

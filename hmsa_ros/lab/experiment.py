@@ -342,16 +342,17 @@ class _Watch:
                     f'{spec.name} is {other} for the planner and {own} for the plant')
         self.client.spin_until(
             lambda: not self.client.unheard(),
-            f'nobody takes the commands on {", ".join(self.client.unheard()) or "their topics"}: '
+            'no node receives the commands on '
+            f'{", ".join(self.client.unheard()) or "their topics"}: '
             'expected a plant or a driver of the coil (hmsa plant)')
         joints = self._experiment.joints
         if not self.client.node.count_publishers(
                 topics.of_joint(topics.FLUX_DENSITY_APPLIED, joints[0], joints).name):
             self.notes.append(
-                'nobody reports the levels that take effect (flux_density_applied)')
+                'no node reports the applied levels (flux_density_applied)')
             if not self.measured:
                 raise HmsaError(
-                    'nobody reports levels that take effect (flux_density_applied) or samples '
+                    'no node reports applied levels (flux_density_applied) or samples '
                     '(joint_states): expected a plant or a driver that does')
 
     def look(self, end: float) -> None:
@@ -378,8 +379,8 @@ class _Watch:
             raise HmsaError('the planner has gone: expected it to run until the end')
         if unheard := self.client.unheard():
             raise HmsaError(
-                f'nobody takes the commands on {", ".join(unheard)} any more: expected plant or '
-                'driver to run until the end')
+                f'no node receives the commands on {", ".join(unheard)} any more: expected plant '
+                'or driver to run until the end')
         if now > end:
             self._over = self._over or moment
             if moment - self._over > _GRACE_SECONDS:

@@ -54,14 +54,14 @@ class JointChannel:
         if not self._applied:
             return ''
         if not self._command.get_subscription_count():
-            return f'nobody subscribes to {self._command.topic_name}: start a plant or a driver'
+            return f'no node subscribes to {self._command.topic_name}: start a plant or a driver'
         if not self._node.count_publishers(self._received):
             # Who listens now gives no receipts.
             self._runtime.hearing.receipts.forget(self._joint)
         if not self._node.count_publishers(self._applied) and not self._node.count_publishers(
                 topics.JOINT_STATES.name):
             return (
-                f'nobody reports levels that take effect ({self._applied}) or samples '
+                f'no node reports applied levels ({self._applied}) or samples '
                 '(joint_states): start a plant, or a driver that does')
         return ''
 

@@ -225,6 +225,6 @@ def _notes(run: Run, left_out: int, unapplied: int) -> Iterator[str]:
                'that size, from the first sample on')
     if unapplied:
         yield (f'{unapplied} commands never took effect, as {run.topics[APPLIED]} shows: '
-               'nobody applied them')
+               'no node applied them')
     if left_out:
         yield f'left out: {left_out} of the messages, since they are not what their topic is for'
