@@ -55,6 +55,9 @@ BAD_OF_A_NODE = {
         'unknown_choice': (
             ['--ros-args', '-p', 'shaper:=zigzag'],
             "parameter shaper is 'zigzag': expected one of two_step"),
+        'nothing_to_estimate': (
+            ['--ros-args', '-p', 'feedback_parameters:=[]'],
+            'parameter feedback_parameters: free parameter missing: expected some of'),
         'limits_out_of_order': (
             ['--ros-args', '-p', 'flux_density_max:=-0.6'],
             'flux_density_min is -0.5 T: expected less than flux_density_max'),

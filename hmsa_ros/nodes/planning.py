@@ -233,10 +233,17 @@ def settings_from(values: JointParameters) -> Settings:
         'heartbeat_period', 'lateness_tolerance', 'takeover_timeout', 'takeover_max_age')}
     return Settings(
         **plain, **times,
-        feedback_parameters=check_free(values['feedback_parameters']),
+        feedback_parameters=_free(values),
         known=values.each(lambda _, own: Known.read(own)),
         tolerances=Tolerances(*(values[f'{x}_tolerance'] for x in (
             'arrival', 'vibration', 'stretch'))))
+
+
+def _free(values: JointParameters) -> tuple[str, ...]:
+    try:
+        return check_free(values['feedback_parameters'])
+    except BadInputError as error:
+        raise BadInputError(f'parameter feedback_parameters: {error}') from error
 
 
 def group_from(values: JointParameters) -> PlannerGroup:
