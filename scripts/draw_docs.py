@@ -302,8 +302,8 @@ def adapting(path: Path) -> None:
 
 
 def moves(path: Path) -> None:
-    """Draw what the page on bags in a notebook draws, by its own code."""
-    page = (ROOT / 'docs' / 'tutorials' / 'bags-in-a-notebook.md').read_text(encoding='utf-8')
+    """Draw the figure of the guide to bags, by its own code."""
+    page = (ROOT / 'docs' / 'guides' / 'bags.md').read_text(encoding='utf-8')
     code, = re.findall(r'```python\n(import matplotlib.*?)```', page, flags=re.DOTALL)
     run = simulated((1.2, 0.3), (0.9, 0.3), (1.0, 0.3), rate=1000.0)
     names = {
