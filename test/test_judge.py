@@ -70,6 +70,19 @@ def test_the_rest_of_the_hold_counts():
     assert judge(time, kicked, setpoint(end=1600 * MS)).arrived
 
 
+@pytest.mark.parametrize('begin', [0.075, 0.1, 0.11, 0.15])
+def test_a_vibration_that_begins_while_it_is_held_is_not_arrived(begin):
+    time, stretch = held(noise=0.02, seconds=0.2)
+    after = np.maximum(time / 1e9 - begin, 0.0)
+    kicked = stretch + 0.02 * STEP * np.exp(-DECAY * after) * np.sin(OMEGA * after)
+    assert judge(time, kicked, setpoint(end=200 * MS)).verdict in ('undecided', 'vibrating')
+
+
+def test_all_samples_count_however_many_there_are():
+    assert judge(*held(noise=4.0, seconds=0.1), setpoint()).verdict == 'undecided'
+    assert judge(*held(noise=4.0, seconds=0.1, rate=100_000), setpoint()).arrived
+
+
 @pytest.mark.parametrize('seconds', [0.025, 0.08])
 @pytest.mark.parametrize(('creep', 'vibration', 'verdict'), [
     (1.5, 1.0, 'arrived'), (6.0, 0.0, 'off_target'), (1.5, 5.0, 'vibrating')])
@@ -104,6 +117,7 @@ def test_what_is_known_of_the_sensor_counts():
 
 @pytest.mark.parametrize(('samples', 'words'), [
     ({'seconds': 0.01}, 'expected at least a hold of 0.023 s'),
+    ({'seconds': 0.0005}, 'expected at least 115 samples a second'),
     ({'rate': 100, 'seconds': 0.05}, 'expected at least 200 samples a second'),
     ({'noise': 4.0}, 'times as many samples')])
 def test_undecided_says_what_would_decide(samples, words):

@@ -30,11 +30,13 @@ Stamps = NDArray[np.int64]
 
 #: Periods of the vibration in one look, and samples where they are rare.
 PERIODS, ENOUGH = 6, 24
-# Samples that count of each period at most.
-_KEPT = 40
+# Parts of a period of which the samples count as one.
+_KEPT = 32
 # Whatever stays nearer to the target than this share of a tolerance, as a root mean square, is
 # within it.
 _QUIET = 0.3
+# Noise of a period from peak to peak, in standard deviations, that is hardly ever exceeded.
+_PEAKS = 7.0
 # How much wider than for an arrival the bounds are for a miss.
 _SURER = 1.5
 # Changes from sample to sample of so small a share of the step are those of a motion that fades.
@@ -99,25 +101,43 @@ def _judged(
     if not count:
         return unobserved(setpoint)
     stamps, values = _thinned(stamps[held], values[held], begin, setpoint)
-    first, *later = _looks(stamps, begin, setpoint)
-    quiet = _QUIET * min(tolerances.of(setpoint))
-    looks = [first, *(
-        x for x in later if np.mean(np.square(values[x] - setpoint.target)) > quiet**2)]
+    allowed, swing = tolerances.of(setpoint)
+    quiet = _QUIET * min(allowed, swing)
     findings: list[Finding] = []
-    for number, part in enumerate(looks):
+    noise = math.inf
+    for number, part in enumerate(_looks(stamps, begin, setpoint)):
+        rest = values[part] - setpoint.target
+        moves = number > 0 and (
+            _largest(stamps[part], rest, setpoint) - _PEAKS * noise > swing)
+        if number and not moves and np.mean(np.square(rest)) <= quiet**2:
+            continue
         # Later looks see the vibration from their own beginning on.
         origin = int(stamps[part][0]) if number else begin
         seconds = ((stamps[part] - origin) / NANOSECONDS).astype(np.float64)
-        rest = values[part] - setpoint.target
         shown = fit(seconds, rest, setpoint.frequency, setpoint.decay)
         if shown is not None:
             findings.append(_decided(
-                shown, len(rest), setpoint, tolerances, sensor, later=number > 0))
+                shown, len(rest), setpoint, tolerances, sensor,
+                # What has come to rest is taken to do so until it is seen to move.
+                rests=not moves if number else shown.vibration.high <= swing))
+            noise = min(noise, shown.noise)
         elif not number:
             findings.append(_too_few(setpoint, stamps[part]))
     # Of equal ones the first look, which shows the vibration; else the one that is farthest off.
     return max(
         findings, key=lambda x: (VERDICTS.index(x.verdict), x is findings[0], x.rank[1]))
+
+
+def _largest(stamps: Stamps, rest: Array, setpoint: Setpoint) -> float:
+    """Return the largest motion from peak to peak in a period of a look."""
+    period = round(period_of(setpoint) * NANOSECONDS)
+    most = 0.0
+    # What half a period shows is in one period or in one that begins half of it later.
+    for begin in (stamps[0], stamps[0] - period // 2):
+        _, first = np.unique((stamps - begin) // period, return_index=True)
+        swings = np.maximum.reduceat(rest, first) - np.minimum.reduceat(rest, first)
+        most = max(most, float(np.max(swings)))
+    return most
 
 
 def rests_from(setpoint: Setpoint) -> int:
@@ -189,10 +209,12 @@ def _frozen(values: Array, setpoint: Setpoint) -> str:
 
 def _thinned(
         stamps: Stamps, values: Array, begin: int, setpoint: Setpoint) -> tuple[Stamps, Array]:
-    """Return the first sample of each part of a period."""
-    cell = max(round(period_of(setpoint) * NANOSECONDS) // _KEPT, 1)
-    kept = np.diff((stamps - begin) // cell, prepend=-1) > 0
-    return stamps[kept], values[kept]
+    """Return the mean sample of each part of a period, in which the vibration hardly changes."""
+    part = max(round(period_of(setpoint) * NANOSECONDS) // _KEPT, 1)
+    _, first, counts = np.unique(
+        (stamps - begin) // part, return_index=True, return_counts=True)
+    after = np.add.reduceat(stamps - begin, first) // counts
+    return begin + after, np.add.reduceat(values, first) / counts
 
 
 def _looks(stamps: Stamps, begin: int, setpoint: Setpoint) -> Iterator[slice]:
@@ -222,6 +244,8 @@ def _too_few(setpoint: Setpoint, stamps: Stamps) -> Finding:
     """Return the finding where there are samples, and what more there should be."""
     span = float(stamps[-1] - stamps[0]) / NANOSECONDS if len(stamps) else 0.0
     least = 2.0 * period_of(setpoint)
+    if len(stamps) < 2:
+        span = PERIODS * period_of(setpoint)
     wanted = (f'a hold of {least:.2g} s' if span < least
               else f'{FEWEST / span:.3g} samples a second')
     return Finding(
@@ -235,15 +259,14 @@ def _too_few(setpoint: Setpoint, stamps: Stamps) -> Finding:
 
 def _decided(
         found: Fit, count: int, setpoint: Setpoint, tolerances: Tolerances,
-        sensor: Sensor, *, later: bool) -> Finding:
+        sensor: Sensor, *, rests: bool) -> Finding:
     offset, vibration = _widened(found.offset, sensor.std(setpoint.target)), found.vibration
     allowed, swing = tolerances.of(setpoint)
     # One of several looks is enough for a miss, so that each has to be surer.
     off = offset.value - _SURER * (offset.value - offset.low) > allowed or (
         offset.value + _SURER * (offset.high - offset.value) < -allowed)
     vibrates = vibration.value - _SURER * (vibration.value - vibration.low) > swing
-    # What has come to rest is taken to do so until it is seen to vibrate.
-    within = max(-offset.low, offset.high) <= allowed and (later or vibration.high <= swing)
+    within = max(-offset.low, offset.high) <= allowed and rests
     code = (Code.OFF_TARGET if off else Code.VIBRATING if vibrates
             else Code.ARRIVED if within else Code.UNDECIDED)
     frequency = found.frequency / (2.0 * math.pi) if vibration.low > 0.0 else math.nan
