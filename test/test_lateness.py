@@ -95,10 +95,11 @@ class Bench:
         return 200.0 * math.hypot(stretch - target, rate / frequency) / step
 
     def mean(self, targets=TARGETS):
-        starts = (1.0, *targets)
+        # The last one is held on, in which it may still be put right.
+        starts, ends = (1.0, *targets), (*range(1, len(targets)), len(targets) + 1)
         return float(np.mean([
-            self.left(x, abs(x - start), self.begin + (i + 1) * self.span - 1)
-            for i, (x, start) in enumerate(zip(targets, starts, strict=False))]))
+            self.left(x, abs(x - start), self.begin + end * self.span - 1)
+            for x, start, end in zip(targets, starts, ends, strict=False)]))
 
     @property
     def status(self):
@@ -111,7 +112,7 @@ class Bench:
 def sequence(unit, lead, write, **more):
     bench = Bench(unit, lead, write=write, **more)
     assert bench.go().severity is Severity.OK
-    bench.run(lead + 4 * bench.span)
+    bench.run(lead + 5 * bench.span)
     return bench
 
 
@@ -207,10 +208,11 @@ def test_deciding_is_as_good_as_doing_nothing_and_as_always_replanning(monkeypat
         median = {x: float(np.median([case[x] for case in cases])) for x in cases[0]}
         print(f'{kind:10}', {key: round(value, 2) for key, value in median.items()})
         assert median['decide'] <= min(median['nothing'], median['always']) + 0.5
+        # Where all are late by chance, commands of a new plan have other chances.
         worse += [
-            (kind, seed) for seed, x in enumerate(cases) if x['decide'] > x['nothing'] + 0.5]
-    # Where all are late by chance, chance decides.
-    assert len(worse) <= 0.015 * sum(map(len, rows.values())), worse
+            (kind, seed) for seed, x in enumerate(cases)
+            if x['decide'] > x['nothing'] + 0.5 and kind != 'jitter']
+    assert len(worse) <= 0.01 * sum(map(len, rows.values())), worse
 
 
 # -- lateness by its cost -----------------------------------------------------------------------

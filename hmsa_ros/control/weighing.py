@@ -25,9 +25,10 @@ from hmsa_ros.planning.timeline import Draft, Plan, PlannedLevel
 LEAST_STEP = 0.1
 #: Residual vibration from peak to peak, as a share of the step, from which on it counts.
 SHARE = 5e-3
-# How much less a new plan is to leave, and how much more it may. After an exception: which share
-# of the gain it may leave more, and which share of what is there, once no more will be known.
-_GAIN, _RISK, _CLEARLY = 5e-3, 0.2, 0.5
+# How much less a new plan is to leave, beyond so many deviations over the ways. After an
+# exception: which share of the gain it may leave more, and which share of what is there, once no
+# more will be known.
+_GAIN, _SURE, _RISK, _CLEARLY = 5e-3, 3.0, 0.2, 0.5
 # What stands for a motion that cannot be predicted.
 _LOST = 1e3
 # Setpoints that are looked at, how far ahead the next one may begin, units of time that may be
@@ -156,11 +157,14 @@ def worthwhile(
     """
     Return whether to take a draft, by what is left without it and with it in several ways.
 
-    It must do no harm in any way. Where the newest command was an exception (``unsure``), a little
-    is allowed; once there will be no ``news`` in time, it is enough that much less is left.
+    It must do no harm in any way, or by chance in one that was not tried. Where the newest command
+    was an exception (``unsure``), a little is allowed; once there will be no ``news`` in time, it
+    is enough that much less is left.
     """
     gain = before - after
     mean, harm = float(gain.mean()), float(-gain.min())
     if unsure and not news:
         return mean >= max(_GAIN, (1.0 - _CLEARLY) * float(before.mean()))
-    return mean >= _GAIN >= harm - _RISK * mean * unsure
+    if unsure:
+        return mean >= _GAIN >= harm - _RISK * mean
+    return mean >= _GAIN + _SURE * float(gain.std())
