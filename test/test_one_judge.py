@@ -9,16 +9,23 @@ import numpy as np
 import pytest
 
 from hmsa_ros.control.planner import PlannerRuntime
-from hmsa_ros.control.records import PlanChanged, Send, Settings, StatusChanged, Trajectory
+from hmsa_ros.control.records import (
+    EstimateChanged,
+    PlanChanged,
+    Send,
+    Settings,
+    StatusChanged,
+    Trajectory,
+)
 from hmsa_ros.device.sensor import SensorErrors
 from hmsa_ros.device.simulated import SimulatedDevice, SimulatedJoint
-from hmsa_ros.judge import VERDICTS
+from hmsa_ros.judge import Sensor, VERDICTS
 from hmsa_ros.model.actuators import Setup
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Options, Planner
 from hmsa_ros.recordings.levels import Level
-from hmsa_ros.recordings.record import RecordedRequest, Run, Verdict
+from hmsa_ros.recordings.record import LearntSensor, RecordedRequest, Run, Verdict
 from hmsa_ros.report.outcome import findings_of
 
 MS = 1_000_000
@@ -35,6 +42,10 @@ class Drawn:
         real = replace(block, shear_modulus=block.shear_modulus * draw.choice(
             [1.0, 1.0, 1.005, 1.02, 1.1]))
         rate = draw.choice([100, 500, 1000])
+        more = random.Random(f'{seed} more')
+        # How samples come: as they are, in no order, with some lost, or from a clock ahead.
+        self.way = more.choice(['', '', 'unordered', 'lost', 'ahead'])
+        self.chance = more
         self.device = SimulatedDevice(
             [SimulatedJoint(Setup(real, real.rest), errors=SensorErrors(
                 stretch_noise=draw.choice([0.0, 1e-4, 1e-3, 3e-3])))],
@@ -43,7 +54,8 @@ class Drawn:
         self.runtime = PlannerRuntime(
             PlannerGroup({'a': Planner(block, Options(
                 flux_density_min=-0.5, flux_density_max=0.5, lead_time=50 * MS))}),
-            Settings(takeover_timeout=0), clock=lambda: self.now, steady=lambda: self.now)
+            Settings(takeover_timeout=0, feedback=more.choice(['off', 'off', 'adapt'])),
+            clock=lambda: self.now, steady=lambda: self.now)
         self.runtime.active = True
         hold = draw.choice([20, 60, 100, 200]) * MS
         self.late_for = draw.choice([20, 100, 400]) * MS
@@ -53,6 +65,7 @@ class Drawn:
         self.late = draw.choice([0, 0, draw.randint(1, 120)]) * MS
         self.late_from = START + draw.randint(0, hold * len(self.points) // MS) * MS
         self.online: dict[int, str] = {}
+        self.waiting: list[tuple[int, float]] = []
         self.record = Run(
             'run', 'a', Path('run'), *([np.zeros(1, dtype=np.int64)] * 2), *([np.zeros(1)] * 3),
             requests=(RecordedRequest(START, 0, tuple((x, y) for (x,), y in self.points)),),
@@ -61,7 +74,7 @@ class Drawn:
     def carry_out(self) -> Run:
         """Carry it out and return what a recorder would have seen of it."""
         self.runtime.request(Trajectory(('a',), self.points, len(self.points), name='x'))
-        plans, commands, verdicts, samples = [], [], [], []
+        plans, commands, verdicts, samples, sensors = [], [], [], [], []
         under_way: list[tuple[int, Send]] = []
         end = START + self.points[-1][1] + 1500 * MS
         while self.now < end:
@@ -75,6 +88,9 @@ class Drawn:
                         Level(stamp, level, self.now, stretch, speed) for stamp, (
                             stretch, speed, level) in zip(
                                 x.stamps, x.samples['a'], strict=True)))
+                elif isinstance(x, EstimateChanged):
+                    sensors.append(LearntSensor(self.now, Sensor.of(
+                        {key: str(value) for key, value in x.values.items()})))
                 elif isinstance(x, StatusChanged):
                     verdicts.append(Verdict(
                         self.now, LEVELS[x.verdict.severity], x.verdict.code, x.verdict.message,
@@ -90,16 +106,30 @@ class Drawn:
             self.device.advance(self.now)
             for x in self.device.changes():
                 self.runtime.applied('a', x.stamp, x.level)
-            for x in self.device.samples():
-                samples.append((x.time, x.stretch[0]))
-                if self.runtime.looks_at(x.time):
-                    self.runtime.observed('a', x.time, x.stretch[0], math.nan, math.nan)
-        time, stretch = map(np.array, zip(*samples, strict=True))
+            for stamp, value in self.shown():
+                samples.append((stamp, self.now, value))
+                if self.runtime.looks_at(stamp):
+                    self.runtime.observed('a', stamp, value, math.nan, math.nan)
+        time, logged, stretch = map(np.array, zip(*sorted(samples), strict=True))
         unknown = np.full(len(time), math.nan)
         return replace(
-            self.record, time=time, logged=time, stretch=stretch, rate=unknown,
+            self.record, time=time, logged=logged, stretch=stretch, rate=unknown,
             flux_density=unknown, commands=tuple(commands), plans=tuple(plans),
-            verdicts=tuple(verdicts))
+            verdicts=tuple(verdicts), sensors=tuple(sensors))
+
+    def shown(self) -> list[tuple[int, float]]:
+        """Return the samples that come now."""
+        self.waiting += [(x.time, x.stretch[0]) for x in self.device.samples()]
+        if self.way == 'unordered' and len(self.waiting) < 7:
+            return []
+        found, self.waiting = self.waiting, []
+        if self.way == 'unordered':
+            self.chance.shuffle(found)
+        elif self.way == 'lost':
+            found = [x for x in found if self.chance.random() < 0.6]
+        elif self.way == 'ahead':
+            found = [(stamp + 300 * MS, x) for stamp, x in found]
+        return found
 
 
 def said(seeds: range) -> set[str]:
