@@ -12,7 +12,7 @@ seed of a run is its number, so that each can be drawn again.
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -28,7 +28,8 @@ KINDS = {
     'dropouts': 'dropouts', 'quantised': 'quantised', 'creep': 'creep after the arrival',
     'undamped': 'no damping', 'rare': '4 to 8 samples a period',
     'short': '1.5 to 3 periods', 'frozen': 'sensor frozen on the way',
-    'nan': 'sensor not a number', 'out': 'sensor out of range'}
+    'nan': 'sensor not a number', 'out': 'sensor out of range',
+    'unordered': 'in no order, repeated', 'edge': 'within 20 % of the tolerance'}
 #: Kinds in which part of the samples, or all, show something else than the stretch.
 BROKEN = ('frozen', 'nan', 'out')
 TOLERANCES = Tolerances(arrival=0.02, vibration=0.02, stretch=1e-3)
@@ -102,6 +103,7 @@ def draw(seed: int, kind: str) -> Trial:
     hold = period * (random.uniform(1.5, 3.0) if kind == 'short' else spread(1.5, 40.0))
     interval = period / (random.uniform(4.0, 8.0) if kind == 'rare' else spread(4.0, 200.0))
     noise = size * spread(1e-5, 0.05)
+    limit = max(0.02 * size, 1e-3)
     creeps = kind == 'creep'
     truth = Truth(
         size * float(random.choice([0.0, random.uniform(-0.1, 0.1)])),
@@ -110,6 +112,9 @@ def draw(seed: int, kind: str) -> Trial:
         0.0 if kind == 'undamped' else decay * random.uniform(0.0, 2.0),
         size * random.uniform(-0.06, 0.06) if creeps else 0.0,
         hold * spread(0.1, 3.0) if creeps else 1.0)
+    if kind == 'edge':
+        share, off = limit * random.uniform(0.8, 1.2), random.uniform() < 0.5
+        truth = replace(truth, offset=share * off, amplitude=0.5 * share * (not off))
     move = 0.6 * period
     time = np.arange(-random.uniform(1.0, 2.0) * period - move, hold, interval)
     stamps = time
@@ -137,11 +142,13 @@ def draw(seed: int, kind: str) -> Trial:
     elif kind in BROKEN:
         broken = random.uniform(size=len(stretch)) < random.choice([1.0, random.uniform()])
         stretch[broken] = math.nan if kind == 'nan' else random.choice([0.0, -1.0, 7.2, 1e6])
+    if kind == 'unordered':
+        order = random.integers(len(time), size=3 * len(time))
+        time, stamps, stretch = time[order], stamps[order], stretch[order]
     fine = np.linspace(0.0, hold, max(2, math.ceil(hold / period) * _FINE))
     means = [float(np.mean(truth.rests(x))) for x in (
         fine[fine <= _SLICE * period], fine[fine >= hold - _SLICE * period], fine)]
     vibration = float(np.ptp(truth.vibrates(fine)))
-    limit = max(0.02 * size, 1e-3)
     error = math.sqrt(
         noise ** 2 * (1.0 + correlation) / (1.0 - correlation) + quantum ** 2 / 12.0)
     within: bool | None = vibration <= limit and max(map(abs, means)) <= limit
@@ -153,7 +160,7 @@ def draw(seed: int, kind: str) -> Trial:
         model, decay, possible=(0.1, 3.0))
     return Trial(
         seed, kind, setpoint, _ARRIVAL + np.rint(1e9 * stamps).astype(np.int64), stretch, within,
-        _clarity(time[time >= 0.0], truth, error, means, vibration, limit),
+        _clarity(np.unique(time[time >= 0.0]), truth, error, means, vibration, limit),
         f'step {step:.3g}, offset {100 * truth.offset / size:.3g} %, vibration '
         f'{100 * vibration / size:.3g} %, frequency {truth.omega / model:.3g} and decay '
         f'{truth.decay / decay:.3g} of the model (decay/frequency {decay / model:.3g}), noise '
