@@ -71,7 +71,8 @@ def run(arguments: argparse.Namespace) -> int:
     _check_targets(arguments)
 
     from hmsa_ros.identification.files import file_text, read_belief
-    from hmsa_ros.identification.identify import identify, profile
+    from hmsa_ros.identification.identify import identify
+    from hmsa_ros.identification.intervals import profile
     from hmsa_ros.identification.quantities import free_of
 
     belief = read_belief(arguments.params_file)

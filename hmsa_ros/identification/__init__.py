@@ -5,7 +5,8 @@ The parameters of an actuator out of a recording of its motion.
 needs ROS.
 """
 
-from hmsa_ros.identification.identify import identify, profile
+from hmsa_ros.identification.identify import identify
+from hmsa_ros.identification.intervals import profile
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.result import Identification
 

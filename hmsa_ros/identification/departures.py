@@ -31,15 +31,16 @@ _HINT = 2.0
 # Median of chi-squared with one degree of freedom: by so much the square of a deviation is too
 # large in the median.
 _MEDIAN = 0.455
-# What a gain that nobody gave may be off, and the deviation from which on it would not show.
-_GAIN, _HIDDEN_GAIN = 0.02, 0.006
+GAIN = 'stretch_gain'
+#: Standard deviation of a gain that nobody gave, and from which deviation on it would not show.
+USUAL_GAIN, _HIDDEN_GAIN = 0.02, 0.006
 # Directions need no more than that of the integration.
 _RTOL = 1e-6
 _DELAYS = {'sensor_latency', 'coil_time_constant'}
 # Words, and what to free, by parameter.
 _PARAMETERS = {
     'coil_time_constant': 'lag of the coil', 'sensor_latency': 'latency of the sensor',
-    'stretch_gain': 'gain of the sensor'}
+    GAIN: 'gain of the sensor'}
 _FORCES = {
     places.FRICTION: 'friction that does not depend on the rate',
     places.SQUARE: 'damping by the square of the rate'}
@@ -93,8 +94,8 @@ class Departures:
 
     signatures: tuple[Signature, ...]  # the largest first
     hint: Array  # variance of the coordinates by what the residuals hint at, shape (p,)
-    considered: Array  # covariance by what they cannot show, shape (p, p)
-    hidden: bool  # whether a gain that nobody gave is among these
+    # By name what a standard deviation of what they cannot show moves the coordinates by.
+    considered: dict[str, Array]
 
 
 def departures(
@@ -117,8 +118,8 @@ def departures(
     total = float(residual @ residual)
     floor = dead_band(fit, deviation)
     single = np.sqrt(np.diag(inverse)) * deviation
-    hint, considered = np.zeros(len(fit.free)), np.zeros_like(inverse)
-    signatures, hidden = [], False
+    hint: Array = np.zeros(len(fit.free))
+    signatures, considered = [], dict[str, Array]()
     for one in _columns(fit):
         column = root * one.column
         direction = column
@@ -126,11 +127,9 @@ def departures(
             direction = direction - base @ (solved @ (base.T @ direction))
         norm, length = float(np.linalg.norm(direction)), float(np.linalg.norm(column))
         way = inverse @ (own.T @ column)
-        gain = 'stretch_gain' in one.remedy
-        if gain and 'stretch_gain' not in given and (
+        if one.remedy == GAIN and GAIN not in given and (
                 deviation / max(norm, 1e-300) > _HIDDEN_GAIN):
-            considered += np.outer(way, way) * _GAIN ** 2
-            hidden = True
+            considered[GAIN] = USUAL_GAIN * way
         if total == 0.0 or norm <= 3e-5 * length:
             continue
         direction = direction / norm
@@ -150,10 +149,9 @@ def departures(
                 hint, (way / norm) ** 2 * max(size ** 2 - _MEDIAN * spread ** 2, 0.0))
     for name, std in given.items():
         if std and name not in fit.free:
-            way = inverse @ (own.T @ (root * _change(fit, name)))
-            considered += np.outer(way, way) * std ** 2
+            considered[name] = std * (inverse @ (own.T @ (root * _change(fit, name))))
     return Departures(tuple(sorted(
-        signatures, key=lambda x: (-x.found, -x.share))), hint, considered, hidden)
+        signatures, key=lambda x: (-x.found, -x.share))), hint, considered)
 
 
 def dead_band(fit: Fit, deviation: float) -> float:

@@ -1,12 +1,13 @@
 """Whether data hold the parameters, and whether the model holds the data."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 import math
 
 import numpy as np
 
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification.departures import GAIN, USUAL_GAIN
 from hmsa_ros.identification.fit import Fit
 from hmsa_ros.identification.noise import autocorrelation, Whiteness
 from hmsa_ros.identification.quantities import (
@@ -38,6 +39,8 @@ _OUT = 0.5  # weight below which a sample does not count
 _SOON = 10  # samples after a change of level
 _CHANCE = 2e-3  # below it no chance makes residuals repeat
 _FEW_WORDS = 4  # frequencies that are named
+_FIRST_KEPT = ('density', 'chain_limit', 'stretch_gain')  # what is known soonest from elsewhere
+_WORTH_SAYING = 0.3  # deviations by which something moves a parameter
 _NUMERICAL = 1e-6  # residuals below this are those of the integration
 DISTANT = 0.1  # residual over motion from which on nothing was fitted
 # What soft actuators have, with a wide margin, in SI, and the power of the time in it.
@@ -118,10 +121,12 @@ def weakness(fit: Fit, deviation: float, factors: Array) -> Weakness | None:
     if {'shear_modulus', 'density', 'remanence'} <= set(fit.free) or (
             {'shear_modulus', 'time_unit', 'remanence'} <= set(fit.free)):
         advice = [QUANTITIES['density'].advice]
+    kept = next((x for x in _FIRST_KEPT if x in names), names[0])
     listed = '; '.join(sentences) or 'the recorded motion hardly depends on them'
     return Weakness(names, (
         f'{_listed(list(names))} cannot be identified from this recording: {listed}. Instead, '
-        f'{"; or ".join(advice[:3])}; or leave out of --free what is known'))
+        f'{"; or ".join(advice[:3])}; or keep what is known, as with --free=-{kept} or --known '
+        f'{kept}=VALUE+-STD'))
 
 
 def _change(fit: Fit, place: int, change: float, first: float) -> str:
@@ -300,14 +305,35 @@ def cost(fit: Fit, marks: Sequence[Signature], alike: Repeated | None) -> float:
     return 2.0 * math.sqrt(2.0 * share) * rms / step
 
 
-def of_gain(considered: Array, inverse: Array, deviation: float, free: Sequence[str]) -> str:
-    """Return what a gain of the sensor may do that does not show."""
-    ratio = np.sqrt(np.diag(considered) / np.diag(inverse)) / deviation
-    place = int(np.argmax(ratio))
+def considered(moves: Mapping[str, Array], std: Array, free: Sequence[str]) -> list[str]:
+    """
+    Return what is wrong perhaps and does not show, where intervals hold it, a sentence each.
+
+    Given is by name what it may move the coordinates by, and their deviations.
+    """
+    found = []
+    for name, way in moves.items():
+        ratio = np.abs(way) / std
+        place = int(np.argmax(ratio))
+        if ratio[place] > _WORTH_SAYING:
+            found.append(
+                f'an error of {name} does not show in this recording: the intervals allow for '
+                f'its standard deviation, which moves {free[place]} by {ratio[place]:.2g} of its '
+                'own' + (
+                    f'; {name} is taken to be known to {100.0 * USUAL_GAIN:g} %: calibrate the '
+                    f'sensor, and give --known {name}=1+-0.1%' if name == GAIN else ''))
+    return found
+
+
+def resting(fit: Fit, names: Collection[str]) -> str:
+    """Return that samples show rest alone, which does not determine the parameters named."""
+    gap = float(np.median(np.diff(fit.recording.time)))
     return (
-        f'the gain of the sensor is not given, and does not show in this recording: the intervals '
-        f'hold an error of 2 %, which moves {free[place]} by {ratio[place]:.2g} deviations; '
-        'calibrate the sensor, and give --known stretch_gain=1+-0.001')
+        f'{_listed([x for x in fit.free if x in names])} cannot be identified from this '
+        f'recording: rest at each level explains the samples, {gap:.3g} s apart, as well as any '
+        'motion does; record the motion after each change of level, with ten samples a period or '
+        'more, or free only what rest determines, as with --free remanence,chain_limit,'
+        'stretch_bias')
 
 
 def alike(best: Fit, others: Sequence[Fit]) -> str:

@@ -31,6 +31,7 @@ _MAX_PASSES = 60
 # A step this small against the standard deviations is the last one.
 _SMALL = 1e-2
 _MAX_DAMPING = 1e10
+_MOST_DERIVATIVE = 1e100
 # Largest change of a coordinate's logarithm in one step.
 _STRIDE = 0.7
 # Root mean square error of the simulation, which is no smooth function of the parameters.
@@ -80,10 +81,15 @@ class Fit:
         return 0.5 * (matrix + matrix.T)
 
 
-def robust_scale(residual: Array) -> float:
-    """Return the standard deviation of residuals of which a few may be outliers."""
+def robust_scale(residual: Array, fitted: int = 0) -> float:
+    """
+    Return the standard deviation of residuals of which a few may be outliers.
+
+    So many of them as parameters were fitted may be none, whatever the noise is.
+    """
     last = len(residual) - 1
-    places = int(0.6827 * last), int(0.9545 * last)
+    rest = max(last - fitted, 0)
+    places = [last - rest + int(x * rest) for x in (0.6827, 0.9545)]
     size = np.partition(np.abs(residual), places)
     return max(float(size[places[0]]), 0.5 * float(size[places[1]]), LEAST_SCALE)
 
@@ -154,7 +160,10 @@ class _Search:
 
     def _respond(self, values: Mapping[str, float], shifts: Array) -> Response | None:
         self._passes += 1
-        return respond(self._recording, values, self._free, shifts=shifts)
+        response = respond(self._recording, values, self._free, shifts=shifts)
+        # Nothing that so much depends on can be measured.
+        return response if response is not None and np.max(
+            np.abs(response.jacobian), initial=0.0) < _MOST_DERIVATIVE else None
 
     def _residual(self, response: Response) -> Array:
         return (self._recording.stretch - response.stretch) / self._spread
@@ -175,7 +184,7 @@ class _Search:
         if response is None:
             return None
         residual = self._residual(response)
-        scale = robust_scale(residual)
+        scale = robust_scale(residual, len(self._free))
         damping, converged = 1e-4, False
         while self._passes < self._most:
             weights = weights_of(residual, scale, convex=self._convex)
@@ -225,10 +234,11 @@ class _Search:
                     converged = True
                     break
                 self._convex = False
-            if self._convex or not scale < 2.0 * robust_scale(residual):
+            now = robust_scale(residual, len(self._free))
+            if self._convex or scale >= 2.0 * now:
                 # Fixed once samples may be left out (Yohai, Ann. Statist. 15 (1987) 642), and
                 # never rising, so that it comes to an end.
-                scale = min(scale, robust_scale(residual))
+                scale = min(scale, now)
             damping = max(0.1 * damping, 1e-12)
         return Fit(
             self._recording, values, self._free, response, residual * self._spread,

@@ -5,12 +5,14 @@ import math
 
 import numpy as np
 
+from hmsa_ros import motion
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification import diagnosis
 from hmsa_ros.identification.fit import Fit, fit, loss, robust_scale
+from hmsa_ros.identification.quantities import STATIC
 from hmsa_ros.identification.recording import Recording
-from hmsa_ros.identification.response import respond
-from hmsa_ros.identification.start import at_frequencies, scan, segments, starts
+from hmsa_ros.identification.response import complete, respond, sensed, Setup
+from hmsa_ros.identification.start import at_units, scan, seeks_time, segments, starts, static
 
 # Residuals this near to the scatter of their differences are white enough for a first look.
 _NEAR_WHITE = 1.5
@@ -29,11 +31,13 @@ _ENOUGH = 2
 _SAME = 0.02
 # Fewer samples, or fewer of them a period, may be fitted by several frequencies.
 _FEW_SAMPLES, _FEW_A_PERIOD = 200, 2.0
-# Frequencies to start from, the highest in sampling rates.
-_FREQUENCIES, _HIGHEST = 33, 5.0
+# Frequencies to start from, the highest in sampling rates, and the share of critical damping.
+_FREQUENCIES, _HIGHEST, _DECAY = 33, 5.0, 0.1
 # Fits whose chi-squared is this much larger at most are rivals, if their frequencies are this
 # factor apart.
 _RIVAL, _ANOTHER = 10.0, 1.05
+# Chance of as much motion in samples of an actuator at rest, below which they show some.
+_MOVES = 1e-3
 
 
 def _good(found: Fit) -> bool:
@@ -60,16 +64,9 @@ def search(
     found: list[Fit] = []
 
     def tried(candidates: Sequence[Mapping[str, float]]) -> bool:
-        for candidate in candidates:
-            few = any(x.converged for x in found)
-            one = fit(recording, candidate, free, most=_FEW_PASSES if few else _FIRST_PASSES)
-            if few and one is not None and not one.converged and _promising(found, one):
-                one = fit(recording, one.values, free, most=_FIRST_PASSES)
-            if one is not None:
-                found.append(one)
-                if _good(one) or _settled(found):
-                    return True
-        return False
+        return any(
+            _descended(found, recording, x, free) and (_good(found[-1]) or _settled(found))
+            for x in candidates)
 
     given = starts(recording, values, free)
     nearest = min((given[0], given[-1]), key=lambda x: _miss(recording, x))
@@ -122,6 +119,18 @@ def _miss(recording: Recording, candidate: Mapping[str, float]) -> float:
         np.mean(np.abs(recording.stretch - response.stretch)))
 
 
+def _descended(
+        found: list[Fit], recording: Recording, start: Mapping[str, float], free: Sequence[str]
+) -> bool:
+    """Add the fit from a start, if any; in full where it may become the likeliest."""
+    few = any(x.converged for x in found)
+    one = fit(recording, start, free, most=_FEW_PASSES if few else _FIRST_PASSES)
+    if few and one is not None and not one.converged and _promising(found, one):
+        one = fit(recording, one.values, free, most=_FIRST_PASSES)
+    if one is not None:
+        found.append(one)
+    return one is not None
+
 
 def rivals(best: Fit) -> tuple[Fit, list[Fit]]:
     """
@@ -133,29 +142,62 @@ def rivals(best: Fit) -> tuple[Fit, list[Fit]]:
     recording = best.recording
     gap = float(np.median(np.diff(recording.time)))
     many = diagnosis.frequency_of(best) * gap * _FEW_A_PERIOD < 1.0
-    if many and len(recording.time) >= _FEW_SAMPLES:
-        return best, []
     longest = max((float(recording.time[end - 1] - recording.time[begin])
                    for begin, end, _, _ in segments(recording)), default=0.0)
-    if not longest > gap:
+    if many and len(recording.time) >= _FEW_SAMPLES or longest <= gap or not seeks_time(
+            best.values, best.free):
         return best, []
     found = [best]
-    for start in at_frequencies(recording, best.values, best.free, np.geomspace(
-            1.0 / longest, _HIGHEST / gap, _FREQUENCIES)):
-        one = fit(recording, start, best.free, most=_FEW_PASSES)
-        if one is not None and not one.converged and _promising([best], one):
-            one = fit(recording, one.values, best.free, most=_FIRST_PASSES)
-        if one is not None:
-            found.append(one)
-    freedom = max(len(recording.time) - len(best.free), 1)
-    scale = min(x.scale for x in found) * math.sqrt(len(recording.time) / freedom)
+    natural = diagnosis.frequency_of(best) * complete(best.values, best.free)['time_unit']
+    for start in at_units(
+            best.values, best.free, natural / np.geomspace(
+                1.0 / longest, _HIGHEST / gap, _FREQUENCIES), _DECAY,
+            static(recording, best.values, best.free)):
+        _descended(found, recording, start, best.free)
+    scale = min(x.scale for x in found)
     deviances = [2.0 * loss(x.residual, scale) for x in found]
-    order = np.argsort(deviances, kind='stable')
-    best = found[order[0]]
-    others: list[Fit] = []
-    for i in order[1:].tolist():
-        if deviances[i] < deviances[order[0]] + _RIVAL and all(abs(math.log(
-                diagnosis.frequency_of(found[i]) / diagnosis.frequency_of(x))) > math.log(
-                    _ANOTHER) for x in (best, *others)):
-            others.append(found[i])
+    best, *rest = (found[i] for i in np.argsort(deviances, kind='stable'))
+    least, others = min(deviances), list[Fit]()
+    for one in rest:
+        if 2.0 * loss(one.residual, scale) < least + _RIVAL and all(abs(math.log(
+                diagnosis.frequency_of(one) / diagnosis.frequency_of(x))) > math.log(_ANOTHER)
+                for x in (best, *others)):
+            others.append(one)
     return best, others
+
+
+def unmoved(best: Fit) -> set[str]:
+    """
+    Return what only motion shows, if rest at each level explains the samples as well as motion.
+
+    As well is what the test of Fisher cannot tell apart, of as many frequencies as are tried.
+    """
+    # Slow to load, and no use to a planner that estimates.
+    from scipy.special import fdtrc
+
+    recording, values = best.recording, complete(best.values, best.free)
+    setup = Setup.of(values, best.free)
+    place = np.searchsorted(
+        recording.level_times, recording.time - values['sensor_latency'], side='right').clip(1) - 1
+    levels, which = np.unique(recording.levels[place], return_inverse=True)
+    rests, slopes = np.empty(len(levels)), np.empty((len(levels), len(setup.wanted)))
+    for i, level in enumerate(levels.tolist()):
+        rests[i] = motion.rest(setup.theta, setup.material, level, setup.wanted, slopes[i])
+    if not np.all(np.isfinite(rests)):
+        return set()
+    rests, by = sensed(
+        values, best.free, rests, np.zeros(len(rests)),
+        values['stretch_gain'] * slopes @ setup.mixing)
+    weighted = best.root * (recording.stretch - rests[which])
+    columns = best.root[:, None] * by[which]
+    shift, _, rank, _ = np.linalg.lstsq(columns, weighted, rcond=1e-9)
+    still = float(np.sum((weighted - columns @ shift) ** 2))
+    moving = float(np.sum((best.root * best.residual) ** 2))
+    more = len(best.free) - int(rank)
+    freedom = max(float(np.sum(best.weights)) - len(best.free), 1.0)
+    if not more or moving == 0.0 or _FREQUENCIES * float(fdtrc(
+            more, freedom, (still / moving - 1.0) * freedom / more)) < _MOVES:
+        return set()
+    if seeks_time(values, best.free):
+        return set(best.free) - STATIC
+    return {x for x, column in zip(best.free, by.T, strict=True) if not np.any(column)}

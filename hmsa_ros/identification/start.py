@@ -31,6 +31,8 @@ from hmsa_ros.model.law import EQUILIBRIUM, evaluate, FORCE, pack
 from hmsa_ros.model.units import MU_0
 
 _FEWEST = 6  # samples on a level that may ring
+_FEWEST_AT_REST = 4  # samples before the first change of level that show whether it is at rest
+_BY_CHANCE = 1e-4  # of as much scatter there as is taken for motion
 _MOST_SAMPLES = 150  # of a level that are looked at
 _MOST_LEVELS = 3
 _CHAIN_LIMITS = (1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 15.0, 40.0, 1000.0)
@@ -77,6 +79,31 @@ def deviations(values: Array, parts: NDArray[np.int64]) -> Array:
     mean, square = ((x[ends] - x[begins]) / (ends - begins) for x in sums)
     found: Array = np.sqrt(np.maximum(square - mean ** 2, 0.0))
     return found
+
+
+def begins_at_rest(recording: Recording) -> bool:
+    """Whether the samples before the first change of level show no motion."""
+    # Slow to load, and no use to a planner that estimates.
+    from scipy.special import fdtri
+
+    changes = recording.level_times[1:][np.diff(recording.levels) != 0.0]
+    first = float(changes[0]) if len(changes) else math.inf
+    before = recording.stretch[recording.time <= first]
+    if len(before) < _FEWEST_AT_REST:
+        return True
+    tails = np.array([(end - max((end - begin) // 3, 3), end)
+                      for begin, end, _, _ in segments(recording, _FEWEST_AT_REST)],
+                     np.int64).reshape(-1, 2)
+    size = tails[:, 1] - tails[:, 0]
+    # Of white noise second differences have a deviation of sqrt(6).
+    steps = np.where(size < 2 * _FEWEST_AT_REST, math.inf, deviations(
+        np.diff(recording.stretch, 2), tails - np.array([0, 2])) / math.sqrt(6.0))
+    quiet = np.minimum(deviations(recording.stretch, tails) * np.sqrt(size / (size - 1.0)), steps)
+    # Of the quietest end of a level; a short one may be quiet by chance.
+    chance = fdtri(len(before) - 1.0, size - 1.0, 1.0 - _BY_CHANCE)
+    allowed = np.maximum(4.0, np.sqrt(chance)) * np.maximum(
+        quiet, max(0.5 * recording.quantum, 1e-6))
+    return float(np.std(before)) < float(np.min(allowed, initial=math.inf))
 
 
 def _median(values: Array) -> float:
@@ -221,18 +248,11 @@ def scan(
         if first < len(recording.time) else recording
     shortest = _SHORTEST * float(np.median(np.diff(recording.time)))
     tried: list[tuple[float, float, dict[str, float]]] = []
-    timed = {'shear_modulus', 'density', 'time_unit', *_stresses(values)}.intersection(free)
-    factors = np.geomspace(1.0 / _SCAN_RANGE, _SCAN_RANGE, _SCAN_POINTS) if timed else (1.0,)
-    group = group_of(values)
-    critical = float(equations.critical_zeta(group.rest, group))
-    for factor in factors:
-        unit = max(float(factor) * values['time_unit'], shortest)
-        candidate = _candidate(values, free, unit, found)
-        for decay in _SCAN_DECAYS if 'damping_coefficient' in free else (0.0,):
-            if decay:
-                # The share of critical damping about rest.
-                candidate = candidate | {
-                    'damping_coefficient': decay * critical * damping_unit(candidate)}
+    timed = seeks_time(values, free)
+    factors = np.geomspace(1.0 / _SCAN_RANGE, _SCAN_RANGE, _SCAN_POINTS) if timed else np.ones(1)
+    units = np.maximum(factors * values['time_unit'], shortest)
+    for decay in _SCAN_DECAYS if 'damping_coefficient' in free else (0.0,):
+        for candidate in at_units(values, free, units, decay, found):
             response = respond(part, candidate, (), rtol=1e-5)
             if response is not None:
                 miss = float(np.mean(np.abs(part.stretch - response.stretch)))
@@ -246,22 +266,22 @@ def scan(
     return [x for _, x in best]
 
 
-def at_frequencies(
-        recording: Recording, values: Mapping[str, float], free: Sequence[str],
-        frequencies: Array) -> list[dict[str, float]]:
-    """Return start values that ring at frequencies in Hz; none if no time unit is sought."""
-    if not {'shear_modulus', 'density', 'time_unit', *_stresses(values)}.intersection(free):
-        return []
-    found, group = static(recording, values, free), group_of(values)
-    natural = float(equations.natural_frequency(group.rest, group)) / (2.0 * math.pi)
+def at_units(
+        values: Mapping[str, float], free: Sequence[str], units: Array, decay: float,
+        found: Static) -> list[dict[str, float]]:
+    """Return start values of time units in s, and of a share of critical damping about rest."""
+    group = group_of(values)
     critical = float(equations.critical_zeta(group.rest, group))
-    candidates = [
-        _candidate(values, free, natural / x, found) for x in frequencies.tolist()]
+    candidates = [_candidate(values, free, x, found) for x in units.tolist()]
     if 'damping_coefficient' in free:
         for candidate in candidates:
-            candidate['damping_coefficient'] = (
-                _SCAN_DECAYS[0] * 2.0 * critical * damping_unit(candidate))
+            candidate['damping_coefficient'] = decay * critical * damping_unit(candidate)
     return candidates
+
+
+def seeks_time(values: Mapping[str, Any], free: Sequence[str]) -> bool:
+    """Whether a free parameter sets the time unit."""
+    return bool({'shear_modulus', 'density', 'time_unit', *_stresses(values)}.intersection(free))
 
 
 def _stresses(values: Mapping[str, Any]) -> list[str]:

@@ -1,0 +1,216 @@
+"""How exactly samples determine the parameters: covariance, intervals, profiles."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+
+from hmsa_ros.errors import BadInputError
+from hmsa_ros.identification import diagnosis
+from hmsa_ros.identification.departures import Departures, departures
+from hmsa_ros.identification.fit import Fit, fit, LEAST_SCALE, moved
+from hmsa_ros.identification.noise import Whiteness, whiteness, widening
+from hmsa_ros.identification.quantities import (
+    constants_of,
+    derivative,
+    from_coordinate,
+    GEOMETRY,
+    QUANTITIES,
+    quantity_of,
+    to_coordinate,
+)
+from hmsa_ros.identification.response import complete, respond
+from hmsa_ros.identification.result import Estimate, Identification
+from hmsa_ros.model.equations import Array
+
+# Share of what is allowed from which on a deviation is looked at twice.
+_NEARLY_LOST = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Precision:
+    """How exactly the coordinates of a fit are known; factors are on their deviations."""
+
+    deviation: float  # of a sample
+    freedom: float  # samples that count, less parameters
+    whiteness: Whiteness
+    inverse: Array  # of the information for a noise of 1
+    correlated: Array  # factors by correlation of the noise
+    proved: Array  # factors without what residuals only hint at, which is not to lose a number
+    covariance: Array
+    missing: Departures
+
+
+def precision_of(best: Fit, variance: Array, given: Mapping[str, float | None]) -> Precision:
+    """
+    Work out how exactly a fit is known.
+
+    Given are the variance of its coordinates where stamps may be off, and the names of what the
+    caller knows, with standard deviations, None for exactly.
+    """
+    weighted = best.root * best.residual
+    freedom = max(float(np.sum(best.weights)) - len(best.free), 1.0)
+    deviation = max(math.sqrt(float(weighted @ weighted) / freedom), LEAST_SCALE)
+    found, inverse = whiteness(weighted), _inverse(best.information)
+    columns = best.root[:, None] * best.jacobian
+    correlated = widening(columns, weighted, inverse, found)
+    variance = variance + _blurred(best, deviation, columns, inverse)
+    missing = departures(best, found, inverse, deviation, given)
+    proved, factors = (
+        correlated * np.sqrt(np.maximum(x / np.diag(inverse) / deviation ** 2, 1.0))
+        for x in (variance, variance + missing.hint))
+    curved = _bent(best, inverse, deviation, proved)
+    factors = curved * factors
+    return Precision(
+        deviation, freedom, found, inverse, correlated, curved * proved,
+        inverse * deviation ** 2 * np.outer(factors, factors), missing)
+
+
+def stamp_error(best: Fit, deviation: float) -> float:
+    """Return the root mean square error of the stamps in s, as far as one was estimated."""
+    place = int(np.argmax(best.spread))
+    return deviation * math.sqrt(float(best.spread[place]) ** 2 - 1.0) / max(
+        abs(float(best.response.rate[place])), 1e-300)
+
+
+def _blurred(best: Fit, deviation: float, columns: Array, inverse: Array) -> Array:
+    """Return the squares of what the curvature of the motion moves where stamps are off."""
+    error = stamp_error(best, deviation)
+    nothing: Array = np.zeros(len(best.free))
+    late = {**best.values, 'sensor_latency': best.values['sensor_latency'] + error}
+    after = respond(best.recording, late, ()) if error else None
+    if after is None:
+        return nothing
+    # In the mean a sample lies half the square of the error times the acceleration off.
+    missed = 0.5 * error * best.values['stretch_gain'] * (best.response.rate - after.rate)
+    shift: Array = inverse @ (columns.T @ (best.root * missed))
+    return shift ** 2
+
+
+def _bent(best: Fit, inverse: Array, deviation: float, held: Array) -> Array:
+    """
+    Return by how much deviations are larger than the information at the optimum says.
+
+    Looked at where a parameter is nearly lost: two deviations off, the best fit of the others
+    has to be as much worse as those say.
+    """
+    std = np.sqrt(np.diag(inverse)) * deviation * held
+    limits, weights = diagnosis.allowed(best), best.root ** 2
+    base = float(weights @ best.residual ** 2)
+    factors: Array = np.ones(len(best.free))
+    for place in np.flatnonzero((std > _NEARLY_LOST * limits) & (std <= limits)):
+        largest, others = 1.0, tuple(x for i, x in enumerate(best.free) if i != place)
+        for change in (-2.0 * std[place], 2.0 * std[place]):
+            step = inverse[:, place] / inverse[place, place] * change
+            start = moved(best.values, best.free, step)
+            one = fit(best.recording, start, others, spread=best.spread) if others else None
+            if one is not None:
+                worse = (float(weights @ one.residual ** 2) - base) / deviation ** 2
+                largest = max(largest, 2.0 * held[place] / math.sqrt(max(worse, 1e-2)))
+        shared = inverse[:, place] ** 2 / inverse[place, place] / np.diag(inverse)
+        factors = np.maximum(factors, np.sqrt(1.0 + shared * (largest ** 2 - 1.0)))
+    return factors
+
+
+def _inverse(information: Array) -> Array:
+    """Return the inverse of an information matrix, large where it is singular."""
+    size = np.sqrt(np.maximum(np.diag(information), 1e-12))
+    values, vectors = np.linalg.eigh(information / np.outer(size, size))
+    values = np.maximum(values, 1e-13 * values[-1])
+    found: Array = (vectors / values) @ vectors.T / np.outer(size, size)
+    return found
+
+
+def estimates_of(
+        best: Fit, known: Precision, lost: set[str]) -> tuple[dict[str, Estimate], Array]:
+    """
+    Return all parameters with intervals, and the covariance of the free values in SI.
+
+    What is considered widens the intervals alone: with the same sizes and the same sensor what
+    the values predict is as good as without.
+    """
+    # Slow to load, and no use to a planner that estimates.
+    from scipy.special import stdtrit
+
+    # The noise is estimated too: Student's interval.
+    quantile = float(stdtrit(known.freedom, 0.975))
+    whole = np.sqrt(np.diag(known.covariance) + sum(
+        x ** 2 for x in known.missing.considered.values()))
+    values = complete(best.values, best.free)
+    scales = np.array([derivative(x, values[x]) for x in best.free])
+    matrix = known.covariance * np.outer(scales, scales)
+    estimates: dict[str, Estimate] = {}
+    constants = [x for x in constants_of(values.get('law')) if x in values]
+    for name in (*QUANTITIES, *constants):
+        value, quantity = values[name], quantity_of(name)
+        if name in lost:
+            estimates[name] = Estimate(
+                math.nan, math.nan, math.nan, math.nan, quantity.unit, True)
+        elif name in best.free:
+            place = best.free.index(name)
+            half = quantile * float(whole[place])
+            x = to_coordinate(name, value)
+            ends = sorted(from_coordinate(name, y) for y in (x - half, x + half))
+            if quantity.scale == 'inverse' and x - half <= 1e-9:
+                ends[1] = math.inf
+            estimates[name] = Estimate(
+                value, math.sqrt(matrix[place, place]), ends[0], ends[1], quantity.unit, True)
+        else:
+            estimates[name] = Estimate(value, 0.0, value, value, quantity.unit, False)
+    for name in GEOMETRY:
+        value = values[name]
+        estimates[name] = Estimate(value, 0.0, value, value, 'm', False)
+    for place, name in enumerate(best.free):
+        if name in lost:
+            matrix[place, :] = matrix[:, place] = math.nan
+    return estimates, matrix
+
+
+def profile(
+        found: Identification, name: str, points: int = 11
+) -> list[tuple[float, float]]:
+    """
+    Return the profile likelihood of a parameter: the best of all others at each of its values.
+
+    Parameters
+    ----------
+    found : Identification
+        The optimum.
+    name : str
+        Of a free parameter.
+    points : int
+        Values over its interval of four deviations on either side.
+
+    Returns
+    -------
+    list of (float, float)
+        Value, and how much the deviance, twice the negative logarithm of the likelihood, lies
+        above that of the optimum: 3.84 at the ends of a 95 % interval.
+
+    Raises
+    ------
+    BadInputError
+        If the parameter was not free.
+
+    """
+    if name not in found.names:
+        raise BadInputError(
+            f'{name} was not free: expected one of {", ".join(found.names)}')
+    others = tuple(x for x in found.names if x != name)
+    place = found.names.index(name)
+    centre = to_coordinate(name, found.values[name])
+    std = math.sqrt(float(found.covariance[place, place])) / abs(
+        derivative(name, found.values[name])) if math.isfinite(
+            found.covariance[place, place]) else 0.2 * max(abs(centre), 0.1)
+    weights = found.weights / found.spread ** 2
+    base = float(np.sum(weights * found.residual ** 2))
+    kept = replace(found.recording, notes=())
+    rows = []
+    for x in centre + 4.0 * std * np.linspace(-1.0, 1.0, points):
+        values = {**found.values, name: from_coordinate(name, float(x))}
+        one = fit(kept, values, others, spread=found.spread) if others else None
+        if one is not None:
+            loss = float(np.sum(weights * one.residual ** 2))
+            rows.append((values[name], max(loss - base, 0.0) / found.noise_std ** 2))
+    return rows
