@@ -9,7 +9,6 @@ from hmsa_ros.cli.pictures import add_picture_options, paper_of
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text
-from hmsa_ros.report.paper import kind_of
 
 
 def add_parser(subparsers: Any) -> None:
@@ -31,8 +30,6 @@ def add_parser(subparsers: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Read, compare and print; raise `BadInputError` for a single run."""
     paper = paper_of(arguments)
-    for picture in arguments.picture:
-        kind_of(picture)
     if len(arguments.runs) < 2:
         raise BadInputError(
             f'only {arguments.runs[0]} is given: expected two runs or more, such as hmsa compare '

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from hmsa_ros.cli.options import add_options
-from hmsa_ros.report.paper import KINDS, kinds_in, Paper
+from hmsa_ros.report.paper import kind_of, KINDS, kinds_in, Paper
 
 _ENDS = f'{", ".join(f".{x}" for x in KINDS[:-1])} or .{KINDS[-1]}'
 
@@ -52,7 +52,9 @@ def add_picture_options(
 
 
 def paper_of(arguments: argparse.Namespace) -> Paper:
-    """Return what the options ask for; raise `BadInputError` for what is out of range."""
+    """Return what the options ask for; raise `BadInputError` for what no picture can be."""
+    for picture in getattr(arguments, 'picture', ()):
+        kind_of(picture)
     return Paper(arguments.width, arguments.font_size, arguments.dpi,
                  getattr(arguments, 'data', False))
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.cli.options import add_options, law_of, LAW_OPTION, MATERIAL, of_unit
+from hmsa_ros.cli.progress import progress
 from hmsa_ros.cli.setpoints import setpoint
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text
@@ -84,9 +85,10 @@ def run(arguments: argparse.Namespace) -> int:
                  'time_unit': units.time, 'flux_density_unit': units.load}
         rows = [_si_row(x, units.time, units.load, arguments.tesla_per_ampere) for x in segments]
         if arguments.amplifier:
-            amplifiers = actuator.amplifiers(
-                arguments.setpoints, shaper=arguments.shaper or 'two_step',
-                **_more(arguments), **{x: getattr(arguments, x) for x in _WINDING})
+            with progress('planning for amplifiers'):
+                amplifiers = actuator.amplifiers(
+                    arguments.setpoints, shaper=arguments.shaper or 'two_step',
+                    **_more(arguments), **{x: getattr(arguments, x) for x in _WINDING})
         shown = [
             Column('span', 's'), Column('flux_density_p', 'T'), Column('time_p', 's'),
             Column('flux_density_1', 'T')]

@@ -9,7 +9,6 @@ from hmsa_ros.cli.pictures import add_picture_options, paper_of
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.files import json_text, write_text
-from hmsa_ros.report.paper import kind_of
 
 if TYPE_CHECKING:
     from hmsa_ros.recordings.record import Run
@@ -49,8 +48,6 @@ def run(arguments: argparse.Namespace) -> int:
     paper = paper_of(arguments)
     targets = [out, *pictures, *(
         dict.fromkeys(x.with_suffix('.csv') for x in pictures) if paper.data else ())]
-    for picture in pictures:
-        kind_of(picture)
     _check_targets(targets, bags)
 
     from hmsa_ros.recordings.bags import read_runs

@@ -8,7 +8,6 @@ from hmsa_ros.cli.options import add_options, JSON
 from hmsa_ros.cli.pictures import add_picture_options, paper_of
 from hmsa_ros.cli.progress import progress
 from hmsa_ros.files import json_text
-from hmsa_ros.report.paper import kind_of
 
 
 def add_parser(subparsers: Any) -> None:
@@ -42,8 +41,6 @@ def add_parser(subparsers: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Simulate, write and print."""
     paper = paper_of(arguments)
-    for picture in arguments.picture:
-        kind_of(picture)
     from hmsa_ros.api.actuator import Actuator
 
     actuator = Actuator() if arguments.params_file is None else Actuator.from_yaml(

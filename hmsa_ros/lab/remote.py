@@ -1,6 +1,7 @@
 """Parameters of a running node, read and changed while its caller waits."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from difflib import get_close_matches
 from time import monotonic
 from typing import Any
@@ -112,11 +113,7 @@ class RemoteNode:
 
         """
         before = self._values([name])[name]
-        value = get_parameter_value(text)
-        if before is not None:
-            value = _as(value, before.type)
-            if before.type == ParameterType.PARAMETER_STRING:
-                value.type, value.string_value = before.type, text
+        value = _value(text, None if before is None else before.type)
         result = self._ask(SetParameters, 'set_parameters', parameters=[
             Parameter(name=name, value=value)]).results[0]
         if not result.successful:
@@ -125,11 +122,17 @@ class RemoteNode:
             self.get([name])[name])
 
 
-def _as(value: Any, kind: int) -> Any:
-    """Return a value as the type that a parameter has: 1 for 1.0, [] for no numbers."""
-    if kind == ParameterType.PARAMETER_DOUBLE and value.type == ParameterType.PARAMETER_INTEGER:
-        value.type, value.double_value = kind, float(value.integer_value)
-    if kind == ParameterType.PARAMETER_DOUBLE_ARRAY and (
-            value.type == ParameterType.PARAMETER_INTEGER_ARRAY):
-        value.type, value.double_array_value = kind, [float(x) for x in value.integer_array_value]
+def _value(text: str, kind: int | None) -> Any:
+    """Return a value as the type that a parameter has: 1 and 5e3, no word of YAML, for numbers."""
+    value = get_parameter_value(text)
+    if kind == ParameterType.PARAMETER_STRING:
+        value.type, value.string_value = kind, text
+    elif kind == ParameterType.PARAMETER_DOUBLE:
+        with suppress(ValueError):
+            value.type, value.double_value = kind, float(text)
+    elif kind == ParameterType.PARAMETER_DOUBLE_ARRAY:
+        with suppress(ValueError):
+            numbers = filter(str.strip, text.strip(' []').split(','))
+            value.double_array_value = [float(x) for x in numbers]
+            value.type = kind
     return value
