@@ -288,6 +288,7 @@ def test_bad_input_of_the_commands_is_one_line_with_status_2(files, capsys, word
     assert said in found.err
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_parameters_change_and_a_stop_comes_to_rest_without_ros2(start, ros):
     start.hmsa('planner', '--ros-args', '-p', 'lead_time:=0.5')

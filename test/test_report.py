@@ -16,7 +16,9 @@ import pytest
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.rosbag2.enums import StoragePlugin
 from rosbags.typesys import get_typestore, Stores
+from scipy.io import loadmat
 
+import hmsa_ros
 from hmsa_ros.bag.definitions import message_definition
 from hmsa_ros.bag.writer import BagWriter, Topic
 from hmsa_ros.cli import main
@@ -1229,3 +1231,33 @@ sys.exit(main(sys.argv[1:]))
         [sys.executable, '-W', 'error', '-c', blocked, 'report', str(bag), '--out',
          str(tmp_path / 'x.html')], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_runs_are_compared_in_numbers_and_read_and_exported_without_ros(bag, tmp_path, capsys):
+    stiffer = replace(ACTUATOR, shear_modulus=1.1 * ACTUATOR.shear_modulus)
+    other = write(
+        tmp_path / 'other', simulated(plant=stiffer),
+        **parameters(planner=ACTUATOR, plant=stiffer))
+    assert main(['compare', str(bag), str(other), '--picture', str(tmp_path / 'both.svg'),
+                 '--width', '85', '--json']) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert (tmp_path / 'both.svg').exists()
+    first, second = said['setpoints'][:2]
+    assert (first['run'], second['run']) == ('run', 'other')
+    assert (first['verdict'], second['verdict']) == ('arrived', 'off target')
+    # 10 % more stiffness at the same level: the same as the runs say one by one.
+    read = [hmsa_ros.read(x) for x in (bag, other)]
+    single = read[1].report()
+    assert second['offset'] == pytest.approx(single['offset'][0])
+    # Both were sampled at the same times, so that the samples differ by no more than the curves.
+    begin = read[0].levels[0, 0]
+    inside = (read[0].times >= begin) & (read[0].times < begin + 5e-3 * first['move time'])
+    largest = np.max(np.abs(read[0].stretches - read[1].stretches)[inside])
+    assert second['apart'] == pytest.approx(100.0 * largest / 0.1, rel=0.1)
+    assert main(['compare', str(bag), str(other)]) == 0
+    assert 'move time (ms)' in capsys.readouterr().out
+    assert main(['export', str(bag), '--out', str(tmp_path / 'run.mat')]) == 0
+    matrix = loadmat(tmp_path / 'run.mat')
+    assert np.array_equal(matrix['stretch'].ravel(), read[0].stretches)
+    assert np.array_equal(matrix['level_time'].ravel(), read[0].levels[:, 0])
+    assert read[0].actuator.block == ACTUATOR
