@@ -15,6 +15,8 @@ TARGETS = (1.1, 1.3, 0.95, 1.2, 1.4)
 LEAD = 0.05
 #: Where lead_time is not what is looked at, in s.
 PATIENT_LEAD = 0.2
+# Levels in T that differ by less are one.
+_SAME = 1e-9
 
 Inject = Callable[[Rig], Seen]
 
@@ -53,6 +55,10 @@ def move(
     rig.setpoint(target)
     await_change(rig, mark, patience)
     rig.let_pass(pause, patience)
+    # A report may come later than the samples that show its level.
+    rig.spin_until(
+        lambda: abs(rig.applied[-1][1] - rig.samples(mark)[1][-1, 2]) < _SAME,
+        'the report of the last level', patience)
     return settled(*rig.samples(mark), rig.applied, target, target - start)
 
 

@@ -58,8 +58,7 @@ for _fault, _name, _how, _expected, _word, _counter in (
          'rejected and named', 'open loop until samples fit again', 'rejected'),
         ('swap', 'samples in the wrong order', 'each two swapped',
          'put in order by their stamps', '', ''),
-        ('twice', 'samples that come twice', 'each sample sent twice', 'counted as repeated', '',
-         'repeated'),
+        ('twice', 'samples that come twice', 'each sample sent twice', 'passed over', '', ''),
         ('silence', 'a sensor that falls silent', 'no samples any more', 'open loop', '', '')):
     FAULTS.fault(
         f'sensor_{_fault}', f'{_name}, feedback adapt',
