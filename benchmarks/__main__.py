@@ -13,9 +13,9 @@ Those of recorder, player and crash take some seven minutes together. faults inj
 running nodes and fails if one is not answered as it should be; soak runs for hours; feedback
 moves actuators that are not as planned with, in real time, for some three minutes;
 identification fits thousands of simulated runs; defects those of actuators that are not as the
-model has them; studies kills the workers of a study; rates
-measures how many plans a second studies make, for some seven minutes; lockstep compares the kernel
-of batches with C.
+model has them; harm holds feedback against open loop in random laboratories, for half an hour;
+studies kills the workers of a study; rates measures how many plans a second studies make, for some
+seven minutes; lockstep compares the kernel of batches with C.
 A page is a Markdown file with marks ``<!-- begin NAME -->`` and ``<!-- end NAME -->``, between
 which a table is put.
 """
@@ -39,7 +39,8 @@ _WIDTH = 120
 NAMES = ('judge', 'planner', 'plant', 'preemption', 'joints', 'controller', 'recorder', 'player',
          'crash')
 #: Not run unless asked for: they take long and need the machine for themselves.
-LONG = ('faults', 'soak', 'feedback', 'identification', 'defects', 'studies', 'rates', 'lockstep')
+LONG = ('faults', 'soak', 'feedback', 'identification', 'defects', 'harm', 'studies', 'rates',
+        'lockstep')
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -57,7 +58,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument('--only', action='append', default=[], metavar='KEY',
                         help='faults: beginning of the key of a fault to inject')
     parser.add_argument('--runs', type=int, default=None,
-                        help='identification, judge, defects: simulated runs of each kind '
+                        help='harm: laboratories (default 400); identification, judge, defects: '
+                             'simulated runs of each kind '
                              '(default 200, defects 30), in identification at most 40 of those')
     parser.add_argument('--hours', type=float, default=8.0,
                         help='soak: simulated time (default 8)')
@@ -69,7 +71,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument('--rate', type=float, default=1000.0,
                         help='soak: sample rate of the plant in Hz (default 1000)')
     parser.add_argument('--picture', type=Path, metavar='FILE',
-                        help='soak: PNG of memory over time')
+                        help='soak: PNG of memory over time; harm: of what feedback leaves more')
     options = parser.parse_args(arguments)
     if options.page and not options.page.is_file():
         parser.error(f'--page: there is no file {options.page}: expected a page with marks')
@@ -136,6 +138,11 @@ def main(arguments: list[str] | None = None) -> int:
 
         add(bench_defects.compare(
             quick=options.quick, runs=options.runs or bench_defects.RUNS))
+    if 'harm' in names:
+        from benchmarks import bench_harm
+
+        add(bench_harm.compare(
+            quick=options.quick, runs=options.runs or bench_harm.RUNS, picture=options.picture))
     if 'studies' in names:
         from benchmarks import bench_studies
 

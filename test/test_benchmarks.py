@@ -5,13 +5,15 @@ from decimal import Decimal
 import json
 import math
 
+from identification_oracle import Extras, simulate
 import numpy as np
 import pytest
 from rich.console import Console
 from scipy.integrate import solve_ivp
 
 from benchmarks import __main__ as program
-from benchmarks import bench_defects, bench_judge, bench_plant, contenders
+from benchmarks import bench_defects, bench_harm, bench_judge, bench_plant, contenders
+from benchmarks.laboratory import Device, drawn, Plant
 from benchmarks.measure import Contender, loosest, race, Report, Row, text_of_time
 from benchmarks.reference import Actuator, response, two_step
 from benchmarks.sheet import Sheet
@@ -128,6 +130,35 @@ def test_verdicts_on_runs_drawn_at_random_are_never_wrong_and_mostly_given():
 def test_a_fit_of_what_the_model_lacks_is_never_called_identified_with_wrong_intervals():
     sheet = bench_defects.compare(quick=False, runs=10)
     assert sheet.passed, sheet.figures
+
+
+def test_the_plant_of_a_laboratory_moves_as_scipy_says():
+    bench = replace(
+        drawn(1), lag=0.05 * drawn(1).unit, ratio=0.05, relaxation=2.0 * drawn(1).unit, force=0.02)
+    unit = bench.unit
+    switches, levels = [0.0, unit, 2.3 * unit], [0.0, 0.08, 0.12]
+    times = np.linspace(0.0, 12.0 * unit, 60)
+    plant = Plant(bench, 0)
+    for time, level in zip(switches, levels, strict=True):
+        plant.command(round(1e9 * time), level)
+    found = [plant.advance(round(1e9 * x)) for x in times]
+    expected = simulate(times, switches, levels, bench.block, Extras(
+        coil=bench.lag, ratio=bench.ratio, time=bench.relaxation, force=bench.force))
+    assert found == pytest.approx(expected, abs=2e-5)
+
+
+def test_a_laboratory_is_the_same_for_the_same_seed_and_in_open_loop_leaves_what_is_wrong():
+    assert drawn(5) == drawn(5)
+    assert {drawn(x).group for x in range(20)} == set(bench_harm.GROUPS)
+    bench = replace(drawn(0), targets=(1.2,))
+    exact, = bench_harm.run(bench, 'open loop')
+    assert exact.size < 1e-4
+    weak, = bench_harm.run(replace(
+        bench, block=replace(bench.block, remanence=0.95 * bench.block.remanence)), 'open loop')
+    assert 0.04 < weak.offset < 0.08
+    assert bench_harm.harm({'open loop': [exact], 'adapt': [weak]}, 'adapt') == [
+        weak.size - exact.size]
+    assert Device(bench, 0).next_sample > 0
 
 
 @pytest.mark.parametrize(('within', 'verdict', 'said'), [

@@ -1,0 +1,268 @@
+"""
+Random laboratories in virtual time: an actuator, a coil and a sensor that a planner does not know.
+
+The motion is Eq. 10 with a coil that lags, a branch that creeps and a constant force, integrated
+by Runge and Kutta's method in plain floating point. Nothing of the package takes part but the
+record of a block's sizes.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.constants import mu_0
+
+from hmsa_ros.model.parameters import ActuatorParameters, paper_actuator
+
+Array = NDArray[np.float64]
+#: What can be wrong, by name.
+KINDS = {
+    'modulus': 'G and damping', 'remanence': 'remanence', 'lag': 'lag of the coil',
+    'stamps': 'late timestamps', 'gain': 'gain of the sensor', 'creep': 'creep',
+    'force': 'constant force'}
+#: All that are drawn, with nothing wrong and with several things wrong.
+GROUPS = {'none': 'nothing', **KINDS, 'several': 'several of these'}
+# Steps of the integration in a unit of time, at least, and samples in one.
+_STEPS, _SAMPLES = 30, (4.4, 25.0)
+# Every second bench has several things wrong, each with this probability.
+_LIKELY = 0.5
+_TARGETS = (1.08, 1.45)  # range of stretches, and the least step
+_LEAST_STEP = 0.1
+_PAPER = paper_actuator()
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What one laboratory has; times in s, shares of the unit of time where named so."""
+
+    group: str  # of `GROUPS`
+    seed: int
+    given: ActuatorParameters  # what the planner is given
+    block: ActuatorParameters  # what there is
+    lag: float  # of the coil
+    late: float  # by how much timestamps are later than the motion they are of
+    delay: float  # of samples on their way
+    gain: float  # of the sensor about rest without field
+    bias: float  # of the sensor
+    ratio: float  # of a branch that creeps
+    relaxation: float
+    force: float  # in N
+    noise: float
+    period: float  # of samples
+    dropouts: float  # share of samples that are lost, in bursts
+    targets: tuple[float, ...]
+
+    @property
+    def unit(self) -> float:
+        """Unit of time of what is given."""
+        return self.given.time_unit
+
+    def shown(self, stretch: Array) -> Array:
+        """Return what the sensor would show without noise and bias."""
+        return 1.0 + self.gain * (stretch - 1.0)
+
+    @property
+    def wrong(self) -> str:
+        """What is wrong, in words."""
+        unit, found = self.unit, []
+        for name in ('shear_modulus', 'damping_coefficient', 'remanence'):
+            ratio = getattr(self.block, name) / getattr(self.given, name)
+            if ratio != 1.0:
+                found.append(f'{name} {100.0 * (ratio - 1.0):+.1f} %')
+        found += [f'{name} {100.0 * x:+.1f} %' for name, x in (
+            ('lag', self.lag / unit), ('stamps', self.late / unit), ('gain', self.gain - 1.0),
+            ('creep', self.ratio), ('force', self.force * self.given.load_per_newton)) if x]
+        return ', '.join(found) or 'nothing'
+
+
+def drawn(seed: int, targets: int = 3) -> Bench:
+    """Return the laboratory of a seed; the groups come in turn."""
+    random = np.random.default_rng((27, seed))
+    names = list(GROUPS)
+    group = 'several' if seed % 2 else names[(seed // 2) % (len(names) - 1)]
+    wrong = {x for x in KINDS if random.random() < _LIKELY} if group == 'several' else {group}
+
+    def log(low: float, high: float) -> float:
+        return math.exp(random.uniform(math.log(low), math.log(high)))
+
+    size = log(1.0, 200.0 / 4.4)
+    given = replace(
+        _PAPER, half_length=size * _PAPER.half_length,
+        half_thickness=size * _PAPER.half_thickness,
+        damping_coefficient=size ** 2 * _PAPER.damping_coefficient)
+    unit = given.time_unit
+    # All is drawn whether it is wrong or not, so that one seed is one sequence of numbers.
+    modulus, damping = random.uniform(0.8, 1.25), log(0.5, 2.0)
+    remanence, lag, late, gain = (
+        random.uniform(0.92, 1.08), random.uniform(0.0, 0.1), random.uniform(0.0, 0.1),
+        random.uniform(0.97, 1.03))
+    ratio, relaxation = random.uniform(0.0, 0.06), log(0.5, 10.0)
+    force, bias = random.uniform(-0.015, 0.015), random.uniform(-3e-3, 3e-3)
+    delay, noise = random.uniform(0.0, 0.1), log(1e-4, 3e-3)
+    per_unit, dropouts = log(*_SAMPLES), random.uniform(0.0, 0.2) * (random.random() < 0.3)
+    stretches: list[float] = []
+    while len(stretches) < targets:
+        stretch = round(random.uniform(*_TARGETS), 3)
+        if abs(stretch - (stretches[-1] if stretches else 1.0)) >= _LEAST_STEP:
+            stretches.append(stretch)
+    block = given
+    if 'modulus' in wrong:
+        block = replace(
+            block, shear_modulus=modulus * block.shear_modulus,
+            damping_coefficient=damping * block.damping_coefficient)
+    if 'remanence' in wrong:
+        block = replace(block, remanence=remanence * block.remanence)
+    late = late * unit if 'stamps' in wrong else 0.0
+    return Bench(
+        group, seed, given, block, lag * unit if 'lag' in wrong else 0.0, late,
+        # A timestamp never lies ahead of the clock.
+        max(delay * unit, late), gain if 'gain' in wrong else 1.0, bias,
+        ratio if 'creep' in wrong else 0.0, relaxation * unit,
+        force / given.load_per_newton if 'force' in wrong else 0.0, noise, unit / per_unit,
+        dropouts, tuple(stretches))
+
+
+class Plant:
+    """The actuator of a bench; times in ns, levels in T."""
+
+    def __init__(self, bench: Bench, time: int) -> None:
+        block = bench.block
+        # Coefficients of Eq. 10 in SI units, divided by the area of the block.
+        inertia = block.density * block.half_length ** 2
+        self._stiffness = block.shear_modulus / inertia
+        self._drive = block.remanence / mu_0 / inertia
+        self._damping = block.damping_coefficient * block.half_thickness / (
+            8.0 * block.half_length ** 2) / inertia
+        self._limit = block.chain_limit
+        self._c1 = 2.0 * (block.half_thickness / block.half_length) ** 2
+        self._force = bench.force * block.load_per_newton * block.shear_modulus / inertia
+        self._lag, self._ratio, self._relaxation = bench.lag, bench.ratio, bench.relaxation
+        self._largest = bench.unit / _STEPS
+        self.time = time
+        self._levels: list[tuple[int, float]] = []
+        self._level = 0.0
+        self.applied: list[tuple[int, float]] = []
+        state = 1.0
+        # Rest under the force, once branches have relaxed.
+        for _ in range(50):
+            slope = (self._elastic(state + 1e-6) - self._elastic(state - 1e-6)) / 2e-6
+            state -= (self._elastic(state) - self._force / self._stiffness) / slope
+        self.state = (state, 0.0, self._elastic(state), 0.0)
+
+    def command(self, stamp: int, level: float) -> None:
+        """Take a level from a stamp on; it takes the place of all at or after it."""
+        stamp = max(stamp, self.time)
+        self._levels = [*(x for x in self._levels if x[0] < stamp), (stamp, level)]
+
+    def advance(self, time: int) -> float:
+        """Go on until a time; return the stretch then."""
+        while self._levels and self._levels[0][0] <= time:
+            stamp, level = self._levels.pop(0)
+            self._integrate(1e-9 * (stamp - self.time))
+            self.time, self._level = stamp, level
+            self.applied.append((stamp, level))
+        self._integrate(1e-9 * (time - self.time))
+        self.time = time
+        return self.state[0]
+
+    def _elastic(self, stretch: float) -> float:
+        """Return psi' of the Gent law."""
+        return (stretch - stretch ** -2) / (
+            1.0 - (2.0 / stretch + stretch ** 2 - 3.0) / self._limit)
+
+    def _slope(
+            self, stretch: float, rate: float, relaxed: float, field: float
+    ) -> tuple[float, float, float, float]:
+        elastic = self._elastic(stretch)
+        lag, cube = self._lag, stretch ** -3
+        acting = field if lag else self._level
+        total = self._drive * acting + self._force - self._damping * rate - self._stiffness * (
+            elastic + self._ratio * (elastic - relaxed)) + (
+                0.25 * rate * rate * cube / stretch)
+        return (
+            rate, 6.0 * total / (cube + self._c1), (elastic - relaxed) / self._relaxation,
+            (self._level - field) / lag if lag else 0.0)
+
+    def _integrate(self, span: float) -> None:
+        if span <= 0.0:
+            return
+        # A coil that lags little needs short steps.
+        count = math.ceil(span / min(self._largest, self._lag or self._largest))
+        h = span / count
+        for _ in range(count):
+            x, v, w, b = self.state
+            x1, v1, w1, b1 = self._slope(x, v, w, b)
+            g = 0.5 * h
+            x2, v2, w2, b2 = self._slope(x + g * x1, v + g * v1, w + g * w1, b + g * b1)
+            x3, v3, w3, b3 = self._slope(x + g * x2, v + g * v2, w + g * w2, b + g * b2)
+            x4, v4, w4, b4 = self._slope(x + h * x3, v + h * v3, w + h * w3, b + h * b3)
+            g = h / 6.0
+            self.state = (
+                x + g * (x1 + 2.0 * (x2 + x3) + x4), v + g * (v1 + 2.0 * (v2 + v3) + v4),
+                w + g * (w1 + 2.0 * (w2 + w3) + w4), b + g * (b1 + 2.0 * (b2 + b3) + b4))
+
+
+class Device:
+    """Actuator and sensor of a bench, as `hmsa_ros.control.loop.Loop` wants them."""
+
+    def __init__(self, bench: Bench, time: int) -> None:
+        self.bench, self.time = bench, time
+        self.plant = Plant(bench, time)
+        self._random = np.random.default_rng((28, bench.seed))
+        self._measured = time  # when it measured last
+        self._period = round(1e9 * bench.period)
+        self._silent = 0  # samples that will still be lost
+        # When a sample arrives, its timestamp and value.
+        self._wire: list[tuple[int, int, float]] = []
+        self.truth: list[tuple[int, float]] = []
+
+    @property
+    def next_sample(self) -> int:
+        """When something of the sensor happens next."""
+        due = self._measured + self._period
+        return min(due, self._wire[0][0]) if self._wire else due
+
+    def receive(self, joint: int, stamp: int, level: float) -> None:
+        """Take a level from a stamp on."""
+        self.plant.command(stamp, level)
+
+    def advance(self, time: int) -> None:
+        """Do what is due up to a time."""
+        while self._measured + self._period <= time:
+            self._measured += self._period
+            self._measure()
+        self.time = time
+
+    def _measure(self) -> None:
+        bench, now = self.bench, self._measured
+        stretch = self.plant.advance(now)
+        self.truth.append((now, stretch))
+        noise = bench.noise * float(self._random.standard_normal())
+        lucky = float(self._random.random())
+        if self._silent:
+            self._silent -= 1
+            return
+        if bench.dropouts and lucky < bench.dropouts / 5.0:
+            # Five in a row on average.
+            self._silent = int(lucky / bench.dropouts * 5.0 * 10.0)
+            return
+        self._wire.append((
+            now + round(1e9 * bench.delay), now + round(1e9 * bench.late),
+            1.0 + bench.gain * (stretch - 1.0) + bench.bias + noise))
+
+    def changes(self) -> Sequence[tuple[int, int, float]]:
+        """Return which levels took effect."""
+        self.plant.advance(self.time)
+        found, self.plant.applied = self.plant.applied, []
+        return [(0, *x) for x in found]
+
+    def samples(self) -> Sequence[tuple[int, Array, Array, Array]]:
+        """Return what has arrived: stamp, stretch, and neither rate nor field."""
+        found = []
+        nothing = np.array([math.nan])
+        while self._wire and self._wire[0][0] <= self.time:
+            _, stamp, value = self._wire.pop(0)
+            found.append((stamp, np.array([value]), nothing, nothing))
+        return found
