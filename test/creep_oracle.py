@@ -15,15 +15,25 @@ def elastic(x):
     return above / g, ((1.0 + 2.0 * x ** -3) + 2.0 * above ** 2 / (J * g)) / g
 
 
-def motion(t, y, load, slope, lag, ratios, speeds, zeta):
+def motion(t, y, load, slope, lag, creep, zeta):
     """Return the derivative of stretch, rate, field and what the branches hold; t in a piece."""
+    ratios = np.array(creep.ratios)
     x, v, field, held = y[0], y[1], y[2], y[3:]
     field = field if lag else load + slope * t
     force, stiffness = elastic(x)
     mass = (x ** -3 + C1) / 6.0
     return [v, (field - force - held.sum() - 0.5 * zeta * C1 * v + 0.25 * x ** -4 * v * v) / mass,
             (load + slope * t - field) / lag if lag else 0.0,
-            *(ratios * stiffness * v - speeds * held)]
+            *(ratios * stiffness * v - flowing(held, ratios, creep))]
+
+
+def flowing(held, ratios, creep):
+    """Return how fast branches lose what they hold: J. S. Bergstroem and M. C. Boyce, 1998."""
+    lost = held / np.array(creep.times)
+    if creep.flow == 'power_law':
+        exponents, stresses = map(np.array, creep.constants)
+        lost = lost * (np.abs(held) / (ratios * stresses)) ** (exponents - 1.0)
+    return lost
 
 
 def ended(levels, creep, end, delivery):
@@ -53,8 +63,7 @@ def judged(levels, creep, end, slew=math.inf, lag=0.0, zeta=ZETA):
                 t_eval=np.linspace(0.0, stop - start, 9 + int(6 * (stop - start))),
                 # In longer steps it does not see a field that decays within some lags.
                 max_step=max(lag, (stop - start) / 1000.0) if lag else math.inf,
-                args=(
-                    first, slope, lag, np.array(creep.ratios), 1.0 / np.array(creep.times), zeta))
+                args=(first, slope, lag, creep, zeta))
             times.append(start + found.t)
             stretches.append(found.y[0])
             state = found.y[:, -1]

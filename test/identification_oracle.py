@@ -24,6 +24,7 @@ class Extras:
     force: float = 0.0
     bias: float = 0.0
     gain: float = 1.0
+    power: tuple = (1.0, 1.0)  # with which branches flow: exponent, and stress over G
     more: tuple = ()  # pairs of ratio and time of more branches
     law: tuple = ()  # name and constants in Pa of a law in place of Gent's
 
@@ -80,7 +81,7 @@ def _simulated(times: bytes, level_times: bytes, levels: bytes, block: ActuatorP
     damping = block.damping_coefficient * block.half_thickness / (8.0 * block.half_length ** 2)
     load = x.force / (4.0 * block.half_length ** 2)
 
-    branches = ((x.ratio, x.time), *x.more)
+    branches, flows = ((x.ratio, x.time), *x.more), x.power[1] * modulus
 
     def held(stretch):
         return stress(stretch, x.law) if x.law else modulus * force_of(stretch, block.chain_limit)
@@ -95,7 +96,8 @@ def _simulated(times: bytes, level_times: bytes, levels: bytes, block: ActuatorP
             - damping * rate + 0.25 * inertia * rate ** 2 / stretch ** 4)
         return [rate, total / (inertia * (stretch ** -3 + c1) / 6.0),
                 (level - field) / x.coil if x.coil else 0.0,
-                *((elastic - y) / t for (_, t), y in zip(branches, relaxed, strict=True))]
+                *((elastic - y) / t * abs((elastic - y) / flows) ** (x.power[0] - 1.0)
+                  for (_, t), y in zip(branches, relaxed, strict=True))]
 
     first = block.remanence * levels[0] / mu_0 + load
     rest = brentq(

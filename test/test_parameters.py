@@ -39,6 +39,7 @@ DIMENSIONLESS = {
     'play.read_ahead_queue_size', 'play.realtime_priority', 'record.queue_depth',
     'reset_stretch', 'seed', 'law.alpha', 'law.lambda_m', 'law.stretch', 'step_count',
     'smooth_periods', 'stretch_bias', 'stretch_gain', 'stretch_noise', 'viscoelastic.ratio',
+    'viscoelastic.exponent', 'viscoelastic.stress',
     # Each number of them has its own unit.
     'identification.values', 'identification.covariance',
     'arrival_tolerance', 'feedback_tolerance', 'stretch_tolerance', 'vibration_tolerance',

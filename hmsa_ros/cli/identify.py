@@ -39,7 +39,8 @@ def add_parser(subparsers: Any) -> None:
          'remanence, stretch_bias); +NAME adds to these, and --free=-NAME takes from them; '
          'others: density, time_unit, stretch_gain, sensor_latency, '
          'coil_time_constant, constant_force, initial_stretch, initial_rate, '
-         'viscoelastic_ratio and viscoelastic_time, for more branches with _2 and _3 after them; '
+         'viscoelastic_ratio, viscoelastic_time and viscoelastic_exponent, for more branches with '
+         '_2 and _3 after them; '
          'with a law its constants, such as law.c10 and law.c01', {'default': ''}),
         ('--known', 'NAME=VALUE[+-STD],...', str,
          'fixed values, such as sensor_latency=2ms or half_length=5mm+-1%%; the intervals include '

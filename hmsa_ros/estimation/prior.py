@@ -9,9 +9,13 @@ import numpy as np
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.known import Known
-from hmsa_ros.identification.quantities import check_free, derivative, values_of
+from hmsa_ros.identification.quantities import (
+    check_free,
+    derivative,
+    QUANTITIES,
+    values_of,
+)
 from hmsa_ros.identification.response import complete
-from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.laws.coordinate import Coordinate, coordinate_of
 from hmsa_ros.model.parameters import ActuatorParameters
@@ -30,7 +34,8 @@ _LEAST_LIMIT, _LEAST_ZETA = 0.02, 0.1
 _FORCE = 0.02
 # The planner has no parameters of these.
 _SENSED = ('stretch_bias', 'stretch_gain', 'sensor_latency', 'constant_force')
-_NOT_TRACKED = ('initial_stretch', 'initial_rate', 'viscoelastic_ratio', 'viscoelastic_time')
+_NOT_TRACKED = (
+    'initial_stretch', 'initial_rate', *(x for x in QUANTITIES if x.startswith('viscoelastic_')))
 #: Tracked unless others are named.
 TRACKED = ('shear_modulus', 'damping_coefficient', 'stretch_bias')
 
@@ -65,10 +70,8 @@ class Prior:
                 f'{", ".join(wrong)} cannot be tracked: expected some of '
                 + ', '.join(x for x in DEVIATIONS if x not in _NOT_TRACKED))
         values: dict[str, Any] = complete(values_of(actuator, others), free)
-        held = [x for x in zip(
-            actuator.creep.ratios, actuator.creep.times, strict=True) if x[0] > 0.0]
-        if held:
-            values['creep'] = Creep(*map(tuple, zip(*held, strict=True)))
+        if actuator.creep:
+            values['creep'] = actuator.creep.held
         if 'chain_limit' in free:
             values['chain_limit'] = min(values['chain_limit'], 1e9)
         size = []

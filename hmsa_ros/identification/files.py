@@ -17,11 +17,20 @@ import numpy as np
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.identification.known import Known, PREFIX
-from hmsa_ros.identification.quantities import actuator_of, BRANCHES, constants_of, quantity_of
+from hmsa_ros.identification.quantities import (
+    actuator_of,
+    BRANCHES,
+    constants_of,
+    flow_of,
+    FLOWING,
+    quantity_of,
+)
 from hmsa_ros.identification.result import Identification
 from hmsa_ros.interfaces.actuator import actuator_from, parameters_of
 from hmsa_ros.interfaces.parameters import BLOCK
 from hmsa_ros.interfaces.topics import PLANNER, PLANT
+from hmsa_ros.model.flows import CONSTANTS, FLOWS
+from hmsa_ros.model.flows.record import Flow, MAXWELL
 from hmsa_ros.model.mismatch import Ellipsoid, Uncertainty
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.planning.shapers.request import as_errors, LARGEST_ERROR
@@ -33,7 +42,8 @@ _OTHERS = {
     'stretch_gain': 'stretch_gain', 'sensor_latency': 'sensor_latency',
     'initial_stretch': 'initial_stretch'}
 _LISTS = dict(zip(
-    ('viscoelastic.ratio', 'viscoelastic.time'), zip(*BRANCHES, strict=True), strict=True))
+    ('viscoelastic.ratio', 'viscoelastic.time', *(f'viscoelastic.{x}' for x in CONSTANTS)),
+    zip(*(x + y for x, y in zip(BRANCHES, FLOWING, strict=True)), strict=True), strict=True))
 # Half of a 95 % interval, or half an axis of the ellipsoid of so many, in standard deviations.
 _HALF_95 = (0.0, 1.96, 2.448, 2.795, 3.080)
 # What changes how a block moves, in the order of `hmsa_ros.model.mismatch.Errors`.
@@ -86,8 +96,9 @@ def read_belief(path: Path | None, entries: Entries | None = None) -> Belief:
     values = values_of({f'{PLANNER}.{x}': y for x, y in settings.items()}, PLANNER, BLOCK)
     others = {name: _number(path, key, settings[key])
               for name, key in _OTHERS.items() if key in settings}
+    flow = FLOWS.get(str(settings.get('viscoelastic.flow')), MAXWELL)
     for key, names in _LISTS.items():
-        value = settings.get(key)
+        value = settings.get(key) if _has(flow, key) else None
         if isinstance(value, list) and len(value) > len(names):
             raise BadInputError(
                 f'{path} gives {len(value)} values of {key}: expected at most {len(names)}, '
@@ -148,6 +159,12 @@ def errors_from(file: str, others: Sequence[float]) -> Uncertainty:
     return errors_of(belief, errors)
 
 
+def _has(flow: Flow, key: str) -> bool:
+    """Return whether a list of numbers of branches is one of a flow, or of all."""
+    name = key.removeprefix('viscoelastic.')
+    return name not in CONSTANTS or CONSTANTS[name] in flow.constants
+
+
 def _number(path: Path | None, name: str, value: object) -> float:
     number = number_of(value)
     if number is None:
@@ -190,9 +207,14 @@ def file_text(found: Identification, belief: Belief, run: str, now: datetime) ->
             written[key] = found.values[name]
             lines.append(_line(key, written[key], found, name))
     held = [i for i, pair in enumerate(BRANCHES)
-            if found.values[pair[0]] > 0.0 or set(pair) & set(found.names)]
+            if found.values[pair[0]] > 0.0 or set(pair + FLOWING[i]) & set(found.names)]
+    flow = flow_of(found.values, found.names)
+    creeps = any(x in found.names for names in _LISTS.values() for x in names)
+    if creeps and flow is not MAXWELL:
+        written['viscoelastic.flow'] = flow.name
+        lines.append(f'    viscoelastic.flow: {flow.name}')
     for key, names in _LISTS.items():
-        if any(x in found.names for pair in BRANCHES for x in pair):
+        if creeps and _has(flow, key):
             written[key] = [found.values[names[i]] for i in held]
             lines.append(_line(
                 key, written[key], found, *(names[i] for i in held if names[i] in found.names)))

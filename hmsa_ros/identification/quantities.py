@@ -8,6 +8,8 @@ from typing import Any
 
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.creep import Creep
+from hmsa_ros.model.flows import CONSTANTS, FLOWS
+from hmsa_ros.model.flows.record import Flow, MAXWELL
 from hmsa_ros.model.laws import LAWS
 from hmsa_ros.model.laws.record import Constant, Elastic
 from hmsa_ros.model.parameters import ActuatorParameters, Geometry, NondimensionalParameters
@@ -30,6 +32,7 @@ _STEP = 'record unshaped steps that ring, at a rate above twice the frequency of
 _SCALE = ('only ratios of shear_modulus, density and remanence act on the motion: measure one of '
           'them (weigh the actuator for the density) and leave it out of --free')
 _CREEP = 'record rest far from that without field for several times the time of the creep'
+_NUMBERS = ('', '_2', '_3')
 #: By name; those of the actuator are named as its parameters are.
 QUANTITIES: dict[str, Quantity] = {
     'shear_modulus': Quantity('Pa', advice=_STEP),
@@ -62,9 +65,15 @@ QUANTITIES: dict[str, Quantity] = {
     'viscoelastic_time_2': Quantity('s', 0.1, advice=_CREEP),
     'viscoelastic_ratio_3': Quantity('', 0.0, 'linear', advice=_CREEP),
     'viscoelastic_time_3': Quantity('s', 1.0, advice=_CREEP),
+    **{f'viscoelastic_{name}{x}': Quantity(
+        '', 1.0, 'linear', constant.minimum, constant.maximum,
+        f'{_CREEP}, from steps of different heights')
+       for name, constant in CONSTANTS.items() for x in _NUMBERS},
 }
 #: Ratio and time of each branch of creep.
-BRANCHES = tuple((f'viscoelastic_ratio{x}', f'viscoelastic_time{x}') for x in ('', '_2', '_3'))
+BRANCHES = tuple((f'viscoelastic_ratio{x}', f'viscoelastic_time{x}') for x in _NUMBERS)
+#: Constants of the flow of each branch.
+FLOWING = tuple(tuple(f'viscoelastic_{y}{x}' for y in CONSTANTS) for x in _NUMBERS)
 #: Constants of the laws, by the name of their parameter.
 _OF_LAWS = {
     x.name: Quantity(
@@ -226,6 +235,16 @@ def actuator_of(values: Mapping[str, Any]) -> ActuatorParameters:
         remanence=values['remanence'], chain_limit=values['chain_limit'],
         damping_coefficient=values['damping_coefficient'], law=values.get('law'),
         creep=values.get('creep', Creep()))
+
+
+def flow_of(values: Mapping[str, Any], free: Iterable[str]) -> Flow:
+    """Return how branches flow: the flow that has a constant which is sought, or is not 1."""
+    sought = set(free)
+    for flow in FLOWS.values():
+        if any(name in sought or values[name] != 1.0 for x in flow.constants
+               for name in (f'viscoelastic_{x.name}{y}' for y in _NUMBERS)):
+            return flow
+    return MAXWELL
 
 
 def group_of(

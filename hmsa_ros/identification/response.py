@@ -15,6 +15,8 @@ from hmsa_ros.identification.quantities import (
     BRANCHES,
     constants_of,
     derivative,
+    flow_of,
+    FLOWING,
     geometry_of,
     quantity_of,
     with_constants,
@@ -25,6 +27,7 @@ from hmsa_ros.model.equations import Array
 from hmsa_ros.model.law import KIND, pack
 from hmsa_ros.model.laws.record import Elastic, GENT
 from hmsa_ros.model.units import MU_0
+from hmsa_ros.motion import SPEED
 from hmsa_ros.motion import theta as places
 
 #: Relative tolerance of the integration: far below the noise of any sensor.
@@ -35,7 +38,10 @@ _SENSOR = ('stretch_bias', 'stretch_gain', 'sensor_latency')
 _PLACES = {
     'coil_time_constant': places.LAG, 'initial_stretch': places.STRETCH,
     'initial_rate': places.RATE,
-    **{x: places.FIRST_BRANCH + i for i, x in enumerate(y for z in BRANCHES for y in z)}}
+    **{x: places.FIRST_BRANCH + places.BRANCH * i + j
+       for i, z in enumerate(BRANCHES) for j, x in enumerate(z)},
+    **{x: places.FIRST_BRANCH + places.BRANCH * i + places.FLOW_CONSTANT + j
+       for i, z in enumerate(FLOWING) for j, x in enumerate(z)}}
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,17 +67,19 @@ def _chain(
     k = values['remanence'] / (MU_0 * inertia)
     per_force = 1.0 / (geometry.loaded * inertia)
     f = per_force * values['constant_force']
-    theta = np.zeros(places.FIRST_BRANCH + 2 * branches)
+    theta = np.zeros(places.FIRST_BRANCH + places.BRANCH * branches)
     theta[:places.FIRST_BRANCH] = (
         a, d, k, f, values['coil_time_constant'], values['initial_stretch'],
         values['initial_rate'])
     if 'creep' in values:
-        theta[places.FIRST_BRANCH::2] = values['creep'].ratios
-        theta[places.FIRST_BRANCH + 1::2] = values['creep'].times
+        rows = np.array(values['creep'].rows())
+        rows[:, SPEED] = values['creep'].times
+        theta[places.FIRST_BRANCH:] = rows[:, :places.BRANCH].ravel()
     else:
         for name, i in _PLACES.items():
             if places.FIRST_BRANCH <= i < len(theta):
                 theta[i] = values[name]
+        theta[places.FIRST_BRANCH + places.FLOW::places.BRANCH] = flow_of(values, free).kind
     per_density = {
         places.STIFFNESS: -a / density, places.DAMPING: -d / density,
         places.DRIVE: -k / density, places.FORCE: -f / density}
@@ -152,8 +160,8 @@ class Setup:
         """
         given: Creep | None = values.get('creep')
         branches = len(given.ratios) if given else max((
-            i for i, (ratio, time) in enumerate(BRANCHES, 1)
-            if values[ratio] > 0.0 or ratio in free or time in free), default=0)
+            i for i, names in enumerate(BRANCHES, 1)
+            if values[names[0]] > 0.0 or set(names) & set(free)), default=0)
         theta, chain = _chain(values, branches, free)
         inner = sorted({i for x in chain.values() for i in x})
         rows = {x: i for i, x in enumerate(inner)}

@@ -7,6 +7,7 @@ from typing import Any, TYPE_CHECKING
 
 from hmsa_ros.interfaces.parameters import ACTUATOR_FIELDS, LAW, LAW_NAME, VISCOELASTIC
 from hmsa_ros.model.creep import Creep
+from hmsa_ros.model.flows import FLOWS
 from hmsa_ros.model.laws import LAWS
 from hmsa_ros.model.parameters import ActuatorParameters
 
@@ -68,8 +69,13 @@ def planned_from(
 
 
 def creep_from(values: Mapping[str, Any]) -> Creep:
-    """Return the Maxwell branches of ``viscoelastic.*``; none where there is no such value."""
-    return Creep(*(tuple(values.get(x.name, ())) for x in VISCOELASTIC))
+    """Return the branches of ``viscoelastic.*``; none where there is no such value."""
+    given = {x.name: values.get(x.name, x.default) for x in VISCOELASTIC}
+    flow = given['viscoelastic.flow']
+    constants = FLOWS[flow].constants if flow in FLOWS else ()
+    return Creep(
+        tuple(given['viscoelastic.ratio']), tuple(given['viscoelastic.time']), flow,
+        tuple(tuple(given[f'viscoelastic.{x.name}']) for x in constants))
 
 
 def parameters_of(actuator: ActuatorParameters) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import math
 from typing import Any
 
 from hmsa_ros.errors import BadInputError, excerpt
+from hmsa_ros.model.flows import CONSTANTS, FLOWS
 from hmsa_ros.model.laws import LAWS
 
 #: Words that YAML reads as false or true where nobody quotes them.
@@ -225,7 +226,7 @@ COIL_TIME_CONSTANT = ParameterSpec(
 #: What a plan depends on.
 PLANNED = (*BLOCK, FLUX_DENSITY_MIN, FLUX_DENSITY_MAX, SLEW_LIMIT, COIL_TIME_CONSTANT)
 
-#: Maxwell branches beside the elastic law.
+#: Branches beside the elastic law.
 VISCOELASTIC = (
     ParameterSpec(
         'viscoelastic.ratio', [],
@@ -235,6 +236,13 @@ VISCOELASTIC = (
     ParameterSpec(
         'viscoelastic.time', [], 'Creep: relaxation time of each viscoelastic branch.', 's',
         1e-9, 1e9, items=float),
+    ParameterSpec(
+        'viscoelastic.flow', next(iter(FLOWS)),
+        'Creep: how the branches flow, in proportion to their overstress or not.',
+        choices=tuple(FLOWS)),
+    *(ParameterSpec(
+        f'viscoelastic.{x.name}', [], f'Creep: {x.words}; one for each branch.', '', x.minimum,
+        x.maximum, items=float) for x in CONSTANTS.values()),
 )
 
 #: How well parameters are known, as ``hmsa identify --out`` and ``~/save_estimate`` write it.

@@ -117,13 +117,11 @@ def _check_load(name: str, value: float, unit_name: str, unit: float) -> None:
 def _branches_of(creeps: Sequence[Creep], time_units: Array) -> Array:
     """Return the branches of several actuators as `motion.follow` takes them."""
     if not any(creeps):
-        return np.zeros((0, MOST, 3))
-    rows = np.zeros((len(creeps), MOST, 3))
+        return np.zeros((0, MOST, motion.BRANCH))
+    rows = np.zeros((len(creeps), MOST, motion.BRANCH))
     for branches, creep, unit in zip(rows, creeps, time_units.tolist(), strict=True):
-        held = [x for x in zip(creep.ratios, creep.times, strict=True) if x[0] > 0.0]
-        for branch, (ratio, time) in zip(branches, held, strict=False):
-            branch[motion.RATIO] = ratio
-            branch[motion.SPEED] = unit / time
+        for branch, row in zip(branches, creep.rows(unit), strict=False):
+            branch[:] = row
     return rows
 
 

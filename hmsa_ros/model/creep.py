@@ -1,9 +1,11 @@
-"""Creep of the elastomer: up to three Maxwell branches beside the law, a Prony series."""
+"""Creep of the elastomer: up to three branches beside the law, which flow in proportion or not."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
-from hmsa_ros.errors import BadInputError
+from hmsa_ros.errors import BadInputError, excerpt
+from hmsa_ros.model.flows import FLOWS
+from hmsa_ros.model.flows.record import Flow, FLOW_CONSTANTS, MAXWELL
 
 #: Branches that an elastomer may have.
 MOST = 3
@@ -15,18 +17,21 @@ _STIFFEST = 1e3
 @dataclass(frozen=True)
 class Creep:
     """
-    Up to three Maxwell branches of an elastomer.
+    Up to three branches of an elastomer.
 
-    The law is what the elastomer holds in the end; branch i adds h_i to its force, with
-    h_i' = ratio_i (dW/dl)' - h_i/time_i (J. C. Simo, Comput. Methods Appl. Mech. Eng. 60, 153
-    (1987), in the force of the block).
+    The law is what the elastomer holds in the end; branch i adds h_i = ratio_i x_i to its force,
+    with x_i' = (dW/dl)' - flow(x_i), in units of G. With the flow of Maxwell, x_i/time_i, they
+    are a Prony series.
     """
 
     ratios: tuple[float, ...] = ()  #: stiffness in units of that of the law, 0 to 1000
     times: tuple[float, ...] = ()  #: of relaxation, in s
+    flow: str = MAXWELL.name  #: one of `hmsa_ros.model.flows.FLOWS`
+    constants: tuple[tuple[float, ...], ...] = ()  #: of the flow, each for every branch
 
     def __post_init__(self) -> None:
         """Check the values."""
+        self._check_flow()
         count = max(len(self.ratios), len(self.times))
         if len(self.ratios) != len(self.times):
             raise BadInputError(
@@ -45,15 +50,64 @@ class Creep:
                 raise BadInputError(
                     f'viscoelastic.time has {time:g} s: expected finite numbers above 0')
 
+    def _check_flow(self) -> None:
+        if self.flow not in FLOWS:
+            raise BadInputError(
+                f'viscoelastic.flow is {excerpt(self.flow)}: expected one of {", ".join(FLOWS)}')
+        constants = self.law.constants
+        if len(self.constants) not in (0, len(constants)):
+            raise BadInputError(
+                f'creep has {len(self.constants)} constants: expected {len(constants)} of '
+                f'viscoelastic.flow {self.flow}')
+        for constant, values in zip(
+                constants, self.constants or ((),) * len(constants), strict=True):
+            if len(values) != len(self.ratios):
+                raise BadInputError(
+                    f'viscoelastic.{constant.name} has {len(values)} values and '
+                    f'viscoelastic.ratio {len(self.ratios)}: expected one of each for every '
+                    f'branch with viscoelastic.flow {self.flow}')
+            for value in values:
+                if not constant.minimum <= value <= constant.maximum:
+                    raise BadInputError(
+                        f'viscoelastic.{constant.name} has {value:g}: expected '
+                        f'{constant.minimum:g} to {constant.maximum:g}')
+
+    @property
+    def law(self) -> Flow:
+        """How the branches flow."""
+        return FLOWS[self.flow]
+
+    @property
+    def held(self) -> 'Creep':
+        """The branches that hold anything."""
+        kept = [i for i, x in enumerate(self.ratios) if x > 0.0]
+
+        def of(values: tuple[float, ...]) -> tuple[float, ...]:
+            return tuple(values[i] for i in kept)
+
+        return replace(
+            self, ratios=of(self.ratios), times=of(self.times),
+            constants=tuple(map(of, self.constants)) if kept else ())
+
+    def rows(self, unit: float = 1.0) -> list[list[float]]:
+        """Return the branches that hold anything as `hmsa_ros.motion` takes them; a unit in s."""
+        held = self.held
+        return [
+            [ratio, unit / time, float(self.law.kind), *constants,
+             *[0.0] * (FLOW_CONSTANTS - len(constants)), 0.0]
+            for ratio, time, *constants in zip(
+                held.ratios, held.times, *held.constants, strict=True)]
+
     def __bool__(self) -> bool:
         """Return whether there is a branch that holds anything."""
         return any(self.ratios)
 
     def check(self, time_unit: float) -> None:
         """Refuse with `BadInputError` what only damps, for a unit of time in s."""
-        for time in self.times:
-            if time < _FASTEST * time_unit:
+        for time, *constants in zip(self.times, *self.constants, strict=True):
+            least = _FASTEST * time_unit * self.law.hastens(*constants)
+            if time < least:
                 raise BadInputError(
                     f'viscoelastic.time has {time:g} s: expected at least '
-                    f'{_FASTEST * time_unit:.3g} s, {_FASTEST:g} of L sqrt(rho/G); a faster '
+                    f'{least:.3g} s, {_FASTEST:g} of L sqrt(rho/G); a faster '
                     'branch is damping, which actuator.damping_coefficient has')

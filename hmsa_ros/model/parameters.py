@@ -30,7 +30,7 @@ def _check(record: object) -> None:
             raise BadInputError(
                 f'law is {excerpt(value)}: expected an elastic law, or none for Gent')
         if field.name == 'creep' and not isinstance(value, Creep):
-            raise BadInputError(f'creep is {excerpt(value)}: expected Maxwell branches, or none')
+            raise BadInputError(f'creep is {excerpt(value)}: expected branches, or none')
         if field.name in _NO_NUMBERS:
             continue
         if not isinstance(value, (int, float)) or isinstance(value, bool):
@@ -65,7 +65,7 @@ class NondimensionalParameters:
     law : Elastic, optional
         Elastic energy in units of G, in place of the Gent model: J_lim is then without effect.
     creep : Creep
-        Maxwell branches beside the law, their times in units of time; default none.
+        Branches beside the law, their times in units of time; default none.
 
     Raises
     ------
@@ -103,11 +103,10 @@ class NondimensionalParameters:
 
     @cached_property
     def branches(self) -> NDArray[np.float64]:
-        """Stiffness and 1/time of each branch that holds anything, shape (n, 2)."""
-        return np.array([
-            (ratio, 1.0 / time) for ratio, time in zip(
-                self.creep.ratios, self.creep.times, strict=True) if ratio > 0.0
-        ]).reshape(-1, 2)
+        """Branches that hold anything, as `hmsa_ros.motion` takes them, shape (n, 6)."""
+        from hmsa_ros.motion import BRANCH  # as above
+
+        return np.array(self.creep.rows()).reshape(-1, BRANCH)
 
     @cached_property
     def elastic(self) -> 'NondimensionalParameters':
@@ -172,7 +171,7 @@ class ActuatorParameters:
         Elastic energy in units of G, in place of the Gent model: the chain limit is then without
         effect.
     creep : Creep
-        Maxwell branches beside the law, for planning; default none.
+        Branches beside the law, for planning; default none.
 
     Raises
     ------

@@ -18,6 +18,7 @@ from hmsa_ros.model.actuators import Actuators, check_stretch, RTOL, Setup
 from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.delivery import Delivery, Piece, ramps
 from hmsa_ros.model.equations import Array
+from hmsa_ros.model.flows.record import MAXWELL
 from hmsa_ros.model.moves import Level, State
 from hmsa_ros.model.parameters import ActuatorParameters, NondimensionalParameters
 from hmsa_ros.model.schedule import CommandSchedule
@@ -30,6 +31,8 @@ __all__ = [
 # its phase.
 _SETTLED = 40.0
 _MOST_PERIODS = 2000.0
+# A stress too small to be told from none, and how exactly branches relax alone.
+_NOTHING, _SLOWLY = 1e-12, 1e-12
 _STUCK = 'the integration ran out of steps: the load is too large to follow'
 
 
@@ -119,11 +122,34 @@ def followed_by(state: State, material: NondimensionalParameters) -> tuple[float
     return (float(law.elastic_force(state.stretch, material.packed)),) * count
 
 
+def with_followed(
+        material: NondimensionalParameters, followed: ArrayLike) -> Array:
+    """Return branches as `hmsa_ros.motion` takes them, with what they have followed."""
+    branches = material.branches.copy()
+    branches[:, motion.FOLLOWER] = followed
+    return branches
+
+
+def paces(material: NondimensionalParameters, above: ArrayLike) -> Array:
+    """Return how fast branches relax that hold so much over their ratio, in units of G."""
+    given: Array = np.asarray(above, dtype=np.float64)
+    given = np.where(np.abs(given) > _NOTHING, given, _NOTHING)
+    found: Array = flow_rates(material, given) / given
+    return found
+
+
+def flow_rates(material: NondimensionalParameters, above: Array) -> Array:
+    """Return how fast branches follow that hold so much over their ratio, in units of G."""
+    rates = np.empty(len(above))
+    motion.flow_rates(material.branches, above, rates)
+    return rates
+
+
 def sampled(
         switches: Array, loads: Array, slopes: Array, times: Array, state: State,
         material: NondimensionalParameters, rtol: float, lag: float = 0.0) -> Array:
     """Return stretch, rate, field and what branches follow, (3 + n, m), or raise `HmsaError`."""
-    branches = np.column_stack([material.branches, followed_by(state, material)])
+    branches = with_followed(material, followed_by(state, material))
     out = np.empty((motion.FOLLOWED + len(branches), times.size))
     if not motion.sample(
             state.stretch, state.rate, loads[0] if math.isnan(state.load) else state.load,
@@ -147,16 +173,33 @@ def _follow_slowly(
     if rings == end:
         return State(
             stretch, rate, last if amplifier is None else field, amplifier, tuple(followed))
-    # Without inertia the elastic force is linear in what the branches follow, which follows it.
-    ratios, speeds = material.branches.T
-    share = ratios / (1.0 + np.sum(ratios))
-    values, vectors = np.linalg.eig(speeds[:, None] * (share - np.eye(len(share))))
-    left = np.linalg.solve(vectors, np.array(followed) - last)
-    relaxed = last + np.real(vectors @ (left * np.exp(values * (end - rings))))
+    share = material.branches[:, motion.RATIO] / (1.0 + material.branches[:, motion.RATIO].sum())
+    relaxed = _relaxed(np.array(followed), last, share, end - rings, material)
     force = last + float(share @ (relaxed - last))
     return State(
         float(law.equilibrium_stretch(force, material.packed)), 0.0, last, amplifier,
         tuple(relaxed.tolist()))
+
+
+def _relaxed(
+        followed: Array, last: float, share: Array, duration: float,
+        material: NondimensionalParameters) -> Array:
+    """Return what branches follow after a duration without inertia, under a constant load."""
+    # The elastic force is linear in what they follow, which follows it.
+    if material.creep.law.kind == MAXWELL.kind:
+        speeds = material.branches[:, motion.SPEED]
+        values, vectors = np.linalg.eig(speeds[:, None] * (share - np.eye(len(share))))
+        left = np.linalg.solve(vectors, followed - last)
+        found: Array = last + np.real(vectors @ (left * np.exp(values * duration)))
+        return found
+    from scipy.integrate import solve_ivp  # others need not wait for it
+
+    def change(_: float, y: Array) -> Array:
+        return flow_rates(material, last + share @ (y - last) - y)
+
+    ended: Array = solve_ivp(
+        change, (0.0, duration), followed, method='LSODA', rtol=_SLOWLY, atol=_SLOWLY).y[:, -1]
+    return ended
 
 
 def _vector(values: ArrayLike) -> Array:

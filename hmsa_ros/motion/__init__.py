@@ -14,6 +14,7 @@ from hmsa_ros.motion._motion import (
     elastic_stiffness,
     equilibrium_stretch,
     evaluate,
+    flow_rates,
     follow,
     mass,
     natural_frequency,
@@ -22,6 +23,7 @@ from hmsa_ros.motion._motion import (
     sample,
     solve,
     staircase,
+    trail,
     turning_point,
     two_step,
     two_step_batch,
@@ -30,14 +32,16 @@ from hmsa_ros.motion._motion import (
 
 __all__ = [
     'accelerations', 'critical_zeta', 'damping', 'elastic_energy', 'elastic_force',
-    'elastic_stiffness', 'equilibrium_stretch', 'evaluate', 'follow', 'mass',
-    'natural_frequency', 'respond', 'rest', 'sample', 'solve', 'staircase', 'turning_point',
+    'elastic_stiffness', 'equilibrium_stretch', 'evaluate', 'flow_rates', 'follow',
+    'mass', 'natural_frequency', 'respond', 'rest', 'sample', 'solve', 'staircase', 'trail',
+    'turning_point',
     'two_step', 'two_step_batch', 'two_step_late']
 
 #: Statuses of a turning point: found; into an equilibrium instead; out of steps; against a
 #: limiting stretch too hard to be resolved. Those of `follow` are the first and the third.
 DONE, NO_TURN, STUCK, TOO_CLOSE = range(4)
-#: Columns of a branch: gamma, 1/tau and, where it goes on with the state, what it follows.
-RATIO, SPEED, FOLLOWER = range(3)
+#: Columns of a branch: gamma, 1/tau, the number of its flow and the constants of that, and where
+#: it goes on with the state, what it follows; and how many there are.
+RATIO, SPEED, FLOW, FLOW_CONSTANT, FOLLOWER, BRANCH = 0, 1, 2, 3, 5, 6
 #: Rows that `sample` writes before what the branches follow.
 STRETCH, RATE, FIELD, FOLLOWED = range(4)

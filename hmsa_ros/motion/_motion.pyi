@@ -41,14 +41,18 @@ def sample(
     stretch: float, rate: float, field: float, switches: Array, loads: Array, slopes: Array,
     lag: float, times: Array, material: Array, branches: Array, rtol: float, out: Array, /
 ) -> bool: ...
-# Whether it is solved, and the duration.
+# Whether it is solved, the duration, and the work that it was of the most that it may be.
 def solve(
     times: Array, loads: Array, d_times: Array, d_loads: Array, stretch: float, rate: float,
     field: float, load: float, target: float, slew: float, lag: float, material: Array,
-    branches: Array, followed: Array, /) -> tuple[bool, float]: ...
+    branches: Array, followed: Array, most_work: int, /) -> tuple[bool, float, int]: ...
+# How fast branches follow that hold so much over their ratios.
+def flow_rates(branches: Array, above: Array, out: Array, /) -> None: ...
+# What branches follow under an elastic force that is linear between times; whether all do.
+def trail(times: Array, forces: Array, branches: Array, out: Array, /) -> bool: ...
 # How many levels there are, and a bound of their vibration.
 def staircase(
-    held: Array, branches: Array, stretch: float, material: Array, lag: float, period: float,
+    behind: Array, branches: Array, stretch: float, material: Array, lag: float, period: float,
     end: float, ripple: float, out: Array, /) -> tuple[int, float]: ...
 # Whether the motion was followed to its end.
 def respond(

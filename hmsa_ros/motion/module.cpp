@@ -27,13 +27,14 @@ template <class F> auto with_system(const double *m, const F &f)
 template <int n> constexpr std::integral_constant<int, n> fixed{};
 // What is used most has code of its own; the rest of it is compiled once.
 template <class System, int NB> constexpr bool usual = std::is_same_v<System, GentBlock> && NB <= 1;
-// Calls f with as many branches as there are, or with some that hold nothing.
-template <class System, class F> auto with_branches(int count, const F &f)
+// Calls f with as many branches as there are, or with some that hold nothing. More than one, and
+// those that do not flow in proportion, have one code.
+template <class System, class F> auto with_branches(int count, bool proportional, const F &f)
 {
     if (count == 0)
         return f(fixed<0>);
     if constexpr (usual<System, 1>)
-        if (count == 1)
+        if (count == 1 && proportional)
             return f(fixed<1>);
     return f(fixed<most_branches>);
 }
@@ -106,6 +107,13 @@ template <> struct Argument<Followed> {
         return !PyErr_Occurred();
     }
 };
+bool proportional(const double *rows, int count, int columns = branch_columns, int at = flow_at)
+{
+    bool is = true;
+    for (int b = 0; b < count; b++)
+        is = is && rows[columns * b + at] == maxwell;
+    return is;
+}
 bool fit(bool is)
 {
     if (!is)
@@ -216,13 +224,13 @@ auto two_step_late(double start, double rate, double target, double least, doubl
     double hold, Numbers material, Numbers branches, Followed followed, double field, double load,
     double lag)
 {
-    const int creeping = branches.count / 2;
+    const int creeping = branches.count / branch_columns;
     const double *known = followed.count == creeping ? followed.values : nullptr;
     Late found{};
     if (fit(creeping <= most_branches))
         found = with_system(material.data, [&](const auto &system) {
             using System = std::decay_t<decltype(system)>;
-            return with_branches<System>(creeping, [&](auto n) {
+            return with_branches<System>(creeping, proportional(branches.data, creeping), [&](auto n) {
                 constexpr int unknowns = usual<System, n()> ? 3 : most_unknowns;
                 return late<n(), unknowns>(system, material.data, {start, rate, target},
                     {least, most, rtol, hold}, {field, load, lag, branches.data, creeping, known});
@@ -269,7 +277,7 @@ int follow(int first, int last, Array<const bool> wanted, Results state, Results
     const int rows = durations.count;
     if (!fit(state.count == 3 * rows && drive.count == 4 * rows && status.count == rows
             && wanted.count == rows && first >= 0 && last <= rows
-            && (!branches.count || branches.count == 3 * most_branches * rows)))
+            && (!branches.count || branches.count == branch_columns * most_branches * rows)))
         return 0;
     const Plant plant{state.data, drive.data, material.data, rows ? material.count / rows : 0,
         branches.count ? branches.data : nullptr, durations.data, rtol};
@@ -278,13 +286,13 @@ int follow(int first, int last, Array<const bool> wanted, Results state, Results
         if (!wanted[i])
             continue;
         int creeping = 0;
+        const double *own = plant.branches + branch_columns * most_branches * i;
         if (plant.branches)
-            while (creeping < most_branches
-                    && plant.branches[3 * (most_branches * i + creeping) + speed_at] > 0)
+            while (creeping < most_branches && own[branch_columns * creeping + speed_at] > 0)
                 creeping++;
         const bool done = with_system(plant.material + int64_t(plant.stride) * i,
             [&](const auto &system) {
-                return with_branches<std::decay_t<decltype(system)>>(creeping, [&](auto n) {
+                return with_branches<std::decay_t<decltype(system)>>(creeping, proportional(own, creeping), [&](auto n) {
                     return advance_row<n()>(plant, i, system);
                 });
             });
@@ -297,7 +305,7 @@ int follow(int first, int last, Array<const bool> wanted, Results state, Results
 bool sample_of(double stretch, double rate, double field, Numbers switches, Numbers loads, Numbers slopes,
     double lag, Numbers times, Numbers material, Numbers branches, double rtol, Results out)
 {
-    const int creeping = branches.count / 3;
+    const int creeping = branches.count / branch_columns;
     if (!fit(loads.count == switches.count && slopes.count == switches.count && switches.count
             && out.count == (3 + creeping) * times.count && creeping <= most_branches))
         return false;
@@ -305,35 +313,58 @@ bool sample_of(double stretch, double rate, double field, Numbers switches, Numb
         stretch, rate, field, lag, material[zeta_at], rtol, branches.data, creeping, out.data};
     return apart([&] {
         return with_system(material.data, [&](const auto &system) {
-            return with_branches<std::decay_t<decltype(system)>>(creeping, [&](auto n) {
+            return with_branches<std::decay_t<decltype(system)>>(creeping, proportional(branches.data, creeping), [&](auto n) {
                 return sample<n()>(system, course);
             });
         });
     });
 }
 
+// How fast branches follow that hold so much, (count,).
+Nothing flow_rates(Numbers branches, Numbers above, Results out)
+{
+    const int creeping = above.count;
+    if (fit(branches.count == branch_columns * creeping && out.count == creeping && creeping <= most_branches)) {
+        Branches<most_branches> all;
+        all.read(branches.data, creeping);
+        for (int b = 0; b < creeping; b++)
+            out[b] = all.rate(b, above[b]);
+    }
+    return {};
+}
+// What branches follow, (times, count), under an elastic force that is linear between times.
+bool trail_of(Numbers times, Numbers forces, Numbers branches, Results out)
+{
+    const int creeping = branches.count / branch_columns;
+    return fit(forces.count == times.count && out.count == times.count * creeping && creeping <= most_branches)
+        && trail({times.count, times.data, forces.data, branches.data, creeping, out.data});
+}
+
 // -- levels ---------------------------------------------------------------------------------------
 
-// Whether it is solved, and the duration.
-std::tuple<bool, double> solve(Results times, Results loads, Numbers d_times, Numbers d_loads,
+// Whether it is solved, the duration, and the work that it was.
+std::tuple<bool, double, int> solve(Results times, Results loads, Numbers d_times, Numbers d_loads,
     double stretch, double rate, double field, double load, double target, double slew, double lag,
-    Numbers material, Numbers branches, Numbers followed)
+    Numbers material, Numbers branches, Numbers followed, int most_work)
 {
     const int levels = times.count, unknowns = levels ? d_times.count / levels : 0;
     const int creeping = followed.count;
     if (!fit(levels && loads.count == levels && d_times.count == unknowns * levels
-            && d_loads.count == unknowns * levels && branches.count == 2 * creeping
+            && d_loads.count == unknowns * levels && branches.count == branch_columns * creeping
             && levels <= most_levels && unknowns <= most_unknowns && creeping <= most_branches))
         return {};
     const Shot shot{levels, unknowns, times.data, loads.data, d_times.data, d_loads.data, stretch, rate,
-        field, load, target, slew, lag, branches.data, creeping, followed.data};
+        field, load, target, slew, lag, branches.data, creeping, followed.data, most_work};
     double lasts = 0;
+    int work = 0;
     const bool solved = with_system(material.data, [&](const auto &system) {
         using System = std::decay_t<decltype(system)>;
-        return with_branches<System>(creeping, [&](auto n) {
+        return with_branches<System>(creeping, proportional(branches.data, creeping), [&](auto n) {
             const auto with = [&](auto p) {
                 Shooting<System, n(), p()> shooting{system, shot};
-                return shooting.solve(material.data, lasts);
+                const bool found = shooting.solve(material.data, lasts);
+                work = shooting.work;
+                return found;
             };
             if constexpr (n() == 0 || usual<System, n()>)
                 if (unknowns <= 2)
@@ -344,17 +375,17 @@ std::tuple<bool, double> solve(Results times, Results loads, Numbers d_times, Nu
             return with(fixed<most_unknowns>);
         });
     });
-    return {solved, lasts};
+    return {solved, lasts, work};
 }
 // The number of levels and a bound of their vibration.
-std::tuple<int, double> staircase(Numbers held, Numbers branches, double stretch, Numbers material,
+std::tuple<int, double> staircase(Numbers behind, Numbers branches, double stretch, Numbers material,
     double lag, double period, double end, double ripple, Results out)
 {
     Tail tail{};
-    tail.count = held.count;
-    if (!fit(branches.count == 2 * tail.count && tail.count <= most_branches))
+    tail.count = behind.count;
+    if (!fit(branches.count == branch_columns * tail.count && tail.count <= most_branches))
         return {};
-    tail.held = held.data, tail.branches = branches.data;
+    tail.behind = behind.data, tail.rows = branches.data;
     tail.lag = lag, tail.period = period, tail.until = end;
     tail.out = out.data, tail.room = out.count / columns;
     double most = 0;
@@ -407,7 +438,7 @@ bool respond(Numbers theta, Numbers material, int branches, Places wanted, Numbe
     Results stretch, Results rate, Results jacobian, Results by_rate, Numbers behind, Results behind_last)
 {
     const int64_t cells = int64_t(times.count) * wanted.count;
-    if (!fit(branches >= 0 && branches <= most_branches && theta.count == first_branch + 2 * branches
+    if (!fit(branches >= 0 && branches <= most_branches && theta.count == first_branch + branch_places * branches
             && start.count == wanted.count && begins.count && levels.count == begins.count
             && ramps.count == begins.count && stretch.count == times.count && rate.count == times.count
             && jacobian.count == cells && (!by_rate.count || by_rate.count == cells)
@@ -424,7 +455,8 @@ bool respond(Numbers theta, Numbers material, int branches, Places wanted, Numbe
     of.behind = behind.count ? behind.data : nullptr;
     of.behind_last = behind_last.count ? behind_last.data : nullptr;
     return apart([&] {
-        return with_branches<GentBlock>(branches, [&](auto n) { return respond_all<n()>(of); });
+        const bool in_proportion = proportional(theta.data + first_branch, branches, branch_places, 2);
+        return with_branches<GentBlock>(branches, in_proportion, [&](auto n) { return respond_all<n()>(of); });
     });
 }
 // The stretch at which a level holds the actuator, no number if there is none; its derivatives by
@@ -463,7 +495,8 @@ PyMethodDef methods[] = {
     method<turning_point_of>("turning_point"),
     method<two_step_of>("two_step"), method<two_step_late>("two_step_late"),
     method<two_step_batch>("two_step_batch"), method<follow>("follow"),
-    method<sample_of>("sample"), method<solve>("solve"), method<staircase>("staircase"),
+    method<sample_of>("sample"), method<flow_rates>("flow_rates"), method<trail_of>("trail"),
+    method<solve>("solve"), method<staircase>("staircase"),
     method<respond>("respond"), method<rest>("rest"), {nullptr, nullptr, 0, nullptr}};
 PyModuleDef module = {PyModuleDef_HEAD_INIT, "_motion", nullptr, 0, methods, nullptr, nullptr, nullptr, nullptr};
 }  // namespace

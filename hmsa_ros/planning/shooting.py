@@ -85,10 +85,12 @@ def solve(
         if wait > 0.0:
             times, loads = np.append(times, times[-1] + wait), np.append(loads, loads[-1])
             d_times, d_loads = (np.concatenate([x, x[-1:]]) for x in (d_times, d_loads))
-    solved, duration = motion.solve(
+    solved, duration, done = motion.solve(
         times, loads, np.ascontiguousarray(d_times), np.ascontiguousarray(d_loads), state.stretch,
         state.rate, request.field, request.load, request.target, delivery.slew, delivery.lag,
-        material.packed, material.branches, np.array(followed_by(state, material)))
+        material.packed, material.branches, np.array(followed_by(state, material)),
+        request.work.left)
+    request.work.left -= done
     if not solved:
         return None
     levels = tuple(Level(t, x) for t, x in zip(times.tolist(), loads.tolist(), strict=True))

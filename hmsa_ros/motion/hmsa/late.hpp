@@ -12,7 +12,7 @@ struct Late {
 struct Before {
     double field, load;  // in force, and the amplifier's
     double lag;
-    const double *branches;  // (branch_count, 2)
+    const double *branches;  // (branch_count, branch_columns)
     int branch_count;
     const double *followed;  // null where they have relaxed
 };
@@ -26,7 +26,7 @@ template <int NB, int P, class System> Late late(const System &system, const dou
     constexpr double length = 0.6931471805599453;
     Planner<System, NB> planner;
     auto &search = planner.search;
-    search.branches.read(before.branches, 2, before.branch_count);
+    search.branches.read(before.branches, before.branch_count);
     for (int b = 0; b < NB; b++)
         search.followed[b] = before.followed && b < before.branch_count
             ? before.followed[b] : system.elastic(move.start).v;
@@ -44,7 +44,7 @@ template <int NB, int P, class System> Late late(const System &system, const dou
     const double d_times[9] = {0, 0, 0, 0, 0, 1, 0, 0, 1}, d_loads[9] = {1, 0, 0, 0, 1, 0, 0, 0, 0};
     const Shot shot{3, 3, times, loads, d_times, d_loads, move.start, move.rate, before.field,
         before.load, move.target, infinity(), before.lag, before.branches, before.branch_count,
-        search.followed};
+        search.followed, most_attempts};
     Shooting<System, NB, P> shooting{system, shot};
     double lasts;
     if (!shooting.solve(m, lasts))

@@ -20,6 +20,7 @@ template <class S, class System, int NB> struct Motion {
     const Branches<NB> &branches;
     S y[width] = {};  // stretch, rate, what the branches follow
     Step<S, width> step;
+    int room = most_attempts, made = 0;  // steps that it may try to the end of a piece; and has
     Motion(const System &a, const Branches<NB> &b) : system(a), branches(b) {}
 
     // Integrates over a duration; h is the step to begin with, 0 for none known, and to go on with.
@@ -36,7 +37,7 @@ template <class S, class System, int NB> struct Motion {
         }
         S end[width];
         double done = 0;
-        for (int i = 0; i < most_attempts; i++) {
+        for (int i = 0; i < room; i++, made++) {
             const double left = duration - done;
             if (!(left > 0))
                 return true;
@@ -84,7 +85,7 @@ inline double faded(double line, double rest, double decay, double duration)
 }
 
 // Actuators that are advanced together, each by a duration of its own: rows of stretch, rate and
-// step, of the drive, of the packed material, and of the branches (most_branches, 3).
+// step, of the drive, of the packed material, and of the branches (most_branches, branch_columns).
 struct Plant {
     double *state, *drive;
     const double *material;
@@ -96,14 +97,14 @@ struct Plant {
 template <int NB, class System> bool advance_row(const Plant &plant, int i, const System &system)
 {
     double *state = plant.state + 3 * i, *drive = plant.drive + 4 * i;
-    double *rows = plant.branches ? plant.branches + 3 * most_branches * i : nullptr;
+    double *rows = plant.branches ? plant.branches + branch_columns * most_branches * i : nullptr;
     Branches<NB> branches;
     if (NB > 0)
-        branches.read(rows, 3, NB);
+        branches.read(rows, NB);
     Motion<double, System, NB> motion{system, branches};
     motion.y[0] = state[0], motion.y[1] = state[1];
     for (int b = 0; b < NB; b++)
-        motion.y[2 + b] = rows[3 * b + follower_at];
+        motion.y[2 + b] = rows[branch_columns * b + follower_at];
     const double duration = plant.durations[i];
     const double zeta = plant.material[int64_t(plant.stride) * i + zeta_at];
     double h = state[2];
@@ -111,7 +112,7 @@ template <int NB, class System> bool advance_row(const Plant &plant, int i, cons
         return false;
     state[0] = motion.y[0], state[1] = motion.y[1], state[2] = h;
     for (int b = 0; b < NB; b++)
-        rows[3 * b + follower_at] = motion.y[2 + b];
+        rows[branch_columns * b + follower_at] = motion.y[2 + b];
     const double line = drive[0];
     drive[0] += drive[1] * duration;
     if (drive[2] != 0)
@@ -126,18 +127,18 @@ struct Course {
     int pieces, count;
     const double *switches, *loads, *slopes, *times;
     double stretch, rate, field, lag, zeta, rtol;
-    const double *branches;  // (NB, 3)
+    const double *branches;  // (branch_count, branch_columns)
     int branch_count;
     double *out;
 };
 template <int NB, class System> bool sample(const System &system, const Course &course)
 {
     Branches<NB> branches;
-    branches.read(course.branches, 3, course.branch_count);
+    branches.read(course.branches, course.branch_count);
     Motion<double, System, NB> motion{system, branches};
     motion.y[0] = course.stretch, motion.y[1] = course.rate;
     for (int b = 0; b < NB && b < course.branch_count; b++)
-        motion.y[2 + b] = course.branches[3 * b + follower_at];
+        motion.y[2 + b] = course.branches[branch_columns * b + follower_at];
     const double lag = course.lag, decay = lag > 0 ? 1 / lag : 0;
     double t = course.switches[0], field = course.field, h = 0;
     int piece = 0;
@@ -167,6 +168,52 @@ template <int NB, class System> bool sample(const System &system, const Course &
         column[2 * course.count] = field;
         for (int b = 0; b < NB && b < course.branch_count; b++)
             column[(3 + b) * course.count] = motion.y[2 + b];
+    }
+    return true;
+}
+
+// What branches follow under an elastic force given at times, and linear in between; from what the
+// rows of the branches say.
+struct Trail {
+    int count;
+    const double *times, *forces, *branches;
+    int branch_count;
+    double *out;  // (count, branch_count)
+};
+inline bool trail(const Trail &of)
+{
+    constexpr double rtol = 1e-13;
+    Branches<most_branches> branches;
+    branches.read(of.branches, of.branch_count);
+    Step<double, 1> step;
+    for (int b = 0; b < of.branch_count; b++) {
+        // Of how far it is behind; exactly where it flows in proportion.
+        double x = of.forces[0] - of.branches[branch_columns * b + follower_at], end, h = 0;
+        for (int i = 0; i < of.count; i++) {
+            const double span = i ? of.times[i] - of.times[i - 1] : 0;
+            const double slope = span != 0 ? (of.forces[i] - of.forces[i - 1]) / span : 0;
+            if (branches.flow[b].kind == maxwell) {
+                const double faded = expm1(-branches.speed[b] * span);
+                x += faded * (x - slope / branches.speed[b]);
+            } else {
+                const double sign = span < 0 ? -1 : 1;
+                double left = abs(span);
+                for (int n = 0; left > 0; n++) {
+                    if (n == most_attempts)
+                        return false;
+                    h = min(h > 0 ? h : 0.1 / branches.tangent(b, x), left);
+                    const double scale = abs(x) + 1e-9;  // errors count against what there is
+                    double y = x / scale;
+                    const double error = step([&](int, const double *at, double *by) {
+                        *by = sign * (slope - branches.rate(b, *at * scale)) / scale;
+                    }, &y, h, rtol, &end);
+                    if (error <= 1)
+                        x = end * scale, left -= h;
+                    h *= resized(error);
+                }
+            }
+            of.out[i * of.branch_count + b] = of.forces[i] - x;
+        }
     }
     return true;
 }

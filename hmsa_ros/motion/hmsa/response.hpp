@@ -6,11 +6,12 @@
 #include "motion.hpp"
 
 namespace hmsa {
-// Places in theta; after first_branch gamma and tau of each branch in turn. Beyond all places:
+// Places in theta; after first_branch gamma, tau, flow and its constants of each branch in turn. Beyond all places:
 // constant i of the law is the first plus i, the time at which piece m begins the second plus m.
 // Two forces that no motion has are there to be differentiated by alone: one against the motion
 // whatever its rate, and one with the square of the rate.
 enum Theta { stiffness_of, damping_of, drive_of, force_of, lag_of, stretch_of, rate_of, first_branch };
+constexpr int branch_places = 3 + flow_constants;
 constexpr int friction_of = 400, square_of = 401, constant_of = 500, switch_of = 1000;
 // Rate over the fastest frequency at which the friction turns.
 constexpr double soft_rate = 3e-3;
@@ -60,7 +61,9 @@ template <class C, class System, int NB> struct Response {
     Response(const Recorded &recorded, int first) : of(recorded), from(first) {}
     System system;
     typename System::Bare bare;  // the same without derivatives
-    S a, damping, drive, force, lag, ratio[NB + 1], per_time[NB + 1];
+    S a, damping, drive, force, lag;
+    Branches<NB, S> branches;
+    Branches<NB> bare_branches;
     double level, ramp;
     S excess;  // of the field over the line, where the piece began
     double piece_begin, fastest;
@@ -103,11 +106,19 @@ template <class C, class System, int NB> struct Response {
             rubs = wanted == friction_of ? j : rubs;
             squares = wanted == square_of ? j : squares;
         });
-        for (int b = 0; b < NB; b++) {
-            ratio[b] = per_time[b] = plain(0);
-            if (b < of.branches) {
-                ratio[b] = seeded_at(first_branch + 2 * b);
-                per_time[b] = inverse(seeded_at(first_branch + 2 * b + 1));
+        for (int b = 0; b < NB && b < of.branches; b++) {
+            const int first = first_branch + branch_places * b;
+            branches.ratio[b] = seeded_at(first);
+            branches.speed[b] = inverse(seeded_at(first + 1));
+            bare_branches.speed[b] = value(branches.speed[b]);
+            if constexpr (Branches<NB, S>::flows) {
+                branches.flow[b].read(of.theta + first + 2);
+                bare_branches.flow[b].read(of.theta + first + 2);
+                if constexpr (N > 0)
+                    each([&](int j, int wanted) {
+                        if (first + 3 <= wanted && wanted < first + branch_places)
+                            branches.flow[b].seed(wanted - first - 3, j);
+                    });
             }
         }
     }
@@ -132,11 +143,8 @@ template <class C, class System, int NB> struct Response {
         by[1] = system.acceleration(x[0], x[1], damping, [&](const S &elastic)
             __attribute__((always_inline)) {
                 S held = elastic;
-                for (int b = 0; b < NB; b++) {
-                    const S above = elastic - x[2 + b];
-                    held = held + ratio[b] * above;
-                    by[2 + b] = above * per_time[b];
-                }
+                branches.hold(elastic, x + 2, by + 2, [&](const S &more)
+                    __attribute__((always_inline)) { held = held + more; });
                 return pull - a * held;
             });
     }
@@ -187,9 +195,7 @@ template <class C, class System, int NB> struct Response {
             });
         const double stiff = value(a);
         fastest = sqrt(stiff / bare.mass(bare.rest));
-        double h = 0.2 / fastest, relaxed = infinity(), t = of.begins[0];
-        for (int b = 0; b < of.branches; b++)
-            relaxed = min(relaxed, relaxed_share * of.theta[first_branch + 2 * b + 1]);
+        double h = 0.2 / fastest, t = of.begins[0];
         bool fresh = true;
         int piece = 0, i = 0;
         const int64_t most = most_response_steps + int64_t(most_steps_a_sample) * of.count;
@@ -211,8 +217,11 @@ template <class C, class System, int NB> struct Response {
             double target = min(limit, of.times[i] - t >= smooth ? of.times[i] : t + smooth);
             if (of.behind_last)
                 target = min(target, of.times[of.count - 1]);
-            if (of.wanted_count > 0)
-                h = min(h, min(longest_phase * per_phase, relaxed));
+            if (of.wanted_count > 0) {
+                h = min(h, longest_phase * per_phase);
+                for (int b = 0; b < NB && b < of.branches; b++)
+                    h = min(h, relaxed_share / bare_branches.tangent(b, bare.elastic(l).v - value(y[2 + b])));
+            }
             const double span = min(h, target - t), dt = t - piece_begin;
             const double error = make(y, first, dt, span, end);
             if (!(error <= 1)) {

@@ -13,9 +13,10 @@ struct Shot {
     double stretch, rate;
     double field, load;  // in force at the start, and the amplifier's
     double target, slew, lag;
-    const double *branches;  // (branch_count, 2)
+    const double *branches;  // (branch_count, branch_columns)
     int branch_count;
     const double *followed;
+    int most_work;
 };
 
 template <class System, int NB, int P> struct Shooting {
@@ -46,6 +47,7 @@ template <class System, int NB, int P> struct Shooting {
     double miss[most_unknowns], trial[most_unknowns][P];  // as many rows as unknowns
     double frequency_at_target, stiffness, force;
     double first_times[most_levels], first_loads[most_levels];
+    int work = 0;  // steps, each as often as it has numbers of a kind
 
     // Fills in the pieces of the load and their derivatives; false if a ramp does not fit.
     bool cut()
@@ -122,7 +124,12 @@ template <class System, int NB, int P> struct Shooting {
             const S line = with<S>(begin[m] - slope[m] * shot.lag, d_begin[m]);
             const S rest = shot.lag > 0 ? S(field - line) : S(0.0 * line);
             double h = 0;
-            if (!motion.advance({line, slope[m], rest, decay}, duration[m], zeta, rtol, h))
+            constexpr int each = 2 + count_of<S>;
+            motion.room = min(most_attempts, (shot.most_work - work) / each);
+            const int before = motion.made;
+            const bool there = motion.advance({line, slope[m], rest, decay}, duration[m], zeta, rtol, h);
+            work += each * (motion.made - before);
+            if (!there)
                 return false;
             const double left = shot.lag > 0 ? exp(-decay * duration[m]) : 0;
             field = line + slope[m] * duration[m] + rest * left;
@@ -175,12 +182,13 @@ template <class System, int NB, int P> struct Shooting {
         for (int b = 0; b < NB && b < shot.branch_count; b++)
             // What a branch holds the field has to balance, and the amplifier to lead.
             for (int i = 2; i < row; i++) {
-                double share = branches.ratio[b] / stiffness;
+                const double share = branches.ratio[b] / stiffness;
+                Dual<double, 1> above{force - end[3 + b], {1}};
                 if (i + 1 == row && ramps)
-                    share *= 1 - shot.lag * branches.speed[b];
-                miss[i] -= share * (force - end[3 + b]);
+                    above = above - branches.rate(b, above) * shot.lag;
+                miss[i] -= share * above.v;
                 for (int c = 0; c < n; c++)
-                    trial[i][c] += share * d_end[3 + b][c];
+                    trial[i][c] += share * above.d[0] * d_end[3 + b][c];
             }
         double squares = 0;
         for (int i = 0; i < shot.unknowns; i++)
@@ -239,7 +247,7 @@ template <class System, int NB, int P> struct Shooting {
         const int n = shot.unknowns, levels = shot.levels;
         lasts = __builtin_nan("");
         zeta = material[zeta_at];
-        branches.read(shot.branches, 2, shot.branch_count);
+        branches.read(shot.branches, shot.branch_count);
         const auto elastic = system.elastic(shot.target);
         force = elastic.v, stiffness = elastic.d[0];
         frequency_at_target = frequency(system, shot.target);
@@ -259,7 +267,7 @@ template <class System, int NB, int P> struct Shooting {
         double rtol = max(fine, min(rough, rough_share * move));
         double tolerance = max(rtol, min(first, rough_share * move));
         bool measuring = false;
-        for (int pass = 0; pass < most;) {
+        for (int pass = 0; pass < most && work < shot.most_work;) {
             place(x, share, step);
             double now = infinity();
             high = 0;

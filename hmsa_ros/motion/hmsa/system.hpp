@@ -3,6 +3,7 @@
 // with stretch l, time in L sqrt(rho/G) and the load beta = Br B/(mu0 G).
 #pragma once
 #include "dop853.hpp"
+#include "flow.hpp"
 #include "law.hpp"
 
 namespace hmsa {
@@ -216,22 +217,52 @@ template <class C> struct AnyOf {
 using Any = AnyOf<double>;
 
 constexpr int most_branches = 3;
-// Columns of a branch: ratio, 1/time, and where it goes on with the state, what it follows.
-enum Column { ratio_at, speed_at, follower_at };
+// Columns of a branch: ratio, 1/time, its flow and the constants of that, and where it goes on with
+// the state, what it follows.
+enum Column { ratio_at, speed_at, flow_at, follower_at = flow_at + 1 + flow_constants, branch_columns };
 
-// Maxwell branches beside the law: branch i holds ratio (psi'(l) - w), where w follows the elastic
-// force, w' = speed (psi'(l) - w).
-template <int NB> struct Branches {
-    double ratio[NB + 1] = {}, speed[NB + 1] = {};
+// Branches beside the law: branch i holds ratio (psi'(l) - w), where w follows the elastic force,
+// w' = speed flow(psi'(l) - w). C is the type of their constants. As many as there may be flow as
+// they like, fewer in proportion.
+template <int NB, class C = double> struct Branches {
+    static constexpr bool flows = NB == most_branches;
+    C ratio[NB + 1] = {}, speed[NB + 1] = {};
+    AnyFlow<C> flow[flows ? NB : 1];
     double total = 1, fastest = 0;
     // Fewer than NB are filled up by ones that hold nothing.
-    void read(const double *from, int columns, int count)
+    void read(const double *from, int count)
     {
-        for (int b = 0; b < count && b < NB; b++) {
-            ratio[b] = from[columns * b + ratio_at];
-            speed[b] = from[columns * b + speed_at];
+        for (int b = 0; b < count && b < NB; b++, from += branch_columns) {
+            ratio[b] = from[ratio_at];
+            speed[b] = from[speed_at];
+            if constexpr (flows)
+                flow[b].read(from + flow_at);
             total += ratio[b];
             fastest = max(fastest, speed[b]);
+        }
+    }
+    template <class S> HMSA_INLINE auto rate(int b, const S &above) const
+    {
+        if constexpr (flows)
+            return flow[b](above) * speed[b];
+        else
+            return above * speed[b];
+    }
+    // How fast a branch relaxes that holds so much.
+    double pace(int b, double above) const
+    {
+        above = abs(above) > 1e-12 ? above : 1e-12;
+        return rate(b, above) / above;
+    }
+    // How steeply the rate rises with what a branch holds.
+    double tangent(int b, double above) const { return rate(b, Dual<double, 1>{above, {1}}).d[0]; }
+    // What each holds under an elastic force, and the derivative of what it follows.
+    template <class S, class F> HMSA_INLINE void hold(const S &force, const S *followed, S *by, const F &held) const
+    {
+        for (int b = 0; b < NB; b++) {
+            const S above = force - followed[b];
+            held(above * ratio[b]);
+            by[b] = rate(b, above);
         }
     }
 };
@@ -240,14 +271,11 @@ template <int NB, class System, class S, class L> HMSA_INLINE void change(const 
     const Branches<NB> &branches, const S *x, const L &load, S *by, real<S> *squared = nullptr)
 {
     by[0] = x[1];
-    by[1] = system.acceleration(x[0], x[1], system.drag, [&](const auto &force)
+    by[1] = system.acceleration(x[0], x[1], system.drag, [&](const S &force)
         __attribute__((always_inline)) {
-            auto net = load - force;
-            for (int b = 0; b < NB; b++) {
-                const auto above = force - x[2 + b];
-                net = net - above * branches.ratio[b];
-                by[2 + b] = above * branches.speed[b];
-            }
+            S net = load - force;
+            branches.hold(force, x + 2, by + 2, [&](const S &held)
+                __attribute__((always_inline)) { net = net - held; });
             return net;
         }, squared);
 }

@@ -41,21 +41,27 @@ struct Tail {
     // that height rings to both sides, and some to be sure.
     static constexpr double single = 3.5;
     static constexpr double forever = 1e15;  // half periods of a single level at the most
+    // Half periods for which a branch is followed whose flow never ends.
+    static constexpr double endless = 1e6;
+    // A term that has decayed by so many times its own time is nothing.
+    static constexpr double faded_phase = 50;
     // How the vibration grows until there is room for its levels, and how often the way back is
     // halved.
     static constexpr double coarser = 3;
     static constexpr int halvings = 5;
 
     int count;  // of branches
-    const double *held, *branches;  // (count,) and (count, 2)
+    const double *rows, *behind;  // (count, branch_columns), and psi' less what each follows (count,)
     double lag, period, until;
     double *out;  // (room, columns)
     int room;
     double stiffness, inertia, frequency, half;
     Complex modes[2];
-    double excess[most_branches];
+    // What the branches hold as it fades on target, as exponentials.
+    static constexpr int most_terms = most_branches * Fading::most;
+    int terms;
+    double held[most_terms], speed[most_terms], excess[most_terms];
 
-    double speed(int b) const { return branches[2 * b + speed_at]; }
     double &at(int row, int column) const { return out[row * columns + column]; }
 
     template <class System> void set_up(const System &system, double stretch)
@@ -63,6 +69,8 @@ struct Tail {
         stiffness = system.elastic(stretch).d[0];
         inertia = system.mass(stretch);
         frequency = hmsa::frequency(system, stretch);
+        Branches<most_branches> branches;
+        branches.read(rows, count);
         // Branches are springs to fast motion, dampers to slow motion.
         const double own = system.drag * system.shape(stretch);
         double drag = own;
@@ -70,8 +78,8 @@ struct Tail {
             double stiff = stiffness;
             drag = own;
             for (int b = 0; b < count; b++) {
-                const double phase = frequency / speed(b);
-                const double part = branches[2 * b + ratio_at] * stiffness * phase / (1 + phase * phase);
+                const double phase = frequency / max(branches.tangent(b, behind[b]), 1e-9 * frequency);
+                const double part = branches.ratio[b] * stiffness * phase / (1 + phase * phase);
                 stiff += part * phase;
                 drag += part / frequency;
             }
@@ -83,19 +91,30 @@ struct Tail {
             root = {1e-6 * frequency, 0};
         half = 3.141592653589793 / (decay < frequency ? abs(root) : frequency);
         modes[0] = root - decay, modes[1] = Complex{-root.re, -root.im} - decay;
-        // So that the field, behind the amplifier, is what they hold.
-        for (int b = 0; b < count; b++)
-            excess[b] = held[b] * (1 - lag * speed(b));
+        terms = 0;
+        for (int b = 0; b < count; b++) {
+            if (branches.flow[b].kind != maxwell)
+                until = min(until, endless * half);
+            const Fading fading = branches.flow[b].fading(behind[b], branches.speed[b], until);
+            for (int i = 0; i < fading.count; i++, terms++) {
+                held[terms] = branches.ratio[b] * behind[b] * fading.share[i];
+                speed[terms] = fading.speed[i];
+                // So that the field, behind the amplifier, is what they hold.
+                excess[terms] = held[terms] * (1 - lag * speed[terms]);
+            }
+        }
     }
     // Of the tail at a time: its value, and the bounds of value and slope.
     void left(double time, double &sum, double &bound, double &steepest) const
     {
         sum = bound = steepest = 0;
-        for (int b = 0; b < count; b++) {
-            const double part = excess[b] * exp(-speed(b) * time);
+        for (int b = 0; b < terms; b++) {
+            if (speed[b] * time > faded_phase)
+                continue;
+            const double part = excess[b] * exp(-speed[b] * time);
             sum += part;
             bound += abs(part);
-            steepest += speed(b) * abs(part);
+            steepest += speed[b] * abs(part);
         }
     }
     double bound(double time) const
@@ -115,8 +134,8 @@ struct Tail {
     Complex passed(const double *of, Complex mode, Complex turned, double time, double span) const
     {
         Complex sum{0, 0};
-        for (int b = 0; b < count; b++)
-            sum = sum + taken(mode, turned, speed(b), span) * (of[b] * exp(-speed(b) * time));
+        for (int b = 0; b < terms; b++)
+            sum = sum + taken(mode, turned, speed[b], span) * (of[b] * exp(-speed[b] * time));
         return sum;
     }
     // What a mode takes up of the tail in two spans, in units of a level in one.
@@ -138,21 +157,27 @@ struct Tail {
     }
     // For how long the tail may go down by a drift: odd multiples of a half period, since rings of
     // equal steps so far apart cancel.
-    double single_span(double time, double drift) const
+    // And all of it that is left may stay.
+    double single_span(double time, double drift, double rest) const
     {
         const double here = bound(time);
-        double low = 0, high = 1;
+        double low = 0, high = 1, less = -drift, more = -drift;  // than the drift
         for (; high < forever; high *= 2) {
             const double later = bound(time + high * half);
-            if (here - later > drift)
+            more = here - later - drift;
+            if (more > 0)
                 break;
-            low = high;
-            if (later < drift)
+            low = high, less = more;
+            if (later < rest)
                 break;
         }
-        while (high - low > 1) {
-            const double middle = __builtin_floor(0.5 * (low + high));
-            (here - bound(time + middle * half) > drift ? high : low) = middle;
+        for (bool secant = true; high - low > 1; secant = !secant) {
+            const double share = secant ? max(0.01, min(0.99, less / (less - more))) : 0.5;
+            const double guess = __builtin_floor(low + share * (high - low));
+            const double middle = max(low + 1, min(high - 1, guess));
+            const double off = here - bound(time + middle * half) - drift;
+            (off > 0 ? high : low) = middle;
+            (off > 0 ? more : less) = off;
         }
         const double whole = max(low, 1.0);
         const double even = whole - 2 * __builtin_floor(0.5 * whole) == 0;
@@ -180,7 +205,8 @@ struct Tail {
             if (single * steepest * half <= ripple * stiffness || frequency * period > last_phase) {
                 const double drift = ripple * stiffness / single;
                 // From rest on target half of it, and about the target then.
-                const double span = single_span(time, drifting ? drift : 0.5 * drift);
+                const double span = single_span(
+                    time, drifting ? drift : 0.5 * drift, 0.25 * ripple * stiffness);
                 double later, rest, unused;
                 left(time + span, later, rest, unused);
                 at(found, time_column) = time;
@@ -212,7 +238,7 @@ struct Tail {
         const Complex gap = (modes[0] - modes[1]) * inertia;
         Complex up[2] = {{0, 0}, {0, 0}};
         double field = 0;
-        for (int b = 0; b < count; b++)
+        for (int b = 0; b < terms; b++)
             field += held[b];
         for (int i = 0; i < found; i++) {
             at(i, deviation_column) = ((up[0] - up[1]) / gap).re;

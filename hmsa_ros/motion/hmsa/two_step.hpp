@@ -68,7 +68,8 @@ template <class System, int NB = 0> struct Search {
         const double half = 0.5 * (start + target);
         double felt[NB + 1], drag = system.drag * system.shape(half);
         for (int b = 0; b < NB; b++) {
-            const double omega = frequency(system, target), phase = omega / branches.speed[b];
+            const double omega = frequency(system, target);
+            const double phase = omega / max(branches.pace(b, beta_1 - followed[b]), 1e-9 * omega);
             const double part = branches.ratio[b] * phase / (1 + phase * phase);
             felt[b] = part * phase;
             drag += part * system.elastic(target).d[0] / omega;

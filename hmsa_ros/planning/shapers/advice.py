@@ -15,6 +15,8 @@ _SEARCHED = (Code.FLUX_LIMIT, Code.SLEW_LIMIT, Code.NO_TWO_STEP, Code.NOT_CONVER
 # By the limit that is to blame, those first that are most often wrong rather than given.
 _CODES = {'flux': Code.FLUX_LIMIT, 'slew': Code.SLEW_LIMIT, 'period': Code.NO_TWO_STEP,
           'lag': Code.NO_TWO_STEP}
+# Work of the search for advice.
+_ADVISING = 500_000
 # How much wider or faster limits are tried.
 _FACTORS = (1.5, 3.0, 10.0, 30.0, math.inf)
 
@@ -34,6 +36,7 @@ def advised(
         try:
             return shaper(request)
         except RefusedError as error:
+            request.work.left = _ADVISING
             ways = _ways(asked, request) if error.code in _SEARCHED else []
             what, _, advice = str(error).partition(': expected ')
             if not ways or (advice and ways == [('flux',)] and error.code is Code.FLUX_LIMIT):

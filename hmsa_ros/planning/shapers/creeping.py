@@ -3,7 +3,8 @@ Moves of an elastomer that creeps, and the levels that keep it at rest afterward
 
 A branch adds stiffness to a fast motion: level and duration of a move are found from those
 without branches, while their stiffness grows. At arrival the branches still hold something. To
-stay at rest the level has to follow it: psi'(l_d) + sum h_i exp(-t/tau_i), as a staircase.
+stay at rest the level has to follow it, psi'(l_d) + sum h_i exp(-t/tau_i) for Maxwell branches,
+as a staircase.
 """
 
 from collections.abc import Sequence
@@ -14,12 +15,19 @@ import numpy as np
 
 from hmsa_ros import motion
 from hmsa_ros.model import law
-from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.delivery import Delivery, IDEAL, ramps
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.moves import Level, Move, State
 from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.model.simulation import follow, followed_by, RTOL, sampled
+from hmsa_ros.model.simulation import (
+    follow,
+    followed_by,
+    longest_motion,
+    paces,
+    RTOL,
+    sampled,
+    with_followed,
+)
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.planning.shapers.lagged import free_heights
 from hmsa_ros.planning.shapers.request import Request
@@ -59,17 +67,17 @@ def with_branches(
     """Solve for the free numbers of levels with branches, given those without them."""
     # A free first level pushes as much harder as the branches are stiff; times shrink with it.
     material, state = request.material, request.state
-    branches = material.branches.tolist()
-    frequency = request.frequency
+    creep = material.creep.held
     # How much of a branch a motion as fast as this feels.
-    felt = [1.0 / (1.0 + (speed / frequency) ** 2) for _, speed in branches]
+    speeds = paces(material, request.behind(request.target)) / request.frequency
+    felt = (1.0 / (1.0 + speeds ** 2)).tolist()
     force = float(law.elastic_force(state.stretch, material.packed))
-    held = [force - x for x in followed_by(state, material)]
+    held = request.behind(state.stretch).tolist()
     loads = {i for kind, i in free if kind == 'load'}
     times = {i for kind, i in free if kind == 'time'}
 
     def grown(share: float) -> list[float]:
-        return [(1.0 + ratio) ** share - 1.0 for ratio, _ in branches]
+        return [(1.0 + ratio) ** share - 1.0 for ratio in creep.ratios]
 
     def stiffer(levels: tuple[Level, ...], share: float, aim: float) -> Attempt:
         before, after = grown(share), grown(aim)
@@ -81,7 +89,7 @@ def with_branches(
             force + _product(after, held) + stiffness * (x.load - force - _product(before, held)))
             for i, x in enumerate(levels)]
         there = request if aim == 1.0 else replace(request, material=replace(
-            material, creep=Creep(tuple(after), tuple(1.0 / x for _, x in branches))))
+            material, creep=replace(creep, ratios=tuple(after))))
         found = solve(Template.of(guess, free), there, delivery)
         return found and (found[0][:len(plain)], found[1]) if aim < 1.0 else found
 
@@ -131,11 +139,10 @@ def held(request: Request, found: Move, span: float) -> Move:
         return found
     end = arrival(request, found)
     holding = float(law.elastic_force(request.target, material.packed))
-    ratios, speeds = material.branches.T
     step = max(abs(request.target - request.state.stretch), _LEAST_MOVE)
     out = np.empty((_MOST, 5))
     count, vibration = motion.staircase(
-        ratios * (holding - np.array(end.followed)), material.branches, request.target,
+        holding - np.array(end.followed), material.branches, request.target,
         material.packed, delivery.lag, delivery.period,
         max(span - found.duration, _SHORTEST), delivery.ripple / _SURE * step, out)
     times, excess, deviation, rates, fields = out[:count].T
@@ -148,19 +155,20 @@ def held(request: Request, found: Move, span: float) -> Move:
         begins = np.rint(begins / delivery.resolution) * delivery.resolution
     tail = tuple(map(Level, begins.tolist(), loads.tolist()))
     request.check(tail)
-    if found.code in _RINGING:
-        moved = replace(found, levels=levels + tail, tail=_passed(
-            request, levels + tail, begins))
-        return replace(moved, vibration=_SURE * (vibration + more))
-    followed = holding - (holding - np.array(end.followed)) * np.exp(
-        -np.outer(times - late, speeds))
+    followed = np.empty((1 + count, len(end.followed)))
+    motion.trail(
+        np.append(0.0, times - late), np.full(1 + count, holding),
+        with_followed(material, end.followed), followed)
     field, amplifiers = before, [None] * count
     if delivery.lag > 0.0:
         field = holding + fields + late * (holding + fields - before) / delivery.lag
         amplifiers = before.tolist()
-    states = map(
+    states = list(map(
         State, (request.target + deviation - late * rates).tolist(), rates.tolist(),
-        field.tolist(), amplifiers, map(tuple, followed.tolist()))
+        field.tolist(), amplifiers, map(tuple, followed[1:].tolist())))
+    if found.code in _RINGING:
+        rings = int(np.searchsorted(begins, begins[0] + longest_motion(holding, material)))
+        states[:rings] = _passed(request, levels + tail[:rings], begins[:rings])
     return replace(
         found, levels=levels + tail, tail=tuple(states), vibration=_SURE * (vibration + more))
 

@@ -69,7 +69,7 @@ def shaped(request: Request, impulses: Impulses) -> Move:
     """Shape the step with impulses for the motion linearised about the target."""
     holding = request.holding_load()
     material, target = request.material, request.target
-    mode = oscillation(material, target)
+    mode = oscillation(material, target, request.behind(target))
     if mode is None:
         return request.plain(
             Code.TOO_DAMPED,

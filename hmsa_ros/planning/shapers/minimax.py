@@ -25,7 +25,7 @@ from hmsa_ros.model.delivery import late, ramps
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.mismatch import Ellipsoid, Errors
 from hmsa_ros.model.moves import Level, Move, State
-from hmsa_ros.model.simulation import followed_by
+from hmsa_ros.model.simulation import flow_rates, followed_by, with_followed
 from hmsa_ros.model.status import Code
 from hmsa_ros.planning.shapers.creeping import arrival
 from hmsa_ros.planning.shapers.modes import oscillation
@@ -105,7 +105,7 @@ class _Case:
     faster: float
     stretch: float
     rate: float
-    branches: Array  #: (n, 3), with what they follow at the start
+    branches: Array  #: (n, 6), with what they follow at the start
     rest: float
     force: float  #: that holds it
     stiffness: float
@@ -142,14 +142,14 @@ def _case(request: Request, holding: float, errors: Errors) -> _Case | None:
     stretch = state.stretch + shift
     if not packed[law.LOWER] < stretch < packed[law.UPPER]:
         return None
-    found = oscillation(material, rest)
+    found = oscillation(material, rest, request.behind(request.target))
     if found is None:
         return None
     root, mode, tail = found
     peaks = (1.0 + math.exp(math.pi * root.real / root.imag)) / abs(request.target - state.stretch)
     return _Case(
-        packed, stiffer, faster, stretch, state.rate / faster, np.column_stack([
-            material.branches, np.array(followed_by(state, request.material)) / stiffer]),
+        packed, stiffer, faster, stretch, state.rate / faster, with_followed(
+            material, np.array(followed_by(state, request.material)) / stiffer),
         rest, law.elastic_force(rest, packed), law.elastic_stiffness(rest, packed), peaks * mode,
         peaks / stiffer * tail)
 
@@ -163,7 +163,7 @@ def left(
     faster, stiffer = np.array([(x.faster, x.stiffer) for x in cases]).T[:, :, np.newaxis]
     switches, loads, slopes = np.array(rows).T
     found = np.empty((len(cases), 2))
-    ratios = request.material.branches[:, 0]
+    ratios = request.material.branches[:, motion.RATIO]
     out = np.empty((3 + len(ratios), 1))
     held: Array | float = 0.0
     for row, x, end, begins, heights, rises in zip(
@@ -361,12 +361,12 @@ def _command(
 
 def _balance(request: Request, chain: Move, levels: Sequence[Level]) -> tuple[float, float]:
     """Return what field and amplifier are at arrival, from when on they follow the branches."""
-    ratios, speeds = request.material.branches.T
+    material = request.material
     followed = arrival(request, replace(chain, levels=tuple(levels))).followed
     holding = request.holding_load()
-    held = ratios * (holding - np.array(followed))
-    return holding + float(held.sum()), holding + float(
-        held @ (1.0 - request.delivery.lag * speeds))
+    above, ratios = holding - np.array(followed), material.branches[:, motion.RATIO]
+    return holding + float(ratios @ above), holding + float(
+        ratios @ (above - request.delivery.lag * flow_rates(material, above)))
 
 
 def _settled(

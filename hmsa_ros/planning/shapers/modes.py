@@ -3,17 +3,25 @@
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from hmsa_ros import motion
 from hmsa_ros.model import law
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.parameters import NondimensionalParameters
+from hmsa_ros.model.simulation import paces
+
+# Of a branch, in units of the natural frequency.
+_SLOWEST = 1e-6
 
 
 def oscillation(
-        material: NondimensionalParameters,
-        stretch: float) -> tuple[complex, Array, Array] | None:
+        material: NondimensionalParameters, stretch: float,
+        above: ArrayLike) -> tuple[complex, Array, Array] | None:
     """
     Return the mode that oscillates about rest at a stretch; None if none does.
+
+    Branches flow in proportion, as fast as they do under what they hold over their ratio.
 
     First its root, -decay + i frequency. Then the rows (2, 2 + n) that make a vector of a state:
     deviation of the stretch, rate, and what n branches follow, less the force at rest, over the
@@ -31,7 +39,8 @@ def oscillation(
         frequency = math.sqrt(gap)
         rows = np.array([[1.0, 0.0], [0.5 * damped / frequency, 1.0 / frequency]])
         return complex(-0.5 * damped, frequency), rows, np.empty((2, 0))
-    ratios, speeds = branches.T
+    ratios = branches[:, motion.RATIO]
+    speeds = np.maximum(paces(material, above), _SLOWEST * math.sqrt(squared))
     count = 2 + len(branches)
     matrix = np.zeros((count, count))
     matrix[0, 1] = 1.0

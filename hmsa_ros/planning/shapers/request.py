@@ -4,13 +4,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 import math
 
+import numpy as np
+
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model import law
 from hmsa_ros.model.delivery import Delivery, IDEAL
+from hmsa_ros.model.equations import Array
 from hmsa_ros.model.mismatch import Ellipsoid, Uncertainty
 from hmsa_ros.model.moves import Level, Limits, Move, State
 from hmsa_ros.model.parameters import NondimensionalParameters
-from hmsa_ros.model.simulation import check_stretch
+from hmsa_ros.model.simulation import check_stretch, followed_by
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import Units
 from hmsa_ros.planning.shapers.pace import PACE, Pace
@@ -36,6 +39,18 @@ def as_errors(values: Sequence[float] | Ellipsoid) -> Uncertainty:
     return float(values[0]), float(values[1]), float(values[2])
 
 
+@dataclass
+class Work:
+    """
+    What a request may still cost, counted in steps of the integration, times their numbers.
+
+    Its searches share it: when nothing is left, they find nothing more. So what is found does not
+    depend on how fast or how busy a machine is.
+    """
+
+    left: int = 1_000_000
+
+
 @dataclass(frozen=True)
 class Request:
     """One move to be commanded, from a state of motion or rest to rest at a target."""
@@ -50,6 +65,7 @@ class Request:
     #: Of G, damping coefficient and J_lim, as `as_errors` returns them, for minimax.
     errors: Uncertainty = ERRORS
     pace: Pace = PACE  #: of smooth; the rate per unit of nondimensional time
+    work: Work = field(default_factory=Work, compare=False)
 
     @property
     def named_target(self) -> str:
@@ -93,11 +109,16 @@ class Request:
         self.limits.check(load, self.target, self.units)
         return load
 
+    def behind(self, stretch: float) -> Array:
+        """Return how far what branches follow at the start is from the force at a stretch."""
+        force = float(law.elastic_force(stretch, self.material.packed))
+        return np.array([force - x for x in followed_by(self.state, self.material)])
+
     def balance(self, followed: Sequence[float]) -> float:
         """Return the load that keeps the target at rest where branches have followed forces."""
         load = float(law.elastic_force(self.target, self.material.packed))
         return load + float(sum(
-            ratio * (load - force) for (ratio, _), force in zip(
+            ratio * (load - force) for (ratio, *_), force in zip(
                 self.material.branches.tolist(), followed, strict=True)))
 
     def check(self, levels: Sequence[Level]) -> None:

@@ -14,6 +14,7 @@ import math
 
 import numpy as np
 
+from hmsa_ros import motion
 from hmsa_ros.errors import HmsaError
 from hmsa_ros.model import law
 from hmsa_ros.model.equations import Array
@@ -24,6 +25,7 @@ from hmsa_ros.model.simulation import (
     RTOL,
     sampled,
     simulate,
+    with_followed,
 )
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.planning.shapers.lagged import at_rest
@@ -172,7 +174,7 @@ def _free(
             lag)
         stretch, rate = rows[0].copy(), rows[1].copy()
         force = np.array([law.elastic_force(x, material.packed) for x in stretch.tolist()])
-        pull = loads - material.branches[:, 0] @ (force - rows[3:])
+        pull = loads - material.branches[:, motion.RATIO] @ (force - rows[3:])
     elif state.rate == 0.0 and field == load == law.elastic_force(
             state.stretch, material.packed):
         nothing = np.zeros(_POINTS)
@@ -189,18 +191,13 @@ def _free(
 def _branches(
         request: Request, stretch: Array, followed: tuple[float, ...], step: float) -> Array:
     """Return the force of the branches along a path."""
-    ratios, speeds = request.material.branches.T
-    decay = np.exp(-speeds * step)
-    # Of a force that changes linearly over a step.
-    mean = (1.0 - decay) / (speeds * step)
-    behind = np.array(followed)
-    before = float(law.elastic_force(float(stretch[0]), request.material.packed))
-    held: Array = np.empty(_POINTS)
-    for i, x in enumerate(stretch.tolist()):
-        force = float(law.elastic_force(x, request.material.packed))
-        behind = force - (force - before) * mean + (behind - before) * decay if i else behind
-        held[i] = ratios @ (force - behind)
-        before = force
+    material = request.material
+    forces = np.empty(_POINTS)
+    law.evaluate(law.FORCE, stretch, material.packed, forces)
+    behind = np.empty((_POINTS, len(followed)))
+    times: Array = (step * np.arange(_POINTS)).astype(np.float64)
+    motion.trail(times, forces, with_followed(material, followed), behind)
+    held: Array = (forces[:, np.newaxis] - behind) @ material.branches[:, motion.RATIO]
     return held
 
 

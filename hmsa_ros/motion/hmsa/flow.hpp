@@ -1,0 +1,88 @@
+// How a branch of creep flows: what it follows goes w' = speed flow(x), where x = psi'(l) - w is what
+// it holds over its ratio. A flow is this function over any scalar, and how x fades while the stretch
+// stays, as a sum of exponentials. Derivatives come from Dual, those by its constants too: C is their
+// type. It reads its constants from those of a branch (hmsa_ros/model/flows).
+#pragma once
+#include "dual.hpp"
+
+namespace hmsa {
+// Numbers as in hmsa_ros/model/flows/record.py; and constants of a flow at the most.
+enum Flow { maxwell, power_law };
+constexpr int flow_constants = 2;
+
+// Exponentials: a share of what there was, and how fast it decays.
+struct Fading {
+    static constexpr int most = 96;
+    int count = 0;
+    double share[most], speed[most];
+    void add(double a, double b) { share[count] = a, speed[count++] = b; }
+};
+
+template <class C> struct PowerLaw {
+    // x |x/s|^(m - 1): the flow of J. S. Bergstroem and M. C. Boyce, J. Mech. Phys. Solids 46, 931
+    // (1998), without its dependence on the strain of the branch.
+    C m, s;
+    void read(const double *c) { set(m, 0, c[0]), set(s, 0, c[1]); }
+    void seed(int constant, int j) { (constant == 0 ? m : s).d[j] = 1; }
+    template <class S> S operator()(const S &x) const
+    {
+        constexpr double nothing = 1e-200;  // so that there is a logarithm
+        const S size = x * inverse(s);
+        return x * power(S(size * size + nothing), C(0.5 * (m - 1.0)));
+    }
+    // x = x0 (1 + a t)^(-n) is the mean of exponentials whose speeds have a Gamma distribution: a sum
+    // over their logarithms, right to 1e-8. The slow ones are one until a time.
+    Fading fading(double x, double speed, double until) const
+    {
+        constexpr double nothing = 1e-9, deep = 21;
+        Fading found;
+        const double pace = x != 0 ? speed * (*this)(x) / x : 0;
+        const double p = value(m) - 1, a = p * pace, n = 1 / p;
+        if (!(p > nothing && a * until > nothing)) {
+            found.add(1, pace);
+            return found;
+        }
+        const double step = 6.283185307179586 / (11.4 + 6 * sqrt(n)), middle = log(n);
+        const auto depth = [&](double y) { return n * (y - middle) - exp(y) + n; };
+        double y = middle, sum = 0;
+        while (depth(y) > -deep)
+            y += step;
+        for (bool last = false; !last && depth(y) > -2 * deep; y -= step) {
+            double share = exp(depth(y)), fast = exp(y);
+            const double slow = fast * a * until;
+            last = found.count + 1 == Fading::most || (y < middle && share * slow * slow < nothing);
+            if (last) {
+                const double all = 1 - exp(-n * step);
+                share /= all, fast *= all / (1 - exp(-(n + 1) * step));
+            }
+            found.add(share, a * fast);
+            sum += share;
+        }
+        for (int i = 0; i < found.count; i++)
+            found.share[i] /= sum;
+        return found;
+    }
+};
+
+// One of them, chosen while it runs.
+template <class C> struct AnyFlow {
+    int kind = maxwell;
+    PowerLaw<C> power_law_flow{};
+    void read(const double *from)
+    {
+        kind = int(from[0]);
+        power_law_flow.read(from + 1);
+    }
+    void seed(int constant, int j) { power_law_flow.seed(constant, j); }
+    template <class S> HMSA_INLINE S operator()(const S &x) const { return kind == maxwell ? x : other(x); }
+    template <class S> HMSA_APART S other(const S &x) const { return power_law_flow(x); }
+    Fading fading(double x, double speed, double until) const
+    {
+        if (kind != maxwell)
+            return power_law_flow.fading(x, speed, until);
+        Fading one;
+        one.add(1, speed);
+        return one;
+    }
+};
+}  // namespace hmsa
