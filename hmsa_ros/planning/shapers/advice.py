@@ -16,7 +16,7 @@ _SEARCHED = (Code.FLUX_LIMIT, Code.SLEW_LIMIT, Code.NO_TWO_STEP, Code.NOT_CONVER
 _CODES = {'flux': Code.FLUX_LIMIT, 'slew': Code.SLEW_LIMIT, 'period': Code.NO_TWO_STEP,
           'lag': Code.NO_TWO_STEP}
 # Work of the search for advice.
-_ADVISING = 500_000
+_ADVISING = 400_000
 # How much wider or faster limits are tried.
 _FACTORS = (1.5, 3.0, 10.0, 30.0, math.inf)
 

@@ -6,8 +6,11 @@ import math
 from hmsa_ros.model.moves import Move
 from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.planning.shapers.push_brake import push_brake
-from hmsa_ros.planning.shapers.request import Request
+from hmsa_ros.planning.shapers.request import Request, Work
 from hmsa_ros.planning.shapers.two_step import two_step
+
+# Of the search for full push and full brake.
+_PUSHING = 400_000
 
 
 def minimum_time(request: Request) -> Move:
@@ -20,9 +23,10 @@ def minimum_time(request: Request) -> Move:
     """
     found: list[Move] = []
     refusals: list[RefusedError] = []
-    for shaper in (push_brake, two_step):
+    # What the two-step command would find alone, it finds here.
+    for shaper, work in ((push_brake, Work(_PUSHING)), (two_step, request.work)):
         try:
-            found.append(shaper(request))
+            found.append(shaper(replace(request, work=work)))
         except RefusedError as error:
             refusals.append(error)
     if not found:

@@ -48,7 +48,7 @@ class Work:
     depend on how fast or how busy a machine is.
     """
 
-    left: int = 1_000_000
+    left: int = 700_000
 
 
 @dataclass(frozen=True)
