@@ -212,6 +212,20 @@ def test_setpoint_that_is_left_while_it_is_held_is_found_out():
     assert codes[-1] == 'off_target'
 
 
+def test_an_arrival_is_left_open_by_a_motion_that_is_too_short_to_be_a_vibration():
+    loop = Loop()
+
+    def spoil(samples):
+        return [(t, x + 0.008 * (abs(t - START - 650 * MS) < 2 * MS)) for t, x in samples]
+
+    loop.spoil = spoil
+    loop.run((1.2, HOLD), (1.4, 2 * HOLD))
+    codes = [
+        x.findings['a'].verdict for x in loop.outputs if isinstance(x, StatusChanged)
+        and x.findings and x.findings['a'].setpoint.number == 2]
+    assert (codes[0], codes[-1]) == ('arrived', 'undecided')
+
+
 def test_silence_of_all_drivers_is_warned_of_at_once_and_taken_back():
     loop = Loop()
     loop.unheard = 'nobody subscribes'

@@ -26,8 +26,6 @@ _MOVING = 32
 # How long samples may stay away, by the steady clock, before it is judged without them.
 _PATIENCE = NANOSECONDS // 2
 _TOLERANCES = Tolerances()
-# What more samples may still change.
-_OPEN = (Code.UNOBSERVED, Code.UNDECIDED)
 # How far in ns ahead of the clock a stamp may be: news of the time may be late.
 _AHEAD = NANOSECONDS // 20
 
@@ -150,13 +148,18 @@ class Hold:
         found, self.news = self.judged(
             self.setpoint, tolerances, sensor=sensor), bool(self._samples)
         self.over = self.due >= self._closes or (
-            self.due >= self._enough and found.verdict not in _OPEN)
+            self.due >= self._enough and not found.open)
         after = self.due - self._begin
         due = self._begin + max(2 * after, self._length)
         self.due = min(due, self._closes if self.due >= self._enough else self._enough)
-        before, self.found = self.found, self._better_known(found)
-        same = before is not None and before.verdict is self.found.verdict
-        return None if same and not self.over else self.found
+        before = self.found
+        if before is not None and found.open and (
+                before.failed or before.arrived and found.verdict is Code.UNOBSERVED):
+            # A miss that was shown stays one, and an arrival until samples leave it open.
+            found = before
+        self.found = found
+        same = before is not None and before.verdict is found.verdict
+        return None if same and not self.over else found
 
     def wake(self, now: int) -> int:
         """Return when to judge next, a time in ns; 0 for now."""
@@ -190,10 +193,3 @@ class Hold:
         stamps = np.fromiter(self._samples, dtype=np.int64, count=len(self._samples))
         values = np.fromiter(self._samples.values(), dtype=np.float64, count=len(stamps))
         return judge(stamps, values, setpoint, tolerances, sensor=sensor)
-
-    def _better_known(self, found: Finding) -> Finding:
-        """Return a finding, or the one before where the samples are too few for another."""
-        before = self.found
-        if before is not None and found.verdict in _OPEN and before.verdict not in _OPEN:
-            return before
-        return found

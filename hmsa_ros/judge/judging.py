@@ -44,8 +44,6 @@ _FADED = 1e-9
 # Fewer changes do not show whether a sensor rounds.
 _FEW_CHANGES = 3
 _NO_SENSOR = Sensor()
-# Verdicts that more samples may change.
-_OPEN = (Code.UNOBSERVED, Code.UNDECIDED)
 
 
 def judge(
@@ -84,7 +82,7 @@ def judge(
         return found
     # Not as it was planned at first; perhaps as it was planned anew.
     again = _judged(stamps, values, setpoint, tolerances, sensor, moved)
-    if again.verdict in _OPEN and found.verdict not in _OPEN:
+    if again.open and not found.open:
         return found
     after = moved - (setpoint.end or moved + 1)
     return judged_late(again, after) if again.arrived and after >= 0 else again

@@ -142,6 +142,11 @@ class Finding:
         return self.verdict is Code.ARRIVED
 
     @property
+    def open(self) -> bool:
+        """Whether more samples may change the verdict."""
+        return self.verdict in (Code.UNOBSERVED, Code.UNDECIDED)
+
+    @property
     def failed(self) -> bool:
         """Whether the setpoint was shown not to be arrived at in time."""
         return VERDICTS.index(self.verdict) > VERDICTS.index(Code.UNDECIDED)
