@@ -18,11 +18,13 @@ class Column:
     name: str
     unit: str = ''
     form: str = '.6g'  #: of `format`; ``'%'``, perhaps after a sign, for percent of a step
+    head: str = ''  #: shown in place of the name where room is short
 
     @property
     def title(self) -> str:
         """The name with its unit."""
-        return f'{self.name} ({self.unit})' if self.unit else self.name
+        name = self.head or self.name
+        return f'{name} ({self.unit})' if self.unit and name != '±' else name
 
     def shown(self, value: object) -> str:
         """Return a value as text: a dash where there is none."""
@@ -103,7 +105,8 @@ class Table:
             If pandas is not installed.
 
         """
-        return frame({x.title: self[x.name] for x in self.columns})
+        return frame({
+            f'{x.name} ({x.unit})' if x.unit else x.name: self[x.name] for x in self.columns})
 
 
 def frame(columns: dict[str, Any]) -> Any:

@@ -59,12 +59,12 @@ def comparison(parts: Sequence[Part]) -> Table:
                 _apart(parts[0], part, number), str(found.verdict).replace('_', ' ')))
     return Table((
         Column('setpoint'), Column('run'), Column('target'), Column('move time', 'ms', '.4g'),
-        Column('offset', '%', '+%'), Column('offset std', '%', '%'), Column('vibration', '%', '%'),
-        Column('vibration std', '%', '%'), Column('apart', '%', '%'), Column('verdict')),
-        tuple(rows),
+        Column('offset', '%', '+%'), Column('offset std', '%', '%', '±'),
+        Column('vibration', '%', '%'), Column('vibration std', '%', '%', '±'),
+        Column('apart', '%', '%'), Column('verdict')), tuple(rows),
         'move time: from the first level to rest; offset: mean less the target; vibration: peak '
         f'to peak; apart: largest distance from the curve of {labels[0]}, from the begin of the '
-        'move on; all of these in % of the step')
+        'move on; all in % of the step; ±: standard deviations')
 
 
 def _place(part: Part, number: int) -> int | None:
