@@ -170,12 +170,14 @@ class Sensor:
 
 
 def measured(place: int, given: Plants, seen: Callable[[int, Array], Array], switches: Array,
-             levels: Array, end: float, sensor: Sensor, seed: int) -> Recording:
-    """Return the recording of one plant in SI."""
+             levels: Array, end: float, sensor: Sensor, seed: int, at: Array | None = None
+             ) -> Recording:
+    """Return the recording of one plant in SI; samples are even, unless their times are given."""
     random = np.random.default_rng((seed, place))
     block = given.block(place)
     unit = block.time_unit
-    at = np.arange(0.05, end - 0.05, PERIOD / sensor.per_period)
+    if at is None:
+        at = np.arange(0.05, end - 0.05, PERIOD / sensor.per_period)
     noise = sensor.noise * random.standard_normal(len(at))
     true = at
     if sensor.kind == 'jittered':

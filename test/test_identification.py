@@ -327,6 +327,53 @@ def test_ratios_alone_are_not_identifiable_and_said_to_be():
     assert np.isfinite(found.parameters['chain_limit'].value)
 
 
+def test_samples_at_rest_alone_show_no_frequency_but_what_rest_determines():
+    random = np.random.default_rng(4)
+    targets = random.permutation(np.linspace(0.85, 1.6, 8))
+    levels = np.array([level_of(x) for x in targets])
+    times = np.sort(np.append(*(np.arange(8) + random.uniform(0.5, 0.95, 8) for _ in range(2))))
+    for noise in (1e-4, 1e-3, 5e-3):
+        recording = Recording(
+            times, np.repeat(targets, 2) + noise * random.standard_normal(16), np.arange(8.0),
+            levels)
+        found = identify(recording)
+        assert found.verdict == 'not_identifiable', found.reason
+        assert np.isnan(found.parameters['shear_modulus'].value)
+        found = identify(recording, free=('remanence', 'chain_limit'))
+        assert found.verdict == 'identified', found.reason
+        assert abs(found.parameters['remanence'].value - BLOCK.remanence) < 4.0 * (
+            found.parameters['remanence'].std)
+
+
+def test_noisy_samples_of_one_step_are_no_higher_frequency_that_fits_them_by_chance():
+    # At 4.2 samples a period: 353 Hz fit a recording like this one better than 17.5 Hz.
+    unit = 1.0 / 17.5 / 2.56
+    block = replace(
+        BLOCK, shear_modulus=BLOCK.density * (BLOCK.half_length / unit) ** 2)
+    times, level_times = 0.0136 * np.arange(61), np.array([0.0, 0.07])
+    levels = np.array([0.0, level_of(1.3, block)])
+    noise = 0.03 * np.random.default_rng(3).standard_normal(61)
+    found = identify(
+        Recording(times, simulate(times, level_times, levels, block) + noise, level_times, levels),
+        free=('shear_modulus', 'damping_coefficient', 'remanence', 'stretch_bias'))
+    x = found.parameters['shear_modulus']
+    assert found.verdict == 'not_identifiable' or x.low < block.shear_modulus < x.high
+
+
+def test_errors_that_no_residual_shows_widen_the_intervals_and_are_said():
+    recording = recorded(extras=Extras(gain=1.02), repeats=1, times=TIMES[:160], noise=3e-3)
+    found = identify(recording, uncertain={'density': 0.05 * BLOCK.density})
+    assert found.verdict == 'identified', found.reason
+    for name in ('shear_modulus', 'remanence', 'chain_limit', 'damping_coefficient'):
+        x = found.parameters[name]
+        assert x.low < getattr(BLOCK, name) < x.high, name
+    x = found.parameters['shear_modulus']
+    assert x.high - x.value == pytest.approx(1.97 * 0.05 * x.value, rel=0.1)
+    assert x.std < 0.005 * x.value
+    for words in ('an error of density', '--known stretch_gain=1+-0.1%'):
+        assert any(words in note for note in found.warnings)
+
+
 @pytest.mark.slow
 def test_small_stretches_do_not_hold_the_chain_limit():
     found = identify(recorded((1.02, 1.0)))

@@ -249,6 +249,7 @@ def misfit(
         fit: Fit, found: Whiteness, marks: Sequence[Signature], alike: Repeated | None) -> str:
     """Return why the model is rejected, with the figures; empty if it is not."""
     motion = float(np.std(fit.recording.stretch))
+    seen = [x for x in marks if x.found]
     figures = (
         f'residuals of {fit.scale:.3g} with an autocorrelation of '
         f'{float(autocorrelation(fit.residual * fit.root)[1]):.2f} from one sample '
@@ -256,11 +257,10 @@ def misfit(
     if distant(fit, found):
         return (
             f'no motion of the model is like the recorded one: {figures}, against a motion of '
-            f'{motion:.3g} rms; are times in s and levels in tesla, of one clock and one run, and '
-            'is the actuator described by --params-file?')
+            f'{motion:.3g} rms; check that times are in s and levels in tesla, of one clock and '
+            f'one run, and that --params-file describes the actuator{_remedy(seen)}')
     if fit.scale < _NUMERICAL:
         return ''
-    seen = [x for x in marks if x.found]
     if seen:
         words = '; '.join(
             f'{x.name} ({x.share:.0%} of them, {x.deviations:.0f} deviations)' for x in seen[:3])
@@ -305,11 +305,14 @@ def cost(fit: Fit, marks: Sequence[Signature], alike: Repeated | None) -> float:
     return 2.0 * math.sqrt(2.0 * share) * rms / step
 
 
-def considered(moves: Mapping[str, Array], std: Array, free: Sequence[str]) -> list[str]:
+def considered(
+        moves: Mapping[str, Array], std: Array, free: Sequence[str], given: Collection[str]
+) -> list[str]:
     """
-    Return what is wrong perhaps and does not show, where intervals hold it, a sentence each.
+    Return the errors that do not show but that the intervals allow for, a sentence each.
 
-    Given is by name what it may move the coordinates by, and their deviations.
+    Moves are those of the coordinates, by the name of what may be wrong; with them come the
+    deviations of the coordinates, and the names that the caller gave.
     """
     found = []
     for name, way in moves.items():
@@ -318,10 +321,10 @@ def considered(moves: Mapping[str, Array], std: Array, free: Sequence[str]) -> l
         if ratio[place] > _WORTH_SAYING:
             found.append(
                 f'an error of {name} does not show in this recording: the intervals allow for '
-                f'its standard deviation, which moves {free[place]} by {ratio[place]:.2g} of its '
-                'own' + (
-                    f'; {name} is taken to be known to {100.0 * USUAL_GAIN:g} %: calibrate the '
-                    f'sensor, and give --known {name}=1+-0.1%' if name == GAIN else ''))
+                f'one standard deviation of it, which moves {free[place]} by '
+                f'{ratio[place]:.3g} of its own' + (
+                    f'; {100.0 * USUAL_GAIN:g} % is assumed: calibrate the sensor, and give '
+                    f'--known {name}=1+-0.1%' if name == GAIN and name not in given else ''))
     return found
 
 

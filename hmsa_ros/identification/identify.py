@@ -1,6 +1,6 @@
 """Identification from start to verdict."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 import math
 
@@ -215,15 +215,17 @@ def _conclude(
     reason = reason.replace('shear_modulus', modulus_of(best.values.get('law'))[0])
     parameters, matrix = estimates_of(best, known, lost)
     outliers = int(np.count_nonzero(best.weights == 0.0))
+    warnings = (*best.recording.notes, *_warnings(best, known, outliers, given))
     return Identification(
-        verdict, reason, (*best.recording.notes, *_warnings(best, known, outliers)), parameters,
-        best.free, matrix, known.deviation, float(np.sqrt(np.mean(best.residual ** 2))),
-        len(best.recording.time), outliers, best.recording, best.response.stretch, best.residual,
-        best.weights, best.spread, found, marks, float(np.max(known.correlated)),
-        complete(best.values, best.free), tried, agreed, diagnosis.cost(best, marks, alike))
+        verdict, reason, warnings, parameters, best.free, matrix, known.deviation,
+        float(np.sqrt(np.mean(best.residual ** 2))), len(best.recording.time), outliers,
+        best.recording, best.response.stretch, best.residual, best.weights, best.spread, found,
+        marks, float(np.max(known.correlated)), complete(best.values, best.free), tried, agreed,
+        diagnosis.cost(best, marks, alike))
 
 
-def _warnings(best: Fit, known: Precision, outliers: int) -> list[str]:
+def _warnings(
+        best: Fit, known: Precision, outliers: int, given: Collection[str]) -> list[str]:
     """Return what a reader should know besides the verdict, a sentence each."""
     found, recording = [], best.recording
     if outliers:
@@ -241,7 +243,7 @@ def _warnings(best: Fit, known: Precision, outliers: int) -> list[str]:
     if recording.quantum:
         found.append(f'the {recording.coordinate.name} comes in steps of {recording.quantum:.3g}')
     found += diagnosis.considered(
-        known.missing.considered, np.sqrt(np.diag(known.covariance)), best.free)
+        known.missing.considered, np.sqrt(np.diag(known.covariance)), best.free, given)
     if _shaped(best):
         found.append(
             'all moves are shaped so that nothing rings: they carry about a sixth of the '

@@ -137,7 +137,7 @@ def free_of(
     Return the names of free parameters that a text of a command line means.
 
     Names replace the default list, without what is known; ``+NAME`` adds to it and ``-NAME``
-    takes from it.
+    takes from it. Raises `BadInputError` if that is not free, and as `check_free` does.
     """
     names = [x.strip() for x in text.split(',') if x.strip()]
     free = [x for x in names if x[0] not in '+-']
@@ -146,6 +146,10 @@ def free_of(
             law is None or x != 'chain_limit')]
     free += [x[1:] for x in names if x[0] == '+']
     without = {x[1:] for x in names if x[0] == '-'}
+    if missing := sorted(without.difference(free)):
+        raise BadInputError(
+            f'--free=-{missing[0]} takes away a parameter that is not free: expected one of '
+            f'{", ".join(free)}')
     return check_free((x for x in free if x not in without), law)
 
 

@@ -132,8 +132,8 @@ class Recording:
         if still:
             raise BadInputError(
                 f'the {self.coordinate.name} of {self.label} stays within {spread:.3g}, scatter '
-                f'{jitter:.2g}: expected a motion; was the coil on, and is it the column of the '
-                f'{self.coordinate.name}?')
+                f'{jitter:.2g}: expected a motion; was the coil on, is it the column of the '
+                f'{self.coordinate.name}, and does it begin before the first change of level?')
         clipped, repeated = self._flat()
         if repeated:
             raise BadInputError(
