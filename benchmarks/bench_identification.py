@@ -52,7 +52,7 @@ def compare(*, quick: bool = False, runs: int = RUNS) -> Sheet:
     most = binom.ppf(1.0 - _CHANCE, runs, LARGEST_COVERAGE) / runs
     rows, figures, passed = [], {}, True
     for name, shaped, repeats in (
-            ('one plain pass', False, 1), ('plain, repeated', False, 15),
+            ('one unshaped pass', False, 1), ('unshaped, repeated', False, 15),
             ('shaped, repeated', True, 15)):
         for noise in (1e-3, 1e-4):
             for rate in (1000, 200, 60):
