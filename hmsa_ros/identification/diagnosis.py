@@ -13,6 +13,7 @@ from hmsa_ros.identification.noise import autocorrelation, Whiteness
 from hmsa_ros.identification.quantities import (
     BRANCHES,
     damping_unit,
+    DEFAULT_FREE,
     geometry_of,
     group_of,
     modulus_of,
@@ -125,8 +126,9 @@ def weakness(fit: Fit, deviation: float, factors: Array) -> Weakness | None:
     listed = '; '.join(sentences) or 'the recorded motion hardly depends on them'
     return Weakness(names, (
         f'{_listed(list(names))} cannot be identified from this recording: {listed}. Instead, '
-        f'{"; or ".join(advice[:3])}; or keep what is known, as with --free=-{kept} or --known '
-        f'{kept}=VALUE+-STD'))
+        f'{"; or ".join(advice[:3])}; or ' + (
+            f'keep what is known, as with --free=-{kept} or --known {kept}=VALUE+-STD'
+            if kept in DEFAULT_FREE else f'leave {kept} out of --free')))
 
 
 def _change(fit: Fit, place: int, change: float, first: float) -> str:
