@@ -121,7 +121,7 @@ def public_members(module: str) -> Iterator[tuple[str, Any]]:
         if inspect.isclass(thing):
             for below, member in vars(thing).items():
                 if not below.startswith('_') and inspect.isfunction(member) \
-                        and member.__module__ == module:
+                        and member.__module__ == module and member.__name__ != '<lambda>':
                     yield f'{module}.{name}.{below}', member
 
 
