@@ -183,5 +183,10 @@ def test_constants_that_the_flow_does_not_have_are_without_effect():
         'viscoelastic.exponent': [4.0]}) == Creep((0.1,), (0.02,))
 
 
+@pytest.mark.parametrize('creep', [Creep(), Creep((0.1,), (0.02,)), TWO.creep], ids=str)
+def test_parameters_describe_the_branches_whole(creep):
+    assert creep_from(creep.parameters) == creep
+
+
 def test_each_flow_has_the_number_that_the_compiled_motion_gives_it():
     assert [x.kind for x in FLOWS.values()] == list(range(len(FLOWS)))

@@ -24,6 +24,7 @@ from hmsa_ros.interfaces.parameters import (
     ZETA,
 )
 from hmsa_ros.interfaces.topics import PLANNER
+from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.delivery import IDEAL
 from hmsa_ros.model.equations import critical_zeta, elastic_force, equilibrium_stretch
 from hmsa_ros.model.laws import LAWS
@@ -225,11 +226,7 @@ class Actuator:
     def parameters(self) -> dict[str, Any]:
         """All parameters by the names that the nodes have for them."""
         actuator, options = self.block, self.model.options
-        values = parameters_of(actuator)
-        if actuator.creep:
-            values |= {'viscoelastic.ratio': list(actuator.creep.ratios),
-                       'viscoelastic.time': list(actuator.creep.times)}
-        return values | {
+        return parameters_of(actuator) | actuator.creep.parameters | {
             'flux_density_min': options.flux_density_min,
             'flux_density_max': options.flux_density_max,
             'slew_limit': 0.0 if math.isinf(options.slew_limit) else options.slew_limit,
@@ -330,7 +327,7 @@ class Actuator:
         now: dict[str, Any] = {x: getattr(block, x) for x in (
             'density', 'half_length', 'half_thickness', 'remanence', 'chain_limit')} | {
             'zeta': self.zeta, 'law': self.law,
-            'creep': tuple(zip(block.creep.ratios, block.creep.times, strict=True)),
+            'creep': block.creep,
             'flux_density_limits': self.flux_density_limits, 'slew_limit': options.slew_limit,
             'coil_time_constant': options.coil_time_constant}
         if parameters.get('law', self.law) == self.law:
@@ -621,7 +618,9 @@ def _of_law(
 
 
 def _of_creep(creep: Any) -> dict[str, Any]:
-    """Return the parameters of Maxwell branches."""
+    """Return the parameters of branches, pairs of ratio and time unless they are `Creep`."""
+    if isinstance(creep, Creep):
+        return creep.parameters
     if not len(creep):
         return {}
     ratios, times = columns_of(creep, ('ratio', 'time'), 'branches of creep')

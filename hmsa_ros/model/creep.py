@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 import math
+from typing import Any
 
 from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.model.flows import FLOWS
@@ -88,6 +89,16 @@ class Creep:
         return replace(
             self, ratios=of(self.ratios), times=of(self.times),
             constants=tuple(map(of, self.constants)) if kept else ())
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """The parameters that describe the branches, none where there are none."""
+        if not self:
+            return {}
+        named = {'ratio': self.ratios, 'time': self.times, **{
+            x.name: y for x, y in zip(self.law.constants, self.constants, strict=True)}}
+        flow = {'viscoelastic.flow': self.flow} if self.law is not MAXWELL else {}
+        return {f'viscoelastic.{x}': list(y) for x, y in named.items()} | flow
 
     def rows(self, unit: float = 1.0) -> list[list[float]]:
         """Return the branches that hold anything as `hmsa_ros.motion` takes them; a unit in s."""
