@@ -8,6 +8,7 @@ import numpy as np
 
 from hmsa_ros.api.columns import number
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.model.equations import Array
 from hmsa_ros.model.status import RefusedError
 from hmsa_ros.table import Column, Table
 
@@ -120,13 +121,9 @@ def _row(
     fields = response(
         plan.actuator, plan.times, plan.flux_densities,
         np.append(plan.times, plan.times[-1] + 1.0), plan.segments[0].start.stretch)[2]
-    if math.isinf(slew) and math.isinf(band):
-        change = np.array([math.inf, math.inf])
-        current = np.zeros(2)
-    elif math.isinf(band):
-        change = np.array([slew, slew]) / factor
-        current = np.array([most, -most]) / factor
-    else:
+    change: Array = np.full(2, slew / factor)
+    current: Array = np.array([most, -most]) / factor
+    if not math.isinf(band):
         at = np.concatenate([fields[:-1], fields[1:]])
         wanted = np.concatenate([plan.flux_densities] * 2)
         change = 2.0 * math.pi * band * (wanted - at) / factor

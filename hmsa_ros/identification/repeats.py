@@ -68,8 +68,8 @@ def repeated(fit: Fit, period: float, floor: float = 0.0) -> Repeated | None:
         step = abs(float(shown[end - 1] - shown[max(begin - 1, 0)]))
         if step > 0.0:
             cost = max(cost, 2.0 * math.sqrt(2.0 * max(mean, 0.0)) / step)
-    size = math.sqrt(max(squares, 0.0) / max(count, 1.0))
-    return Repeated(_chance(grams) if size > floor else 1.0, size, cost)
+    rms = math.sqrt(max(squares, 0.0) / max(count, 1.0))
+    return Repeated(_chance(grams) if rms > floor else 1.0, rms, cost)
 
 
 def _apart(rows: Array) -> Array:

@@ -13,6 +13,7 @@ from hmsa_ros.identification.quantities import STATIC
 from hmsa_ros.identification.recording import Recording
 from hmsa_ros.identification.response import complete, respond, sensed, Setup
 from hmsa_ros.identification.start import at_units, scan, seeks_time, segments, starts, static
+from hmsa_ros.model.equations import Array
 
 # Residuals this near to the scatter of their differences are white enough for a first look.
 _NEAR_WHITE = 1.5
@@ -149,10 +150,10 @@ def rivals(best: Fit) -> tuple[Fit, list[Fit]]:
         return best, []
     found = [best]
     natural = diagnosis.frequency_of(best) * complete(best.values, best.free)['time_unit']
+    units = np.asarray(natural / np.geomspace(
+        1.0 / longest, _HIGHEST / gap, _FREQUENCIES), dtype=np.float64)
     for start in at_units(
-            best.values, best.free, natural / np.geomspace(
-                1.0 / longest, _HIGHEST / gap, _FREQUENCIES), _DECAY,
-            static(recording, best.values, best.free)):
+            best.values, best.free, units, _DECAY, static(recording, best.values, best.free)):
         _descended(found, recording, start, best.free)
     scale = min(x.scale for x in found)
     deviances = [2.0 * loss(x.residual, scale) for x in found]
@@ -180,7 +181,8 @@ def unmoved(best: Fit) -> set[str]:
     place = np.searchsorted(
         recording.level_times, recording.time - values['sensor_latency'], side='right').clip(1) - 1
     levels, which = np.unique(recording.levels[place], return_inverse=True)
-    rests, slopes = np.empty(len(levels)), np.empty((len(levels), len(setup.wanted)))
+    rests: Array = np.empty(len(levels))
+    slopes: Array = np.empty((len(levels), len(setup.wanted)))
     for i, level in enumerate(levels.tolist()):
         rests[i] = motion.rest(setup.theta, setup.material, level, setup.wanted, slopes[i])
     if not np.all(np.isfinite(rests)):
