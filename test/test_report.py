@@ -971,7 +971,7 @@ def test_several_bags_lie_over_each_other_in_colours_of_their_own(tmp_path, bag)
     report = Page(page(parts_of(bag, other)))
     curves = [report.trace('response', name) for name in ('run', 'other')]
     shown = [x['name'] for x in report.figures['response']['data'] if x['showlegend']]
-    assert sorted(shown) == ['other', 'unshaped steps', 'plan', 'run']
+    assert sorted(shown) == ['other', 'plan', 'run', 'unshaped steps']
     assert curves[0]['line']['color'] != curves[1]['line']['color']
     assert curves[0]['legendgroup'] != curves[1]['legendgroup']
     rows = report.table('setpoint-table')
