@@ -202,11 +202,19 @@ def _saturated(rig: Rig) -> Seen:
 
 
 def _blocked(bench: _Bench, word: str) -> float:
-    """Have answers to a kind of call cease; return when."""
+    """Have answers to a kind of call cease; return when one had none."""
     bench.switch_on()
-    begin = monotonic()
-    bench.board.answer = lambda right: '' if right[0] == word else right
-    return begin
+    asked: list[float] = []
+
+    def answer(right: str) -> str:
+        if right[0] != word:
+            return right
+        asked.append(monotonic())
+        return ''
+
+    bench.board.answer = answer
+    bench.beat_until(lambda: asked, 'a call that does not return')
+    return asked[0]
 
 
 def _hung(rig: Rig, word: str, method: str) -> Seen:
