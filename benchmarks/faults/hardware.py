@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 import math
 import signal
+from threading import Event
 from time import monotonic
 from typing import Any
 
@@ -202,19 +203,20 @@ def _saturated(rig: Rig) -> Seen:
 
 
 def _blocked(bench: _Bench, word: str) -> float:
-    """Have answers to a kind of call cease; return when one had none."""
+    """Have answers to a kind of call cease, and wait for a call without one; return since when."""
     bench.switch_on()
-    asked: list[float] = []
+    unanswered = Event()
 
     def answer(right: str) -> str:
         if right[0] != word:
             return right
-        asked.append(monotonic())
+        unanswered.set()
         return ''
 
+    begin = monotonic()
     bench.board.answer = answer
-    bench.beat_until(lambda: asked, 'a call that does not return')
-    return asked[0]
+    bench.beat_until(unanswered.is_set, 'a call that does not return')
+    return begin
 
 
 def _hung(rig: Rig, word: str, method: str) -> Seen:
