@@ -21,6 +21,7 @@ from hmsa_ros.errors import HmsaError
 from hmsa_ros.model.equations import natural_frequency
 from hmsa_ros.model.parameters import paper_actuator
 from hmsa_ros.model.simulation import ActuatorSimulation
+from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.planner import Options, Planner
 
@@ -282,6 +283,15 @@ def test_stop_is_answered_at_once_whatever_is_planned():
         (x.verdict.code, x.verdict.request) for x in rig.outputs if isinstance(x, StatusChanged)]
     assert rig.runtime.wake != 0
     assert rig.status.verdict.code == 'accepted'
+
+
+def test_of_several_planners_each_takes_no_request_but_to_stop():
+    rig = Rig()
+    rig.runtime.request(trajectory(*SEQUENCE))
+    rig.run(START + LEAD + 3 * MS)
+    rig.runtime.crowded = RefusedError(Code.SEVERAL_PLANNERS, '2 planners (/a and /b): stop one')
+    assert rig.runtime.request(Target('a', 1.1)).code == 'several_planners'
+    assert rig.runtime.request(Stop()).code == 'accepted'
 
 
 def test_refused_request_leaves_the_one_alone_that_is_being_planned():

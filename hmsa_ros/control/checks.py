@@ -7,10 +7,8 @@ from hmsa_ros.errors import excerpt
 from hmsa_ros.model.status import Code, RefusedError
 
 
-def check_ready(now: int, *, active: bool, crowded: str) -> None:
+def check_ready(now: int, *, active: bool) -> None:
     """Raise `RefusedError` if no request can be taken at all, at a time in ns."""
-    if crowded:
-        raise RefusedError(Code.SEVERAL_PLANTS, crowded)
     if not active:
         raise RefusedError(
             Code.INACTIVE, 'the planner is inactive: expected it active (ros2 lifecycle set NODE '

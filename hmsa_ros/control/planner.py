@@ -67,8 +67,8 @@ class PlannerRuntime:
         self.group = group
         self.settings = settings
         self.active = False
-        #: That several plants carry out the commands, which is refused; empty otherwise.
-        self.crowded = ''
+        #: Refuses requests, except to stop, while several planners or devices run.
+        self.crowded: RefusedError | None = None
         #: Returns whether one clock tells the times of all nodes, as simulated time does.
         self.one_clock: Callable[[], bool] = bool
         self.following = Following(group)
@@ -104,9 +104,11 @@ class PlannerRuntime:
         yet.
         """
         try:
-            check_ready(self._clock(), active=self.active, crowded=self.crowded)
+            check_ready(self._clock(), active=self.active)
             check_joints(request, tuple(self.group.planners), self.settings)
             if not isinstance(request, Stop):
+                if self.crowded is not None:
+                    raise self.crowded
                 self.hearing.check_clocks()
         except RefusedError as error:
             return self.planning.refuse(error, request)

@@ -39,6 +39,7 @@ class Code(str, Enum):
     TOO_LONG = 'too_long'
     NO_TIME = 'no_time'
     INACTIVE = 'inactive'
+    SEVERAL_PLANNERS = 'several_planners'
     SEVERAL_PLANTS = 'several_plants'
     CLOCKS_DIFFER = 'clocks_differ'
     UNSEEN = 'unseen'
@@ -137,6 +138,9 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
     Code.INACTIVE: (
         'The planner is a managed node and is not active.',
         'Activate it: ros2 lifecycle set /planner activate.'),
+    Code.SEVERAL_PLANNERS: (
+        'Several planners of one name run and would command the same joints.',
+        'Stop all but one, or give each a namespace.'),
     Code.SEVERAL_PLANTS: (
         'Several plants or drivers move or measure one joint, such as a simulator beside the '
         'physical one: the samples do not belong to one actuator.',

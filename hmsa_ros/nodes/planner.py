@@ -31,6 +31,7 @@ from hmsa_ros.errors import BadInputError
 from hmsa_ros.interfaces import topics
 from hmsa_ros.interfaces.actuator import actuator_from
 from hmsa_ros.model.actuators import unheld
+from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.nodes import conversions, endpoints
 from hmsa_ros.nodes.capture import decode, RawSubscription
@@ -301,9 +302,12 @@ class PlannerNode(ManagedNode):
     def _crowd(self) -> str:
         """Return of what there is more than one; empty if there is not."""
         self._presence.look()
-        self._runtime.crowded = self._presence.devices(self._settings.names)
+        rivals = self._presence.planners()
+        crowd = rivals or self._presence.devices(self._settings.names)
+        self._runtime.crowded = RefusedError(
+            Code.SEVERAL_PLANNERS if rivals else Code.SEVERAL_PLANTS, crowd) if crowd else None
         clocks = self.count_publishers('/clock') if self._clock_reader.simulated else 1
-        return self._presence.planners() or self._runtime.crowded or (
+        return crowd or (
             f'{clocks} publishers on /clock, and time may go back and forth: expected one'
             if clocks > 1 else '')
 
