@@ -319,8 +319,8 @@ def test_what_is_given_is_not_asked_for(tmp_path):
     assert status == 0
     questions = [x.rpartition('\n')[2].partition(' [')[0] for x in err.split(']: ')[:-1]]
     assert questions == [
-        "coil's largest flux density",
-        "coil's least flux density, negative in the other direction",
+        "coil's maximum flux density",
+        "coil's minimum flux density, negative in the other direction",
         "rate of the amplifier's ramps, 0 for steps",
         'joint name, or several separated by commas']
     assert parameters(tmp_path / 'actuator.yaml')['flux_density_max'] == 0.1

@@ -25,6 +25,9 @@ DEFLECTIONS = (0.05, 0.1, 0.2, 0.4, 0.6, 0.7, 0.78)
 USUAL_MOVE = 0.1
 # Points of the first look for the reach on either side.
 _LOOK = 400
+# Damping, over the critical one where the block is stiffest, above which no step overshoots and so
+# no two-step command exists: to search for one takes long.
+_OVERDAMPED = 3.0
 
 
 @dataclass(frozen=True)
@@ -86,6 +89,8 @@ def scales(actuator: ActuatorParameters, coil: Coil) -> Scales:
     def reach(end: float) -> float:
         # Fractions of the way out, so that the stretches near rest are looked at closely.
         targets = home + (end - home) * np.linspace(0.0, 1.0, _LOOK + 1)[1:] ** 2
+        if material.zeta > _OVERDAMPED * np.max(critical_zeta(targets, material)):
+            return home
         plans = plan_two_step_batch(
             home, targets, zeta=material.zeta, j_lim=material.j_lim, c1=material.c1,
             load_limits=loads, elastic=material.law)
