@@ -94,6 +94,7 @@ def test_a_broken_class_fails_the_check_that_is_for_it(lab, capsys, name):
     assert ': ' in sentence  # what to do
 
 
+@pytest.mark.slow
 def test_without_a_sensor_it_says_what_it_could_not_try(lab, capsys):
     found = lab(capsys, 'blind', 'def read(self, now): return []')
     assert failed(found) == []
