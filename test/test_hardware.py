@@ -489,6 +489,63 @@ def test_a_clock_is_asked_on_when_that_of_the_host_has_been_set_back():
     assert board.asked > asked
 
 
+@pytest.mark.parametrize('by', [240_000 * MS, -5_000 * MS])
+def test_when_the_clock_is_set_levels_ahead_and_the_watchdog_go_on(by):
+    bench, device = driver(fallback=Fallback(0.1, 'zero'))
+    device.receive(0, START, 0.1)
+    device.advance(START)
+    device.receive(0, START + 50 * MS, 0.2)
+    device.advance(START + 10 * MS)
+    device.clock_set(by)
+    words = f'set {"ahead" if by > 0 else "back"} by {abs(by) / 1e9:.3f} s'
+    assert [words in x.text for x in device.notices()] == [True]
+    start = START + by
+    device.advance(start + 49 * MS)
+    device.advance(start + 51 * MS)
+    assert bench.writes[1:] == [(START, 0.1), (start + 51 * MS, 0.2)]
+    device.advance(start + 109 * MS)
+    assert device.silent == []
+    device.advance(start + 111 * MS)
+    assert (device.silent, bench.levels[-1]) == ([0], 0.0)
+    # What was commanded for before is refused by the new time, and what is for after it obeyed.
+    device.receive(0, start + 100 * MS, 0.3)
+    device.receive(0, start + 120 * MS, 0.4)
+    device.advance(start + 120 * MS)
+    assert bench.levels[-1] == 0.4
+
+
+@pytest.mark.parametrize('by', [240_000 * MS, -5_000 * MS])
+def test_a_device_that_keeps_time_is_the_same_when_the_clock_of_the_host_is_set(by):
+    board, device = board_driver()
+    for k in range(2, 290):
+        step(board, device, START + k * MS)
+    device.receive(0, START + 310 * MS, 0.1)
+    step(board, device, START + 290 * MS)
+    board.host += by
+    board.begun += by
+    device.clock_set(by)
+    for k in range(291, 1000):
+        step(board, device, START + by + k * MS)
+    change, = device.changes()
+    assert abs(change.stamp - (START + by + 310 * MS + board.late)) < 15_000
+    assert device.counts['state_lost'] == 0
+
+
+def test_a_worker_sees_that_the_clock_is_set():
+    bench, by = Bench(), [0]
+    worker = HardwareWorker(lambda: HardwareDevice(
+        [HardwareJoint(bench, 0.5, Fallback(3600.0, 'zero'))], time=monotonic_ns(),
+        calls=Calls(60.0)), lambda: monotonic_ns() + by[0])
+    assert worker.started(60.0)
+    worker.receive(0, monotonic_ns(), 0.1)
+    wait_until(lambda: bench.levels[-1] == 0.1, 'the level')
+    by[0] = 7200 * 1000 * MS
+    worker.receive(0, monotonic_ns() + by[0], 0.2)
+    wait_until(lambda: bench.levels[-1] == 0.2, 'the level by the other clock')
+    assert (worker.trips, bench.levels) == (0, [0.0, 0.1, 0.2])
+    worker.close()
+
+
 @pytest.mark.parametrize('clock', [
     lambda self: 'now', lambda self: None, lambda self: 10**400])
 def test_a_clock_that_says_no_time_refuses_the_start(clock):
@@ -706,7 +763,7 @@ def test_a_level_of_before_a_cut_off_is_not_written_when_a_call_returns_late():
     gate = Gate()
     now = [START]
     worker = HardwareWorker(lambda: HardwareDevice(
-        [HardwareJoint(gate, 0.5)], time=START, calls=Calls(60.0)), lambda: now[0])
+        [HardwareJoint(gate, 0.5)], time=START, calls=Calls(60.0)), *[lambda: now[0]] * 2)
     assert worker.started(60.0)
     gate.blocks = 'write'
     worker.receive(0, START, 0.1)

@@ -72,6 +72,8 @@ class Rig:
         self.transport = 0
         self.driver = lambda: 0
         self.hold_back = False
+        # How far the clock was set ahead, which actuators take no notice of.
+        self.set_by = 0
 
     def clock(self):
         if self.set_back_at is not None:
@@ -113,19 +115,21 @@ class Rig:
         self.wire = [x for x in self.wire if x[0] > self.now]
         for _, x in arrived:
             plant = self.plants[x.joint]
-            stamp = max(x.stamp, plant.time)
+            stamp = max(x.stamp - self.set_by, plant.time)
             delay = self.driver() if x.flux_density != plant.schedule.current else 0
             plant.command(stamp + delay, x.flux_density)
 
     def advance(self):
         """Let the actuators move on, and tell what takes effect."""
         for name, plant in self.plants.items():
-            while (stamp := plant.schedule.next_stamp) is not None and stamp <= self.now:
+            now = self.now - self.set_by
+            while (stamp := plant.schedule.next_stamp) is not None and stamp <= now:
                 before = plant.schedule.current
                 plant.advance(stamp)
                 if plant.schedule.current != before:
-                    self.runtime.applied(name, plant.time, plant.schedule.current)
-            plant.advance(self.now)
+                    self.runtime.applied(
+                        name, plant.time + self.set_by, plant.schedule.current)
+            plant.advance(now)
 
     def run(self, end, step=2 * MS):
         while self.now < end:
@@ -625,6 +629,33 @@ def test_clock_that_is_set_back_drops_the_plan_and_tells_so_once():
     assert rig.runtime.wake is None
     assert rig.runtime.request(Target('a', 1.1)).code == 'accepted'
     assert rig.planner.plan.levels[0].stretch == 1.0
+
+
+@pytest.mark.parametrize('by', [240_000 * MS, -5_000 * MS])
+def test_the_plan_goes_on_when_the_clock_is_set(by):
+    rig = Rig(settings=replace(QUIET, heartbeat_period=10 * MS))
+    rig.runtime.request(trajectory(*SEQUENCE))
+    planned = [(x.stamp, x.flux_density) for x in rig.planner.plan.levels[1:]]
+    rig.run(START + LEAD + 20 * MS)
+    rig.deliver()
+    rig.runtime.clock_set(by)
+    rig.now += by
+    rig.set_by = by
+    known = len(rig.sent)
+    rig.run(START + by + LEAD + 3 * HOLD)
+    later = [x for x in planned if x[0] > START + 2 * LEAD + 20 * MS]
+    assert later
+    sent = [(x.stamp - by, x.flux_density) for _, x in rig.sent[known:]]
+    assert [x for x in sent if x in planned] == later
+    gaps = [now - before for (before, _), (now, _) in zip(
+        rig.sent[known:], rig.sent[known + 1:], strict=False)]
+    assert max(gaps) <= 20 * MS
+    words = f'{"ahead" if by > 0 else "back"} by {abs(by) / 1e9:.3f} s: what is planned goes on'
+    assert [words in x for x in rig.notes()] == [True]
+    assert rig.residual(1.4) < RESIDUAL
+    assert rig.status.progress.state == 'at_rest'
+    assert rig.runtime.request(Target('a', 1.3)).code == 'accepted'
+    assert rig.planner.plan.segments[-1].since - rig.now == LEAD
 
 
 @pytest.mark.parametrize('again', [Target('a', 1.2), trajectory((1.2, HOLD))])

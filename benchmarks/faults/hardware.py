@@ -8,12 +8,15 @@ from threading import Event
 from time import monotonic
 from typing import Any
 
+from sensor_msgs.msg import TimeReference
+
 from benchmarks.faults.board import Board
 from benchmarks.faults.common import Register
 from benchmarks.faults.rig import Child, Rig
 from benchmarks.faults.table import Seen
 from hmsa_ros.interfaces import topics
-from hmsa_ros.nodes.conversions import to_command
+from hmsa_ros.nodes import endpoints
+from hmsa_ros.nodes.conversions import CUT_OFF, to_command
 
 FAULTS = Register()
 _LEVEL = 0.02
@@ -36,6 +39,11 @@ class _Bench:
             'hardware.port': rig.folder / 'port', 'hardware.timeout': _CALL,
             'command_timeout': _TIMEOUT, 'publish_rate': 50.0, **parameters})
         self._command = rig.publisher(topics.FLUX_DENSITY_COMMAND)
+        self._cut_off = False
+        endpoints.subscribe(rig.node, topics.FLUX_DENSITY_RECEIVED, self._on_receipt)
+
+    def _on_receipt(self, message: TimeReference) -> None:
+        self._cut_off = message.header.frame_id == CUT_OFF
 
     def ready(self) -> None:
         """Wait until the driver takes commands."""
@@ -48,8 +56,9 @@ class _Bench:
         self.beat_until(lambda: self.board.level == _LEVEL, 'the level')
 
     def beat_until(
-            self, condition: Callable[[], Any], what: str, level: float = _LEVEL) -> None:
-        """Repeat a level until a condition holds."""
+            self, condition: Callable[[], Any], what: str, level: float = _LEVEL, *,
+            yields: bool = True) -> None:
+        """Repeat a level until a condition holds; it ``yields`` to a cut-off by 0 first."""
         due = 0.0
 
         def look() -> Any:
@@ -57,7 +66,8 @@ class _Bench:
             if monotonic() >= due:
                 due = monotonic() + _BEAT
                 now = self.rig.node.get_clock().now().nanoseconds
-                self._command.publish(to_command(now + _LEAD, level, ''))
+                wanted = 0.0 if yields and self._cut_off else level
+                self._command.publish(to_command(now + _LEAD, wanted, ''))
             return condition()
 
         self.rig.spin_until(look, what)
@@ -177,9 +187,11 @@ def _reboot(rig: Rig) -> Seen:
         bench.switch_on()
         begin = monotonic()
         bench.board.reboot()
-        bench.beat_until(lambda: 'has lost its state' in bench.driver.said, 'the alarm')
-        bench.beat_until(lambda: rig.applied[-1][1] == 0.0, 'the report')
-        bench.beat_until(lambda: monotonic() > begin + 2.0 * _TIMEOUT, 'time to pass')
+        for condition, what in (
+                (lambda: 'has lost its state' in bench.driver.said, 'the alarm'),
+                (lambda: rig.applied[-1][1] == 0.0, 'the report'),
+                (lambda: monotonic() > begin + 2.0 * _TIMEOUT, 'time to pass')):
+            bench.beat_until(condition, what, yields=False)
         again = bench.board.largest_since(begin)
         bench.beat_until(lambda: bench.board.level == 0.01, 'another level', 0.01)
         return Seen(f'said; another level obeyed, {again:g} T without it', '-',

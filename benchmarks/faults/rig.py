@@ -36,6 +36,8 @@ _SLICE = 0.02
 _ACQUAINTANCE = 0.2
 _PR_SET_PDEATHSIG = 1
 _TRACE = 'Traceback (most recent call last)'
+# Lines of a log that a failure is told with.
+_LAST = 4
 
 
 class Child:
@@ -227,6 +229,13 @@ class Rig:
                 last = next((x for x in part.splitlines()[1:] if x[:1].strip()), '')
                 found.append(f'{log.stem}: {last.strip()}')
         return found
+
+    def last_words(self) -> str:
+        """Return the last lines of each node of the package, for a failure."""
+        logs = {x.log: x for x in self.children if x.log.stem.split('_')[0] in topics.NODES}
+        return ''.join(
+            f'; {log.stem} said last: {" / ".join(child.said.split(chr(10))[-_LAST - 1:-1])}'
+            for log, child in logs.items())
 
     # -- what is seen --------------------------------------------------------------------------
 

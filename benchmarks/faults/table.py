@@ -50,7 +50,7 @@ def inject(fault: Fault, domain: int) -> Outcome:
             with rig:
                 seen = fault.inject(rig)
         except HmsaError as error:
-            seen = Seen(str(error), '-', met=False)
+            seen = Seen(f'{error}{rig.last_words()}', '-', met=False)
         traces = rig.traces()
         if traces:
             seen = Seen(

@@ -8,6 +8,7 @@ to topics, a loop that has the coil at hand to the coil.
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 import math
 from time import monotonic_ns
 
@@ -38,6 +39,7 @@ from hmsa_ros.model.status import Code, RefusedError
 from hmsa_ros.model.units import NANOSECONDS
 from hmsa_ros.planning.group import PlannerGroup
 from hmsa_ros.planning.timeline import Model
+from hmsa_ros.timekeeping import clock_set_words
 
 # Clock jumps nearer to each other than this make one verdict.
 _STORM = NANOSECONDS
@@ -73,6 +75,9 @@ class PlannerRuntime:
         self.one_clock: Callable[[], bool] = bool
         self.following = Following(group)
         self.clock_jumps = 0
+        #: By how many ns the clock was set ahead since `tick` has taken that in.
+        self._stepped = 0
+        clock = partial(self._read, clock)
         self._clock, self._steady, self._observable = clock, steady, observable
         self._glance = glance
         self._takeover = Takeover(group, clock, steady, observable, unheard)
@@ -92,6 +97,11 @@ class PlannerRuntime:
         self._last_jump: int | None = None
         self._set_back = 0
         self._tell_impossible = Seldom()
+
+    def _read(self, clock: Clock) -> int:
+        """Return the time in ns; one that is set meanwhile goes on until that is taken in."""
+        now = clock()
+        return now - self._stepped
 
     # -- in ------------------------------------------------------------------------------------
 
@@ -183,10 +193,15 @@ class PlannerRuntime:
                     f'joint {joint}: a report that {flux_density:g} T took effect is ignored, '
                     'since no motion can be predicted from there; see what publishes it')
             return
+        now = self._clock()
+        if self._stepped:
+            # The stamp is of the clock as it was set.
+            self._begin_anew()
+            now = self._clock()
         self.feedback.applied(joint, stamp, flux_density)
         if self._takeover.engaged:
             self._bulletin.outputs += self.following.applied(
-                joint, stamp, flux_density, self.settings, self._clock())
+                joint, stamp, flux_density, self.settings, now)
         else:
             self.following.newest[joint] = stamp, flux_density
 
@@ -202,9 +217,14 @@ class PlannerRuntime:
         if self.feedback.looks_at(stamp):
             self.feedback.add(joint, stamp, stretch, flux_density)
 
+    def clock_set(self, by: int) -> None:
+        """Take in that the clock was set ahead by some ns, and that what is planned goes on."""
+        self.clock_jumps += 1
+        self._stepped += by
+
     def clock_set_back(self, back: int) -> None:
         """
-        Take in that the clock was set back by some ns: the state in force is read again.
+        Take in that simulated time began anew, some ns back: the state in force is read again.
 
         The clock may find this out when it is read in the middle of planning, so the plans are
         dropped when that is done.
@@ -213,19 +233,24 @@ class PlannerRuntime:
         self._set_back = max(self._set_back, back)
 
     def _begin_anew(self) -> None:
-        """Drop the plans if the clock was set back, and report it."""
+        """Take in that the clock was set, if it was, and report it."""
         back, self._set_back = self._set_back, 0
-        if not back:
+        by, self._stepped = self._stepped, 0
+        if not (back or by):
             return
-        self.group.restart()
-        self.following.restart()
+        requests = [] if back else self.planning.requests
         self.planning.clear()
-        self._watch.restart()
+        self.following.restart()
         self.feedback.restart()
         self.hearing.receipts.clock_set_back()
-        self._takeover.drop()
         self._silence.restart()
-        self._takeover.engaged = False
+        if back:
+            self.group.restart()
+            self._watch.restart()
+            self._takeover.drop()
+            self._takeover.engaged = False
+        else:
+            self._go_on(by, requests)
         last, self._last_jump = self._last_jump, self._steady()
         if last is not None and self._last_jump - last < _STORM:
             return
@@ -233,8 +258,21 @@ class PlannerRuntime:
             Severity.WARN, Code.CLOCK_JUMPED,
             f'the clock jumped back by {back / NANOSECONDS:.3f} s: the plan is dropped, and the '
             'actuator is assumed where it began, at initial_stretch, unless joint_states shows '
-            'otherwise'),
+            'otherwise' if back else
+            f'{clock_set_words(by)}: what is planned goes on, as long from now as before; have it '
+            'slewed, not set, while an experiment runs', self._bulletin.verdict.request),
             log=True)
+
+    def _go_on(self, by: int, requests: Iterable[Request]) -> None:
+        """Have all that is planned happen when it would have, though the clock was set."""
+        self.group.clock_set(by)
+        self._watch.clock_set(by)
+        self._takeover.clock_set(by)
+        self.sending.next_beat += by
+        for request in requests:
+            # It was being planned for times that are others now.
+            self.planning.add(request, engaged=self._takeover.engaged)
+        self._bulletin.show()
 
     def deactivate(self) -> None:
         """Come to rest, for which all commands are sent now, and take no more requests."""
@@ -282,7 +320,7 @@ class PlannerRuntime:
     @property
     def wake(self) -> int | None:
         """Time in ns at which there is something to do next; None for never, 0 for now."""
-        if (self._set_back or self.planning or self._takeover.waiting
+        if (self._set_back or self._stepped or self.planning or self._takeover.waiting
                 or self._bulletin.outputs):
             return 0
         if not self._takeover.engaged:

@@ -91,6 +91,11 @@ class Takeover:
         self._unsure.clear()
         self._doubted.clear()
 
+    def clock_set(self, by: int) -> None:
+        """Take in that the clock was set ahead by some ns: samples of before are no older."""
+        self._samples = {
+            name: x._replace(stamp=x.stamp + by) for name, x in self._samples.items()}
+
     def go_on(
             self, settings: Settings, newest: Mapping[str, tuple[int, float]]) -> list[str]:
         """

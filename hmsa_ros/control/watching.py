@@ -103,6 +103,15 @@ class Watch:
             self._joints[name] = _Joint(
                 replace(plan, kept=len(plan.segments)), plan, self._group.number)
 
+    def clock_set(self, by: int) -> None:
+        """Take in that the clock was set ahead by some ns, and all plans with it."""
+        for name, joint in self._joints.items():
+            joint.asked = joint.asked.shifted(by)
+            joint.plan = self._group.planners[name].plan
+            # What samples have shown so far is of times that were others.
+            joint.holds = [x if x.over else self._hold(name, joint, x.setpoint.number - 1)
+                           for x in joint.holds]
+
     def _asked(self) -> list[_Joint]:
         """Return the joints of the newest request."""
         newest = max(x.request for x in self._joints.values())
@@ -196,9 +205,13 @@ class Watch:
             if hold.over:
                 joint.close(hold.found)
         joint.holds = [x for x in joint.holds if not x.over]
+        joint.holds.append(self._hold(name, joint, number))
+
+    def _hold(self, name: str, joint: _Joint, number: int) -> Hold:
+        """Return what gathers samples of a setpoint."""
         hold = Hold(self._setpoint(name, joint, number), last=number + 1 == joint.count)
         _keep_up(hold, joint)
-        joint.holds.append(hold)
+        return hold
 
     def _setpoint(self, name: str, joint: _Joint, number: int) -> Setpoint:
         """Return a setpoint as it was requested."""

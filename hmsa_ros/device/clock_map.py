@@ -128,6 +128,11 @@ class ClockMap:
             return math.inf
         return self._error(self._answers[-1].host) / NANOSECONDS
 
+    def host_set(self, by: int) -> None:
+        """Take in that the clock of the host was set ahead by some ns."""
+        host, device = self._origin
+        self._origin = host + by, device
+
     def to_device(self, host: int) -> int:
         """Return the time of the device in ns at one of the host."""
         begin, clock = self._origin

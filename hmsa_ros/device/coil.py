@@ -71,6 +71,21 @@ class Coil:
         # From when on what it keeps is not what is ahead.
         self._changed: int | None = None
 
+    def clock_set(self, by: int) -> None:
+        """Take in that the clock of this host was set ahead by some ns."""
+        self.schedule.shift(by)
+        self._history, self._handed, self._awaited = (
+            deque(((x + by, level) for x, level in times), times.maxlen)
+            for times in (self._history, self._handed, self._awaited))
+        if self.heard is not None:
+            self.heard += by
+        if self._changed is not None:
+            self._changed += by
+        if self._next_question is not None:
+            self._next_question += by
+        if self.instrument.clock_map is not None:
+            self.instrument.clock_map.host_set(by)
+
     # -- levels in force -----------------------------------------------------------------------
 
     def set(self, when: int, asked: float, level: float) -> bool:

@@ -12,6 +12,7 @@ from hmsa_ros.device.hardware import Calls, Hardware, HardwareError, Instrument
 from hmsa_ros.device.protocol import Change, Kind, Notice, Sample, StateLostError
 from hmsa_ros.device.watchdog import Device, Fallback
 from hmsa_ros.errors import BadInputError
+from hmsa_ros.timekeeping import clock_set_words
 
 # A level is not written again where the next one is due within so many of the longest writes.
 _ROOM = 2.0
@@ -178,6 +179,19 @@ class HardwareDevice(Device):
             # The clock was set back.
             self._next_sample = min(self._next_sample, time)
         self._time = time
+
+    def clock_set(self, by: int) -> None:
+        """Take in that the clock was set ahead by some ns: all that is ahead stays as far away."""
+        self._time += by
+        self._next_sample += by
+        for watchdog, cut_off, coil in zip(
+                self._watchdogs, self._cut_offs, self._coils, strict=True):
+            watchdog.pass_over(by)
+            cut_off.clock_set(by)
+            coil.clock_set(by)
+        self._notices.append(Notice(Kind.CLOCK, 0, (
+            f'{clock_set_words(by)}: levels ahead apply as long from now as before; have it '
+            'slewed, not set, while an experiment runs')))
 
     def advance(self, time: int) -> None:
         """

@@ -41,6 +41,7 @@ class Kind(Enum):
     FAILED = 'failed'
     SATURATED = 'saturated'
     LOST = 'lost'
+    CLOCK = 'clock'
 
 
 class Notice(NamedTuple):

@@ -124,6 +124,9 @@ class Watchdog:
         """Leave out a span of time in ns, which was no silence."""
         if self._last is not None:
             self._last += span
+        if self._ramp is not None:
+            begin, level = self._ramp
+            self._ramp = begin + span, level
 
     def disarm(self) -> None:
         """Wait for a first command again."""
@@ -152,6 +155,11 @@ class CutOff:
         """Refuse what was commanded before a time in ns, if anything was."""
         if self._before:
             self._since = now
+
+    def clock_set(self, by: int) -> None:
+        """Take in that the clock was set ahead by some ns."""
+        if self._since is not None:
+            self._since += by
 
     def end(self) -> None:
         """Forget it, and what was commanded."""

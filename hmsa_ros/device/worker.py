@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable
 import sys
 from threading import Condition, Event, Thread
-from time import monotonic
+from time import monotonic, monotonic_ns
 from typing import NamedTuple, TypeVar
 
 from hmsa_ros.device.driven import HardwareDevice
@@ -17,6 +17,7 @@ from hmsa_ros.device.hardware import told
 from hmsa_ros.device.protocol import Change, Kind, Notice, Sample
 from hmsa_ros.errors import BadInputError, HmsaError
 from hmsa_ros.model.units import NANOSECONDS
+from hmsa_ros.timekeeping import StepWatch
 
 T = TypeVar('T')
 
@@ -32,7 +33,7 @@ _MEND = 'mend it, then start the driver again'
 
 
 class _Command(NamedTuple):
-    """A level in T from a stamp in ns on, and when it came."""
+    """A level in T from a stamp in ns on, and when it came by the steady clock."""
 
     joint: int
     stamp: int
@@ -51,8 +52,11 @@ class HardwareWorker:
 
     device: HardwareDevice  # since it has `started`
 
-    def __init__(self, make: Callable[[], HardwareDevice], clock: Callable[[], int]) -> None:
-        self._make, self._clock = make, clock
+    def __init__(
+            self, make: Callable[[], HardwareDevice], clock: Callable[[], int],
+            steady: Callable[[], int] = monotonic_ns) -> None:
+        self._make, self._clock, self._steady = make, clock, steady
+        self._steps = StepWatch()
         self._turn = Condition()
         self._ready = Event()
         self._ended = False
@@ -118,7 +122,7 @@ class HardwareWorker:
         if self.trouble:
             raise BadInputError(self.trouble)
         self.device.check(joint, stamp, level)
-        self._put(_Command(joint, stamp, level, self._clock()))
+        self._put(_Command(joint, stamp, level, self._steady()))
 
     def switch_off(self) -> None:
         """Have all coils switched off, with nothing ahead."""
@@ -181,6 +185,7 @@ class HardwareWorker:
             self._ready.set()
         try:
             while not self._ended:
+                self._see_clock()
                 self._hear()
                 self.device.advance(self._clock())
                 self._hand_over()
@@ -191,13 +196,18 @@ class HardwareWorker:
         else:
             self._end('')
 
+    def _see_clock(self) -> None:
+        """Look whether the clock was set, which nobody has been silent for."""
+        if by := self._steps.step(self._steady(), self._clock(), self._steady()):
+            self.device.clock_set(by)
+
     def _hear(self) -> None:
         """Take what has come, with the time at which it came: calls may have blocked since."""
         while self._commands:
             command = self._commands.popleft()
             if command is not None:
                 try:
-                    self.device.hear(*command)
+                    self.device.hear(*command[:3], self._clock() - self._steady() + command.came)
                 except BadInputError as error:
                     self._notices.append(Notice(Kind.REFUSED, command.joint, str(error)))
             elif left := self.device.switch_off(self._clock()):
@@ -215,7 +225,9 @@ class HardwareWorker:
         left = 0 if due is None else due - self._clock()
         if due is not None and due == level and left <= _WATCHED:
             device.calls.make_ready()
-            while self._clock() < due and not self._commands:
+            # By the steady clock: the other may be set meanwhile.
+            end = self._steady() + left
+            while self._steady() < end and not self._commands:
                 pass
             return
         device.calls.relax()

@@ -40,6 +40,10 @@ class Superseding(Generic[T]):
         self._stamps.append(stamp)
         self._things.append(thing)
 
+    def shift(self, span: int) -> None:
+        """Add a span in ns to all stamps."""
+        self._stamps = deque(x + span for x in self._stamps)
+
     def _drop(self, stamp: int) -> int:
         """Drop what is stamped at or after a time; return how many there were."""
         dropped = len(self._stamps) - bisect_left(self._stamps, stamp)

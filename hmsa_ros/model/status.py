@@ -183,8 +183,10 @@ EXPLANATIONS: Mapping[Code, tuple[str, str]] = {
         'could not be planned anew, for the reason that the message gives.',
         'Send the request again.'),
     Code.CLOCK_JUMPED: (
-        'The clock was set back, and the plan was dropped.',
-        'Send the request again; set clocks before the experiment.'),
+        'The clock was set. If simulated time went back, the plan was dropped; after a step of '
+        'the clock of a host, it goes on as before.',
+        'If the plan was dropped, send the request again. Synchronise clocks before the '
+        'experiment, and have them slewed during it.'),
     Code.ARRIVED: (
         'Measured: the stretch rests at the setpoint, within the tolerances.', ''),
     Code.OFF_TARGET: (

@@ -113,7 +113,7 @@ class DeviceJoint:
                 logger.warning(text)
         elif notice.kind == Kind.REFUSED:
             self._refuse(notice.text)
-        elif notice.kind == Kind.SATURATED:
+        elif notice.kind in (Kind.SATURATED, Kind.CLOCK):
             logger.warning(text)
         elif notice.kind == Kind.HEARD:
             logger.info(text)

@@ -44,8 +44,8 @@ from hmsa_ros.nodes.parameters import check_names
 from hmsa_ros.nodes.planning import group_from, models_from, OWN, settings_from, SPECS
 from hmsa_ros.nodes.presence import Presence
 from hmsa_ros.nodes.runner import run
-from hmsa_ros.nodes.timekeeping import StepWatch
 from hmsa_ros.nodes.trajectories import read_trajectory
+from hmsa_ros.timekeeping import StepWatch
 
 PARAMETERS = SPECS
 
@@ -212,13 +212,12 @@ class PlannerNode(ManagedNode):
     # -- time ----------------------------------------------------------------------------------
 
     def now(self) -> int:
-        """Return the node's time in ns; that the clock was set back is noted."""
+        """Return the node's time in ns; that the clock was set is noted."""
         before = monotonic_ns()
         now = self._clock_reader.read()
-        if not self._clock_reader.simulated:
-            back = self._steps.set_back(before, now, monotonic_ns())
-            if back:
-                self._runtime.clock_set_back(back)
+        if not self._clock_reader.simulated and (
+                by := self._steps.step(before, now, monotonic_ns())):
+            self._runtime.clock_set(by)
         return now
 
     def _on_jump(self, jump: TimeJump) -> None:

@@ -158,6 +158,11 @@ class PlannerGroup:
         for planner in self.planners.values():
             planner.restart()
 
+    def clock_set(self, by: int) -> None:
+        """Take in that the clock was set ahead by some ns: what is planned goes on as before."""
+        for planner in self.planners.values():
+            planner.clock_set(by)
+
     def next_command(self) -> int | None:
         """Return the time in ns at which a command is to be handed out; None for none."""
         times = ((x.next_stamp, x.options.lead_time) for x in self.planners.values())

@@ -53,6 +53,12 @@ class RunningPlan:
         self._begin_with(PlannedLevel(
             ALWAYS, flux_density, self._initial, 0.0, flux_density, self.model))
 
+    def clock_set(self, by: int) -> None:
+        """Take in that the clock was set ahead by some ns: what is planned goes on as before."""
+        self.plan = self.plan.shifted(by)
+        self._history = replace(self._history, levels=self.plan.levels)
+        self.revision += 1
+
     def _begin_with(self, level: PlannedLevel, *, keep: bool = False) -> None:
         """Begin anew from a level; if its setpoints are kept, so is what was not sent yet."""
         old, ahead = self.plan, self._history.levels[self._history.sent:] if keep else ()

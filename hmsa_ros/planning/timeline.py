@@ -145,6 +145,12 @@ class PlannedLevel:
         """Stamp in ns with which it is sent."""
         return self.stamp if self.sent_for is None else self.sent_for
 
+    def shifted(self, span: int) -> 'PlannedLevel':
+        """Return the level with a span in ns added to its times."""
+        return replace(
+            self, stamp=self.stamp if self.stamp == ALWAYS else self.stamp + span,
+            sent_for=None if self.sent_for is None else self.sent_for + span)
+
     def at(self, time: int) -> State:
         """Predict the nondimensional state at a time in ns; before the stamp, as at the stamp."""
         model = self.model
@@ -216,6 +222,13 @@ class PlannedSegment:
     vibration: float = 0.0
     until: int | None = None  #: end as requested; None for one that is held on
 
+    def shifted(self, span: int) -> 'PlannedSegment':
+        """Return the segment with a span in ns added to all times."""
+        return replace(
+            self, begin=self.begin + span, since=self.since + span,
+            arrival=None if self.arrival is None else self.arrival + span,
+            until=None if self.until is None else self.until + span)
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -225,6 +238,12 @@ class Plan:
     levels: tuple[PlannedLevel, ...]  #: by stamp; the first ones may lie in the past
     segments: tuple[PlannedSegment, ...]  #: by time
     kept: int = 0  #: how many segments, the first ones, belong to earlier requests
+
+    def shifted(self, span: int) -> 'Plan':
+        """Return the plan with a span in ns added to all times."""
+        return replace(
+            self, levels=tuple(x.shifted(span) for x in self.levels),
+            segments=tuple(x.shifted(span) for x in self.segments))
 
     def ahead(self, now: int, limit: int | None = None) -> tuple[PlannedLevel, ...]:
         """Return levels from the one in force on; none that is in force for ever."""
