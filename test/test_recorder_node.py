@@ -161,6 +161,17 @@ def test_what_was_sent_before_it_was_matched_is_counted_apart(record, ros):
     assert 'complete  yes, but for 20 messages' in to_text(summary)
 
 
+def test_a_topic_of_which_nothing_came_is_named_by_the_recorder_and_by_its_bag(record, ros):
+    recorder = record('record.regex:=^/a', topics='')
+    publishers = [ros.publisher(Float64, x) for x in ('/a1', '/a2')]
+    publishers[0].publish(Float64(data=1.0))
+    recorder.wait_for('received', '1')
+    reader = recorder.end()
+    assert reader.counts() == {'/a1': 1, '/a2': 0}
+    assert 'nothing was received of /a2' in recorder.process.stdout
+    assert 'note: nothing was received of /a2' in to_text(summarize(recorder.folder))
+
+
 @pytest.mark.slow
 def test_several_publishers_of_one_topic_are_counted_apart(record, start):
     recorder = record()

@@ -180,6 +180,8 @@ def _lines(summary: BagSummary, parameters: bool) -> Iterator[str]:
         if topic.sent_before:
             yield (f'note: {topic.sent_before} messages of {topic.name} were sent before the '
                    'recorder was matched')
+    if silent := [x.name for x in summary.topics if not x.count]:
+        yield f'note: nothing was received of {", ".join(silent)}'
     for problem in summary.problems:
         yield f'note: {problem}'
 

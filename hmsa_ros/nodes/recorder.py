@@ -357,8 +357,8 @@ class Recorder(ManagedNode):
             if count:
                 print(f'hmsa recorder: {count} of {name} were sent before the recorder was '
                       'matched', flush=True)
-        for name in self._recorded.silent():
-            print(f'hmsa recorder: nothing was received of {name}', flush=True)
+        if silent := self._recorded.silent():
+            print(f'hmsa recorder: nothing was received of {", ".join(silent)}', flush=True)
         if status.error and self.failure is None:
             self.failure = BagError(status.error)
 

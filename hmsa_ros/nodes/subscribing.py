@@ -47,9 +47,9 @@ class Subscriptions:
         return len(self.topics) + len(missing)
 
     def silent(self) -> list[str]:
-        """Return the topics asked for by name of which nothing was received."""
+        """Return the topics, subscribed to or asked for by name, of which nothing was received."""
         heard = {name for name, topic in self.topics.items() if topic.received}
-        return sorted({*self._selection.topics} - heard)
+        return sorted({*self._selection.topics, *self.topics} - heard)
 
     def look(self, found: Iterable[tuple[str, Sequence[str]]]) -> None:
         """Subscribe to what is new of the topics found, with their types."""
