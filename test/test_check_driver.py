@@ -36,8 +36,8 @@ BROKEN = {
     'late': ('def write(self, level, now): super().write(level, now); return now + 8_000_000',
              'lateness'),
     'blocking': ('def read(self, now): sleep(0.1); return super().read(now)', 'read_time'),
-    'stamps': ('def read(self, now): return [(*super().read(now)[0][:2], 10**18)]',
-               'stamps_rise'),
+    'stamps': ('def read(self, now): self.first = getattr(self, "first", now); '
+               'return [(*super().read(now)[0][:2], self.first)]', 'stamps_rise'),
     'future': ('def read(self, now): return [(*super().read(now)[0][:2], time_ns() + 10**9)]',
                'stamps_past'),
     'staircase': ('def read(self, now): self.count -= self.count % 20 != 0; '

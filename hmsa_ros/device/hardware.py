@@ -304,8 +304,8 @@ class Instrument:
         if not (_is_number(when) and self._may_be(when, now) and _is_number(really)):
             raise HardwareError(
                 f'{self.name}.write of joint {self._joint} returned {excerpt(answer)}: expected '
-                'when the level took effect in ns, as now is, that and the level really set in '
-                'T, or None')
+                f'when the level took effect in ns, near now, {now}, that and the level really '
+                'set in T, or None')
         return int(when), float(really)
 
     def read(self, now: int) -> list[Reading]:
@@ -333,8 +333,8 @@ class Instrument:
         except (TypeError, ValueError) as error:
             raise HardwareError(
                 f'{self.name}.read of joint {self._joint} returned {excerpt(answer)}: expected '
-                'stretch, (stretch, rate), (stretch, rate, stamp in ns, as now is) or a list of '
-                f'the latter, at most {_MOST_PIECES}, with NaN for what is not measured'
+                f'stretch, (stretch, rate), (stretch, rate, stamp in ns, near now, {now}) or a '
+                f'list of the latter, at most {_MOST_PIECES}, with NaN for what is not measured'
             ) from error
 
     def _reading(self, values: Sequence[Any], now: int) -> Reading:
