@@ -10,12 +10,19 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hmsa_ros.api.columns import columns_of, number
+from hmsa_ros.api.arguments import (
+    columns_of,
+    creep_values,
+    DEFAULTS,
+    law_values,
+    limits_of,
+    number,
+)
+from hmsa_ros.api.facts import facts
 from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.files import write_text
 from hmsa_ros.interfaces.actuator import actuator_from, model_from, parameters_of
 from hmsa_ros.interfaces.parameters import (
-    ACTUATOR,
     CREEP_TOLERANCE,
     FLUX_DENSITY_MAX,
     LAW_NAME,
@@ -24,12 +31,11 @@ from hmsa_ros.interfaces.parameters import (
     ZETA,
 )
 from hmsa_ros.interfaces.topics import PLANNER
-from hmsa_ros.model.creep import Creep
 from hmsa_ros.model.delivery import IDEAL
 from hmsa_ros.model.equations import critical_zeta, elastic_force, equilibrium_stretch
 from hmsa_ros.model.laws import LAWS
 from hmsa_ros.model.mismatch import Uncertainty
-from hmsa_ros.model.moves import Limits, State
+from hmsa_ros.model.moves import State
 from hmsa_ros.model.parameters import ActuatorParameters
 from hmsa_ros.planning.scales import Coil, Scales, scales
 from hmsa_ros.planning.sequence import plan_sequence
@@ -45,7 +51,6 @@ if TYPE_CHECKING:
     from hmsa_ros.api.plan import Plan
     from hmsa_ros.identification.files import Belief
 
-_DEFAULTS = {x.name.partition('.')[2]: x.default for x in ACTUATOR}
 _STRONGEST: Any = FLUX_DENSITY_MAX.default
 # Nobody has to send the levels of such a plan: unless a file says how fine, they are very fine.
 _SPECS = (*PLANNED, *VISCOELASTIC, replace(CREEP_TOLERANCE, default=IDEAL.ripple))
@@ -114,8 +119,8 @@ class Actuator:
             ('density', density, 'kg/m^3'), ('half_length', half_length, 'm'),
             ('half_thickness', half_length if half_thickness is None else half_thickness, 'm'),
             ('remanence', remanence, 'T'), ('chain_limit', chain_limit, ''))}
-        values |= _of_law(law, constants or {}, shear_modulus) | _of_creep(creep)
-        low, high = _limits(flux_density_limits)
+        values |= law_values(law, constants or {}, shear_modulus) | creep_values(creep)
+        low, high = limits_of(flux_density_limits)
         slew_limit = number(slew_limit, 'slew_limit', 'T/s')
         values |= {
             'flux_density_min': low, 'flux_density_max': high,
@@ -129,9 +134,7 @@ class Actuator:
                 'both zeta and damping_coefficient are given: expected one of them')
         if damping_coefficient is None:
             undamped = actuator_from(_checked(values | {'actuator.damping_coefficient': 0.0}))
-            zeta = ZETA if zeta is None else number(zeta, 'zeta')
-            if not 0.0 <= zeta < math.inf:
-                raise BadInputError(f'zeta is {zeta:g}: expected a finite number of at least 0')
+            zeta = ZETA if zeta is None else number(zeta, 'zeta', least=0.0)
             damping_coefficient = zeta * undamped.damping_unit
         self._take(values | {'actuator.damping_coefficient': number(
             damping_coefficient, 'damping_coefficient', 'N s/m')})
@@ -370,10 +373,10 @@ class Actuator:
         12000.0
 
         """
-        unknown = [x for x in factors if x not in _DEFAULTS]
+        unknown = [x for x in factors if x not in DEFAULTS]
         if unknown:
             raise BadInputError(
-                f'{unknown[0]} has no factor: expected {", ".join(_DEFAULTS)}')
+                f'{unknown[0]} has no factor: expected {", ".join(DEFAULTS)}')
         values = _checked(self.parameters)
         made = Actuator.__new__(Actuator)
         made._belief = None
@@ -448,7 +451,7 @@ class Actuator:
             if reason := impossible(stretch, model.material.rest):
                 raise BadInputError(reason)
         if limits is not None:
-            low, high = _limits(limits)
+            low, high = limits_of(limits)
             model = Model(model.actuator, replace(
                 model.options, flux_density_min=low, flux_density_max=high))
         unit = model.units.time
@@ -587,89 +590,3 @@ _KEYS = tuple(x for x in Actuator.__init__.__annotations__ if x != 'return')
 def _checked(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return all parameters that a plan needs, checked."""
     return values_of({f'{PLANNER}.{x}': y for x, y in values.items()}, PLANNER, _SPECS)
-
-
-def _of_law(
-        name: Any, constants: Mapping[str, Any], modulus: float | None) -> dict[str, Any]:
-    """Return the parameters of a law."""
-    if not isinstance(name, str) or name not in LAWS:
-        raise BadInputError(f'law is {excerpt(name)}: expected one of {", ".join(LAWS)}')
-    law = LAWS[name]
-    names = {x.name.partition('.')[2]: x for x in law.constants}
-    unknown = [x for x in constants if x not in names]
-    if unknown:
-        raise BadInputError(
-            f'law {name} has no constant {unknown[0]!r}: expected '
-            + (', '.join(names) or 'none'))
-    if law.scaled is not None and modulus is not None:
-        raise BadInputError(
-            f'shear_modulus is given with law {name}, whose constants it follows from: expected '
-            f'constants={{...}} of {", ".join(names)} alone')
-    values: dict[str, Any] = {LAW_NAME.name: name}
-    for key, value in constants.items():
-        kind = names[key].kind
-        values[names[key].name] = (
-            number(value, key, names[key].unit) if kind is float
-            else [number(x, key) for x in value] if kind is list else str(value))
-    if law.scaled is None:
-        values['actuator.shear_modulus'] = number(
-            _DEFAULTS['shear_modulus'] if modulus is None else modulus, 'shear_modulus', 'Pa')
-    return values
-
-
-def _of_creep(creep: Any) -> dict[str, Any]:
-    """Return the parameters of branches, pairs of ratio and time unless they are `Creep`."""
-    if isinstance(creep, Creep):
-        return creep.parameters
-    if not len(creep):
-        return {}
-    ratios, times = columns_of(creep, ('ratio', 'time'), 'branches of creep')
-    return {'viscoelastic.ratio': ratios.tolist(), 'viscoelastic.time': times.tolist()}
-
-
-def _limits(limits: Any) -> tuple[float, float]:
-    """Return the least and the largest flux density in T."""
-    if isinstance(limits, Limits):
-        raise BadInputError('limits are without a dimension: expected flux densities in T')
-    if isinstance(limits, (tuple, list, np.ndarray)):
-        if len(limits) != 2:
-            raise BadInputError(
-                f'limits are {excerpt(limits)}: expected the least and the largest flux density '
-                'in T, or one number for both directions')
-        low, high = (number(x, 'a flux density limit', 'T') for x in limits)
-    else:
-        high = number(limits, 'flux density limit', 'T')
-        low = -high
-    if not low < high:
-        raise BadInputError(
-            f'flux densities from {low:g} to {high:g} T: expected the least below the largest')
-    return low, high
-
-
-def facts(found: Scales, block: ActuatorParameters) -> list[tuple[str, str]]:
-    """Return what follows from parameters, as names and values with their units."""
-    beam = block.rest == 0.0
-    words = block.coordinate.plural
-    return [
-        ('time unit' if beam else 'time unit L sqrt(rho/G)', time_text(found.time_unit)),
-        ('natural frequency at rest', f'{found.frequency:.5g} Hz'),
-        ('damping', f'{found.damping:.4g} N s/m, zeta {found.zeta:.4g}'),
-        ('critical damping at rest',
-         f'{found.critical_damping:.4g} N s/m, zeta {found.critical_zeta:.4g}'),
-        (f'limiting {words}', '{:.4f} and {:.4f}'.format(*found.stretch_limits)),
-        *([] if beam else [('shape c1', f'{found.c1:.4g}')]),
-        *((f'flux density for {stretch:.6g}', f'{1e3 * flux:.4g} mT')
-          for stretch, flux in found.flux_densities),
-        (f'coil holds {words}', '{:.6g} to {:.6g}'.format(*found.held)),
-        ('two steps reach from rest', 'nothing' if found.reached == (block.rest,) * 2
-         else '{:.6g} to {:.6g}'.format(*found.reached)),
-        ('a move from rest', 'none in two steps' if math.isnan(found.duration)
-         else f'{time_text(found.duration)} to {found.target:.6g}')]
-
-
-def time_text(seconds: float) -> str:
-    """Return a time in a unit that suits it."""
-    for size, unit in ((1.0, 's'), (1e-3, 'ms')):
-        if seconds >= size:
-            return f'{seconds / size:.4g} {unit}'
-    return f'{seconds * 1e6:.4g} us'

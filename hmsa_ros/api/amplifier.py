@@ -6,7 +6,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from hmsa_ros.api.columns import number
+from hmsa_ros.api.arguments import number
 from hmsa_ros.errors import BadInputError
 from hmsa_ros.model.equations import Array
 from hmsa_ros.model.status import RefusedError
@@ -38,11 +38,8 @@ def amplifiers(
     """
     coil = {'inductance': (inductance, 'H'), 'resistance': (resistance, 'ohm'),
             'tesla_per_ampere': (tesla_per_ampere, 'T/A')}
-    numbers = {x: number(y, x, unit) for x, (y, unit) in coil.items() if y is not None}
-    bad = [x for x, y in numbers.items() if not 0.0 < y < math.inf]
-    if bad:
-        raise BadInputError(
-            f'{bad[0]} is {numbers[bad[0]]:g}: expected a finite number above 0')
+    numbers = {
+        x: number(y, x, unit, above=0.0) for x, (y, unit) in coil.items() if y is not None}
     if numbers and 'tesla_per_ampere' not in numbers:
         raise BadInputError(
             'tesla_per_ampere is missing: expected it with inductance and resistance')

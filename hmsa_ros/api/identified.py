@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 
 from hmsa_ros.api.actuator import Actuator
-from hmsa_ros.api.columns import columns_of
+from hmsa_ros.api.arguments import columns_of
 from hmsa_ros.api.motion import Motion
 from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.files import write_text

@@ -8,7 +8,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from hmsa_ros.api.columns import number
+from hmsa_ros.api.arguments import number
 from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.model.delivery import ramps
 from hmsa_ros.model.equations import Array, elastic_force, natural_frequency
@@ -292,9 +292,7 @@ def simulated(
         raise BadInputError(
             f'{end:g} s at {hertz:g} Hz are {end * hertz:.3g} samples: expected at most '
             f'{_MOST_SAMPLES}; give a lower rate or an earlier end (until)')
-    noise = number(noise, 'noise')
-    if not 0.0 <= noise < math.inf:
-        raise BadInputError(f'noise is {noise:g}: expected a finite number of at least 0')
+    noise = number(noise, 'noise', least=0.0)
     stamps = np.round(np.arange(int(end * hertz * (1.0 + 1e-12)) + 1) / hertz * NANOSECONDS
                       ).astype(np.int64)
     stretch, speed, field = response(truth, times, levels, stamps / NANOSECONDS, begin)
@@ -349,10 +347,7 @@ def _end(
         plan: 'Plan | None') -> float:
     """Return when a simulation ends, in s."""
     if until is not None:
-        end = number(until, 'until', 's')
-        if not 0.0 < end < math.inf:
-            raise BadInputError(f'until is {end:g} s: expected a finite number above 0')
-        return end
+        return number(until, 'until', 's', above=0.0)
     if plan is not None and math.isfinite(end := float(np.sum(plan.setpoints[:, 1]))):
         return end
     model = truth.model
@@ -369,7 +364,4 @@ def _rate(truth: 'Actuator', rate: float | None) -> float:
         wanted = max(_RATE, _A_PERIOD * frequency)
         digits = 10 ** (math.floor(math.log10(wanted)) - 1)
         return float(math.ceil(wanted / digits) * digits)
-    hertz = number(rate, 'rate', 'Hz')
-    if not 0.0 < hertz <= 1e9:
-        raise BadInputError(f'rate is {hertz:g} Hz: expected more than 0 and at most 1e9')
-    return hertz
+    return number(rate, 'rate', 'Hz', above=0.0, most=1e9)

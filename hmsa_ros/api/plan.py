@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hmsa_ros.api.actuator import Actuator
-from hmsa_ros.api.columns import number
+from hmsa_ros.api.arguments import number
 from hmsa_ros.api.motion import Motion, simulated
 from hmsa_ros.errors import BadInputError, excerpt
 from hmsa_ros.model.equations import Array
@@ -86,10 +86,8 @@ class Plan:
             If this is not a number above 0.
 
         """
-        factor = number(tesla_per_ampere, 'tesla_per_ampere', 'T/A')
-        if not factor > 0.0:
-            raise BadInputError(f'tesla_per_ampere is {factor:g}: expected a number above 0 T/A')
-        return self.flux_densities / factor
+        return self.flux_densities / number(
+            tesla_per_ampere, 'tesla_per_ampere', 'T/A', above=0.0)
 
     def report(self) -> Table:
         """Return the first and last level of each setpoint, its move time and its status."""

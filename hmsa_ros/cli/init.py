@@ -289,7 +289,7 @@ def _doubts(given: Mapping[str, float], found: 'Scales') -> list[str]:
 
 def table(found: 'Scales', actuator: 'ActuatorParameters') -> list[str]:
     """Return what follows from the parameters, aligned, a line each."""
-    from hmsa_ros.api.actuator import facts
+    from hmsa_ros.api.facts import facts
 
     return [f'{name:<26} {value}' for name, value in facts(found, actuator)]
 

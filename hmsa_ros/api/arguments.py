@@ -1,0 +1,181 @@
+"""Arguments of the public functions, checked: numbers, columns of them, laws, branches, limits."""
+
+from collections.abc import Mapping
+import math
+from numbers import Real
+from typing import Any
+
+import numpy as np
+
+from hmsa_ros.errors import BadInputError, excerpt
+from hmsa_ros.interfaces.parameters import ACTUATOR, LAW_NAME
+from hmsa_ros.model.creep import Creep
+from hmsa_ros.model.equations import Array
+from hmsa_ros.model.laws import LAWS
+from hmsa_ros.model.moves import Limits
+
+#: Parameters of a block by their names without the group, with their defaults.
+DEFAULTS = {x.name.partition('.')[2]: x.default for x in ACTUATOR}
+
+#: Other names of a column.
+_ALIASES = {'duration': ('span', 'seconds'), 'stretch': ('deflection', 'position')}
+
+
+def columns_of(value: Any, names: tuple[str, str], what: str) -> tuple[Array, Array]:
+    """
+    Return two columns of finite numbers, each of shape (n,).
+
+    Parameters
+    ----------
+    value : pairs, tuple of two arrays, array of shape (n, 2), mapping or DataFrame
+        The numbers; a mapping has the columns by name.
+    names : tuple of str
+        Of the columns.
+    what : str
+        What they are, for messages.
+
+    Returns
+    -------
+    tuple of ndarray
+        Both columns.
+
+    Raises
+    ------
+    BadInputError
+        If it is none of these, or a number is not finite.
+
+    """
+    expected = (
+        f'expected pairs of {names[0]} and {names[1]}, two arrays, or columns of these names')
+    if isinstance(value, Mapping) or hasattr(value, 'columns') and hasattr(value, '__getitem__'):
+        pair = [_column(value, x, what) for x in names]
+    elif isinstance(value, tuple) and len(value) == 2 and all(
+            isinstance(x, np.ndarray) for x in value):
+        pair = list(value)
+    else:
+        rows = _numbers(value, what, expected)
+        if rows.ndim != 2 or rows.shape[1] != 2:
+            raise BadInputError(
+                f'{what} have the shape {rows.shape}: {expected}, as in [(1.1, 0.5), (1.0, 0.5)]')
+        pair = [rows[:, 0], rows[:, 1]]
+    one, other = (np.ascontiguousarray(_numbers(x, what, expected)) for x in pair)
+    if one.ndim != 1 or one.shape != other.shape or not len(one):
+        raise BadInputError(
+            f'{what} have {names[0]} of shape {one.shape} and {names[1]} of shape {other.shape}: '
+            'expected two rows of one length, of at least 1')
+    return one, other
+
+
+def _column(value: Any, name: str, what: str) -> Any:
+    found = next((x for x in (name, *_ALIASES.get(name, ())) if x in value), None)
+    if found is None:
+        raise BadInputError(
+            f'{what} have the columns {", ".join(map(str, value))}: expected one named {name}')
+    return value[found]
+
+
+def _numbers(value: Any, what: str, expected: str) -> Array:
+    try:
+        found: Array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise BadInputError(f'{what} are {excerpt(value)}: {expected}') from error
+    return found
+
+
+def number(
+        value: Any, what: str, unit: str = '', *, least: float = -math.inf,
+        above: float = -math.inf, most: float = math.inf) -> float:
+    """
+    Return a number of at least one, above another and at most a third.
+
+    Raises
+    ------
+    BadInputError
+        If it is none, out of range, or with a bound from below not finite.
+
+    """
+    units = f' {unit}' if unit else ''
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
+        raise BadInputError(
+            f'{what} is {excerpt(value)}: expected a number' + (f' in {unit}' if unit else ''))
+    found = float(value)
+    bounded = least > -math.inf or above > -math.inf
+    if bounded and not (least <= found and above < found <= most and found < math.inf):
+        raise BadInputError(
+            f'{what} is {found:g}{units}: expected a finite number '
+            + (f'of at least {least:g}' if least > -math.inf else f'above {above:g}')
+            + (f' and at most {most:g}' if most < math.inf else '') + units)
+    return found
+
+
+def law_values(
+        name: Any, constants: Mapping[str, Any], modulus: float | None) -> dict[str, Any]:
+    """
+    Return the parameters of a law.
+
+    Raises
+    ------
+    BadInputError
+        If there is no such law or constant, or a constant is of another type.
+
+    """
+    if not isinstance(name, str) or name not in LAWS:
+        raise BadInputError(f'law is {excerpt(name)}: expected one of {", ".join(LAWS)}')
+    law = LAWS[name]
+    names = {x.name.partition('.')[2]: x for x in law.constants}
+    unknown = [x for x in constants if x not in names]
+    if unknown:
+        raise BadInputError(
+            f'law {name} has no constant {unknown[0]!r}: expected '
+            + (', '.join(names) or 'none'))
+    if law.scaled is not None and modulus is not None:
+        raise BadInputError(
+            f'shear_modulus is given with law {name}, whose constants it follows from: expected '
+            f'constants={{...}} of {", ".join(names)} alone')
+    values: dict[str, Any] = {LAW_NAME.name: name}
+    for key, value in constants.items():
+        kind = names[key].kind
+        values[names[key].name] = (
+            number(value, key, names[key].unit) if kind is float
+            else [number(x, key) for x in value] if kind is list else str(value))
+    if law.scaled is None:
+        values['actuator.shear_modulus'] = number(
+            DEFAULTS['shear_modulus'] if modulus is None else modulus, 'shear_modulus', 'Pa')
+    return values
+
+
+def creep_values(creep: Any) -> dict[str, Any]:
+    """Return the parameters of branches, pairs of ratio and time unless they are `Creep`."""
+    if isinstance(creep, Creep):
+        return creep.parameters
+    if not len(creep):
+        return {}
+    ratios, times = columns_of(creep, ('ratio', 'time'), 'branches of creep')
+    return {'viscoelastic.ratio': ratios.tolist(), 'viscoelastic.time': times.tolist()}
+
+
+def limits_of(limits: Any) -> tuple[float, float]:
+    """
+    Return the least and the largest flux density in T.
+
+    Raises
+    ------
+    BadInputError
+        If they are no numbers or not in this order.
+
+    """
+    if isinstance(limits, Limits):
+        raise BadInputError('limits are without a dimension: expected flux densities in T')
+    if isinstance(limits, (tuple, list, np.ndarray)):
+        if len(limits) != 2:
+            raise BadInputError(
+                f'limits are {excerpt(limits)}: expected the least and the largest flux density '
+                'in T, or one number for both directions')
+        low, high = (number(x, 'a flux density limit', 'T') for x in limits)
+    else:
+        high = number(limits, 'flux density limit', 'T')
+        low = -high
+    if not low < high:
+        raise BadInputError(
+            f'flux densities from {low:g} to {high:g} T: expected the least below the largest')
+    return low, high
