@@ -70,7 +70,7 @@ def _print_table(result: 'DemoResult') -> None:
             x.stretch, x.b_p, x.tau_p, x.b_1, x.arrival * 1e3, 100.0 * x.residual,
             100.0 * x.residual_unshaped, str(x.finding['verdict']).replace('_', ' '))
             for x in result.setpoints),
-        'b and tau nondimensional as in the paper; arrival from the begin of the move; residual: '
+        'b and tau nondimensional as in the paper; arrival from the start of the move; residual: '
         'peak-to-peak stretch after arrival, in % of the step; unshaped: simulated on the same '
         'plant'))
     print(Table((

@@ -63,7 +63,7 @@ def comparison(parts: Sequence[Part]) -> Table:
         Column('vibration', '%', '%'), Column('vibration std', '%', '%', '±'),
         Column('apart', '%', '%'), Column('verdict')), tuple(rows),
         'move time: from the first level to rest; offset: mean less the target; vibration: peak '
-        f'to peak; apart: largest distance from the curve of {labels[0]}, from the begin of the '
+        f'to peak; apart: largest distance from the curve of {labels[0]}, from the start of the '
         'move on; all in % of the step; ±: standard deviations')
 
 

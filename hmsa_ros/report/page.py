@@ -288,7 +288,7 @@ def _setpoints(parts: Sequence[Part]) -> str:
         'setpoint-table', 'Verdict by the samples, with offset and vibration (peak to peak) and '
         'their standard deviations. b and tau nondimensional as in the paper: of the first '
         'level, the time until arrival, and of the level that holds the target. Begin from the '
-        'first level of the run; arrival and end from the begin of the move. Error and '
+        'first level of the run; arrival and end from the start of the move. Error and '
         'residual from arrival on, noise included. All in percent of the step.', {
             'run': '', 'setpoint': '', f'target {parts[0].run.plant.coordinate.symbol} [1]': '.6g',
             'verdict': '', 'offset [%]': '+%', '± [%]': '%', 'vibration [%]': '%',
